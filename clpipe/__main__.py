@@ -1,0 +1,5 @@
+"""``python -m clpipe``."""
+
+from clpipe.cli import main
+
+main()

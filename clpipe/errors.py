@@ -1,0 +1,25 @@
+"""What can go wrong, by whose fault it is. Each class carries the exit status of the program."""
+
+
+class ClpipeError(Exception):
+    """Base of all errors that are reported as one clear message, without a traceback."""
+
+    exit_status = 2
+
+
+class RequestError(ClpipeError):
+    """The request was wrong: an unknown name, a bad value, a chain that does not fit."""
+
+    exit_status = 2
+
+
+class ImageError(ClpipeError):
+    """One image cannot be read, processed or written; the others go on."""
+
+    exit_status = 1
+
+
+class DeviceError(ClpipeError):
+    """There is no usable device, or the one that was asked for cannot be used."""
+
+    exit_status = 3

@@ -1,0 +1,296 @@
+"""From a chain of stages to launches and buffer slots. Pure: it needs no device.
+
+Passes go into groups, and a group becomes one launch. A stencil opens a group, because its
+neighbours must be there first; pointwise passes join the group before them; sums and a kept
+intermediate close it. What crosses from one launch to the next is an image of one to three planes;
+a plane lives in a slot from the launch that writes it to the last one that reads it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from clpipe.config import Pipeline, Step
+from clpipe.stage import Access, Kind, Literal, Pass
+
+
+@dataclass(frozen=True)
+class Op:
+    """One pass of one step, with the types of its run-time arguments and its literals."""
+
+    step: str
+    kernel: str
+    pass_: Pass
+    kind: Kind  # of what it gives
+    types: tuple[tuple[str, str], ...]  # argument -> OpenCL type
+    literals: tuple[tuple[str, str], ...]  # argument -> OpenCL text
+
+
+@dataclass(frozen=True)
+class Image:
+    """An image between launches."""
+
+    number: int
+    kind: Kind
+
+
+@dataclass(frozen=True)
+class Read:
+    """An image as a launch reads it: passes in ``prologue`` are redone at each tap."""
+
+    image: Image
+    prologue: tuple[Op, ...] = ()
+
+
+@dataclass(frozen=True)
+class Launch:
+    """One kernel call over the image.
+
+    ``reads`` is empty where the launch reads the source; if the first op is a stencil they are
+    its images in order, else the one image that is loaded. ``writes`` is stored as planes,
+    ``encodes`` says that eight-bit pixels are written, ``sums`` is a SUMS pass fed on the way.
+    """
+
+    name: str
+    ops: tuple[Op, ...]
+    reads: tuple[Read, ...] = ()
+    writes: Image | None = None
+    encodes: bool = False
+    sums: Op | None = None
+    rows: int = 2
+
+    @property
+    def stencil(self) -> Op | None:
+        """The stencil that opens the group, if one does."""
+        return self.ops[0] if self.ops and self.ops[0].pass_.access is Access.STENCIL else None
+
+
+@dataclass(frozen=True)
+class Lines:
+    """One launch that fills the line tables of all steps that have one."""
+
+    ops: tuple[Op, ...]
+    name: str = "lines"
+
+
+@dataclass(frozen=True)
+class AddUp:
+    """The first half of a reduction: partial sums of blocks to partial sums of work items."""
+
+    op: Op
+    name: str
+
+
+@dataclass(frozen=True)
+class Find:
+    """The second half of a reduction: one work item makes the numbers out of the sums."""
+
+    op: Op
+    name: str
+
+
+AnyLaunch = Launch | Lines | AddUp | Find
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that is to be done to one image, in order."""
+
+    source: Kind
+    half: bool
+    launches: tuple[AnyLaunch, ...]
+    slots: dict[int, tuple[int, ...]] = field(hash=False)  # image number -> slots of its planes
+    slot_count: int = 0
+    kept: tuple[tuple[str, Image], ...] = ()  # step -> its image
+    final: Image | None = None  # the last image as float planes
+    encoded: Kind | None = None  # the kind that is encoded to eight bits
+    apron: int = 0
+
+    def bytes_per_pixel(self, lanes: int) -> float:
+        """Device memory a pixel takes: source, slots, partial sums and eight-bit result."""
+        source = len(self.source.channels) * (2 if self.half else 4)
+        sums = [x for x in self.launches if isinstance(x, Launch) and x.sums]
+        encoded = len(self.encoded.channels) if self.encoded else 0
+        return source + 4 * self.slot_count + sum(16 / (lanes * x.rows) for x in sums) + encoded
+
+
+class _Planner:
+    def __init__(self, source: Kind, fold: bool) -> None:
+        self.kind = source
+        self.fold = fold
+        self.launches: list[AnyLaunch] = []
+        self.lines: list[Op] = []
+        self.images: list[Image] = []
+        self.group: Launch | None = Launch("load", ())  # open, still to be stored
+        self.stored: Image | None = None  # the current image, when no group is open
+
+    def close(self, sums: Op | None = None) -> Image:
+        """End the open group and store its result; the stored current image if none is open."""
+        if self.group is None:
+            assert self.stored is not None
+            if not sums:
+                return self.stored
+            self.group = Launch("sums", (), (Read(self.stored),))
+        if sums and not self.group.ops and self.group.reads:
+            image = self.group.reads[0].image  # nothing new to store
+            self.emit(replace(self.group, sums=sums))
+        else:
+            image = Image(len(self.images), self.kind)
+            self.images.append(image)
+            self.emit(replace(self.group, writes=image, sums=sums))
+        self.group, self.stored = None, image
+        return image
+
+    def emit(self, group: Launch) -> None:
+        names = list(dict.fromkeys(op.step for op in group.ops))
+        rows = 4 if any(op.pass_.random for op in group.ops) or group.sums else 2
+        name = names[0] if len(names) == 1 else f"{names[0]}..{names[-1]}" if names else group.name
+        if group.stencil and group.stencil.pass_.function != group.stencil.step:
+            name = name.replace(
+                group.stencil.step, f"{group.stencil.step}.{group.stencil.pass_.function}", 1
+            )
+        self.launches.append(replace(group, rows=rows, name=name))
+
+    def input_of_stencil(self) -> Read:
+        """The current image for a stencil: cheap pointwise passes on a stored one are redone."""
+        group = self.group
+        if group and self.fold and group.reads and not group.stencil:
+            if all(op.pass_.cheap for op in group.ops):
+                self.group, self.stored = None, group.reads[0].image
+                return Read(group.reads[0].image, group.ops)
+        return Read(self.close())
+
+    def add_step(self, step: Step) -> None:
+        passes = step.method.passes()
+        local: dict[str, Read] = {}
+        if any(p.access is Access.STENCIL and "src" in p.reads for p in passes):
+            local["src"] = self.input_of_stencil()
+        written = "src"
+        for pass_ in passes:
+            op = make_op(step, pass_)
+            match pass_.access:
+                case Access.LINES:
+                    self.lines.append(op)
+                    continue
+                case Access.SUMS:
+                    self.close(sums=op)
+                    self.launches.append(AddUp(op, f"{step.name}.add_up"))
+                    self.launches.append(Find(op, f"{step.name}.{pass_.finish}"))
+                    continue
+                case Access.STENCIL:
+                    if written not in local:
+                        local[written] = Read(self.close())
+                    self.group = Launch("", (op,), tuple(local[name] for name in pass_.reads))
+                case Access.POINTWISE | Access.CURVE:
+                    if self.group is None:
+                        assert self.stored is not None
+                        self.group = Launch("", (), (Read(self.stored),))
+                    self.group = replace(self.group, ops=(*self.group.ops, op))
+            self.kind, written = op.kind, pass_.writes
+
+
+def make_op(step: Step, pass_: Pass) -> Op:
+    """A pass of a step with the types of its arguments, which decide the kernel's signature."""
+    types, literals = [], []
+    for name, value in step.method.arguments(step.context).items():
+        if isinstance(value, Literal):
+            literals.append((name, value.text))
+        elif isinstance(value, np.ndarray):
+            types.append((name, "__global const float *"))
+        else:
+            types.append((name, {"f": "float", "u": "uint", "i": "int"}[value.dtype.kind]))
+    kind = pass_.kind or step.stage.writes
+    return Op(step.name, step.method.kernel, pass_, kind, tuple(types), tuple(literals))
+
+
+def make_plan(
+    pipeline: Pipeline,
+    half: bool = True,
+    keep: Sequence[str] = (),
+    encode: bool = True,
+    final: bool = False,
+    fold: bool = True,
+) -> Plan:
+    """The plan of a chain.
+
+    Args:
+        half: the source holds half floats, not floats.
+        keep: steps whose image is wanted.
+        encode: the last image is wanted in eight bits.
+        final: the last image is wanted in float.
+        fold: let a stencil redo cheap passes at its taps. It must be off for images one pixel
+            wide or high: mirroring cannot keep the Bayer phase there.
+
+    Raises:
+        RequestError: a step to keep that the chain has not.
+    """
+    for name in keep:
+        pipeline.step_named(name)
+    last = pipeline.steps[-1].name
+    final = final or last in keep
+    planner = _Planner(pipeline.source, fold)
+    kept: dict[str, Image] = {}
+    for step in pipeline.steps:
+        planner.add_step(step)
+        if step.name in keep and step.name != last:
+            kept[step.name] = planner.close()
+    group = planner.group or Launch("encode", (), (Read(planner.close()),))
+    final_image = None
+    if final:
+        final_image = Image(len(planner.images), planner.kind)
+        planner.images.append(final_image)
+        if last in keep:
+            kept[last] = final_image
+    planner.emit(replace(group, writes=final_image, encodes=encode))
+    launches = list(planner.launches)
+    if planner.lines:
+        launches.insert(0, Lines(tuple(planner.lines)))
+    pinned = {image.number for image in kept.values()}
+    if final_image:
+        pinned.add(final_image.number)
+    slots, count = assign_slots(launches, planner.images, pinned)
+    radii = [x.stencil.pass_.radius for x in launches if isinstance(x, Launch) and x.stencil]
+    return Plan(
+        source=pipeline.source,
+        half=half,
+        launches=tuple(launches),
+        slots=slots,
+        slot_count=count,
+        kept=tuple(kept.items()),
+        final=final_image,
+        encoded=pipeline.result if encode else None,
+        apron=max(radii, default=0),
+    )
+
+
+def assign_slots(
+    launches: Sequence[AnyLaunch], images: Sequence[Image], pinned: set[int]
+) -> tuple[dict[int, tuple[int, ...]], int]:
+    """Slots for the planes of every image, by last use; those of ``pinned`` are never reused.
+
+    Returns the slots of each image number, and how many slots there are.
+    """
+    last_use = {
+        read.image.number: i
+        for i, launch in enumerate(launches)
+        if isinstance(launch, Launch)
+        for read in launch.reads
+    }
+    slots: dict[int, tuple[int, ...]] = {}
+    free: list[int] = []
+    count = 0
+    for i, launch in enumerate(launches):
+        if not isinstance(launch, Launch):
+            continue
+        if launch.writes:
+            planes = len(launch.writes.kind.channels)
+            while len(free) < planes:
+                free.append(count)
+                count += 1
+            slots[launch.writes.number] = tuple(free[:planes])
+            del free[:planes]
+        for read in {read.image.number for read in launch.reads}:
+            if last_use[read] == i and read not in pinned:
+                free.extend(slots[read])
+    return slots, count

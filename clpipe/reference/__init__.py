@@ -1,0 +1,1 @@
+"""NumPy twins of ``kernels/lib``: the same definitions, file by file, for the references."""

@@ -1,0 +1,39 @@
+"""The Bayer patterns, as ``kernels/lib/cfa.h`` has them."""
+
+from typing import Literal, get_args
+
+import numpy as np
+
+from clpipe.types import Floats
+
+Pattern = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
+PATTERNS: tuple[Pattern, ...] = get_args(Pattern)
+
+
+def red_site(pattern: Pattern) -> tuple[int, int]:
+    """Column and row (0 or 1) of red in the 2x2 cell that the pattern spells row by row.
+
+    >>> red_site("GRBG")
+    (1, 0)
+    """
+    return pattern.index("R") % 2, pattern.index("R") // 2
+
+
+def by_site(
+    shape: tuple[int, ...],
+    pattern: Pattern,
+    red: Floats | np.float32,
+    green: Floats | np.float32,
+    blue: Floats | np.float32,
+) -> Floats:
+    """One value (or image) a colour in, at each pixel the site's own colour's out.
+
+    >>> by_site((2, 2), "RGGB", np.float32(1), np.float32(2), np.float32(3)).tolist()
+    [[1.0, 2.0], [2.0, 3.0]]
+    """
+    red_x, red_y = red_site(pattern)
+    in_red_row = ((np.arange(shape[0]) ^ red_y) & 1 == 0)[:, None]
+    in_red_column = ((np.arange(shape[1]) ^ red_x) & 1 == 0)[None, :]
+    return np.where(
+        in_red_row, np.where(in_red_column, red, green), np.where(in_red_column, green, blue)
+    ).astype(np.float32)

@@ -1,0 +1,30 @@
+"""Luma and colour differences, as ``kernels/lib/colour.h`` has them."""
+
+import numpy as np
+
+from clpipe.types import Floats
+
+LUMA = np.float32([0.299, 0.587, 0.114])
+
+
+def rgb_to_ycbcr(image: Floats) -> Floats:
+    """ITU-R BT.601: Y = .299R + .587G + .114B, Cb = .564(B-Y), Cr = .713(R-Y).
+
+    ``image`` is (height, width, 3), linear; so is the answer, as (Y, Cb, Cr).
+    """
+    red, green, blue = np.moveaxis(image, -1, 0)
+    y = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
+    return np.stack([y, np.float32(0.564) * (blue - y), np.float32(0.713) * (red - y)], axis=-1)
+
+
+def ycbcr_to_rgb(image: Floats) -> Floats:
+    """The exact inverse of :func:`rgb_to_ycbcr`.
+
+    >>> ycbcr_to_rgb(rgb_to_ycbcr(np.float32([[[0.2, 0.5, 0.9]]]))).round(5).tolist()
+    [[[0.20000000298023224, 0.5, 0.8999999761581421]]]
+    """
+    y, cb, cr = np.moveaxis(image, -1, 0)
+    red = y + cr * np.float32(1.4025246)
+    blue = y + cb * np.float32(1.7730496)
+    green = (y - LUMA[0] * red - LUMA[2] * blue) * np.float32(1.7035775)
+    return np.stack([red, green, blue], axis=-1)

@@ -1,0 +1,46 @@
+"""One-dimensional curves as tables, as ``kernels/lib/curve.h`` has them.
+
+The index is the upper part of the float itself: 20 octaves below 1, 4096 steps each. A value takes
+the nearest entry (relative error at most 2^-13), so a table of tables gives, bit for bit, what
+two look-ups one after the other would.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clpipe.types import Array, Floats
+
+OCTAVES, STEPS = 20, 4096
+SIZE = OCTAVES * STEPS + 1
+_SMALLEST = np.float32(2.0**-OCTAVES)
+_FIRST = int(_SMALLEST.view(np.int32)) >> 11
+
+
+def curve_index(values: Floats) -> NDArray[np.int32]:
+    """The table entry nearest to each value; below 2^-20 entry 0, above 1 the last.
+
+    >>> curve_index(np.float32([-1, 0, 2**-20, 0.5, 1, 7])).tolist()
+    [0, 0, 0, 77824, 81920, 81920]
+    """
+    inside = np.minimum(np.maximum(np.nan_to_num(values), _SMALLEST), np.float32(1))
+    return ((inside.view(np.int32) + np.int32(0x400)) >> np.int32(11)) - np.int32(_FIRST)
+
+
+def tabulate(function: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Floats:
+    """The table of a function on 0..1: its value at each entry's own float; entry 0 stands for 0."""
+    points = ((np.arange(SIZE, dtype=np.int32) + _FIRST) << 11).view(np.float32).astype(np.float64)
+    points[0] = 0
+    return function(points).astype(np.float32)
+
+
+def compose(first: Floats, second: Array) -> Array:
+    """The table that does in one look-up what ``first`` and then ``second`` do in two."""
+    return second[curve_index(first)]
+
+
+def to_8_bit(values: Floats) -> NDArray[np.uint8]:
+    """0..1 to 0..255, rounded to nearest (ties to even), clipped."""
+    clipped = np.minimum(np.maximum(np.nan_to_num(values), np.float32(0)), np.float32(1))
+    return np.rint(clipped * np.float32(255)).astype(np.uint8)

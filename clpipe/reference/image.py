@@ -1,0 +1,28 @@
+"""Neighbours and borders, as ``kernels/lib/image.h`` has them."""
+
+import numpy as np
+
+from clpipe.types import Floats
+
+
+def mirror(index: np.ndarray, size: int) -> np.ndarray:
+    """The pixels of 0..size-1 that reflect-101 shows at these places.
+
+    >>> mirror(np.arange(-3, 7), 4).tolist()
+    [3, 2, 1, 0, 1, 2, 3, 2, 1, 0]
+    """
+    if size == 1:
+        return np.zeros_like(index)
+    period = 2 * (size - 1)
+    index = index % period
+    return np.where(index < size, index, period - index)
+
+
+def tap(image: Floats, dx: int, dy: int) -> Floats:
+    """The image as seen from each pixel ``dx`` to the right and ``dy`` down, mirrored at borders.
+
+    ``image`` is (height, width) or (height, width, channel); so is the answer.
+    """
+    rows = mirror(np.arange(image.shape[0]) + dy, image.shape[0])
+    columns = mirror(np.arange(image.shape[1]) + dx, image.shape[1])
+    return image[rows][:, columns]

@@ -1,0 +1,173 @@
+"""One image through a chain, on a device or in NumPy."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from clpipe.codegen import Parameter
+from clpipe.config import Pipeline, Step
+from clpipe.device import Device, Timing
+from clpipe.errors import ImageError
+from clpipe.plan import Plan, make_plan
+from clpipe.reference.curve import compose, to_8_bit
+from clpipe.reference.random import Stream, stream_of
+from clpipe.stage import Frame, Owner
+from clpipe.types import Array, Floats
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came out of a chain.
+
+    ``final`` is the last image in float32, ``encoded`` the same in eight bits, ``kept`` the images
+    of the steps that were asked for, ``found`` what stages found in the image.
+    """
+
+    final: Floats | None
+    encoded: Array | None
+    kept: dict[str, Floats]
+    found: dict[str, dict[str, float]]
+
+
+def streams(pipeline: Pipeline, step: Step, image_key: str) -> dict[Owner, Stream]:
+    """The random streams of a step for one image.
+
+    Image noise is keyed on the seed and the image key, fixed pattern noise on the camera.
+    """
+    return {
+        Owner.IMAGE: stream_of(f"image:{pipeline.seed}:{image_key}", step.name),
+        Owner.CAMERA: stream_of(f"camera:{pipeline.camera.name}", step.name),
+    }
+
+
+class Runner:
+    """Runs one chain over images, on a device, or in NumPy where there is none.
+
+    Args:
+        pipeline: the chain.
+        device: where to run; None is NumPy.
+        keep: steps whose image is wanted.
+        encode: whether the last image is wanted in eight bits.
+        final: whether the last image is wanted in float.
+    """
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        device: Device | None,
+        keep: Sequence[str] = (),
+        encode: bool = True,
+        final: bool = False,
+    ) -> None:
+        self.pipeline = pipeline
+        self.device = device
+        self.keep = tuple(keep)
+        self.encode = encode
+        self.final = final
+        self._plans: dict[tuple[bool, bool], Plan] = {}
+        self._arguments = {s.name: s.method.arguments(s.context) for s in pipeline.steps}
+        self._table8: dict[str, Array] = {}
+
+    def plan(self, half: bool = True, fold: bool = True) -> Plan:
+        """The plan for a source of half floats or floats."""
+        key = (half, fold)
+        if key not in self._plans:
+            self._plans[key] = make_plan(
+                self.pipeline, half, self.keep, self.encode, self.final, fold
+            )
+        return self._plans[key]
+
+    def warm_up(self, half: bool = True) -> None:
+        """Compile everything, so that the first image does not wait for it."""
+        if self.device:
+            shape = (8, 8, 3)[: 2 if len(self.pipeline.source.channels) == 1 else 3]
+            self.run(np.zeros(shape, np.float16 if half else np.float32), "")
+
+    def run(
+        self,
+        image: Array,
+        image_key: str,
+        timings: list[Timing] | None = None,
+        download: bool = True,
+    ) -> Result:
+        """Put one image through.
+
+        Args:
+            image: (height, width, 3) linear RGB, or (height, width) for a chain that starts on a
+                mosaic; float16 or float32, finite.
+            image_key: what the image's noise is keyed on.
+            timings: is given one entry a launch (devices only).
+            download: False leaves the results on the device (for measuring).
+
+        Raises:
+            ImageError: an image of the wrong shape, or one that does not fit the device.
+        """
+        channels = len(self.pipeline.source.channels)
+        shape = image.shape[2] if image.ndim == 3 else 1
+        if image.ndim not in (2, 3) or shape != channels or 0 in image.shape:
+            raise ImageError(
+                f"found an image of shape {image.shape}, but the chain starts on "
+                f"{self.pipeline.source.label} with {channels} channel(s)"
+            )
+        if not self.device:
+            return self._run_numpy(np.asarray(image, np.float32), image_key)
+        if image.dtype not in (np.float16, np.float32):
+            image = image.astype(np.float32)
+        plan = self.plan(image.dtype == np.float16, fold=min(image.shape[:2]) > 1)
+        keys = {s.name: streams(self.pipeline, s, image_key) for s in self.pipeline.steps}
+
+        def bind(parameter: Parameter) -> Any:
+            if parameter.role == "table8":
+                return self._composed(parameter.item)
+            if parameter.role == "value":
+                return self._arguments[parameter.step][parameter.item]
+            of = keys[parameter.step]
+            if parameter.item == "stage":
+                return np.uint32(of[Owner.IMAGE].stage)
+            stream = of[Owner(parameter.item[:-1])]
+            return np.uint32(stream.key1 if parameter.item.endswith("1") else stream.key0)
+
+        output = self.device.run(plan, image, bind, timings, download)
+        names = {
+            s.name: [n for p in s.method.passes() for n in p.found] for s in self.pipeline.steps
+        }
+        return Result(
+            final=output.images.get(plan.final.number) if plan.final else None,
+            encoded=output.encoded,
+            kept={name: output.images[i.number] for name, i in plan.kept if output.images},
+            found={
+                step: dict(zip(names[step], map(float, values), strict=False))
+                for step, values in output.found.items()
+            },
+        )
+
+    def _composed(self, steps: str) -> Array:
+        """The table of these curves and the conversion to eight bits, all in one."""
+        if steps not in self._table8:
+            *first, last = (self._arguments[name]["table"] for name in steps.split(","))
+            assert isinstance(last, np.ndarray)
+            table: Array = to_8_bit(last)
+            for curve in reversed(first):
+                assert isinstance(curve, np.ndarray)
+                table = compose(curve, table)
+            self._table8[steps] = table
+        return self._table8[steps]
+
+    def _run_numpy(self, image: Floats, image_key: str) -> Result:
+        kept: dict[str, Floats] = {}
+        found: dict[str, dict[str, float]] = {}
+        for step in self.pipeline.steps:
+            frame = Frame(step.context, streams(self.pipeline, step, image_key), {})
+            image = step.method.reference(image, frame)
+            if step.name in self.keep:
+                kept[step.name] = image
+            if frame.found:
+                found[step.name] = frame.found
+        return Result(
+            final=image if self.final or self.pipeline.steps[-1].name in self.keep else None,
+            encoded=to_8_bit(image) if self.encode else None,
+            kept=kept,
+            found=found,
+        )

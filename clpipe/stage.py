@@ -1,0 +1,185 @@
+"""What a stage is: the image kinds it reads and writes, how it touches pixels, its parameters.
+
+A stage is declared once, in ``clpipe/stages/<name>.py``, as a :class:`Stage` with one or more
+:class:`Method` classes. The fields of a method are its parameters; everything that is said of them
+anywhere (validation, help, ``--set``, kernel arguments, the sidecar) is derived from there.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from functools import cached_property
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from clpipe.camera import Camera
+from clpipe.reference.cfa import Pattern, red_site
+from clpipe.reference.random import Stream
+from clpipe.types import Array, Floats
+
+
+class Kind(Enum):
+    """A kind of image: what its samples mean, how it is called in OpenCL, its planes."""
+
+    RGB = ("rgb", "rgb", ("R", "G", "B"))  # linear, 1 = sensor full scale at EV 0
+    MOSAIC = ("mosaic", "vf", ("Y",))  # signal: 0 = black level, 1 = white level
+    RAW = ("raw", "vf", ("Y",))  # mosaic in DN
+    DISPLAY = ("display", "rgb", ("R", "G", "B"))  # as a screen wants it, 0..1
+    YCBCR = ("ycbcr", "ycbcr", ("Y", "Cb", "Cr"))  # inside a stage only
+    DIFFERENCES = ("differences", "differences", ("R-G", "B-G"))  # inside a stage only
+
+    def __init__(self, label: str, c_type: str, channels: tuple[str, ...]) -> None:
+        self.label = label
+        self.c_type = c_type
+        self.channels = channels
+
+    @property
+    def c_name(self) -> str:
+        """What the kernel library calls it in ``tap_*`` and ``store_*``."""
+        return "mosaic" if self.c_type == "vf" else self.c_type
+
+
+class Access(Enum):
+    """How a pass touches pixels."""
+
+    POINTWISE = "pointwise"  # a pixel from that pixel
+    CURVE = "curve"  # pointwise, each channel through the table named "table"
+    STENCIL = "stencil"  # a pixel from its neighbours
+    LINES = "lines"  # a table with a value a row or column, from no image
+    SUMS = "sums"  # sums over the whole image, then a few numbers found from them
+
+
+class Owner(Enum):
+    """What noise belongs to, and so what its random key is made of."""
+
+    IMAGE = "image"  # new in each image
+    CAMERA = "camera"  # fixed: the same across images, views and ISOs
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One function of a method's kernel file, and how the planner may place it.
+
+    ``reads`` and ``writes`` name images of the stage: ``src`` is its input, ``dst`` its output, any
+    other name is scratch. ``arguments`` are, in order, names from :meth:`Method.arguments`, from
+    ``found`` of an earlier SUMS pass, or the line table that an earlier LINES pass writes.
+    """
+
+    function: str
+    access: Access = Access.POINTWISE
+    arguments: tuple[str, ...] = ()
+    reads: tuple[str, ...] = ("src",)
+    writes: str = "dst"
+    kind: Kind | None = None  # of what it writes; None: what the stage writes
+    radius: int = 0
+    random: Owner | None = None  # gets a random stream as its first argument
+    cheap: bool = False  # so cheap that a stencil after it may redo it at each tap
+    lines: str = ""  # LINES: "rows" or "columns"
+    finish: str = ""  # SUMS: the function that turns sums into what is found
+    found: tuple[str, ...] = ()  # SUMS: names of the numbers it finds
+
+
+@dataclass(frozen=True)
+class Literal:
+    """An argument that is compiled in, as OpenCL text."""
+
+    text: str
+
+
+Argument = np.float32 | np.uint32 | np.int32 | Array | Literal
+
+
+@dataclass(frozen=True)
+class Context:
+    """What is known of the image where a stage stands in the chain."""
+
+    camera: Camera
+    iso: float
+    pattern: Pattern = "RGGB"
+    gains: tuple[float, float] = (1.0, 1.0)  # red, blue: taken out by inverse_white_balance
+    noise: tuple[float, float] | None = None  # a, b of the sensor noise that was added
+    black_level: float | None = None  # DN, as quantize used them
+    white_level: float | None = None
+
+    @property
+    def cfa(self) -> Literal:
+        """The pattern as a compiled-in kernel argument."""
+        return Literal("(cfa){%d, %d}" % red_site(self.pattern))
+
+
+def parameter(
+    default: Any, text: str, unit: str = "", auto: str = "", structural: bool = False, **limits: Any
+) -> Any:
+    """Declare a parameter: default, one sentence, unit, limits (ge, gt, le, lt).
+
+    ``auto`` says where the value comes from when it is left at None. ``structural`` values are
+    compiled into the kernel; all others may change from image to image at no cost.
+    """
+    extra = {"unit": unit, "auto": auto, "structural": structural}
+    return Field(default, description=text, json_schema_extra=extra, **limits)
+
+
+class Method(BaseModel):
+    """One way to do a stage. Subclasses declare parameters as fields and override what follows."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    method: ClassVar[str]
+    kernel: ClassVar[str]  # file name in kernels/, without .cl
+    summary: ClassVar[str]
+    tolerance: ClassVar[float] = 0.0  # of the kernel against the reference; 0: bit for bit
+
+    def resolve(self, context: Context) -> Self:
+        """The same method with every parameter that was left to the camera or the chain filled."""
+        return self
+
+    def after(self, context: Context) -> Context:
+        """What is known after this (resolved) stage."""
+        return context
+
+    def passes(self) -> tuple[Pass, ...]:
+        """The kernel functions, in order."""
+        raise NotImplementedError(type(self).__name__)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        """Kernel arguments by name, from the resolved parameters."""
+        return {}
+
+    def reference(self, image: Floats, frame: "Frame") -> Floats:
+        """The stage in NumPy: (height, width[, channel]) float32 in and out."""
+        raise NotImplementedError(type(self).__name__)
+
+    def filled(self, **values: Any) -> Self:
+        """A copy in which those of ``values`` replace parameters that are None."""
+        missing = {k: v for k, v in values.items() if getattr(self, k) is None}
+        return self.model_copy(update=missing) if missing else self
+
+
+@dataclass
+class Frame:
+    """What a reference needs besides the image and its parameters.
+
+    ``found`` is where a stage puts numbers that it found in the image, such as gains.
+    """
+
+    context: Context
+    stream: Mapping[Owner, Stream]
+    found: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A named step of the chain. The first method is the default."""
+
+    name: str
+    summary: str
+    reads: Kind
+    writes: Kind
+    methods: tuple[type[Method], ...]
+
+    @cached_property
+    def by_name(self) -> dict[str, type[Method]]:
+        """The methods by their names."""
+        return {m.method: m for m in self.methods}

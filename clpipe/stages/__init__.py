@@ -1,0 +1,34 @@
+"""The stages, one a file, found by looking; and the default chain."""
+
+from functools import cache
+from importlib import import_module
+from pkgutil import iter_modules
+
+from clpipe.stage import Stage
+
+DEFAULT_CHAIN = (
+    "exposure",
+    "mosaic",
+    "inverse_white_balance",
+    "sensor_noise",
+    "row_noise",
+    "column_noise",
+    "quantize",
+    "normalize",
+    "white_balance",
+    "demosaic",
+    "denoise",
+    "tone_curve",
+    "gamma",
+)
+
+
+@cache
+def all_stages() -> dict[str, Stage]:
+    """Every stage by its name: the default chain first, in its order, then the others."""
+    found = {
+        module.name: import_module(f"{__name__}.{module.name}").STAGE
+        for module in iter_modules(__path__)
+    }
+    rest = [name for name in found if name not in DEFAULT_CHAIN]
+    return {name: found[name] for name in (*DEFAULT_CHAIN, *rest)}

@@ -1,0 +1,70 @@
+"""Noise that a whole column shares."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.reference.random import normal_of_line
+from clpipe.stage import (
+    Access,
+    Argument,
+    Context,
+    Frame,
+    Kind,
+    Method,
+    Owner,
+    Pass,
+    Stage,
+    parameter,
+)
+from clpipe.types import Floats
+
+
+class Gaussian(Method):
+    """One Gaussian offset a column, the same in every image of a camera."""
+
+    method: ClassVar = "gaussian"
+    kernel: ClassVar = "line_noise"
+    summary: ClassVar = "add one Gaussian offset a column, the same in every image of a camera"
+
+    sigma: float | None = parameter(
+        None,
+        "Standard deviation of the offsets.",
+        "signal",
+        "column_noise_ratio of the camera times its read noise",
+        ge=0,
+    )
+
+    def resolve(self, context: Context) -> "Gaussian":
+        if self.sigma is not None:
+            return self
+        _, b = context.camera.noise(context.iso)
+        return self.filled(sigma=context.camera.column_noise_ratio * b**0.5)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (
+            Pass(
+                "noise_of_lines",
+                Access.LINES,
+                arguments=("sigma",),
+                writes="lines",
+                random=Owner.CAMERA,
+                lines="columns",
+            ),
+            Pass("column_noise", arguments=("lines",)),
+        )
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        assert self.sigma is not None
+        return {"sigma": np.float32(self.sigma)}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        assert self.sigma is not None
+        normals = normal_of_line(image.shape[1], frame.stream[Owner.CAMERA])
+        return image + (normals * np.float32(self.sigma))[None, :]
+
+
+STAGE = Stage(
+    "column_noise", "Add noise that a whole column shares.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,)
+)

@@ -1,0 +1,31 @@
+"""Exposure compensation."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.types import Floats
+
+
+class Gain(Method):
+    """Linear light times 2^EV."""
+
+    method: ClassVar = "gain"
+    kernel: ClassVar = "exposure"
+    summary: ClassVar = "multiply linear light by 2^ev"
+
+    ev: float = parameter(0.0, "Exposure compensation.", "EV", ge=-20, le=20)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("exposure", arguments=("gain",)),)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {"gain": np.float32(2.0**self.ev)}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        return image * np.float32(2.0**self.ev)
+
+
+STAGE = Stage("exposure", "Brighten or darken the scene.", Kind.RGB, Kind.RGB, (Gain,))

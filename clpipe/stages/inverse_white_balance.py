@@ -1,0 +1,56 @@
+"""Taking white balance out, so that the noise falls on the signal as the sensor saw it."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.reference.cfa import by_site
+from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.types import Floats
+
+
+class Gains(Method):
+    """Each colour divided by the gain that white balance would give it (green = 1)."""
+
+    method: ClassVar = "gains"
+    kernel: ClassVar = "site_gains"
+    summary: ClassVar = "divide red and blue by the camera's white balance gains"
+
+    red_gain: float | None = parameter(
+        None, "White balance gain of red, green = 1.", auto="from the camera", gt=0, le=64
+    )
+    blue_gain: float | None = parameter(
+        None, "White balance gain of blue, green = 1.", auto="from the camera", gt=0, le=64
+    )
+
+    def resolve(self, context: Context) -> "Gains":
+        red, blue = context.camera.white_balance_gains
+        return self.filled(red_gain=red, blue_gain=blue)
+
+    def after(self, context: Context) -> Context:
+        assert self.red_gain is not None and self.blue_gain is not None
+        return replace(context, gains=(self.red_gain, self.blue_gain))
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("inverse_white_balance", arguments=("pattern", "red", "blue")),)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        assert self.red_gain is not None and self.blue_gain is not None
+        red, blue = np.float32(1 / self.red_gain), np.float32(1 / self.blue_gain)
+        return {"pattern": context.cfa, "red": red, "blue": blue}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        assert self.red_gain is not None and self.blue_gain is not None
+        red, blue = np.float32(1 / self.red_gain), np.float32(1 / self.blue_gain)
+        return image * by_site(image.shape, frame.context.pattern, red, np.float32(1), blue)
+
+
+STAGE = Stage(
+    "inverse_white_balance",
+    "Undo white balance: the render becomes what the sensor would see.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (Gains,),
+)

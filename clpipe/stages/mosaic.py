@@ -1,0 +1,41 @@
+"""The colour filter array."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.reference.cfa import Pattern, by_site
+from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.types import Floats
+
+
+class Bayer(Method):
+    """A Bayer pattern (US patent 3,971,065, 1976): a pixel keeps one of its three colours."""
+
+    method: ClassVar = "bayer"
+    kernel: ClassVar = "mosaic"
+    summary: ClassVar = "keep one colour a pixel, by a Bayer pattern"
+
+    pattern: Pattern = parameter(
+        "RGGB", "Colours of the upper left 2x2 pixels, row by row.", structural=True
+    )
+
+    def after(self, context: Context) -> Context:
+        return replace(context, pattern=self.pattern)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("mosaic", arguments=("pattern",)),)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {"pattern": replace(context, pattern=self.pattern).cfa}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        red, green, blue = np.moveaxis(image, -1, 0)
+        return by_site(image.shape, self.pattern, red, green, blue)
+
+
+STAGE = Stage(
+    "mosaic", "Lay a colour filter array over the image.", Kind.RGB, Kind.MOSAIC, (Bayer,)
+)

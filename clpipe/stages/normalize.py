@@ -1,0 +1,65 @@
+"""Levels: the first thing a raw converter does."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+from pydantic import model_validator
+
+from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.types import Floats
+
+
+class Linear(Method):
+    """(DN - black) / (white - black); what lies below black stays negative."""
+
+    method: ClassVar = "linear"
+    kernel: ClassVar = "normalize"
+    summary: ClassVar = "subtract the black level, scale the white level to 1"
+
+    black_level: float | None = parameter(
+        None,
+        "DN that becomes 0.",
+        "DN",
+        "as quantize used it, else from the camera",
+        ge=0,
+        le=65535,
+    )
+    white_level: float | None = parameter(
+        None,
+        "DN that becomes 1.",
+        "DN",
+        "as quantize used it, else from the camera",
+        gt=0,
+        le=65535,
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "Linear":
+        black, white = self.black_level, self.white_level
+        if black is not None and white is not None and white <= black:
+            raise ValueError("white_level must be above black_level")
+        return self
+
+    def resolve(self, context: Context) -> "Linear":
+        camera, known = context.camera, context
+        black = camera.black_level if known.black_level is None else known.black_level
+        white = camera.white_level if known.white_level is None else known.white_level
+        filled = self.filled(black_level=black, white_level=white)
+        return type(self).model_validate(filled.model_dump())
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("normalize_levels", arguments=("black_level", "scale")),)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        assert self.black_level is not None and self.white_level is not None
+        scale = np.float32(1 / (self.white_level - self.black_level))
+        return {"black_level": np.float32(self.black_level), "scale": scale}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        assert self.black_level is not None and self.white_level is not None
+        scale = np.float32(1 / (self.white_level - self.black_level))
+        return (image - np.float32(self.black_level)) * scale
+
+
+STAGE = Stage("normalize", "Levels: DN back to signal.", Kind.RAW, Kind.MOSAIC, (Linear,))

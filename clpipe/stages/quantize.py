@@ -1,0 +1,63 @@
+"""The analogue-to-digital converter."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+from pydantic import model_validator
+
+from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.types import Floats
+
+
+class Linear(Method):
+    """Signal to whole DN, rounded to nearest, clipped to 0..white level."""
+
+    method: ClassVar = "linear"
+    kernel: ClassVar = "quantize"
+    summary: ClassVar = "round to whole DN and clip to 0..white_level"
+
+    black_level: float | None = parameter(
+        None, "DN without light.", "DN", "from the camera", ge=0, le=65535
+    )
+    white_level: float | None = parameter(
+        None, "DN at full scale; more light clips.", "DN", "from the camera", gt=0, le=65535
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "Linear":
+        if None not in (self.black_level, self.white_level) and self._range <= 0:
+            raise ValueError("white_level must be above black_level")
+        return self
+
+    @property
+    def _range(self) -> float:
+        assert self.black_level is not None and self.white_level is not None
+        return self.white_level - self.black_level
+
+    def resolve(self, context: Context) -> "Linear":
+        filled = self.filled(
+            black_level=context.camera.black_level, white_level=context.camera.white_level
+        )
+        return type(self).model_validate(filled.model_dump())
+
+    def after(self, context: Context) -> Context:
+        return replace(context, black_level=self.black_level, white_level=self.white_level)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("quantize", arguments=("range", "black_level", "white_level")),)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {
+            "range": np.float32(self._range),
+            "black_level": np.float32(self.black_level),
+            "white_level": np.float32(self.white_level),
+        }
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        dn = np.rint(image * np.float32(self._range) + np.float32(self.black_level))
+        return np.minimum(np.maximum(dn, np.float32(0)), np.float32(self.white_level))
+
+
+STAGE = Stage("quantize", "Digitise: signal to DN.", Kind.MOSAIC, Kind.RAW, (Linear,))

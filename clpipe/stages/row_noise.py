@@ -1,0 +1,70 @@
+"""Noise that a whole row shares."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.reference.random import normal_of_line
+from clpipe.stage import (
+    Access,
+    Argument,
+    Context,
+    Frame,
+    Kind,
+    Method,
+    Owner,
+    Pass,
+    Stage,
+    parameter,
+)
+from clpipe.types import Floats
+
+
+class Gaussian(Method):
+    """One Gaussian offset a row, new in each image."""
+
+    method: ClassVar = "gaussian"
+    kernel: ClassVar = "line_noise"
+    summary: ClassVar = "add one Gaussian offset a row, new in each image"
+
+    sigma: float | None = parameter(
+        None,
+        "Standard deviation of the offsets.",
+        "signal",
+        "row_noise_ratio of the camera times its read noise",
+        ge=0,
+    )
+
+    def resolve(self, context: Context) -> "Gaussian":
+        if self.sigma is not None:
+            return self
+        _, b = context.camera.noise(context.iso)
+        return self.filled(sigma=context.camera.row_noise_ratio * b**0.5)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (
+            Pass(
+                "noise_of_lines",
+                Access.LINES,
+                arguments=("sigma",),
+                writes="lines",
+                random=Owner.IMAGE,
+                lines="rows",
+            ),
+            Pass("row_noise", arguments=("lines",)),
+        )
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        assert self.sigma is not None
+        return {"sigma": np.float32(self.sigma)}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        assert self.sigma is not None
+        normals = normal_of_line(image.shape[0], frame.stream[Owner.IMAGE])
+        return image + (normals * np.float32(self.sigma))[:, None]
+
+
+STAGE = Stage(
+    "row_noise", "Add noise that a whole row shares.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,)
+)

@@ -1,0 +1,75 @@
+// Edge-directed demosaicing with Freeman's median step, in three passes.
+
+// Green along the edge, not across it (Hamilton and Adams 1997): the direction with the smaller
+// gradient; equal gradients take the mean of both. The result is held in one plane: green at green
+// sites, the colour difference (R-G or B-G) at red and blue ones.
+INLINE vf green_or_difference(site at, cfa pattern, src_image src) {
+    const vf centre = src_tap(src, 0, 0);
+    const vf west = src_tap(src, -1, 0), east = src_tap(src, 1, 0);
+    const vf north = src_tap(src, 0, -1), south = src_tap(src, 0, 1);
+    const vf bend_x = 2.0f * centre - src_tap(src, -2, 0) - src_tap(src, 2, 0);
+    const vf bend_y = 2.0f * centre - src_tap(src, 0, -2) - src_tap(src, 0, 2);
+    const vf gradient_x = magnitude(west - east) + magnitude(bend_x);
+    const vf gradient_y = magnitude(north - south) + magnitude(bend_y);
+    const vf green_x = (west + east) * 0.5f + bend_x * 0.25f;
+    const vf green_y = (north + south) * 0.5f + bend_y * 0.25f;
+    const vf either = (green_x + green_y) * 0.5f;
+    const vf green = gradient_x < gradient_y ? green_x : gradient_y < gradient_x ? green_y : either;
+    return by_site(at, pattern, centre - green, centre, centre - green);
+}
+
+// Colour differences at every pixel, bilinear from where they are known.
+INLINE differences spread_differences(site at, cfa pattern, image known) {
+    const vf centre = tap_mosaic(known, 0, 0);
+    const vf horizontal = (tap_mosaic(known, -1, 0) + tap_mosaic(known, 1, 0)) * 0.5f;
+    const vf vertical = (tap_mosaic(known, 0, -1) + tap_mosaic(known, 0, 1)) * 0.5f;
+    const vf diagonal = ((tap_mosaic(known, -1, -1) + tap_mosaic(known, 1, -1)) +
+                         (tap_mosaic(known, -1, 1) + tap_mosaic(known, 1, 1))) * 0.25f;
+    const vi red_column = in_red_column(at, pattern);
+    differences v;
+    if (in_red_row(at, pattern)) {
+        v.red = red_column ? centre : horizontal;
+        v.blue = red_column ? diagonal : vertical;
+    } else {
+        v.red = red_column ? vertical : diagonal;
+        v.blue = red_column ? horizontal : centre;
+    }
+    return v;
+}
+
+#define ORDER(a, b) { const vf smaller = min(a, b); b = max(a, b); a = smaller; }
+
+// Median of nine by the exchange network of Paeth (Graphics Gems, 1990).
+INLINE vf median9(vf a, vf b, vf c, vf d, vf e, vf f, vf g, vf h, vf i) {
+    ORDER(b, c) ORDER(e, f) ORDER(h, i) ORDER(a, b) ORDER(d, e) ORDER(g, h)
+    ORDER(b, c) ORDER(e, f) ORDER(h, i)
+    d = max(a, d);
+    g = max(d, g);
+    f = min(f, i);
+    c = min(c, f);
+    ORDER(e, h)
+    e = max(b, e);
+    e = min(e, h);
+    ORDER(e, c)
+    e = max(g, e);
+    return min(e, c);
+}
+#undef ORDER
+
+// Freeman (US patent 4,724,395, 1988): the colour differences are median filtered, the samples
+// that the sensor took are kept, and the other colours follow from them.
+INLINE rgb freeman(site at, cfa pattern, src_image src, image spread) {
+    const differences nw = tap_differences(spread, -1, -1), n = tap_differences(spread, 0, -1),
+                      ne = tap_differences(spread, 1, -1), w = tap_differences(spread, -1, 0),
+                      m = tap_differences(spread, 0, 0), e = tap_differences(spread, 1, 0),
+                      sw = tap_differences(spread, -1, 1), s = tap_differences(spread, 0, 1),
+                      se = tap_differences(spread, 1, 1);
+    const vf red = median9(nw.red, n.red, ne.red, w.red, m.red, e.red, sw.red, s.red, se.red);
+    const vf blue =
+        median9(nw.blue, n.blue, ne.blue, w.blue, m.blue, e.blue, sw.blue, s.blue, se.blue);
+    const vf centre = src_tap(src, 0, 0);
+    const vf green = by_site(at, pattern, centre - red, centre, centre - blue);
+    const vf r = green + red, b = green + blue;
+    const rgb v = {by_site(at, pattern, centre, r, r), green, by_site(at, pattern, b, b, centre)};
+    return v;
+}

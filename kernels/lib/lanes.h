@@ -1,0 +1,75 @@
+// Lane vectors: every stage is written once on vf / vi / vu, LANES of them wide.
+// A CPU takes 8 or 16 lanes (one vector register), a GPU takes 1 (a plain scalar).
+#ifndef CLPIPE_LANES_H
+#define CLPIPE_LANES_H
+
+// The same arithmetic on every device: never contract a*b+c behind our back.
+#pragma OPENCL FP_CONTRACT OFF
+
+#define INLINE static inline __attribute__((always_inline))
+
+#if LANES == 1
+typedef float vf;
+typedef int vi;
+typedef uint vu;
+typedef ulong vul;
+#define LANES_OF(name) name
+#else
+#define LANES_JOIN_(name, n) name##n
+#define LANES_JOIN(name, n) LANES_JOIN_(name, n)
+#define LANES_OF(name) LANES_JOIN(name, LANES)
+typedef LANES_OF(float) vf;
+typedef LANES_OF(int) vi;
+typedef LANES_OF(uint) vu;
+// Half as many lanes of 64 bits: as wide as a vector register goes. PoCL 3.0 miscompiles wider ones.
+#if LANES == 8
+typedef ulong4 vh;
+#else
+typedef ulong8 vh;
+#endif
+#endif
+
+#if LANES == 1
+INLINE vf load(__global const float *p) { return *p; }
+INLINE void store(vf v, __global float *p) { *p = v; }
+INLINE vf load_half(__global const half *p) { return vload_half(0, p); }
+INLINE vi iota(void) { return 0; }
+INLINE void spill(vf v, __private float *p) { *p = v; }
+INLINE void spill_int(vi v, __private int *p) { *p = v; }
+#else
+__constant int LANE_NUMBERS[16] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+INLINE vf load(__global const float *p) { return LANES_OF(vload)(0, p); }
+INLINE void store(vf v, __global float *p) { LANES_OF(vstore)(v, 0, p); }
+INLINE vf load_half(__global const half *p) { return LANES_OF(vload_half)(0, p); }
+INLINE vi iota(void) { return LANES_OF(vload)(0, LANE_NUMBERS); }
+INLINE void spill(vf v, __private float *p) { LANES_OF(vstore)(v, 0, p); }
+INLINE void spill_int(vi v, __private int *p) { LANES_OF(vstore)(v, 0, p); }
+#endif
+
+#if LANES == 1
+INLINE vh even_lanes(vu v) { return v; }
+INLINE vh odd_lanes(vu v) { return v; }
+INLINE vu join_lanes(vh even, vh odd) { return (uint)even; }
+#else
+#if LANES == 8
+#define AS_HALVES as_ulong4
+#else
+#define AS_HALVES as_ulong8
+#endif
+// The even and the odd lanes as 64-bit numbers; the upper halves of the even ones are rubbish.
+INLINE vh even_lanes(vu v) { return AS_HALVES(v); }
+INLINE vh odd_lanes(vu v) { return AS_HALVES(v) >> (vh)(32); }
+// Back again, from the lower halves.
+INLINE vu join_lanes(vh even, vh odd) {
+    return LANES_OF(as_uint)((even & (vh)(0xffffffffUL)) | (odd << (vh)(32)));
+}
+#endif
+
+INLINE vf to_float(vi v) { return LANES_OF(convert_float)(v); }
+INLINE vi to_int(vf v) { return LANES_OF(convert_int)(v); }
+INLINE vf bits_to_float(vi v) { return LANES_OF(as_float)(v); }
+INLINE vi float_bits(vf v) { return LANES_OF(as_int)(v); }
+INLINE vi signed_bits(vu v) { return LANES_OF(as_int)(v); }
+INLINE vf magnitude(vf v) { return bits_to_float(float_bits(v) & 0x7fffffff); }
+
+#endif

@@ -1,0 +1,34 @@
+// Short polynomials in place of the built-in log and exp, which are scalar calls on some CPU
+// runtimes and differ between devices. Coefficients: our own least-squares minimax fits.
+#ifndef CLPIPE_MATH_H
+#define CLPIPE_MATH_H
+
+// -ln(t) for t > 0; relative error 3e-7. Only * and +, so NumPy gives the same bits.
+INLINE vf negative_log(vf t) {
+    const vi bits = float_bits(t);
+    const vi exponent = (bits - 0x3f3504f3) >> 23;  // mantissa in [sqrt(1/2), sqrt(2))
+    const vf y = bits_to_float(bits - (exponent << 23)) - 1.0f;
+    vf p = (vf)(0.118273675f);
+    p = p * y + -0.18901953f;
+    p = p * y + 0.20604694f;
+    p = p * y + -0.24881342f;
+    p = p * y + 0.33303297f;
+    p = p * y + -0.50001967f;
+    p = p * y + 1.0000032f;
+    return to_float(exponent) * -0.6931472f - y * p;
+}
+
+// 2^x for x <= 0; relative error 8e-5. Below 2^-30 it stays there: a filter weight that small is
+// nothing, and smaller ones would turn into denormals, which are slow.
+INLINE vf exp2_of_negative(vf x) {
+    const vf round_magic = (vf)(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer
+    x = max(x, -30.0f);
+    const vf shifted = x + round_magic;
+    const vf f = x - (shifted - round_magic);
+    vf p = fma(f, (vf)(0.055171624f), (vf)(0.24261113f));
+    p = fma(p, f, (vf)(0.69326097f));
+    p = fma(p, f, (vf)(0.99992806f));
+    return bits_to_float(float_bits(p) + (float_bits(shifted) << 23));
+}
+
+#endif

@@ -1,0 +1,39 @@
+// Sums over an image in integers: exact, so order, lanes, tiles and devices do not matter.
+// A block writes one int4 of partial sums, one a site of the 2x2 cell of a mosaic:
+// (even x, even y), (odd x, even y), (even x, odd y), (odd x, odd y).
+#ifndef CLPIPE_SUMS_H
+#define CLPIPE_SUMS_H
+
+INLINE vi only_inside(vi v, site at, extent e) {
+    if (at.y >= e.height) return (vi)(0);
+    return (iota() + (vi)((int)at.x)) < (vi)((int)e.width) ? v : (vi)(0);
+}
+
+INLINE int2 fold_columns(vi v, site at) {
+#if LANES == 1
+    return at.odd ? (int2)(0, v) : (int2)(v, 0);
+#elif LANES == 8
+    const int4 half_way = v.lo + v.hi;
+    return half_way.lo + half_way.hi;
+#else
+    const int8 half_way = v.lo + v.hi;
+    const int4 quarter = half_way.lo + half_way.hi;
+    return quarter.lo + quarter.hi;
+#endif
+}
+
+// Work item i of n adds up its share of the blocks.
+INLINE void add_up_blocks(__global const int4 *blocks, __global long4 *shares, uint count) {
+    const uint n = get_global_size(0), i = get_global_id(0);
+    long4 sum = (long4)(0);
+    for (uint k = i; k < count; k += n) sum += convert_long4(blocks[k]);
+    shares[i] = sum;
+}
+
+INLINE long4 add_up_shares(__global const long4 *shares, uint count) {
+    long4 sum = (long4)(0);
+    for (uint k = 0; k < count; ++k) sum += shares[k];
+    return sum;
+}
+
+#endif

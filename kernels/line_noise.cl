@@ -1,0 +1,9 @@
+// Noise that whole rows or columns share, from the readout. One launch fills a table with a value
+// a line; the pixels then add their line's.
+INLINE vf noise_of_lines(vu line, stream s, float sigma) { return normal_of_line(line, s) * sigma; }
+
+INLINE vf row_noise(vf y, site at, __global const float *lines) { return y + lines[at.y]; }
+
+INLINE vf column_noise(vf y, site at, __global const float *lines) {
+    return y + load(lines + at.x);
+}
