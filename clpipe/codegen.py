@@ -316,7 +316,7 @@ def _pixels(writer: _Writer, launch: Launch) -> tuple[list[str], str, str]:
 
 def _lines(writer: _Writer, launch: Lines) -> str:
     body = "    const uint i = (uint)get_global_id(0) * LANES;\n"
-    body += "    const vu line = (vu)(i) + LANES_OF(as_uint)(iota());\n"
+    body += "    const vu line = lane_indices(i);\n"
     for op in launch.ops:
         table = writer.parameter(
             f"{op.step}_{op.pass_.writes}",

@@ -37,22 +37,22 @@ INLINE differences spread_differences(site at, cfa pattern, image known) {
     return v;
 }
 
-#define ORDER(a, b) { const vf smaller = min(a, b); b = max(a, b); a = smaller; }
+#define ORDER(a, b) { const vf smaller = least(a, b); b = most(a, b); a = smaller; }
 
 // Median of nine by the exchange network of Paeth (Graphics Gems, 1990).
 INLINE vf median9(vf a, vf b, vf c, vf d, vf e, vf f, vf g, vf h, vf i) {
     ORDER(b, c) ORDER(e, f) ORDER(h, i) ORDER(a, b) ORDER(d, e) ORDER(g, h)
     ORDER(b, c) ORDER(e, f) ORDER(h, i)
-    d = max(a, d);
-    g = max(d, g);
-    f = min(f, i);
-    c = min(c, f);
+    d = most(a, d);
+    g = most(d, g);
+    f = least(f, i);
+    c = least(c, f);
     ORDER(e, h)
-    e = max(b, e);
-    e = min(e, h);
+    e = most(b, e);
+    e = least(e, h);
     ORDER(e, c)
-    e = max(g, e);
-    return min(e, c);
+    e = most(g, e);
+    return least(e, c);
 }
 #undef ORDER
 

@@ -80,6 +80,19 @@ def negative_log(t: Floats) -> Floats:
     return exponent.astype(np.float32) * np.float32(-0.6931472) - y * horner(LOG_COEFFICIENTS, y)
 
 
+def square_root(x: Floats) -> Floats:
+    """sqrt(x), x >= 0, float32, relative error 5e-6, by two Newton steps (Lomont 2003).
+
+    >>> square_root(np.float32([0, 1, 2])).round(4).tolist()
+    [0.0, 1.0, 1.4141999483108521]
+    """
+    half_x = x * np.float32(0.5)
+    r = (np.int32(0x5F375A86) - (x.view(np.int32) >> np.int32(1))).view(np.float32)
+    for _ in range(2):
+        r = r * (np.float32(1.5) - half_x * r * r)
+    return x * r
+
+
 def horner(coefficients: Floats, x: Floats) -> Floats:
     """The polynomial with these coefficients, highest power first, step by step in float32."""
     value = np.full_like(x, coefficients[0])
@@ -99,7 +112,7 @@ def normal_of(words: Words) -> Floats:
         2.3283064e-10
     )
     w = negative_log(np.float32(4) * p * (np.float32(1) - p))
-    s = np.sqrt(np.maximum(w, np.float32(0))) - np.float32(2.25)
+    s = square_root(np.maximum(w, np.float32(0))) - np.float32(2.25)
     z = horner(NORMAL_COEFFICIENTS, s) * (np.float32(1) - np.float32(2) * p)
     return (z.view(np.int32) ^ (bits & np.int32(-0x80000000))).view(np.float32)
 

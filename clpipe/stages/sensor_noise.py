@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.reference.random import normal_at
+from clpipe.reference.random import normal_at, square_root
 from clpipe.stage import Argument, Context, Frame, Kind, Method, Owner, Pass, Stage, parameter
 from clpipe.types import Floats
 
@@ -45,7 +45,7 @@ class Gaussian(Method):
     def reference(self, image: Floats, frame: Frame) -> Floats:
         assert self.a is not None and self.b is not None
         variance = np.maximum(np.float32(self.a) * image + np.float32(self.b), np.float32(0))
-        return image + normal_at(image.shape, 0, frame.stream[Owner.IMAGE]) * np.sqrt(variance)
+        return image + normal_at(image.shape, 0, frame.stream[Owner.IMAGE]) * square_root(variance)
 
 
 STAGE = Stage("sensor_noise", "Add shot and read noise.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,))

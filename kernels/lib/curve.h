@@ -6,16 +6,14 @@
 #define CLPIPE_CURVE_H
 
 INLINE vi curve_index(vf v) {
-    const vf inside = min(max(v, 9.5367431640625e-07f), 1.0f);
-    // The second clamp is for NaN, which the first may let through.
-    const vi index = ((float_bits(inside) + 0x400) >> 11) - (0x35800000 >> 11);
-    return min(max(index, 0), 20 * 4096);
+    const vf inside = least(most(v, (vf)(9.5367431640625e-07f)), (vf)(1.0f));
+    return ((float_bits(inside) + 0x400) >> 11) - (0x35800000 >> 11);
 }
 
 #define GATHER(channel)                                                             \
     spill_int(curve_index(c.channel), index);                                       \
     for (int k = 0; k < LANES; ++k) value[k] = table[index[k]];                     \
-    v.channel = LANES_OF(vload)(0, value);
+    v.channel = *(__private unaligned_vf *)value;
 INLINE rgb look_up(rgb c, __global const float *table) {
     rgb v;
 #if LANES == 1

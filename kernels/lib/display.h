@@ -22,9 +22,10 @@ INLINE void store_rgb8(__global uchar *dst, const int *r, const int *g, const in
     }
 }
 
-// 0..1 to 0..255, rounded to nearest; the last clamp is for NaN.
+// 0..1 to 0..255, rounded to nearest.
 INLINE vi to_8_bit(vf v) {
-    return min(max(to_int(rint(min(max(v, 0.0f), 1.0f) * 255.0f)), 0), 255);
+    const vf inside = least(most(v, (vf)(0.0f)), (vf)(1.0f));
+    return to_int(nearest(inside * 255.0f));
 }
 
 INLINE void encode_rgb(rgb c, __global uchar *dst, site at, extent e) {

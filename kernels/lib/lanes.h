@@ -29,6 +29,8 @@ typedef ulong8 vh;
 #endif
 #endif
 
+// Loads, stores, conversions, minimum and maximum are written without the OpenCL built-ins: on a CPU
+// that PoCL 3.0 does not know it does not inline those, and a call for each costs a factor of ten.
 #if LANES == 1
 INLINE vf load(__global const float *p) { return *p; }
 INLINE void store(vf v, __global float *p) { *p = v; }
@@ -36,15 +38,35 @@ INLINE vf load_half(__global const half *p) { return vload_half(0, p); }
 INLINE vi iota(void) { return 0; }
 INLINE void spill(vf v, __private float *p) { *p = v; }
 INLINE void spill_int(vi v, __private int *p) { *p = v; }
+INLINE vf to_float(vi v) { return convert_float(v); }
+INLINE vi to_int(vf v) { return convert_int(v); }
 #else
+typedef vf unaligned_vf __attribute__((aligned(4)));
+typedef vi unaligned_vi __attribute__((aligned(4)));
+typedef LANES_OF(ushort) vs;
+typedef vs unaligned_vs __attribute__((aligned(2)));
+
 __constant int LANE_NUMBERS[16] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
-INLINE vf load(__global const float *p) { return LANES_OF(vload)(0, p); }
-INLINE void store(vf v, __global float *p) { LANES_OF(vstore)(v, 0, p); }
+INLINE vf load(__global const float *p) { return *(__global const unaligned_vf *)p; }
+INLINE void store(vf v, __global float *p) { *(__global unaligned_vf *)p = v; }
+INLINE vi iota(void) { return *(__constant const unaligned_vi *)LANE_NUMBERS; }
+INLINE void spill(vf v, __private float *p) { *(__private unaligned_vf *)p = v; }
+INLINE void spill_int(vi v, __private int *p) { *(__private unaligned_vi *)p = v; }
+INLINE vf to_float(vi v) { return __builtin_convertvector(v, vf); }
+INLINE vi to_int(vf v) { return __builtin_convertvector(v, vi); }
+
+// Finite halves by their bits: exponent and mantissa move into place, and a factor of 2^112 mends
+// the exponent's bias; subnormal halves go through a subtraction, for speed.
 INLINE vf load_half(__global const half *p) { return LANES_OF(vload_half)(0, p); }
-INLINE vi iota(void) { return LANES_OF(vload)(0, LANE_NUMBERS); }
-INLINE void spill(vf v, __private float *p) { LANES_OF(vstore)(v, 0, p); }
-INLINE void spill_int(vi v, __private int *p) { LANES_OF(vstore)(v, 0, p); }
 #endif
+
+INLINE vf least(vf a, vf b) { return a < b ? a : b; }
+INLINE vf most(vf a, vf b) { return a > b ? a : b; }
+INLINE vi least_int(vi a, vi b) { return a < b ? a : b; }
+INLINE vi most_int(vi a, vi b) { return a > b ? a : b; }
+
+// To the nearest whole number, ties to even, for |v| < 2^22.
+INLINE vf nearest(vf v) { return (v + 12582912.0f) - 12582912.0f; }
 
 #if LANES == 1
 INLINE vh even_lanes(vu v) { return v; }
@@ -65,11 +87,10 @@ INLINE vu join_lanes(vh even, vh odd) {
 }
 #endif
 
-INLINE vf to_float(vi v) { return LANES_OF(convert_float)(v); }
-INLINE vi to_int(vf v) { return LANES_OF(convert_int)(v); }
 INLINE vf bits_to_float(vi v) { return LANES_OF(as_float)(v); }
 INLINE vi float_bits(vf v) { return LANES_OF(as_int)(v); }
 INLINE vi signed_bits(vu v) { return LANES_OF(as_int)(v); }
+INLINE vu lane_indices(uint first) { return LANES_OF(as_uint)(iota() + (vi)((int)first)); }
 INLINE vf magnitude(vf v) { return bits_to_float(float_bits(v) & 0x7fffffff); }
 
 #endif

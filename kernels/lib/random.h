@@ -43,11 +43,11 @@ INLINE words philox(vu x, uint y, uint draw, stream s) {
 // Standard normal from one random word, by inverse CDF: 31 bits give the tail probability p in
 // (0, 1/2], the top bit the side. Form after Giles ("Approximating the erfinv function", GPU
 // Computing Gems 2011), a polynomial in sqrt(w), w = -ln(4p(1-p)); our own fit, relative error
-// 4e-5 out to 6.2 sigma. Only * + sqrt and bit operations, so NumPy gives the same bits.
+// 4e-5 out to 6.2 sigma. Only * + and bit operations, so NumPy gives the same bits.
 INLINE vf normal_of(vu word) {
     const vi bits = signed_bits(word);
     const vf p = (to_float(bits & 0x7fffffff) + 0.5f) * 2.3283064e-10f;
-    const vf s = sqrt(max(negative_log(4.0f * p * (1.0f - p)), 0.0f)) - 2.25f;
+    const vf s = square_root(most(negative_log(4.0f * p * (1.0f - p)), (vf)(0.0f))) - 2.25f;
     vf z = (vf)(-4.68934e-05f);
     z = z * s + 1.8514459e-06f;
     z = z * s + 0.0008937495f;
@@ -65,7 +65,7 @@ INLINE vf normal_of(vu word) {
 
 // The normal of a pixel. Four rows share one Philox call, which the compiler finds by itself.
 INLINE vf normal_at(site at, uint draw, stream s) {
-    const words w = philox((vu)(at.x) + LANES_OF(as_uint)(iota()), at.y >> 2, draw, s);
+    const words w = philox(lane_indices(at.x), at.y >> 2, draw, s);
     const vu upper = (at.y & 1) ? w.word1 : w.word0, lower = (at.y & 1) ? w.word3 : w.word2;
     return normal_of((at.y & 2) ? lower : upper);
 }
