@@ -34,7 +34,8 @@ class Parameter:
     """One kernel parameter: its OpenCL declaration, and what is bound to it.
 
     ``role`` is one of extent (width, height, pitch), source, slot, encoded, table8 (the composed
-    curve), value, key, lines, found, sums, shares, count; ``step``, ``item`` and ``number`` tell which.
+    curve), value, key, lines, found, sums, shares, count; ``step``, ``item`` and
+    ``number`` tell which.
     """
 
     declaration: str
@@ -326,7 +327,8 @@ def _lines(writer: _Writer, launch: Lines) -> str:
             item=op.pass_.writes,
         )
         count = "height" if op.pass_.lines == "rows" else "width"
-        body += f"    if (i < {count}) store({call(op, 'line', writer.arguments(op, {}))}, {table} + i);\n"
+        value = call(op, "line", writer.arguments(op, {}))
+        body += f"    if (i < {count}) store({value}, {table} + i);\n"
     return body
 
 

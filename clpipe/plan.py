@@ -155,10 +155,10 @@ class _Planner:
     def input_of_stencil(self) -> Read:
         """The current image for a stencil: cheap pointwise passes on a stored one are redone."""
         group = self.group
-        if group and self.fold and group.reads and not group.stencil:
-            if all(op.pass_.cheap for op in group.ops):
-                self.group, self.stored = None, group.reads[0].image
-                return Read(group.reads[0].image, group.ops)
+        loaded = group and group.reads and not group.stencil
+        if group and loaded and self.fold and all(op.pass_.cheap for op in group.ops):
+            self.group, self.stored = None, group.reads[0].image
+            return Read(group.reads[0].image, group.ops)
         return Read(self.close())
 
     def add_step(self, step: Step) -> None:
@@ -294,3 +294,22 @@ def assign_slots(
             if last_use[read] == i and read not in pinned:
                 free.extend(slots[read])
     return slots, count
+
+
+def launch_bytes(plan: Plan, launch: AnyLaunch, lanes: int) -> float:
+    """Bytes a pixel that a launch reads and writes in device memory, each sample once."""
+    if isinstance(launch, AddUp):
+        return 16 / (lanes * 4)
+    if not isinstance(launch, Launch):
+        return 0.0
+    total = 0.0
+    if not launch.reads:
+        total += len(plan.source.channels) * (2 if plan.half else 4)
+    total += sum(4 * len(read.image.kind.channels) for read in launch.reads)
+    if launch.writes:
+        total += 4 * len(launch.writes.kind.channels)
+    if launch.encodes and plan.encoded:
+        total += len(plan.encoded.channels)
+    if launch.sums:
+        total += 16 / (lanes * launch.rows)
+    return total

@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from clpipe.camera import Camera
 from clpipe.reference.cfa import Pattern, red_site
@@ -106,7 +106,8 @@ class Context:
     @property
     def cfa(self) -> Literal:
         """The pattern as a compiled-in kernel argument."""
-        return Literal("(cfa){%d, %d}" % red_site(self.pattern))
+        red_x, red_y = red_site(self.pattern)
+        return Literal(f"(cfa){{{red_x}, {red_y}}}")
 
 
 def parameter(
@@ -117,7 +118,7 @@ def parameter(
     ``auto`` says where the value comes from when it is left at None. ``structural`` values are
     compiled into the kernel; all others may change from image to image at no cost.
     """
-    extra = {"unit": unit, "auto": auto, "structural": structural}
+    extra: dict[str, JsonValue] = {"unit": unit, "auto": auto, "structural": structural}
     return Field(default, description=text, json_schema_extra=extra, **limits)
 
 

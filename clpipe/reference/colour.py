@@ -4,7 +4,7 @@ import numpy as np
 
 from clpipe.types import Floats
 
-LUMA = np.float32([0.299, 0.587, 0.114])
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 
 def rgb_to_ycbcr(image: Floats) -> Floats:

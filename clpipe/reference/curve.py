@@ -29,7 +29,7 @@ def curve_index(values: Floats) -> NDArray[np.int32]:
 
 
 def tabulate(function: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Floats:
-    """The table of a function on 0..1: its value at each entry's own float; entry 0 stands for 0."""
+    """The table of a function on 0..1, at each entry's own float; entry 0 stands for 0."""
     points = ((np.arange(SIZE, dtype=np.int32) + _FIRST) << 11).view(np.float32).astype(np.float64)
     points[0] = 0
     return function(points).astype(np.float32)

@@ -11,10 +11,11 @@ from clpipe.types import Floats
 
 Words = NDArray[np.uint32]
 
-LOG_COEFFICIENTS = np.float32(
-    [0.118273675, -0.18901953, 0.20604694, -0.24881342, 0.33303297, -0.50001967, 1.0000032]
+LOG_COEFFICIENTS = np.array(
+    [0.118273675, -0.18901953, 0.20604694, -0.24881342, 0.33303297, -0.50001967, 1.0000032],
+    np.float32,
 )
-NORMAL_COEFFICIENTS = np.float32(
+NORMAL_COEFFICIENTS = np.array(
     [
         -4.68934e-05,
         1.8514459e-06,
@@ -27,7 +28,8 @@ NORMAL_COEFFICIENTS = np.float32(
         0.09441337,
         1.3548409,
         2.9601128,
-    ]
+    ],
+    np.float32,
 )
 
 
@@ -118,7 +120,7 @@ def normal_of(words: Words) -> Floats:
 
 
 def normal_at(shape: tuple[int, ...], draw: int, stream: Stream) -> Floats:
-    """One standard normal a pixel, (height, width): counter (x, y // 4, draw, stage), word y % 4."""
+    """One standard normal a pixel: counter (x, y // 4, draw, stage), word y % 4."""
     height, width = shape[:2]
     quarter = np.arange((height + 3) // 4, dtype=np.uint32)[:, None]
     words = philox(

@@ -1,4 +1,4 @@
-"""White balance on the mosaic. What a gain lifts above 1 clips, so burnt-out highlights are white."""
+"""White balance on the mosaic. What a gain lifts above 1 clips: burnt-out highlights are white."""
 
 from collections.abc import Mapping
 from typing import ClassVar

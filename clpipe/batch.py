@@ -1,0 +1,243 @@
+"""Many image files through one chain: which files, under which names, with which sidecars."""
+
+import glob
+import json
+import os
+import platform
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import clpipe
+from clpipe.config import Pipeline
+from clpipe.errors import ImageError, RequestError
+from clpipe.image_io import (
+    READABLE,
+    SourceImage,
+    Tags,
+    read_image,
+    versions,
+    write_beside,
+    write_display,
+    write_exr,
+)
+from clpipe.run import Result, Runner
+from clpipe.stage import Kind
+
+FORMATS = ("jpg", "png", "exr")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One input file, and its name relative to the input root: the image key, with its ending."""
+
+    path: Path
+    key: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one job."""
+
+    job: Job
+    megapixels: float
+    seconds: float
+    warnings: tuple[str, ...] = ()
+    error: str = ""
+
+
+def find_jobs(inputs: Sequence[str]) -> list[Job]:
+    """The files that inputs name: files, folders (all images in them, at any depth) and globs.
+
+    The image key of a file in a folder is its path relative to that folder, that of a file given
+    by name or found by a glob is its name. A file that does not exist is a job too: it fails later,
+    alone.
+
+    Raises:
+        RequestError: a folder without images, or two inputs that would make the same output.
+    """
+    jobs: list[Job] = []
+    for text in inputs:
+        path = Path(text)
+        if path.is_dir():
+            files = sorted(p for p in path.rglob("*") if p.suffix.lower() in READABLE)
+            files = [p for p in files if p.is_file() and not p.name.startswith(".")]
+            if not files:
+                endings = ", ".join(READABLE)
+                raise RequestError(f"{path}: a folder without images (looked for {endings})")
+            jobs += [Job(p, p.relative_to(path).as_posix()) for p in files]
+        elif glob.has_magic(text) and not path.exists():
+            matches = sorted(glob.glob(text, recursive=True))  # noqa: PTH207 (may be absolute)
+            if not matches:
+                raise RequestError(f"{text}: no file matches")
+            jobs += [Job(Path(m), Path(m).name) for m in matches if Path(m).is_file()]
+        else:
+            jobs.append(Job(path, path.name))
+    taken: dict[str, Job] = {}
+    for job in jobs:
+        stem = str(Path(job.key).with_suffix(""))
+        if stem in taken:
+            raise RequestError(
+                f"{taken[stem].path} and {job.path} would both be written to {stem}; "
+                "run them into different folders"
+            )
+        taken[stem] = job
+    return jobs
+
+
+def prepare_folder(folder: Path) -> None:
+    """Make the output folder, and see that it can be written.
+
+    Raises:
+        RequestError: it cannot.
+    """
+    probe = folder / f".clpipe.{os.getpid()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise RequestError(f"{folder}: cannot write there: {error.strerror}") from None
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where results go, and in which formats."""
+
+    folder: Path
+    formats: tuple[str, ...]
+
+    def check(self, pipeline: Pipeline, jobs: Sequence[Job]) -> None:
+        """See that the results can be written in these formats, over no input.
+
+        Raises:
+            RequestError: they cannot.
+        """
+        eight_bit = [f for f in self.formats if f != "exr"]
+        if eight_bit and pipeline.result is Kind.RAW:
+            raise RequestError(
+                f"the chain ends in DN, which {eight_bit[0]} cannot hold; "
+                "end it with normalize or a later stage, or use --format exr"
+            )
+        inputs = {job.path.resolve(): job for job in jobs}
+        for job in jobs:
+            for format_ in self.formats:
+                if self.path(job, format_).resolve() in inputs:
+                    raise RequestError(
+                        f"{self.path(job, format_)} is an input and would be overwritten; "
+                        "choose another output folder"
+                    )
+
+    def path(self, job: Job, ending: str) -> Path:
+        """The output of a job with that ending."""
+        return self.folder / f"{Path(job.key).with_suffix('')}.{ending}"
+
+    def write(self, job: Job, runner: Runner, source: SourceImage, result: Result) -> None:
+        """Write a job's images, then its sidecar.
+
+        Raises:
+            ImageError: a file cannot be written.
+        """
+        pipeline = runner.pipeline
+        tags = Tags(pipeline.camera.make, pipeline.camera.model, pipeline.iso)
+        outputs = []
+        for step in pipeline.steps:
+            if step.name in runner.keep:
+                path = self.path(job, f"{step.name}.exr")
+                attributes = {"clpipe:stage": step.name, "clpipe:kind": step.stage.writes.label}
+                write_exr(path, result.kept[step.name], step.stage.writes.channels, attributes)
+                outputs.append(path.name)
+        for format_ in self.formats:
+            path = self.path(job, format_)
+            if format_ == "exr":
+                assert result.final is not None
+                last = pipeline.steps[-1]
+                attributes = {"clpipe:stage": last.name, "clpipe:kind": pipeline.result.label}
+                write_exr(path, result.final, pipeline.result.channels, attributes)
+            else:
+                assert result.encoded is not None
+                write_display(path, result.encoded, tags)
+            outputs.append(path.name)
+        record = sidecar(job, runner, source, result, outputs)
+        text = json.dumps(record, indent=2) + "\n"
+        write_beside(self.path(job, "json"), lambda to: _write_text(to, text))
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text)
+
+
+def sidecar(
+    job: Job, runner: Runner, source: SourceImage, result: Result, outputs: Sequence[str]
+) -> dict[str, Any]:
+    """Everything that is needed to make the same files again."""
+    pipeline = runner.pipeline
+    device = runner.device
+    return {
+        "clpipe": clpipe.__version__,
+        "input": str(job.path),
+        "sha256": source.sha256,
+        "layer": source.layer,
+        "image_key": job.key,
+        "seed": pipeline.seed,
+        "width": source.pixels.shape[1],
+        "height": source.pixels.shape[0],
+        "camera": pipeline.camera.name,
+        "iso": pipeline.iso,
+        "stages": [
+            {
+                "name": step.name,
+                "stage": step.stage.name,
+                "method": step.method.method,
+                "parameters": step.method.model_dump(),
+                **({"found": result.found[step.name]} if step.name in result.found else {}),
+            }
+            for step in pipeline.steps
+        ],
+        "outputs": list(outputs),
+        "warnings": list(source.warnings),
+        "device": {
+            "name": device.info.name if device else "numpy",
+            "platform": device.info.platform if device else "numpy",
+            "version": device.info.version if device else version("numpy"),
+            "lanes": device.info.lanes if device else 0,
+        },
+        "versions": {
+            "python": platform.python_version(),
+            "numpy": version("numpy"),
+            "pyopencl": version("pyopencl"),
+            **versions(),
+        },
+    }
+
+
+def run_jobs(jobs: Sequence[Job], runner: Runner, target: Target) -> Iterator[Outcome]:
+    """Put every job through; one that fails is reported and the others go on.
+
+    The next file is read, and the first one read while the kernels compile, in a second thread.
+    """
+    with ThreadPoolExecutor(1) as reader:
+        ahead = reader.submit(read_image, jobs[0].path)
+        runner.warm_up()
+        for i, job in enumerate(jobs):
+            reading = ahead
+            if i + 1 < len(jobs):
+                ahead = reader.submit(read_image, jobs[i + 1].path)
+            start = time.perf_counter()
+            try:
+                source = reading.result()
+                result = runner.run(source.pixels, job.key)
+                target.write(job, runner, source, result)
+            except ImageError as error:
+                message = str(error)
+                if str(job.path) not in message:
+                    message = f"{job.path}: {message}"
+                yield Outcome(job, 0, time.perf_counter() - start, error=message)
+                continue
+            height, width = source.pixels.shape[:2]
+            seconds = time.perf_counter() - start
+            yield Outcome(job, width * height / 1e6, seconds, source.warnings)

@@ -1,0 +1,270 @@
+"""Image files in and out. The only importer of OpenImageIO and Pillow."""
+
+import hashlib
+import io
+import os
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+from PIL import Image, ImageCms
+
+import clpipe
+from clpipe.errors import ImageError
+from clpipe.types import Array, Floats
+
+READABLE = (".exr", ".hdr", ".pfm", ".tif", ".tiff")
+JPEG_QUALITY = 97
+MAX_PIXELS = 1_000_000_000
+# Layers that hold the finished picture, in order of preference: no layer, then common names.
+PICTURE_LAYERS = ("", "combined", "beauty", "rgba", "rgb", "color", "default")
+
+
+@dataclass(frozen=True)
+class SourceImage:
+    """An image as it came from a file.
+
+    ``pixels`` is (height, width, 3) linear RGB, float16 or float32, finite and C-contiguous.
+    """
+
+    pixels: Array
+    sha256: str
+    layer: str
+    warnings: tuple[str, ...]
+
+
+def read_image(path: Path) -> SourceImage:
+    """Read the picture of a file: R, G and B by name, the display window, everything finite.
+
+    Half stays half. Alpha, depth and other layers are left alone. NaN and infinity become 0,
+    counted in a warning. What the data window leaves out of the display window is black.
+
+    Raises:
+        ImageError: the file is missing, empty, damaged, no image, not linear float, deep, or has no
+            RGB; the message names the file and the reason.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise ImageError(f"{path}: no such file") from None
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+    if not data:
+        raise ImageError(f"{path}: the file is empty")
+    file = oiio.ImageInput.open(str(path))
+    if file is None:
+        raise ImageError(f"{path}: not an image that can be read: {_reason(oiio.geterror())}")
+    try:
+        pixels, layer, warnings = _read_picture(path, file)
+    finally:
+        file.close()
+    pixels, count = without_non_finite(pixels)
+    if count:
+        warnings.append(f"{count} samples were NaN or infinite and were set to 0")
+    return SourceImage(pixels, hashlib.sha256(data).hexdigest(), layer, tuple(warnings))
+
+
+def _reason(text: str) -> str:
+    """An error of OpenImageIO, in one line."""
+    return " ".join(text.split()) or "damaged, or of no known format"
+
+
+def _read_picture(path: Path, file: Any) -> tuple[Array, str, list[str]]:
+    """The pixels of the part and layer that hold the picture, the layer's name, and warnings."""
+    found: list[str] = []
+    part = 0
+    while file.seek_subimage(part, 0):
+        spec = file.spec()
+        if spec.deep:
+            raise ImageError(
+                f"{path}: a deep image (many samples a pixel); flatten it in the renderer first"
+            )
+        if "CubeFace" in (spec.getattribute("textureformat") or ""):
+            raise ImageError(f"{path}: a cube map, not a picture")
+        names = list(spec.channelnames)
+        found += [name for name in names if name not in found]
+        if picture := picture_channels(names):
+            layer, channels = picture
+            return _read_part(path, file, part, channels), layer, _warnings(spec)
+        part += 1
+    listed = ", ".join(found[:20]) or "none"
+    raise ImageError(f"{path}: no R, G and B channels; found {listed}")
+
+
+def picture_channels(names: Sequence[str]) -> tuple[str, tuple[int, int, int]] | None:
+    """The layer that holds the picture, and where its R, G and B stand among the channels.
+
+    >>> picture_channels(["View.Depth.Z", "View.Combined.B", "View.Combined.G", "View.Combined.R"])
+    ('View.Combined', (3, 2, 1))
+    """
+    place = {name.lower(): i for i, name in enumerate(names)}
+    layers = {name.rpartition(".")[0] for name in names}
+
+    def rank(layer: str) -> tuple[int, str]:
+        last = layer.lower().rpartition(".")[2]
+        known = PICTURE_LAYERS.index(last) if last in PICTURE_LAYERS else len(PICTURE_LAYERS)
+        return known, layer
+
+    for layer in sorted(layers, key=rank):
+        prefix = f"{layer.lower()}." if layer else ""
+        if all(prefix + c in place for c in "rgb"):
+            red, green, blue = (place[prefix + c] for c in "rgb")
+            return layer, (red, green, blue)
+    return None
+
+
+def _read_part(path: Path, file: Any, part: int, channels: tuple[int, int, int]) -> Array:
+    """Three channels of one part, in its display window."""
+    spec = file.spec()
+    formats = spec.channelformats or [spec.format] * spec.nchannels
+    types = {formats[i].basetype for i in channels}
+    if not types <= {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}:
+        raise ImageError(
+            f"{path}: holds {spec.format} samples, not linear float ones; "
+            "give an OpenEXR file (or Radiance HDR, PFM, float TIFF)"
+        )
+    width, height = spec.full_width, spec.full_height
+    if not 0 < width * height <= MAX_PIXELS or spec.width * spec.height > MAX_PIXELS:
+        raise ImageError(f"{path}: {width}x{height} pixels; at most {MAX_PIXELS} can be read")
+    half = types == {oiio.HALF}
+    first, last = min(channels), max(channels) + 1
+    data = file.read_image(part, 0, first, last, oiio.HALF if half else oiio.FLOAT)
+    problem = file.geterror()
+    if data is None or problem:
+        raise ImageError(f"{path}: damaged: {_reason(problem)}")
+    pixels = np.asarray(data).reshape(spec.height, spec.width, last - first)
+    order = [i - first for i in channels]
+    if order != [0, 1, 2] or pixels.shape[2] != 3:
+        pixels = pixels[..., order]
+    if (spec.x, spec.y, spec.width, spec.height) != (spec.full_x, spec.full_y, width, height):
+        pixels = display_window(pixels, spec.x - spec.full_x, spec.y - spec.full_y, width, height)
+    return np.ascontiguousarray(pixels)
+
+
+def display_window(data: Array, x: int, y: int, width: int, height: int) -> Array:
+    """The part of a data window, placed at (x, y), that lies in a width x height display window."""
+    window = np.zeros((height, width, data.shape[2]), data.dtype)
+    left, top = max(x, 0), max(y, 0)
+    right, bottom = min(x + data.shape[1], width), min(y + data.shape[0], height)
+    if left < right and top < bottom:
+        window[top:bottom, left:right] = data[top - y : bottom - y, left - x : right - x]
+    return window
+
+
+def without_non_finite(pixels: Array) -> tuple[Array, int]:
+    """The image with 0 for each NaN or infinity, and how many there were."""
+    if pixels.dtype == np.float16:
+        bad = (pixels.view(np.uint16) & 0x7C00) == 0x7C00
+    else:
+        bad = ~np.isfinite(pixels)
+    count = int(np.count_nonzero(bad))
+    if count:
+        pixels = np.where(bad, pixels.dtype.type(0), pixels)
+    return pixels, count
+
+
+def _warnings(spec: Any) -> list[str]:
+    """What a user should know of how the picture is read."""
+    primaries = spec.getattribute("chromaticities")
+    srgb = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+    if primaries is not None and not np.allclose(primaries, srgb, atol=2e-3):
+        return ["its chromaticities are not those of linear sRGB; its values are used as they are"]
+    return []
+
+
+def srgb_profile() -> bytes:
+    """An ICC profile of sRGB, always the same bytes."""
+    profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    profile[24:36] = bytes(12)  # the date of creation
+    return bytes(profile)
+
+
+def write_beside(path: Path, write: Callable[[Path], None]) -> None:
+    """Write a file under a temporary name beside ``path``, then rename it: never half a file.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    beside = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(beside)
+        beside.replace(path)
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be written: {error.strerror or error}") from None
+    finally:
+        with suppress(OSError):
+            beside.unlink(missing_ok=True)
+
+
+@dataclass(frozen=True)
+class Tags:
+    """What goes into a picture's EXIF."""
+
+    make: str
+    model: str
+    iso: float
+
+
+def write_display(path: Path, pixels: Array, tags: Tags) -> None:
+    """Write eight-bit pixels, (height, width[, 3]), as JPEG (quality 97, 4:2:2) or PNG, with EXIF
+    and an sRGB profile.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110] = tags.make, tags.model
+    exif[0x0131] = f"clpipe {clpipe.__version__}"
+    exif.get_ifd(0x8769)[0x8827] = round(tags.iso)
+    options: dict[str, Any] = {"exif": exif.tobytes()}
+    if pixels.ndim == 3:
+        options["icc_profile"] = srgb_profile()
+    if path.suffix == ".jpg":
+        options |= {"quality": JPEG_QUALITY, "subsampling": "4:2:2"}
+        limit = 65500
+        if max(pixels.shape[:2]) > limit:
+            raise ImageError(f"{path}: JPEG holds at most {limit} pixels a side; use --format png")
+    image = Image.fromarray(pixels)
+
+    def write(to: Path) -> None:
+        with io.BytesIO() as buffer:
+            image.save(buffer, "JPEG" if path.suffix == ".jpg" else "PNG", **options)
+            to.write_bytes(buffer.getvalue())
+
+    write_beside(path, write)
+
+
+def write_exr(
+    path: Path, pixels: Floats, channels: Sequence[str], attributes: Mapping[str, str | float]
+) -> None:
+    """Write a float image, (height, width[, channel]), as OpenEXR (ZIP), channels named.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    height, width = pixels.shape[:2]
+    spec = oiio.ImageSpec(width, height, len(channels), oiio.FLOAT)
+    spec.channelnames = tuple(channels)
+    spec.attribute("compression", "zip")
+    for name, value in attributes.items():
+        spec.attribute(name, value)
+
+    def write(to: Path) -> None:
+        file = oiio.ImageOutput.create(str(to))
+        data = np.ascontiguousarray(pixels).reshape(height, width, len(channels))
+        if file is None or not file.open(str(to), spec) or not file.write_image(data):
+            raise OSError(0, _reason(file.geterror() if file else oiio.geterror()))
+        if not file.close():
+            raise OSError(0, _reason(file.geterror()))
+
+    write_beside(path, write)
+
+
+def versions() -> dict[str, str]:
+    """The versions of what reads and writes files."""
+    return {"OpenImageIO": oiio.__version__, "Pillow": Image.__version__}  # type: ignore[attr-defined]
