@@ -57,7 +57,7 @@ def read_image(path: Path) -> SourceImage:
         raise ImageError(f"{path}: the file is empty")
     file = oiio.ImageInput.open(str(path))
     if file is None:
-        raise ImageError(f"{path}: not an image that can be read: {_reason(oiio.geterror())}")
+        raise ImageError(f"{path}: cannot be read as an image: {_reason(oiio.geterror())}")
     try:
         pixels, layer, warnings = _read_picture(path, file)
     finally:
@@ -70,7 +70,9 @@ def read_image(path: Path) -> SourceImage:
 
 def _reason(text: str) -> str:
     """An error of OpenImageIO, in one line."""
-    return " ".join(text.split()) or "damaged, or of no known format"
+    if not text or "could not find a format reader" in text:
+        return "it is damaged, or of no known format"
+    return " ".join(text.split())
 
 
 def _read_picture(path: Path, file: Any) -> tuple[Array, str, list[str]]:
@@ -91,7 +93,7 @@ def _read_picture(path: Path, file: Any) -> tuple[Array, str, list[str]]:
             layer, channels = picture
             return _read_part(path, file, part, channels), layer, _warnings(spec)
         part += 1
-    listed = ", ".join(found[:20]) or "none"
+    listed = ", ".join(name for name in found[:20] if name) or "none"
     raise ImageError(f"{path}: no R, G and B channels; found {listed}")
 
 

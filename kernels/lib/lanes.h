@@ -12,7 +12,7 @@
 typedef float vf;
 typedef int vi;
 typedef uint vu;
-typedef ulong vul;
+typedef ulong vh;
 #define LANES_OF(name) name
 #else
 #define LANES_JOIN_(name, n) name##n

@@ -1,0 +1,76 @@
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from clpipe.config import make_pipeline, settings_from
+from clpipe.device import Device, choose, find_devices
+from clpipe.run import Result, Runner
+from clpipe.stage import Kind
+
+ROOT = Path(__file__).resolve().parent.parent
+STILL_LIFE = ROOT / "tests" / "data" / "still_life.exr"
+SHARED = ROOT.parent / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def device() -> Device:
+    return Device(choose(None, find_devices()))
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    if not SHARED.is_dir():
+        pytest.skip("needs the developers' folder of real inputs, which is not here")
+    return SHARED
+
+
+@pytest.fixture
+def develop(device: Device) -> Callable[..., Result]:
+    """Run a chain, given as nested settings, on one image: on the device or in NumPy."""
+
+    def run(
+        image: np.ndarray,
+        key: str = "test",
+        numpy: bool = False,
+        source: Kind = Kind.RGB,
+        keep: tuple[str, ...] = (),
+        encode: bool = False,
+        **settings: Any,
+    ) -> Result:
+        pipeline = make_pipeline(settings_from(settings), source)
+        runner = Runner(pipeline, None if numpy else device, keep, encode=encode, final=True)
+        return runner.run(image, key)
+
+    return run
+
+
+@pytest.fixture
+def write_exr(tmp_path: Path) -> Callable[..., Path]:
+    """Write an EXR with any channels, format and windows."""
+
+    def write(
+        name: str,
+        pixels: np.ndarray,
+        channels: str = "R,G,B",
+        half: bool = True,
+        **spec_fields: int,
+    ) -> Path:
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        spec = oiio.ImageSpec(
+            pixels.shape[1], pixels.shape[0], pixels.shape[2], oiio.HALF if half else oiio.FLOAT
+        )
+        spec.channelnames = tuple(channels.split(","))
+        for field, value in spec_fields.items():
+            setattr(spec, field, value)
+        file = oiio.ImageOutput.create(str(path))
+        assert file.open(str(path), spec)
+        assert file.write_image(np.ascontiguousarray(pixels, np.float32))
+        assert file.close()
+        return path
+
+    return write

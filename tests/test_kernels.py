@@ -1,0 +1,82 @@
+"""Every kernel against its NumPy reference: odd sizes, one pixel wide or high, all four patterns."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clpipe.check import SIZES, check_method, check_raw, compare
+from clpipe.config import Settings
+from clpipe.device import Device
+from clpipe.stage import Kind
+from clpipe.stages import all_stages
+
+METHODS = [(stage, method) for stage in all_stages().values() for method in stage.methods]
+LABELS = [f"{stage.name}-{method.method}" for stage, method in METHODS]
+KERNELS = {
+    "exposure",
+    "mosaic",
+    "site_gains",
+    "sensor_noise_gaussian",
+    "line_noise",
+    "quantize",
+    "normalize",
+    "gray_world",
+    "demosaic_bilinear",
+    "demosaic_edge_directed_median",
+    "denoise_bilateral",
+    "curve",
+}
+
+
+@pytest.fixture(scope="module")
+def scalar_device(device: Device) -> Device:
+    """The same device as if it were a GPU: one lane, so the kernels are plain scalar code."""
+    return Device(replace(device.info, lanes=1))
+
+
+@pytest.mark.parametrize(("stage", "method"), METHODS, ids=LABELS)
+def test_kernel_agrees_with_its_reference(device, stage, method):
+    result = check_method(device, stage, method)
+    assert result.samples > 1000
+    assert result.passed, result
+
+
+@pytest.mark.parametrize(("stage", "method"), METHODS, ids=LABELS)
+def test_kernel_agrees_with_its_reference_on_one_lane(scalar_device, stage, method):
+    result = check_method(scalar_device, stage, method, SIZES[:6], ("GRBG", "BGGR"))
+    assert result.passed, result
+
+
+def test_raw_is_bit_for_bit_the_references(device, scalar_device):
+    for any_device in (device, scalar_device):
+        result = check_raw(any_device)
+        assert result.differing == 0, result
+
+
+@pytest.mark.parametrize("radius", [1, 3, 7])
+def test_wide_stencils_on_small_images(device, radius):
+    settings = Settings(
+        stages=("denoise",),
+        parameters={
+            "denoise": {
+                "radius": radius,
+                "luma_sigma": 0.2,
+                "chroma_sigma": 0.3,
+                "spatial_sigma": 3,
+            }
+        },
+    )
+    _, _, largest = compare(device, settings, Kind.RGB, ((1, 1), (1, 5), (4, 3), (9, 8), (33, 70)))
+    assert largest < 2e-4
+
+
+def test_a_wrong_kernel_is_caught(device, monkeypatch):
+    stage = all_stages()["exposure"]
+    method = stage.methods[0]
+    monkeypatch.setattr(method, "reference", lambda self, image, frame: image * np.float32(1.001))
+    assert not check_method(device, stage, method).passed
+
+
+def test_every_kernel_file_belongs_to_a_method():
+    assert {method.kernel for _, method in METHODS} == KERNELS

@@ -1,0 +1,147 @@
+"""Whole chains: the same bits whatever is kept, fused or run before; and sane pictures."""
+
+import numpy as np
+import pytest
+
+from clpipe.config import make_pipeline, settings_from
+from clpipe.image_io import read_image
+from clpipe.run import Runner
+from tests.conftest import STILL_LIFE
+
+SETTINGS = [
+    {"iso": 3200},
+    {"iso": 800, "white_balance": {"method": "gray_world"}, "mosaic": {"pattern": "GBRG"}},
+    {"iso": 1600, "demosaic": {"method": "bilinear"}, "skip": ["denoise"]},
+]
+
+
+@pytest.fixture(scope="module")
+def still_life():
+    return read_image(STILL_LIFE).pixels
+
+
+def runner(settings, device, **options):
+    return Runner(make_pipeline(settings_from(settings)), device, **options)
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+@pytest.mark.parametrize("shape", [(67, 101), (1, 40), (3, 3)])
+def test_what_is_kept_changes_no_bit(device, still_life, settings, shape):
+    image = np.ascontiguousarray(still_life[200 : 200 + shape[0], 300 : 300 + shape[1]])
+    plain = runner(settings, device)
+    expected = plain.run(image, "k").encoded
+    steps = [step.name for step in plain.pipeline.steps]
+    for keep in ([s] for s in steps):
+        result = runner(settings, device, keep=keep).run(image, "k")
+        assert np.array_equal(result.encoded, expected), keep
+    everything = runner(settings, device, keep=steps, final=True).run(image, "k")
+    assert np.array_equal(everything.encoded, expected)
+    assert np.array_equal(everything.kept[steps[-1]], everything.final)
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+def test_device_and_numpy_agree(device, still_life, settings):
+    image = np.ascontiguousarray(still_life[100:301, 250:553])
+    steps = ["quantize", "demosaic"]
+    one = runner(settings, device, keep=steps).run(image, "k")
+    two = runner(settings, None, keep=steps).run(image, "k")
+    assert np.array_equal(one.kept["quantize"], two.kept["quantize"])
+    assert np.abs(one.kept["demosaic"] - two.kept["demosaic"]).max() < 1e-6
+    assert np.abs(one.encoded.astype(int) - two.encoded).max() <= 1
+    for step, values in two.found.items():
+        assert one.found[step] == pytest.approx(values, rel=1e-6)
+
+
+def test_images_of_all_sizes_one_after_the_other(device, still_life):
+    many = runner({"iso": 3200}, device)
+    for size in ((50, 70), (640, 960), (50, 70), (33, 8), (64, 64)):
+        image = np.ascontiguousarray(still_life[: size[0], : size[1]])
+        fresh = runner({"iso": 3200}, device).run(image, "k").encoded
+        assert np.array_equal(many.run(image, "k").encoded, fresh)
+
+
+def test_half_and_float_sources_agree(device, still_life):
+    image = np.ascontiguousarray(still_life[:64, :64])
+    one = runner({}, device).run(image, "k").encoded
+    assert np.array_equal(one, runner({}, device).run(image.astype(np.float32), "k").encoded)
+
+
+def test_a_render_keeps_its_colours(develop, still_life):
+    crop = np.ascontiguousarray(still_life[120:240, 120:360])
+    result = develop(crop, skip=["sensor_noise", "row_noise", "denoise", "tone_curve", "gamma"])
+    clean = np.minimum(crop.astype(np.float64), 1)
+    assert np.abs(result.final.mean((0, 1)) - clean.mean((0, 1))).max() < 2e-3
+
+
+def test_burnt_out_highlights_are_white(develop):
+    bright = np.full((32, 32, 3), 40, np.float32)
+    encoded = develop(bright, encode=True).encoded
+    assert encoded.min() == 255
+
+
+def test_gray_world_makes_means_equal(develop):
+    random = np.random.default_rng(0)
+    image = (random.random((64, 64, 3)) * [0.5, 0.3, 0.1]).astype(np.float32)
+    chain = ["mosaic", "white_balance"]
+    result = develop(image, stages=chain, white_balance={"method": "gray_world"})
+    sites = [result.final[y::2, x::2].mean() for y in (0, 1) for x in (0, 1)]
+    green = (sites[1] + sites[2]) / 2
+    assert sites[0] == pytest.approx(green, rel=1e-5)
+    assert sites[3] == pytest.approx(green, rel=1e-5)
+    gains = result.found["white_balance"]
+    assert gains["red_gain"] == pytest.approx(0.6, rel=0.05)
+    assert gains["blue_gain"] == pytest.approx(3.0, rel=0.05)
+
+
+@pytest.mark.parametrize("numpy", [False, True])
+def test_gray_world_of_darkness_changes_nothing(develop, numpy):
+    result = develop(
+        np.zeros((8, 8, 3), np.float32),
+        numpy=numpy,
+        stages=["mosaic", "white_balance"],
+        white_balance={"method": "gray_world"},
+    )
+    assert result.found["white_balance"] == {"red_gain": 1.0, "blue_gain": 1.0}
+
+
+def test_denoising_follows_the_iso_and_is_stronger_on_chroma():
+    def sigmas(iso):
+        method = make_pipeline(settings_from({"iso": iso})).step_named("denoise").method
+        return method.luma_sigma, method.chroma_sigma
+
+    low, high = sigmas(100), sigmas(3200)
+    assert high[0] > 4 * low[0]
+    assert high[1] > 2 * high[0]
+
+
+def test_denoising_takes_noise_away_and_leaves_edges(develop):
+    image = np.full((128, 128, 3), 0.1, np.float32)
+    image[:, 64:] = 0.6
+    result = develop(image, iso=3200, skip=["tone_curve", "gamma"], keep=("demosaic",))
+    before, after = result.kept["demosaic"], result.final
+    flat = (slice(8, -8), slice(8, 50))
+    assert after[flat].std() < 0.6 * before[flat].std()
+    step = after[8:-8, 66].mean() - after[8:-8, 61].mean()
+    assert step > 0.48
+
+
+def cpsnr(one, two, border=10):
+    crop = slice(border, -border)
+    error = (one[crop, crop].astype(np.float64) - two[crop, crop]) ** 2
+    return 10 * np.log10(255**2 / error.mean())
+
+
+@pytest.mark.parametrize(
+    ("method", "expected"), [("bilinear", 27.76), ("edge_directed_median", 37.56)]
+)
+def test_demosaicing_is_as_good_as_published(device, shared_data, method, expected):
+    from PIL import Image
+
+    values = []
+    chain = runner({"stages": ["mosaic", "demosaic"], "demosaic": {"method": method}}, device)
+    for path in sorted((shared_data / "kodak").glob("*.png")):
+        truth = np.asarray(Image.open(path))
+        image = (truth / np.float32(255)).astype(np.float32)
+        values.append(cpsnr(chain.run(image, path.name).encoded, truth))
+    assert len(values) == 8
+    assert np.mean(values) == pytest.approx(expected, abs=0.05)

@@ -1,0 +1,132 @@
+"""The planner: pure, so it is tested without a device."""
+
+import pytest
+
+from clpipe.codegen import write_kernel
+from clpipe.config import make_pipeline, settings_from
+from clpipe.errors import RequestError
+from clpipe.plan import AddUp, Find, Launch, Lines, make_plan
+from clpipe.stage import Kind
+
+GRAY_WORLD = {"white_balance": {"method": "gray_world"}}
+
+
+def plan_of(keep=(), fold=True, final=False, encode=True, **settings):
+    return make_plan(
+        make_pipeline(settings_from(settings)), keep=keep, fold=fold, final=final, encode=encode
+    )
+
+
+def names(plan):
+    return [launch.name for launch in plan.launches]
+
+
+def test_default_chain():
+    assert names(plan_of()) == [
+        "lines",
+        "exposure..white_balance",
+        "demosaic.green_or_difference",
+        "demosaic.spread_differences",
+        "demosaic.freeman..denoise",
+        "denoise.bilateral..gamma",
+    ]
+
+
+def test_default_chain_with_gray_world_is_eight_launches_and_at_most_48_bytes():
+    plan = plan_of(**GRAY_WORLD)
+    assert [type(launch) for launch in plan.launches] == [Lines, Launch, AddUp, Find] + [Launch] * 4
+    assert plan.bytes_per_pixel(8) <= 48
+
+
+def test_gains_found_in_the_image_are_applied_where_the_stencil_reads():
+    plan = plan_of(**GRAY_WORLD)
+    prologues = [
+        [op.step for read in launch.reads for op in read.prologue]
+        for launch in plan.launches
+        if isinstance(launch, Launch)
+    ]
+    assert prologues == [[], ["white_balance"], [], ["white_balance"], []]
+    unfolded = plan_of(fold=False, **GRAY_WORLD)
+    assert "white_balance" in names(unfolded)
+
+
+def test_keeping_a_stage_inside_a_group_splits_it():
+    plain, kept = plan_of(), plan_of(keep=("sensor_noise",))
+    assert len(kept.launches) == len(plain.launches) + 1
+    assert names(kept)[1:3] == ["exposure..sensor_noise", "row_noise..white_balance"]
+    assert [name for name, _ in kept.kept] == ["sensor_noise"]
+
+
+def test_keeping_a_stage_at_the_end_of_a_group_costs_no_launch_but_a_slot():
+    assert len(plan_of(keep=("white_balance",)).launches) == len(plan_of().launches)
+
+
+def test_keeping_all():
+    pipeline = make_pipeline(settings_from(GRAY_WORLD))
+    steps = tuple(step.name for step in pipeline.steps)
+    plan = make_plan(pipeline, keep=steps)
+    assert tuple(name for name, _ in plan.kept) == steps
+
+
+@pytest.mark.parametrize("keep", [(), ("mosaic",), ("demosaic", "denoise"), ("normalize", "gamma")])
+@pytest.mark.parametrize("method", ["as_shot", "gray_world"])
+def test_no_launch_writes_a_slot_that_is_still_needed(keep, method):
+    plan = plan_of(keep=keep, final=True, white_balance={"method": method})
+    holder: dict[int, int] = {}
+    for launch in plan.launches:
+        if not isinstance(launch, Launch):
+            continue
+        for read in launch.reads:
+            for slot in plan.slots[read.image.number]:
+                assert holder[slot] == read.image.number
+        if launch.writes:
+            read_slots = {s for r in launch.reads for s in plan.slots[r.image.number]}
+            for slot in plan.slots[launch.writes.number]:
+                assert slot not in read_slots
+                holder[slot] = launch.writes.number
+    for image in [image for _, image in plan.kept] + [plan.final]:
+        for slot in plan.slots[image.number]:
+            assert holder[slot] == image.number
+
+
+def test_every_image_is_written_before_it_is_read():
+    plan = plan_of(keep=("demosaic",), **GRAY_WORLD)
+    written: set[int] = set()
+    for launch in plan.launches:
+        if isinstance(launch, Launch):
+            assert {read.image.number for read in launch.reads} <= written
+            if launch.writes:
+                written.add(launch.writes.number)
+
+
+def test_a_plan_depends_on_structure_alone():
+    one, two = plan_of(iso=100), plan_of(iso=3200, exposure={"ev": 1}, seed=7)
+    assert one == two
+    assert hash(one) == hash(two)
+    assert one != plan_of(mosaic={"pattern": "BGGR"})
+    assert one != plan_of(denoise={"radius": 3})
+
+
+def test_the_apron_is_as_wide_as_the_widest_stencil():
+    assert plan_of().apron == 2
+    assert plan_of(denoise={"radius": 5}).apron == 5
+    assert plan_of(stages=["exposure", "gamma"]).apron == 0
+
+
+def test_curves_before_eight_bits_become_one_table():
+    plan = plan_of()
+    kernel = write_kernel(plan, plan.launches[-1], 0, 8)
+    assert [p.item for p in kernel.parameters if p.role == "table8"] == ["tone_curve,gamma"]
+    kept = plan_of(keep=("tone_curve",))
+    kernel = write_kernel(kept, kept.launches[-1], 0, 8)
+    assert [p.item for p in kernel.parameters if p.role == "table8"] == ["gamma"]
+
+
+def test_a_stage_that_is_not_in_the_chain_cannot_be_kept():
+    with pytest.raises(RequestError, match="'denoize'.*did you mean 'denoise'"):
+        plan_of(keep=("denoize",))
+
+
+def test_a_chain_may_begin_with_a_stencil():
+    pipeline = make_pipeline(settings_from({"stages": ["demosaic"]}), Kind.MOSAIC)
+    assert names(make_plan(pipeline))[0] == "load"
