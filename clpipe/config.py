@@ -2,7 +2,8 @@
 
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -185,13 +186,24 @@ def make_method(stage: Stage, name: str, table: Mapping[str, Any]) -> Method:
         message = one_of("method", str(chosen), stage.by_name)
         raise KeyedError(f"{name}.method", f"{name}.method: {message}")
     method = stage.by_name[chosen]
-    try:
+    with named_errors(name, method):
         return method.model_validate({k: v for k, v in table.items() if k != "method"})
+
+
+@contextmanager
+def named_errors(name: str, method: type[Method]) -> Iterator[None]:
+    """Turn what pydantic says of a step's parameters into a message that names the step.
+
+    Raises:
+        KeyedError: a parameter is unknown, or its value is not allowed.
+    """
+    try:
+        yield
     except ValidationError as errors:
         error = errors.errors()[0]
         key = ".".join([name, *(str(part) for part in error["loc"])])
         if error["type"] == "extra_forbidden":
-            what = f"parameter of {name} ({chosen})"
+            what = f"parameter of {name} ({method.method})"
             raise KeyedError(
                 key, one_of(what, str(error["loc"][0]), ["method", *method.model_fields])
             ) from None
@@ -222,7 +234,9 @@ def make_pipeline(settings: Settings, source: Kind = Kind.RGB) -> Pipeline:
         name = stage_name if count == 1 else f"{stage_name}_{count}"
         if stage.reads is not kind:
             raise RequestError(misfit(name, stage, before, kind))
-        method = make_method(stage, name, settings.parameters.get(name, {})).resolve(context)
+        method = make_method(stage, name, settings.parameters.get(name, {}))
+        with named_errors(name, type(method)):
+            method = method.resolve(context)
         steps.append(Step(name, stage, method, context))
         context = method.after(context)
         kind, before = stage.writes, name

@@ -253,6 +253,8 @@ def write_exr(
     spec = oiio.ImageSpec(width, height, len(channels), oiio.FLOAT)
     spec.channelnames = tuple(channels)
     spec.attribute("compression", "zip")
+    # Else the time of writing is put in, and no two runs make the same bytes.
+    spec.attribute("DateTime", "1970:01:01 00:00:00")
     for name, value in attributes.items():
         spec.attribute(name, value)
 

@@ -1,4 +1,4 @@
-"""Every kernel against its NumPy reference: odd sizes, one pixel wide or high, all four patterns."""
+"""Every kernel against its NumPy reference: odd sizes, 1xN images, all four patterns."""
 
 from dataclasses import replace
 

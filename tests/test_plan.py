@@ -123,7 +123,7 @@ def test_curves_before_eight_bits_become_one_table():
 
 
 def test_a_stage_that_is_not_in_the_chain_cannot_be_kept():
-    with pytest.raises(RequestError, match="'denoize'.*did you mean 'denoise'"):
+    with pytest.raises(RequestError, match=r"'denoize'.*did you mean 'denoise'"):
         plan_of(keep=("denoize",))
 
 

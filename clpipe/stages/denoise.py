@@ -23,7 +23,7 @@ from clpipe.stage import (
 from clpipe.types import Floats
 
 MID_GREY = 0.18
-LUMA_STRENGTH, CHROMA_STRENGTH = 2.0, 4.0
+LUMA_STRENGTH, CHROMA_STRENGTH = 3.0, 6.0
 
 
 def predicted_noise(context: Context) -> tuple[float, float]:

@@ -78,10 +78,13 @@ class GrayWorld(Method):
         green1, green2 = total(1 - red_x, red_y), total(red_x, 1 - red_y)
         green = (green1[0] + green2[0], green1[1] + green2[1])
 
+        def mean(colour: tuple[int, int]) -> np.float32:
+            return np.float32(colour[0]) / np.float32(colour[1])
+
         def gain(colour: tuple[int, int]) -> np.float32:
             if green[0] <= 0 or colour[0] <= 0:
                 return np.float32(1)
-            return np.float32(green[0] / green[1] / (colour[0] / colour[1]))
+            return mean(green) / mean(colour)
 
         frame.found["red_gain"], frame.found["blue_gain"] = float(gain(red)), float(gain(blue))
         return balanced(image, frame.context, gain(red), gain(blue))

@@ -1,0 +1,316 @@
+"""The command line, from the outside."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from clpipe.cli import main
+from tests.conftest import ROOT, STILL_LIFE
+
+
+@pytest.fixture
+def clpipe(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments, status=0):
+        result = CliRunner().invoke(main, [str(a) for a in arguments])
+        if result.exception and not isinstance(result.exception, SystemExit):
+            raise result.exception
+        assert result.exit_code == status, result.output
+        return result
+
+    return call
+
+
+@pytest.fixture
+def small(write_exr):
+    pixels = np.random.default_rng(0).random((24, 32, 3)).astype(np.float32)
+    return write_exr("in/small.exr", pixels)
+
+
+def files(folder):
+    return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+
+
+def read_exr(path):
+    file = oiio.ImageInput.open(str(path))
+    pixels = file.read_image(oiio.FLOAT)
+    return np.squeeze(pixels), file.spec()
+
+
+def read_png(path):
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def test_the_main_job(clpipe, tmp_path):
+    clpipe("run", STILL_LIFE, "-o", "out", "--iso", 1600)
+    assert files(tmp_path / "out") == ["still_life.jpg", "still_life.json"]
+    with Image.open("out/still_life.jpg") as image:
+        assert image.size == (960, 640)
+    sidecar = json.loads((tmp_path / "out" / "still_life.json").read_text())
+    assert len(sidecar["sha256"]) == 64
+    assert sidecar["image_key"] == "still_life.exr"
+    assert sidecar["iso"] == 1600
+    stages = {s["name"]: s for s in sidecar["stages"]}
+    assert stages["sensor_noise"]["parameters"]["a"] == pytest.approx(5.0419 / 15871)
+    assert stages["white_balance"]["parameters"] == {"red_gain": 2.77, "blue_gain": 1.36}
+    assert None not in [v for s in stages.values() for v in s["parameters"].values()]
+
+
+def test_numpy_gives_the_same_picture(clpipe, small, tmp_path):
+    clpipe("run", small, "-o", "a", "--iso", 3200, "--format", "png", "--keep", "quantize")
+    clpipe(
+        "run",
+        small,
+        "-o",
+        "b",
+        "--iso",
+        3200,
+        "--format",
+        "png",
+        "--keep",
+        "quantize",
+        "--device",
+        "numpy",
+    )
+    assert files(tmp_path / "a") == ["small.json", "small.png", "small.quantize.exr"]
+    one, two = (read_png(f"{f}/small.png").astype(int) for f in "ab")
+    assert np.abs(one - two).max() <= 1
+    assert np.array_equal(*(read_exr(f"{f}/small.quantize.exr")[0] for f in "ab"))
+    assert json.loads((tmp_path / "b" / "small.json").read_text())["device"]["name"] == "numpy"
+
+
+def test_a_second_run_makes_the_same_bytes(clpipe, small, tmp_path):
+    for folder in "ab":
+        clpipe(
+            "run",
+            small,
+            "-o",
+            folder,
+            "--iso",
+            3200,
+            "--format",
+            "jpg",
+            "--format",
+            "exr",
+            "--keep",
+            "all",
+        )
+    assert files(tmp_path / "a") == files(tmp_path / "b")
+    assert len(files(tmp_path / "a")) == 2 + 1 + 13
+    for name in files(tmp_path / "a"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+
+
+def test_float_exr_of_the_last_stage(clpipe, small):
+    clpipe(
+        "run",
+        small,
+        "-o",
+        "out",
+        "--stages",
+        "mosaic,sensor_noise",
+        "--format",
+        "exr",
+        "--set",
+        "sensor_noise.a=0",
+        "--set",
+        "sensor_noise.b=0",
+    )
+    pixels, spec = read_exr("out/small.exr")
+    source, _ = read_exr(small)
+    assert spec.channelnames == ("Y",)
+    assert np.array_equal(pixels[::2, ::2], source[::2, ::2, 0])
+    assert np.array_equal(pixels[1::2, ::2], source[1::2, ::2, 1])
+
+
+def test_gray_world_gains_are_in_the_sidecar(clpipe, small, tmp_path):
+    clpipe("run", small, "-o", "out", "--set", "white_balance.method=gray_world")
+    sidecar = json.loads((tmp_path / "out" / "small.json").read_text())
+    found = next(s["found"] for s in sidecar["stages"] if s["name"] == "white_balance")
+    assert found["red_gain"] == pytest.approx(2.77, rel=0.1)
+    assert found["blue_gain"] == pytest.approx(1.36, rel=0.1)
+
+
+def test_a_configuration_with_options_over_it(clpipe, small, tmp_path):
+    (tmp_path / "p.toml").write_text(
+        'iso = 200\nskip = ["denoise"]\n[mosaic]\npattern = "GBRG"\n[exposure]\nev = 1\n'
+    )
+    clpipe(
+        "run",
+        small,
+        "-o",
+        "out",
+        "-c",
+        "p.toml",
+        "--iso",
+        400,
+        "--set",
+        "exposure.ev=-1",
+        "--skip",
+        "row_noise",
+    )
+    sidecar = json.loads((tmp_path / "out" / "small.json").read_text())
+    stages = {s["name"]: s["parameters"] for s in sidecar["stages"]}
+    assert sidecar["iso"] == 400
+    assert stages["mosaic"] == {"pattern": "GBRG"}
+    assert stages["exposure"] == {"ev": -1}
+    assert not {"denoise", "row_noise"} & set(stages)
+
+
+def test_a_folder_keeps_its_structure_and_a_bad_file_stops_nobody(clpipe, write_exr, tmp_path):
+    pixels = np.full((8, 8, 3), 0.5, np.float32)
+    for name in ("in/a.exr", "in/sub/b.exr", "in/sub/deep/a.exr"):
+        write_exr(name, pixels)
+    (tmp_path / "in" / "broken.exr").write_bytes(b"no image")
+    (tmp_path / "in" / "notes.txt").write_text("not looked at")
+    result = clpipe("run", "in", "nowhere.exr", "-o", "out", status=1)
+    assert "in/broken.exr: cannot be read as an image" in result.stderr
+    assert "nowhere.exr: no such file" in result.stderr
+    assert "3 of 5 images done, 2 failed" in result.stderr
+    made = ["a.jpg", "a.json", "sub/b.jpg", "sub/b.json", "sub/deep/a.jpg", "sub/deep/a.json"]
+    assert files(tmp_path / "out") == made
+    keys = [
+        json.loads((tmp_path / "out" / m).read_text())["image_key"] for m in made if "json" in m
+    ]
+    assert keys == ["a.exr", "sub/b.exr", "sub/deep/a.exr"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        (["--set", "demosaic.method=bilinaer"], 2, "did you mean 'bilinear'"),
+        (["--set", "denois.radius=2"], 2, "did you mean 'denoise'"),
+        (["--set", "denoise.radus=2"], 2, "did you mean 'radius'"),
+        (["--set", "denoise.radius=0"], 2, "denoise.radius: found 0"),
+        (["--set", "denoise"], 2, "expected stage.parameter=value"),
+        (["--stages", "mosaic,gamma"], 2, "gamma reads rgb, but mosaic gives mosaic"),
+        (["--skip", "noise"], 2, "unknown stage 'noise'"),
+        (["--keep", "noise"], 2, "unknown stage in this chain 'noise'"),
+        (["-c", "missing.toml"], 2, "missing.toml: cannot read"),
+        (["--camera", "leica"], 2, "unknown camera 'leica'"),
+        (["--iso", "1"], 2, "from 100 to 25600"),
+        (["--stages", "mosaic,quantize"], 2, "ends in DN, which jpg cannot hold"),
+        (["--device", "quantum"], 3, "unknown device 'quantum'"),
+        (["--device", "99"], 3, "unknown device '99'"),
+        (["--format", "bmp"], 2, "bmp"),
+    ],
+)
+def test_a_wrong_request_writes_nothing(clpipe, small, tmp_path, arguments, status, message):
+    result = clpipe("run", small, "-o", "out", *arguments, status=status)
+    assert message in result.stderr
+    assert "Traceback" not in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_inputs_that_cannot_be(clpipe, small, tmp_path):
+    (tmp_path / "empty").mkdir()
+    assert "without images" in clpipe("run", "empty", "-o", "out", status=2).stderr
+    assert "no file matches" in clpipe("run", "*.nothing", "-o", "out", status=2).stderr
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "small.exr").write_bytes(small.read_bytes())
+    result = clpipe("run", small, other / "small.exr", "-o", "out", status=2)
+    assert "would both be written to small" in result.stderr
+    result = clpipe("run", small, "-o", small.parent, "--format", "exr", status=2)
+    assert "is an input and would be overwritten" in result.stderr
+
+
+def test_an_output_folder_that_cannot_be_written(clpipe, small, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    result = clpipe("run", small, "-o", "file/out", status=2)
+    assert "cannot write there" in result.stderr
+
+
+def test_nothing_is_left_half_written(clpipe, small, tmp_path, monkeypatch):
+    def no_space(self, target):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.replace", no_space)
+    result = clpipe("run", small, "-o", "out", status=1)
+    assert "No space left on device" in result.stderr
+    assert files(tmp_path / "out") == []
+
+
+def test_a_jpeg_has_its_limit(clpipe, write_exr):
+    wide = write_exr("wide.exr", np.zeros((1, 65600, 3), np.float32))
+    assert "use --format png" in clpipe("run", wide, "-o", "out", status=1).stderr
+    clpipe("run", wide, "-o", "out", "--format", "png")
+
+
+def test_plan(clpipe):
+    result = clpipe("plan", "--set", "white_balance.method=gray_world")
+    assert "8 launches, 6 slots" in result.stdout
+    record = json.loads(clpipe("plan", "--json", "--keep", "sensor_noise").stdout)
+    assert record["kept"] == ["sensor_noise"]
+    assert len(record["launches"]) == 7
+
+
+def test_stages(clpipe):
+    assert "edge_directed_median, bilinear" in clpipe("stages").stdout
+    assert "from the camera and ISO" in clpipe("stages", "sensor_noise").stdout
+    assert "did you mean 'demosaic'" in clpipe("stages", "demosaik", status=2).stderr
+    assert len(json.loads(clpipe("stages", "--json").stdout)) >= 13
+
+
+def test_devices(clpipe):
+    rows = json.loads(clpipe("devices", "--json").stdout)
+    assert sum(row["status"] == "used by default" for row in rows) == 1
+    assert rows[-1]["index"] == "numpy"
+    assert "used by default" in clpipe("devices").stdout
+
+
+def test_check(clpipe):
+    record = json.loads(clpipe("check", "--small", "--json").stdout)
+    assert record["failed"] == 0
+    assert len(record["checks"]) >= 16
+    assert "numpy is the reference" in clpipe("check", "--device", "numpy", status=2).stderr
+
+
+def test_bench(clpipe):
+    record = json.loads(clpipe("bench", "--size", "640x480", "--repeat", 2, "--json").stdout)
+    assert record["mp_per_s"] > 0
+    assert len(record["launches"]) == 6
+    assert all(launch["mp_per_s"] > 0 for launch in record["launches"])
+    assert "expected WIDTHxHEIGHT" in clpipe("bench", "--size", "big", status=2).stderr
+
+
+def python(code, **environment):
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+    )
+
+
+def test_no_platform_at_all(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "clpipe", "run", STILL_LIFE, "-o", tmp_path / "out"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OCL_ICD_VENDORS": str(tmp_path)},
+    )
+    if "no OpenCL platform was found" not in done.stderr:
+        # The pip loader may bring its own PoCL whatever OCL_ICD_VENDORS says.
+        from clpipe.device import choose
+        from clpipe.errors import DeviceError
+
+        with pytest.raises(DeviceError, match="no OpenCL platform was found"):
+            choose(None, [])
+    else:
+        assert done.returncode == 3
+
+
+def test_a_missing_linker_is_said_before_it_aborts_the_process(tmp_path):
+    done = python("from clpipe.cli import main; main(['check', '--small'])", PATH=str(tmp_path))
+    assert done.returncode == 3
+    assert "PoCL needs a linker" in done.stderr

@@ -1,0 +1,131 @@
+"""Requests: what is wrong with one is said in one message that names it."""
+
+from pathlib import Path
+
+import pytest
+
+from clpipe.camera import load_camera
+from clpipe.config import make_pipeline, parse_assignment, read_settings, settings_from
+from clpipe.errors import RequestError
+
+
+def build(**settings):
+    return make_pipeline(settings_from(settings))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"demosiac": {"method": "bilinear"}}, "unknown stage 'demosiac' .*mean 'demosaic'"),
+        ({"demosaic": {"method": "biliner"}}, "demosaic.method: .*'biliner' .*mean 'bilinear'"),
+        (
+            {"sensor_noise": {"aa": 1}},
+            "unknown parameter of sensor_noise .*'aa'.*allowed: method, a, b",
+        ),
+        ({"sensor_noise": {"a": -1}}, r"sensor_noise.a: found -1: .*greater than or equal to 0"),
+        ({"sensor_noise": {"a": "much"}}, r"sensor_noise.a: found 'much': .*number"),
+        ({"sensor_noise": {"a": float("nan")}}, r"sensor_noise.a: found nan: .*finite"),
+        ({"mosaic": {"pattern": "RGBG"}}, "mosaic.pattern: found 'RGBG': .*'RGGB', 'BGGR', 'GRBG'"),
+        ({"denoise": {"radius": 99}}, "denoise.radius: found 99: .*less than or equal to 7"),
+        ({"stages": ["mosaic", "nosie"]}, "unknown stage 'nosie'"),
+        ({"skip": ["nosie"]}, "unknown stage 'nosie'"),
+        ({"stages": "mosaic"}, "stages: found 'mosaic', but it is a list"),
+        ({"iso": "high"}, "iso: found 'high', but it is a number"),
+        ({"isoo": 3}, "unknown key 'isoo' .*mean 'iso'"),
+        ({"iso": 50}, "iso: found 50, but camera sony-a7r2 goes from 100 to 25600"),
+        ({"camera": "sony-a7r3"}, "unknown camera 'sony-a7r3' .*mean 'sony-a7r2'"),
+        ({"camera": "nowhere.toml"}, "nowhere.toml: cannot read"),
+        (
+            {"stages": ["exposure", "demosaic"]},
+            "demosaic reads mosaic, but exposure gives rgb; put mosaic",
+        ),
+        ({"stages": ["demosaic"]}, "demosaic reads mosaic, but the input gives rgb"),
+        ({"skip": ["normalize"]}, "white_balance reads mosaic, but quantize gives raw.*normalize"),
+        ({"skip": ["quantize"]}, "normalize reads raw, but column_noise gives mosaic.*quantize"),
+        ({"stages": []}, "nothing is left to do"),
+        ({"quantize": {"black_level": 600, "white_level": 500}}, "white_level must be above"),
+        ({"quantize": {"white_level": 500}}, "white_level must be above"),
+    ],
+)
+def test_a_bad_request_is_named(settings, message):
+    with pytest.raises(RequestError, match=message):
+        build(**settings)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("iso = 100\n[sensor_noise]\na = -1\n", "line 3: sensor_noise.a: found -1"),
+        ("iso = 100\n\n[sensor_nose]\na = 1\n", "line 3: unknown stage 'sensor_nose'"),
+        ("seed = 1\niso = \n", r"not valid TOML: .*line 2"),
+        ("camra = 'x'\n", "line 1: unknown key 'camra'"),
+        ("demosaic.method = 'x'\n", "line 1: demosaic.method: unknown method 'x'"),
+    ],
+)
+def test_a_mistake_in_a_file_is_named_with_its_line(tmp_path, text, message):
+    path = tmp_path / "pipeline.toml"
+    path.write_text(text)
+    with pytest.raises(RequestError, match=f"pipeline.toml.*{message}"):
+        read_settings(path)
+
+
+def test_a_file_that_cannot_be_read(tmp_path):
+    with pytest.raises(RequestError, match="cannot read"):
+        read_settings(Path(tmp_path / "no.toml"))
+    (tmp_path / "bad.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(RequestError, match="not a text file"):
+        read_settings(tmp_path / "bad.toml")
+
+
+@pytest.mark.parametrize("text", ["", "a", "a.b", "=3", "stage=3", "a.b.c=3"])
+def test_a_malformed_assignment(text):
+    with pytest.raises(RequestError, match=r"expected stage\.parameter=value"):
+        parse_assignment(text)
+
+
+def test_parameters_come_from_the_camera_and_from_each_other():
+    pipeline = build(iso=640, inverse_white_balance={"red_gain": 2.5})
+    values = {step.name: step.method.model_dump() for step in pipeline.steps}
+    assert values["inverse_white_balance"] == {"red_gain": 2.5, "blue_gain": 1.36}
+    assert values["white_balance"] == values["inverse_white_balance"]
+    assert values["normalize"] == values["quantize"] == {"black_level": 512, "white_level": 16383}
+    assert values["sensor_noise"]["a"] == pytest.approx(2.0002 / 15871)
+    assert None not in [v for table in values.values() for v in table.values()]
+
+
+def test_without_its_inverse_white_balance_takes_nothing_in():
+    pipeline = build(skip=["inverse_white_balance"])
+    assert pipeline.step_named("white_balance").method.model_dump() == {
+        "red_gain": 1,
+        "blue_gain": 1,
+    }
+
+
+def test_a_repeated_stage_has_settings_of_its_own():
+    pipeline = build(stages=["exposure", "exposure"], exposure={"ev": 1}, exposure_2={"ev": 2})
+    assert [(s.name, s.method.ev) for s in pipeline.steps] == [("exposure", 1), ("exposure_2", 2)]
+
+
+def test_every_parameter_says_what_it_is():
+    from clpipe.describe import parameter_rows
+    from clpipe.stages import all_stages
+
+    for stage in all_stages().values():
+        for method in stage.methods:
+            for name, default, _, allowed, text in parameter_rows(method):
+                assert default and allowed and text.endswith("."), (stage.name, name)
+
+
+def test_a_camera_of_ones_own(tmp_path):
+    from clpipe.camera import built_in_cameras
+
+    text = built_in_cameras()["sony-a7r2"].read_text()
+    own = tmp_path / "own.toml"
+    own.write_text(text.replace('name = "sony-a7r2"', 'name = "mine"'))
+    assert load_camera(str(own)).name == "mine"
+    own.write_text(text.replace("black_level = 512", "black_level = -3"))
+    with pytest.raises(RequestError, match=r"own.toml: black_level: .*greater"):
+        load_camera(str(own))
+    own.write_text("name = ")
+    with pytest.raises(RequestError, match=r"own.toml: not valid TOML"):
+        load_camera(str(own))

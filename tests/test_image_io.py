@@ -1,0 +1,157 @@
+"""Image files: the right picture or the right refusal."""
+
+import io
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from PIL import Image, ImageCms
+
+from clpipe.errors import ImageError
+from clpipe.image_io import Tags, display_window, picture_channels, read_image, write_display
+from tests.conftest import STILL_LIFE
+
+
+def ramp(height=6, width=9, channels=3):
+    count = height * width * channels
+    return (np.arange(count, dtype=np.float32) / 64).reshape(height, width, channels)
+
+
+@pytest.mark.parametrize("half", [True, False])
+def test_half_stays_half(write_exr, half):
+    source = read_image(write_exr("a.exr", ramp(), half=half))
+    assert source.pixels.dtype == (np.float16 if half else np.float32)
+    assert np.array_equal(source.pixels, ramp())
+
+
+@pytest.mark.parametrize(
+    ("channels", "layer", "order"),
+    [
+        ("B,G,R", "", (2, 1, 0)),
+        ("A,B,G,R,Z", "", (3, 2, 1)),
+        ("r,g,b", "", (0, 1, 2)),
+        ("ViewLayer.Combined.A,ViewLayer.Combined.B,ViewLayer.Combined.G,ViewLayer.Combined.R",
+         "ViewLayer.Combined", (3, 2, 1)),
+        ("ViewLayer.Depth.Z,ViewLayer.DiffCol.R,ViewLayer.DiffCol.G,ViewLayer.DiffCol.B,"
+         "ViewLayer.Combined.R,ViewLayer.Combined.G,ViewLayer.Combined.B",
+         "ViewLayer.Combined", (4, 5, 6)),
+    ],
+)  # fmt: skip
+def test_rgb_is_found_by_name(write_exr, channels, layer, order):
+    pixels = ramp(channels=len(channels.split(",")))
+    source = read_image(write_exr("layers.exr", pixels, channels))
+    assert source.layer == layer
+    assert np.array_equal(source.pixels, pixels[..., list(order)])
+    names = channels.split(",")
+    assert picture_channels(names) == (layer, order)
+
+
+def test_nan_and_infinity_become_zero_and_are_counted(write_exr):
+    pixels = ramp()
+    pixels[0, 0, 0], pixels[1, 2, 1], pixels[3, 3, 2] = np.nan, np.inf, -np.inf
+    for half in (True, False):
+        source = read_image(write_exr("nan.exr", pixels, half=half))
+        assert source.warnings == ("3 samples were NaN or infinite and were set to 0",)
+        assert np.isfinite(source.pixels).all()
+        assert source.pixels[1, 2, 1] == 0
+        assert source.pixels[5, 5, 1] == pixels[5, 5, 1]
+
+
+def test_the_display_window_is_the_picture(write_exr):
+    pixels = ramp(4, 5)
+    windows = {"x": 2, "y": 1, "full_width": 10, "full_height": 8}
+    source = read_image(write_exr("small.exr", pixels, **windows))
+    assert source.pixels.shape == (8, 10, 3)
+    assert np.array_equal(source.pixels[1:5, 2:7], pixels)
+    assert source.pixels.sum(dtype=np.float64) == pytest.approx(pixels.sum())
+    windows = {"full_x": 1, "full_y": 2, "full_width": 3, "full_height": 2}
+    source = read_image(write_exr("large.exr", pixels, **windows))
+    assert np.array_equal(source.pixels, pixels[2:4, 1:4])
+    assert display_window(pixels, 50, 0, 3, 3).sum() == 0
+
+
+def test_no_rgb(write_exr):
+    with pytest.raises(ImageError, match=r"grey\.exr: no R, G and B channels; found Y"):
+        read_image(write_exr("grey.exr", ramp(channels=1), "Y"))
+
+
+def test_not_an_image(tmp_path):
+    for name, data in (("a.exr", b""), ("b.exr", b"hello" * 99), ("c.jpg", b"\xff\xd8\xff\xe0")):
+        path = tmp_path / name
+        path.write_bytes(data)
+        reason = "empty" if not data else "cannot be read as an image"
+        with pytest.raises(ImageError, match=f"{name}: .*{reason}"):
+            read_image(path)
+    with pytest.raises(ImageError, match="no such file"):
+        read_image(tmp_path / "missing.exr")
+    with pytest.raises(ImageError, match="cannot be read"):
+        read_image(tmp_path)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.7, 0.99])
+def test_truncated(tmp_path, share):
+    data = STILL_LIFE.read_bytes()
+    path = tmp_path / "cut.exr"
+    path.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(ImageError, match=r"cut\.exr: "):
+        read_image(path)
+
+
+def test_deep(tmp_path):
+    path = tmp_path / "deep.exr"
+    spec = oiio.ImageSpec(4, 4, 3, oiio.FLOAT)
+    spec.deep = True
+    data = oiio.DeepData()
+    data.init(16, 3, [oiio.FLOAT] * 3, ["R", "G", "B"])
+    file = oiio.ImageOutput.create(str(path))
+    assert file.open(str(path), spec)
+    assert file.write_deep_image(data)
+    file.close()
+    with pytest.raises(ImageError, match=r"deep\.exr: a deep image"):
+        read_image(path)
+
+
+def test_eight_bit_files_are_not_linear(tmp_path):
+    path = tmp_path / "photo.png"
+    Image.new("RGB", (4, 4)).save(path)
+    with pytest.raises(ImageError, match=r"photo\.png: holds uint8 samples, not linear float"):
+        read_image(path)
+
+
+def test_jpeg_is_as_a_camera_writes_it(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
+    write_display(tmp_path / "a.jpg", pixels, Tags("Sony", "ILCE-7RM2", 3200))
+    with Image.open(tmp_path / "a.jpg") as image:
+        assert [layer[1:3] for layer in image.layer] == [(2, 1), (1, 1), (1, 1)]  # 4:2:2
+        assert image.quantization[0][0] == 1  # quality 97: 16 * 0.06, rounded
+        exif = image.getexif()
+        profile = ImageCms.ImageCmsProfile(io.BytesIO(image.info["icc_profile"]))
+    assert (exif[0x010F], exif[0x0110]) == ("Sony", "ILCE-7RM2")
+    assert exif.get_ifd(0x8769)[0x8827] == 3200
+    assert "sRGB" in ImageCms.getProfileDescription(profile)
+
+
+def test_real_files(shared_data):
+    """Every real file gives its picture or its reason."""
+    right = {
+        "Beachball_multipart.0001.exr": (1556, 2048),
+        "Chromaticities_XYZ.exr": (406, 610),
+        "ScanLines_Cannon.exr": (566, 780),
+        "ScanLines_Carrots.exr": (400, 600),
+        "ScanLines_Desk.exr": (874, 644),
+        "Tiles_GoldenGate.exr": (860, 1262),
+        "blender_world_forest.exr": (512, 1024),
+        "blender_world_interior.exr": (512, 1024),
+        "blender_world_night.exr": (512, 1024),
+    }
+    assert {p.name for p in (shared_data / "exr").iterdir()} == set(right)
+    for name, size in right.items():
+        assert read_image(shared_data / "exr" / name).pixels.shape == (*size, 3)
+
+
+def test_damaged_files_are_refused(shared_data):
+    damaged = sorted((shared_data / "exr_damaged").iterdir())
+    assert len(damaged) == 23
+    for path in damaged:
+        with pytest.raises(ImageError):
+            read_image(path)

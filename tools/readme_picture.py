@@ -1,0 +1,70 @@
+"""Make docs/before_after.png, the README's picture: crops of the render and of what comes out.
+
+Usage: .venv/bin/python tools/readme_picture.py
+"""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from clpipe.batch import Job, Target, run_jobs
+from clpipe.config import make_pipeline, settings_from
+from clpipe.device import Device, choose, find_devices
+from clpipe.image_io import read_image
+from clpipe.run import Runner
+
+ROOT = Path(__file__).resolve().parent.parent
+RENDER = ROOT / "tests" / "data" / "still_life.exr"
+CROPS = ((112, 226, 110, 80), (560, 300, 110, 80), (420, 470, 110, 80))  # x, y, width, height
+SCALE = 3
+ISOS = (800, 6400)
+
+
+def develop(folder: Path, device: Device, iso: float) -> Image.Image:
+    """The render through the camera at an ISO."""
+    pipeline = make_pipeline(settings_from({"iso": iso}))
+    job, target = Job(RENDER, RENDER.name), Target(folder, ("png",))
+    list(run_jobs([job], Runner(pipeline, device), target))
+    with Image.open(target.path(job, "png")) as image:
+        return image.convert("RGB")
+
+
+def plain(render: Path) -> Image.Image:
+    """The render as a viewer shows it: clipped, gamma 2.2."""
+    pixels = np.clip(read_image(render).pixels.astype(np.float32), 0, 1) ** (1 / 2.2)
+    return Image.fromarray(np.rint(pixels * 255).astype(np.uint8))
+
+
+def sheet(columns: list[tuple[str, Image.Image]]) -> Image.Image:
+    """The crops of every picture, enlarged, a column a picture with its caption above."""
+    gap, head = 6, 30
+    width, height = (side * SCALE for side in CROPS[0][2:])
+    size = (len(columns) * (width + gap) - gap, head + len(CROPS) * (height + gap) - gap)
+    page = Image.new("RGB", size, "white")
+    draw = ImageDraw.Draw(page)
+    font = ImageFont.load_default(17)
+    for i, (caption, image) in enumerate(columns):
+        x = i * (width + gap)
+        draw.text((x + 2, 4), caption, fill="black", font=font)
+        for j, (left, top, w, h) in enumerate(CROPS):
+            crop = image.crop((left, top, left + w, top + h))
+            enlarged = crop.resize((width, height), Image.Resampling.NEAREST)
+            page.paste(enlarged, (x, head + j * (height + gap)))
+    return page
+
+
+def main() -> None:
+    """Write the picture."""
+    device = Device(choose(None, find_devices()))
+    with tempfile.TemporaryDirectory() as folder:
+        columns = [("render, gamma 2.2", plain(RENDER))]
+        for iso in ISOS:
+            image = develop(Path(folder) / str(iso), device, iso)
+            columns.append((f"clpipe, ISO {iso}", image))
+        sheet(columns).save(ROOT / "docs" / "before_after.png", optimize=True)
+
+
+if __name__ == "__main__":
+    main()
