@@ -204,6 +204,7 @@ def sidecar(
             "name": device.info.name if device else "numpy",
             "platform": device.info.platform if device else "numpy",
             "version": device.info.version if device else version("numpy"),
+            "driver": device.info.driver if device else "",
             "lanes": device.info.lanes if device else 0,
         },
         "versions": {

@@ -312,34 +312,9 @@ def devices(as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(rows, indent=2))
         return
-    table = Table(
-        "index",
-        "device",
-        "platform",
-        "type",
-        "units",
-        "memory",
-        "lanes",
-        "status",
-        box=None,
-        pad_edge=False,
-    )
+    table = Table(*(key.replace("_", " ") for key in rows[0]), box=None, pad_edge=False)
     for row in rows:
-        table.add_row(
-            *(
-                str(row[k])
-                for k in (
-                    "index",
-                    "name",
-                    "platform",
-                    "type",
-                    "compute_units",
-                    "memory",
-                    "lanes",
-                    "status",
-                )
-            )
-        )
+        table.add_row(*map(str, row.values()))
     console().print(table)
 
 
@@ -390,7 +365,7 @@ def check(selector: str | None, small: bool, as_json: bool) -> None:
             )
         )
     else:
-        click.echo(f"{device.info.label}, {device.info.version}, {device.info.lanes} lanes")
+        click.echo(f"{device.info.label}, driver {device.info.driver}, {device.info.lanes} lanes")
         console().print(table)
         click.echo(f"{len(checks) - failed} passed, {failed} failed")
     sys.exit(1 if failed else 0)

@@ -5,6 +5,7 @@ name the right file and line) and one short function that loads, calls the stage
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -142,9 +143,9 @@ def found_by(plan: Plan, step: str) -> dict[str, tuple[str, int]]:
     return {}
 
 
-def call(op: Op, first: str, rest: list[str]) -> str:
+def call(op: Op, arguments: Sequence[str]) -> str:
     """The call of a pass's function."""
-    return f"{op.pass_.function}({', '.join([first, *rest] if first else rest)})"
+    return f"{op.pass_.function}({', '.join(arguments)})"
 
 
 def write_kernel(plan: Plan, launch: AnyLaunch, index: int, lanes: int) -> Kernel:
@@ -153,24 +154,25 @@ def write_kernel(plan: Plan, launch: AnyLaunch, index: int, lanes: int) -> Kerne
     name = f"launch_{index}_" + re.sub(r"\W+", "_", launch.name)
     for dimension in ("width", "height", "pitch"):
         writer.parameter(dimension, "uint", "extent", item=dimension)
-    files = [f"lib/{part}.h" for part in LIBRARY]
-    between = ""
+    seen: set[str] = set()
+    left = -(-plan.apron // lanes) * lanes
+    text = f"#define LANES {lanes}\n#define APRON {plan.apron}\n#define APRON_LEFT {left}\n"
+    text += files_text([f"lib/{part}.h" for part in LIBRARY], seen)
     match launch:
         case Launch():
-            after, between, body = _pixels(writer, launch)
+            body = _pixels(writer, launch)
+            # The tap function calls the stages of its prologue, and the stencil calls it.
+            text += files_text(kernels_of([op for r in launch.reads for op in r.prologue]), seen)
+            text += _source_image(writer, launch)
+            text += files_text(kernels_of([*launch.ops, launch.sums]), seen)
         case Lines():
-            after, body = [f"{op.kernel}.cl" for op in launch.ops], _lines(writer, launch)
+            body = _lines(writer, launch)
+            text += files_text(kernels_of(launch.ops), seen)
         case AddUp():
-            after, body = [], _add_up(writer, launch)
+            body = _add_up(writer, launch)
         case Find():
-            after, body = [f"{launch.op.kernel}.cl"], _find(writer, launch)
-    left = -(-plan.apron // lanes) * lanes
-    defines = f"#define LANES {lanes}\n#define APRON {plan.apron}\n#define APRON_LEFT {left}\n"
-    seen: set[str] = set()
-    before_files = [f for f in after if f.startswith("<")]
-    text = defines + "".join(file_text(f, seen) for f in files)
-    text += "".join(file_text(f[1:], seen) for f in before_files) + between
-    text += "".join(file_text(f, seen) for f in after if not f.startswith("<"))
+            body = _find(writer, launch)
+            text += files_text(kernels_of([launch.op]), seen)
     signature = ",\n    ".join(p.declaration for p in writer.parameters.values())
     size = 1 if isinstance(launch, Find) else LOCAL_SIZE
     setup = "".join(f"    {line}\n" for line in writer.setup)
@@ -183,12 +185,31 @@ def write_kernel(plan: Plan, launch: AnyLaunch, index: int, lanes: int) -> Kerne
     return Kernel(name, text, tuple(writer.parameters.values()), launch)
 
 
+def kernels_of(ops: Sequence[Op | None]) -> list[str]:
+    """The kernel files of these passes."""
+    return [f"{op.kernel}.cl" for op in ops if op]
+
+
+def files_text(names: Sequence[str], seen: set[str]) -> str:
+    """These kernel files, each once, one after the other."""
+    return "".join(file_text(name, seen) for name in names)
+
+
+def _prologue(writer: _Writer, read: Read) -> list[tuple[Op, list[str], list[str]]]:
+    """Each pass redone at a tap, its arguments, and which of them are run-time values."""
+    calls = []
+    for op in read.prologue:
+        arguments = writer.arguments(op, found_by(writer.plan, op.step))
+        literals = dict(op.literals).values()
+        calls.append((op, arguments, [a for a in arguments if a not in literals]))
+    return calls
+
+
 def _source_image(writer: _Writer, launch: Launch) -> str:
-    """The type and tap function of a stencil's ``src``, with the passes redone at each tap."""
-    stencil = launch.stencil
-    if not stencil:
+    """The type and the tap function of a stencil's ``src``, with the passes redone at each tap."""
+    if not launch.stencil:
         return ""
-    reads = dict(zip(stencil.pass_.reads, launch.reads, strict=True))
+    reads = dict(zip(launch.stencil.pass_.reads, launch.reads, strict=True))
     read = reads.get("src")
     if not read or not read.prologue:
         kind = read.image.kind if read else Kind.MOSAIC
@@ -197,104 +218,69 @@ def _source_image(writer: _Writer, launch: Launch) -> str:
             f"INLINE {kind.c_type} src_tap(src_image src, int dx, int dy) "
             f"{{ return tap_{kind.c_name}(src, dx, dy); }}\n"
         )
-    fields, calls = [], []
+    fields = ""
     value = f"tap_{read.image.kind.c_name}(src.stored, dx, dy)"
-    for op in read.prologue:
-        arguments = writer.arguments(op, found_by(writer.plan, op.step))
-        literals = dict(op.literals).values()
-        own = [a for a in arguments if a not in literals]
-        fields += [f"float {a}; " for a in own]
-        value = call(op, value, ["at", *(f"src.{a}" if a in own else a for a in arguments)])
-        calls += own
-    last = read.prologue[-1].kind
+    for op, arguments, values in _prologue(writer, read):
+        fields += "".join(f"float {v}; " for v in values)
+        value = call(op, [value, "at", *(f"src.{a}" if a in values else a for a in arguments)])
     return (
-        f"typedef struct {{ image stored; {''.join(fields)}}} src_image;\n"
-        f"INLINE {last.c_type} src_tap(src_image src, int dx, int dy) {{\n"
+        f"typedef struct {{ image stored; {fields}}} src_image;\n"
+        f"INLINE {read.prologue[-1].kind.c_type} src_tap(src_image src, int dx, int dy) {{\n"
         f"    const site at = shifted(src.stored.at, dx, dy);\n    return {value};\n}}\n"
     )
 
 
-def _pixels(writer: _Writer, launch: Launch) -> tuple[list[str], str, str]:
-    """Stage files, what goes between those of the prologue and the others, and the body."""
+def _load(writer: _Writer, launch: Launch) -> tuple[list[str], Kind]:
+    """The lines that make ``v0``: from the source, a stored image or the stencil; and its kind."""
     plan = writer.plan
-    prologue = [op for read in launch.reads for op in read.prologue]
-    files = [f"<{op.kernel}.cl" for op in prologue]
-    lines: list[str] = []
-    ops = list(launch.ops)
-    curves: list[Op] = []
-    if launch.encodes and not launch.writes:
-        while ops and ops[-1].pass_.access is Access.CURVE:
-            curves.insert(0, ops.pop())
-    files += [f"{op.kernel}.cl" for op in ops]
-    if launch.sums:
-        files.append(f"{launch.sums.kernel}.cl")
-    between = _source_image(writer, launch)
-
     stencil = launch.stencil
-    if stencil:
-        actual = []
-        for name, read in zip(stencil.pass_.reads, launch.reads, strict=True):
-            stored = f"image_at({', '.join(writer.planes(read))}, pitch, at)"
-            if read.prologue:
-                extra = [
-                    a
-                    for op in read.prologue
-                    for a in writer.arguments(op, found_by(plan, op.step))
-                    if a not in dict(op.literals).values()
-                ]
-                lines.append(f"const src_image {name} = {{{', '.join([stored, *extra])}}};")
-            else:
-                type_ = "src_image" if name == "src" else "image"
-                lines.append(f"const {type_} {name} = {stored};")
-            actual.append(name)
-        arguments = writer.arguments(stencil, found_by(plan, stencil.step))
-        pattern = [a for a in arguments if a.startswith("(cfa)")]
-        rest = [a for a in arguments if a not in pattern]
-        lines.append(
-            f"const {stencil.kind.c_type} v0 = {call(stencil, 'at', [*pattern, *actual, *rest])};"
-        )
-        ops = ops[1:]
-        kind = stencil.kind
-    elif launch.reads:
+    if not launch.reads:
+        kind, dtype = plan.source, "half" if plan.half else "float"
+        writer.parameter("src", f"__global const {dtype} *restrict ", "source")
+        return [f"const {kind.c_type} v0 = source_{kind.c_name}_{dtype}(src, at, e);"], kind
+    images = [f"image_at({', '.join(writer.planes(read))}, pitch, at)" for read in launch.reads]
+    if not stencil:
         kind = launch.reads[0].image.kind
-        stored = f"image_at({', '.join(writer.planes(launch.reads[0]))}, pitch, at)"
-        lines.append(f"const {kind.c_type} v0 = tap_{kind.c_name}({stored}, 0, 0);")
-    else:
-        kind = plan.source
-        dtype = "half" if plan.half else "float"
-        writer.parameter("src", f"__global const {dtype} *restrict", "source")
-        lines.append(f"const {kind.c_type} v0 = source_{kind.c_name}_{dtype}(src, at, e);")
+        return [f"const {kind.c_type} v0 = tap_{kind.c_name}({images[0]}, 0, 0);"], kind
+    lines = []
+    for name, read, stored in zip(stencil.pass_.reads, launch.reads, images, strict=True):
+        values = [v for _, _, own in _prologue(writer, read) for v in own]
+        type_ = "src_image" if name == "src" else "image"
+        made = f"{{{', '.join([stored, *values])}}}" if values else stored
+        lines.append(f"const {type_} {name} = {made};")
+    arguments = writer.arguments(stencil, found_by(plan, stencil.step))
+    made = call(stencil, ["at", *stencil.pass_.reads, *arguments])
+    return [*lines, f"const {stencil.kind.c_type} v0 = {made};"], stencil.kind
 
+
+def _encode(writer: _Writer, value: str, kind: Kind, curves: Sequence[Op]) -> str:
+    """The line that writes eight-bit pixels, through one table where curves come last."""
+    writer.parameter("dst", "__global uchar *restrict ", "encoded")
+    if not curves:
+        return f"encode_{'mosaic' if kind.c_type == 'vf' else 'rgb'}({value}, dst, at, e);"
+    steps = ",".join(op.step for op in curves)
+    writer.parameter("table8", "__global const uchar *restrict ", "table8", item=steps)
+    return f"encode_rgb_by_table({value}, table8, dst, at, e);"
+
+
+def _pixels(writer: _Writer, launch: Launch) -> str:
+    """The body of a kernel over the image: load, the stages, store."""
+    plan = writer.plan
+    lines, kind = _load(writer, launch)
+    ops = list(launch.ops[1:] if launch.stencil else launch.ops)
+    curves: list[Op] = []
+    while launch.encodes and not launch.writes and ops and ops[-1].pass_.access is Access.CURVE:
+        curves.insert(0, ops.pop())
     for i, op in enumerate(ops):
         kind = op.kind
-        arguments = writer.arguments(op, found_by(plan, op.step))
-        lines.append(f"const {kind.c_type} v{i + 1} = {call(op, f'v{i}', ['at', *arguments])};")
+        made = call(op, [f"v{i}", "at", *writer.arguments(op, found_by(plan, op.step))])
+        lines.append(f"const {kind.c_type} v{i + 1} = {made};")
     value = f"v{len(ops)}"
-    if launch.sums:
-        lines.append(
-            f"const vi sample = only_inside({launch.sums.pass_.function}({value}), at, e);"
-        )
-        lines.append("if (row & 1) odd_rows += sample; else even_rows += sample;")
-    if launch.writes:
-        slots = [writer.slot(n, True) for n in plan.slots[launch.writes.number]]
-        lines.append(f"store_{kind.c_name}({', '.join([value, *slots])}, at, e);")
-    if launch.encodes:
-        writer.parameter("dst", "__global uchar *restrict", "encoded")
-        if curves:
-            writer.parameter(
-                "table8",
-                "__global const uchar *restrict",
-                "table8",
-                item=",".join(op.step for op in curves),
-            )
-            lines.append(f"encode_rgb_by_table({value}, table8, dst, at, e);")
-        else:
-            lines.append(
-                f"encode_{'mosaic' if kind.c_type == 'vf' else 'rgb'}({value}, dst, at, e);"
-            )
     before = after = ""
     if launch.sums:
-        writer.parameter("sums", "__global int4 *restrict", "sums")
+        writer.parameter("sums", "__global int4 *restrict ", "sums")
+        lines.append(f"const vi sample = only_inside({call(launch.sums, [value])}, at, e);")
+        lines.append("if (row & 1) odd_rows += sample; else even_rows += sample;")
         before = "    vi even_rows = (vi)(0), odd_rows = (vi)(0);\n"
         after = (
             "    const site first = site_at(x, y);\n"
@@ -303,16 +289,19 @@ def _pixels(writer: _Writer, launch: Launch) -> tuple[list[str], str, str]:
             "    sums[block] = (int4)(fold_columns(even_rows, first), "
             "fold_columns(odd_rows, first));\n"
         )
-    body = (
+    if launch.writes:
+        slots = [writer.slot(n, True) for n in plan.slots[launch.writes.number]]
+        lines.append(f"store_{kind.c_name}({', '.join([value, *slots])}, at, e);")
+    if launch.encodes:
+        lines.append(_encode(writer, value, kind, curves))
+    rows = "".join(f"        {line}\n" for line in lines)
+    return (
         "    const uint x = (uint)get_global_id(0) * LANES;\n"
         f"    const uint y = (uint)get_global_id(1) * {launch.rows};\n"
         f"    if (x >= width) return;\n{before}"
         f"#pragma unroll\n    for (uint row = 0; row < {launch.rows}; ++row) {{\n"
-        "        const site at = site_at(x, y + row);\n"
-        + "".join(f"        {line}\n" for line in lines)
-        + f"    }}\n{after}"
+        f"        const site at = site_at(x, y + row);\n{rows}    }}\n{after}"
     )
-    return files, between, body
 
 
 def _lines(writer: _Writer, launch: Lines) -> str:
@@ -327,7 +316,7 @@ def _lines(writer: _Writer, launch: Lines) -> str:
             item=op.pass_.writes,
         )
         count = "height" if op.pass_.lines == "rows" else "width"
-        value = call(op, "line", writer.arguments(op, {}))
+        value = call(op, ["line", *writer.arguments(op, {})])
         body += f"    if (i < {count}) store({value}, {table} + i);\n"
     return body
 

@@ -148,14 +148,15 @@ def device_rows(devices: Sequence[Found]) -> list[dict[str, Any]]:
         elif device.problem:
             status = f"passed over: {device.problem}"
         elif used and used.type == "GPU" and device.type != "GPU":
-            status = "passed over: there is a GPU; choose it with --device"
+            status = f"passed over: there is a GPU; --device {device.index}"
         else:
-            status = "passed over: an earlier one serves; choose it with --device"
+            status = f"passed over: an earlier one serves; --device {device.index}"
         rows.append(
             {
                 "index": device.index,
                 "name": device.name,
                 "platform": device.platform,
+                "driver": device.driver,
                 "type": device.type,
                 "compute_units": device.compute_units,
                 "memory": f"{device.memory / 2**30:.1f} GiB",
@@ -163,8 +164,8 @@ def device_rows(devices: Sequence[Found]) -> list[dict[str, Any]]:
                 "status": status,
             }
         )
-    numpy = "slow; choose it with --device numpy" if used else "used with --device numpy"
-    blank = dict.fromkeys(("compute_units", "memory", "lanes"), "")
+    numpy = "slow; --device numpy"
+    blank = dict.fromkeys(("driver", "compute_units", "memory", "lanes"), "")
     rows.append(
         {"index": "numpy", "name": "NumPy", "platform": "the references", "type": "CPU"}
         | blank

@@ -31,7 +31,8 @@ class Found:
     platform: str
     name: str
     type: str  # "GPU", "CPU" or "accelerator"
-    version: str
+    version: str  # of OpenCL, as the device tells it
+    driver: str
     compute_units: int
     memory: int  # bytes
     lanes: int
@@ -75,7 +76,8 @@ def find_devices() -> list[Found]:
                     platform=platform.name.strip(),
                     name=device.name.strip(),
                     type=type_,
-                    version=f"{device.version.strip()}, driver {device.driver_version.strip()}",
+                    version=device.version.strip(),
+                    driver=device.driver_version.strip(),
                     compute_units=device.max_compute_units,
                     memory=device.global_mem_size,
                     lanes=lanes_for(type_, platform.name, device),

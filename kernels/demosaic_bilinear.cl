@@ -1,5 +1,5 @@
 // Bilinear demosaicing: a missing colour is the mean of its nearest samples.
-INLINE rgb bilinear(site at, cfa pattern, src_image src) {
+INLINE rgb bilinear(site at, src_image src, cfa pattern) {
     const vf centre = src_tap(src, 0, 0);
     const vf horizontal = (src_tap(src, -1, 0) + src_tap(src, 1, 0)) * 0.5f;
     const vf vertical = (src_tap(src, 0, -1) + src_tap(src, 0, 1)) * 0.5f;

@@ -3,7 +3,7 @@
 // Green along the edge, not across it (Hamilton and Adams 1997): the direction with the smaller
 // gradient; equal gradients take the mean of both. The result is held in one plane: green at green
 // sites, the colour difference (R-G or B-G) at red and blue ones.
-INLINE vf green_or_difference(site at, cfa pattern, src_image src) {
+INLINE vf green_or_difference(site at, src_image src, cfa pattern) {
     const vf centre = src_tap(src, 0, 0);
     const vf west = src_tap(src, -1, 0), east = src_tap(src, 1, 0);
     const vf north = src_tap(src, 0, -1), south = src_tap(src, 0, 1);
@@ -19,7 +19,7 @@ INLINE vf green_or_difference(site at, cfa pattern, src_image src) {
 }
 
 // Colour differences at every pixel, bilinear from where they are known.
-INLINE differences spread_differences(site at, cfa pattern, image known) {
+INLINE differences spread_differences(site at, image known, cfa pattern) {
     const vf centre = tap_mosaic(known, 0, 0);
     const vf horizontal = (tap_mosaic(known, -1, 0) + tap_mosaic(known, 1, 0)) * 0.5f;
     const vf vertical = (tap_mosaic(known, 0, -1) + tap_mosaic(known, 0, 1)) * 0.5f;
@@ -58,7 +58,7 @@ INLINE vf median9(vf a, vf b, vf c, vf d, vf e, vf f, vf g, vf h, vf i) {
 
 // Freeman (US patent 4,724,395, 1988): the colour differences are median filtered, the samples
 // that the sensor took are kept, and the other colours follow from them.
-INLINE rgb freeman(site at, cfa pattern, src_image src, image spread) {
+INLINE rgb freeman(site at, src_image src, image spread, cfa pattern) {
     const differences nw = tap_differences(spread, -1, -1), n = tap_differences(spread, 0, -1),
                       ne = tap_differences(spread, 1, -1), w = tap_differences(spread, -1, 0),
                       m = tap_differences(spread, 0, 0), e = tap_differences(spread, 1, 0),

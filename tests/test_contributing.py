@@ -1,0 +1,43 @@
+"""The example in CONTRIBUTING.md, run as it stands there."""
+
+import re
+
+import pytest
+
+from clpipe import codegen
+from clpipe.check import check_method
+from clpipe.device import Device
+from clpipe.stages import all_stages
+from tests.conftest import ROOT
+
+TEXT = (ROOT / "CONTRIBUTING.md").read_text()
+
+
+def block(language: str) -> str:
+    return re.search(rf"```{language}\n(.*?)```", TEXT, re.DOTALL)[1]
+
+
+def test_the_example_stage_works(device, tmp_path, monkeypatch):
+    (tmp_path / "lib").symlink_to(codegen.kernel_folder() / "lib")
+    (tmp_path / "vignette.cl").write_text(block("c"))
+    namespace: dict = {"__name__": "vignette"}
+    exec(block("python"), namespace)
+    stage = namespace["STAGE"]
+    everything = {**all_stages(), stage.name: stage}
+    monkeypatch.setattr("clpipe.codegen.kernel_folder", lambda: tmp_path)
+    monkeypatch.setattr("clpipe.config.all_stages", lambda: everything)
+    result = check_method(Device(device.info), stage, stage.methods[0])
+    assert result.samples > 1000
+    assert result.passed, result
+
+
+def test_every_file_it_names_is_there():
+    for name in re.findall(r"`((?:clpipe|kernels|tests|tools)/[\w./]+)`", TEXT):
+        if "vignette" not in name:
+            assert (ROOT / name).exists(), name
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md"])
+def test_every_link_leads_somewhere(name):
+    for target in re.findall(r"\]\(([^)#]+)\)", (ROOT / name).read_text()):
+        assert (ROOT / target).exists(), target
