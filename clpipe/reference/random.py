@@ -11,23 +11,24 @@ from clpipe.types import Floats
 
 Words = NDArray[np.uint32]
 
+# Lowest power first.
 LOG_COEFFICIENTS = np.array(
-    [0.118273675, -0.18901953, 0.20604694, -0.24881342, 0.33303297, -0.50001967, 1.0000032],
+    [1.0000032, -0.50001967, 0.33303297, -0.24881342, 0.20604694, -0.18901953, 0.118273675],
     np.float32,
 )
 NORMAL_COEFFICIENTS = np.array(
     [
-        -4.68934e-05,
-        1.8514459e-06,
-        0.0008937495,
-        -0.00031167656,
-        -0.0069498117,
-        0.0062090177,
-        0.028542647,
-        -0.076602094,
-        0.09441337,
-        1.3548409,
         2.9601128,
+        1.3548409,
+        0.09441337,
+        -0.076602094,
+        0.028542647,
+        0.0062090177,
+        -0.0069498117,
+        -0.00031167656,
+        0.0008937495,
+        1.8514459e-06,
+        -4.68934e-05,
     ],
     np.float32,
 )
@@ -79,7 +80,7 @@ def negative_log(t: Floats) -> Floats:
     bits = t.view(np.int32)
     exponent = (bits - np.int32(0x3F3504F3)) >> np.int32(23)
     y = (bits - (exponent << np.int32(23))).view(np.float32) - np.float32(1)
-    return exponent.astype(np.float32) * np.float32(-0.6931472) - y * horner(LOG_COEFFICIENTS, y)
+    return exponent.astype(np.float32) * np.float32(-0.6931472) - y * estrin(LOG_COEFFICIENTS, y)
 
 
 def square_root(x: Floats) -> Floats:
@@ -95,12 +96,28 @@ def square_root(x: Floats) -> Floats:
     return x * r
 
 
-def horner(coefficients: Floats, x: Floats) -> Floats:
-    """The polynomial with these coefficients, highest power first, step by step in float32."""
-    value = np.full_like(x, coefficients[0])
-    for c in coefficients[1:]:
-        value = value * x + c
-    return value
+def estrin(coefficients: Floats, x: Floats) -> Floats:
+    """The polynomial with these coefficients, lowest power first, in float32, pair by pair.
+
+    Estrin's scheme: pairs, then pairs of pairs, then sums of these from the lowest up.
+
+    >>> estrin(np.float32([1, 2, 3, 4, 5]), np.float32([2])).tolist()
+    [129.0]
+    """
+    x2 = x * x
+    x4 = x2 * x2
+    total = np.zeros_like(x)
+    power = np.ones_like(x)
+    for i in range(0, len(coefficients), 4):
+        c = coefficients[i : i + 4]
+        group = x * c[1] + c[0] if len(c) > 1 else np.full_like(x, c[0])
+        if len(c) == 3:
+            group = group + x2 * c[2]
+        elif len(c) == 4:
+            group = group + (x * c[3] + c[2]) * x2
+        total = group if i == 0 else total + group * power
+        power = x4 if i == 0 else power * x4
+    return total
 
 
 def normal_of(words: Words) -> Floats:
@@ -115,7 +132,7 @@ def normal_of(words: Words) -> Floats:
     )
     w = negative_log(np.float32(4) * p * (np.float32(1) - p))
     s = square_root(np.maximum(w, np.float32(0))) - np.float32(2.25)
-    z = horner(NORMAL_COEFFICIENTS, s) * (np.float32(1) - np.float32(2) * p)
+    z = estrin(NORMAL_COEFFICIENTS, s) * (np.float32(1) - np.float32(2) * p)
     return (z.view(np.int32) ^ (bits & np.int32(-0x80000000))).view(np.float32)
 
 

@@ -45,9 +45,9 @@ INLINE void encode_rgb_by_table(rgb c, __global const uchar *table, __global uch
     spill_int(curve_index(c.b), b);
 #pragma unroll
     for (int k = 0; k < LANES; ++k) {
-        r[k] = table[r[k]];
-        g[k] = table[g[k]];
-        b[k] = table[b[k]];
+        r[k] = table[(uint)r[k]];
+        g[k] = table[(uint)g[k]];
+        b[k] = table[(uint)b[k]];
     }
     store_rgb8(dst, r, g, b, at, e);
 }

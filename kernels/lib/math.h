@@ -3,18 +3,15 @@
 #ifndef CLPIPE_MATH_H
 #define CLPIPE_MATH_H
 
-// -ln(t) for t > 0; relative error 3e-7. Only * and +, so NumPy gives the same bits.
+// -ln(t) for t > 0; relative error 3e-7. Only * and +, so NumPy gives the same bits. Polynomials
+// are summed in pairs (Estrin), not one power after the other: the wait for each sum is what costs.
 INLINE vf negative_log(vf t) {
     const vi bits = float_bits(t);
     const vi exponent = (bits - 0x3f3504f3) >> 23;  // mantissa in [sqrt(1/2), sqrt(2))
     const vf y = bits_to_float(bits - (exponent << 23)) - 1.0f;
-    vf p = (vf)(0.118273675f);
-    p = p * y + -0.18901953f;
-    p = p * y + 0.20604694f;
-    p = p * y + -0.24881342f;
-    p = p * y + 0.33303297f;
-    p = p * y + -0.50001967f;
-    p = p * y + 1.0000032f;
+    const vf y2 = y * y, y4 = y2 * y2;
+    const vf low = (y * -0.50001967f + 1.0000032f) + (y * -0.24881342f + 0.33303297f) * y2;
+    const vf p = low + ((y * -0.18901953f + 0.20604694f) + y2 * 0.118273675f) * y4;
     return to_float(exponent) * -0.6931472f - y * p;
 }
 

@@ -48,18 +48,11 @@ INLINE vf normal_of(vu word) {
     const vi bits = signed_bits(word);
     const vf p = (to_float(bits & 0x7fffffff) + 0.5f) * 2.3283064e-10f;
     const vf s = square_root(most(negative_log(4.0f * p * (1.0f - p)), (vf)(0.0f))) - 2.25f;
-    vf z = (vf)(-4.68934e-05f);
-    z = z * s + 1.8514459e-06f;
-    z = z * s + 0.0008937495f;
-    z = z * s + -0.00031167656f;
-    z = z * s + -0.0069498117f;
-    z = z * s + 0.0062090177f;
-    z = z * s + 0.028542647f;
-    z = z * s + -0.076602094f;
-    z = z * s + 0.09441337f;
-    z = z * s + 1.3548409f;
-    z = z * s + 2.9601128f;
-    z = z * (1.0f - 2.0f * p);
+    const vf s2 = s * s, s4 = s2 * s2, s8 = s4 * s4;
+    const vf z0 = (s * 1.3548409f + 2.9601128f) + (s * -0.076602094f + 0.09441337f) * s2;
+    const vf z4 = (s * 0.0062090177f + 0.028542647f) + (s * -0.00031167656f + -0.0069498117f) * s2;
+    const vf z8 = (s * 1.8514459e-06f + 0.0008937495f) + s2 * -4.68934e-05f;
+    const vf z = ((z0 + z4 * s4) + z8 * s8) * (1.0f - 2.0f * p);
     return bits_to_float(float_bits(z) ^ (bits & (int)0x80000000));
 }
 
