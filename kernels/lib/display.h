@@ -2,54 +2,67 @@
 #ifndef CLPIPE_DISPLAY_H
 #define CLPIPE_DISPLAY_H
 
-INLINE void store_rgb8(__global uchar *dst, const int *r, const int *g, const int *b, site at,
-                       extent e) {
-    if (at.y >= e.height) return;
-    __global uchar *p = dst + 3 * ((size_t)at.y * e.width + at.x);
-    if (at.x + LANES <= e.width) {
-#pragma unroll
-        for (int k = 0; k < LANES; ++k) {
-            p[3 * k] = (uchar)r[k];
-            p[3 * k + 1] = (uchar)g[k];
-            p[3 * k + 2] = (uchar)b[k];
-        }
-    } else {
-        for (uint k = 0; at.x + k < e.width; ++k) {
-            p[3 * k] = (uchar)r[k];
-            p[3 * k + 1] = (uchar)g[k];
-            p[3 * k + 2] = (uchar)b[k];
-        }
-    }
-}
-
 // 0..1 to 0..255, rounded to nearest.
 INLINE vi to_8_bit(vf v) {
     const vf inside = least(most(v, (vf)(0.0f)), (vf)(1.0f));
     return to_int(nearest(inside * 255.0f));
 }
 
-INLINE void encode_rgb(rgb c, __global uchar *dst, site at, extent e) {
+// Three channels of levels, or of indices into a table of levels if there is one.
+typedef struct {
     int r[LANES], g[LANES], b[LANES];
-    spill_int(to_8_bit(c.r), r);
-    spill_int(to_8_bit(c.g), g);
-    spill_int(to_8_bit(c.b), b);
-    store_rgb8(dst, r, g, b, at, e);
+    __global const uchar *table;
+} levels;
+
+INLINE uint level(const levels *v, const int *channel, int k) {
+    return v->table ? v->table[(uint)channel[k]] : (uint)channel[k];
+}
+
+INLINE void store_levels(const levels *v, __global uchar *dst, site at, extent e) {
+    if (at.y >= e.height) return;
+    __global uchar *p = dst + 3 * ((size_t)at.y * e.width + at.x);
+#if LANES > 1
+    if (at.x + LANES <= e.width) {
+        // Whole words: a store for each byte is what takes the time.
+        typedef uint unaligned_uint __attribute__((aligned(1)));
+        __global unaligned_uint *word = (__global unaligned_uint *)p;
+#pragma unroll
+        for (int k = 0; k < LANES; k += 4, word += 3) {
+            word[0] = level(v, v->r, k) | level(v, v->g, k) << 8 | level(v, v->b, k) << 16 |
+                      level(v, v->r, k + 1) << 24;
+            word[1] = level(v, v->g, k + 1) | level(v, v->b, k + 1) << 8 |
+                      level(v, v->r, k + 2) << 16 | level(v, v->g, k + 2) << 24;
+            word[2] = level(v, v->b, k + 2) | level(v, v->r, k + 3) << 8 |
+                      level(v, v->g, k + 3) << 16 | level(v, v->b, k + 3) << 24;
+        }
+        return;
+    }
+#endif
+    for (int k = 0; k < LANES && at.x + k < e.width; ++k) {
+        p[3 * k] = (uchar)level(v, v->r, k);
+        p[3 * k + 1] = (uchar)level(v, v->g, k);
+        p[3 * k + 2] = (uchar)level(v, v->b, k);
+    }
+}
+
+INLINE void encode_rgb(rgb c, __global uchar *dst, site at, extent e) {
+    levels v;
+    v.table = 0;
+    spill_int(to_8_bit(c.r), v.r);
+    spill_int(to_8_bit(c.g), v.g);
+    spill_int(to_8_bit(c.b), v.b);
+    store_levels(&v, dst, at, e);
 }
 
 // A curve and the conversion to eight bits in one look-up.
 INLINE void encode_rgb_by_table(rgb c, __global const uchar *table, __global uchar *dst, site at,
                                 extent e) {
-    int r[LANES], g[LANES], b[LANES];
-    spill_int(curve_index(c.r), r);
-    spill_int(curve_index(c.g), g);
-    spill_int(curve_index(c.b), b);
-#pragma unroll
-    for (int k = 0; k < LANES; ++k) {
-        r[k] = table[(uint)r[k]];
-        g[k] = table[(uint)g[k]];
-        b[k] = table[(uint)b[k]];
-    }
-    store_rgb8(dst, r, g, b, at, e);
+    levels v;
+    v.table = table;
+    spill_int(curve_index(c.r), v.r);
+    spill_int(curve_index(c.g), v.g);
+    spill_int(curve_index(c.b), v.b);
+    store_levels(&v, dst, at, e);
 }
 
 INLINE void encode_mosaic(vf v, __global uchar *dst, site at, extent e) {
