@@ -147,6 +147,8 @@ def device_rows(devices: Sequence[Found]) -> list[dict[str, Any]]:
             status = "used by default"
         elif device.problem:
             status = f"passed over: {device.problem}"
+        elif device.type == "emulator":
+            status = f"passed over: an emulator, slow; --device {device.index}"
         elif used and used.type == "GPU" and device.type != "GPU":
             status = f"passed over: there is a GPU; --device {device.index}"
         else:

@@ -30,7 +30,7 @@ class Found:
     index: int
     platform: str
     name: str
-    type: str  # "GPU", "CPU" or "accelerator"
+    type: str  # "GPU", "CPU", "emulator" or "accelerator"
     version: str  # of OpenCL, as the device tells it
     driver: str
     compute_units: int
@@ -70,6 +70,8 @@ def find_devices() -> list[Found]:
             type_ = "GPU" if kind & cl.device_type.GPU else "CPU"
             if not kind & (cl.device_type.GPU | cl.device_type.CPU):
                 type_ = "accelerator"
+            if "oclgrind" in platform.name.lower():
+                type_ = "emulator"  # it finds errors in kernels, slowly, and says it is all types
             found.append(
                 Found(
                     index=len(found),
@@ -142,9 +144,9 @@ def choose(selector: str | None, devices: list[Found]) -> Found:
         if not usable:
             raise DeviceError(f"device {wanted[0].label}: {wanted[0].problem}")
         return usable[0]
-    usable = sorted((d for d in devices if not d.problem), key=lambda d: d.type != "GPU")
+    usable = [d for kind in ("GPU", "CPU") for d in devices if d.type == kind and not d.problem]
     if not usable:
-        reasons = "; ".join(f"{d.label}: {d.problem}" for d in devices)
+        reasons = "; ".join(f"{d.label}: {d.problem or 'an emulator'}" for d in devices)
         raise DeviceError(f"no usable OpenCL device ({reasons}); or use --device numpy")
     return usable[0]
 
@@ -284,6 +286,11 @@ class Device:
         extent = Extent(width, height, self.info.lanes, plan.apron)
         channels = len(plan.source.channels)
         room = extent.rows * width * channels + 3 * extent.lanes
+        needed = plan.bytes_per_pixel(extent.lanes) * width * height
+        memory = f"on the device, which has {self.info.memory / 2**20:.0f} MiB"
+        too_large = f"{width}x{height} pixels need {needed / 2**20:.0f} MiB {memory}"
+        if needed > self.info.memory:
+            raise ImageError(too_large)
         try:
             if download or "src" not in self._buffers:
                 src = self._buffer("src", room * source.itemsize)
@@ -303,11 +310,7 @@ class Device:
                 self._download(plan, extent, output)
             self._queue.finish()
         except cl.MemoryError as error:
-            needed = plan.bytes_per_pixel(extent.lanes) * width * height / 2**20
-            raise ImageError(
-                f"{width}x{height} pixels need {needed:.0f} MiB on the device, which has "
-                f"{self.info.memory / 2**20:.0f} MiB: {error}"
-            ) from None
+            raise ImageError(f"{too_large}: {error}") from None
         if timings is not None:
             for (kernel, _), event in zip(kernels, events, strict=True):
                 seconds = (event.profile.end - event.profile.start) * 1e-9

@@ -1,0 +1,110 @@
+"""The choice of a device, and what one cannot do."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clpipe.config import make_pipeline, settings_from
+from clpipe.describe import device_rows
+from clpipe.device import Device, Extent, choose, find_devices
+from clpipe.errors import DeviceError, ImageError
+from clpipe.run import Runner
+
+
+@pytest.fixture
+def devices(device):
+    """A CPU, an emulator, a broken GPU and a good one, in this order."""
+    cpu = replace(device.info, index=0, name="slow", platform="Portable Computing Language")
+    return [
+        replace(cpu, type="CPU"),
+        replace(cpu, index=1, name="grind", platform="Oclgrind", type="emulator"),
+        replace(
+            cpu, index=2, name="broken", platform="A", type="GPU", problem="it has no compiler"
+        ),
+        replace(cpu, index=3, name="fast", platform="B", type="GPU"),
+    ]
+
+
+def test_a_gpu_comes_first_then_a_cpu(devices):
+    assert choose(None, devices).name == "fast"
+    assert choose(None, devices[:3]).name == "slow"
+
+
+@pytest.mark.parametrize(
+    ("selector", "name"),
+    [
+        ("0", "slow"),
+        ("pocl", "slow"),
+        ("portable", "slow"),
+        ("FAST", "fast"),
+        ("oclgrind", "grind"),
+    ],
+)
+def test_a_device_is_chosen_by_index_or_name(devices, selector, name):
+    assert choose(selector, devices).name == name
+
+
+def test_devices_that_cannot_be_used(devices):
+    with pytest.raises(DeviceError, match=r"broken .A.: it has no compiler"):
+        choose("broken", devices)
+    with pytest.raises(DeviceError, match=r"no usable OpenCL device .*an emulator.*no compiler"):
+        choose(None, devices[1:3])
+    with pytest.raises(DeviceError, match=r"unknown device 'x'.*0: slow.*numpy"):
+        choose("x", devices)
+    with pytest.raises(DeviceError, match="no OpenCL platform"):
+        choose(None, [])
+
+
+def test_why_devices_are_passed_over(devices):
+    status = [row["status"] for row in device_rows(devices)]
+    assert status == [
+        "passed over: there is a GPU; --device 0",
+        "passed over: an emulator, slow; --device 1",
+        "passed over: it has no compiler",
+        "used by default",
+        "slow; --device numpy",
+    ]
+
+
+def test_a_missing_linker_is_a_problem_of_pocl(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    for found in find_devices():
+        if "Portable Computing" in found.platform:
+            assert "no 'ld' on the PATH" in found.problem
+
+
+def test_an_image_too_large_for_the_device_fails_alone(device):
+    tiny = Device(replace(device.info, memory=1000))
+    runner = Runner(make_pipeline(settings_from({})), tiny)
+    with pytest.raises(
+        ImageError, match=r"64x64 pixels need .* MiB on the device, which has 0 MiB"
+    ):
+        runner.run(np.zeros((64, 64, 3), np.float32), "k")
+
+
+def test_a_second_run_compiles_nothing(device, monkeypatch):
+    fresh = Device(device.info)
+    runner = Runner(make_pipeline(settings_from({})), fresh)
+    image = np.zeros((20, 30, 3), np.float16)
+    runner.run(image, "k")
+
+    def compile_again(kernel):
+        raise AssertionError(f"{kernel.name} is compiled again")
+
+    monkeypatch.setattr(fresh, "_compile", compile_again)
+    runner.run(image, "other")
+    runner.run(np.zeros((50, 10, 3), np.float16), "k")
+    changed = make_pipeline(settings_from({"iso": 3200, "exposure": {"ev": 1}, "seed": 4}))
+    Runner(changed, fresh).run(image, "k")
+
+
+@pytest.mark.parametrize("lanes", [1, 8, 16])
+@pytest.mark.parametrize("width", [1, 7, 8, 1000, 1008])
+def test_extents(lanes, width):
+    extent = Extent(width, 5, lanes, 3)
+    assert extent.rows == 8
+    assert extent.columns >= width
+    assert extent.columns % lanes == 0
+    assert extent.pitch >= extent.columns + 6
+    assert extent.pitch % 1024
