@@ -31,6 +31,7 @@ from clpipe.run import Runner
 from clpipe.suggest import one_of
 
 NUMPY = "numpy"
+DEFAULTS = Settings()
 
 
 class Group(click.Group):
@@ -66,10 +67,16 @@ def chain_options(function: Callable[..., Any]) -> Callable[..., Any]:
             "-c", "--config", type=click.Path(path_type=Path), help="A TOML file with settings."
         ),
         click.option(
-            "--camera", metavar="NAME|FILE", help="A built-in camera or a profile (.toml)."
+            "--camera",
+            metavar="NAME|FILE",
+            help=f"A built-in camera or a profile (.toml). [default: {DEFAULTS.camera}]",
         ),
-        click.option("--iso", type=float, help="The ISO; it sets the noise and the denoising."),
-        click.option("--seed", type=int, help="The seed of the noise."),
+        click.option(
+            "--iso",
+            type=float,
+            help=f"The ISO; it sets noise and denoising. [default: {DEFAULTS.iso:g}]",
+        ),
+        click.option("--seed", type=int, help=f"The seed of the noise. [default: {DEFAULTS.seed}]"),
         click.option(
             "--set",
             "assignments",
@@ -103,6 +110,13 @@ keep_option = click.option(
     metavar="STAGE|all",
     help="Write a stage's image too, as float EXR; may be repeated.",
 )
+format_option = click.option(
+    "--format",
+    "formats",
+    multiple=True,
+    type=click.Choice(FORMATS),
+    help="Of the last image; may be repeated. [default: jpg]",
+)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 
@@ -116,7 +130,7 @@ def pipeline_from(
     skip: Sequence[str],
 ) -> Pipeline:
     """The chain that a configuration file and the options over it ask for."""
-    settings = read_settings(config) if config else Settings()
+    settings = read_settings(config) if config else DEFAULTS
     tables: dict[str, dict[str, Any]] = {k: dict(v) for k, v in settings.parameters.items()}
     for text in assignments:
         stage, parameter, value = parse_assignment(text)
@@ -173,13 +187,7 @@ def main() -> None:
 )
 @chain_options
 @keep_option
-@click.option(
-    "--format",
-    "formats",
-    multiple=True,
-    type=click.Choice(FORMATS),
-    help="Of the last image; may be repeated. [default: jpg]",
-)
+@format_option
 @device_option
 def run(
     inputs: tuple[str, ...],
@@ -224,13 +232,7 @@ def run(
 @main.command()
 @chain_options
 @keep_option
-@click.option(
-    "--format",
-    "formats",
-    multiple=True,
-    type=click.Choice(FORMATS),
-    help="As for run. [default: jpg]",
-)
+@format_option
 @json_option
 def plan(keep: tuple[str, ...], formats: tuple[str, ...], as_json: bool, **chain: Any) -> None:
     """Show the launches and buffer slots of a chain, without running it."""

@@ -16,8 +16,6 @@ from clpipe.stage import Context, Kind, Method, Stage
 from clpipe.stages import DEFAULT_CHAIN, all_stages
 from clpipe.suggest import one_of
 
-DEFAULT_CAMERA = "sony-a7r2"
-DEFAULT_ISO = 100.0
 KEYS = ("camera", "iso", "seed", "stages", "skip")
 
 
@@ -25,8 +23,8 @@ KEYS = ("camera", "iso", "seed", "stages", "skip")
 class Settings:
     """A request as it was written, names checked but nothing resolved yet."""
 
-    camera: str = DEFAULT_CAMERA
-    iso: float = DEFAULT_ISO
+    camera: str = "sony-a7r2"
+    iso: float = 100.0
     seed: int = 0
     stages: tuple[str, ...] = DEFAULT_CHAIN
     skip: tuple[str, ...] = ()
