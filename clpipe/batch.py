@@ -16,6 +16,7 @@ import clpipe
 from clpipe.config import Pipeline
 from clpipe.errors import ImageError, RequestError
 from clpipe.image_io import (
+    JPEG_MAX_SIDE,
     READABLE,
     SourceImage,
     Tags,
@@ -58,35 +59,45 @@ def find_jobs(inputs: Sequence[str]) -> list[Job]:
     alone.
 
     Raises:
-        RequestError: a folder without images, or two inputs that would make the same output.
+        RequestError: an empty name, a folder without images, or a glob that no file matches.
     """
     jobs: list[Job] = []
     for text in inputs:
+        if not text:
+            raise RequestError("an input is empty; give files, folders or globs")
         path = Path(text)
-        if path.is_dir():
-            files = sorted(p for p in path.rglob("*") if p.suffix.lower() in READABLE)
-            files = [p for p in files if p.is_file() and not p.name.startswith(".")]
+        if os.path.isdir(text):
+            files = images_in(path)
             if not files:
                 endings = ", ".join(READABLE)
                 raise RequestError(f"{path}: a folder without images (looked for {endings})")
             jobs += [Job(p, p.relative_to(path).as_posix()) for p in files]
-        elif glob.has_magic(text) and not path.exists():
-            matches = sorted(glob.glob(text, recursive=True))  # noqa: PTH207 (may be absolute)
+        elif glob.has_magic(text) and not os.path.exists(text):
+            matches = sorted(m for m in glob.glob(text, recursive=True) if os.path.isfile(m))
             if not matches:
                 raise RequestError(f"{text}: no file matches")
-            jobs += [Job(Path(m), Path(m).name) for m in matches if Path(m).is_file()]
+            jobs += [Job(Path(m), Path(m).name) for m in matches]
         else:
             jobs.append(Job(path, path.name))
-    taken: dict[str, Job] = {}
-    for job in jobs:
-        stem = str(Path(job.key).with_suffix(""))
-        if stem in taken:
-            raise RequestError(
-                f"{taken[stem].path} and {job.path} would both be written to {stem}; "
-                "run them into different folders"
-            )
-        taken[stem] = job
     return jobs
+
+
+def images_in(folder: Path) -> list[Path]:
+    """The image files in a folder at any depth, hidden ones aside, links followed, sorted."""
+    found: list[Path] = []
+    seen: set[str] = set()
+    for place, folders, names in os.walk(folder, followlinks=True):
+        real = os.path.realpath(place)
+        if real in seen:
+            folders.clear()  # a link that leads back
+            continue
+        seen.add(real)
+        found += [
+            Path(place, n)
+            for n in names
+            if not n.startswith(".") and os.path.splitext(n)[1].lower() in READABLE
+        ]
+    return sorted(path for path in found if path.is_file())
 
 
 def prepare_folder(folder: Path) -> None:
@@ -111,8 +122,8 @@ class Target:
     folder: Path
     formats: tuple[str, ...]
 
-    def check(self, pipeline: Pipeline, jobs: Sequence[Job]) -> None:
-        """See that the results can be written in these formats, over no input.
+    def check(self, pipeline: Pipeline, jobs: Sequence[Job], keep: Sequence[str]) -> None:
+        """See that the results can be written in these formats, over no input and no other result.
 
         Raises:
             RequestError: they cannot.
@@ -123,18 +134,34 @@ class Target:
                 f"the chain ends in DN, which {eight_bit[0]} cannot hold; "
                 "end it with normalize or a later stage, or use --format exr"
             )
-        inputs = {job.path.resolve(): job for job in jobs}
+        inputs = {os.path.realpath(job.path) for job in jobs}
+        makers: dict[Path, Job] = {}
         for job in jobs:
-            for format_ in self.formats:
-                if self.path(job, format_).resolve() in inputs:
+            for ending in ("json", *self.formats, *(f"{step}.exr" for step in keep)):
+                path = self.path(job, ending)
+                if os.path.realpath(path) in inputs:
                     raise RequestError(
-                        f"{self.path(job, format_)} is an input and would be overwritten; "
-                        "choose another output folder"
+                        f"{path} is an input and would be overwritten; choose another output folder"
                     )
+                if path in makers:
+                    raise RequestError(
+                        f"{makers[path].path} and {job.path} would both write {path}; "
+                        "run them into different folders"
+                    )
+                makers[path] = job
 
     def path(self, job: Job, ending: str) -> Path:
         """The output of a job with that ending."""
         return self.folder / f"{Path(job.key).with_suffix('')}.{ending}"
+
+    def check_size(self, source: SourceImage) -> None:
+        """See that an image fits into the formats.
+
+        Raises:
+            ImageError: it is too large for one.
+        """
+        if "jpg" in self.formats and max(source.pixels.shape[:2]) > JPEG_MAX_SIDE:
+            raise ImageError(f"JPEG holds at most {JPEG_MAX_SIDE} pixels a side; use --format png")
 
     def write(self, job: Job, runner: Runner, source: SourceImage, result: Result) -> None:
         """Write a job's images, then its sidecar.
@@ -231,10 +258,11 @@ def run_jobs(jobs: Sequence[Job], runner: Runner, target: Target) -> Iterator[Ou
             start = time.perf_counter()
             try:
                 source = reading.result()
+                target.check_size(source)
                 result = runner.run(source.pixels, job.key)
                 target.write(job, runner, source, result)
-            except ImageError as error:
-                message = str(error)
+            except (ImageError, MemoryError) as error:
+                message = str(error) or "there is not enough memory for it"
                 if str(job.path) not in message:
                     message = f"{job.path}: {message}"
                 yield Outcome(job, 0, time.perf_counter() - start, error=message)

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from clpipe.errors import RequestError
 from clpipe.suggest import one_of
 
-Positive = Annotated[float, Field(gt=0)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class GainStage(BaseModel):
@@ -19,9 +19,17 @@ class GainStage(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    iso: tuple[Positive, ...]
+    iso: Annotated[tuple[Positive, ...], Field(min_length=1)]
     system_gain: tuple[Positive, ...]  # DN/e-
     read_noise: tuple[Positive, ...]  # DN
+
+    @model_validator(mode="after")
+    def _aligned(self) -> "GainStage":
+        if not len(self.iso) == len(self.system_gain) == len(self.read_noise):
+            raise ValueError("iso, system_gain and read_noise must be equally long")
+        if list(self.iso) != sorted(set(self.iso)):
+            raise ValueError("iso must ascend")
+        return self
 
 
 class Camera(BaseModel):
@@ -38,8 +46,14 @@ class Camera(BaseModel):
     row_noise_ratio: Annotated[float, Field(ge=0)]  # row sigma over read noise sigma
     column_noise_ratio: Annotated[float, Field(ge=0)]
     iso_range: tuple[Positive, Positive]
-    gain_stages: tuple[GainStage, ...]
+    gain_stages: Annotated[tuple[GainStage, ...], Field(min_length=1)]
     sources: dict[str, str]
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "Camera":
+        if self.white_level <= self.black_level:
+            raise ValueError("white_level must be above black_level")
+        return self
 
     def noise(self, iso: float) -> tuple[float, float]:
         """The a and b of Var[y] = a*y + b at an ISO, in signal units (y = 1 at the white level).
@@ -90,4 +104,5 @@ def load_camera(name: str) -> Camera:
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
-        raise RequestError(f"{path}: {key}: {first['msg']}") from None
+        reason = first["msg"].removeprefix("Value error, ")
+        raise RequestError(f"{path}: {key + ': ' if key else ''}{reason}") from None

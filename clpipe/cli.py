@@ -20,12 +20,14 @@ from clpipe.config import (
     Pipeline,
     Settings,
     make_pipeline,
+    method_of,
     parse_assignment,
     read_settings,
     settings_from,
 )
 from clpipe.device import Device, choose, find_devices
 from clpipe.errors import ClpipeError, RequestError
+from clpipe.image_io import MAX_PIXELS
 from clpipe.plan import make_plan
 from clpipe.run import Runner
 from clpipe.suggest import one_of
@@ -47,6 +49,8 @@ class Group(click.Group):
             sys.exit(130)
         except BrokenPipeError:
             sys.exit(0)
+        except OSError as error:
+            fail(RequestError(f"cannot print: {error.strerror}"))
 
 
 def fail(error: ClpipeError) -> NoReturn:
@@ -131,13 +135,16 @@ def pipeline_from(
 ) -> Pipeline:
     """The chain that a configuration file and the options over it ask for."""
     settings = read_settings(config) if config else DEFAULTS
-    tables: dict[str, dict[str, Any]] = {k: dict(v) for k, v in settings.parameters.items()}
+    assigned: dict[str, dict[str, Any]] = {}
     for text in assignments:
         stage, parameter, value = parse_assignment(text)
+        assigned.setdefault(stage, {})[parameter] = value
+    tables = {stage: dict(table) for stage, table in settings.parameters.items()}
+    for stage, values in assigned.items():
         table = tables.setdefault(stage, {})
-        if parameter == "method" and table.get("method") != value:
+        if "method" in values and values["method"] != method_of(stage, table):
             table.clear()  # what the file set belongs to another method
-        table[parameter] = value
+        table.update(values)
     plain: dict[str, Any] = {"camera": camera, "iso": iso, "seed": seed}
     if stages is not None:
         plain["stages"] = [name.strip() for name in stages.split(",") if name.strip()]
@@ -145,7 +152,10 @@ def pipeline_from(
         plain["skip"] = [*settings.skip, *skip]
     given = settings_from({k: v for k, v in plain.items() if v is not None} | tables)
     named = {k: getattr(given, k) for k, v in plain.items() if v is not None}
-    return make_pipeline(replace(settings, parameters=given.parameters, **named))
+    pipeline = make_pipeline(replace(settings, parameters=given.parameters, **named))
+    for stage in assigned:
+        pipeline.step_named(stage)
+    return pipeline
 
 
 def kept_names(pipeline: Pipeline, keep: Sequence[str]) -> tuple[str, ...]:
@@ -157,7 +167,7 @@ def kept_names(pipeline: Pipeline, keep: Sequence[str]) -> tuple[str, ...]:
 
 def open_device(selector: str | None) -> Device | None:
     """The device that a selector names; None is NumPy."""
-    if selector == NUMPY:
+    if selector is not None and selector.lower() == NUMPY:
         return None
     return Device(choose(selector, find_devices()))
 
@@ -206,7 +216,7 @@ def run(
     formats = tuple(dict.fromkeys(formats)) or ("jpg",)
     jobs = find_jobs(inputs)
     target = Target(output, formats)
-    target.check(pipeline, jobs)
+    target.check(pipeline, jobs, kept)
     device = open_device(selector)
     prepare_folder(output)
     eight_bit = any(f != "exr" for f in formats)
@@ -386,8 +396,12 @@ def check(selector: str | None, small: bool, as_json: bool) -> None:
 def bench(selector: str | None, size: str, repeat: int, as_json: bool, **chain: Any) -> None:
     """Time the chain and each launch, from half RGB to eight-bit RGB on the device."""
     width, _, height = size.partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) * int(height)):
-        raise RequestError(f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 6000x4000")
+    numbers = width.isdecimal() and height.isdecimal()
+    if not numbers or not 0 < int(width) * int(height) <= MAX_PIXELS:
+        raise RequestError(
+            f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 6000x4000, "
+            f"at most {MAX_PIXELS} pixels"
+        )
     pipeline = pipeline_from(**chain)
     device = open_device(selector)
     if device is None:

@@ -76,7 +76,7 @@ def read_settings(path: Path) -> Settings:
             gives the file and, where there is one, the line.
     """
     try:
-        text = path.read_text()
+        text = path.read_text("utf-8-sig")
         return settings_from(tomllib.loads(text))
     except OSError as error:
         raise RequestError(f"{path}: cannot read this configuration: {error.strerror}") from None
@@ -122,12 +122,15 @@ def settings_from(values: Mapping[str, Any]) -> Settings:
     tables = {key: value for key, value in values.items() if isinstance(value, Mapping)}
     plain = {key: value for key, value in values.items() if key not in tables}
     for key in plain:
+        if key in all_stages():
+            raise KeyedError(key, f"{key}: found {plain[key]!r}, but a stage is a table: [{key}]")
         if key not in KEYS:
             raise KeyedError(key, one_of("key", key, (*KEYS, *all_stages())))
     for key, expected in (("camera", str), ("iso", (int, float)), ("seed", int)):
-        if key in plain and (not isinstance(plain[key], expected) or plain[key] is True):
+        value = plain.get(key)
+        if key in plain and (not isinstance(value, expected) or isinstance(value, bool)):
             kinds = {"camera": "text", "iso": "a number", "seed": "a whole number"}
-            raise KeyedError(key, f"{key}: found {plain[key]!r}, but it is {kinds[key]}")
+            raise KeyedError(key, f"{key}: found {value!r}, but it is {kinds[key]}")
     for key in ("stages", "skip"):
         names = plain.get(key, [])
         if not isinstance(names, Sequence) or isinstance(names, str):
@@ -173,6 +176,12 @@ def parse_assignment(text: str) -> tuple[str, str, Any]:
     return match[1], match[2], value
 
 
+def method_of(name: str, table: Mapping[str, Any]) -> Any:
+    """The method that a step's settings choose: the one they name, or the stage's default."""
+    stage = all_stages().get(re.sub(r"_\d+$", "", name))
+    return table.get("method", stage.methods[0].method if stage else None)
+
+
 def make_method(stage: Stage, name: str, table: Mapping[str, Any]) -> Method:
     """A stage's method from its settings, parameters validated.
 
@@ -180,7 +189,7 @@ def make_method(stage: Stage, name: str, table: Mapping[str, Any]) -> Method:
         KeyedError: an unknown method or parameter, or a value that is not allowed.
     """
     chosen = table.get("method", stage.methods[0].method)
-    if chosen not in stage.by_name:
+    if not isinstance(chosen, str) or chosen not in stage.by_name:
         message = one_of("method", str(chosen), stage.by_name)
         raise KeyedError(f"{name}.method", f"{name}.method: {message}")
     method = stage.by_name[chosen]
@@ -240,6 +249,10 @@ def make_pipeline(settings: Settings, source: Kind = Kind.RGB) -> Pipeline:
         kind, before = stage.writes, name
     if not steps:
         raise RequestError("stages: nothing is left to do; every stage was skipped")
+    names = [step.name for step in steps]
+    for name in settings.parameters:
+        if name not in names and name not in all_stages():
+            raise KeyedError(name, one_of("stage in this chain", name, names))
     return Pipeline(tuple(steps), source, camera, settings.iso, settings.seed)
 
 

@@ -35,6 +35,7 @@ class Found:
     driver: str
     compute_units: int
     memory: int  # bytes
+    max_buffer: int  # bytes
     lanes: int
     problem: str
     handle: Any
@@ -82,6 +83,7 @@ def find_devices() -> list[Found]:
                     driver=device.driver_version.strip(),
                     compute_units=device.max_compute_units,
                     memory=device.global_mem_size,
+                    max_buffer=device.max_mem_alloc_size,
                     lanes=lanes_for(type_, platform.name, device),
                     problem=problem_with(type_, platform.name, device),
                     handle=device,
@@ -155,7 +157,7 @@ def matches(selector: str, device: Found) -> bool:
     """Whether a selector is a part of a device's name, type or platform ('pocl' counts)."""
     alias = " pocl" if "Portable Computing" in device.platform else ""
     names = f"{device.name} {device.platform} {device.type}{alias}"
-    return selector.lower() in names.lower()
+    return bool(selector) and selector.lower() in names.lower()
 
 
 @dataclass(frozen=True)
@@ -282,6 +284,8 @@ class Device:
         """
         cl = self._cl
         kernels = self.prepare(plan)
+        if len(self._tables) > 32:
+            self._tables.clear()
         height, width = source.shape[:2]
         extent = Extent(width, height, self.info.lanes, plan.apron)
         channels = len(plan.source.channels)
@@ -370,21 +374,20 @@ class Device:
     def _buffer(self, name: str, size: int) -> Any:
         """The buffer of that name, made anew only when its size changes."""
         cl = self._cl
-        held = self._buffers.get(name)
+        held = self._buffers.pop(name, None)
         if held is None or held.size != size:
             if held is not None:
                 held.release()
-            if size > self.info.handle.max_mem_alloc_size:
+            if size > self.info.max_buffer:
                 raise cl.MemoryError(f"one buffer of {size / 2**20:.0f} MiB is too large for it")
-            self._buffers[name] = cl.Buffer(self._context, cl.mem_flags.READ_WRITE, max(size, 1))
-        return self._buffers[name]
+            held = cl.Buffer(self._context, cl.mem_flags.READ_WRITE, size)
+        self._buffers[name] = held
+        return held
 
     def _table(self, table: Array) -> Any:
         """A small constant array on the device, uploaded once."""
         cl = self._cl
         if id(table) not in self._tables:
-            if len(self._tables) >= 32:
-                self._tables.clear()
             flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
             # The array is held so that its id stays its own.
             self._tables[id(table)] = table, cl.Buffer(self._context, flags, hostbuf=table)

@@ -19,6 +19,8 @@ from clpipe.types import Array, Floats
 
 READABLE = (".exr", ".hdr", ".pfm", ".tif", ".tiff")
 JPEG_QUALITY = 97
+JPEG_MAX_SIDE = 65500
+HALF_MAX = np.float32(65504)  # so bright that nothing is lost, and no square overflows
 MAX_PIXELS = 1_000_000_000
 # Layers that hold the finished picture, in order of preference: no layer, then common names.
 PICTURE_LAYERS = ("", "combined", "beauty", "rgba", "rgb", "color", "default")
@@ -48,6 +50,10 @@ def read_image(path: Path) -> SourceImage:
             RGB; the message names the file and the reason.
     """
     try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise ImageError(f"{str(path)!a}: its name is not UTF-8; rename it") from None
+    try:
         data = path.read_bytes()
     except FileNotFoundError:
         raise ImageError(f"{path}: no such file") from None
@@ -65,6 +71,9 @@ def read_image(path: Path) -> SourceImage:
     pixels, count = without_non_finite(pixels)
     if count:
         warnings.append(f"{count} samples were NaN or infinite and were set to 0")
+    if pixels.dtype == np.float32 and (beyond := int((np.abs(pixels) > HALF_MAX).sum())):
+        pixels = np.clip(pixels, -HALF_MAX, HALF_MAX)
+        warnings.append(f"{beyond} samples beyond {HALF_MAX:g}, the range of half, were clipped")
     return SourceImage(pixels, hashlib.sha256(data).hexdigest(), layer, tuple(warnings))
 
 
@@ -228,9 +237,6 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> None:
         options["icc_profile"] = srgb_profile()
     if path.suffix == ".jpg":
         options |= {"quality": JPEG_QUALITY, "subsampling": "4:2:2"}
-        limit = 65500
-        if max(pixels.shape[:2]) > limit:
-            raise ImageError(f"{path}: JPEG holds at most {limit} pixels a side; use --format png")
     image = Image.fromarray(pixels)
 
     def write(to: Path) -> None:

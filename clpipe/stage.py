@@ -125,7 +125,7 @@ def parameter(
 class Method(BaseModel):
     """One way to do a stage. Subclasses declare parameters as fields and override what follows."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     method: ClassVar[str]
     kernel: ClassVar[str]  # file name in kernels/, without .cl

@@ -193,6 +193,12 @@ def test_a_folder_keeps_its_structure_and_a_bad_file_stops_nobody(clpipe, write_
         (["--set", "denoise.radius=0"], 2, "denoise.radius: found 0"),
         (["--set", "denoise"], 2, "expected stage.parameter=value"),
         (["--stages", "mosaic,gamma"], 2, "gamma reads rgb, but mosaic gives mosaic"),
+        (["--set", "denoise.method=[1]"], 2, "denoise.method: unknown method"),
+        (["--set", "sensor_noise_2.a=1"], 2, "unknown stage in this chain 'sensor_noise_2'"),
+        (["--set", "denoise.radius=3", "--skip", "denoise"], 2, "in this chain 'denoise'"),
+        (["--set", "sensor_noise.a=1e300"], 2, "sensor_noise.a: found 1e+300"),
+        (["--set", "denoise.radius=true"], 2, "denoise.radius: found True"),
+        (["--device", ""], 3, "unknown device ''"),
         (["--skip", "noise"], 2, "unknown stage 'noise'"),
         (["--keep", "noise"], 2, "unknown stage in this chain 'noise'"),
         (["-c", "missing.toml"], 2, "missing.toml: cannot read"),
@@ -219,9 +225,52 @@ def test_inputs_that_cannot_be(clpipe, small, tmp_path):
     other.mkdir()
     (other / "small.exr").write_bytes(small.read_bytes())
     result = clpipe("run", small, other / "small.exr", "-o", "out", status=2)
-    assert "would both be written to small" in result.stderr
+    assert "would both write out/small.json" in result.stderr
     result = clpipe("run", small, "-o", small.parent, "--format", "exr", status=2)
     assert "is an input and would be overwritten" in result.stderr
+
+
+def test_a_kept_stage_never_overwrites_an_input_or_another_result(clpipe, write_exr, tmp_path):
+    pixels = np.full((4, 4, 3), 0.5, np.float32)
+    one, two = write_exr("in/a.exr", pixels), write_exr("in/a.demosaic.exr", pixels)
+    before = two.read_bytes()
+    keep = ("--keep", "demosaic")
+    result = clpipe("run", one, two, "-o", "in", *keep, status=2)
+    assert "a.demosaic.exr is an input and would be overwritten" in result.stderr
+    assert two.read_bytes() == before
+    result = clpipe("run", one, two, "-o", "out", *keep, "--format", "exr", status=2)
+    assert "would both write out/a.demosaic.exr" in result.stderr
+
+
+def test_the_order_of_assignments_does_not_matter(clpipe, small, tmp_path):
+    (tmp_path / "p.toml").write_text("[denoise]\nspatial_sigma = 3\n")
+    method, radius = ("--set", "denoise.method=bilateral"), ("--set", "denoise.radius=5")
+    for options in ((*method, *radius), (*radius, *method)):
+        clpipe("run", small, "-o", "out", "-c", "p.toml", *options)
+        sidecar = json.loads((tmp_path / "out" / "small.json").read_text())
+        values = next(s["parameters"] for s in sidecar["stages"] if s["name"] == "denoise")
+        assert (values["radius"], values["spatial_sigma"]) == (5, 3)
+    (tmp_path / "q.toml").write_text("[white_balance]\nred_gain = 2\n")
+    clpipe("run", small, "-o", "out", "-c", "q.toml", "--set", "white_balance.method=gray_world")
+
+
+def test_links_to_folders_are_followed_once(clpipe, write_exr, tmp_path):
+    write_exr("real/a.exr", np.zeros((4, 4, 3), np.float32))
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "linked").symlink_to(tmp_path / "real")
+    (tmp_path / "real" / "back").symlink_to(tmp_path / "in")
+    clpipe("run", "in", "-o", "out")
+    assert files(tmp_path / "out") == ["linked/a.jpg", "linked/a.json"]
+
+
+def test_odd_names(clpipe, write_exr, tmp_path):
+    write_exr("in/sp ace \u00e9\u4e2d.exr", np.zeros((4, 4, 3), np.float32))
+    (tmp_path / os.fsdecode(b"in/bad\xff.exr")).write_bytes(b"x")
+    result = clpipe("run", "in", "-o", "out", status=1)
+    assert "its name is not UTF-8" in result.stderr
+    assert files(tmp_path / "out") == ["sp ace \u00e9\u4e2d.jpg", "sp ace \u00e9\u4e2d.json"]
+    assert "File name too long" in clpipe("run", "a" * 300, "-o", "out", status=1).stderr
+    assert "an input is empty" in clpipe("run", "", "-o", "out", status=2).stderr
 
 
 def test_an_output_folder_that_cannot_be_written(clpipe, small, tmp_path):

@@ -58,6 +58,8 @@ def test_a_bad_request_is_named(settings, message):
         ("iso = 100\n[sensor_noise]\na = -1\n", "line 3: sensor_noise.a: found -1"),
         ("iso = 100\n\n[sensor_nose]\na = 1\n", "line 3: unknown stage 'sensor_nose'"),
         ("seed = 1\niso = \n", r"not valid TOML: .*line 2"),
+        ("denoise = 3\n", r"line 1: denoise: found 3, but a stage is a table: \[denoise\]"),
+        ("seed = false\n", "line 1: seed: found False, but it is a whole number"),
         ("camra = 'x'\n", "line 1: unknown key 'camra'"),
         ("demosaic.method = 'x'\n", "line 1: demosaic.method: unknown method 'x'"),
     ],
@@ -126,6 +128,14 @@ def test_a_camera_of_ones_own(tmp_path):
     own.write_text(text.replace("black_level = 512", "black_level = -3"))
     with pytest.raises(RequestError, match=r"own.toml: black_level: .*greater"):
         load_camera(str(own))
+    for old, new, message in (
+        ("read_noise = [1.413, ", "read_noise = [", "gain_stages.0: .*equally long"),
+        ("iso = [100, 125,", "iso = [125, 100,", "gain_stages.0: iso must ascend"),
+        ("white_level = 16383", "white_level = 512", "white_level must be above black_level"),
+    ):
+        own.write_text(text.replace(old, new))
+        with pytest.raises(RequestError, match=rf"own.toml: {message}"):
+            load_camera(str(own))
     own.write_text("name = ")
     with pytest.raises(RequestError, match=r"own.toml: not valid TOML"):
         load_camera(str(own))

@@ -6,6 +6,7 @@ import pytest
 
 from clpipe import codegen
 from clpipe.check import check_method
+from clpipe.config import make_pipeline, read_settings
 from clpipe.device import Device
 from clpipe.stages import all_stages
 from tests.conftest import ROOT
@@ -41,3 +42,11 @@ def test_every_file_it_names_is_there():
 def test_every_link_leads_somewhere(name):
     for target in re.findall(r"\]\(([^)#]+)\)", (ROOT / name).read_text()):
         assert (ROOT / target).exists(), target
+
+
+def test_the_configuration_in_the_readme_is_valid(tmp_path):
+    path = tmp_path / "pipeline.toml"
+    path.write_text(re.search(r"```toml\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1])
+    pipeline = make_pipeline(read_settings(path))
+    assert pipeline.iso == 1600
+    assert "row_noise" not in [step.name for step in pipeline.steps]

@@ -83,6 +83,17 @@ def test_an_image_too_large_for_the_device_fails_alone(device):
         runner.run(np.zeros((64, 64, 3), np.float32), "k")
 
 
+def test_after_an_image_that_is_too_large_the_next_one_works(device):
+    small = Device(replace(device.info, max_buffer=200_000))
+    runner = Runner(make_pipeline(settings_from({})), small)
+    image = np.full((20, 30, 3), 0.5, np.float16)
+    expected = runner.run(image, "k").encoded
+    for _ in range(2):
+        with pytest.raises(ImageError, match="is too large for it"):
+            runner.run(np.zeros((300, 300, 3), np.float16), "k")
+    assert np.array_equal(runner.run(image, "k").encoded, expected)
+
+
 def test_a_second_run_compiles_nothing(device, monkeypatch):
     fresh = Device(device.info)
     runner = Runner(make_pipeline(settings_from({})), fresh)

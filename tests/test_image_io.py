@@ -57,6 +57,15 @@ def test_nan_and_infinity_become_zero_and_are_counted(write_exr):
         assert source.pixels[5, 5, 1] == pixels[5, 5, 1]
 
 
+def test_light_beyond_half_is_clipped(write_exr):
+    pixels = ramp()
+    pixels[0, 0, 0], pixels[1, 1, 1] = 3e38, -1e30
+    source = read_image(write_exr("bright.exr", pixels, half=False))
+    assert source.pixels[0, 0, 0] == 65504
+    assert source.pixels[1, 1, 1] == -65504
+    assert "2 samples beyond 65504" in source.warnings[0]
+
+
 def test_the_display_window_is_the_picture(write_exr):
     pixels = ramp(4, 5)
     windows = {"x": 2, "y": 1, "full_width": 10, "full_height": 8}

@@ -34,6 +34,7 @@ class Gaussian(Method):
         "signal",
         "row_noise_ratio of the camera times its read noise",
         ge=0,
+        le=1,
     )
 
     def resolve(self, context: Context) -> "Gaussian":

@@ -19,10 +19,20 @@ class Gaussian(Method):
     summary: ClassVar = "add Gaussian noise of variance a*y + b"
 
     a: float | None = parameter(
-        None, "Shot noise: variance a unit of signal.", "signal", "from the camera and ISO", ge=0
+        None,
+        "Shot noise: variance a unit of signal.",
+        "signal",
+        "from the camera and ISO",
+        ge=0,
+        le=1,
     )
     b: float | None = parameter(
-        None, "Read noise: variance without light.", "signal^2", "from the camera and ISO", ge=0
+        None,
+        "Read noise: variance without light.",
+        "signal^2",
+        "from the camera and ISO",
+        ge=0,
+        le=1,
     )
 
     def resolve(self, context: Context) -> "Gaussian":
