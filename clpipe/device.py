@@ -1,6 +1,5 @@
 """OpenCL devices: which there are, and running a plan on one. The only importer of pyopencl."""
 
-import os
 import shutil
 import time
 import warnings
@@ -16,9 +15,6 @@ from clpipe.errors import DeviceError, ImageError
 from clpipe.plan import AddUp, Find, Image, Launch, Lines, Plan
 from clpipe.suggest import one_of
 from clpipe.types import Array
-
-# PoCL 3.0 leaks its compiler's chatter onto stderr unless it is told not to.
-os.environ.setdefault("PYOPENCL_COMPILER_OUTPUT", "0")
 
 Bind = Callable[[Parameter], Any]
 
