@@ -56,6 +56,16 @@ class Kernel:
     launch: AnyLaunch
 
 
+def round_up(value: int, step: int) -> int:
+    """The smallest multiple of ``step`` that is not below ``value``."""
+    return -(-value // step) * step
+
+
+def apron_left(apron: int, lanes: int) -> int:
+    """Columns before the first pixel of a plane's row: the apron, in whole blocks."""
+    return round_up(apron, lanes)
+
+
 @cache
 def kernel_folder() -> Path:
     """Where the kernel files are: in the package, or beside it in a checkout."""
@@ -155,7 +165,7 @@ def write_kernel(plan: Plan, launch: AnyLaunch, index: int, lanes: int) -> Kerne
     for dimension in ("width", "height", "pitch"):
         writer.parameter(dimension, "uint", "extent", item=dimension)
     seen: set[str] = set()
-    left = -(-plan.apron // lanes) * lanes
+    left = apron_left(plan.apron, lanes)
     text = f"#define LANES {lanes}\n#define APRON {plan.apron}\n#define APRON_LEFT {left}\n"
     text += files_text([f"lib/{part}.h" for part in LIBRARY], seen)
     match launch:

@@ -10,7 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.codegen import LOCAL_SIZE, SHARES, Kernel, Parameter, write_kernel
+from clpipe.codegen import (
+    LOCAL_SIZE,
+    SHARES,
+    Kernel,
+    Parameter,
+    apron_left,
+    round_up,
+    write_kernel,
+)
 from clpipe.errors import DeviceError, ImageError
 from clpipe.plan import AddUp, Find, Image, Launch, Lines, Plan
 from clpipe.suggest import one_of
@@ -168,20 +176,19 @@ class Extent:
     @cached_property
     def pitch(self) -> int:
         """Floats from one row of a plane to the next."""
-        side = -(-self.apron // self.lanes) * self.lanes
-        pitch = self.columns + 2 * side
+        pitch = self.columns + 2 * apron_left(self.apron, self.lanes)
         # Rows a multiple of 4 KiB apart would fall into the same cache sets.
         return pitch + self.lanes * (pitch % 1024 == 0)
 
     @property
     def columns(self) -> int:
         """The width, in whole blocks."""
-        return -(-self.width // self.lanes) * self.lanes
+        return round_up(self.width, self.lanes)
 
     @property
     def rows(self) -> int:
         """The height, in whole blocks of four."""
-        return -(-self.height // 4) * 4
+        return round_up(self.height, 4)
 
     @property
     def plane_bytes(self) -> int:
@@ -322,19 +329,15 @@ class Device:
     ) -> tuple[tuple[int, ...], tuple[int, ...]]:
         match kernel.launch:
             case Launch(rows=rows):
-                blocks = self._round_up(extent.columns // extent.lanes, LOCAL_SIZE)
-                return (blocks, -(-extent.height // rows)), (LOCAL_SIZE, 1)
+                blocks = round_up(extent.columns // extent.lanes, LOCAL_SIZE)
+                return (blocks, round_up(extent.height, rows) // rows), (LOCAL_SIZE, 1)
             case Lines():
-                lines = -(-max(extent.width, extent.height) // extent.lanes)
-                return (self._round_up(lines, LOCAL_SIZE),), (LOCAL_SIZE,)
+                longest = round_up(max(extent.width, extent.height), extent.lanes)
+                return (round_up(longest // extent.lanes, LOCAL_SIZE),), (LOCAL_SIZE,)
             case AddUp():
                 return (SHARES,), (LOCAL_SIZE,)
             case Find():
                 return (1,), (1,)
-
-    @staticmethod
-    def _round_up(value: int, step: int) -> int:
-        return -(-value // step) * step
 
     def _argument(
         self, parameter: Parameter, kernel: Kernel, plan: Plan, extent: Extent, bind: Bind
@@ -414,7 +417,7 @@ class Device:
         """An image from its planes, without the apron: (height, width[, channel]) float32."""
         slots = plan.slots[image.number]
         result = np.empty((extent.height, extent.width, len(slots)), np.float32)
-        side = -(-plan.apron // extent.lanes) * extent.lanes
+        side = apron_left(plan.apron, extent.lanes)
         rows = extent.rows + 2 * plan.apron
         plane = np.empty(extent.plane_bytes // 4, np.float32)
         for channel, slot in enumerate(slots):
