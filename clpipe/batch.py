@@ -51,12 +51,12 @@ class Outcome:
     error: str = ""
 
 
-def find_jobs(inputs: Sequence[str]) -> list[Job]:
+def find_jobs(inputs: Sequence[str], output: Path) -> list[Job]:
     """The files that inputs name: files, folders (all images in them, at any depth) and globs.
 
     The image key of a file in a folder is its path relative to that folder, that of a file given
     by name or found by a glob is its name. A file that does not exist is a job too: it fails later,
-    alone.
+    alone. Where the output folder lies inside an input folder, what is in it is no input.
 
     Raises:
         RequestError: an empty name, a folder without images, or a glob that no file matches.
@@ -67,7 +67,7 @@ def find_jobs(inputs: Sequence[str]) -> list[Job]:
             raise RequestError("an input is empty; give files, folders or globs")
         path = Path(text)
         if os.path.isdir(text):
-            files = images_in(path)
+            files = images_in(path, output)
             if not files:
                 endings = ", ".join(READABLE)
                 raise RequestError(f"{path}: a folder without images (looked for {endings})")
@@ -82,14 +82,17 @@ def find_jobs(inputs: Sequence[str]) -> list[Job]:
     return jobs
 
 
-def images_in(folder: Path) -> list[Path]:
-    """The image files in a folder at any depth, hidden ones aside, links followed, sorted."""
+def images_in(folder: Path, output: Path) -> list[Path]:
+    """The image files in a folder at any depth, sorted; hidden ones and a folder in it that is the
+    output aside, links followed.
+    """
     found: list[Path] = []
     seen: set[str] = set()
     for place, folders, names in os.walk(folder, followlinks=True):
         real = os.path.realpath(place)
-        if real in seen:
-            folders.clear()  # a link that leads back
+        led_back = real in seen
+        if led_back or (seen and real == os.path.realpath(output)):
+            folders.clear()
             continue
         seen.add(real)
         found += [

@@ -214,7 +214,7 @@ def run(
     pipeline = pipeline_from(**chain)
     kept = kept_names(pipeline, keep)
     formats = tuple(dict.fromkeys(formats)) or ("jpg",)
-    jobs = find_jobs(inputs)
+    jobs = find_jobs(inputs, output)
     target = Target(output, formats)
     target.check(pipeline, jobs, kept)
     device = open_device(selector)

@@ -263,6 +263,13 @@ def test_links_to_folders_are_followed_once(clpipe, write_exr, tmp_path):
     assert files(tmp_path / "out") == ["linked/a.jpg", "linked/a.json"]
 
 
+def test_an_output_folder_inside_the_input_is_no_input(clpipe, small, tmp_path):
+    for _ in range(2):
+        clpipe("run", "in", "-o", "in/out", "--format", "exr", "--keep", "mosaic")
+    made = ["small.exr", "small.json", "small.mosaic.exr"]
+    assert files(tmp_path / "in" / "out") == made
+
+
 def test_odd_names(clpipe, write_exr, tmp_path):
     write_exr("in/sp ace \u00e9\u4e2d.exr", np.zeros((4, 4, 3), np.float32))
     (tmp_path / os.fsdecode(b"in/bad\xff.exr")).write_bytes(b"x")
