@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import clpipe
-from clpipe.config import Pipeline
+from clpipe.config import Chain
 from clpipe.errors import ImageError, RequestError
 from clpipe.image_io import (
     JPEG_MAX_SIDE,
@@ -125,14 +125,14 @@ class Target:
     folder: Path
     formats: tuple[str, ...]
 
-    def check(self, pipeline: Pipeline, jobs: Sequence[Job], keep: Sequence[str]) -> None:
+    def check(self, chain: Chain, jobs: Sequence[Job], keep: Sequence[str]) -> None:
         """See that the results can be written in these formats, over no input and no other result.
 
         Raises:
             RequestError: they cannot.
         """
         eight_bit = [f for f in self.formats if f != "exr"]
-        if eight_bit and pipeline.result is Kind.RAW:
+        if eight_bit and chain.result is Kind.RAW:
             raise RequestError(
                 f"the chain ends in DN, which {eight_bit[0]} cannot hold; "
                 "end it with normalize or a later stage, or use --format exr"
@@ -172,10 +172,10 @@ class Target:
         Raises:
             ImageError: a file cannot be written.
         """
-        pipeline = runner.pipeline
-        tags = Tags(pipeline.camera.make, pipeline.camera.model, pipeline.iso)
+        chain = runner.chain
+        tags = Tags(chain.camera.make, chain.camera.model, chain.iso)
         outputs = []
-        for step in pipeline.steps:
+        for step in chain.steps:
             if step.name in runner.keep:
                 path = self.path(job, f"{step.name}.exr")
                 attributes = {"clpipe:stage": step.name, "clpipe:kind": step.stage.writes.label}
@@ -185,9 +185,9 @@ class Target:
             path = self.path(job, format_)
             if format_ == "exr":
                 assert result.final is not None
-                last = pipeline.steps[-1]
-                attributes = {"clpipe:stage": last.name, "clpipe:kind": pipeline.result.label}
-                write_exr(path, result.final, pipeline.result.channels, attributes)
+                last = chain.steps[-1]
+                attributes = {"clpipe:stage": last.name, "clpipe:kind": chain.result.label}
+                write_exr(path, result.final, chain.result.channels, attributes)
             else:
                 assert result.encoded is not None
                 write_display(path, result.encoded, tags)
@@ -205,7 +205,7 @@ def sidecar(
     job: Job, runner: Runner, source: SourceImage, result: Result, outputs: Sequence[str]
 ) -> dict[str, Any]:
     """Everything that is needed to make the same files again."""
-    pipeline = runner.pipeline
+    chain = runner.chain
     device = runner.device
     return {
         "clpipe": clpipe.__version__,
@@ -213,11 +213,11 @@ def sidecar(
         "sha256": source.sha256,
         "layer": source.layer,
         "image_key": job.key,
-        "seed": pipeline.seed,
+        "seed": chain.seed,
         "width": source.pixels.shape[1],
         "height": source.pixels.shape[0],
-        "camera": pipeline.camera.name,
-        "iso": pipeline.iso,
+        "camera": chain.camera.name,
+        "iso": chain.iso,
         "stages": [
             {
                 "name": step.name,
@@ -226,7 +226,7 @@ def sidecar(
                 "parameters": step.method.model_dump(),
                 **({"found": result.found[step.name]} if step.name in result.found else {}),
             }
-            for step in pipeline.steps
+            for step in chain.steps
         ],
         "outputs": list(outputs),
         "warnings": list(source.warnings),

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.config import Pipeline
+from clpipe.config import Chain
 from clpipe.device import Device, Timing
 from clpipe.plan import launch_bytes
 from clpipe.run import Runner
@@ -53,14 +53,14 @@ def scene(width: int, height: int) -> Array:
 
 
 def bench(
-    device: Device, pipeline: Pipeline, width: int = 6000, height: int = 4000, repeat: int = 7
+    device: Device, chain: Chain, width: int = 6000, height: int = 4000, repeat: int = 7
 ) -> Report:
     """Time a chain from half RGB on the device to eight-bit RGB on the device.
 
     The chain is timed whole, with one wait at its end; its launches by the device's own events.
     Each figure is the best of ``repeat`` runs after a first one that compiles.
     """
-    runner = Runner(pipeline, device)
+    runner = Runner(chain, device)
     image = scene(width, height)
     pixels = width * height
     start = time.perf_counter()

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.config import Settings, make_pipeline
+from clpipe.config import Settings, make_chain
 from clpipe.device import Device
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.run import Runner
@@ -58,11 +58,11 @@ def compare(
     Eight-bit results count too, where a difference of one level is taken for none: an ulp before
     rounding can make it.
     """
-    pipeline = make_pipeline(settings, source)
-    encode = pipeline.result is not Kind.RAW
-    on_device = Runner(pipeline, device, encode=encode, final=True)
-    alone = Runner(pipeline, device, encode=encode)
-    in_numpy = Runner(pipeline, None, encode=encode, final=True)
+    chain = make_chain(settings, source)
+    encode = chain.result is not Kind.RAW
+    on_device = Runner(chain, device, encode=encode, final=True)
+    alone = Runner(chain, device, encode=encode)
+    in_numpy = Runner(chain, None, encode=encode, final=True)
     samples, differing, largest = 0, 0, 0.0
     for number, size in enumerate(sizes):
         half = number % 2 == 1 and source is not Kind.RAW

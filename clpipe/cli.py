@@ -17,9 +17,9 @@ from clpipe.batch import FORMATS, Target, find_jobs, prepare_folder, run_jobs
 from clpipe.bench import bench as run_bench
 from clpipe.check import SIZES, check_all
 from clpipe.config import (
-    Pipeline,
+    Chain,
     Settings,
-    make_pipeline,
+    make_chain,
     method_of,
     parse_assignment,
     read_settings,
@@ -124,7 +124,7 @@ format_option = click.option(
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 
-def pipeline_from(
+def chain_from(
     config: Path | None,
     camera: str | None,
     iso: float | None,
@@ -132,7 +132,7 @@ def pipeline_from(
     assignments: Sequence[str],
     stages: str | None,
     skip: Sequence[str],
-) -> Pipeline:
+) -> Chain:
     """The chain that a configuration file and the options over it ask for."""
     settings = read_settings(config) if config else DEFAULTS
     assigned: dict[str, dict[str, Any]] = {}
@@ -152,17 +152,17 @@ def pipeline_from(
         plain["skip"] = [*settings.skip, *skip]
     given = settings_from({k: v for k, v in plain.items() if v is not None} | tables)
     named = {k: getattr(given, k) for k, v in plain.items() if v is not None}
-    pipeline = make_pipeline(replace(settings, parameters=given.parameters, **named))
+    chain = make_chain(replace(settings, parameters=given.parameters, **named))
     for stage in assigned:
-        pipeline.step_named(stage)
-    return pipeline
+        chain.step_named(stage)
+    return chain
 
 
-def kept_names(pipeline: Pipeline, keep: Sequence[str]) -> tuple[str, ...]:
+def kept_names(chain: Chain, keep: Sequence[str]) -> tuple[str, ...]:
     """The steps to keep; ``all`` is every one."""
     if "all" in keep:
-        return tuple(step.name for step in pipeline.steps)
-    return tuple(pipeline.step_named(name).name for name in dict.fromkeys(keep))
+        return tuple(step.name for step in chain.steps)
+    return tuple(chain.step_named(name).name for name in dict.fromkeys(keep))
 
 
 def open_device(selector: str | None) -> Device | None:
@@ -205,22 +205,22 @@ def run(
     keep: tuple[str, ...],
     formats: tuple[str, ...],
     selector: str | None,
-    **chain: Any,
+    **request: Any,
 ) -> None:
     """Run images through the chain: files, folders or globs of linear float images (EXR).
 
     Each makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used.
     """
-    pipeline = pipeline_from(**chain)
-    kept = kept_names(pipeline, keep)
+    chain = chain_from(**request)
+    kept = kept_names(chain, keep)
     formats = tuple(dict.fromkeys(formats)) or ("jpg",)
     jobs = find_jobs(inputs, output)
     target = Target(output, formats)
-    target.check(pipeline, jobs, kept)
+    target.check(chain, jobs, kept)
     device = open_device(selector)
     prepare_folder(output)
     eight_bit = any(f != "exr" for f in formats)
-    runner = Runner(pipeline, device, kept, encode=eight_bit, final="exr" in formats)
+    runner = Runner(chain, device, kept, encode=eight_bit, final="exr" in formats)
     failed = 0
     for outcome in run_jobs(jobs, runner, target):
         if outcome.error:
@@ -244,13 +244,11 @@ def run(
 @keep_option
 @format_option
 @json_option
-def plan(keep: tuple[str, ...], formats: tuple[str, ...], as_json: bool, **chain: Any) -> None:
+def plan(keep: tuple[str, ...], formats: tuple[str, ...], as_json: bool, **request: Any) -> None:
     """Show the launches and buffer slots of a chain, without running it."""
-    pipeline = pipeline_from(**chain)
+    chain = chain_from(**request)
     eight_bit = not formats or any(f != "exr" for f in formats)
-    made = make_plan(
-        pipeline, keep=kept_names(pipeline, keep), encode=eight_bit, final="exr" in formats
-    )
+    made = make_plan(chain, keep=kept_names(chain, keep), encode=eight_bit, final="exr" in formats)
     if as_json:
         click.echo(json.dumps(describe.plan_record(made), indent=2))
         return
@@ -393,7 +391,7 @@ def check(selector: str | None, small: bool, as_json: bool) -> None:
     "--repeat", default=7, show_default=True, type=click.IntRange(1), help="Runs; the best counts."
 )
 @json_option
-def bench(selector: str | None, size: str, repeat: int, as_json: bool, **chain: Any) -> None:
+def bench(selector: str | None, size: str, repeat: int, as_json: bool, **request: Any) -> None:
     """Time the chain and each launch, from half RGB to eight-bit RGB on the device."""
     width, _, height = size.partition("x")
     numbers = width.isdecimal() and height.isdecimal()
@@ -402,11 +400,11 @@ def bench(selector: str | None, size: str, repeat: int, as_json: bool, **chain: 
             f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 6000x4000, "
             f"at most {MAX_PIXELS} pixels"
         )
-    pipeline = pipeline_from(**chain)
+    chain = chain_from(**request)
     device = open_device(selector)
     if device is None:
         raise RequestError("bench: it times the kernels of a device; numpy has none")
-    report = run_bench(device, pipeline, int(width), int(height), repeat)
+    report = run_bench(device, chain, int(width), int(height), repeat)
     if as_json:
         click.echo(json.dumps(report.record(), indent=2))
         return

@@ -42,7 +42,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Pipeline:
+class Chain:
     """A chain of stages, ready to plan."""
 
     steps: tuple[Step, ...]
@@ -219,7 +219,7 @@ def named_errors(name: str, method: type[Method]) -> Iterator[None]:
         raise KeyedError(key, f"{key}:{found} {reason}") from None
 
 
-def make_pipeline(settings: Settings, source: Kind = Kind.RGB) -> Pipeline:
+def make_chain(settings: Settings, source: Kind = Kind.RGB) -> Chain:
     """The chain that the settings ask for, every parameter resolved.
 
     A stage that comes a second time is called ``stage_2``, and so on.
@@ -253,7 +253,7 @@ def make_pipeline(settings: Settings, source: Kind = Kind.RGB) -> Pipeline:
     for name in settings.parameters:
         if name not in names and name not in all_stages():
             raise KeyedError(name, one_of("stage in this chain", name, names))
-    return Pipeline(tuple(steps), source, camera, settings.iso, settings.seed)
+    return Chain(tuple(steps), source, camera, settings.iso, settings.seed)
 
 
 def misfit(name: str, stage: Stage, before: str, kind: Kind) -> str:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from clpipe.config import Pipeline, Step
+from clpipe.config import Chain, Step
 from clpipe.stage import Access, Kind, Literal, Pass
 
 
@@ -205,7 +205,7 @@ def make_op(step: Step, pass_: Pass) -> Op:
 
 
 def make_plan(
-    pipeline: Pipeline,
+    chain: Chain,
     half: bool = True,
     keep: Sequence[str] = (),
     encode: bool = True,
@@ -226,12 +226,12 @@ def make_plan(
         RequestError: a step to keep that the chain has not.
     """
     for name in keep:
-        pipeline.step_named(name)
-    last = pipeline.steps[-1].name
+        chain.step_named(name)
+    last = chain.steps[-1].name
     final = final or last in keep
-    planner = _Planner(pipeline.source, fold)
+    planner = _Planner(chain.source, fold)
     kept: dict[str, Image] = {}
-    for step in pipeline.steps:
+    for step in chain.steps:
         planner.add_step(step)
         if step.name in keep and step.name != last:
             kept[step.name] = planner.close()
@@ -252,14 +252,14 @@ def make_plan(
     slots, count = assign_slots(launches, planner.images, pinned)
     radii = [x.stencil.pass_.radius for x in launches if isinstance(x, Launch) and x.stencil]
     return Plan(
-        source=pipeline.source,
+        source=chain.source,
         half=half,
         launches=tuple(launches),
         slots=slots,
         slot_count=count,
         kept=tuple(kept.items()),
         final=final_image,
-        encoded=pipeline.result if encode else None,
+        encoded=chain.result if encode else None,
         apron=max(radii, default=0),
     )
 

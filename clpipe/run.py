@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.codegen import Parameter
-from clpipe.config import Pipeline, Step
+from clpipe.config import Chain, Step
 from clpipe.device import Device, Timing
 from clpipe.errors import ImageError
 from clpipe.plan import Plan, make_plan
@@ -31,14 +31,14 @@ class Result:
     found: dict[str, dict[str, float]]
 
 
-def streams(pipeline: Pipeline, step: Step, image_key: str) -> dict[Owner, Stream]:
+def streams(chain: Chain, step: Step, image_key: str) -> dict[Owner, Stream]:
     """The random streams of a step for one image.
 
     Image noise is keyed on the seed and the image key, fixed pattern noise on the camera.
     """
     return {
-        Owner.IMAGE: stream_of(f"image:{pipeline.seed}:{image_key}", step.name),
-        Owner.CAMERA: stream_of(f"camera:{pipeline.camera.name}", step.name),
+        Owner.IMAGE: stream_of(f"image:{chain.seed}:{image_key}", step.name),
+        Owner.CAMERA: stream_of(f"camera:{chain.camera.name}", step.name),
     }
 
 
@@ -46,7 +46,7 @@ class Runner:
     """Runs one chain over images, on a device, or in NumPy where there is none.
 
     Args:
-        pipeline: the chain.
+        chain: the chain.
         device: where to run; None is NumPy.
         keep: steps whose image is wanted.
         encode: whether the last image is wanted in eight bits.
@@ -55,34 +55,32 @@ class Runner:
 
     def __init__(
         self,
-        pipeline: Pipeline,
+        chain: Chain,
         device: Device | None,
         keep: Sequence[str] = (),
         encode: bool = True,
         final: bool = False,
     ) -> None:
-        self.pipeline = pipeline
+        self.chain = chain
         self.device = device
         self.keep = tuple(keep)
         self.encode = encode
         self.final = final
         self._plans: dict[tuple[bool, bool], Plan] = {}
-        self._arguments = {s.name: s.method.arguments(s.context) for s in pipeline.steps}
+        self._arguments = {s.name: s.method.arguments(s.context) for s in chain.steps}
         self._table8: dict[str, Array] = {}
 
     def plan(self, half: bool = True, fold: bool = True) -> Plan:
         """The plan for a source of half floats or floats."""
         key = (half, fold)
         if key not in self._plans:
-            self._plans[key] = make_plan(
-                self.pipeline, half, self.keep, self.encode, self.final, fold
-            )
+            self._plans[key] = make_plan(self.chain, half, self.keep, self.encode, self.final, fold)
         return self._plans[key]
 
     def warm_up(self, half: bool = True) -> None:
         """Compile everything, so that the first image does not wait for it."""
         if self.device:
-            shape = (8, 8, 3)[: 2 if len(self.pipeline.source.channels) == 1 else 3]
+            shape = (8, 8, 3)[: 2 if len(self.chain.source.channels) == 1 else 3]
             self.run(np.zeros(shape, np.float16 if half else np.float32), "")
 
     def run(
@@ -104,19 +102,19 @@ class Runner:
         Raises:
             ImageError: an image of the wrong shape, or one that does not fit the device.
         """
-        channels = len(self.pipeline.source.channels)
+        channels = len(self.chain.source.channels)
         shape = image.shape[2] if image.ndim == 3 else 1
         if image.ndim not in (2, 3) or shape != channels or 0 in image.shape:
             raise ImageError(
                 f"found an image of shape {image.shape}, but the chain starts on "
-                f"{self.pipeline.source.label} with {channels} channel(s)"
+                f"{self.chain.source.label} with {channels} channel(s)"
             )
         if not self.device:
             return self._run_numpy(np.asarray(image, np.float32), image_key)
         if image.dtype not in (np.float16, np.float32):
             image = image.astype(np.float32)
         plan = self.plan(image.dtype == np.float16, fold=min(image.shape[:2]) > 1)
-        keys = {s.name: streams(self.pipeline, s, image_key) for s in self.pipeline.steps}
+        keys = {s.name: streams(self.chain, s, image_key) for s in self.chain.steps}
 
         def bind(parameter: Parameter) -> Any:
             if parameter.role == "table8":
@@ -130,9 +128,7 @@ class Runner:
             return np.uint32(stream.key1 if parameter.item.endswith("1") else stream.key0)
 
         output = self.device.run(plan, image, bind, timings, download)
-        names = {
-            s.name: [n for p in s.method.passes() for n in p.found] for s in self.pipeline.steps
-        }
+        names = {s.name: [n for p in s.method.passes() for n in p.found] for s in self.chain.steps}
         return Result(
             final=output.images.get(plan.final.number) if plan.final else None,
             encoded=output.encoded,
@@ -158,15 +154,15 @@ class Runner:
     def _run_numpy(self, image: Floats, image_key: str) -> Result:
         kept: dict[str, Floats] = {}
         found: dict[str, dict[str, float]] = {}
-        for step in self.pipeline.steps:
-            frame = Frame(step.context, streams(self.pipeline, step, image_key), {})
+        for step in self.chain.steps:
+            frame = Frame(step.context, streams(self.chain, step, image_key), {})
             image = step.method.reference(image, frame)
             if step.name in self.keep:
                 kept[step.name] = image
             if frame.found:
                 found[step.name] = frame.found
         return Result(
-            final=image if self.final or self.pipeline.steps[-1].name in self.keep else None,
+            final=image if self.final or self.chain.steps[-1].name in self.keep else None,
             encoded=to_8_bit(image) if self.encode else None,
             kept=kept,
             found=found,

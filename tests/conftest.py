@@ -6,7 +6,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from clpipe.config import make_pipeline, settings_from
+from clpipe.config import make_chain, settings_from
 from clpipe.device import Device, choose, find_devices
 from clpipe.run import Result, Runner
 from clpipe.stage import Kind
@@ -41,8 +41,8 @@ def develop(device: Device) -> Callable[..., Result]:
         encode: bool = False,
         **settings: Any,
     ) -> Result:
-        pipeline = make_pipeline(settings_from(settings), source)
-        runner = Runner(pipeline, None if numpy else device, keep, encode=encode, final=True)
+        chain = make_chain(settings_from(settings), source)
+        runner = Runner(chain, None if numpy else device, keep, encode=encode, final=True)
         return runner.run(image, key)
 
     return run

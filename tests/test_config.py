@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 
 from clpipe.camera import load_camera
-from clpipe.config import make_pipeline, parse_assignment, read_settings, settings_from
+from clpipe.config import make_chain, parse_assignment, read_settings, settings_from
 from clpipe.errors import RequestError
 
 
 def build(**settings):
-    return make_pipeline(settings_from(settings))
+    return make_chain(settings_from(settings))
 
 
 @pytest.mark.parametrize(
@@ -86,8 +86,8 @@ def test_a_malformed_assignment(text):
 
 
 def test_parameters_come_from_the_camera_and_from_each_other():
-    pipeline = build(iso=640, inverse_white_balance={"red_gain": 2.5})
-    values = {step.name: step.method.model_dump() for step in pipeline.steps}
+    chain = build(iso=640, inverse_white_balance={"red_gain": 2.5})
+    values = {step.name: step.method.model_dump() for step in chain.steps}
     assert values["inverse_white_balance"] == {"red_gain": 2.5, "blue_gain": 1.36}
     assert values["white_balance"] == values["inverse_white_balance"]
     assert values["normalize"] == values["quantize"] == {"black_level": 512, "white_level": 16383}
@@ -96,16 +96,16 @@ def test_parameters_come_from_the_camera_and_from_each_other():
 
 
 def test_without_its_inverse_white_balance_takes_nothing_in():
-    pipeline = build(skip=["inverse_white_balance"])
-    assert pipeline.step_named("white_balance").method.model_dump() == {
+    chain = build(skip=["inverse_white_balance"])
+    assert chain.step_named("white_balance").method.model_dump() == {
         "red_gain": 1,
         "blue_gain": 1,
     }
 
 
 def test_a_repeated_stage_has_settings_of_its_own():
-    pipeline = build(stages=["exposure", "exposure"], exposure={"ev": 1}, exposure_2={"ev": 2})
-    assert [(s.name, s.method.ev) for s in pipeline.steps] == [("exposure", 1), ("exposure_2", 2)]
+    chain = build(stages=["exposure", "exposure"], exposure={"ev": 1}, exposure_2={"ev": 2})
+    assert [(s.name, s.method.ev) for s in chain.steps] == [("exposure", 1), ("exposure_2", 2)]
 
 
 def test_every_parameter_says_what_it_is():

@@ -6,7 +6,7 @@ import pytest
 
 from clpipe import codegen
 from clpipe.check import check_method
-from clpipe.config import make_pipeline, read_settings
+from clpipe.config import make_chain, read_settings
 from clpipe.device import Device
 from clpipe.stages import all_stages
 from tests.conftest import ROOT
@@ -47,6 +47,6 @@ def test_every_link_leads_somewhere(name):
 def test_the_configuration_in_the_readme_is_valid(tmp_path):
     path = tmp_path / "pipeline.toml"
     path.write_text(re.search(r"```toml\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1])
-    pipeline = make_pipeline(read_settings(path))
-    assert pipeline.iso == 1600
-    assert "row_noise" not in [step.name for step in pipeline.steps]
+    chain = make_chain(read_settings(path))
+    assert chain.iso == 1600
+    assert "row_noise" not in [step.name for step in chain.steps]

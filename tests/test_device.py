@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clpipe.config import make_pipeline, settings_from
+from clpipe.config import make_chain, settings_from
 from clpipe.describe import device_rows
 from clpipe.device import Device, Extent, choose, find_devices
 from clpipe.errors import DeviceError, ImageError
@@ -76,7 +76,7 @@ def test_a_missing_linker_is_a_problem_of_pocl(monkeypatch):
 
 def test_an_image_too_large_for_the_device_fails_alone(device):
     tiny = Device(replace(device.info, memory=1000))
-    runner = Runner(make_pipeline(settings_from({})), tiny)
+    runner = Runner(make_chain(settings_from({})), tiny)
     with pytest.raises(
         ImageError, match=r"64x64 pixels need .* MiB on the device, which has 0 MiB"
     ):
@@ -85,7 +85,7 @@ def test_an_image_too_large_for_the_device_fails_alone(device):
 
 def test_after_an_image_that_is_too_large_the_next_one_works(device):
     small = Device(replace(device.info, max_buffer=200_000))
-    runner = Runner(make_pipeline(settings_from({})), small)
+    runner = Runner(make_chain(settings_from({})), small)
     image = np.full((20, 30, 3), 0.5, np.float16)
     expected = runner.run(image, "k").encoded
     for _ in range(2):
@@ -96,7 +96,7 @@ def test_after_an_image_that_is_too_large_the_next_one_works(device):
 
 def test_a_second_run_compiles_nothing(device, monkeypatch):
     fresh = Device(device.info)
-    runner = Runner(make_pipeline(settings_from({})), fresh)
+    runner = Runner(make_chain(settings_from({})), fresh)
     image = np.zeros((20, 30, 3), np.float16)
     runner.run(image, "k")
 
@@ -106,7 +106,7 @@ def test_a_second_run_compiles_nothing(device, monkeypatch):
     monkeypatch.setattr(fresh, "_compile", compile_again)
     runner.run(image, "other")
     runner.run(np.zeros((50, 10, 3), np.float16), "k")
-    changed = make_pipeline(settings_from({"iso": 3200, "exposure": {"ev": 1}, "seed": 4}))
+    changed = make_chain(settings_from({"iso": 3200, "exposure": {"ev": 1}, "seed": 4}))
     Runner(changed, fresh).run(image, "k")
 
 

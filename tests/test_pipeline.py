@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clpipe.config import make_pipeline, settings_from
+from clpipe.config import make_chain, settings_from
 from clpipe.image_io import read_image
 from clpipe.run import Runner
 from tests.conftest import STILL_LIFE
@@ -21,7 +21,7 @@ def still_life():
 
 
 def runner(settings, device, **options):
-    return Runner(make_pipeline(settings_from(settings)), device, **options)
+    return Runner(make_chain(settings_from(settings)), device, **options)
 
 
 @pytest.mark.parametrize("settings", SETTINGS)
@@ -30,7 +30,7 @@ def test_what_is_kept_changes_no_bit(device, still_life, settings, shape):
     image = np.ascontiguousarray(still_life[200 : 200 + shape[0], 300 : 300 + shape[1]])
     plain = runner(settings, device)
     expected = plain.run(image, "k").encoded
-    steps = [step.name for step in plain.pipeline.steps]
+    steps = [step.name for step in plain.chain.steps]
     for keep in (["sensor_noise", "tone_curve"], ["normalize", "demosaic"], ["white_balance"]):
         result = runner(settings, device, keep=keep).run(image, "k")
         assert np.array_equal(result.encoded, expected), keep
@@ -106,7 +106,7 @@ def test_gray_world_of_darkness_changes_nothing(develop, numpy):
 
 def test_denoising_follows_the_iso_and_is_stronger_on_chroma():
     def sigmas(iso):
-        method = make_pipeline(settings_from({"iso": iso})).step_named("denoise").method
+        method = make_chain(settings_from({"iso": iso})).step_named("denoise").method
         return method.luma_sigma, method.chroma_sigma
 
     low, high = sigmas(100), sigmas(3200)

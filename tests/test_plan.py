@@ -3,7 +3,7 @@
 import pytest
 
 from clpipe.codegen import write_kernel
-from clpipe.config import make_pipeline, settings_from
+from clpipe.config import make_chain, settings_from
 from clpipe.errors import RequestError
 from clpipe.plan import AddUp, Find, Launch, Lines, make_plan
 from clpipe.stage import Kind
@@ -13,7 +13,7 @@ GRAY_WORLD = {"white_balance": {"method": "gray_world"}}
 
 def plan_of(keep=(), fold=True, final=False, encode=True, **settings):
     return make_plan(
-        make_pipeline(settings_from(settings)), keep=keep, fold=fold, final=final, encode=encode
+        make_chain(settings_from(settings)), keep=keep, fold=fold, final=final, encode=encode
     )
 
 
@@ -62,9 +62,9 @@ def test_keeping_a_stage_at_the_end_of_a_group_costs_no_launch_but_a_slot():
 
 
 def test_keeping_all():
-    pipeline = make_pipeline(settings_from(GRAY_WORLD))
-    steps = tuple(step.name for step in pipeline.steps)
-    plan = make_plan(pipeline, keep=steps)
+    chain = make_chain(settings_from(GRAY_WORLD))
+    steps = tuple(step.name for step in chain.steps)
+    plan = make_plan(chain, keep=steps)
     assert tuple(name for name, _ in plan.kept) == steps
 
 
@@ -128,5 +128,5 @@ def test_a_stage_that_is_not_in_the_chain_cannot_be_kept():
 
 
 def test_a_chain_may_begin_with_a_stencil():
-    pipeline = make_pipeline(settings_from({"stages": ["demosaic"]}), Kind.MOSAIC)
-    assert names(make_plan(pipeline))[0] == "load"
+    chain = make_chain(settings_from({"stages": ["demosaic"]}), Kind.MOSAIC)
+    assert names(make_plan(chain))[0] == "load"

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from clpipe.batch import Job, Target, run_jobs
-from clpipe.config import make_pipeline, settings_from
+from clpipe.config import make_chain, settings_from
 from clpipe.device import Device, choose, find_devices
 from clpipe.image_io import read_image
 from clpipe.run import Runner
@@ -24,7 +24,7 @@ ISOS = (800, 6400)
 
 def develop(folder: Path, device: Device, iso: float) -> Image.Image:
     """The render through the camera at an ISO."""
-    pipeline = make_pipeline(settings_from({"iso": iso}))
+    pipeline = make_chain(settings_from({"iso": iso}))
     job, target = Job(RENDER, RENDER.name), Target(folder, ("png",))
     list(run_jobs([job], Runner(pipeline, device), target))
     with Image.open(target.path(job, "png")) as image:
