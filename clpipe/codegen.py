@@ -11,7 +11,7 @@ from functools import cache
 from importlib import resources
 from pathlib import Path
 
-from clpipe.plan import AddUp, AnyLaunch, Find, Launch, Lines, Op, Plan, Read
+from clpipe.plan import AddUp, AnyLaunch, Count, Find, Launch, Lines, Op, Plan, Read
 from clpipe.stage import Access, Kind
 
 LIBRARY = (
@@ -35,8 +35,8 @@ class Parameter:
     """One kernel parameter: its OpenCL declaration, and what is bound to it.
 
     ``role`` is one of extent (width, height, pitch), source, slot, encoded, table8 (the composed
-    curve), value, key, lines, found, sums, shares, count; ``step``, ``item`` and
-    ``number`` tell which.
+    curve), value, key, lines, found, sums, shares, count, counts, histogram; ``step``, ``item``
+    and ``number`` tell which.
     """
 
     declaration: str
@@ -112,8 +112,10 @@ class _Writer:
         slots = [self.slot(n, False) for n in self.plan.slots[read.image.number]]
         return (slots + [slots[-1]] * 2)[:3]
 
-    def arguments(self, op: Op, found: dict[str, tuple[str, int]]) -> list[str]:
-        """The actual arguments of a pass after the pixel and its site."""
+    def arguments(
+        self, op: Op, found: dict[str, tuple[str, int]], names: Sequence[str] | None = None
+    ) -> list[str]:
+        """The actual arguments of a pass, or those ``names``, after the pixel and its site."""
         pass_, types, literals = op.pass_, dict(op.types), dict(op.literals)
         texts = []
         if pass_.random:
@@ -124,7 +126,7 @@ class _Writer:
                 )
             stage = self.parameter(f"{op.step}_stage", "uint", "key", step=op.step, item="stage")
             texts.append(f"(stream){{{key}0, {key}1, {stage}}}")
-        for name in pass_.arguments:
+        for name in pass_.arguments if names is None else names:
             full = f"{op.step}_{name}"
             if name in literals:
                 texts.append(literals[name])
@@ -178,6 +180,9 @@ def write_kernel(plan: Plan, launch: AnyLaunch, index: int, lanes: int) -> Kerne
         case Lines():
             body = _lines(writer, launch)
             text += files_text(kernels_of(launch.ops), seen)
+        case Count():
+            body = _count(writer, launch)
+            text += files_text(kernels_of([launch.op]), seen)
         case AddUp():
             body = _add_up(writer, launch)
         case Find():
@@ -289,7 +294,8 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
     before = after = ""
     if launch.sums:
         writer.parameter("sums", "__global int4 *restrict ", "sums")
-        lines.append(f"const vi sample = only_inside({call(launch.sums, [value])}, at, e);")
+        sample = call(launch.sums, [value, *writer.arguments(launch.sums, {})])
+        lines.append(f"const vi sample = only_inside({sample}, at, e);")
         lines.append("if (row & 1) odd_rows += sample; else even_rows += sample;")
         before = "    vi even_rows = (vi)(0), odd_rows = (vi)(0);\n"
         after = (
@@ -331,7 +337,28 @@ def _lines(writer: _Writer, launch: Lines) -> str:
     return body
 
 
+def _count(writer: _Writer, launch: Count) -> str:
+    op, bins = launch.op, launch.op.pass_.bins
+    plane = writer.planes(launch.reads[0])[0]
+    counts = writer.parameter("counts", "__global uint *", "counts", number=bins)
+    arguments = ["origin", "x", "y", "e", *writer.arguments(op, {})]
+    return (
+        f"    __global const float *origin = {plane} + plane_offset(site_at(0, 0), pitch);\n"
+        f"    __global uint *own = {counts} + (size_t)get_global_id(0) * {bins};\n"
+        f"    for (uint k = 0; k < {bins}; ++k) own[k] = 0;\n"
+        f"    for (uint y = get_global_id(0); y < height; y += {SHARES}) {{\n"
+        "        for (uint x = 0; x < width; ++x) {\n"
+        f"            const int bin = {call(op, arguments)};\n"
+        "            if (bin >= 0) own[bin] += 1;\n"
+        "        }\n    }\n"
+    )
+
+
 def _add_up(writer: _Writer, launch: AddUp) -> str:
+    if bins := launch.op.pass_.bins:
+        writer.parameter("counts", "__global const uint *", "counts", number=bins)
+        writer.parameter("histogram", "__global uint *", "histogram", number=bins)
+        return f"    add_up_counts(counts, histogram, {bins}, {SHARES});\n"
     writer.parameter("sums", "__global const int4 *", "sums")
     writer.parameter("shares", "__global long4 *", "shares")
     writer.parameter("count", "uint", "count", step=launch.op.step)
@@ -339,11 +366,17 @@ def _add_up(writer: _Writer, launch: AddUp) -> str:
 
 
 def _find(writer: _Writer, launch: Find) -> str:
-    writer.parameter("shares", "__global const long4 *", "shares")
+    pass_ = launch.op.pass_
+    if pass_.bins:
+        whole = writer.parameter(
+            "histogram", "__global const uint *", "histogram", number=pass_.bins
+        )
+    else:
+        writer.parameter("shares", "__global const long4 *", "shares")
+        whole = f"add_up_shares(shares, {SHARES})"
     found = writer.parameter(
         f"{launch.op.step}_found", "__global float *", "found", step=launch.op.step
     )
-    arguments = writer.arguments(launch.op, {})
-    finish = launch.op.pass_.finish
-    texts = [f"add_up_shares(shares, {SHARES})", *arguments, "e", found]
-    return f"    {finish}({', '.join(texts)});\n"
+    arguments = writer.arguments(launch.op, {}, pass_.finish_arguments)
+    texts = [whole, *arguments, "e", found]
+    return f"    {pass_.finish}({', '.join(texts)});\n"

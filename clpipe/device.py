@@ -20,7 +20,7 @@ from clpipe.codegen import (
     write_kernel,
 )
 from clpipe.errors import DeviceError, ImageError
-from clpipe.plan import AddUp, Find, Image, Launch, Lines, Plan
+from clpipe.plan import AddUp, Count, Find, Image, Launch, Lines, Plan
 from clpipe.suggest import one_of
 from clpipe.types import Array
 
@@ -334,7 +334,7 @@ class Device:
             case Lines():
                 longest = round_up(max(extent.width, extent.height), extent.lanes)
                 return (round_up(longest // extent.lanes, LOCAL_SIZE),), (LOCAL_SIZE,)
-            case AddUp():
+            case Count() | AddUp():
                 return (SHARES,), (LOCAL_SIZE,)
             case Find():
                 return (1,), (1,)
@@ -364,6 +364,10 @@ class Device:
                 return np.uint32(blocks)
             case "shares":
                 return self._buffer("shares", SHARES * 32)
+            case "counts":
+                return self._buffer("counts", SHARES * parameter.number * 4)
+            case "histogram":
+                return self._buffer("histogram", parameter.number * 4)
             case "found":
                 return self._buffer(f"found.{parameter.step}", 16)
             case _:

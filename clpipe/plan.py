@@ -75,8 +75,17 @@ class Lines:
 
 
 @dataclass(frozen=True)
+class Count:
+    """A histogram's start: each work item counts its share of a stored image's rows."""
+
+    op: Op
+    reads: tuple[Read]
+    name: str
+
+
+@dataclass(frozen=True)
 class AddUp:
-    """The first half of a reduction: partial sums of blocks to partial sums of work items."""
+    """A reduction goes on: sums of blocks to sums of work items, or counts to one histogram."""
 
     op: Op
     name: str
@@ -84,13 +93,18 @@ class AddUp:
 
 @dataclass(frozen=True)
 class Find:
-    """The second half of a reduction: one work item makes the numbers out of the sums."""
+    """The end of a reduction: one work item makes the numbers out of the sums or the histogram."""
 
     op: Op
     name: str
 
 
-AnyLaunch = Launch | Lines | AddUp | Find
+AnyLaunch = Launch | Lines | Count | AddUp | Find
+
+
+def reads_of(launch: AnyLaunch) -> tuple[Read, ...]:
+    """The stored images that a launch reads."""
+    return launch.reads if isinstance(launch, Launch | Count) else ()
 
 
 @dataclass(frozen=True)
@@ -175,6 +189,12 @@ class _Planner:
                     continue
                 case Access.SUMS:
                     self.close(sums=op)
+                    self.launches.append(AddUp(op, f"{step.name}.add_up"))
+                    self.launches.append(Find(op, f"{step.name}.{pass_.finish}"))
+                    continue
+                case Access.HISTOGRAM:
+                    stored = Read(self.close())
+                    self.launches.append(Count(op, (stored,), f"{step.name}.count"))
                     self.launches.append(AddUp(op, f"{step.name}.add_up"))
                     self.launches.append(Find(op, f"{step.name}.{pass_.finish}"))
                     continue
@@ -272,25 +292,20 @@ def assign_slots(
     Returns the slots of each image number, and how many slots there are.
     """
     last_use = {
-        read.image.number: i
-        for i, launch in enumerate(launches)
-        if isinstance(launch, Launch)
-        for read in launch.reads
+        read.image.number: i for i, launch in enumerate(launches) for read in reads_of(launch)
     }
     slots: dict[int, tuple[int, ...]] = {}
     free: list[int] = []
     count = 0
     for i, launch in enumerate(launches):
-        if not isinstance(launch, Launch):
-            continue
-        if launch.writes:
+        if isinstance(launch, Launch) and launch.writes:
             planes = len(launch.writes.kind.channels)
             while len(free) < planes:
                 free.append(count)
                 count += 1
             slots[launch.writes.number] = tuple(free[:planes])
             del free[:planes]
-        for read in {read.image.number for read in launch.reads}:
+        for read in {read.image.number for read in reads_of(launch)}:
             if last_use[read] == i and read not in pinned:
                 free.extend(slots[read])
     return slots, count
@@ -298,14 +313,13 @@ def assign_slots(
 
 def launch_bytes(plan: Plan, launch: AnyLaunch, lanes: int) -> float:
     """Bytes a pixel that a launch reads and writes in device memory, each sample once."""
-    if isinstance(launch, AddUp):
+    if isinstance(launch, AddUp) and launch.op.pass_.access is Access.SUMS:
         return 16 / (lanes * 4)
+    total = float(sum(4 * len(read.image.kind.channels) for read in reads_of(launch)))
     if not isinstance(launch, Launch):
-        return 0.0
-    total = 0.0
+        return total
     if not launch.reads:
         total += len(plan.source.channels) * (2 if plan.half else 4)
-    total += sum(4 * len(read.image.kind.channels) for read in launch.reads)
     if launch.writes:
         total += 4 * len(launch.writes.kind.channels)
     if launch.encodes and plan.encoded:

@@ -49,6 +49,7 @@ class Access(Enum):
     STENCIL = "stencil"  # a pixel from its neighbours
     LINES = "lines"  # a table with a value a row or column, from no image
     SUMS = "sums"  # sums over the whole image, then a few numbers found from them
+    HISTOGRAM = "histogram"  # counts over the whole image, then a few numbers found from them
 
 
 class Owner(Enum):
@@ -77,8 +78,10 @@ class Pass:
     random: Owner | None = None  # gets a random stream as its first argument
     cheap: bool = False  # so cheap that a stencil after it may redo it at each tap
     lines: str = ""  # LINES: "rows" or "columns"
-    finish: str = ""  # SUMS: the function that turns sums into what is found
-    found: tuple[str, ...] = ()  # SUMS: names of the numbers it finds
+    finish: str = ""  # SUMS, HISTOGRAM: the function that turns these into what is found
+    finish_arguments: tuple[str, ...] = ()  # of that function
+    found: tuple[str, ...] = ()  # SUMS, HISTOGRAM: names of the numbers it finds, at most four
+    bins: int = 0  # HISTOGRAM: how many
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,7 @@ class Method(BaseModel):
         return context
 
     def passes(self) -> tuple[Pass, ...]:
-        """The kernel functions, in order."""
+        """The kernel functions, in order; none where the image stays as it is."""
         raise NotImplementedError(type(self).__name__)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:

@@ -1,0 +1,14 @@
+"""White balance on the mosaic. What a gain lifts above 1 clips: burnt-out highlights are white."""
+
+from clpipe.stage import Kind, Stage
+from clpipe.stages.white_balance.gains import AsShot, Gains, Unbalanced
+from clpipe.stages.white_balance.gray_world import GrayWorld
+from clpipe.stages.white_balance.white_patch import WhitePatch
+
+STAGE = Stage(
+    "white_balance",
+    "Make white white.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (AsShot, GrayWorld, WhitePatch, Gains, Unbalanced),
+)
