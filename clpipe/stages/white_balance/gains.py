@@ -1,0 +1,77 @@
+"""White balance with gains that are known beforehand."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.reference.cfa import by_site
+from clpipe.stage import Argument, Context, Frame, Method, Pass, parameter
+from clpipe.types import Floats
+
+
+def balanced(image: Floats, context: Context, red: np.float32, blue: np.float32) -> Floats:
+    """The mosaic with its gains, clipped at white."""
+    gains = by_site(image.shape, context.pattern, red, np.float32(1), blue)
+    return np.minimum(image * gains, np.float32(1))
+
+
+class AsShot(Method):
+    """The gains that inverse_white_balance took out (none, if it did not run)."""
+
+    method: ClassVar = "as_shot"
+    kernel: ClassVar = "site_gains"
+    summary: ClassVar = "give back the gains that inverse_white_balance took out"
+
+    red_gain: float | None = parameter(
+        None, "Gain of red, green = 1.", auto="as inverse_white_balance used it", gt=0, le=64
+    )
+    blue_gain: float | None = parameter(
+        None, "Gain of blue, green = 1.", auto="as inverse_white_balance used it", gt=0, le=64
+    )
+
+    def resolve(self, context: Context) -> "AsShot":
+        red, blue = context.gains
+        return self.filled(red_gain=red, blue_gain=blue)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("white_balance", arguments=("pattern", "red_gain", "blue_gain"), cheap=True),)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        red, blue = np.float32(self.red_gain), np.float32(self.blue_gain)
+        return {"pattern": context.cfa, "red_gain": red, "blue_gain": blue}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        return balanced(image, frame.context, np.float32(self.red_gain), np.float32(self.blue_gain))
+
+
+class Gains(AsShot):
+    """Fixed gains, those of the camera if none are given."""
+
+    method: ClassVar = "gains"
+    summary: ClassVar = "fixed gains, the camera's unless given"
+
+    red_gain: float | None = parameter(
+        None, "Gain of red, green = 1.", auto="from the camera", gt=0, le=64
+    )
+    blue_gain: float | None = parameter(
+        None, "Gain of blue, green = 1.", auto="from the camera", gt=0, le=64
+    )
+
+    def resolve(self, context: Context) -> "Gains":
+        red, blue = context.camera.white_balance_gains
+        return self.filled(red_gain=red, blue_gain=blue)
+
+
+class Unbalanced(Method):
+    """The mosaic stays as it is; with inverse_white_balance before it, as the sensor saw it."""
+
+    method: ClassVar = "none"
+    kernel: ClassVar = ""
+    summary: ClassVar = "no gains"
+
+    def passes(self) -> tuple[Pass, ...]:
+        return ()
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        return image

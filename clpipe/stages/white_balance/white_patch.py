@@ -1,0 +1,107 @@
+"""White patch."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.reference.cfa import by_site
+from clpipe.stage import Access, Argument, Context, Frame, Method, Pass, parameter
+from clpipe.stages.white_balance.gains import balanced
+from clpipe.types import Floats
+
+STEPS = 6144  # bins a colour: 12 octaves below 1, 512 each
+_FIRST = int(np.float32(2.0**-12).view(np.int32))
+
+
+def cell_maximum(image: Floats) -> Floats:
+    """At each pixel the largest sample of its 2x2 cell; (height, width) in and out.
+
+    >>> cell_maximum(np.float32([[1, 2, 9], [3, 4, 0]])).tolist()
+    [[4.0, 4.0, 9.0], [4.0, 4.0, 9.0]]
+    """
+    height, width = image.shape
+    whole = np.pad(image, ((0, height % 2), (0, width % 2)), mode="edge")
+    cells = whole.reshape(len(whole) // 2, 2, -1, 2).max((1, 3))
+    return np.repeat(np.repeat(cells, 2, 0), 2, 1)[:height, :width]
+
+
+def percentile_level(samples: Floats, millionths: int) -> np.float32:
+    """The middle of the bin that holds the sample of that rank; 0 where there are no samples.
+
+    >>> percentile_level(np.float32([0.1, 0.2, 0.5]), 500_000)
+    np.float32(0.20007324)
+    """
+    if not samples.size:
+        return np.float32(0)
+    bins = (np.maximum(samples, np.float32(2.0**-12)).view(np.int32) - _FIRST) >> 14
+    rank = -(-samples.size * millionths // 1_000_000)
+    below = np.cumsum(np.bincount(bins.ravel(), minlength=STEPS))
+    bin_ = int(np.argmax(below >= rank))
+    return np.int32(_FIRST + (bin_ << 14) + (1 << 13)).view(np.float32)
+
+
+class WhitePatch(Method):
+    """k_c = max(G) / max(c), the maximum as a percentile (Land and McCann, J. Opt. Soc. Am. 1971).
+
+    Cells of 2x2 samples that clip are left out: of a burnt-out light nothing is known but that it
+    was too bright. Levels are told apart in steps of 1/512 of an octave's lower end.
+    """
+
+    method: ClassVar = "white_patch"
+    kernel: ClassVar = "white_patch"
+    summary: ClassVar = "make the brightest samples that do not clip equal"
+    tolerance: ClassVar = 1e-6  # of the gains: division is not exact on every device
+
+    percentile: float = parameter(
+        99.0, "Share of a colour's samples that are darker than its white.", "%", gt=0, le=100
+    )
+    clip: float = parameter(
+        0.99,
+        "Level from which a sample counts as clipped; its 2x2 cell is left out.",
+        "signal",
+        gt=0,
+        le=1,
+    )
+
+    @property
+    def _millionths(self) -> int:
+        return max(1, round(self.percentile * 10_000))
+
+    def passes(self) -> tuple[Pass, ...]:
+        gains = ("red_gain", "blue_gain")
+        return (
+            Pass(
+                "white_patch_bin",
+                Access.HISTOGRAM,
+                ("pattern", "clip"),
+                finish="white_patch",
+                finish_arguments=("millionths",),
+                found=gains,
+                bins=3 * STEPS,
+            ),
+            Pass("white_balance", arguments=("pattern", *gains), cheap=True),
+        )
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {
+            "pattern": context.cfa,
+            "clip": np.float32(self.clip),
+            "millionths": np.uint32(self._millionths),
+        }
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        site = by_site(
+            image.shape, frame.context.pattern, np.float32(0), np.float32(1), np.float32(2)
+        )
+        unclipped = cell_maximum(image) < np.float32(self.clip)
+        red, green, blue = (
+            percentile_level(image[unclipped & (site == colour)], self._millionths)
+            for colour in range(3)
+        )
+
+        def gain(level: np.float32) -> np.float32:
+            return green / level if green > 0 and level > 0 else np.float32(1)
+
+        frame.found["red_gain"], frame.found["blue_gain"] = float(gain(red)), float(gain(blue))
+        return balanced(image, frame.context, gain(red), gain(blue))
