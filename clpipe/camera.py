@@ -6,10 +6,23 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from clpipe.errors import RequestError
 from clpipe.suggest import one_of
+
+Row = tuple[float, float, float]
+Matrix = tuple[Row, Row, Row]
+
+# Linear sRGB to XYZ, D65 (IEC 61966-2-1, 1999).
+SRGB_TO_XYZ = np.array(
+    [
+        [0.4123908, 0.3575843, 0.1804808],
+        [0.2126390, 0.7151687, 0.0721923],
+        [0.0193308, 0.1191948, 0.9505322],
+    ]
+)
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -43,6 +56,7 @@ class Camera(BaseModel):
     black_level: Annotated[float, Field(ge=0)]
     white_level: Positive
     white_balance_gains: tuple[Positive, Positive]  # red, blue
+    xyz_to_camera: Matrix | None = None  # XYZ to camera RGB at D65, as a DNG's ColorMatrix2
     row_noise_ratio: Annotated[float, Field(ge=0)]  # row sigma over read noise sigma
     column_noise_ratio: Annotated[float, Field(ge=0)]
     iso_range: tuple[Positive, Positive]
@@ -53,7 +67,23 @@ class Camera(BaseModel):
     def _ordered(self) -> "Camera":
         if self.white_level <= self.black_level:
             raise ValueError("white_level must be above black_level")
+        if self.xyz_to_camera and abs(np.linalg.det(self.xyz_to_camera)) < 1e-6:
+            raise ValueError("xyz_to_camera is singular")
         return self
+
+    def srgb_to_camera(self) -> NDArray[np.float64]:
+        """The matrix from linear sRGB to white-balanced camera RGB; a grey stays what it is.
+
+        sRGB goes to XYZ and from there to the camera's RGB; each row is then scaled to the sum 1,
+        which is what white balance does (Coffin, dcraw: cam_xyz_coeff).
+
+        Raises:
+            RequestError: the profile has no ``xyz_to_camera``.
+        """
+        if self.xyz_to_camera is None:
+            raise RequestError(f"camera {self.name}: its profile has no xyz_to_camera")
+        matrix = np.array(self.xyz_to_camera) @ SRGB_TO_XYZ
+        return matrix / matrix.sum(1, keepdims=True)
 
     def noise(self, iso: float) -> tuple[float, float]:
         """The a and b of Var[y] = a*y + b at an ISO, in signal units (y = 1 at the white level).

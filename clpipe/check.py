@@ -98,8 +98,9 @@ def check_method(
         source = stage.reads
         if source is Kind.MOSAIC and stage.name != "mosaic":
             chain, source = ("mosaic", stage.name), Kind.RGB
-        parameters: dict[str, dict[str, str]] = {"mosaic": {"pattern": pattern}}
-        parameters[stage.name] = parameters.get(stage.name, {}) | {"method": method.method}
+        parameters: dict[str, dict[str, Any]] = {"mosaic": {"pattern": pattern}}
+        own = {"method": method.method, **method.example}
+        parameters[stage.name] = parameters.get(stage.name, {}) | own
         settings = Settings(iso=3200, stages=chain, parameters=parameters)
         more = compare(device, settings, source, sizes)
         samples, differing = samples + more[0], differing + more[1]

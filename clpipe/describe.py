@@ -1,8 +1,9 @@
 """Plans, stages and devices in words, for people and for programs."""
 
+import json
 import types
 from collections.abc import Sequence
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from clpipe.device import Found, choose
 from clpipe.errors import DeviceError
@@ -96,9 +97,26 @@ def type_text(annotation: Any) -> str:
     """A parameter's type, in a word."""
     if get_origin(annotation) is Literal:
         return " | ".join(map(str, get_args(annotation)))
+    if get_origin(annotation) is Annotated:
+        return type_text(get_args(annotation)[0])
+    if get_origin(annotation) is tuple:
+        return f"{len(get_args(annotation))} x {type_text(get_args(annotation)[0])}"
     if get_origin(annotation) in (Union, types.UnionType):
         return " | ".join(type_text(a) for a in get_args(annotation) if a is not type(None))
     return {"float": "number", "int": "whole number"}.get(annotation.__name__, annotation.__name__)
+
+
+def value_text(value: Any) -> str:
+    """A parameter's value, as TOML has it.
+
+    >>> value_text((1.0, 2.5)), value_text("bayer"), value_text(False)
+    ('[1, 2.5]', '"bayer"', 'false')
+    """
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(value_text, value))}]"
+    if isinstance(value, float):
+        return repr(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
+    return json.dumps(value, ensure_ascii=False)
 
 
 def parameter_rows(method: type[Method]) -> list[tuple[str, ...]]:
@@ -111,7 +129,7 @@ def parameter_rows(method: type[Method]) -> list[tuple[str, ...]]:
             for key, sign in LIMITS.items():
                 if (value := getattr(limit, key, None)) is not None:
                     allowed.append(f"{sign} {value:g}")
-        default = extra["auto"] if field.default is None else str(field.default)
+        default = extra["auto"] or value_text(field.default)
         rows.append((name, default, extra["unit"], ", ".join(allowed), field.description or ""))
     return rows
 

@@ -114,14 +114,26 @@ class Context:
 
 
 def parameter(
-    default: Any, text: str, unit: str = "", auto: str = "", structural: bool = False, **limits: Any
+    default: Any,
+    text: str,
+    unit: str = "",
+    auto: str = "",
+    structural: bool = False,
+    file: bool = False,
+    **limits: Any,
 ) -> Any:
     """Declare a parameter: default, one sentence, unit, limits (ge, gt, le, lt).
 
     ``auto`` says where the value comes from when it is left at None. ``structural`` values are
-    compiled into the kernel; all others may change from image to image at no cost.
+    compiled into the kernel; all others may change from image to image at no cost. ``file`` is the
+    name of a file, which a configuration gives relative to itself.
     """
-    extra: dict[str, JsonValue] = {"unit": unit, "auto": auto, "structural": structural}
+    extra: dict[str, JsonValue] = {
+        "unit": unit,
+        "auto": auto,
+        "structural": structural,
+        "file": file,
+    }
     return Field(default, description=text, json_schema_extra=extra, **limits)
 
 
@@ -134,6 +146,7 @@ class Method(BaseModel):
     kernel: ClassVar[str]  # file name in kernels/, without .cl
     summary: ClassVar[str]
     tolerance: ClassVar[float] = 0.0  # of the kernel against the reference; 0: bit for bit
+    example: ClassVar[Mapping[str, Any]] = {}  # to be checked with, where defaults do nothing
 
     def resolve(self, context: Context) -> Self:
         """The same method with every parameter that was left to the camera or the chain filled."""

@@ -26,6 +26,7 @@ KERNELS = {
     "demosaic_bilinear",
     "demosaic_edge_directed_median",
     "denoise_bilateral",
+    "color_matrix",
     "curve",
 }
 

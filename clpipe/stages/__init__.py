@@ -18,6 +18,7 @@ DEFAULT_CHAIN = (
     "white_balance",
     "demosaic",
     "denoise",
+    "color_matrix",
     "tone_curve",
     "gamma",
 )

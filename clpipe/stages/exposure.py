@@ -15,6 +15,7 @@ class Gain(Method):
     method: ClassVar = "gain"
     kernel: ClassVar = "exposure"
     summary: ClassVar = "multiply linear light by 2^ev"
+    example: ClassVar = {"ev": 0.7}
 
     ev: float = parameter(0.0, "Exposure compensation.", "EV", ge=-20, le=20)
 

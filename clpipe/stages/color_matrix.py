@@ -1,0 +1,110 @@
+"""From the camera's colours to those of linear sRGB."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import BeforeValidator, field_validator
+
+from clpipe.camera import Matrix
+from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.types import Floats
+
+IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+NAMES = tuple(f"{row}_{column}" for row in "rgb" for column in "rgb")
+
+
+def _as_tuples(value: Any) -> Any:
+    """Lists, as TOML has them, as the tuples that strict validation wants."""
+    return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple) else value
+
+
+class Unchanged(Method):
+    """A render's colours never were a camera's."""
+
+    method: ClassVar = "none"
+    kernel: ClassVar = ""
+    summary: ClassVar = "a render is in linear sRGB already"
+
+    def passes(self) -> tuple[Pass, ...]:
+        return ()
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        return image
+
+
+class Given(Method):
+    """A 3x3 matrix on each pixel's linear RGB."""
+
+    method: ClassVar = "given"
+    kernel: ClassVar = "color_matrix"
+    summary: ClassVar = "a matrix of one's own"
+    example: ClassVar = {"matrix": [[1.6, -0.5, -0.1], [-0.2, 1.5, -0.3], [0.05, -0.6, 1.55]]}
+
+    matrix: Annotated[Matrix, BeforeValidator(_as_tuples)] | None = parameter(
+        IDENTITY, "Three rows of three: what red, green and blue are made of."
+    )
+
+    @field_validator("matrix")
+    @classmethod
+    def _invertible(cls, matrix: Matrix | None) -> Matrix | None:
+        if matrix is not None and abs(np.linalg.det(matrix)) < 1e-6:
+            raise ValueError("the matrix is singular: different colours would become the same")
+        return matrix
+
+    @property
+    def _rows(self) -> Floats:
+        return np.array(self.matrix, np.float32)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("color_matrix", arguments=NAMES),)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return dict(zip(NAMES, self._rows.ravel(), strict=True))
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        red, green, blue = np.moveaxis(image, -1, 0)
+        mixed = [row[0] * red + row[1] * green + row[2] * blue for row in self._rows]
+        return np.stack(mixed, axis=-1)
+
+
+class Camera(Given):
+    """The inverse of the camera's matrix: white-balanced camera RGB to linear sRGB."""
+
+    method: ClassVar = "camera"
+    summary: ClassVar = "camera RGB to linear sRGB, for a camera's own raws"
+
+    matrix: Annotated[Matrix, BeforeValidator(_as_tuples)] | None = parameter(
+        None, "Three rows of three, camera RGB to linear sRGB.", auto="from the camera"
+    )
+
+    def resolve(self, context: Context) -> "Camera":
+        if self.matrix is not None:
+            return self
+        inverse = np.linalg.inv(context.camera.srgb_to_camera())
+        return self.filled(matrix=_as_tuples(inverse.tolist()))
+
+
+class InverseCamera(Given):
+    """The camera's matrix, to stand before the mosaic of a render."""
+
+    method: ClassVar = "inverse_camera"
+    summary: ClassVar = "linear sRGB to camera RGB, for a render, before mosaic"
+
+    matrix: Annotated[Matrix, BeforeValidator(_as_tuples)] | None = parameter(
+        None, "Three rows of three, linear sRGB to camera RGB.", auto="from the camera"
+    )
+
+    def resolve(self, context: Context) -> "InverseCamera":
+        if self.matrix is not None:
+            return self
+        return self.filled(matrix=_as_tuples(context.camera.srgb_to_camera().tolist()))
+
+
+STAGE = Stage(
+    "color_matrix",
+    "Mix colours: from what the camera's filters see to linear sRGB.",
+    Kind.RGB,
+    Kind.RGB,
+    (Unchanged, Camera, InverseCamera, Given),
+)

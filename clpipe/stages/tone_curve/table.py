@@ -1,0 +1,165 @@
+"""Tone curves from files: ``.csv`` with two columns, ``.cube`` with one dimension."""
+
+import re
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clpipe.reference.curve import tabulate
+from clpipe.types import Floats
+
+Knots = NDArray[np.float64]
+
+
+def monotone_cubic(knots: Knots, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The monotone cubic through (n, 2) knots (Fritsch and Butland, SIAM J. Sci. Stat. 1984).
+
+    Slopes inside are the harmonic means of the two chords beside, at the ends those of the chords;
+    beyond the ends the curve is level.
+
+    >>> monotone_cubic(np.array([(0, 0), (1, 1), (2, 1)]), np.array([0.0, 1.0, 1.5])).tolist()
+    [0.0, 1.0, 1.0]
+    """
+    at, value = knots.T
+    x = np.clip(x, at[0], at[-1])
+    step, chord = np.diff(at), np.diff(value) / np.diff(at)
+    left, right = chord[:-1], chord[1:]
+    rising = left * right > 0
+    mean = 2 * left * right / np.where(rising, left + right, 1)
+    slope = np.concatenate([chord[:1], np.where(rising, mean, 0), chord[-1:]])
+    i = np.clip(np.searchsorted(at, x, side="right") - 1, 0, len(step) - 1)
+    t, h = (x - at[i]) / step[i], step[i]
+    return np.asarray(
+        value[i] * (1 + 2 * t) * (1 - t) ** 2
+        + h * slope[i] * t * (1 - t) ** 2
+        + value[i + 1] * t**2 * (3 - 2 * t)
+        + h * slope[i + 1] * t**2 * (t - 1)
+    )
+
+
+def linear(knots: Knots, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Straight lines through (n, 2) knots, level beyond the ends.
+
+    >>> linear(np.array([(0, 0), (1, 4)]), np.array([0.25, 3.0])).tolist()
+    [1.0, 4.0]
+    """
+    return np.interp(x, *knots.T)
+
+
+def parse_csv(text: str) -> Knots:
+    """Knots (n, 2) from lines of ``x,y``, both 0..1, x ascending; comments with #, one header line.
+
+    >>> parse_csv("x,y\\n0,0\\n1,1\\n").tolist()
+    [[0.0, 0.0], [1.0, 1.0]]
+
+    Raises:
+        ValueError: a line that is no such pair; the message has its number.
+    """
+    knots: list[tuple[float, float]] = []
+    header = True
+    for number, line in enumerate(text.splitlines(), 1):
+        fields = re.split(r"[,;\s]+", line.partition("#")[0].strip(" ,;\t"))
+        if fields == [""]:
+            continue
+        try:
+            pair = [float(field) for field in fields]
+        except ValueError:
+            if not header:
+                raise ValueError(f"line {number}: found {line!r}, but expected x,y") from None
+            header = False
+            continue
+        header = False
+        if len(pair) != 2:
+            raise ValueError(f"line {number}: found {len(pair)} columns, but expected two: x,y")
+        if not all(0 <= value <= 1 for value in pair):
+            raise ValueError(f"line {number}: found {line!r}, but x and y go from 0 to 1")
+        if knots and pair[0] <= knots[-1][0]:
+            before = knots[-1][0]
+            raise ValueError(f"line {number}: x is {pair[0]:g} after {before:g}; x must ascend")
+        knots.append((pair[0], pair[1]))
+    if len(knots) < 2:
+        raise ValueError(f"found {len(knots)} points; a curve has at least two lines of x,y")
+    return np.array(knots)
+
+
+def parse_cube(text: str) -> Knots:
+    """Knots (n, 2) from a one-dimensional .cube file (Adobe Cube LUT Specification 1.0, 2013).
+
+    >>> parse_cube("LUT_1D_SIZE 2\\n0 0 0\\n1 1 1").tolist()
+    [[0.0, 0.0], [1.0, 1.0]]
+
+    Raises:
+        ValueError: a table of three dimensions, with three different curves, of another size than
+            it says, or a line that is none of the format; the message has its number.
+    """
+    low, high, size = 0.0, 1.0, None
+    rows: list[float] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        fields = line.partition("#")[0].split()
+        if not fields or fields[0] == "TITLE":
+            continue
+        try:
+            values = [float(field) for field in fields[1 if fields[0][0].isalpha() else 0 :]]
+        except ValueError:
+            raise ValueError(f"line {number}: found {line!r}, but expected numbers") from None
+        match fields[0]:
+            case "LUT_3D_SIZE":
+                raise ValueError(f"line {number}: a table of three dimensions; it must have one")
+            case "LUT_1D_SIZE":
+                size = int(values[0]) if values else 0
+            case "LUT_1D_INPUT_RANGE" if len(values) == 2:
+                low, high = values
+            case "DOMAIN_MIN" | "DOMAIN_MAX" if len(set(values)) == 1:
+                low, high = (values[0], high) if fields[0][-1] == "N" else (low, values[0])
+            case word if word[0].isalpha():
+                raise ValueError(f"line {number}: {line!r} is not understood here")
+            case _ if len(values) != 3:
+                raise ValueError(f"line {number}: found {len(values)} numbers, but expected three")
+            case _ if not np.allclose(values, values[0], rtol=0, atol=1e-6):
+                raise ValueError(
+                    f"line {number}: red, green and blue differ; a tone curve is one for all three"
+                )
+            case _:
+                rows.append(values[0])
+    if size is None or size != len(rows) or size < 2:
+        raise ValueError(f"LUT_1D_SIZE is {size}, at least 2 is needed; found {len(rows)} rows")
+    if not low < high or not np.isfinite([low, high, *rows]).all():
+        raise ValueError(f"its domain goes from {low:g} to {high:g}; all must be finite and ascend")
+    return np.stack([np.linspace(low, high, size), rows], axis=1)
+
+
+FORMATS: dict[
+    str,
+    tuple[
+        Callable[[str], Knots],
+        Callable[[Knots, NDArray[np.float64]], NDArray[np.float64]],
+    ],
+] = {".csv": (parse_csv, monotone_cubic), ".cube": (parse_cube, linear)}
+
+
+def table_of(path: str) -> Floats:
+    """The curve table (see :mod:`clpipe.reference.curve`) of a file; read again when it changes.
+
+    Raises:
+        ValueError: it cannot be read, is of no known format, or is not a curve.
+    """
+    try:
+        status = Path(path).stat()
+        return _table_of(path, status.st_mtime_ns, status.st_size)
+    except OSError as error:
+        raise ValueError(f"cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise ValueError("not a text file") from None
+
+
+@lru_cache(maxsize=16)
+def _table_of(path: str, time: int, size: int) -> Floats:
+    ending = Path(path).suffix.lower()
+    if ending not in FORMATS:
+        raise ValueError(f"expected a file that ends in {' or '.join(FORMATS)}")
+    parse, interpolate = FORMATS[ending]
+    knots = parse(Path(path).read_text("utf-8-sig"))
+    return tabulate(lambda x: interpolate(knots, x))
