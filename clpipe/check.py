@@ -9,9 +9,9 @@ import numpy as np
 from clpipe.config import Settings, make_chain
 from clpipe.device import Device
 from clpipe.reference.cfa import PATTERNS, Pattern
+from clpipe.registry import all_stages
 from clpipe.run import Runner
 from clpipe.stage import Kind, Method, Stage
-from clpipe.stages import all_stages
 from clpipe.types import Array
 
 # Odd sizes, one pixel wide and high, smaller than the widest apron, more than one work-group.

@@ -269,7 +269,7 @@ def plan(keep: tuple[str, ...], formats: tuple[str, ...], as_json: bool, **reque
 @json_option
 def stages(name: str | None, as_json: bool) -> None:
     """List the stages, or explain one: its methods and parameters."""
-    from clpipe.stages import all_stages
+    from clpipe.registry import all_stages
 
     if name is not None and name not in all_stages():
         raise RequestError(one_of("stage", name, all_stages()))

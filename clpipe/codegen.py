@@ -54,6 +54,7 @@ class Kernel:
     source: str
     parameters: tuple[Parameter, ...]
     launch: AnyLaunch
+    files: tuple[str, ...]
 
 
 def round_up(value: int, step: int) -> int:
@@ -74,18 +75,26 @@ def kernel_folder() -> Path:
 
 
 def file_text(name: str, seen: set[str]) -> str:
-    """A kernel file with its includes in place, each file once."""
+    """A kernel file with its includes in place, each file once.
+
+    A stage of somebody else's has its kernels by whole paths; what they include is looked for
+    beside them, then among clpipe's own.
+    """
     if name in seen:
         return ""
     seen.add(name)
-    text = (kernel_folder() / name).read_text()
-    own = f'#line 1 "kernels/{name}"\n'
+    path = kernel_folder() / name  # a whole path stays what it is
+    text = path.read_text()
+    label = name if Path(name).is_absolute() else f"kernels/{name}"
 
     def include(match: re.Match[str]) -> str:
         line = text[: match.start()].count("\n") + 2
-        return f'{file_text(match[1], seen)}#line {line} "kernels/{name}"\n'
+        beside = path.with_name(match[1])
+        own = Path(name).is_absolute() and beside.is_file()
+        return f'{file_text(str(beside) if own else match[1], seen)}#line {line} "{label}"\n'
 
-    return own + re.sub(r'^#include "(.*)"\n', include, text, flags=re.MULTILINE)
+    included = re.sub(r'^#include "(.*)"\n', include, text, flags=re.MULTILINE)
+    return f'#line 1 "{label}"\n{included}'
 
 
 class _Writer:
@@ -197,12 +206,12 @@ def write_kernel(plan: Plan, launch: AnyLaunch, index: int, lanes: int) -> Kerne
         f"void {name}(\n    {signature})\n{{\n"
         f"    const extent e = {{width, height, pitch}};\n{setup}{body}}}\n"
     )
-    return Kernel(name, text, tuple(writer.parameters.values()), launch)
+    return Kernel(name, text, tuple(writer.parameters.values()), launch, tuple(sorted(seen)))
 
 
 def kernels_of(ops: Sequence[Op | None]) -> list[str]:
     """The kernel files of these passes."""
-    return [f"{op.kernel}.cl" for op in ops if op]
+    return [op.kernel for op in ops if op]
 
 
 def files_text(names: Sequence[str], seen: set[str]) -> str:

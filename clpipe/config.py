@@ -5,6 +5,7 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,12 @@ from pydantic import ValidationError
 
 from clpipe.camera import Camera, load_camera
 from clpipe.errors import RequestError
+from clpipe.registry import all_stages, load_stage_file
 from clpipe.stage import Context, Kind, Method, Stage
-from clpipe.stages import DEFAULT_CHAIN, all_stages
+from clpipe.stages import DEFAULT_CHAIN
 from clpipe.suggest import one_of
 
-KEYS = ("camera", "iso", "seed", "stages", "skip")
+KEYS = ("camera", "iso", "seed", "stages", "skip", "stage_files")
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,12 @@ class Settings:
     stages: tuple[str, ...] = DEFAULT_CHAIN
     skip: tuple[str, ...] = ()
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def record(self) -> dict[str, Any]:
+        """The settings as nested values, from which :func:`settings_from` makes them again."""
+        plain = {"camera": self.camera, "iso": self.iso, "seed": self.seed}
+        lists = {"stages": list(self.stages), "skip": list(self.skip)}
+        return {**plain, **lists, **{name: dict(t) for name, t in self.parameters.items()}}
 
 
 @dataclass(frozen=True)
@@ -48,8 +56,17 @@ class Chain:
     steps: tuple[Step, ...]
     source: Kind
     camera: Camera
-    iso: float
-    seed: int
+    settings: Settings  # it was made from
+
+    @property
+    def iso(self) -> float:
+        """The ISO."""
+        return self.settings.iso
+
+    @property
+    def seed(self) -> int:
+        """The seed of the noise."""
+        return self.settings.seed
 
     @property
     def result(self) -> Kind:
@@ -68,8 +85,27 @@ class Chain:
         raise RequestError(one_of("stage in this chain", name, [s.name for s in self.steps]))
 
 
+def built_in_configs() -> dict[str, Path]:
+    """The configurations inside the package, by name."""
+    folder = Path(str(resources.files("clpipe") / "configs"))
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def load_settings(name: str) -> Settings:
+    """A built-in configuration by its name, or a file by its path (ending in .toml).
+
+    Raises:
+        RequestError: there is no such configuration or file, or it is not valid.
+    """
+    built_in = built_in_configs()
+    path = built_in.get(name, Path(name))
+    if path.suffix != ".toml" and not path.is_file():
+        raise RequestError(one_of("configuration", name, built_in) + ", or a .toml file")
+    return read_settings(path)
+
+
 def read_settings(path: Path) -> Settings:
-    """Settings from a TOML file.
+    """Settings from a TOML file. Files that it names are looked for relative to it.
 
     Raises:
         RequestError: the file cannot be read, is not TOML, or names what there is not; the message
@@ -77,7 +113,7 @@ def read_settings(path: Path) -> Settings:
     """
     try:
         text = path.read_text("utf-8-sig")
-        return settings_from(tomllib.loads(text))
+        return settings_from(tomllib.loads(text), path.parent)
     except OSError as error:
         raise RequestError(f"{path}: cannot read this configuration: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -112,15 +148,23 @@ def line_of(text: str, key: str) -> int | None:
     return header
 
 
-def settings_from(values: Mapping[str, Any]) -> Settings:
+def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Settings:
     """Settings from nested values as a TOML file holds them, every name and parameter checked.
+
+    Args:
+        values: a dict of the file's form.
+        folder: what the names of files are relative to; None is the working directory.
 
     Raises:
         KeyedError: an unknown key, stage, method or parameter, or a value of the wrong type or out
             of range.
     """
+    folder = folder or Path()
     tables = {key: value for key, value in values.items() if isinstance(value, Mapping)}
     plain = {key: value for key, value in values.items() if key not in tables}
+    for path in names_in(plain, "stage_files", "files"):
+        load_stage_file(folder / path)
+    plain.pop("stage_files", None)
     for key in plain:
         if key in all_stages():
             raise KeyedError(key, f"{key}: found {plain[key]!r}, but a stage is a table: [{key}]")
@@ -131,19 +175,55 @@ def settings_from(values: Mapping[str, Any]) -> Settings:
         if key in plain and (not isinstance(value, expected) or isinstance(value, bool)):
             kinds = {"camera": "text", "iso": "a number", "seed": "a whole number"}
             raise KeyedError(key, f"{key}: found {value!r}, but it is {kinds[key]}")
-    for key in ("stages", "skip"):
-        names = plain.get(key, [])
-        if not isinstance(names, Sequence) or isinstance(names, str):
-            raise KeyedError(key, f"{key}: found {names!r}, but it is a list of stage names")
+    for key in {"stages", "skip"} & plain.keys():
+        names = names_in(plain, key, "stage names")
         for name in names:
-            stage_named(key, str(name))
-        plain[key] = tuple(names) if key in plain else DEFAULT_CHAIN if key == "stages" else ()
+            stage_named(key, name if key == "stages" else base_name(name))
+        plain[key] = names
     for name, table in tables.items():
-        stage = stage_named(name, re.sub(r"_\d+$", "", name))
-        make_method(stage, name, table)
+        stage = stage_named(name, base_name(name))
+        tables[name] = from_folder(folder, stage, table)
+        make_method(stage, name, tables[name])
     if "iso" in plain:
         plain["iso"] = float(plain["iso"])
+    if str(plain.get("camera", "")).endswith(".toml"):
+        plain["camera"] = str(folder / plain["camera"])
     return Settings(parameters=tables, **plain)
+
+
+def names_in(values: Mapping[str, Any], key: str, what: str) -> tuple[str, ...]:
+    """The list of texts under a key; empty if it is not there.
+
+    Raises:
+        KeyedError: it is something else.
+    """
+    names = values.get(key, [])
+    if isinstance(names, str | Mapping) or not isinstance(names, Sequence):
+        raise KeyedError(key, f"{key}: found {names!r}, but it is a list of {what}")
+    for name in names:
+        if not isinstance(name, str):
+            raise KeyedError(key, f"{key}: found {name!r} in the list, but it is one of {what}")
+    return tuple(names)
+
+
+def from_folder(folder: Path, stage: Stage, table: Mapping[str, Any]) -> dict[str, Any]:
+    """A step's settings, in which the names of files are relative to the folder no more."""
+    method = stage.by_name.get(str(table.get("method", stage.methods[0].method)))
+    values = dict(table)
+    for name, field_ in (method.model_fields if method else {}).items():
+        extra: Any = field_.json_schema_extra
+        if extra["file"] and isinstance(values.get(name), str):
+            values[name] = str(folder / values[name])
+    return values
+
+
+def base_name(step: str) -> str:
+    """The stage of a step that may be a repeated one.
+
+    >>> base_name("denoise_2")
+    'denoise'
+    """
+    return re.sub(r"_\d+$", "", step)
 
 
 def stage_named(key: str, name: str) -> Stage:
@@ -178,7 +258,7 @@ def parse_assignment(text: str) -> tuple[str, str, Any]:
 
 def method_of(name: str, table: Mapping[str, Any]) -> Any:
     """The method that a step's settings choose: the one they name, or the stage's default."""
-    stage = all_stages().get(re.sub(r"_\d+$", "", name))
+    stage = all_stages().get(base_name(name))
     return table.get("method", stage.methods[0].method if stage else None)
 
 
@@ -219,45 +299,85 @@ def named_errors(name: str, method: type[Method]) -> Iterator[None]:
         raise KeyedError(key, f"{key}:{found} {reason}") from None
 
 
-def make_chain(settings: Settings, source: Kind = Kind.RGB) -> Chain:
+def make_chain(
+    settings: Settings,
+    source: Kind | None = None,
+    start_at: str | None = None,
+    until: str | None = None,
+) -> Chain:
     """The chain that the settings ask for, every parameter resolved.
 
     A stage that comes a second time is called ``stage_2``, and so on.
 
+    Args:
+        settings: the request.
+        source: the kind of image that enters; None is linear RGB, or, with ``start_at``, what that
+            step reads.
+        start_at: the first step to run. The steps before it are resolved all the same: what they
+            say of the image (pattern, gains, noise, levels) holds.
+        until: the last step to run.
+
     Raises:
-        RequestError: a chain whose image kinds do not fit, an unknown camera, an ISO it has not.
+        RequestError: a chain whose image kinds do not fit, an unknown camera, an ISO it has not,
+            a step that is not there.
     """
     camera = load_camera(settings.camera)
     camera.noise(settings.iso)  # refuses an ISO that the camera has not
+    steps = resolved_steps(settings, camera, source or (None if start_at else Kind.RGB))
+    names = [step.name for step in steps]
+    for name in settings.parameters:
+        if name not in names and name not in all_stages():
+            raise KeyedError(name, one_of("stage in this chain", name, names))
+    first, last = 0, len(steps)
+    for name in (n for n in (start_at, until) if n is not None):
+        if name not in names:
+            raise RequestError(one_of("stage in this chain", name, names))
+    if start_at is not None:
+        first = names.index(start_at)
+    if until is not None:
+        last = names.index(until) + 1
+    if first >= last:
+        raise RequestError(
+            f"nothing is left to do; {start_at} comes after {until}"
+            if steps
+            else "stages: nothing is left to do; every stage was skipped"
+        )
+    if source is None:
+        source = steps[first].stage.reads
+    return Chain(tuple(steps[first:last]), source, camera, settings)
+
+
+def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:
+    """The steps of the settings, in order, for an image of a kind; None is what the first reads.
+
+    Raises:
+        RequestError: image kinds do not fit.
+    """
     context = Context(camera=camera, iso=settings.iso)
     steps: list[Step] = []
-    kind = source
+    count: dict[str, int] = {}
     before = "the input"
     for stage_name in settings.stages:
-        if stage_name in settings.skip:
-            continue
         stage = all_stages()[stage_name]
-        count = 1 + sum(step.stage is stage for step in steps)
-        name = stage_name if count == 1 else f"{stage_name}_{count}"
-        if stage.reads is not kind:
-            raise RequestError(misfit(name, stage, before, kind))
+        count[stage_name] = count.get(stage_name, 0) + 1
+        name = stage_name if count[stage_name] == 1 else f"{stage_name}_{count[stage_name]}"
+        if name in settings.skip:
+            continue
+        if stage.reads is not (kind or stage.reads):
+            raise RequestError(misfit(name, stage, before, kind or stage.reads))
         method = make_method(stage, name, settings.parameters.get(name, {}))
         with named_errors(name, type(method)):
             method = method.resolve(context)
         steps.append(Step(name, stage, method, context))
         context = method.after(context)
         kind, before = stage.writes, name
-    if not steps:
-        raise RequestError("stages: nothing is left to do; every stage was skipped")
-    names = [step.name for step in steps]
-    for name in settings.parameters:
-        if name not in names and name not in all_stages():
-            raise KeyedError(name, one_of("stage in this chain", name, names))
-    return Chain(tuple(steps), source, camera, settings.iso, settings.seed)
+    return steps
 
 
 def misfit(name: str, stage: Stage, before: str, kind: Kind) -> str:
     """Why a stage cannot follow, and which stages could stand between."""
     bridges = [s.name for s in all_stages().values() if (s.reads, s.writes) == (kind, stage.reads)]
     help_ = f"put {' or '.join(bridges)} between them" if bridges else f"leave out {name} as well"
+    if before == "the input":
+        help_ += f", or enter there with an image of that kind: --start-at {name}"
     return f"stage {name} reads {stage.reads.label}, but {before} gives {kind.label}; {help_}"

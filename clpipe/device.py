@@ -1,11 +1,13 @@
 """OpenCL devices: which there are, and running a plan on one. The only importer of pyopencl."""
 
+import re
 import shutil
 import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,7 @@ from clpipe.codegen import (
     round_up,
     write_kernel,
 )
-from clpipe.errors import DeviceError, ImageError
+from clpipe.errors import DeviceError, ImageError, RequestError
 from clpipe.plan import AddUp, Count, Find, Image, Launch, Lines, Plan
 from clpipe.suggest import one_of
 from clpipe.types import Array
@@ -213,6 +215,17 @@ class Output:
     found: dict[str, Array]
 
 
+def build_log(text: str) -> str:
+    """What the compiler said, out of pyopencl's error message.
+
+    >>> build_log("failed\\n\\nBuild on <x>:\\n\\nerror: a.cl:2:7: no\\n\\n(options: -a)")
+    'error: a.cl:2:7: no'
+    """
+    log = re.sub(r"\n*\(options: .*", "", text.partition(">:\n")[2], flags=re.DOTALL)
+    lines = [line for line in log.splitlines() if "failed to build the program" not in line]
+    return "\n".join(lines).strip() or text
+
+
 class Device:
     """A device with its queue, compiled kernels and buffers, kept from image to image."""
 
@@ -259,7 +272,11 @@ class Device:
                         options, cache_dir=False if own_cache else None
                     )
             except cl.Error as error:
-                raise DeviceError(f"{kernel.launch.name}: does not compile: {error}") from None
+                log = build_log(str(error))
+                for file in kernel.files:
+                    if Path(file).is_absolute():
+                        raise RequestError(f"{file}: does not compile:\n{log}") from None
+                raise DeviceError(f"{kernel.launch.name}: does not compile:\n{log}") from None
             self._programs[kernel.source] = program
         return cl.Kernel(program, kernel.name)
 

@@ -20,7 +20,7 @@ class Op:
     """One pass of one step, with the types of its run-time arguments and its literals."""
 
     step: str
-    kernel: str
+    kernel: str  # file, in clpipe's own folder of kernels unless it is a whole path
     pass_: Pass
     kind: Kind  # of what it gives
     types: tuple[tuple[str, str], ...]  # argument -> OpenCL type
@@ -221,7 +221,10 @@ def make_op(step: Step, pass_: Pass) -> Op:
         else:
             types.append((name, {"f": "float", "u": "uint", "i": "int"}[value.dtype.kind]))
     kind = pass_.kind or step.stage.writes
-    return Op(step.name, step.method.kernel, pass_, kind, tuple(types), tuple(literals))
+    kernel = f"{step.method.kernel}.cl"
+    if step.stage.folder:
+        kernel = str(step.stage.folder / kernel)
+    return Op(step.name, kernel, pass_, kind, tuple(types), tuple(literals))
 
 
 def make_plan(

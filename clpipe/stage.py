@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
+from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -195,6 +196,7 @@ class Stage:
     reads: Kind
     writes: Kind
     methods: tuple[type[Method], ...]
+    folder: Path | None = None  # of the kernel files, where they are not clpipe's own
 
     @cached_property
     def by_name(self) -> dict[str, type[Method]]:

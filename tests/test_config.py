@@ -110,7 +110,7 @@ def test_a_repeated_stage_has_settings_of_its_own():
 
 def test_every_parameter_says_what_it_is():
     from clpipe.describe import parameter_rows
-    from clpipe.stages import all_stages
+    from clpipe.registry import all_stages
 
     for stage in all_stages().values():
         for method in stage.methods:

@@ -8,7 +8,7 @@ from clpipe import codegen
 from clpipe.check import check_method
 from clpipe.config import make_chain, read_settings
 from clpipe.device import Device
-from clpipe.stages import all_stages
+from clpipe.registry import all_stages
 from tests.conftest import ROOT
 
 TEXT = (ROOT / "CONTRIBUTING.md").read_text()

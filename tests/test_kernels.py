@@ -8,8 +8,8 @@ import pytest
 from clpipe.check import SIZES, check_method, check_raw, compare
 from clpipe.config import Settings
 from clpipe.device import Device
+from clpipe.registry import all_stages
 from clpipe.stage import Kind
-from clpipe.stages import all_stages
 
 METHODS = [(stage, method) for stage in all_stages().values() for method in stage.methods]
 LABELS = [f"{stage.name}-{method.method}" for stage, method in METHODS]

@@ -14,6 +14,7 @@ LEVELS = [
     {"camera"},
     {"stage"},
     {"stages"},
+    {"registry"},
     {"config"},
     {"plan"},
     {"codegen"},

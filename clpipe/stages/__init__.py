@@ -1,4 +1,4 @@
-"""The stages, one a file, found by looking; and the default chain."""
+"""The stages, one a file or folder, found by looking; and the default chain."""
 
 from functools import cache
 from importlib import import_module
@@ -25,8 +25,8 @@ DEFAULT_CHAIN = (
 
 
 @cache
-def all_stages() -> dict[str, Stage]:
-    """Every stage by its name: the default chain first, in its order, then the others."""
+def own_stages() -> dict[str, Stage]:
+    """clpipe's own stages by name: the default chain first, in its order, then the others."""
     found = {
         module.name: import_module(f"{__name__}.{module.name}").STAGE
         for module in iter_modules(__path__)
