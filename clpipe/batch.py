@@ -5,15 +5,15 @@ import json
 import os
 import platform
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import clpipe
-from clpipe.config import Chain
+from clpipe.config import Chain, Settings, Step, settings_from
 from clpipe.errors import ImageError, RequestError
 from clpipe.image_io import (
     JPEG_MAX_SIDE,
@@ -26,6 +26,7 @@ from clpipe.image_io import (
     write_display,
     write_exr,
 )
+from clpipe.registry import all_stages
 from clpipe.run import Result, Runner
 from clpipe.stage import Kind
 
@@ -166,7 +167,9 @@ class Target:
         if "jpg" in self.formats and max(source.pixels.shape[:2]) > JPEG_MAX_SIDE:
             raise ImageError(f"JPEG holds at most {JPEG_MAX_SIDE} pixels a side; use --format png")
 
-    def write(self, job: Job, runner: Runner, source: SourceImage, result: Result) -> None:
+    def write(
+        self, job: Job, key: str, runner: Runner, source: SourceImage, result: Result
+    ) -> None:
         """Write a job's images, then its sidecar.
 
         Raises:
@@ -178,23 +181,32 @@ class Target:
         for step in chain.steps:
             if step.name in runner.keep:
                 path = self.path(job, f"{step.name}.exr")
-                attributes = {"clpipe:stage": step.name, "clpipe:kind": step.stage.writes.label}
+                attributes = attributes_of(step, chain, key)
                 write_exr(path, result.kept[step.name], step.stage.writes.channels, attributes)
                 outputs.append(path.name)
         for format_ in self.formats:
             path = self.path(job, format_)
             if format_ == "exr":
                 assert result.final is not None
-                last = chain.steps[-1]
-                attributes = {"clpipe:stage": last.name, "clpipe:kind": chain.result.label}
+                attributes = attributes_of(chain.steps[-1], chain, key)
                 write_exr(path, result.final, chain.result.channels, attributes)
             else:
                 assert result.encoded is not None
                 write_display(path, result.encoded, tags)
             outputs.append(path.name)
-        record = sidecar(job, runner, source, result, outputs)
+        record = sidecar(job, key, runner, source, result, outputs)
         text = json.dumps(record, indent=2) + "\n"
         write_beside(self.path(job, "json"), lambda to: _write_text(to, text))
+
+
+def attributes_of(step: Step, chain: Chain, image_key: str) -> dict[str, str]:
+    """What a kept image says of itself, so that a chain can go on with it."""
+    return {
+        "stage": step.name,
+        "kind": step.stage.writes.label,
+        "image_key": image_key,
+        "settings": json.dumps(chain.settings.record()),
+    }
 
 
 def _write_text(path: Path, text: str) -> None:
@@ -202,7 +214,12 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def sidecar(
-    job: Job, runner: Runner, source: SourceImage, result: Result, outputs: Sequence[str]
+    job: Job,
+    key: str,
+    runner: Runner,
+    source: SourceImage,
+    result: Result,
+    outputs: Sequence[str],
 ) -> dict[str, Any]:
     """Everything that is needed to make the same files again."""
     chain = runner.chain
@@ -212,12 +229,13 @@ def sidecar(
         "input": str(job.path),
         "sha256": source.sha256,
         "layer": source.layer,
-        "image_key": job.key,
+        "image_key": key,
         "seed": chain.seed,
         "width": source.pixels.shape[1],
         "height": source.pixels.shape[0],
         "camera": chain.camera.name,
         "iso": chain.iso,
+        "starts_on": chain.source.label,
         "stages": [
             {
                 "name": step.name,
@@ -246,25 +264,65 @@ def sidecar(
     }
 
 
-def run_jobs(jobs: Sequence[Job], runner: Runner, target: Target) -> Iterator[Outcome]:
+@dataclass(frozen=True)
+class Reentry:
+    """Going on with kept images: how to make the chain, given the settings that one carries."""
+
+    start_at: str
+    chain: Callable[[Settings | None], Chain]
+
+    def chain_for(self, path: Path, source: SourceImage) -> Chain:
+        """The chain for one image.
+
+        Raises:
+            ImageError: the image is not of the kind that the first step reads, or what it says of
+                itself is of no use.
+        """
+        try:
+            values = json.loads(source.attributes.get("settings", "null"))
+            chain = self.chain(settings_from(values) if values else None)
+        except (ValueError, AttributeError, RequestError) as error:
+            raise ImageError(f"{path}: what it was made with cannot be used: {error}") from None
+        kind = source.attributes.get("kind", chain.source.label)
+        if kind != chain.source.label:
+            others = [name for name, stage in all_stages().items() if stage.reads.label == kind]
+            raise ImageError(
+                f"{path}: holds {kind} (kept after {source.attributes.get('stage')}), but "
+                f"{self.start_at} reads {chain.source.label}; stages that read {kind}: "
+                f"{', '.join(others) or 'none'}"
+            )
+        return chain
+
+
+def run_jobs(
+    jobs: Sequence[Job], runner: Runner, target: Target, reentry: Reentry | None = None
+) -> Iterator[Outcome]:
     """Put every job through; one that fails is reported and the others go on.
 
     The next file is read, and the first one read while the kernels compile, in a second thread.
     """
+    mosaic = len(runner.chain.source.channels) == 1
     with ThreadPoolExecutor(1) as reader:
-        ahead = reader.submit(read_image, jobs[0].path)
-        runner.warm_up()
+        ahead = reader.submit(read_image, jobs[0].path, mosaic)
+        runner.warm_up(half=reentry is None)
         for i, job in enumerate(jobs):
             reading = ahead
             if i + 1 < len(jobs):
-                ahead = reader.submit(read_image, jobs[i + 1].path)
+                ahead = reader.submit(read_image, jobs[i + 1].path, mosaic)
             start = time.perf_counter()
             try:
                 source = reading.result()
                 target.check_size(source)
-                result = runner.run(source.pixels, job.key)
-                target.write(job, runner, source, result)
-            except (ImageError, MemoryError) as error:
+                key = job.key
+                if reentry:
+                    runner = runner.of(reentry.chain_for(job.path, source))
+                    key = source.attributes.get("image_key", key)
+                elif kept := source.attributes.get("stage"):
+                    warning = f"was kept after {kept}; is it a render? --start-at goes on from it"
+                    source = replace(source, warnings=(*source.warnings, warning))
+                result = runner.run(source.pixels, key)
+                target.write(job, key, runner, source, result)
+            except (ImageError, RequestError, MemoryError) as error:
                 message = str(error) or "there is not enough memory for it"
                 if str(job.path) not in message:
                     message = f"{job.path}: {message}"

@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -13,23 +13,25 @@ from rich.table import Table
 
 import clpipe
 from clpipe import describe
-from clpipe.batch import FORMATS, Target, find_jobs, prepare_folder, run_jobs
+from clpipe.batch import FORMATS, Reentry, Target, find_jobs, prepare_folder, run_jobs
 from clpipe.bench import bench as run_bench
 from clpipe.check import SIZES, check_all
 from clpipe.config import (
     Chain,
     Settings,
+    built_in_configs,
+    load_settings,
     make_chain,
-    method_of,
+    overlay,
     parse_assignment,
-    read_settings,
-    settings_from,
 )
 from clpipe.device import Device, choose, find_devices
 from clpipe.errors import ClpipeError, RequestError
 from clpipe.image_io import MAX_PIXELS
 from clpipe.plan import make_plan
+from clpipe.registry import all_stages, load_stage_file
 from clpipe.run import Runner
+from clpipe.stage import Kind, Stage
 from clpipe.suggest import one_of
 
 NUMPY = "numpy"
@@ -64,22 +66,39 @@ def console() -> Console:
     return Console(width=None if sys.stdout.isatty() else 140, highlight=False)
 
 
+stage_file_option = click.option(
+    "--stage-file",
+    "stage_files",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="FILE.py",
+    help="Load a stage of your own; may be repeated.",
+)
+
+
+camera_option = click.option(
+    "--camera",
+    metavar="NAME|FILE",
+    help=f"A built-in camera or a profile (.toml). [default: {DEFAULTS.camera}]",
+)
+iso_option = click.option(
+    "--iso",
+    type=float,
+    help=f"The ISO; it sets noise and denoising. [default: {DEFAULTS.iso:g}]",
+)
+
+
 def chain_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """The options that say what chain to run."""
     options = [
         click.option(
-            "-c", "--config", type=click.Path(path_type=Path), help="A TOML file with settings."
-        ),
-        click.option(
-            "--camera",
+            "-c",
+            "--config",
             metavar="NAME|FILE",
-            help=f"A built-in camera or a profile (.toml). [default: {DEFAULTS.camera}]",
+            help=f"Settings: {' or '.join(built_in_configs())}, or a TOML file.",
         ),
-        click.option(
-            "--iso",
-            type=float,
-            help=f"The ISO; it sets noise and denoising. [default: {DEFAULTS.iso:g}]",
-        ),
+        camera_option,
+        iso_option,
         click.option("--seed", type=int, help=f"The seed of the noise. [default: {DEFAULTS.seed}]"),
         click.option(
             "--set",
@@ -96,6 +115,9 @@ def chain_options(function: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--skip", multiple=True, metavar="STAGE", help="Leave a stage out; may be repeated."
         ),
+        click.option("--start-at", metavar="STAGE", help="Enter the chain here, with kept images."),
+        click.option("--until", metavar="STAGE", help="Leave the chain after this stage."),
+        stage_file_option,
     ]
     for option in reversed(options):
         function = option(function)
@@ -119,43 +141,48 @@ format_option = click.option(
     "formats",
     multiple=True,
     type=click.Choice(FORMATS),
-    help="Of the last image; may be repeated. [default: jpg]",
+    help="Of the last image; may be repeated. [default: jpg; exr where --until cuts it off]",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 
-def chain_from(
-    config: Path | None,
-    camera: str | None,
-    iso: float | None,
-    seed: int | None,
-    assignments: Sequence[str],
-    stages: str | None,
-    skip: Sequence[str],
-) -> Chain:
-    """The chain that a configuration file and the options over it ask for."""
-    settings = read_settings(config) if config else DEFAULTS
-    assigned: dict[str, dict[str, Any]] = {}
-    for text in assignments:
-        stage, parameter, value = parse_assignment(text)
-        assigned.setdefault(stage, {})[parameter] = value
-    tables = {stage: dict(table) for stage, table in settings.parameters.items()}
-    for stage, values in assigned.items():
-        table = tables.setdefault(stage, {})
-        if "method" in values and values["method"] != method_of(stage, table):
-            table.clear()  # what the file set belongs to another method
-        table.update(values)
-    plain: dict[str, Any] = {"camera": camera, "iso": iso, "seed": seed}
-    if stages is not None:
-        plain["stages"] = [name.strip() for name in stages.split(",") if name.strip()]
-    if skip:
-        plain["skip"] = [*settings.skip, *skip]
-    given = settings_from({k: v for k, v in plain.items() if v is not None} | tables)
-    named = {k: getattr(given, k) for k, v in plain.items() if v is not None}
-    chain = make_chain(replace(settings, parameters=given.parameters, **named))
-    for stage in assigned:
-        chain.step_named(stage)
-    return chain
+@dataclass(frozen=True)
+class Request:
+    """The options that say what chain to run, as :func:`chain_options` declares them."""
+
+    config: str | None
+    camera: str | None
+    iso: float | None
+    seed: int | None
+    assignments: Sequence[str]
+    stages: str | None
+    skip: Sequence[str]
+    start_at: str | None
+    until: str | None
+    stage_files: Sequence[Path]
+
+    def chain(self, carried: Settings | None = None) -> Chain:
+        """The chain that a configuration and the options over it ask for.
+
+        ``carried`` are the settings of a kept image; they hold where no configuration is named.
+        """
+        for file in self.stage_files:
+            load_stage_file(file)
+        settings = load_settings(self.config) if self.config else carried or DEFAULTS
+        plain = {"camera": self.camera, "iso": self.iso, "seed": self.seed}
+        values: dict[str, Any] = {k: v for k, v in plain.items() if v is not None}
+        if self.stages is not None:
+            values["stages"] = [s.strip() for s in self.stages.split(",") if s.strip()]
+        values["skip"] = list(self.skip)
+        for text in self.assignments:
+            stage, parameter, value = parse_assignment(text)
+            values.setdefault(stage, {})[parameter] = value
+        chain = make_chain(overlay(settings, values), start_at=self.start_at, until=self.until)
+        for text in self.assignments:
+            step = parse_assignment(text)[0]
+            if step not in chain.names:
+                raise RequestError(one_of("stage in this chain", step, chain.names))
+        return chain
 
 
 def kept_names(chain: Chain, keep: Sequence[str]) -> tuple[str, ...]:
@@ -211,9 +238,11 @@ def run(
 
     Each makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used.
     """
-    chain = chain_from(**request)
+    asked = Request(**request)
+    chain = asked.chain()
     kept = kept_names(chain, keep)
-    formats = tuple(dict.fromkeys(formats)) or ("jpg",)
+    whole = asked.until is None or chain.result is Kind.DISPLAY
+    formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
     jobs = find_jobs(inputs, output)
     target = Target(output, formats)
     target.check(chain, jobs, kept)
@@ -221,8 +250,9 @@ def run(
     prepare_folder(output)
     eight_bit = any(f != "exr" for f in formats)
     runner = Runner(chain, device, kept, encode=eight_bit, final="exr" in formats)
+    reentry = Reentry(asked.start_at, asked.chain) if asked.start_at else None
     failed = 0
-    for outcome in run_jobs(jobs, runner, target):
+    for outcome in run_jobs(jobs, runner, target, reentry):
         if outcome.error:
             failed += 1
             click.echo(f"clpipe: {outcome.error}", err=True)
@@ -244,9 +274,17 @@ def run(
 @keep_option
 @format_option
 @json_option
-def plan(keep: tuple[str, ...], formats: tuple[str, ...], as_json: bool, **request: Any) -> None:
+@click.option("--toml", "as_toml", is_flag=True, help="Print the chain as a configuration.")
+def plan(
+    keep: tuple[str, ...], formats: tuple[str, ...], as_json: bool, as_toml: bool, **request: Any
+) -> None:
     """Show the launches and buffer slots of a chain, without running it."""
-    chain = chain_from(**request)
+    asked = Request(**request)
+    if as_toml:
+        whole = replace(asked, start_at=None, until=None)
+        click.echo(describe.toml_text(whole.chain()), nl=False)
+        return
+    chain = asked.chain()
     eight_bit = not formats or any(f != "exr" for f in formats)
     made = make_plan(chain, keep=kept_names(chain, keep), encode=eight_bit, final="exr" in formats)
     if as_json:
@@ -266,52 +304,63 @@ def plan(keep: tuple[str, ...], formats: tuple[str, ...], as_json: bool, **reque
 
 @main.command()
 @click.argument("name", required=False)
+@camera_option
+@iso_option
+@stage_file_option
 @json_option
-def stages(name: str | None, as_json: bool) -> None:
-    """List the stages, or explain one: its methods and parameters."""
-    from clpipe.registry import all_stages
-
+def stages(
+    name: str | None,
+    camera: str | None,
+    iso: float | None,
+    stage_files: tuple[Path, ...],
+    as_json: bool,
+) -> None:
+    """List the stages, or explain one: its methods and parameters, for a camera and an ISO."""
+    for file in stage_files:
+        load_stage_file(file)
     if name is not None and name not in all_stages():
         raise RequestError(one_of("stage", name, all_stages()))
+    values = {"camera": camera, "iso": iso}
+    settings = overlay(DEFAULTS, {k: v for k, v in values.items() if v is not None})
+    chosen = [all_stages()[name]] if name else list(all_stages().values())
     if as_json:
-        chosen = [all_stages()[name]] if name else list(all_stages().values())
-        click.echo(json.dumps([describe.stage_record(s) for s in chosen], indent=2))
-        return
-    out = console()
-    if name is None:
-        table = Table(
-            "stage",
-            "reads",
-            "writes",
-            "what it does",
-            "methods (first is default)",
-            box=None,
-            pad_edge=False,
-        )
-        for stage in all_stages().values():
-            table.add_row(
-                stage.name,
-                stage.reads.label,
-                stage.writes.label,
-                stage.summary,
-                ", ".join(stage.by_name),
-            )
-        out.print(table)
-        return
-    stage = all_stages()[name]
-    click.echo(
-        f"{stage.name}: {stage.summary} Reads {stage.reads.label}, writes {stage.writes.label}."
-    )
+        records = [describe.stage_record(s, describe.context_for(s, settings)) for s in chosen]
+        click.echo(json.dumps(records, indent=2))
+    elif name is None:
+        console().print(stage_table(chosen))
+    else:
+        explain_stage(chosen[0], settings)
+
+
+def stage_table(chosen: Sequence[Stage]) -> Table:
+    """The stages, a line each."""
+    headings = ("stage", "reads", "writes", "what it does", "methods (first is default)")
+    table = Table(*headings, box=None, pad_edge=False)
+    for stage in chosen:
+        methods = ", ".join(stage.by_name)
+        table.add_row(stage.name, stage.reads.label, stage.writes.label, stage.summary, methods)
+    return table
+
+
+def explain_stage(stage: Stage, settings: Settings) -> None:
+    """One stage: its methods and parameters, and what a camera and an ISO make of them."""
+    context = describe.context_for(stage, settings)
+    reads, writes = stage.reads.label, stage.writes.label
+    click.echo(f"{stage.name}: {stage.summary} Reads {reads}, writes {writes}.")
+    place = f"{context.camera.name}, ISO {context.iso:g}"
     for method in stage.methods:
         click.echo(f"\nmethod {method.method}: {method.summary}")
         rows = describe.parameter_rows(method)
+        automatic = describe.resolved(method, context)
+        headings = ["parameter", "default", *([place] if automatic else []), "unit", "allowed", ""]
+        table = Table(*headings, box=None, pad_edge=False)
+        for parameter, default, *rest in rows:
+            value = [automatic.get(parameter, "")] if automatic else []
+            table.add_row(parameter, default, *value, *rest)
         if rows:
-            table = Table(
-                "parameter", "default", "unit", "allowed", "what it is", box=None, pad_edge=False
-            )
-            for row in rows:
-                table.add_row(*row)
-            out.print(table)
+            console().print(table)
+    if stage.explain:
+        click.echo(f"\n{stage.explain(context)}")
 
 
 @main.command()
@@ -331,9 +380,12 @@ def devices(as_json: bool) -> None:
 @main.command()
 @device_option
 @click.option("--small", is_flag=True, help="Only tiny images, for slow devices.")
+@stage_file_option
 @json_option
-def check(selector: str | None, small: bool, as_json: bool) -> None:
+def check(selector: str | None, small: bool, stage_files: tuple[Path, ...], as_json: bool) -> None:
     """Compare every kernel with its NumPy reference on a device, and the raw bit for bit."""
+    for file in stage_files:
+        load_stage_file(file)
     device = open_device(selector)
     if device is None:
         raise RequestError("check: numpy is the reference; choose a device to compare with it")
@@ -400,7 +452,7 @@ def bench(selector: str | None, size: str, repeat: int, as_json: bool, **request
             f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 6000x4000, "
             f"at most {MAX_PIXELS} pixels"
         )
-    chain = chain_from(**request)
+    chain = Request(**request).chain()
     device = open_device(selector)
     if device is None:
         raise RequestError("bench: it times the kernels of a device; numpy has none")

@@ -57,6 +57,7 @@ class Chain:
     source: Kind
     camera: Camera
     settings: Settings  # it was made from
+    names: tuple[str, ...]  # of all steps, those before the first and after the last to run too
 
     @property
     def iso(self) -> float:
@@ -189,6 +190,32 @@ def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Sett
     if str(plain.get("camera", "")).endswith(".toml"):
         plain["camera"] = str(folder / plain["camera"])
     return Settings(parameters=tables, **plain)
+
+
+def overlay(settings: Settings, values: Mapping[str, Any]) -> Settings:
+    """The settings with others over them; what is to be skipped is added to what was.
+
+    Where another method is chosen for a step, the parameters of the one before are dropped.
+
+    Args:
+        settings: what holds where nothing else is said.
+        values: as for :func:`settings_from`.
+
+    Raises:
+        KeyedError: as :func:`settings_from`.
+    """
+    merged = settings.record()
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            old = dict(merged.get(key, {}))
+            if "method" in value and value["method"] != method_of(key, old):
+                old.clear()
+            merged[key] = old | dict(value)
+        elif key == "skip" and isinstance(value, Sequence) and not isinstance(value, str):
+            merged[key] = [*merged[key], *value]
+        else:
+            merged[key] = value
+    return settings_from(merged)
 
 
 def names_in(values: Mapping[str, Any], key: str, what: str) -> tuple[str, ...]:
@@ -344,7 +371,7 @@ def make_chain(
         )
     if source is None:
         source = steps[first].stage.reads
-    return Chain(tuple(steps[first:last]), source, camera, settings)
+    return Chain(tuple(steps[first:last]), source, camera, settings, tuple(names))
 
 
 def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:

@@ -2,41 +2,47 @@
 
 import json
 import types
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+from clpipe.config import Chain, Settings, make_chain
 from clpipe.device import Found, choose
-from clpipe.errors import DeviceError
-from clpipe.plan import AnyLaunch, Launch, Lines, Plan, launch_bytes
-from clpipe.stage import Method, Stage
+from clpipe.errors import ClpipeError, DeviceError
+from clpipe.plan import AnyLaunch, Launch, Lines, Plan, launch_bytes, reads_of
+from clpipe.stage import Context, Method, Stage
 
 LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 
 def plan_rows(plan: Plan) -> list[tuple[str, ...]]:
     """A row a launch: name, what opened it, stages, images read and written, bytes a pixel."""
+    kept = {image.number: name for name, image in plan.kept}
     return [
         (
             launch.name,
-            opener(launch),
+            opener(launch, kept),
             ", ".join(stages_of(launch)),
-            reads_of(plan, launch),
-            writes_of(plan, launch),
+            reads_text(plan, launch),
+            writes_text(plan, launch),
             f"{launch_bytes(plan, launch, 8):.1f}",
         )
         for launch in plan.launches
     ]
 
 
-def opener(launch: AnyLaunch) -> str:
-    """Why a launch is one of its own."""
+def opener(launch: AnyLaunch, kept: Mapping[int, str]) -> str:
+    """Why a launch is one of its own, and which stage is the cause."""
     if isinstance(launch, Lines):
-        return "row and column tables"
+        return "tables of rows and columns"
     if not isinstance(launch, Launch):
-        return "reduction"
+        return f"{launch.op.step}: {launch.op.pass_.access.value}"
     if launch.stencil:
-        return f"stencil, radius {launch.stencil.pass_.radius}"
-    return "stored image" if launch.reads else "source"
+        return f"{launch.stencil.step}: stencil, radius {launch.stencil.pass_.radius}"
+    if not launch.reads:
+        return "source"
+    if name := kept.get(launch.reads[0].image.number):
+        return f"{name} is kept"
+    return f"{launch.ops[0].step if launch.ops else 'end'}: stored image"
 
 
 def stages_of(launch: AnyLaunch) -> list[str]:
@@ -57,18 +63,16 @@ def slots_text(plan: Plan, number: int) -> str:
     return ",".join(str(slot) for slot in plan.slots[number])
 
 
-def reads_of(plan: Plan, launch: AnyLaunch) -> str:
+def reads_text(plan: Plan, launch: AnyLaunch) -> str:
     """What a launch reads."""
-    if not isinstance(launch, Launch):
-        return ""
-    if not launch.reads:
+    if isinstance(launch, Launch) and not launch.reads:
         return f"source {plan.source.label}, {'half' if plan.half else 'float'}"
     return "; ".join(
-        f"{r.image.kind.label} in {slots_text(plan, r.image.number)}" for r in launch.reads
+        f"{r.image.kind.label} in {slots_text(plan, r.image.number)}" for r in reads_of(launch)
     )
 
 
-def writes_of(plan: Plan, launch: AnyLaunch) -> str:
+def writes_text(plan: Plan, launch: AnyLaunch) -> str:
     """What a launch writes."""
     if not isinstance(launch, Launch):
         return ""
@@ -119,6 +123,63 @@ def value_text(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
+def toml_text(chain: Chain) -> str:
+    """A chain as a configuration, complete: what follows camera and ISO is there as a comment."""
+    settings = chain.settings
+    lines = [
+        f"camera = {value_text(settings.camera)}",
+        f"iso = {value_text(settings.iso)}",
+        f"seed = {value_text(settings.seed)}",
+        "stages = [",
+        *(f"    {value_text(step.stage.name)}," for step in chain.steps),
+        "]",
+    ]
+    for step in chain.steps:
+        lines += ["", f"[{step.name}]", f"method = {value_text(step.method.method)}"]
+        given = settings.parameters.get(step.name, {})
+        for name, field in type(step.method).model_fields.items():
+            extra: Any = field.json_schema_extra
+            line = f"{name} = {value_text(getattr(step.method, name))}"
+            if name not in given and field.default is None:
+                line = f"# {line}  # automatic: {extra['auto']}"
+            lines.append(
+                line + (f"  # {extra['unit']}" if extra["unit"] and line[0] != "#" else "")
+            )
+    return "\n".join(lines) + "\n"
+
+
+def resolved(method: type[Method], context: Context) -> dict[str, str]:
+    """The values that automatic parameters of a method take in a context, as text."""
+    try:
+        values = method.model_validate(method.example).resolve(context)
+    except ClpipeError as error:
+        return {name: str(error) for name, f in method.model_fields.items() if f.default is None}
+    return {
+        name: short_text(getattr(values, name))
+        for name, field in method.model_fields.items()
+        if field.default is None
+    }
+
+
+def short_text(value: Any) -> str:
+    """A number, or numbers, with four digits.
+
+    >>> short_text(((1.0, 0.123456), (0.0, 2.0)))
+    '[[1, 0.1235], [0, 2]]'
+    """
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(short_text, value))}]"
+    return f"{value:.4g}" if isinstance(value, float) else value_text(value)
+
+
+def context_for(stage: Stage, settings: Settings) -> Context:
+    """What is known where a stage stands in the default chain, or could stand."""
+    steps = make_chain(settings).steps
+    own = [step.context for step in steps if step.stage is stage]
+    alike = [step.context for step in steps if step.stage.reads is stage.reads]
+    return [steps[0].context, *alike, *own][-1]
+
+
 def parameter_rows(method: type[Method]) -> list[tuple[str, ...]]:
     """A row a parameter: name, default, unit, what is allowed, one sentence."""
     rows: list[tuple[str, ...]] = []
@@ -134,8 +195,8 @@ def parameter_rows(method: type[Method]) -> list[tuple[str, ...]]:
     return rows
 
 
-def stage_record(stage: Stage) -> dict[str, Any]:
-    """A stage as JSON values."""
+def stage_record(stage: Stage, context: Context) -> dict[str, Any]:
+    """A stage as JSON values, with what automatic parameters come to in a context."""
     keys = ("name", "default", "unit", "allowed", "text")
     return {
         "name": stage.name,
@@ -147,6 +208,7 @@ def stage_record(stage: Stage) -> dict[str, Any]:
                 "name": method.method,
                 "summary": method.summary,
                 "parameters": [dict(zip(keys, row, strict=True)) for row in parameter_rows(method)],
+                "automatic": resolved(method, context),
             }
             for method in stage.methods
         ],

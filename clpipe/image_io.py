@@ -21,6 +21,7 @@ READABLE = (".exr", ".hdr", ".pfm", ".tif", ".tiff")
 JPEG_QUALITY = 97
 JPEG_MAX_SIDE = 65500
 HALF_MAX = np.float32(65504)  # so bright that nothing is lost, and no square overflows
+ATTRIBUTES = "clpipe:"  # what the names of our own begin with
 MAX_PIXELS = 1_000_000_000
 # Layers that hold the finished picture, in order of preference: no layer, then common names.
 PICTURE_LAYERS = ("", "combined", "beauty", "rgba", "rgb", "color", "default")
@@ -30,24 +31,30 @@ PICTURE_LAYERS = ("", "combined", "beauty", "rgba", "rgb", "color", "default")
 class SourceImage:
     """An image as it came from a file.
 
-    ``pixels`` is (height, width, 3) linear RGB, float16 or float32, finite and C-contiguous.
+    ``pixels`` is (height, width, 3) linear RGB or a (height, width) mosaic, float16 or float32,
+    finite and C-contiguous. ``attributes`` are those that clpipe gives to a kept image.
     """
 
     pixels: Array
     sha256: str
     layer: str
     warnings: tuple[str, ...]
+    attributes: Mapping[str, str]
 
 
-def read_image(path: Path) -> SourceImage:
+def read_image(path: Path, mosaic: bool = False) -> SourceImage:
     """Read the picture of a file: R, G and B by name, the display window, everything finite.
 
     Half stays half. Alpha, depth and other layers are left alone. NaN and infinity become 0,
     counted in a warning. What the data window leaves out of the display window is black.
 
+    Args:
+        path: the file.
+        mosaic: read a single channel instead, which may hold whole numbers of 16 or 32 bits.
+
     Raises:
-        ImageError: the file is missing, empty, damaged, no image, not linear float, deep, or has no
-            RGB; the message names the file and the reason.
+        ImageError: the file is missing, empty, damaged, no image, not linear float, deep, or has
+            not the channels; the message names the file and the reason.
     """
     try:
         str(path).encode()
@@ -65,16 +72,21 @@ def read_image(path: Path) -> SourceImage:
     if file is None:
         raise ImageError(f"{path}: cannot be read as an image: {_reason(oiio.geterror())}")
     try:
-        pixels, layer, warnings = _read_picture(path, file)
+        pixels, layer, warnings, attributes = _read_picture(path, file, mosaic)
     finally:
         file.close()
     pixels, count = without_non_finite(pixels)
     if count:
         warnings.append(f"{count} samples were NaN or infinite and were set to 0")
-    if pixels.dtype == np.float32 and (beyond := int((np.abs(pixels) > HALF_MAX).sum())):
+    if (
+        not mosaic
+        and pixels.dtype == np.float32
+        and (beyond := int((np.abs(pixels) > HALF_MAX).sum()))
+    ):
         pixels = np.clip(pixels, -HALF_MAX, HALF_MAX)
         warnings.append(f"{beyond} samples beyond {HALF_MAX:g}, the range of half, were clipped")
-    return SourceImage(pixels, hashlib.sha256(data).hexdigest(), layer, tuple(warnings))
+    digest = hashlib.sha256(data).hexdigest()
+    return SourceImage(pixels, digest, layer, tuple(warnings), attributes)
 
 
 def _reason(text: str) -> str:
@@ -84,8 +96,10 @@ def _reason(text: str) -> str:
     return " ".join(text.split())
 
 
-def _read_picture(path: Path, file: Any) -> tuple[Array, str, list[str]]:
-    """The pixels of the part and layer that hold the picture, the layer's name, and warnings."""
+def _read_picture(
+    path: Path, file: Any, mosaic: bool
+) -> tuple[Array, str, list[str], dict[str, str]]:
+    """The pixels of the part and layer that hold the picture, the layer, warnings, attributes."""
     found: list[str] = []
     part = 0
     while file.seek_subimage(part, 0):
@@ -98,12 +112,34 @@ def _read_picture(path: Path, file: Any) -> tuple[Array, str, list[str]]:
             raise ImageError(f"{path}: a cube map, not a picture")
         names = list(spec.channelnames)
         found += [name for name in names if name not in found]
-        if picture := picture_channels(names):
+        attributes = {
+            a.name.removeprefix(ATTRIBUTES): str(a.value)
+            for a in spec.extra_attribs
+            if a.name.startswith(ATTRIBUTES)
+        }
+        if picture := mosaic_channel(names) if mosaic else picture_channels(names):
             layer, channels = picture
-            return _read_part(path, file, part, channels), layer, _warnings(spec)
+            return _read_part(path, file, part, channels), layer, _warnings(spec), attributes
+        if "kind" in attributes:
+            raise ImageError(
+                f"{path}: holds {attributes['kind']}, kept after {attributes.get('stage')}; "
+                "it can enter with --start-at a stage that reads this kind"
+            )
         part += 1
     listed = ", ".join(name for name in found[:20] if name) or "none"
-    raise ImageError(f"{path}: no R, G and B channels; found {listed}")
+    wanted = "no single channel with a mosaic" if mosaic else "no R, G and B channels"
+    raise ImageError(f"{path}: {wanted}; found {listed}")
+
+
+def mosaic_channel(names: Sequence[str]) -> tuple[str, tuple[int]] | None:
+    """The only channel, or the one called Y.
+
+    >>> mosaic_channel(["Z"]), mosaic_channel(["A", "Y"]), mosaic_channel(["R", "G", "B"])
+    (('', (0,)), ('', (1,)), None)
+    """
+    if len(names) == 1:
+        return "", (0,)
+    return ("", (list(names).index("Y"),)) if "Y" in names else None
 
 
 def picture_channels(names: Sequence[str]) -> tuple[str, tuple[int, int, int]] | None:
@@ -128,12 +164,13 @@ def picture_channels(names: Sequence[str]) -> tuple[str, tuple[int, int, int]] |
     return None
 
 
-def _read_part(path: Path, file: Any, part: int, channels: tuple[int, int, int]) -> Array:
-    """Three channels of one part, in its display window."""
+def _read_part(path: Path, file: Any, part: int, channels: tuple[int, ...]) -> Array:
+    """Three channels of one part, or one, in its display window."""
     spec = file.spec()
     formats = spec.channelformats or [spec.format] * spec.nchannels
     types = {formats[i].basetype for i in channels}
-    if not types <= {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}:
+    whole = len(channels) == 1 and types <= {oiio.UINT16, oiio.UINT32}
+    if not whole and not types <= {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}:
         raise ImageError(
             f"{path}: holds {spec.format} samples, not linear float ones; "
             "give an OpenEXR file (or Radiance HDR, PFM, float TIFF)"
@@ -143,17 +180,21 @@ def _read_part(path: Path, file: Any, part: int, channels: tuple[int, int, int])
         raise ImageError(f"{path}: {width}x{height} pixels; at most {MAX_PIXELS} can be read")
     half = types == {oiio.HALF}
     first, last = min(channels), max(channels) + 1
-    data = file.read_image(part, 0, first, last, oiio.HALF if half else oiio.FLOAT)
+    # Asked for as float, whole numbers would come scaled to 0..1.
+    wanted = types.pop() if whole else oiio.HALF if half else oiio.FLOAT
+    data = file.read_image(part, 0, first, last, wanted)
     problem = file.geterror()
     if data is None or problem:
         raise ImageError(f"{path}: damaged: {_reason(problem)}")
     pixels = np.asarray(data).reshape(spec.height, spec.width, last - first)
+    if whole:
+        pixels = pixels.astype(np.float32)
     order = [i - first for i in channels]
-    if order != [0, 1, 2] or pixels.shape[2] != 3:
+    if order != list(range(last - first)):
         pixels = pixels[..., order]
     if (spec.x, spec.y, spec.width, spec.height) != (spec.full_x, spec.full_y, width, height):
         pixels = display_window(pixels, spec.x - spec.full_x, spec.y - spec.full_y, width, height)
-    return np.ascontiguousarray(pixels)
+    return np.ascontiguousarray(pixels if len(channels) > 1 else pixels[..., 0])
 
 
 def display_window(data: Array, x: int, y: int, width: int, height: int) -> Array:
@@ -248,9 +289,11 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> None:
 
 
 def write_exr(
-    path: Path, pixels: Floats, channels: Sequence[str], attributes: Mapping[str, str | float]
+    path: Path, pixels: Floats, channels: Sequence[str], attributes: Mapping[str, str]
 ) -> None:
     """Write a float image, (height, width[, channel]), as OpenEXR (ZIP), channels named.
+
+    The names of ``attributes`` get clpipe's prefix in the file.
 
     Raises:
         ImageError: the file cannot be written.
@@ -262,7 +305,7 @@ def write_exr(
     # Else the time of writing is put in, and no two runs make the same bytes.
     spec.attribute("DateTime", "1970:01:01 00:00:00")
     for name, value in attributes.items():
-        spec.attribute(name, value)
+        spec.attribute(ATTRIBUTES + name, value)
 
     def write(to: Path) -> None:
         file = oiio.ImageOutput.create(str(to))

@@ -70,6 +70,10 @@ class Runner:
         self._arguments = {s.name: s.method.arguments(s.context) for s in chain.steps}
         self._table8: dict[str, Array] = {}
 
+    def of(self, chain: Chain) -> "Runner":
+        """The same for another chain, which compiles nothing if only values are different."""
+        return Runner(chain, self.device, self.keep, self.encode, self.final)
+
     def plan(self, half: bool = True, fold: bool = True) -> Plan:
         """The plan for a source of half floats or floats."""
         key = (half, fold)

@@ -5,7 +5,7 @@ A stage is declared once, in ``clpipe/stages/<name>.py``, as a :class:`Stage` wi
 anywhere (validation, help, ``--set``, kernel arguments, the sidecar) is derived from there.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
@@ -196,6 +196,7 @@ class Stage:
     reads: Kind
     writes: Kind
     methods: tuple[type[Method], ...]
+    explain: Callable[[Context], str] | None = None  # more about it, with numbers
     folder: Path | None = None  # of the kernel files, where they are not clpipe's own
 
     @cached_property

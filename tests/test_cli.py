@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from clpipe.cli import main
+from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import ROOT, STILL_LIFE
 
 
@@ -105,7 +106,7 @@ def test_a_second_run_makes_the_same_bytes(clpipe, small, tmp_path):
             "all",
         )
     assert files(tmp_path / "a") == files(tmp_path / "b")
-    assert len(files(tmp_path / "a")) == 2 + 1 + 13
+    assert len(files(tmp_path / "a")) == 3 + len(DEFAULT_CHAIN)
     for name in files(tmp_path / "a"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
