@@ -25,7 +25,7 @@ from clpipe.config import (
     overlay,
     parse_assignment,
 )
-from clpipe.device import Device, choose, find_devices
+from clpipe.device import find_devices, open_device
 from clpipe.errors import ClpipeError, RequestError
 from clpipe.image_io import MAX_PIXELS
 from clpipe.plan import make_plan
@@ -34,7 +34,6 @@ from clpipe.run import Runner
 from clpipe.stage import Kind, Stage
 from clpipe.suggest import one_of
 
-NUMPY = "numpy"
 DEFAULTS = Settings()
 
 
@@ -190,13 +189,6 @@ def kept_names(chain: Chain, keep: Sequence[str]) -> tuple[str, ...]:
     if "all" in keep:
         return tuple(step.name for step in chain.steps)
     return tuple(chain.step_named(name).name for name in dict.fromkeys(keep))
-
-
-def open_device(selector: str | None) -> Device | None:
-    """The device that a selector names; None is NumPy."""
-    if selector is not None and selector.lower() == NUMPY:
-        return None
-    return Device(choose(selector, find_devices()))
 
 
 @click.group(

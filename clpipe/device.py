@@ -461,3 +461,14 @@ class Device:
         one.release()
         two.release()
         return best
+
+
+def open_device(selector: str | None) -> Device | None:
+    """The device that a selector names, as :func:`choose` has it; None for "numpy".
+
+    Raises:
+        DeviceError: there is none, none matches, or the one that was asked for cannot be used.
+    """
+    if selector is not None and selector.lower() == "numpy":
+        return None
+    return Device(choose(selector, find_devices()))

@@ -30,6 +30,13 @@ class Result:
     kept: dict[str, Floats]
     found: dict[str, dict[str, float]]
 
+    @property
+    def image(self) -> Array:
+        """The last image: in eight bits where these were asked for, else in float."""
+        image = self.final if self.encoded is None else self.encoded
+        assert image is not None
+        return image
+
 
 def streams(chain: Chain, step: Step, image_key: str) -> dict[Owner, Stream]:
     """The random streams of a step for one image.

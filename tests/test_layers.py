@@ -20,7 +20,7 @@ LEVELS = [
     {"codegen"},
     {"device"},
     {"run"},
-    {"image_io", "check", "bench"},
+    {"image_io", "check", "bench", "pipeline"},
     {"batch", "describe"},
     {"cli"},
 ]

@@ -1,0 +1,110 @@
+"""The Python door: a camera as an object that takes NumPy images."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clpipe.config import Chain, Settings, load_settings, make_chain, overlay
+from clpipe.device import open_device
+from clpipe.errors import ImageError
+from clpipe.run import Result, Runner
+from clpipe.stage import Kind
+from clpipe.types import Array
+
+
+class Pipeline:
+    """A chain of stages on a device, ready for images.
+
+    Args:
+        config: a built-in configuration ("default", "paper") or a TOML file.
+        device: an index or a part of a name as ``clpipe devices`` lists them, or "numpy"; None
+            takes the first GPU, else the first CPU.
+        keep: steps whose image is wanted beside the last one.
+        start_at: the first step to run; images are then of the kind that it reads.
+        until: the last step to run.
+        **settings: what a configuration file may hold, over ``config``: ``iso=3200``,
+            ``denoise={"method": "mean"}``.
+
+    Raises:
+        RequestError: a name or value that is not allowed.
+        DeviceError: there is no usable device.
+    """
+
+    def __init__(
+        self,
+        config: str | Path = "default",
+        *,
+        device: str | None = None,
+        keep: Sequence[str] = (),
+        start_at: str | None = None,
+        until: str | None = None,
+        **settings: Any,
+    ) -> None:
+        self._settings = overlay(load_settings(str(config)), settings)
+        self._ends = start_at, until
+        chain = self._chain(self._settings)
+        kept = tuple(chain.step_named(name).name for name in keep)
+        encode = chain.result is Kind.DISPLAY
+        self._runner = Runner(chain, open_device(device), kept, encode=encode, final=not encode)
+
+    def _chain(self, settings: Settings) -> Chain:
+        start_at, until = self._ends
+        return make_chain(settings, start_at=start_at, until=until)
+
+    @property
+    def chain(self) -> Chain:
+        """The steps, each with its resolved parameters."""
+        return self._runner.chain
+
+    def process(self, image: Array, key: str, **settings: Any) -> Result:
+        """Put one image through.
+
+        Args:
+            image: (height, width, 3) linear RGB, 1 = full scale of the sensor, of float16, float32
+                or float64; or (height, width) where the chain starts on a mosaic.
+            key: what the image's noise belongs to: the same key gives the same noise.
+            **settings: other values for this image alone, as for the class. Values such as ISO,
+                gains and noise parameters cost nothing; another method or size is compiled.
+
+        Returns:
+            ``image`` is (height, width, 3) uint8 where the chain ends in display values, else
+            float32; ``kept`` has the images of ``keep``, float32, by their names.
+
+        Raises:
+            ImageError: an image of the wrong shape or type, not finite, or too large.
+            RequestError: a setting that is not allowed.
+        """
+        runner = self._runner
+        if settings:
+            runner = runner.of(self._chain(overlay(self._settings, settings)))
+        return runner.run(_checked(image), key)
+
+    def process_many(
+        self, images: Iterable[Array | tuple[Array, Mapping[str, Any]]]
+    ) -> Iterator[Result]:
+        """Put images through, one after the other, as they are asked for.
+
+        An item is an image, whose key is then its number ("0", "1", ...), or an image with the
+        arguments that :meth:`process` takes beside it, such as ``{"key": "a", "iso": 800}``.
+        """
+        for number, item in enumerate(images):
+            image, arguments = item if isinstance(item, tuple) else (item, {})
+            yield self.process(image, **{"key": str(number), **arguments})
+
+
+def _checked(image: Array) -> Array:
+    """The image in a type that runs, refused where it cannot be linear light.
+
+    Raises:
+        ImageError: it is not of floats, or not finite.
+    """
+    if not isinstance(image, np.ndarray) or image.dtype.kind != "f":
+        found = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
+        raise ImageError(f"found an image of {found}; expected linear light in a NumPy float array")
+    if image.dtype not in (np.float16, np.float32):
+        image = image.astype(np.float32)
+    if not np.isfinite(image).all():
+        raise ImageError("found NaN or infinity in an image; np.nan_to_num takes them out")
+    return image
