@@ -5,7 +5,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import clpipe
-from clpipe.config import Chain, Settings, Step, settings_from
+from clpipe.config import Chain, Settings, Step, base_name, settings_from
 from clpipe.errors import ImageError, RequestError
 from clpipe.image_io import (
     JPEG_MAX_SIDE,
     READABLE,
     SourceImage,
     Tags,
+    read_attributes,
     read_image,
     versions,
     write_beside,
@@ -264,12 +265,40 @@ def sidecar(
     }
 
 
+def carried_settings(attributes: Mapping[str, str]) -> Settings | None:
+    """The settings that a kept image was made with; None where it says nothing of them.
+
+    Raises:
+        RequestError: they are damaged, or name what there is not.
+    """
+    if "settings" not in attributes:
+        return None
+    try:
+        values = json.loads(attributes["settings"])
+    except ValueError as error:
+        raise RequestError(str(error)) from None
+    if not isinstance(values, dict):
+        raise RequestError(f"found {values!r}")
+    return settings_from(values)
+
+
 @dataclass(frozen=True)
 class Reentry:
     """Going on with kept images: how to make the chain, given the settings that one carries."""
 
     start_at: str
-    chain: Callable[[Settings | None], Chain]
+    make: Callable[[Settings | None], Chain]
+
+    def first_chain(self, jobs: Sequence[Job]) -> Chain:
+        """The chain for the first image, from which it is seen early whether the request is right.
+
+        Raises:
+            RequestError: it is not.
+        """
+        try:
+            return self.make(carried_settings(read_attributes(jobs[0].path)))
+        except RequestError:
+            return self.make(None)
 
     def chain_for(self, path: Path, source: SourceImage) -> Chain:
         """The chain for one image.
@@ -279,17 +308,17 @@ class Reentry:
                 itself is of no use.
         """
         try:
-            values = json.loads(source.attributes.get("settings", "null"))
-            chain = self.chain(settings_from(values) if values else None)
-        except (ValueError, AttributeError, RequestError) as error:
+            chain = self.make(carried_settings(source.attributes))
+        except RequestError as error:
             raise ImageError(f"{path}: what it was made with cannot be used: {error}") from None
         kind = source.attributes.get("kind", chain.source.label)
         if kind != chain.source.label:
-            others = [name for name, stage in all_stages().items() if stage.reads.label == kind]
+            stages = {name: all_stages()[base_name(name)] for name in chain.names}
+            others = [name for name, stage in stages.items() if stage.reads.label == kind]
             raise ImageError(
                 f"{path}: holds {kind} (kept after {source.attributes.get('stage')}), but "
-                f"{self.start_at} reads {chain.source.label}; stages that read {kind}: "
-                f"{', '.join(others) or 'none'}"
+                f"{self.start_at} reads {chain.source.label}; {kind} can enter at: "
+                f"{', '.join(others) or 'none of the stages'}"
             )
         return chain
 

@@ -231,18 +231,18 @@ def run(
     Each makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used.
     """
     asked = Request(**request)
-    chain = asked.chain()
+    jobs = find_jobs(inputs, output)
+    reentry = Reentry(asked.start_at, asked.chain) if asked.start_at else None
+    chain = reentry.first_chain(jobs) if reentry else asked.chain()
     kept = kept_names(chain, keep)
     whole = asked.until is None or chain.result is Kind.DISPLAY
     formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
-    jobs = find_jobs(inputs, output)
     target = Target(output, formats)
     target.check(chain, jobs, kept)
     device = open_device(selector)
     prepare_folder(output)
     eight_bit = any(f != "exr" for f in formats)
     runner = Runner(chain, device, kept, encode=eight_bit, final="exr" in formats)
-    reentry = Reentry(asked.start_at, asked.chain) if asked.start_at else None
     failed = 0
     for outcome in run_jobs(jobs, runner, target, reentry):
         if outcome.error:

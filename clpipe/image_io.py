@@ -1,10 +1,10 @@
 """Image files in and out. The only importer of OpenImageIO and Pillow."""
 
+import contextlib
 import hashlib
 import io
 import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -112,11 +112,7 @@ def _read_picture(
             raise ImageError(f"{path}: a cube map, not a picture")
         names = list(spec.channelnames)
         found += [name for name in names if name not in found]
-        attributes = {
-            a.name.removeprefix(ATTRIBUTES): str(a.value)
-            for a in spec.extra_attribs
-            if a.name.startswith(ATTRIBUTES)
-        }
+        attributes = _attributes(spec)
         if picture := mosaic_channel(names) if mosaic else picture_channels(names):
             layer, channels = picture
             return _read_part(path, file, part, channels), layer, _warnings(spec), attributes
@@ -129,6 +125,25 @@ def _read_picture(
     listed = ", ".join(name for name in found[:20] if name) or "none"
     wanted = "no single channel with a mosaic" if mosaic else "no R, G and B channels"
     raise ImageError(f"{path}: {wanted}; found {listed}")
+
+
+def _attributes(spec: Any) -> dict[str, str]:
+    """clpipe's own attributes of a part."""
+    return {
+        a.name.removeprefix(ATTRIBUTES): str(a.value)
+        for a in spec.extra_attribs
+        if a.name.startswith(ATTRIBUTES)
+    }
+
+
+def read_attributes(path: Path) -> dict[str, str]:
+    """The attributes that clpipe gave to a kept image; none if the file is no such image."""
+    file = oiio.ImageInput.open(str(path)) if path.is_file() else None
+    if file is None:
+        oiio.geterror()  # it would be told at the next call
+        return {}
+    with contextlib.closing(file):
+        return _attributes(file.spec())
 
 
 def mosaic_channel(names: Sequence[str]) -> tuple[str, tuple[int]] | None:
@@ -249,7 +264,7 @@ def write_beside(path: Path, write: Callable[[Path], None]) -> None:
     except OSError as error:
         raise ImageError(f"{path}: cannot be written: {error.strerror or error}") from None
     finally:
-        with suppress(OSError):
+        with contextlib.suppress(OSError):
             beside.unlink(missing_ok=True)
 
 

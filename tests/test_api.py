@@ -1,0 +1,122 @@
+"""The Python API, as somebody who imports clpipe sees it."""
+
+import re
+
+import numpy as np
+import pytest
+
+import clpipe
+from tests.conftest import ROOT
+
+
+@pytest.fixture(scope="module")
+def render():
+    return np.random.default_rng(0).random((40, 60, 3), np.float32) * np.float32(0.6)
+
+
+@pytest.fixture(scope="module")
+def camera():
+    return clpipe.Pipeline(iso=3200, denoise={"luma_strength": 0.5}, keep=["quantize"])
+
+
+def test_the_example_in_the_readme(tmp_path, monkeypatch):
+    text = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1]
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(text, names)
+    assert names["shot"].image.dtype == np.uint8
+    assert names["shot"].kept["quantize"].ndim == 2
+
+
+def test_one_image(camera, render):
+    shot = camera.process(render, "a")
+    assert shot.image.shape == render.shape
+    assert shot.image.dtype == np.uint8
+    raw = shot.kept["quantize"]
+    assert raw.shape == render.shape[:2]
+    assert np.array_equal(raw, np.rint(raw))
+    assert np.array_equal(camera.process(render, "a").image, shot.image)
+    assert not np.array_equal(camera.process(render, "b").kept["quantize"], raw)
+
+
+def test_it_gives_what_the_references_give(camera, render):
+    numpy = clpipe.Pipeline(
+        iso=3200, denoise={"luma_strength": 0.5}, keep=["quantize"], device="numpy"
+    )
+    one, two = camera.process(render, "a"), numpy.process(render, "a")
+    assert np.array_equal(one.kept["quantize"], two.kept["quantize"])
+    assert np.abs(one.image.astype(int) - two.image).max() <= 1
+
+
+def test_overrides_hold_for_one_image_and_compile_nothing(camera, render):
+    plain = camera.process(render, "a")
+    compiled = len(camera._runner.device._programs)
+    noisy = camera.process(
+        render,
+        "a",
+        iso=12800,
+        sensor_noise={"a": 5e-3, "b": 1e-5},
+        inverse_white_balance={"red_gain": 1.9, "blue_gain": 1.2},
+    )
+    assert len(camera._runner.device._programs) == compiled
+    assert noisy.kept["quantize"].std() > plain.kept["quantize"].std()
+    fresh = clpipe.Pipeline(
+        iso=12800,
+        denoise={"luma_strength": 0.5},
+        sensor_noise={"a": 5e-3, "b": 1e-5},
+        inverse_white_balance={"red_gain": 1.9, "blue_gain": 1.2},
+    )
+    assert np.array_equal(fresh.process(render, "a").image, noisy.image)
+    assert np.array_equal(camera.process(render, "a").image, plain.image)
+
+
+def test_many_images(camera, render):
+    items = [render, (render, {"key": "a", "iso": 800}), render.astype(np.float16)]
+    shots = list(camera.process_many(iter(items)))
+    assert np.array_equal(shots[0].image, camera.process(render, "0").image)
+    assert np.array_equal(shots[1].image, camera.process(render, "a", iso=800).image)
+    assert len(shots) == 3
+
+
+def test_from_a_file_and_in_part(tmp_path, render):
+    path = tmp_path / "pipeline.toml"
+    path.write_text('iso = 400\n[demosaic]\nmethod = "bilinear"\n')
+    camera = clpipe.Pipeline(path, until="demosaic", seed=3)
+    assert camera.chain.iso == 400
+    shot = camera.process(render.astype(np.float64), "a")
+    assert shot.image.dtype == np.float32
+    rest = clpipe.Pipeline(path, start_at="denoise", seed=3)
+    assert np.array_equal(
+        rest.process(shot.image, "a").image,
+        clpipe.Pipeline(path, seed=3).process(render, "a").image,
+    )
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((4, 4, 3), np.uint8), "found an image of uint8; expected linear light"),
+        ([[1.0]], "found an image of list"),
+        (np.zeros((4, 4), np.float32), "shape .4, 4., but the chain starts on rgb"),
+        (np.zeros((4, 4, 4), np.float32), "shape .4, 4, 4."),
+        (np.full((4, 4, 3), np.nan, np.float32), "NaN or infinity"),
+        (np.zeros((0, 4, 3), np.float32), "shape .0, 4, 3."),
+    ],
+)
+def test_an_image_that_is_none(camera, image, message):
+    with pytest.raises(clpipe.ImageError, match=message):
+        camera.process(image, "a")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"isoo": 3}, "unknown key 'isoo'"),
+        ({"denoise": {"strong": 1}}, "unknown parameter of denoise"),
+        ({"config": "papers"}, "unknown configuration 'papers' .*'paper'"),
+        ({"keep": ["denoize"]}, "unknown stage in this chain 'denoize'"),
+    ],
+)
+def test_a_request_that_is_wrong(settings, message):
+    with pytest.raises(clpipe.RequestError, match=message):
+        clpipe.Pipeline(**settings)

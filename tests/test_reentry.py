@@ -1,0 +1,198 @@
+"""Going on from a kept image, from one that was edited, and from a mosaic of somebody else's."""
+
+import itertools
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from click.testing import CliRunner
+
+from clpipe.cli import main
+from clpipe.image_io import read_image, write_exr
+from clpipe.stages import DEFAULT_CHAIN
+from tests.conftest import STILL_LIFE
+
+OPTIONS = ("--iso", "3200", "--seed", "5", "--set", "mosaic.pattern=GBRG")
+OPTIONS += ("--set", "white_balance.method=gray_world", "--set", "gamma.exponent=1.9")
+OPTIONS += ("--set", "row_noise.sigma=0.01")
+
+
+def clpipe(*arguments, status=0):
+    result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == status, result.output
+    assert "Traceback" not in result.output
+    return result.output
+
+
+def crop(folder: Path, name: str = "crop.exr") -> Path:
+    pixels = read_image(STILL_LIFE).pixels[200:301, 300:437].astype(np.float32)
+    write_exr(folder / name, pixels, ("R", "G", "B"), {})
+    return folder / name
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """A folder with a picture and all that was kept on the way to it."""
+    folder = tmp_path_factory.mktemp("kept")
+    clpipe("run", crop(folder), "-o", folder / "out", *OPTIONS, "--keep", "all")
+    return folder / "out"
+
+
+def edited(path: Path, to: Path, change) -> Path:
+    """A copy with other pixels, all attributes kept, as an image editor makes it."""
+    image = oiio.ImageBuf(str(path))
+    pixels = change(image.get_pixels(oiio.FLOAT))
+    copy = oiio.ImageBuf(image.spec())
+    copy.set_pixels(oiio.ROI(), pixels)
+    assert copy.write(str(to))
+    return to
+
+
+@pytest.mark.parametrize(("after", "start_at"), list(itertools.pairwise(DEFAULT_CHAIN)))
+def test_going_on_gives_the_same_picture(kept, tmp_path, after, start_at):
+    clpipe("run", kept / f"crop.{after}.exr", "-o", tmp_path, "--start-at", start_at)
+    assert (tmp_path / f"crop.{after}.jpg").read_bytes() == (kept / "crop.jpg").read_bytes()
+
+
+def test_going_on_with_some_stages_gives_the_same_images(kept, tmp_path):
+    part = ("--start-at", "quantize", "--until", "demosaic", "--keep", "normalize")
+    clpipe("run", kept / "crop.column_noise.exr", "-o", tmp_path, *part)
+    for made, name in (("column_noise", "demosaic"), ("column_noise.normalize", "normalize")):
+        one = read_image(tmp_path / f"crop.{made}.exr", mosaic=name == "normalize")
+        two = read_image(kept / f"crop.{name}.exr", mosaic=name == "normalize")
+        assert np.array_equal(one.pixels, two.pixels)
+        assert one.attributes == two.attributes
+
+
+def test_options_given_again_win_over_those_of_the_kept_image(kept, tmp_path):
+    entry = (kept / "crop.denoise.exr", "--start-at", "tone_curve", "--format", "png")
+    clpipe("run", *entry, "-o", tmp_path / "a")
+    clpipe("run", *entry, "-o", tmp_path / "b", "--set", "gamma.exponent=2.5")
+    clpipe("run", *entry, "-o", tmp_path / "c", "-c", "default")
+    names = [tmp_path / folder / "crop.denoise.json" for folder in "abc"]
+    exponents = [json.loads(n.read_text())["stages"][-1]["parameters"]["exponent"] for n in names]
+    assert exponents == [1.9, 2.5, 2.2]
+
+
+def test_what_was_edited_is_honoured(kept, tmp_path):
+    def darken(pixels):
+        pixels[:, : pixels.shape[1] // 2] = 0
+        return pixels
+
+    path = edited(kept / "crop.denoise.exr", tmp_path / "crop.exr", darken)
+    out = tmp_path / "out"
+    clpipe("run", path, "-o", out, "--start-at", "tone_curve", "--format", "png")
+    made, whole = (
+        oiio.ImageBuf(str(p)).get_pixels() for p in (out / "crop.png", kept / "crop.jpg")
+    )
+    assert made[:, :60].max() == 0
+    assert np.abs(made[:, 80:] - whole[:, 80:]).mean() < 0.02
+
+
+@pytest.mark.parametrize("stored", [oiio.HALF, oiio.FLOAT, oiio.UINT32])
+@pytest.mark.parametrize("channel", ["Y", "Raw"])
+def test_a_mosaic_from_elsewhere_enters_with_pattern_and_levels(kept, tmp_path, stored, channel):
+    dn = np.rint(read_image(kept / "crop.quantize.exr", mosaic=True).pixels / 8)  # fits half
+    spec = oiio.ImageSpec(dn.shape[1], dn.shape[0], 1, stored)
+    spec.channelnames = (channel,)
+    path = tmp_path / "raw.exr"
+    file = oiio.ImageOutput.create(str(path))
+    values = dn.astype(np.uint32 if stored == oiio.UINT32 else np.float32)
+    assert file.open(str(path), spec) and file.write_image(values[..., None]) and file.close()
+    settings = ("mosaic.pattern=GBRG", "normalize.black_level=64", "normalize.white_level=2047")
+    options = [o for s in settings for o in ("--set", s)]
+    out = tmp_path / "out"
+    clpipe("run", path, "-o", out, "--start-at", "normalize", *options, "--keep", "normalize")
+    expected = (dn - np.float32(64)) * np.float32(1 / (2047 - 64))
+    kept_image = read_image(out / "raw.normalize.exr", mosaic=True).pixels
+    assert np.array_equal(kept_image, expected.astype(np.float32))
+    record = json.loads((out / "raw.json").read_text())
+    assert record["starts_on"] == "raw"
+    assert record["stages"][0]["name"] == "normalize"
+    picture = oiio.ImageBuf(str(out / "raw.jpg")).get_pixels().mean((0, 1))
+    whole = oiio.ImageBuf(str(kept / "crop.jpg")).get_pixels().mean((0, 1))
+    assert np.abs(picture / picture[1] - whole / whole[1]).max() < 0.2
+
+
+@pytest.mark.parametrize(
+    ("after", "start_at", "message"),
+    [
+        (
+            "quantize",
+            "white_balance",
+            "holds raw .kept after quantize., but white_balance .* at: norm",
+        ),
+        ("mosaic", "denoise", "holds mosaic, kept after mosaic"),
+        ("demosaic", "normalize", "holds rgb, kept after demosaic"),
+        (
+            "gamma",
+            "denoise",
+            "holds display .kept after gamma., but denoise reads .*none of",
+        ),
+    ],
+)
+def test_an_image_of_another_kind_is_refused_and_the_others_go_on(
+    kept, tmp_path, after, start_at, message
+):
+    right = DEFAULT_CHAIN[DEFAULT_CHAIN.index(start_at) - 1]
+    files = (kept / f"crop.{after}.exr", kept / f"crop.{right}.exr")
+    output = clpipe("run", *files, "-o", tmp_path, "--start-at", start_at, status=1)
+    assert f"crop.{after}.exr: " in output
+    assert re.search(message, output), output
+    assert (tmp_path / f"crop.{right}.jpg").is_file()
+    assert not (tmp_path / f"crop.{after}.jpg").exists()
+
+
+def test_settings_that_an_image_carries_may_be_of_no_use(kept, tmp_path):
+    image = read_image(kept / "crop.denoise.exr")
+    for number, settings in enumerate(
+        ('{"iso": 1}', '{"nonsense": 1}', "{", "[1]", '{"camera": "x"}')
+    ):
+        attributes = {**image.attributes, "settings": settings}
+        path = tmp_path / f"{number}.exr"
+        write_exr(path, image.pixels, ("R", "G", "B"), attributes)
+        output = clpipe("run", path, "-o", tmp_path / "out", "--start-at", "tone_curve", status=1)
+        assert f"{number}.exr: what it was made with cannot be used" in output
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--start-at", "denoize"), "unknown stage in this chain 'denoize' .*'denoise'"),
+        (("--until", "denoise_2"), "unknown stage in this chain 'denoise_2'"),
+        (("--start-at", "gamma", "--until", "mosaic"), "gamma comes after mosaic"),
+        (("--until", "demosaic", "--keep", "gamma"), "unknown stage in this chain 'gamma'"),
+        (("--until", "quantize", "--format", "jpg"), "the chain ends in DN, which jpg cannot hold"),
+    ],
+)
+def test_a_part_that_cannot_be_run(kept, tmp_path, options, message):
+    output = clpipe("run", kept / "crop.exposure.exr", "-o", tmp_path, *options, status=2)
+    assert re.search(message, output), output
+    assert not list(tmp_path.iterdir())
+
+
+def test_until_gives_a_float_image_unless_it_is_the_end(tmp_path):
+    image = crop(tmp_path)
+    clpipe("run", image, "-o", tmp_path / "a", "--until", "white_balance")
+    assert {p.name for p in (tmp_path / "a").iterdir()} == {"crop.exr", "crop.json"}
+    assert read_image(tmp_path / "a" / "crop.exr", mosaic=True).attributes["kind"] == "mosaic"
+    clpipe("run", image, "-o", tmp_path / "b", "--until", "gamma")
+    assert (tmp_path / "b" / "crop.jpg").is_file()
+
+
+def test_a_kept_image_that_is_taken_for_a_render_is_told(kept, tmp_path):
+    output = clpipe("run", kept / "crop.demosaic.exr", "-o", tmp_path)
+    assert "was kept after demosaic; is it a render?" in output
+
+
+def test_a_repeated_stage_can_be_entered(tmp_path):
+    image = crop(tmp_path)
+    chain = "mosaic,demosaic,denoise,denoise,gamma"
+    clpipe("run", image, "-o", tmp_path / "a", "--stages", chain, "--keep", "denoise")
+    kept_image = tmp_path / "a" / "crop.denoise.exr"
+    clpipe("run", kept_image, "-o", tmp_path / "b", "--start-at", "denoise_2")
+    whole, again = tmp_path / "a" / "crop.jpg", tmp_path / "b" / "crop.denoise.jpg"
+    assert whole.read_bytes() == again.read_bytes()

@@ -1,0 +1,141 @@
+"""Stages of other people: from a file, and from an installed package."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+from click.testing import CliRunner
+
+from clpipe import registry
+from clpipe.cli import main
+from tests.conftest import ROOT, STILL_LIFE
+from tests.test_contributing import block
+
+PYTHON, OPENCL = block("python"), block("c")
+
+
+@pytest.fixture
+def clpipe(monkeypatch):
+    """Run clpipe with no stage file loaded yet."""
+    monkeypatch.setattr(registry, "_from_files", {})
+
+    def call(*arguments, status=0):
+        result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
+        assert result.exit_code == status, result.output
+        return result.output
+
+    return call
+
+
+@pytest.fixture
+def stage_file(tmp_path):
+    (tmp_path / "vignette.py").write_text(PYTHON)
+    (tmp_path / "vignette.cl").write_text(OPENCL)
+    return tmp_path / "vignette.py"
+
+
+def test_a_stage_file_is_a_stage_like_any_other(clpipe, stage_file, tmp_path):
+    assert "vignette" in clpipe("stages", "--stage-file", stage_file)
+    assert "focal_length" in clpipe("stages", "vignette", "--stage-file", stage_file)
+    chain = ("--stages", "exposure,vignette", "--stage-file", stage_file)
+    assert "exposure..vignette" in clpipe("plan", *chain)
+    out = tmp_path / "out"
+    clpipe("run", STILL_LIFE, "-o", out, *chain, "--format", "png", "--keep", "exposure")
+    assert (out / "still_life.png").is_file()
+
+
+def test_a_configuration_names_stage_files_relative_to_itself(clpipe, stage_file, tmp_path):
+    config = tmp_path / "pipeline.toml"
+    config.write_text('stage_files = ["vignette.py"]\nstages = ["exposure", "vignette"]\n')
+    assert "exposure..vignette" in clpipe("plan", "-c", config)
+
+
+def test_without_its_file_the_stage_is_unknown(clpipe):
+    assert "unknown stage 'vignette'" in clpipe("plan", "--stages", "vignette", status=2)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("class CosineFourth(Method):", "class CosineFourth(Method:"), r"vignette.py, line \d+: "),
+        (("STAGE = ", "STAG = "), "vignette.py: STAGE is not there"),
+        (("import numpy as np", "import numpi as np"), "line 6 of .*vignette.py: ModuleNotFound"),
+        (
+            ('"vignette", "Darken', '"denoise", "Darken'),
+            "'denoise', but that name is taken",
+        ),
+        (('"vignette", "Darken', '"denoise_2", "Darken'), "no digit last"),
+        (('kernel: ClassVar = "vignette"', 'kernel: ClassVar = "vig"'), "vig.cl is not there"),
+    ],
+)
+def test_a_stage_file_with_a_mistake(clpipe, stage_file, change, message):
+    text = PYTHON.replace(*change)
+    assert text != PYTHON
+    stage_file.write_text(text)
+    output = clpipe("stages", "--stage-file", stage_file, status=2)
+    assert "Traceback" not in output
+    assert re.search(message, output), output
+
+
+def test_a_kernel_with_a_syntax_error_is_named_with_its_own_line(clpipe, stage_file, tmp_path):
+    lines = OPENCL.splitlines()
+    lines[4] = "    const vf fall = 1.0f + (dx * dx + dy * dy) * scal;"
+    (tmp_path / "vignette.cl").write_text("\n".join(lines) + "\n")
+    chain = ("--stages", "exposure,vignette", "--stage-file", stage_file)
+    output = clpipe("run", STILL_LIFE, "-o", tmp_path / "out", *chain, status=2)
+    assert f"{tmp_path}/vignette.cl: does not compile" in output
+    assert f"{tmp_path}/vignette.cl:5:" in output
+    assert "scal'" in output
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_a_name_is_taken_by_another_file(clpipe, stage_file, tmp_path):
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "mine.py").write_text(PYTHON)
+    (other / "vignette.cl").write_text(OPENCL)
+    files = ("--stage-file", stage_file, "--stage-file", other / "mine.py")
+    assert f"name is taken ({tmp_path})" in clpipe("stages", *files, status=2)
+
+
+@pytest.mark.parametrize("name", ["no.py", "vignette.cl"])
+def test_a_stage_file_that_is_none(clpipe, stage_file, tmp_path, name):
+    assert name in clpipe("stages", "--stage-file", tmp_path / name, status=2)
+
+
+def install(folder, python=PYTHON):
+    package = folder / "lens_stages"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "vignette.py").write_text(python)
+    (package / "vignette.cl").write_text(OPENCL)
+    info = folder / "lens_stages-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: lens-stages\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[clpipe.stages]\nvignette = lens_stages.vignette:STAGE\n"
+    )
+
+
+def run_with_package(folder, *arguments):
+    program = f"import sys; sys.path[:0] = [{str(folder)!r}, {str(ROOT)!r}]\n"
+    program += "from clpipe.cli import main; main()"
+    command = [sys.executable, "-c", program, *arguments]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+def test_a_stage_of_an_installed_package(tmp_path):
+    install(tmp_path)
+    done = run_with_package(tmp_path, "plan", "--stages", "exposure,vignette")
+    assert "exposure..vignette" in done.stdout, done.stderr
+    assert "vignette" in run_with_package(tmp_path, "stages").stdout
+
+
+def test_a_package_whose_stage_cannot_be_loaded(tmp_path):
+    install(tmp_path, PYTHON.replace("import numpy as np", "import numpi as np"))
+    done = run_with_package(tmp_path, "stages")
+    assert done.returncode == 2
+    assert "package lens-stages" in done.stderr
+    assert "numpi" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,110 @@
+"""Tone curves from files."""
+
+import numpy as np
+import pytest
+
+from clpipe.config import make_chain, settings_from
+from clpipe.errors import RequestError
+from clpipe.stages.tone_curve import DEFAULT
+from clpipe.stages.tone_curve.table import table_of
+
+RAMP = np.linspace(0, 1, 300, dtype=np.float32).reshape(10, 10, 3)
+
+
+def chain_with(path):
+    return make_chain(settings_from({"tone_curve": {"method": "file", "path": str(path)}}))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "x", "y"),
+    [
+        ("a.csv", "x,y\n0,0\n0.5,0.25\n1,1\n", [0, 0.5, 1], [0, 0.25, 1]),
+        ("semicolons.csv", "# mine\n0; 0.1\n1; 0.9\n", [0, 0.5, 1], [0.1, 0.5, 0.9]),
+        ("bom.csv", "\ufeff0 0\n1 1", [0, 0.25, 1], [0, 0.25, 1]),
+        ("short.csv", "0.25,0\n0.75,1\n", [0, 0.25, 0.5, 0.75, 1], [0, 0, 0.5, 1, 1]),
+        (
+            "a.cube",
+            'TITLE "t"\nLUT_1D_SIZE 3\nDOMAIN_MIN 0 0 0\nDOMAIN_MAX 1 1 1\n0 0 0\n.2 .2 .2\n1 1 1',
+            [0, 0.25, 0.5, 0.75],
+            [0, 0.1, 0.2, 0.6],
+        ),
+        (
+            "resolve.CUBE",
+            "LUT_1D_SIZE 2\nLUT_1D_INPUT_RANGE 0.0 2.0\n0 0 0\n1 1 1\n",
+            [0, 0.5, 1],
+            [0, 0.25, 0.5],
+        ),
+    ],
+)
+def test_a_curve_from_a_file(develop, tmp_path, name, text, x, y):
+    (tmp_path / name).write_text(text)
+    image = np.repeat(np.float32(x)[None, :, None], 3, axis=2)
+    settings = {"stages": ["tone_curve"], "tone_curve": {"method": "file"}}
+    settings["tone_curve"]["path"] = str(tmp_path / name)
+    for numpy in (False, True):
+        result = develop(image, numpy=numpy, **settings).final
+        assert result[0, :, 1] == pytest.approx(y, abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.csv", "", "found 0 points; a curve has at least two"),
+        ("a.csv", "x,y\n", "found 0 points"),
+        ("a.csv", "0,0\n", "found 1 points"),
+        ("a.csv", "0,0\n0.5,0.5\n0.4,0.6\n", "line 3: x is 0.4 after 0.5; x must ascend"),
+        ("a.csv", "0,0\n0.5,0.5\n0.5,0.6\n", "line 3: x is 0.5 after 0.5; x must ascend"),
+        ("a.csv", "0,0\n255,255\n", "line 2: found '255,255', but x and y go from 0 to 1"),
+        ("a.csv", "0,0\n1,nan\n", "line 2: .*from 0 to 1"),
+        ("a.csv", "0,0,0\n1,1,1\n", "line 1: found 3 columns"),
+        ("a.csv", "0,0\nwhite,1\n", "line 2: found 'white,1', but expected x,y"),
+        ("a.cube", "LUT_3D_SIZE 2\n", "line 1: a table of three dimensions"),
+        ("a.cube", "LUT_1D_SIZE 3\n0 0 0\n1 1 1\n", "LUT_1D_SIZE is 3.*found 2 rows"),
+        ("a.cube", "0 0 0\n1 1 1\n", "LUT_1D_SIZE is None"),
+        ("a.cube", "LUT_1D_SIZE 2\n0 0 0\n1 1 .9\n", "line 3: red, green and blue differ"),
+        ("a.cube", "LUT_1D_SIZE 2\n0 0\n1 1\n", "line 2: found 2 numbers"),
+        ("a.cube", "LUT_1D_SIZE x\n0 0 0\n1 1 1\n", "line 1: .*expected numbers"),
+        (
+            "a.cube",
+            "LUT_1D_SIZE 2\nDOMAIN_MIN 1 1 1\n0 0 0\n1 1 1\n",
+            "its domain goes from 1 to 1",
+        ),
+        ("a.cube", "SHAPER 2\n", "line 1: 'SHAPER 2' is not understood"),
+        ("a.txt", "0,0\n1,1\n", "expected a file that ends in .csv or .cube"),
+    ],
+)
+def test_a_file_that_is_no_curve(tmp_path, name, text, message):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(RequestError, match=rf"tone_curve.path: found '.*{name}': {message}"):
+        chain_with(tmp_path / name)
+
+
+def test_a_file_that_cannot_be_read(tmp_path):
+    with pytest.raises(RequestError, match=r"tone_curve.path: .*cannot be read: No such file"):
+        chain_with(tmp_path / "no.csv")
+    (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(RequestError, match="not a text file"):
+        chain_with(tmp_path / "bytes.csv")
+
+
+def test_a_file_that_changed_is_read_again(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("0,0\n1,1\n")
+    one = table_of(str(path))
+    path.write_text("0,0\n1,0.5\n")
+    assert one[-1] == 1
+    assert table_of(str(path))[-1] == 0.5
+
+
+def test_the_default_curve_is_a_file_of_the_same_form(develop):
+    one = develop(RAMP, stages=["tone_curve"]).final
+    two = develop(RAMP, stages=["tone_curve"], tone_curve={"method": "file", "path": DEFAULT}).final
+    assert np.array_equal(one, two)
+    assert develop(np.full((1, 1, 3), 0.2, np.float32), stages=["tone_curve"]).final == (
+        pytest.approx(0.4294, abs=1e-4)
+    )
+
+
+def test_a_linear_tone_curve_changes_nothing(develop):
+    result = develop(RAMP, stages=["tone_curve"], tone_curve={"method": "linear"})
+    assert np.array_equal(result.final, RAMP)
