@@ -5,8 +5,19 @@ from pathlib import Path
 import pytest
 
 from clpipe.camera import load_camera
-from clpipe.config import make_chain, parse_assignment, read_settings, settings_from
+from clpipe.config import (
+    built_in_configs,
+    load_settings,
+    make_chain,
+    overlay,
+    parse_assignment,
+    read_settings,
+    settings_from,
+)
+from clpipe.describe import toml_text
 from clpipe.errors import RequestError
+from clpipe.stage import Kind
+from clpipe.stages import DEFAULT_CHAIN
 
 
 def build(**settings):
@@ -43,6 +54,16 @@ def build(**settings):
         ({"skip": ["normalize"]}, "white_balance reads mosaic, but quantize gives raw.*normalize"),
         ({"skip": ["quantize"]}, "normalize reads raw, but column_noise gives mosaic.*quantize"),
         ({"stages": []}, "nothing is left to do"),
+        (
+            {"color_matrix": {"method": "given", "matrix": [[1, 0, 0], [0, 1, 0], [1, 1, 0]]}},
+            "color_matrix.matrix: found .*: the matrix is singular",
+        ),
+        (
+            {"color_matrix": {"method": "given", "matrix": [[1, 0, 0], [0, 1, 0]]}},
+            r"color_matrix.matrix.2: .*[Ff]ield required",
+        ),
+        ({"white_balance": {"method": "white_patch", "percentile": 0}}, "percentile: found 0: "),
+        ({"white_balance": {"method": "white_patch", "percentile": 101}}, "percentile: found 101"),
         ({"quantize": {"black_level": 600, "white_level": 500}}, "white_level must be above"),
         ({"quantize": {"white_level": 500}}, "white_level must be above"),
     ],
@@ -116,6 +137,79 @@ def test_every_parameter_says_what_it_is():
         for method in stage.methods:
             for name, default, _, allowed, text in parameter_rows(method):
                 assert default and allowed and text.endswith("."), (stage.name, name)
+
+
+def test_built_in_configurations():
+    for name in built_in_configs():
+        make_chain(load_settings(name))
+    assert load_settings("default") == settings_from({})
+    paper = make_chain(load_settings("paper"))
+    methods = {step.name: step.method.method for step in paper.steps}
+    assert methods["white_balance"] == "gray_world"
+    assert methods["demosaic"] == "edge_directed_median"
+    with pytest.raises(RequestError, match=r"unknown configuration 'papr' .*mean 'paper'"):
+        load_settings("papr")
+
+
+def test_what_is_laid_over_settings():
+    base = settings_from({"iso": 800, "skip": ["denoise"], "gamma": {"exponent": 2}})
+    over = overlay(base, {"seed": 3, "skip": ["row_noise"], "exposure": {"ev": 1}})
+    assert (over.iso, over.seed, over.skip) == (800, 3, ("denoise", "row_noise"))
+    assert over.parameters == {"gamma": {"exponent": 2}, "exposure": {"ev": 1}}
+    other = overlay(base, {"gamma": {"method": "srgb"}})
+    assert other.parameters["gamma"] == {"method": "srgb"}
+    assert overlay(base, {}) == base
+
+
+def test_files_that_a_configuration_names_are_relative_to_it(tmp_path, monkeypatch):
+    from clpipe.camera import built_in_cameras
+
+    folder = tmp_path / "settings"
+    folder.mkdir()
+    (folder / "mine.csv").write_text("0,0\n1,1\n")
+    (folder / "mine.toml").write_text(built_in_cameras()["sony-a7r2"].read_text())
+    (folder / "pipeline.toml").write_text(
+        'camera = "mine.toml"\n[tone_curve]\nmethod = "file"\npath = "mine.csv"\n'
+    )
+    monkeypatch.chdir(tmp_path)
+    chain = make_chain(load_settings("settings/pipeline.toml"))
+    assert chain.step_named("tone_curve").method.path == "settings/mine.csv"
+    (folder / "pipeline.toml").write_text('[tone_curve]\nmethod = "file"\npath = "no.csv"\n')
+    with pytest.raises(RequestError, match=r"line 3: tone_curve.path: .*no.csv.*cannot be read"):
+        load_settings("settings/pipeline.toml")
+
+
+def test_a_chain_in_part_knows_what_the_rest_says_of_the_image():
+    settings = settings_from({"mosaic": {"pattern": "BGGR"}, "sensor_noise": {"a": 0.5}})
+    chain = make_chain(settings, start_at="demosaic", until="denoise")
+    assert [step.name for step in chain.steps] == ["demosaic", "denoise"]
+    assert chain.source is Kind.MOSAIC
+    assert chain.steps[0].context.pattern == "BGGR"
+    assert chain.steps[0].context.noise[0] == 0.5
+
+
+def test_one_of_two_alike_can_be_skipped():
+    names = ["exposure", "exposure", "exposure"]
+    chain = build(stages=names, skip=["exposure_2"], exposure_3={"ev": 3})
+    assert [step.name for step in chain.steps] == ["exposure", "exposure_3"]
+
+
+def test_a_chain_as_toml_is_the_chain_again(tmp_path):
+    settings = settings_from(
+        {
+            "iso": 640,
+            "stages": ["exposure", *DEFAULT_CHAIN],
+            "exposure_2": {"ev": -0.5},
+            "color_matrix": {"method": "given", "matrix": [[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]},
+            "sensor_noise": {"a": 1e-3},
+        }
+    )
+    path = tmp_path / "pipeline.toml"
+    path.write_text(toml_text(make_chain(settings)))
+    one, two = make_chain(settings), make_chain(read_settings(path))
+    assert [(s.name, s.method) for s in one.steps] == [(s.name, s.method) for s in two.steps]
+    assert "\n# b = " in path.read_text()
+    assert "\na = 0.001" in path.read_text()
 
 
 def test_a_camera_of_ones_own(tmp_path):

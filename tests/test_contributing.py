@@ -4,12 +4,14 @@ import re
 from dataclasses import replace
 
 import pytest
+from click.testing import CliRunner
 
 from clpipe.check import check_method
+from clpipe.cli import main
 from clpipe.config import make_chain, read_settings
 from clpipe.device import Device
 from clpipe.registry import load_stage_file
-from tests.conftest import ROOT
+from tests.conftest import ROOT, STILL_LIFE
 
 TEXT = (ROOT / "CONTRIBUTING.md").read_text()
 
@@ -29,9 +31,23 @@ def test_the_example_stage_works(device, tmp_path, monkeypatch):
         assert result.passed, result
 
 
+def test_the_commands_it_shows_work(tmp_path, monkeypatch):
+    monkeypatch.setattr("clpipe.registry._from_files", {})
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "vignette.cl").write_text(block("c"))
+    (tmp_path / "vignette.py").write_text(block("python"))
+    (tmp_path / "render.exr").write_bytes(STILL_LIFE.read_bytes())
+    commands = [line.split()[1:] for line in block("sh").splitlines()]
+    assert [command[0] for command in commands] == ["check", "stages", "run"]
+    for command in commands[1:]:
+        result = CliRunner().invoke(main, command, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+    assert (tmp_path / "out" / "render.jpg").is_file()
+
+
 def test_every_file_it_names_is_there():
     for name in re.findall(r"`((?:clpipe|kernels|tests|tools)/[\w./]+)`", TEXT):
-        if "vignette" not in name:
+        if "vignette" not in name and "<" not in name:
             assert (ROOT / name).exists(), name
 
 

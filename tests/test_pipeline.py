@@ -12,6 +12,12 @@ SETTINGS = [
     {"iso": 3200},
     {"iso": 800, "white_balance": {"method": "gray_world"}, "mosaic": {"pattern": "GBRG"}},
     {"iso": 1600, "demosaic": {"method": "bilinear"}, "skip": ["denoise"]},
+    {
+        "white_balance": {"method": "white_patch"},
+        "color_matrix": {"method": "camera"},
+        "tone_curve": {"method": "linear"},
+        "gamma": {"method": "srgb"},
+    },
 ]
 
 
@@ -102,6 +108,78 @@ def test_gray_world_of_darkness_changes_nothing(develop, numpy):
         white_balance={"method": "gray_world"},
     )
     assert result.found["white_balance"] == {"red_gain": 1.0, "blue_gain": 1.0}
+
+
+WHITE = {"stages": ["mosaic", "white_balance"]}
+
+
+@pytest.mark.parametrize("numpy", [False, True])
+@pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
+def test_white_patch_makes_the_brightest_samples_equal(develop, numpy, pattern):
+    random = np.random.default_rng(1)
+    image = (random.random((61, 90, 3)) * [0.2, 0.4, 0.1]).astype(np.float32)
+    image[10:20, 10:20] = [0.3, 0.6, 0.15]  # a white wall in warm light: 1.6 % of the picture
+    image[30:34, 30:60] = [0.9, 1.0, 0.2]  # a lamp that clips in green
+    settings = {"method": "white_patch", "percentile": 99.5}
+    mosaic = {"pattern": pattern}
+    result = develop(image, numpy=numpy, white_balance=settings, mosaic=mosaic, **WHITE)
+    gains = result.found["white_balance"]
+    assert gains["red_gain"] == pytest.approx(2.0, rel=0.005)
+    assert gains["blue_gain"] == pytest.approx(4.0, rel=0.005)
+
+
+@pytest.mark.parametrize("numpy", [False, True])
+@pytest.mark.parametrize("level", [0.0, 1.0])
+def test_white_patch_of_darkness_or_of_nothing_but_clipping(develop, numpy, level):
+    image = np.full((9, 7, 3), level, np.float32)
+    result = develop(image, numpy=numpy, white_balance={"method": "white_patch"}, **WHITE)
+    assert result.found["white_balance"] == {"red_gain": 1.0, "blue_gain": 1.0}
+
+
+def test_white_patch_counts_a_large_picture_exactly(device):
+    image = np.random.default_rng(0).random((700, 1100, 3), np.float32)
+    settings = {**WHITE, "white_balance": {"method": "white_patch", "percentile": 37.123}}
+    one, two = (
+        runner(settings, d, encode=False, final=True).run(image, "k") for d in (device, None)
+    )
+    assert one.found["white_balance"] == pytest.approx(two.found["white_balance"], rel=1e-6)
+
+
+def test_fixed_gains_and_none(develop):
+    image = np.full((4, 4, 3), 0.1, np.float32)
+    none = develop(image, white_balance={"method": "none"}, **WHITE)
+    assert np.array_equal(none.final, image[..., 0])
+    gains = {"method": "gains", "red_gain": 2, "blue_gain": 3}
+    sites = develop(image, white_balance=gains, **WHITE).final[:2, :2].ravel()
+    assert sites == pytest.approx([0.2, 0.1, 0.1, 0.3])
+    camera = make_chain(settings_from({"white_balance": {"method": "gains"}}))
+    assert camera.step_named("white_balance").method.red_gain == 2.77
+
+
+def test_the_camera_matrix_and_its_inverse_undo_each_other(develop):
+    image = np.random.default_rng(0).random((9, 13, 3), np.float32)
+    chain = {"stages": ["color_matrix", "color_matrix"], "color_matrix": {"method": "camera"}}
+    chain["color_matrix_2"] = {"method": "inverse_camera"}
+    assert np.abs(develop(image, **chain).final - image).max() < 1e-5
+    grey = np.full((1, 1, 3), 0.3, np.float32)
+    for method in ("camera", "inverse_camera"):
+        result = develop(grey, stages=["color_matrix"], color_matrix={"method": method})
+        assert result.final == pytest.approx(grey, abs=1e-6)
+
+
+def test_a_given_matrix_mixes_colours(develop):
+    image = np.float32([[[0.1, 0.2, 0.4]]])
+    matrix = [[0, 1, 0], [0, 0, 1], [1, 1, 0]]
+    given = {"method": "given", "matrix": matrix}
+    result = develop(image, stages=["color_matrix"], color_matrix=given)
+    assert result.final.ravel() == pytest.approx([0.2, 0.4, 0.3])
+
+
+def test_srgb_gamma(develop):
+    image = np.float32([[[0.001, 0.5, 1]]])
+    result = develop(image, stages=["gamma"], gamma={"method": "srgb"}, encode=True)
+    assert result.final.ravel() == pytest.approx([0.01292, 0.73536, 1], abs=1e-4)
+    assert result.encoded.ravel().tolist() == [3, 188, 255]
 
 
 def test_denoising_follows_the_iso_and_is_stronger_on_chroma():

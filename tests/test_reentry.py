@@ -123,7 +123,7 @@ def test_a_mosaic_from_elsewhere_enters_with_pattern_and_levels(kept, tmp_path, 
         (
             "quantize",
             "white_balance",
-            "holds raw .kept after quantize., but white_balance .* at: norm",
+            "holds raw .kept after quantize., but .* at: normalize",
         ),
         ("mosaic", "denoise", "holds mosaic, kept after mosaic"),
         ("demosaic", "normalize", "holds rgb, kept after demosaic"),
