@@ -20,6 +20,7 @@ LIBRARY = (
     "image",
     "cfa",
     "median",
+    "demosaic",
     "colour",
     "random",
     "curve",
