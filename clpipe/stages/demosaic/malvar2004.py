@@ -29,11 +29,11 @@ def malvar2004(image: Floats, pattern: Pattern) -> Floats:
     near_x, near_y = tap(image, -1, 0) + tap(image, 1, 0), tap(image, 0, -1) + tap(image, 0, 1)
     far_x, far_y = tap(image, -2, 0) + tap(image, 2, 0), tap(image, 0, -2) + tap(image, 0, 2)
     corners, far = sum_of_corners(image), far_x + far_y
-    green = (FOUR * image + TWO * (near_x + near_y) - far) * EIGHTH
-    at_green = FIVE * image - corners
-    in_row = (at_green + FOUR * near_x - far_x + HALF * far_y) * EIGHTH
-    in_column = (at_green + FOUR * near_y - far_y + HALF * far_x) * EIGHTH
-    across = (SIX * image + TWO * corners - np.float32(1.5) * far) * EIGHTH
+    green = ((near_x + near_y) * TWO + image * FOUR - far) * EIGHTH
+    at_green = image * FIVE - corners
+    in_row = (at_green + near_x * FOUR - far_x + far_y * HALF) * EIGHTH
+    in_column = (at_green + near_y * FOUR - far_y + far_x * HALF) * EIGHTH
+    across = (image * SIX + corners * TWO - far * np.float32(1.5)) * EIGHTH
     red, blue = red_and_blue(pattern, image, in_row, in_column, across)
     return np.stack([red, by_site(image.shape, pattern, green, image, green), blue], axis=-1)
 
