@@ -1,8 +1,8 @@
 """Every kernel against its NumPy reference, on a device."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 
@@ -90,8 +90,13 @@ def check_method(
     method: type[Method],
     sizes: Sequence[tuple[int, int]] = SIZES,
     patterns: Sequence[Pattern] = PATTERNS,
+    values: Mapping[str, Any] | None = None,
 ) -> Check:
-    """One method of a stage, behind a mosaic where it reads one so that all patterns are seen."""
+    """One method of a stage, behind a mosaic where it reads one so that all patterns are seen.
+
+    ``values`` are parameters of the method that are not left at their defaults.
+    """
+    values = values or {}
     samples, differing, largest, cases = 0, 0, 0.0, 0
     for pattern in patterns:
         chain: tuple[str, ...] = (stage.name,)
@@ -99,7 +104,7 @@ def check_method(
         if source is Kind.MOSAIC and stage.name != "mosaic":
             chain, source = ("mosaic", stage.name), Kind.RGB
         parameters: dict[str, dict[str, Any]] = {"mosaic": {"pattern": pattern}}
-        own = {"method": method.method, **method.example}
+        own = {"method": method.method, **method.example, **values}
         parameters[stage.name] = parameters.get(stage.name, {}) | own
         settings = Settings(iso=3200, stages=chain, parameters=parameters)
         more = compare(device, settings, source, sizes)
@@ -107,7 +112,21 @@ def check_method(
         largest, cases = max(largest, more[2]), cases + len(sizes)
         if not {"mosaic"} & set(chain):
             break  # no pattern in it
-    return Check(stage.name, method.method, cases, samples, differing, largest, method.tolerance)
+    label = " ".join([method.method, *(f"{name}={value}" for name, value in values.items())])
+    return Check(stage.name, label, cases, samples, differing, largest, method.tolerance)
+
+
+def variants(method: type[Method]) -> Iterator[dict[str, Any]]:
+    """What is compiled differently from the defaults: each other choice of a structural parameter.
+
+    The CFA pattern is not among them, because every check goes through all patterns anyway.
+    """
+    for name, field in method.model_fields.items():
+        extra: Any = field.json_schema_extra
+        if extra["structural"] and get_origin(field.annotation) is Literal:
+            choices = get_args(field.annotation)
+            if choices != PATTERNS:
+                yield from ({name: choice} for choice in choices if choice != field.default)
 
 
 def check_raw(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Check:
@@ -134,8 +153,9 @@ def check_raw(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Check
 
 
 def check_all(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Iterator[Check]:
-    """Every method of every stage, then the raw."""
+    """Every method of every stage, in all its variants, then the raw."""
     for stage in all_stages().values():
         for method in stage.methods:
-            yield check_method(device, stage, method, sizes)
+            for values in ({}, *variants(method)):
+                yield check_method(device, stage, method, sizes, values=values)
     yield check_raw(device, sizes)

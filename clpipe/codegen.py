@@ -19,6 +19,8 @@ LIBRARY = (
     "math",
     "image",
     "cfa",
+    "median",
+    "demosaic",
     "colour",
     "random",
     "curve",

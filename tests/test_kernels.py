@@ -5,14 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clpipe.check import SIZES, check_method, check_raw, compare
-from clpipe.config import Settings
+from clpipe.check import SIZES, check_method, check_raw, compare, variants
+from clpipe.config import Settings, make_chain
 from clpipe.device import Device
 from clpipe.registry import all_stages
+from clpipe.run import Runner
 from clpipe.stage import Kind
 
 METHODS = [(stage, method) for stage in all_stages().values() for method in stage.methods]
 LABELS = [f"{stage.name}-{method.method}" for stage, method in METHODS]
+VARIANTS = [
+    pytest.param(stage, method, values, id=f"{stage.name}-{method.method}-{values}")
+    for stage, method in METHODS
+    for values in variants(method)
+]
 KERNELS = {
     "exposure",
     "mosaic",
@@ -24,7 +30,11 @@ KERNELS = {
     "gray_world",
     "white_patch",
     "demosaic_bilinear",
+    "demosaic_edge_directed",
     "demosaic_edge_directed_median",
+    "demosaic_malvar2004",
+    "demosaic_median",
+    "demosaic_menon2007",
     "denoise_bilateral",
     "color_matrix",
     "curve",
@@ -48,6 +58,42 @@ def test_kernel_agrees_with_its_reference(device, stage, method):
 def test_kernel_agrees_with_its_reference_on_one_lane(scalar_device, stage, method):
     result = check_method(scalar_device, stage, method, SIZES[:6], ("GRBG", "BGGR"))
     assert result.passed, result
+
+
+@pytest.mark.parametrize(("stage", "method", "values"), VARIANTS)
+def test_every_structural_choice_agrees_with_its_reference(
+    device, scalar_device, stage, method, values
+):
+    wide = check_method(device, stage, method, values=values)
+    assert wide.passed, wide
+    scalar = check_method(scalar_device, stage, method, SIZES[:6], ("GRBG",), values)
+    assert scalar.passed, scalar
+    (choice,) = values.values()
+    assert str(choice) in wide.method
+
+
+def test_structural_choices_are_found():
+    methods = all_stages()["demosaic"].by_name
+    assert list(variants(methods["edge_directed_median"])) == [
+        {"classifier": "laroche_prescott"},
+        {"classifier": "hibbard"},
+        {"size": 5},
+    ]
+    assert not list(variants(methods["bilinear"]))
+    assert not list(variants(all_stages()["mosaic"].methods[0]))
+
+
+@pytest.mark.parametrize("size", [3, 5])
+def test_median_of_zeros_and_ones(device, size):
+    # By the zero-one principle a network that sorts zeros and ones right sorts everything right.
+    random = np.random.default_rng(size)
+    image = (random.random((301, 403)) < 0.5).astype(np.float32)
+    settings = Settings(
+        stages=("demosaic",), parameters={"demosaic": {"method": "median", "size": size}}
+    )
+    chain = make_chain(settings, Kind.MOSAIC)
+    one, two = (Runner(chain, d, final=True).run(image, "k").final for d in (device, None))
+    assert np.array_equal(one, two)
 
 
 def test_raw_is_bit_for_bit_the_references(device, scalar_device):

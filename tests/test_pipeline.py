@@ -5,6 +5,8 @@ import pytest
 
 from clpipe.config import make_chain, settings_from
 from clpipe.image_io import read_image
+from clpipe.reference.cfa import PATTERNS, red_site
+from clpipe.registry import all_stages
 from clpipe.run import Runner
 from tests.conftest import STILL_LIFE
 
@@ -203,6 +205,22 @@ def test_denoising_takes_noise_away_and_leaves_edges(develop):
     assert step > 0.48
 
 
+@pytest.mark.parametrize("method", all_stages()["demosaic"].by_name)
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_demosaicing_keeps_samples_and_leaves_flat_areas_flat(develop, method, pattern):
+    random = np.random.default_rng(1)
+    chain = {"stages": ["mosaic", "demosaic"], "keep": ("mosaic",), "mosaic": {"pattern": pattern}}
+    colours = random.random((24, 31, 3)).astype(np.float32)
+    result = develop(colours, demosaic={"method": method}, **chain)
+    red_x, red_y = red_site(pattern)
+    for channel, x, y in ((0, red_x, red_y), (1, 1 - red_x, red_y), (2, 1 - red_x, 1 - red_y)):
+        assert np.array_equal(
+            result.final[y::2, x::2, channel], result.kept["mosaic"][y::2, x::2]
+        ), channel
+    flat = np.full((24, 31, 3), 0.25, np.float32)
+    assert np.array_equal(develop(flat, demosaic={"method": method}, **chain).final, flat)
+
+
 def cpsnr(one, two, border=10):
     crop = slice(border, -border)
     error = (one[crop, crop].astype(np.float64) - two[crop, crop]) ** 2
@@ -210,13 +228,25 @@ def cpsnr(one, two, border=10):
 
 
 @pytest.mark.parametrize(
-    ("method", "expected"), [("bilinear", 27.76), ("edge_directed_median", 37.56)]
+    ("demosaic", "expected"),
+    [
+        ({"method": "bilinear"}, 27.76),
+        ({"method": "edge_directed", "classifier": "hibbard"}, 31.00),
+        ({"method": "edge_directed", "classifier": "laroche_prescott"}, 32.24),
+        ({"method": "edge_directed", "classifier": "hamilton_adams"}, 35.11),
+        ({"method": "median", "size": 3}, 34.68),
+        ({"method": "edge_directed_median", "size": 3}, 37.56),
+        # What an independent implementation gives on these files.
+        ({"method": "malvar2004"}, 33.53),
+        ({"method": "menon2007"}, 37.47),
+    ],
+    ids=lambda value: "-".join(map(str, value.values())) if isinstance(value, dict) else "",
 )
-def test_demosaicing_is_as_good_as_published(device, shared_data, method, expected):
+def test_demosaicing_is_as_good_as_published(device, shared_data, demosaic, expected):
     from PIL import Image
 
     values = []
-    chain = runner({"stages": ["mosaic", "demosaic"], "demosaic": {"method": method}}, device)
+    chain = runner({"stages": ["mosaic", "demosaic"], "demosaic": demosaic}, device)
     for path in sorted((shared_data / "kodak").glob("*.png")):
         with Image.open(path) as file:
             truth = np.asarray(file)

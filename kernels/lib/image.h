@@ -18,7 +18,7 @@ typedef struct {
 
 typedef struct { vf r, g, b; } rgb;
 typedef struct { vf y, cb, cr; } ycbcr;
-typedef struct { vf red, blue; } differences;  // R-G and B-G
+typedef struct { vf first, second; } pair;
 
 // Planes of a stored image, each pointing at the block's first lane.
 typedef struct {
@@ -51,8 +51,8 @@ INLINE image image_at(__global const float *p0, __global const float *p1, __glob
 
 #define TAP(plane) load(i.plane + (long)dy * (long)i.pitch + dx)
 INLINE vf tap_mosaic(image i, int dx, int dy) { return TAP(plane0); }
-INLINE differences tap_differences(image i, int dx, int dy) {
-    const differences v = {TAP(plane0), TAP(plane1)};
+INLINE pair tap_pair(image i, int dx, int dy) {
+    const pair v = {TAP(plane0), TAP(plane1)};
     return v;
 }
 INLINE rgb tap_rgb(image i, int dx, int dy) {
@@ -118,10 +118,9 @@ INLINE void store_plane(vf v, __global float *dst, site at, extent e) {
 }
 
 INLINE void store_mosaic(vf v, __global float *p0, site at, extent e) { store_plane(v, p0, at, e); }
-INLINE void store_differences(differences v, __global float *p0, __global float *p1, site at,
-                              extent e) {
-    store_plane(v.red, p0, at, e);
-    store_plane(v.blue, p1, at, e);
+INLINE void store_pair(pair v, __global float *p0, __global float *p1, site at, extent e) {
+    store_plane(v.first, p0, at, e);
+    store_plane(v.second, p1, at, e);
 }
 INLINE void store_rgb(rgb v, __global float *p0, __global float *p1, __global float *p2, site at,
                       extent e) {

@@ -1,0 +1,17 @@
+"""Demosaicing: three colours at every pixel from one. One algorithm a file."""
+
+from clpipe.stage import Kind, Stage
+from clpipe.stages.demosaic.bilinear import Bilinear
+from clpipe.stages.demosaic.edge_directed import EdgeDirected
+from clpipe.stages.demosaic.edge_directed_median import EdgeDirectedMedian
+from clpipe.stages.demosaic.malvar2004 import Malvar2004
+from clpipe.stages.demosaic.median import Median
+from clpipe.stages.demosaic.menon2007 import Menon2007
+
+STAGE = Stage(
+    "demosaic",
+    "Give every pixel its two missing colours.",
+    Kind.MOSAIC,
+    Kind.RGB,
+    (EdgeDirectedMedian, EdgeDirected, Median, Bilinear, Malvar2004, Menon2007),
+)

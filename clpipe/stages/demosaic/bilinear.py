@@ -1,0 +1,49 @@
+"""Bilinear demosaicing."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.reference.cfa import Pattern, by_site
+from clpipe.stage import Access, Argument, Context, Frame, Method, Pass
+from clpipe.stages.demosaic.common import (
+    HALF,
+    QUARTER,
+    mean_above_below,
+    mean_beside,
+    red_and_blue,
+    sum_of_corners,
+)
+from clpipe.types import Floats
+
+
+def bilinear(image: Floats, pattern: Pattern) -> Floats:
+    """RGB, (height, width, 3), from a mosaic: a missing colour is the mean of its nearest samples.
+
+    >>> bilinear(np.float32([[4, 1], [3, 8]]), "RGGB")[0, 0].tolist()
+    [4.0, 2.0, 8.0]
+    """
+    in_row, in_column = mean_beside(image), mean_above_below(image)
+    cross = (in_row + in_column) * HALF
+    across = sum_of_corners(image) * QUARTER
+    red, blue = red_and_blue(pattern, image, in_row, in_column, across)
+    green = by_site(image.shape, pattern, cross, image, cross)
+    return np.stack([red, green, blue], axis=-1)
+
+
+class Bilinear(Method):
+    """A missing colour is the mean of its nearest samples."""
+
+    method: ClassVar = "bilinear"
+    kernel: ClassVar = "demosaic_bilinear"
+    summary: ClassVar = "mean of the nearest samples of each colour"
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("bilinear", Access.STENCIL, ("pattern",), radius=1),)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {"pattern": context.cfa}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        return bilinear(image, frame.context.pattern)

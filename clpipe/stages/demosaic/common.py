@@ -1,0 +1,80 @@
+"""What demosaicing methods share, as ``kernels/lib/demosaic.h`` has it."""
+
+import numpy as np
+
+from clpipe.reference.cfa import Pattern, by_site, red_site
+from clpipe.reference.image import tap
+from clpipe.types import Floats
+
+HALF, QUARTER, EIGHTH = np.float32(0.5), np.float32(0.25), np.float32(0.125)
+
+
+def mean_beside(image: Floats) -> Floats:
+    """Mean of the two pixels to the left and right.
+
+    >>> mean_beside(np.float32([[1, 2, 5]])).tolist()
+    [[2.0, 3.0, 2.0]]
+    """
+    return (tap(image, -1, 0) + tap(image, 1, 0)) * HALF
+
+
+def mean_above_below(image: Floats) -> Floats:
+    """Mean of the two pixels above and below."""
+    return (tap(image, 0, -1) + tap(image, 0, 1)) * HALF
+
+
+def sum_of_corners(image: Floats) -> Floats:
+    """Sum of the four diagonal neighbours."""
+    upper, lower = (tap(image, -1, dy) + tap(image, 1, dy) for dy in (-1, 1))
+    return upper + lower
+
+
+def red_and_blue(
+    pattern: Pattern, own: Floats, in_row: Floats, in_column: Floats, across: Floats
+) -> tuple[Floats, Floats]:
+    """Red and blue, (height, width) each, picked by site.
+
+    Args:
+        pattern: the CFA pattern.
+        own: at red and blue sites, the site's own colour.
+        in_row: at green sites, that of the two that stands in the site's row.
+        in_column: at green sites, that of the two that stands in the site's column.
+        across: at red and blue sites, the other one.
+
+    >>> values = [np.full((2, 2), v, np.float32) for v in (0, 1, 2, 3)]
+    >>> [colour.tolist() for colour in red_and_blue("RGGB", *values)]
+    [[[0.0, 1.0], [2.0, 3.0]], [[3.0, 2.0], [1.0, 0.0]]]
+    """
+    red_row = (np.arange(own.shape[0])[:, None] & 1) == red_site(pattern)[1]
+    red_at_green = np.where(red_row, in_row, in_column)
+    blue_at_green = np.where(red_row, in_column, in_row)
+    return (
+        by_site(own.shape, pattern, own, red_at_green, across),
+        by_site(own.shape, pattern, across, blue_at_green, own),
+    )
+
+
+def spread_differences(known: Floats, pattern: Pattern) -> tuple[Floats, Floats]:
+    """R-G and B-G at every pixel, bilinear from where they are known.
+
+    ``known`` is (height, width) and holds R-G at red sites and B-G at blue ones.
+    """
+    across = sum_of_corners(known) * QUARTER
+    return red_and_blue(pattern, known, mean_beside(known), mean_above_below(known), across)
+
+
+def from_differences(
+    samples: Floats, pattern: Pattern, red_difference: Floats, blue_difference: Floats
+) -> Floats:
+    """RGB, (height, width, 3), from the sensor's samples, R-G and B-G; the samples are kept.
+
+    >>> samples, one = np.float32([[5, 3], [3, 2]]), np.ones((2, 2), np.float32)
+    >>> from_differences(samples, "RGGB", one, -one)[0].tolist()
+    [[5.0, 4.0, 3.0], [4.0, 3.0, 2.0]]
+    """
+    shape = samples.shape
+    green = by_site(shape, pattern, samples - red_difference, samples, samples - blue_difference)
+    red, blue = green + red_difference, green + blue_difference
+    red = by_site(shape, pattern, samples, red, red)
+    blue = by_site(shape, pattern, blue, blue, samples)
+    return np.stack([red, green, blue], axis=-1)

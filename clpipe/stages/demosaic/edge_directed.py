@@ -1,0 +1,94 @@
+"""Edge-directed demosaicing: green is interpolated along edges, not across them."""
+
+import typing
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.reference.cfa import Pattern, by_site
+from clpipe.reference.image import tap
+from clpipe.stage import Access, Argument, Context, Frame, Kind, Literal, Method, Pass, parameter
+from clpipe.stages.demosaic.common import (
+    HALF,
+    QUARTER,
+    from_differences,
+    mean_above_below,
+    mean_beside,
+    spread_differences,
+)
+from clpipe.types import Floats
+
+Classifier = typing.Literal["hamilton_adams", "laroche_prescott", "hibbard"]
+
+
+def green_or_difference(image: Floats, pattern: Pattern, classifier: Classifier) -> Floats:
+    """Green at green sites, R-G at red and B-G at blue ones, (height, width), from a mosaic.
+
+    At red and blue sites green is the mean of its two neighbours in the direction with the smaller
+    gradient, or of all four where the gradients are equal. The gradient is
+
+    - ``hibbard`` (US patent 5,382,976, 1995): the difference of these two neighbours;
+    - ``laroche_prescott`` (US patent 5,373,322, 1994): the second derivative of the site's own
+      colour, over its next samples to both sides;
+    - ``hamilton_adams`` (US patent 5,629,734, 1997): the sum of both; and a quarter of the second
+      derivative, with its sign, is added to the mean.
+
+    >>> edge = np.repeat(np.float32([[0, 0, 0, 8, 8, 8]]), 6, axis=0)
+    >>> green_or_difference(edge, "RGGB", "hibbard")[2].tolist()
+    [0.0, 0.0, 0.0, 8.0, 0.0, 8.0]
+    """
+    change_x = abs(tap(image, -1, 0) - tap(image, 1, 0))
+    change_y = abs(tap(image, 0, -1) - tap(image, 0, 1))
+    bend_x = np.float32(2) * image - tap(image, -2, 0) - tap(image, 2, 0)
+    bend_y = np.float32(2) * image - tap(image, 0, -2) - tap(image, 0, 2)
+    green_x, green_y = mean_beside(image), mean_above_below(image)
+    match classifier:
+        case "hibbard":
+            gradient_x, gradient_y = change_x, change_y
+        case "laroche_prescott":
+            gradient_x, gradient_y = abs(bend_x), abs(bend_y)
+        case "hamilton_adams":
+            gradient_x, gradient_y = change_x + abs(bend_x), change_y + abs(bend_y)
+            green_x, green_y = green_x + bend_x * QUARTER, green_y + bend_y * QUARTER
+    either = (green_x + green_y) * HALF
+    not_x = np.where(gradient_y < gradient_x, green_y, either)
+    green = np.where(gradient_x < gradient_y, green_x, not_x)
+    return by_site(image.shape, pattern, image - green, image, image - green)
+
+
+class EdgeDirected(Method):
+    """Green along edges, red and blue by bilinear colour differences from it.
+
+    The classifiers: Hamilton and Adams (US patent 5,629,734, 1997), Laroche and Prescott
+    (US patent 5,373,322, 1994), Hibbard (US patent 5,382,976, 1995).
+    """
+
+    method: ClassVar = "edge_directed"
+    kernel: ClassVar = "demosaic_edge_directed"
+    summary: ClassVar = "green along edges, then bilinear colour differences"
+
+    classifier: Classifier = parameter(
+        "hamilton_adams", "How the direction of an edge is found.", structural=True
+    )
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (
+            Pass(
+                "green_or_difference",
+                Access.STENCIL,
+                ("pattern", "classifier"),
+                writes="known",
+                kind=Kind.MOSAIC,
+                radius=2,
+            ),
+            Pass("add_differences", Access.STENCIL, ("pattern",), reads=("src", "known"), radius=1),
+        )
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {"pattern": context.cfa, "classifier": Literal(self.classifier.upper())}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        pattern = frame.context.pattern
+        known = green_or_difference(image, pattern, self.classifier)
+        return from_differences(image, pattern, *spread_differences(known, pattern))

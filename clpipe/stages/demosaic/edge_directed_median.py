@@ -1,0 +1,40 @@
+"""Edge-directed demosaicing with Freeman's median step."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+from clpipe.stage import Access, Argument, Context, Frame, Kind, Pass
+from clpipe.stages.demosaic.common import from_differences, spread_differences
+from clpipe.stages.demosaic.edge_directed import EdgeDirected, green_or_difference
+from clpipe.stages.demosaic.median import Median, median_filter
+from clpipe.types import Floats
+
+
+class EdgeDirectedMedian(Median, EdgeDirected):
+    """As ``edge_directed``, but the colour differences are median filtered as in ``median``."""
+
+    method: ClassVar = "edge_directed_median"
+    kernel: ClassVar = "demosaic_edge_directed_median"
+    summary: ClassVar = "green along edges, then colour differences median filtered"
+
+    def passes(self) -> tuple[Pass, ...]:
+        green, _ = EdgeDirected.passes(self)
+        spread = Pass(
+            "spread_differences",
+            Access.STENCIL,
+            ("pattern",),
+            reads=("known",),
+            writes="spread",
+            kind=Kind.PAIR,
+            radius=1,
+        )
+        return green, spread, self.median_pass()
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {**EdgeDirected.arguments(self, context), **Median.arguments(self, context)}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        pattern = frame.context.pattern
+        known = green_or_difference(image, pattern, self.classifier)
+        differences = spread_differences(known, pattern)
+        return from_differences(image, pattern, *(median_filter(d, self.size) for d in differences))

@@ -1,0 +1,67 @@
+"""Freeman's demosaicing: median filtered colour differences."""
+
+import typing
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.reference.image import tap
+from clpipe.stage import Access, Argument, Context, Frame, Kind, Literal, Method, Pass, parameter
+from clpipe.stages.demosaic.bilinear import bilinear
+from clpipe.stages.demosaic.common import from_differences
+from clpipe.types import Floats
+
+
+def median_filter(image: Floats, size: int) -> Floats:
+    """Median of the ``size`` x ``size`` pixels around each pixel, mirrored at borders.
+
+    >>> median_filter(np.float32([[1, 9, 2, 3, 4]]), 3).tolist()
+    [[9.0, 2.0, 3.0, 3.0, 3.0]]
+    """
+    reach = range(-(size // 2), size // 2 + 1)
+    around = [tap(image, dx, dy) for dy in reach for dx in reach]
+    return np.median(np.stack(around), axis=0).astype(np.float32)
+
+
+class Median(Method):
+    """Bilinear, then colour differences R-G and B-G median filtered (Freeman, 1988).
+
+    US patent 4,724,395. The samples that the sensor took are kept; the other colours follow from
+    them and the filtered differences.
+    """
+
+    method: ClassVar = "median"
+    kernel: ClassVar = "demosaic_median"
+    summary: ClassVar = "bilinear, then colour differences median filtered (Freeman)"
+
+    size: typing.Literal[3, 5] = parameter(
+        3, "Width and height of the median filter.", "px", structural=True
+    )
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (
+            Pass(
+                "bilinear_differences",
+                Access.STENCIL,
+                ("pattern",),
+                writes="spread",
+                kind=Kind.PAIR,
+                radius=1,
+            ),
+            self.median_pass(),
+        )
+
+    def median_pass(self) -> Pass:
+        """The pass from colour differences, named "spread", to RGB."""
+        arguments, reads = ("pattern", "size"), ("src", "spread")
+        return Pass("freeman", Access.STENCIL, arguments, reads, radius=self.size // 2)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {"pattern": context.cfa, "size": Literal(str(self.size))}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        pattern = frame.context.pattern
+        red, green, blue = np.moveaxis(bilinear(image, pattern), -1, 0)
+        differences = (median_filter(d, self.size) for d in (red - green, blue - green))
+        return from_differences(image, pattern, *differences)

@@ -1,0 +1,90 @@
+// Demosaicing with directional filtering and a posteriori decision (Menon, Andriani and Calvagno
+// 2007), with their refining step, in four passes. At a red or blue site "own" is the site's
+// colour and "other" is blue or red.
+
+// Own minus green, green interpolated along the row and along the column by the same filter that
+// Hamilton and Adams use; 0 at green sites.
+INLINE pair directional_differences(site at, src_image src, cfa pattern) {
+    const vf centre = src_tap(src, 0, 0);
+    const vf green_x = (src_tap(src, -1, 0) + src_tap(src, 1, 0)) * 0.5f +
+                       (2.0f * centre - src_tap(src, -2, 0) - src_tap(src, 2, 0)) * 0.25f;
+    const vf green_y = (src_tap(src, 0, -1) + src_tap(src, 0, 1)) * 0.5f +
+                       (2.0f * centre - src_tap(src, 0, -2) - src_tap(src, 0, 2)) * 0.25f;
+    const vf zero = (vf)(0.0f);
+    const pair v = {by_site(at, pattern, centre - green_x, zero, centre - green_x),
+                    by_site(at, pattern, centre - green_y, zero, centre - green_y)};
+    return v;
+}
+
+// How much the horizontal differences change along five rows, the vertical ones along five columns:
+// the direction in which they change less wins, the row where they do not differ. First the
+// chosen difference (green at green sites), then 1 where the row won, else 0.
+INLINE pair decide(site at, src_image src, image both, cfa pattern) {
+#define CHANGE_X(x0, x1, y) magnitude(tap_pair(both, x0, y).first - tap_pair(both, x1, y).first)
+#define CHANGE_Y(y0, y1, x) magnitude(tap_pair(both, x, y0).second - tap_pair(both, x, y1).second)
+    const vf change_x = 3.0f * (CHANGE_X(-2, 0, 0) + CHANGE_X(0, 2, 0)) +
+                        (CHANGE_X(-1, 1, -1) + CHANGE_X(-1, 1, 1)) +
+                        ((CHANGE_X(-2, 0, -2) + CHANGE_X(0, 2, -2)) +
+                         (CHANGE_X(-2, 0, 2) + CHANGE_X(0, 2, 2)));
+    const vf change_y = 3.0f * (CHANGE_Y(-2, 0, 0) + CHANGE_Y(0, 2, 0)) +
+                        (CHANGE_Y(-1, 1, -1) + CHANGE_Y(-1, 1, 1)) +
+                        ((CHANGE_Y(-2, 0, -2) + CHANGE_Y(0, 2, -2)) +
+                         (CHANGE_Y(-2, 0, 2) + CHANGE_Y(0, 2, 2)));
+#undef CHANGE_X
+#undef CHANGE_Y
+    const vi in_row = change_y >= change_x;
+    const pair here = tap_pair(both, 0, 0);
+    const vf chosen = in_row ? here.first : here.second;
+    const pair v = {by_site(at, pattern, chosen, src_tap(src, 0, 0), chosen),
+                    in_row ? (vf)(1.0f) : (vf)(0.0f)};
+    return v;
+}
+
+// At the two green sites beside a red or blue one, in the direction that won there: own minus green
+// (the mean of the two `known` beside that site), and own minus other.
+typedef struct { vf own_green1, own_green2, own_other1, own_other2; } beside;
+
+INLINE beside along(image known, vi in_row) {
+    const vf centre = tap_mosaic(known, 0, 0);
+    const vf west = (tap_mosaic(known, -2, 0) + centre) * 0.5f;
+    const vf east = (centre + tap_mosaic(known, 2, 0)) * 0.5f;
+    const vf north = (tap_mosaic(known, 0, -2) + centre) * 0.5f;
+    const vf south = (centre + tap_mosaic(known, 0, 2)) * 0.5f;
+    const vf nw = tap_mosaic(known, -1, -1), ne = tap_mosaic(known, 1, -1);
+    const vf sw = tap_mosaic(known, -1, 1), se = tap_mosaic(known, 1, 1);
+    beside v;
+    v.own_green1 = in_row ? west : north;
+    v.own_green2 = in_row ? east : south;
+    v.own_other1 = v.own_green1 - (nw + (in_row ? sw : ne)) * 0.5f;
+    v.own_other2 = v.own_green2 - ((in_row ? ne : sw) + se) * 0.5f;
+    return v;
+}
+
+#define THIRD 0.33333334f
+
+// Refining, first half: own minus green as the mean of three along the direction; and own minus
+// other, still from what was known before.
+INLINE pair refine(site at, image chosen, cfa pattern) {
+    const vf centre = tap_mosaic(chosen, 0, 0);
+    const beside b = along(chosen, tap_pair(chosen, 0, 0).second > 0.5f);
+    const vf own_green = (b.own_green1 + centre + b.own_green2) * THIRD;
+    const vf own_other = (b.own_other1 + b.own_other2) * 0.5f;
+    const pair v = {by_site(at, pattern, own_green, centre, own_green), own_other};
+    return v;
+}
+
+// Refining, second half: red and blue at green sites by bilinear differences; the other colour at
+// red and blue sites from own minus other as the mean of three along the direction.
+INLINE rgb interpolate(site at, src_image src, image chosen, image refined, cfa pattern) {
+    const vf centre = src_tap(src, 0, 0);
+    const pair here = tap_pair(refined, 0, 0);
+    const beside b = along(refined, tap_pair(chosen, 0, 0).second > 0.5f);
+    const vf other = centre - (b.own_other1 + here.second + b.own_other2) * THIRD;
+    const vf in_row = (tap_mosaic(refined, -1, 0) + tap_mosaic(refined, 1, 0)) * 0.5f;
+    const vf in_column = (tap_mosaic(refined, 0, -1) + tap_mosaic(refined, 0, 1)) * 0.5f;
+    const pair colours =
+        red_and_blue(at, pattern, centre, centre + in_row, centre + in_column, other);
+    const vf green = centre - here.first;
+    const rgb v = {colours.first, by_site(at, pattern, green, centre, green), colours.second};
+    return v;
+}
