@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.config import Chain
+from clpipe.config import Chain, Settings, make_chain, overlay
 from clpipe.device import Device, Timing
 from clpipe.plan import launch_bytes
 from clpipe.run import Runner
+from clpipe.stage import Stage, variant_label, variants
 from clpipe.types import Array
 
 
@@ -40,6 +41,16 @@ class Report:
     def record(self) -> dict[str, Any]:
         """The report as JSON values, with the chain's ``mp_per_s`` at the top."""
         return {"mp_per_s": self.chain.mp_per_s} | asdict(self)
+
+
+@dataclass(frozen=True)
+class MethodSpeed:
+    """One method of a stage: how many launches it takes, milliseconds, megapixels a second."""
+
+    method: str
+    launches: int
+    ms: float
+    mp_per_s: float
 
 
 def scene(width: int, height: int) -> Array:
@@ -102,3 +113,40 @@ def bench(
         chain=speed("chain", whole, sum(touched)),
         launches=tuple(speed(t.name, t.seconds, b) for t, b in zip(best, touched, strict=True)),
     )
+
+
+def bench_methods(
+    device: Device,
+    stage: Stage,
+    settings: Settings,
+    width: int = 6000,
+    height: int = 4000,
+    repeat: int = 7,
+) -> list[MethodSpeed]:
+    """Time every method of a stage alone, from float planes to float planes on the device.
+
+    A figure is the sum of the best times of a method's launches; bringing the image into planes is
+    not counted where it is a launch of its own, as before every stencil.
+    """
+    picture = scene(width, height).astype(np.float32)
+    image = picture if len(stage.reads.channels) == 3 else np.ascontiguousarray(picture[..., 1])
+    speeds = []
+    every = [(method, own) for method in stage.methods for own in variants(method)]
+    for method, choice in every:
+        table = {"method": method.method, **method.example, **choice}
+        own = overlay(settings, {"stages": [stage.name], "skip": [], stage.name: table})
+        runner = Runner(make_chain(own, stage.reads), device, encode=False, final=True)
+        runner.run(image, "bench")
+        best: list[float] = []
+        for _ in range(repeat):
+            timings: list[Timing] = []
+            runner.run(image, "bench", timings, download=False)
+            seconds = [t.seconds for t in timings if t.name != "load"]
+            best = [min(pair) for pair in zip(seconds, best or seconds, strict=True)]
+        total = max(sum(best), 1e-9)
+        speeds.append(
+            MethodSpeed(
+                variant_label(method, choice), len(best), total * 1e3, width * height / total / 1e6
+            )
+        )
+    return speeds

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, get_args, get_origin
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from clpipe.device import Device
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.registry import all_stages
 from clpipe.run import Runner
-from clpipe.stage import Kind, Method, Stage
+from clpipe.stage import Kind, Method, Stage, variant_label, variants
 from clpipe.types import Array
 
 # Odd sizes, one pixel wide and high, smaller than the widest apron, more than one work-group.
@@ -112,21 +112,15 @@ def check_method(
         largest, cases = max(largest, more[2]), cases + len(sizes)
         if not {"mosaic"} & set(chain):
             break  # no pattern in it
-    label = " ".join([method.method, *(f"{name}={value}" for name, value in values.items())])
-    return Check(stage.name, label, cases, samples, differing, largest, method.tolerance)
-
-
-def variants(method: type[Method]) -> Iterator[dict[str, Any]]:
-    """What is compiled differently from the defaults: each other choice of a structural parameter.
-
-    The CFA pattern is not among them, because every check goes through all patterns anyway.
-    """
-    for name, field in method.model_fields.items():
-        extra: Any = field.json_schema_extra
-        if extra["structural"] and get_origin(field.annotation) is Literal:
-            choices = get_args(field.annotation)
-            if choices != PATTERNS:
-                yield from ({name: choice} for choice in choices if choice != field.default)
+    return Check(
+        stage.name,
+        variant_label(method, values),
+        cases,
+        samples,
+        differing,
+        largest,
+        method.tolerance,
+    )
 
 
 def check_raw(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Check:
@@ -156,6 +150,6 @@ def check_all(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Itera
     """Every method of every stage, in all its variants, then the raw."""
     for stage in all_stages().values():
         for method in stage.methods:
-            for values in ({}, *variants(method)):
+            for values in variants(method):
                 yield check_method(device, stage, method, sizes, values=values)
     yield check_raw(device, sizes)

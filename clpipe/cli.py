@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -15,6 +15,7 @@ import clpipe
 from clpipe import describe
 from clpipe.batch import FORMATS, Reentry, Target, find_jobs, prepare_folder, run_jobs
 from clpipe.bench import bench as run_bench
+from clpipe.bench import bench_methods
 from clpipe.check import SIZES, check_all
 from clpipe.config import (
     Chain,
@@ -24,6 +25,7 @@ from clpipe.config import (
     make_chain,
     overlay,
     parse_assignment,
+    stage_named,
 )
 from clpipe.device import find_devices, open_device
 from clpipe.errors import ClpipeError, RequestError
@@ -434,8 +436,18 @@ def check(selector: str | None, small: bool, stage_files: tuple[Path, ...], as_j
 @click.option(
     "--repeat", default=7, show_default=True, type=click.IntRange(1), help="Runs; the best counts."
 )
+@click.option(
+    "--methods", metavar="STAGE", help="Time each method of this stage instead, on its own."
+)
 @json_option
-def bench(selector: str | None, size: str, repeat: int, as_json: bool, **request: Any) -> None:
+def bench(
+    selector: str | None,
+    size: str,
+    repeat: int,
+    methods: str | None,
+    as_json: bool,
+    **request: Any,
+) -> None:
     """Time the chain and each launch, from half RGB to eight-bit RGB on the device."""
     width, _, height = size.partition("x")
     numbers = width.isdecimal() and height.isdecimal()
@@ -448,6 +460,20 @@ def bench(selector: str | None, size: str, repeat: int, as_json: bool, **request
     device = open_device(selector)
     if device is None:
         raise RequestError("bench: it times the kernels of a device; numpy has none")
+    if methods is not None:
+        stage = stage_named("--methods", methods)
+        speeds = bench_methods(device, stage, chain.settings, int(width), int(height), repeat)
+        if as_json:
+            click.echo(json.dumps([asdict(speed) for speed in speeds], indent=2))
+            return
+        click.echo(f"{device.info.label}: {stage.name}, {width}x{height}, planes to planes")
+        table = Table("method", box=None, pad_edge=False)
+        for heading in ("launches", "ms", "MP/s"):
+            table.add_column(heading, justify="right")
+        for row in speeds:
+            table.add_row(row.method, str(row.launches), f"{row.ms:.1f}", f"{row.mp_per_s:.0f}")
+        console().print(table)
+        return
     report = run_bench(device, chain, int(width), int(height), repeat)
     if as_json:
         click.echo(json.dumps(report.record(), indent=2))

@@ -5,18 +5,19 @@ A stage is declared once, in ``clpipe/stages/<name>.py``, as a :class:`Stage` wi
 anywhere (validation, help, ``--set``, kernel arguments, the sidecar) is derived from there.
 """
 
-from collections.abc import Callable, Mapping
+import typing
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, get_args, get_origin
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from clpipe.camera import Camera
-from clpipe.reference.cfa import Pattern, red_site
+from clpipe.reference.cfa import PATTERNS, Pattern, red_site
 from clpipe.reference.random import Stream
 from clpipe.types import Array, Floats
 
@@ -173,6 +174,25 @@ class Method(BaseModel):
         """A copy in which those of ``values`` replace parameters that are None."""
         missing = {k: v for k, v in values.items() if getattr(self, k) is None}
         return self.model_copy(update=missing) if missing else self
+
+
+def variants(method: type[Method]) -> Iterator[dict[str, Any]]:
+    """What is compiled differently: the defaults, then each other choice of a structural parameter.
+
+    The CFA pattern is not among them: whoever goes through variants goes through patterns anyway.
+    """
+    yield {}
+    for name, field in method.model_fields.items():
+        extra: Any = field.json_schema_extra
+        choices = get_args(field.annotation)
+        named = get_origin(field.annotation) is typing.Literal and choices != PATTERNS
+        if extra["structural"] and named:
+            yield from ({name: choice} for choice in choices if choice != field.default)
+
+
+def variant_label(method: type[Method], values: Mapping[str, Any]) -> str:
+    """A method and what is not at its default."""
+    return " ".join([method.method, *(f"{name}={value}" for name, value in values.items())])
 
 
 @dataclass
