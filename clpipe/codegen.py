@@ -264,7 +264,9 @@ def _load(writer: _Writer, launch: Launch) -> tuple[list[str], Kind]:
         kind, dtype = plan.source, "half" if plan.half else "float"
         writer.parameter("src", f"__global const {dtype} *restrict ", "source")
         return [f"const {kind.c_type} v0 = source_{kind.c_name}_{dtype}(src, at, e);"], kind
-    images = [f"image_at({', '.join(writer.planes(read))}, pitch, at)" for read in launch.reads]
+    images = [
+        f"image_at({', '.join(writer.planes(read))}, pitch, first, row)" for read in launch.reads
+    ]
     if not stencil:
         kind = launch.reads[0].image.kind
         return [f"const {kind.c_type} v0 = tap_{kind.c_name}({images[0]}, 0, 0);"], kind
@@ -310,24 +312,34 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
         lines.append("if (row & 1) odd_rows += sample; else even_rows += sample;")
         before = "    vi even_rows = (vi)(0), odd_rows = (vi)(0);\n"
         after = (
-            "    const site first = site_at(x, y);\n"
             "    const size_t block = get_global_id(1) * ((width + LANES - 1) / LANES) + "
             "get_global_id(0);\n"
             "    sums[block] = (int4)(fold_columns(even_rows, first), "
             "fold_columns(odd_rows, first));\n"
         )
+    lines.append(f"values[row] = {value};")
+    stores = []
     if launch.writes:
         slots = [writer.slot(n, True) for n in plan.slots[launch.writes.number]]
-        lines.append(f"store_{kind.c_name}({', '.join([value, *slots])}, at, e);")
+        stores.append(f"store_{kind.c_name}({', '.join(['values[row]', *slots])}, at, e);")
     if launch.encodes:
-        lines.append(_encode(writer, value, kind, curves))
-    rows = "".join(f"        {line}\n" for line in lines)
+        stores.append(_encode(writer, "values[row]", kind, curves))
+
+    def over_rows(lines: Sequence[str]) -> str:
+        body = "".join(f"        {line}\n" for line in lines)
+        return (
+            f"#pragma unroll\n    for (uint row = 0; row < {launch.rows}; ++row) {{\n"
+            f"        const site at = site_at(x, y + row);\n{body}    }}\n"
+        )
+
     return (
         "    const uint x = (uint)get_global_id(0) * LANES;\n"
         f"    const uint y = (uint)get_global_id(1) * {launch.rows};\n"
-        f"    if (x >= width) return;\n{before}"
-        f"#pragma unroll\n    for (uint row = 0; row < {launch.rows}; ++row) {{\n"
-        f"        const site at = site_at(x, y + row);\n{rows}    }}\n{after}"
+        "    if (x >= width) return;\n"
+        f"    const site first = site_at(x, y);\n{before}"
+        # All rows before the first store: what they have in common is then done once, because
+        # no store can have changed what they read.
+        f"    {kind.c_type} values[{launch.rows}];\n{over_rows(lines)}{over_rows(stores)}{after}"
     )
 
 

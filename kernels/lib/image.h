@@ -20,10 +20,13 @@ typedef struct { vf r, g, b; } rgb;
 typedef struct { vf y, cb, cr; } ycbcr;
 typedef struct { vf first, second; } pair;
 
-// Planes of a stored image, each pointing at the block's first lane.
+// Planes of a stored image, each pointing at the first lane of the block's first row, and the row
+// of the block that is being done. All rows tap from the same pointers, so that the compiler sees
+// which taps of two rows are the same and loads them once.
 typedef struct {
     __global const float *plane0, *plane1, *plane2;
     uint pitch;
+    int row;
     site at;
 } image;
 
@@ -43,13 +46,17 @@ INLINE size_t plane_offset(site at, uint pitch) {
 }
 
 INLINE image image_at(__global const float *p0, __global const float *p1, __global const float *p2,
-                      uint pitch, site at) {
-    const size_t offset = plane_offset(at, pitch);
-    const image i = {p0 + offset, p1 + offset, p2 + offset, pitch, at};
+                      uint pitch, site first, uint row) {
+    const size_t offset = plane_offset(first, pitch);
+    const site at = {first.x, first.y + row, first.odd};
+    const image i = {p0 + offset, p1 + offset, p2 + offset, pitch, (int)row, at};
     return i;
 }
 
-#define TAP(plane) load(i.plane + (long)dy * (long)i.pitch + dx)
+INLINE vf tap_plane(__global const float *plane, image i, int dx, int dy) {
+    return load(plane + (long)(i.row + dy) * (long)i.pitch + dx);
+}
+#define TAP(plane) tap_plane(i.plane, i, dx, dy)
 INLINE vf tap_mosaic(image i, int dx, int dy) { return TAP(plane0); }
 INLINE pair tap_pair(image i, int dx, int dy) {
     const pair v = {TAP(plane0), TAP(plane1)};

@@ -79,7 +79,7 @@ INLINE vf median25(sorted5 p, sorted5 q, sorted5 r, sorted5 s, sorted5 t) {
 // Of the pixels around the block at `i`, whose samples are in `plane`.
 INLINE vf median_3x3(__global const float *plane, image i) {
 #define ROW(dy) sort3(TAP(dy, -1), TAP(dy, 0), TAP(dy, 1))
-#define TAP(dy, dx) load(plane + (long)(dy) * (long)i.pitch + (dx))
+#define TAP(dy, dx) tap_plane(plane, i, dx, dy)
     const int odd = i.at.y & 1;
     return median9(ROW(-odd), ROW(1 - odd), ROW(2 * odd - 1));
 #undef ROW
