@@ -219,38 +219,3 @@ def test_demosaicing_keeps_samples_and_leaves_flat_areas_flat(develop, method, p
         ), channel
     flat = np.full((24, 31, 3), 0.25, np.float32)
     assert np.array_equal(develop(flat, demosaic={"method": method}, **chain).final, flat)
-
-
-def cpsnr(one, two, border=10):
-    crop = slice(border, -border)
-    error = (one[crop, crop].astype(np.float64) - two[crop, crop]) ** 2
-    return 10 * np.log10(255**2 / error.mean())
-
-
-@pytest.mark.parametrize(
-    ("demosaic", "expected"),
-    [
-        ({"method": "bilinear"}, 27.76),
-        ({"method": "edge_directed", "classifier": "hibbard"}, 31.00),
-        ({"method": "edge_directed", "classifier": "laroche_prescott"}, 32.24),
-        ({"method": "edge_directed", "classifier": "hamilton_adams"}, 35.11),
-        ({"method": "median", "size": 3}, 34.68),
-        ({"method": "edge_directed_median", "size": 3}, 37.56),
-        # What an independent implementation gives on these files.
-        ({"method": "malvar2004"}, 33.53),
-        ({"method": "menon2007"}, 37.47),
-    ],
-    ids=lambda value: "-".join(map(str, value.values())) if isinstance(value, dict) else "",
-)
-def test_demosaicing_is_as_good_as_published(device, shared_data, demosaic, expected):
-    from PIL import Image
-
-    values = []
-    chain = runner({"stages": ["mosaic", "demosaic"], "demosaic": demosaic}, device)
-    for path in sorted((shared_data / "kodak").glob("*.png")):
-        with Image.open(path) as file:
-            truth = np.asarray(file)
-        image = (truth / np.float32(255)).astype(np.float32)
-        values.append(cpsnr(chain.run(image, path.name).encoded, truth))
-    assert len(values) == 8
-    assert np.mean(values) == pytest.approx(expected, abs=0.05)
