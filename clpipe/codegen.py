@@ -240,18 +240,22 @@ def _source_image(writer: _Writer, launch: Launch) -> str:
     )
 
 
-def _load(writer: _Writer, launch: Launch) -> tuple[list[str], Kind]:
-    """The lines that make ``v0``: from the source, a stored image or the stencil; and its kind."""
+def _load(writer: _Writer, launch: Launch) -> tuple[list[str], list[str], Kind]:
+    """What makes ``v0``, from the source, a stored image or the stencil; and its kind.
+
+    The first lines come once a block (for a stencil that gives all its rows), the others once a
+    row.
+    """
     plan = writer.plan
     stencil = launch.stencil
     if not launch.reads:
         kind, dtype = plan.source, "half" if plan.half else "float"
         writer.parameter("src", f"__global const {dtype} *restrict ", "source")
-        return [f"const {kind.c_type} v0 = source_{kind.c_name}_{dtype}(src, at, e);"], kind
+        return [], [f"const {kind.c_type} v0 = source_{kind.c_name}_{dtype}(src, at, e);"], kind
     images = [f"image_at({', '.join(writer.planes(read))}, pitch, at)" for read in launch.reads]
     if not stencil:
         kind = launch.reads[0].image.kind
-        return [f"const {kind.c_type} v0 = tap_{kind.c_name}({images[0]}, 0, 0);"], kind
+        return [], [f"const {kind.c_type} v0 = tap_{kind.c_name}({images[0]}, 0, 0);"], kind
     lines = []
     for name, read, stored in zip(stencil.pass_.reads, launch.reads, images, strict=True):
         values = [v for _, _, own in _prologue(writer, read) for v in own]
@@ -259,8 +263,15 @@ def _load(writer: _Writer, launch: Launch) -> tuple[list[str], Kind]:
         made = f"{{{', '.join([stored, *values])}}}" if values else stored
         lines.append(f"const {type_} {name} = {made};")
     arguments = writer.arguments(stencil, found_by(plan, stencil.step))
-    made = call(stencil, ["at", *stencil.pass_.reads, *arguments])
-    return [*lines, f"const {stencil.kind.c_type} v0 = {made};"], stencil.kind
+    given = ["at", *stencil.pass_.reads, *arguments]
+    kind = stencil.kind
+    if stencil.pass_.block:
+        lines = ["const site at = site_at(x, y);", *lines, f"{call(stencil, [*given, 'block'])};"]
+        size = f"{launch.rows} * {launch.columns}"
+        once = [f"{kind.c_type} block[{size}];", "{", *(f"    {x}" for x in lines), "}"]
+        value = f"block[row * {launch.columns} + column]" if launch.columns > 1 else "block[row]"
+        return once, [f"const {kind.c_type} v0 = {value};"], kind
+    return [], [*lines, f"const {kind.c_type} v0 = {call(stencil, given)};"], kind
 
 
 def _encode(writer: _Writer, value: str, kind: Kind, curves: Sequence[Op]) -> str:
@@ -276,7 +287,7 @@ def _encode(writer: _Writer, value: str, kind: Kind, curves: Sequence[Op]) -> st
 def _pixels(writer: _Writer, launch: Launch) -> str:
     """The body of a kernel over the image: load, the stages, store."""
     plan = writer.plan
-    lines, kind = _load(writer, launch)
+    once, lines, kind = _load(writer, launch)
     ops = list(launch.ops[1:] if launch.stencil else launch.ops)
     curves: list[Op] = []
     while launch.encodes and not launch.writes and ops and ops[-1].pass_.access is Access.CURVE:
@@ -286,12 +297,12 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
         made = call(op, [f"v{i}", "at", *writer.arguments(op, found_by(plan, op.step))])
         lines.append(f"const {kind.c_type} v{i + 1} = {made};")
     value = f"v{len(ops)}"
-    before = after = ""
+    before, after = "".join(f"    {line}\n" for line in once), ""
     if launch.sums:
         writer.parameter("sums", "__global int4 *restrict ", "sums")
         lines.append(f"const vi sample = only_inside({call(launch.sums, [value])}, at, e);")
         lines.append("if (row & 1) odd_rows += sample; else even_rows += sample;")
-        before = "    vi even_rows = (vi)(0), odd_rows = (vi)(0);\n"
+        before += "    vi even_rows = (vi)(0), odd_rows = (vi)(0);\n"
         after = (
             "    const site first = site_at(x, y);\n"
             "    const size_t block = get_global_id(1) * ((width + LANES - 1) / LANES) + "
@@ -304,13 +315,25 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
         lines.append(f"store_{kind.c_name}({', '.join([value, *slots])}, at, e);")
     if launch.encodes:
         lines.append(_encode(writer, value, kind, curves))
+    where = "x"
+    if launch.columns > 1:
+        where = "x + column * LANES"
+        lines = [f"    {line}" for line in ["if (at.x >= width) break;", *lines]]
+        lines = [
+            f"for (uint column = 0; column < {launch.columns}; ++column) {{",
+            f"    const site at = site_at({where}, y + row);",
+            *lines,
+            "}",
+        ]
+    else:
+        lines = ["const site at = site_at(x, y + row);", *lines]
     rows = "".join(f"        {line}\n" for line in lines)
     return (
-        "    const uint x = (uint)get_global_id(0) * LANES;\n"
+        f"    const uint x = (uint)get_global_id(0) * LANES{f' * {launch.columns}' if launch.columns > 1 else ''};\n"
         f"    const uint y = (uint)get_global_id(1) * {launch.rows};\n"
         f"    if (x >= width) return;\n{before}"
         f"#pragma unroll\n    for (uint row = 0; row < {launch.rows}; ++row) {{\n"
-        f"        const site at = site_at(x, y + row);\n{rows}    }}\n{after}"
+        f"{rows}    }}\n{after}"
     )
 
 

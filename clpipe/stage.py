@@ -5,7 +5,7 @@ A stage is declared once, in ``clpipe/stages/<name>.py``, as a :class:`Stage` wi
 anywhere (validation, help, ``--set``, kernel arguments, the sidecar) is derived from there.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
@@ -63,7 +63,8 @@ class Pass:
     """One function of a method's kernel file, and how the planner may place it.
 
     ``reads`` and ``writes`` name images of the stage: ``src`` is its input, ``dst`` its output, any
-    other name is scratch. ``arguments`` are, in order, names from :meth:`Method.arguments`, from
+    other name is scratch. A STENCIL with a ``block`` gets an array for it, row by row, as its last
+    argument, where others return a pixel. ``arguments`` are, in order, names from :meth:`Method.arguments`, from
     ``found`` of an earlier SUMS pass, or the line table that an earlier LINES pass writes.
     """
 
@@ -75,6 +76,7 @@ class Pass:
     kind: Kind | None = None  # of what it writes; None: what the stage writes
     radius: int = 0
     random: Owner | None = None  # gets a random stream as its first argument
+    block: int = 0  # STENCIL: one call gives 4 rows of that many vectors, which share work
     cheap: bool = False  # so cheap that a stencil after it may redo it at each tap
     lines: str = ""  # LINES: "rows" or "columns"
     finish: str = ""  # SUMS: the function that turns sums into what is found
@@ -99,6 +101,7 @@ class Context:
     iso: float
     pattern: Pattern = "RGGB"
     gains: tuple[float, float] = (1.0, 1.0)  # red, blue: taken out by inverse_white_balance
+    applied_gains: tuple[float, float] = (1.0, 1.0)  # red, blue: put back by white_balance
     noise: tuple[float, float] | None = None  # a, b of the sensor noise that was added
     black_level: float | None = None  # DN, as quantize used them
     white_level: float | None = None
@@ -172,13 +175,17 @@ class Frame:
 
 @dataclass(frozen=True)
 class Stage:
-    """A named step of the chain. The first method is the default."""
+    """A named step of the chain. The first method is the default.
+
+    ``explain`` says in a few lines how the automatic parameters follow from what is known.
+    """
 
     name: str
     summary: str
     reads: Kind
     writes: Kind
     methods: tuple[type[Method], ...]
+    explain: Callable[[Context], str] | None = None
 
     @cached_property
     def by_name(self) -> dict[str, type[Method]]:

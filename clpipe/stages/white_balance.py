@@ -1,6 +1,7 @@
 """White balance on the mosaic. What a gain lifts above 1 clips: burnt-out highlights are white."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -34,6 +35,10 @@ class AsShot(Method):
         red, blue = context.gains
         return self.filled(red_gain=red, blue_gain=blue)
 
+    def after(self, context: Context) -> Context:
+        assert self.red_gain is not None and self.blue_gain is not None
+        return replace(context, applied_gains=(self.red_gain, self.blue_gain))
+
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("white_balance", arguments=("pattern", "red_gain", "blue_gain"), cheap=True),)
 
@@ -55,6 +60,10 @@ class GrayWorld(Method):
     kernel: ClassVar = "gray_world"
     summary: ClassVar = "make the means of the three colours equal"
     tolerance: ClassVar = 1e-6  # of the gains: division is not exact on every device
+
+    def after(self, context: Context) -> Context:
+        # What the image will ask for is not known yet; the camera's own gains are the best guess.
+        return replace(context, applied_gains=context.gains)
 
     def passes(self) -> tuple[Pass, ...]:
         gains = ("red_gain", "blue_gain")
