@@ -19,6 +19,7 @@ LIBRARY = (
     "math",
     "image",
     "cfa",
+    "median",
     "colour",
     "random",
     "curve",

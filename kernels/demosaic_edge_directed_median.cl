@@ -37,36 +37,11 @@ INLINE differences spread_differences(site at, image known, cfa pattern) {
     return v;
 }
 
-#define ORDER(a, b) { const vf smaller = least(a, b); b = most(a, b); a = smaller; }
-
-// Median of nine by the exchange network of Paeth (Graphics Gems, 1990).
-INLINE vf median9(vf a, vf b, vf c, vf d, vf e, vf f, vf g, vf h, vf i) {
-    ORDER(b, c) ORDER(e, f) ORDER(h, i) ORDER(a, b) ORDER(d, e) ORDER(g, h)
-    ORDER(b, c) ORDER(e, f) ORDER(h, i)
-    d = most(a, d);
-    g = most(d, g);
-    f = least(f, i);
-    c = least(c, f);
-    ORDER(e, h)
-    e = most(b, e);
-    e = least(e, h);
-    ORDER(e, c)
-    e = most(g, e);
-    return least(e, c);
-}
-#undef ORDER
-
 // Freeman (US patent 4,724,395, 1988): the colour differences are median filtered, the samples
 // that the sensor took are kept, and the other colours follow from them.
 INLINE rgb freeman(site at, src_image src, image spread, cfa pattern) {
-    const differences nw = tap_differences(spread, -1, -1), n = tap_differences(spread, 0, -1),
-                      ne = tap_differences(spread, 1, -1), w = tap_differences(spread, -1, 0),
-                      m = tap_differences(spread, 0, 0), e = tap_differences(spread, 1, 0),
-                      sw = tap_differences(spread, -1, 1), s = tap_differences(spread, 0, 1),
-                      se = tap_differences(spread, 1, 1);
-    const vf red = median9(nw.red, n.red, ne.red, w.red, m.red, e.red, sw.red, s.red, se.red);
-    const vf blue =
-        median9(nw.blue, n.blue, ne.blue, w.blue, m.blue, e.blue, sw.blue, s.blue, se.blue);
+    const vf red = median_around(spread.plane0, spread, 3);
+    const vf blue = median_around(spread.plane1, spread, 3);
     const vf centre = src_tap(src, 0, 0);
     const vf green = by_site(at, pattern, centre - red, centre, centre - blue);
     const vf r = green + red, b = green + blue;

@@ -1,0 +1,101 @@
+// Medians of the 3x3 and 5x5 pixels around a pixel, in one plane.
+//
+// Both sort the rows of the window first. A sorted row is the same for every window that it is in,
+// and the rows that the windows of lines 2n and 2n+1 share are taken first and in the same order in
+// both; so a work item, which does both lines, does this work once (the compiler sees to it, and
+// drops the halves of exchanges that nothing uses).
+#ifndef CLPIPE_MEDIAN_H
+#define CLPIPE_MEDIAN_H
+
+#define ORDER(a, b) { const vf smaller = least(a, b); b = most(a, b); a = smaller; }
+
+// In ascending order.
+typedef struct { vf a, b, c; } sorted3;
+typedef struct { vf a, b, c, d, e; } sorted5;
+
+INLINE sorted3 sort3(vf a, vf b, vf c) {
+    ORDER(b, c) ORDER(a, b) ORDER(b, c)
+    const sorted3 s = {a, b, c};
+    return s;
+}
+
+// Nine exchanges, the fewest that do (Knuth, The Art of Computer Programming 3, 5.3.4).
+INLINE sorted5 sort5(vf a, vf b, vf c, vf d, vf e) {
+    ORDER(a, d) ORDER(b, e)
+    ORDER(a, c) ORDER(b, d)
+    ORDER(a, b) ORDER(c, e)
+    ORDER(b, c) ORDER(d, e)
+    ORDER(c, d)
+    const sorted5 s = {a, b, c, d, e};
+    return s;
+}
+
+// Four are sorted, then the fifth is put in its place.
+INLINE sorted5 sort4_and_insert(vf a, vf b, vf c, vf d, vf x) {
+    ORDER(a, b) ORDER(c, d)
+    ORDER(a, c) ORDER(b, d)
+    ORDER(b, c)
+    const sorted5 s = {least(a, x), most(a, least(b, x)), most(b, least(c, x)),
+                       most(c, least(d, x)), most(d, x)};
+    return s;
+}
+
+INLINE vf median3(vf a, vf b, vf c) { return most(least(a, b), least(most(a, b), c)); }
+
+// Of three sorted rows, in any order: the median is that of the largest of the small ones, the
+// median of the middle ones and the smallest of the large ones (Smith 1996).
+INLINE vf median9(sorted3 p, sorted3 q, sorted3 r) {
+    return median3(most(most(p.a, q.a), r.a), median3(p.b, q.b, r.b),
+                   least(least(p.c, q.c), r.c));
+}
+
+// Of five sorted rows, in any order. Sorted by columns too, 12 of the 25 cannot be the median: a
+// value in row i and column j has i*j - 1 that are not larger and (6-i)*(6-j) - 1 that are not
+// smaller. Among the other 13 the search below leaves out whatever is known to lie on one side; it
+// holds for all 252 ways in which zeros and ones can be sorted by rows and columns, and so for all
+// values (Knuth's zero-one principle).
+INLINE vf median25(sorted5 p, sorted5 q, sorted5 r, sorted5 s, sorted5 t) {
+    const sorted5 column1 = sort4_and_insert(p.a, q.a, r.a, s.a, t.a);
+    const sorted5 column2 = sort4_and_insert(p.b, q.b, r.b, s.b, t.b);
+    const sorted5 column3 = sort4_and_insert(p.c, q.c, r.c, s.c, t.c);
+    const sorted5 column4 = sort4_and_insert(p.d, q.d, r.d, s.d, t.d);
+    const sorted5 column5 = sort4_and_insert(p.e, q.e, r.e, s.e, t.e);
+    const vf m = least(most(column3.b, column2.d), column4.c);
+    vf a = least(most(column4.b, column1.d), column2.e);
+    vf b = least(column5.b, m);
+    b = most(b, column4.a);
+    vf c = least(most(column5.a, column2.c), column3.d);
+    vf d = column1.e;
+    ORDER(c, d)
+    ORDER(b, a)
+    a = least(a, d);
+    c = most(b, c);
+    vf e = column3.c;
+    ORDER(c, e)
+    return least(e, most(c, a));
+}
+#undef ORDER
+
+// Of the pixels around the block at `i`, whose samples are in `plane`.
+INLINE vf median_3x3(__global const float *plane, image i) {
+#define ROW(dy) sort3(TAP(dy, -1), TAP(dy, 0), TAP(dy, 1))
+#define TAP(dy, dx) load(plane + (long)(dy) * (long)i.pitch + (dx))
+    const int odd = i.at.y & 1;
+    return median9(ROW(-odd), ROW(1 - odd), ROW(2 * odd - 1));
+#undef ROW
+}
+
+INLINE vf median_5x5(__global const float *plane, image i) {
+#define ROW(dy) sort5(TAP(dy, -2), TAP(dy, -1), TAP(dy, 0), TAP(dy, 1), TAP(dy, 2))
+    const int odd = i.at.y & 1;
+    return median25(ROW(-1 - odd), ROW(-odd), ROW(1 - odd), ROW(2 - odd), ROW(4 * odd - 2));
+#undef TAP
+#undef ROW
+}
+
+// `size` is 3 or 5, and a constant.
+INLINE vf median_around(__global const float *plane, image i, int size) {
+    return size == 5 ? median_5x5(plane, i) : median_3x3(plane, i);
+}
+
+#endif
