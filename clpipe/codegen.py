@@ -316,21 +316,16 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
         lines.append(f"store_{kind.c_name}({', '.join([value, *slots])}, at, e);")
     if launch.encodes:
         lines.append(_encode(writer, value, kind, curves))
-    where = "x"
+    across, column_x = "LANES", "x"
     if launch.columns > 1:
-        where = "x + column * LANES"
-        lines = [f"    {line}" for line in ["if (at.x >= width) break;", *lines]]
-        lines = [
-            f"for (uint column = 0; column < {launch.columns}; ++column) {{",
-            f"    const site at = site_at({where}, y + row);",
-            *lines,
-            "}",
-        ]
-    else:
-        lines = ["const site at = site_at(x, y + row);", *lines]
+        across, column_x = f"LANES * {launch.columns}", "x + column * LANES"
+    lines.insert(0, f"const site at = site_at({column_x}, y + row);")
+    if launch.columns > 1:
+        head = f"for (uint column = 0; column < {launch.columns} && {column_x} < width; ++column) {{"
+        lines = [head, *(f"    {line}" for line in lines), "}"]
     rows = "".join(f"        {line}\n" for line in lines)
     return (
-        f"    const uint x = (uint)get_global_id(0) * LANES{f' * {launch.columns}' if launch.columns > 1 else ''};\n"
+        f"    const uint x = (uint)get_global_id(0) * {across};\n"
         f"    const uint y = (uint)get_global_id(1) * {launch.rows};\n"
         f"    if (x >= width) return;\n{before}"
         f"#pragma unroll\n    for (uint row = 0; row < {launch.rows}; ++row) {{\n"

@@ -4,6 +4,7 @@ from clpipe.stage import Kind, Stage
 from clpipe.stages.denoise.bilateral import Bilateral
 from clpipe.stages.denoise.law import explain
 from clpipe.stages.denoise.mean import Mean
+from clpipe.stages.denoise.median import Median
 from clpipe.stages.denoise.non_local_means import NonLocalMeans
 
 STAGE = Stage(
@@ -11,6 +12,6 @@ STAGE = Stage(
     "Take noise away, as a camera does.",
     Kind.RGB,
     Kind.RGB,
-    (Bilateral, NonLocalMeans, Mean),
+    (Bilateral, NonLocalMeans, Median, Mean),
     explain,
 )
