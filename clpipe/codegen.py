@@ -321,7 +321,9 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
         across, column_x = f"LANES * {launch.columns}", "x + column * LANES"
     lines.insert(0, f"const site at = site_at({column_x}, y + row);")
     if launch.columns > 1:
-        head = f"for (uint column = 0; column < {launch.columns} && {column_x} < width; ++column) {{"
+        head = (
+            f"for (uint column = 0; column < {launch.columns} && {column_x} < width; ++column) {{"
+        )
         lines = [head, *(f"    {line}" for line in lines), "}"]
     rows = "".join(f"        {line}\n" for line in lines)
     return (

@@ -155,8 +155,8 @@ class _Planner:
             name = name.replace(
                 group.stencil.step, f"{group.stencil.step}.{group.stencil.pass_.function}", 1
             )
-        size = {"rows": 4 if shared else 2, "columns": max(block, 1)}
-        self.launches.append(replace(group, name=name, **size))
+        rows = 4 if shared else 2
+        self.launches.append(replace(group, name=name, rows=rows, columns=max(block, 1)))
 
     def input_of_stencil(self) -> Read:
         """The current image for a stencil: cheap pointwise passes on a stored one are redone."""

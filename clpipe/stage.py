@@ -64,8 +64,9 @@ class Pass:
 
     ``reads`` and ``writes`` name images of the stage: ``src`` is its input, ``dst`` its output, any
     other name is scratch. A STENCIL with a ``block`` gets an array for it, row by row, as its last
-    argument, where others return a pixel. ``arguments`` are, in order, names from :meth:`Method.arguments`, from
-    ``found`` of an earlier SUMS pass, or the line table that an earlier LINES pass writes.
+    argument, where others return a pixel. ``arguments`` are, in order, names from
+    :meth:`Method.arguments`, from ``found`` of an earlier SUMS pass, or the line table that an
+    earlier LINES pass writes.
     """
 
     function: str

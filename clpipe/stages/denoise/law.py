@@ -87,8 +87,7 @@ def explain(context: Context) -> str:
         f" = {luma:.3g}\n"
         "  chroma_noise = the same for Cb and Cr together"
         f" = {chroma:.3g}\n"
-        "  A method filters as strongly as luma_strength * luma_noise and"
-        " chroma_strength * chroma_noise ask for."
+        "  A method filters as luma_strength * luma_noise and chroma_strength * chroma_noise ask for."
     )
 
 
