@@ -28,6 +28,7 @@ class Kind(Enum):
     RAW = ("raw", "vf", ("Y",))  # mosaic in DN
     DISPLAY = ("display", "rgb", ("R", "G", "B"))  # as a screen wants it, 0..1
     YCBCR = ("ycbcr", "ycbcr", ("Y", "Cb", "Cr"))  # inside a stage only
+    STABILIZED = ("stabilized", "stabilized", ("Y", "f(Y)"))  # inside a stage only
     DIFFERENCES = ("differences", "differences", ("R-G", "B-G"))  # inside a stage only
 
     def __init__(self, label: str, c_type: str, channels: tuple[str, ...]) -> None:

@@ -1,4 +1,5 @@
 // Non-local means (Buades, Coll and Morel 2005) on luma and chroma, patches of 3x3.
+#include "lib/patch.h"
 
 // In units in which the squared differences of two patches simply add up to their distance.
 INLINE ycbcr to_noise_units(rgb c, site at, float luma_unit, float chroma_unit) {
@@ -13,11 +14,6 @@ INLINE rgb from_noise_units(ycbcr c, site at, float luma_unit, float chroma_unit
     return ycbcr_to_rgb(v);
 }
 
-// A block of 4 rows and COLUMNS vectors at once. One column of patches begins a pixel to the left of
-// the block and the last one ends a pixel to its right: so there are more columns of differences.
-#define COLUMNS 4
-#define WITH_MARGIN (LANES == 1 ? COLUMNS + 2 : COLUMNS + 1)
-
 // Squared differences, all planes, of pixels and those dx, dy away, summed over three rows.
 INLINE void column_distances(image planes, int dx, int dy, float down[4][WITH_MARGIN * LANES]) {
 #pragma OPENCL FP_CONTRACT ON
@@ -27,7 +23,8 @@ INLINE void column_distances(image planes, int dx, int dy, float down[4][WITH_MA
         vf squared[6];
 #pragma unroll
         for (int y = 0; y < 6; ++y) {
-            const ycbcr one = tap_ycbcr(planes, x, y - 1), two = tap_ycbcr(planes, x + dx, y - 1 + dy);
+            const ycbcr one = tap_ycbcr(planes, x, y - 1);
+            const ycbcr two = tap_ycbcr(planes, x + dx, y - 1 + dy);
             const vf d = one.y - two.y, b = one.cb - two.cb, r = one.cr - two.cr;
             squared[y] = d * d + b * b + r * r;
         }
@@ -37,6 +34,8 @@ INLINE void column_distances(image planes, int dx, int dy, float down[4][WITH_MA
     }
 }
 
+INLINE bool inside(int offset, int reach) { return offset >= -reach && offset <= reach; }
+
 // The loops over the window are not unrolled: one turn is long enough, and all would not fit the
 // instruction cache.
 INLINE void non_local_means(site at, image planes, int luma_reach, int chroma_reach,
@@ -44,8 +43,9 @@ INLINE void non_local_means(site at, image planes, int luma_reach, int chroma_re
                             float chroma_bias, float luma_scale, float chroma_scale, ycbcr *out) {
 #pragma OPENCL FP_CONTRACT ON
     const int reach = luma_reach > chroma_reach ? luma_reach : chroma_reach;
-    const int last = reach + (int)(at.x >> 31);
-    const float luma_start = -luma_bias * luma_scale, chroma_start = -chroma_bias * chroma_scale;
+    const int last = last_offset(at, reach);
+    const float luma_start = -luma_bias * luma_scale;
+    const float chroma_start = -chroma_bias * chroma_scale;
     float down[4][WITH_MARGIN * LANES];
     ycbcr sum[4 * COLUMNS];
     vf luma_weight[4 * COLUMNS], chroma_weight[4 * COLUMNS], per_variance[4 * COLUMNS];
@@ -70,15 +70,14 @@ INLINE void non_local_means(site at, image planes, int luma_reach, int chroma_re
 #pragma unroll 1
         for (int dx = -reach; dx <= last; ++dx) {
             column_distances(planes, dx, dy, down);
-            const bool luma = dx >= -luma_reach && dx <= luma_reach && dy >= -luma_reach && dy <= luma_reach;
-            const bool chroma = dx >= -chroma_reach && dx <= chroma_reach && dy >= -chroma_reach && dy <= chroma_reach;
+            const bool luma = inside(dx, luma_reach) && inside(dy, luma_reach);
+            const bool chroma = inside(dx, chroma_reach) && inside(dy, chroma_reach);
 #pragma unroll
             for (int y = 0; y < 4; ++y) {
 #pragma unroll
                 for (int column = 0; column < COLUMNS; ++column) {
                     const int i = y * COLUMNS + column;
-                    const float *from = down[y] + column * LANES;
-                    const vf distance = (unspill(from) + unspill(from + 1) + unspill(from + 2)) * per_variance[i];
+                    const vf distance = across(down[y] + column * LANES) * per_variance[i];
                     const ycbcr other = tap_ycbcr(planes, column * LANES + dx, y + dy);
                     if (luma) {
                         const vf beyond = luma_start + distance * luma_scale;

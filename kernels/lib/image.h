@@ -19,6 +19,7 @@ typedef struct {
 typedef struct { vf r, g, b; } rgb;
 typedef struct { vf y, cb, cr; } ycbcr;
 typedef struct { vf red, blue; } differences;  // R-G and B-G
+typedef struct { vf signal, stable; } stabilized;  // a sample, and a function of it
 
 // Planes of a stored image, each pointing at the block's first lane.
 typedef struct {
@@ -53,6 +54,10 @@ INLINE image image_at(__global const float *p0, __global const float *p1, __glob
 INLINE vf tap_mosaic(image i, int dx, int dy) { return TAP(plane0); }
 INLINE differences tap_differences(image i, int dx, int dy) {
     const differences v = {TAP(plane0), TAP(plane1)};
+    return v;
+}
+INLINE stabilized tap_stabilized(image i, int dx, int dy) {
+    const stabilized v = {TAP(plane0), TAP(plane1)};
     return v;
 }
 INLINE rgb tap_rgb(image i, int dx, int dy) {
@@ -122,6 +127,11 @@ INLINE void store_differences(differences v, __global float *p0, __global float 
                               extent e) {
     store_plane(v.red, p0, at, e);
     store_plane(v.blue, p1, at, e);
+}
+INLINE void store_stabilized(stabilized v, __global float *p0, __global float *p1, site at,
+                             extent e) {
+    store_plane(v.signal, p0, at, e);
+    store_plane(v.stable, p1, at, e);
 }
 INLINE void store_rgb(rgb v, __global float *p0, __global float *p1, __global float *p2, site at,
                       extent e) {

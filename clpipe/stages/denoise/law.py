@@ -87,7 +87,7 @@ def explain(context: Context) -> str:
         f" = {luma:.3g}\n"
         "  chroma_noise = the same for Cb and Cr together"
         f" = {chroma:.3g}\n"
-        "  A method filters as luma_strength * luma_noise and chroma_strength * chroma_noise ask for."
+        "  Methods filter as luma_strength * luma_noise, chroma_strength * chroma_noise ask for."
     )
 
 
