@@ -316,9 +316,10 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
         lines.append(f"store_{kind.c_name}({', '.join([value, *slots])}, at, e);")
     if launch.encodes:
         lines.append(_encode(writer, value, kind, curves))
-    across, column_x = "LANES", "x"
+    across, column_x, unroll = "LANES", "x", ""
     if launch.columns > 1:
         across, column_x = f"LANES * {launch.columns}", "x + column * LANES"
+        unroll = " 1"  # what is stored is in an array already: more copies only compile longer
     lines.insert(0, f"const site at = site_at({column_x}, y + row);")
     if launch.columns > 1:
         head = (
@@ -330,7 +331,7 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
         f"    const uint x = (uint)get_global_id(0) * {across};\n"
         f"    const uint y = (uint)get_global_id(1) * {launch.rows};\n"
         f"    if (x >= width) return;\n{before}"
-        f"#pragma unroll\n    for (uint row = 0; row < {launch.rows}; ++row) {{\n"
+        f"#pragma unroll{unroll}\n    for (uint row = 0; row < {launch.rows}; ++row) {{\n"
         f"{rows}    }}\n{after}"
     )
 

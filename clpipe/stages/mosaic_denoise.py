@@ -163,7 +163,7 @@ def stabilized(y: Floats, a: np.float32, offset: np.float32, root_of_offset: np.
 
     >>> a, c = np.float32(0.01), np.float32(1e-3)
     >>> below, above = 3 * stabilized(np.float32([0.1, 0.11]), a, c, c ** np.float32(0.5))
-    >>> float(round(((above - below) / 0.01) ** -2, 5))  # a*y + c halfway
+    >>> round(float((above - below) / 0.01) ** -2, 5)  # a*y + c halfway
     0.00205
     """
     root = square_root(np.maximum(a * y + offset, np.float32(0)))
