@@ -91,7 +91,7 @@ def file_text(name: str, seen: set[str]) -> str:
 
     def include(match: re.Match[str]) -> str:
         line = text[: match.start()].count("\n") + 2
-        beside = path.with_name(match[1])
+        beside = path.parent / match[1]
         own = Path(name).is_absolute() and beside.is_file()
         return f'{file_text(str(beside) if own else match[1], seen)}#line {line} "{label}"\n'
 
@@ -256,20 +256,26 @@ def _source_image(writer: _Writer, launch: Launch) -> str:
     )
 
 
-def _load(writer: _Writer, launch: Launch) -> tuple[list[str], Kind]:
-    """The lines that make ``v0``: from the source, a stored image or the stencil; and its kind."""
+def _load(writer: _Writer, launch: Launch) -> tuple[list[str], list[str], Kind]:
+    """What makes ``v0``, from the source, a stored image or the stencil; and its kind.
+
+    The first lines come once a work item (for a stencil that gives its whole block), the others
+    once a row.
+    """
     plan = writer.plan
     stencil = launch.stencil
     if not launch.reads:
         kind, dtype = plan.source, "half" if plan.half else "float"
         writer.parameter("src", f"__global const {dtype} *restrict ", "source")
-        return [f"const {kind.c_type} v0 = source_{kind.c_name}_{dtype}(src, at, e);"], kind
+        return [], [f"const {kind.c_type} v0 = source_{kind.c_name}_{dtype}(src, at, e);"], kind
+    block = stencil.pass_.block if stencil else 0
     images = [
-        f"image_at({', '.join(writer.planes(read))}, pitch, first, row)" for read in launch.reads
+        f"image_at({', '.join(writer.planes(read))}, pitch, first, {'0' if block else 'row'})"
+        for read in launch.reads
     ]
     if not stencil:
         kind = launch.reads[0].image.kind
-        return [f"const {kind.c_type} v0 = tap_{kind.c_name}({images[0]}, 0, 0);"], kind
+        return [], [f"const {kind.c_type} v0 = tap_{kind.c_name}({images[0]}, 0, 0);"], kind
     lines = []
     for name, read, stored in zip(stencil.pass_.reads, launch.reads, images, strict=True):
         values = [v for _, _, own in _prologue(writer, read) for v in own]
@@ -277,8 +283,12 @@ def _load(writer: _Writer, launch: Launch) -> tuple[list[str], Kind]:
         made = f"{{{', '.join([stored, *values])}}}" if values else stored
         lines.append(f"const {type_} {name} = {made};")
     arguments = writer.arguments(stencil, found_by(plan, stencil.step))
-    made = call(stencil, ["at", *stencil.pass_.reads, *arguments])
-    return [*lines, f"const {stencil.kind.c_type} v0 = {made};"], stencil.kind
+    kind, given = stencil.kind, [*stencil.pass_.reads, *arguments]
+    if not block:
+        return [], [*lines, f"const {kind.c_type} v0 = {call(stencil, ['at', *given])};"], kind
+    lines.append(f"{call(stencil, ['first', *given, 'block'])};")
+    once = [f"{kind.c_type} block[{launch.rows * block}];", "{", *(f"    {x}" for x in lines), "}"]
+    return once, [f"const {kind.c_type} v0 = block[row * {block} + column];"], kind
 
 
 def _encode(writer: _Writer, value: str, kind: Kind, curves: Sequence[Op]) -> str:
@@ -294,7 +304,7 @@ def _encode(writer: _Writer, value: str, kind: Kind, curves: Sequence[Op]) -> st
 def _pixels(writer: _Writer, launch: Launch) -> str:
     """The body of a kernel over the image: load, the stages, store."""
     plan = writer.plan
-    lines, kind = _load(writer, launch)
+    once, lines, kind = _load(writer, launch)
     ops = list(launch.ops[1:] if launch.stencil else launch.ops)
     curves: list[Op] = []
     while launch.encodes and not launch.writes and ops and ops[-1].pass_.access is Access.CURVE:
@@ -303,44 +313,57 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
         kind = op.kind
         made = call(op, [f"v{i}", "at", *writer.arguments(op, found_by(plan, op.step))])
         lines.append(f"const {kind.c_type} v{i + 1} = {made};")
-    value = f"v{len(ops)}"
-    before = after = ""
+    value, after = f"v{len(ops)}", ""
     if launch.sums:
         writer.parameter("sums", "__global int4 *restrict ", "sums")
         sample = call(launch.sums, [value, *writer.arguments(launch.sums, {})])
         lines.append(f"const vi sample = only_inside({sample}, at, e);")
         lines.append("if (row & 1) odd_rows += sample; else even_rows += sample;")
-        before = "    vi even_rows = (vi)(0), odd_rows = (vi)(0);\n"
+        once.append("vi even_rows = (vi)(0), odd_rows = (vi)(0);")
         after = (
             "    const size_t block = get_global_id(1) * ((width + LANES - 1) / LANES) + "
             "get_global_id(0);\n"
             "    sums[block] = (int4)(fold_columns(even_rows, first), "
             "fold_columns(odd_rows, first));\n"
         )
-    lines.append(f"values[row] = {value};")
+    block = launch.stencil.pass_.block if launch.stencil else 0
+    if not block:
+        # All rows before the first store: what they have in common is then done once, because no
+        # store can have changed what they read.
+        once.append(f"{kind.c_type} values[{launch.rows}];")
+        lines.append(f"values[row] = {value};")
+        value = "values[row]"
     stores = []
     if launch.writes:
         slots = [writer.slot(n, True) for n in plan.slots[launch.writes.number]]
-        stores.append(f"store_{kind.c_name}({', '.join(['values[row]', *slots])}, at, e);")
+        stores.append(f"store_{kind.c_name}({', '.join([value, *slots])}, at, e);")
     if launch.encodes:
-        stores.append(_encode(writer, "values[row]", kind, curves))
-
-    def over_rows(lines: Sequence[str]) -> str:
-        body = "".join(f"        {line}\n" for line in lines)
-        return (
-            f"#pragma unroll\n    for (uint row = 0; row < {launch.rows}; ++row) {{\n"
-            f"        const site at = site_at(x, y + row);\n{body}    }}\n"
-        )
-
+        stores.append(_encode(writer, value, kind, curves))
+    loops = _over_block([*lines, *stores], launch) if block else [lines, stores]
+    start = "".join(f"    {line}\n" for line in once)
+    body = "".join(_over_rows(part, launch.rows, unroll=not block) for part in loops)
     return (
-        "    const uint x = (uint)get_global_id(0) * LANES;\n"
+        f"    const uint x = (uint)get_global_id(0) * {max(block, 1)} * LANES;\n"
         f"    const uint y = (uint)get_global_id(1) * {launch.rows};\n"
         "    if (x >= width) return;\n"
-        f"    const site first = site_at(x, y);\n{before}"
-        # All rows before the first store: what they have in common is then done once, because
-        # no store can have changed what they read.
-        f"    {kind.c_type} values[{launch.rows}];\n{over_rows(lines)}{over_rows(stores)}{after}"
+        f"    const site first = site_at(x, y);\n{start}{body}{after}"
     )
+
+
+def _over_block(lines: Sequence[str], launch: Launch) -> list[list[str]]:
+    """Lines for each vector of a row of a stencil's block."""
+    head = f"for (uint column = 0; column < {launch.columns}; ++column) {{"
+    beyond = "    if (x + column * LANES >= width) break;"
+    place = "    const site at = site_at(x + column * LANES, y + row);"
+    return [[head, beyond, place, *(f"    {line}" for line in lines), "}"]]
+
+
+def _over_rows(lines: Sequence[str], rows: int, unroll: bool) -> str:
+    """A loop over the rows of a work item. What is in an array already need not be unrolled."""
+    place = ["const site at = site_at(x, y + row);"] if unroll else []
+    body = "".join(f"        {line}\n" for line in [*place, *lines])
+    pragma = "#pragma unroll" if unroll else "#pragma unroll 1"
+    return f"{pragma}\n    for (uint row = 0; row < {rows}; ++row) {{\n{body}    }}\n"
 
 
 def _lines(writer: _Writer, launch: Lines) -> str:

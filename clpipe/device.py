@@ -194,8 +194,8 @@ class Extent:
 
     @property
     def plane_bytes(self) -> int:
-        """The size of a plane with its apron; the last lanes' loads may run over by one vector."""
-        return ((self.rows + 2 * self.apron) * self.pitch + self.lanes) * 4
+        """The size of a plane with its apron; the last block's loads may run over by its width."""
+        return ((self.rows + 2 * self.apron) * self.pitch + 5 * self.lanes) * 4
 
 
 @dataclass(frozen=True)
@@ -345,8 +345,9 @@ class Device:
         self, kernel: Kernel, extent: Extent
     ) -> tuple[tuple[int, ...], tuple[int, ...]]:
         match kernel.launch:
-            case Launch(rows=rows):
-                blocks = round_up(extent.columns // extent.lanes, LOCAL_SIZE)
+            case Launch(rows=rows, columns=columns):
+                across = round_up(extent.columns, extent.lanes * columns)
+                blocks = round_up(across // (extent.lanes * columns), LOCAL_SIZE)
                 return (blocks, round_up(extent.height, rows) // rows), (LOCAL_SIZE, 1)
             case Lines():
                 longest = round_up(max(extent.width, extent.height), extent.lanes)

@@ -58,7 +58,8 @@ class Launch:
     writes: Image | None = None
     encodes: bool = False
     sums: Op | None = None
-    rows: int = 2
+    rows: int = 2  # of a work item's block
+    columns: int = 1  # of it, in vectors
 
     @property
     def stencil(self) -> Op | None:
@@ -146,6 +147,9 @@ class _Planner:
             if not sums:
                 return self.stored
             self.group = Launch("sums", (), (Read(self.stored),))
+        elif sums and self.group.stencil and self.group.stencil.pass_.block:
+            # Sums go over narrower blocks.
+            self.group = Launch("sums", (), (Read(self.close()),))
         if sums and not self.group.ops and self.group.reads:
             image = self.group.reads[0].image  # nothing new to store
             self.emit(replace(self.group, sums=sums))
@@ -158,13 +162,15 @@ class _Planner:
 
     def emit(self, group: Launch) -> None:
         names = list(dict.fromkeys(op.step for op in group.ops))
-        rows = 4 if any(op.pass_.random for op in group.ops) or group.sums else 2
+        block = group.stencil.pass_.block if group.stencil else 0
+        shared = block or group.sums or any(op.pass_.random for op in group.ops)
         name = names[0] if len(names) == 1 else f"{names[0]}..{names[-1]}" if names else group.name
         if group.stencil and group.stencil.pass_.function != group.stencil.step:
             name = name.replace(
                 group.stencil.step, f"{group.stencil.step}.{group.stencil.pass_.function}", 1
             )
-        self.launches.append(replace(group, rows=rows, name=name))
+        rows = 4 if shared else 2
+        self.launches.append(replace(group, name=name, rows=rows, columns=max(block, 1)))
 
     def input_of_stencil(self) -> Read:
         """The current image for a stencil: cheap pointwise passes on a stored one are redone."""

@@ -66,8 +66,10 @@ class Pass:
     """One function of a method's kernel file, and how the planner may place it.
 
     ``reads`` and ``writes`` name images of the stage: ``src`` is its input, ``dst`` its output, any
-    other name is scratch. ``arguments`` are, in order, names from :meth:`Method.arguments`, from
-    ``found`` of an earlier SUMS pass, or the line table that an earlier LINES pass writes.
+    other name is scratch. A STENCIL with a ``block`` gets an array for it, row by row, as its last
+    argument, where others return a pixel. ``arguments`` are, in order, names from
+    :meth:`Method.arguments`, from ``found`` of an earlier SUMS pass, or the line table that an
+    earlier LINES pass writes.
     """
 
     function: str
@@ -78,6 +80,7 @@ class Pass:
     kind: Kind | None = None  # of what it writes; None: what the stage writes
     radius: int = 0
     random: Owner | None = None  # gets a random stream as its first argument
+    block: int = 0  # STENCIL: one call gives 4 rows of that many vectors, which share work
     cheap: bool = False  # so cheap that a stencil after it may redo it at each tap
     lines: str = ""  # LINES: "rows" or "columns"
     finish: str = ""  # SUMS, HISTOGRAM: the function that turns these into what is found
@@ -104,6 +107,7 @@ class Context:
     iso: float
     pattern: Pattern = "RGGB"
     gains: tuple[float, float] = (1.0, 1.0)  # red, blue: taken out by inverse_white_balance
+    applied_gains: tuple[float, float] = (1.0, 1.0)  # red, blue: put back by white_balance
     noise: tuple[float, float] | None = None  # a, b of the sensor noise that was added
     black_level: float | None = None  # DN, as quantize used them
     white_level: float | None = None
@@ -209,7 +213,10 @@ class Frame:
 
 @dataclass(frozen=True)
 class Stage:
-    """A named step of the chain. The first method is the default."""
+    """A named step of the chain. The first method is the default.
+
+    ``explain`` says in a few lines how the automatic parameters follow from what is known.
+    """
 
     name: str
     summary: str

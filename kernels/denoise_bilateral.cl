@@ -1,20 +1,20 @@
 // Bilateral filter (Tomasi and Manduchi 1998) on luma and chroma, each with its own range sigma.
 // Scales come in as -log2(e) / (2 sigma^2), so that a weight is one power of two.
-INLINE ycbcr to_luma_chroma(rgb c, site at) { return rgb_to_ycbcr(c); }
+#include "lib/luma_chroma.h"
 
 // Contraction to fma is welcome here: it is exact to one rounding, and only the raw has to be the
 // same on every device. Luma and chroma go over the window one after the other, because both at
 // once need more registers than a CPU has.
-INLINE ycbcr bilateral(site at, image planes, int radius, float spatial_scale, float luma_scale,
-                       float chroma_scale) {
+INLINE ycbcr bilateral(site at, image planes, int luma_reach, int chroma_reach,
+                       float spatial_scale, float luma_scale, float chroma_scale) {
 #pragma OPENCL FP_CONTRACT ON
     const ycbcr centre = tap_ycbcr(planes, 0, 0);
     ycbcr sum = centre;
     vf luma_weight = (vf)(1.0f), chroma_weight = (vf)(1.0f);
 #pragma unroll
-    for (int dy = -radius; dy <= radius; ++dy) {
+    for (int dy = -luma_reach; dy <= luma_reach; ++dy) {
 #pragma unroll
-        for (int dx = -radius; dx <= radius; ++dx) {
+        for (int dx = -luma_reach; dx <= luma_reach; ++dx) {
             if (dx == 0 && dy == 0) continue;
             const vf near = (vf)((float)(dx * dx + dy * dy) * spatial_scale);
             const vf y = tap_ycbcr(planes, dx, dy).y;
@@ -25,9 +25,9 @@ INLINE ycbcr bilateral(site at, image planes, int radius, float spatial_scale, f
         }
     }
 #pragma unroll
-    for (int dy = -radius; dy <= radius; ++dy) {
+    for (int dy = -chroma_reach; dy <= chroma_reach; ++dy) {
 #pragma unroll
-        for (int dx = -radius; dx <= radius; ++dx) {
+        for (int dx = -chroma_reach; dx <= chroma_reach; ++dx) {
             if (dx == 0 && dy == 0) continue;
             const vf near = (vf)((float)(dx * dx + dy * dy) * spatial_scale);
             const ycbcr c = tap_ycbcr(planes, dx, dy);
@@ -41,5 +41,3 @@ INLINE ycbcr bilateral(site at, image planes, int radius, float spatial_scale, f
     const ycbcr v = {sum.y / luma_weight, sum.cb / chroma_weight, sum.cr / chroma_weight};
     return v;
 }
-
-INLINE rgb from_luma_chroma(ycbcr c, site at) { return ycbcr_to_rgb(c); }

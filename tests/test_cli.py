@@ -189,16 +189,20 @@ def test_a_folder_keeps_its_structure_and_a_bad_file_stops_nobody(clpipe, write_
     ("arguments", "status", "message"),
     [
         (["--set", "demosaic.method=bilinaer"], 2, "did you mean 'bilinear'"),
-        (["--set", "denois.radius=2"], 2, "did you mean 'denoise'"),
-        (["--set", "denoise.radus=2"], 2, "did you mean 'radius'"),
-        (["--set", "denoise.radius=0"], 2, "denoise.radius: found 0"),
+        (["--set", "denois.luma_size=3"], 2, "did you mean 'denoise'"),
+        (["--set", "denoise.luma_sise=3"], 2, "did you mean 'luma_size'"),
+        (
+            ["--set", "denoise.luma_size=4"],
+            2,
+            "denoise.luma_size: found 4: it must be odd, 1 to 15",
+        ),
         (["--set", "denoise"], 2, "expected stage.parameter=value"),
         (["--stages", "mosaic,gamma"], 2, "gamma reads rgb, but mosaic gives mosaic"),
         (["--set", "denoise.method=[1]"], 2, "denoise.method: unknown method"),
         (["--set", "sensor_noise_2.a=1"], 2, "unknown stage in this chain 'sensor_noise_2'"),
-        (["--set", "denoise.radius=3", "--skip", "denoise"], 2, "in this chain 'denoise'"),
+        (["--set", "denoise.luma_size=3", "--skip", "denoise"], 2, "in this chain 'denoise'"),
         (["--set", "sensor_noise.a=1e300"], 2, "sensor_noise.a: found 1e+300"),
-        (["--set", "denoise.radius=true"], 2, "denoise.radius: found True"),
+        (["--set", "denoise.luma_size=true"], 2, "denoise.luma_size: found True"),
         (["--device", ""], 3, "unknown device ''"),
         (["--skip", "noise"], 2, "unknown stage 'noise'"),
         (["--keep", "noise"], 2, "unknown stage in this chain 'noise'"),
@@ -245,12 +249,12 @@ def test_a_kept_stage_never_overwrites_an_input_or_another_result(clpipe, write_
 
 def test_the_order_of_assignments_does_not_matter(clpipe, small, tmp_path):
     (tmp_path / "p.toml").write_text("[denoise]\nspatial_sigma = 3\n")
-    method, radius = ("--set", "denoise.method=bilateral"), ("--set", "denoise.radius=5")
-    for options in ((*method, *radius), (*radius, *method)):
+    method, size = ("--set", "denoise.method=bilateral"), ("--set", "denoise.luma_size=7")
+    for options in ((*method, *size), (*size, *method)):
         clpipe("run", small, "-o", "out", "-c", "p.toml", *options)
         sidecar = json.loads((tmp_path / "out" / "small.json").read_text())
         values = next(s["parameters"] for s in sidecar["stages"] if s["name"] == "denoise")
-        assert (values["radius"], values["spatial_sigma"]) == (5, 3)
+        assert (values["luma_size"], values["spatial_sigma"]) == (7, 3)
     (tmp_path / "q.toml").write_text("[white_balance]\nred_gain = 2\n")
     clpipe("run", small, "-o", "out", "-c", "q.toml", "--set", "white_balance.method=gray_world")
 

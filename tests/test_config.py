@@ -37,7 +37,15 @@ def build(**settings):
         ({"sensor_noise": {"a": "much"}}, r"sensor_noise.a: found 'much': .*number"),
         ({"sensor_noise": {"a": float("nan")}}, r"sensor_noise.a: found nan: .*finite"),
         ({"mosaic": {"pattern": "RGBG"}}, "mosaic.pattern: found 'RGBG': .*'RGGB', 'BGGR', 'GRBG'"),
-        ({"denoise": {"radius": 99}}, "denoise.radius: found 99: .*less than or equal to 7"),
+        ({"denoise": {"luma_size": 4}}, "denoise.luma_size: found 4: it must be odd, 1 to 15"),
+        (
+            {"denoise": {"method": "median", "chroma_size": 7}},
+            "denoise.chroma_size: found 7: it must be odd, 1 to 5",
+        ),
+        (
+            {"mosaic_denoise": {"size": 17}},
+            "mosaic_denoise.size: found 17: it must be odd, 1 to 15",
+        ),
         ({"stages": ["mosaic", "nosie"]}, "unknown stage 'nosie'"),
         ({"skip": ["nosie"]}, "unknown stage 'nosie'"),
         ({"stages": "mosaic"}, "stages: found 'mosaic', but it is a list"),

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clpipe.check import SIZES, check_method, check_raw, compare
+from clpipe.check import SIZES, check_method, check_raw, compare, example
 from clpipe.config import Settings, make_chain
 from clpipe.device import Device
+from clpipe.reference.cfa import PATTERNS
 from clpipe.registry import all_stages
 from clpipe.run import Runner
 from clpipe.stage import Kind, variant_label, variants
@@ -36,6 +37,10 @@ KERNELS = {
     "demosaic_menon2007",
     "denoise_bilateral",
     "color_matrix",
+    "denoise_mean",
+    "denoise_median",
+    "denoise_non_local_means",
+    "mosaic_denoise_non_local_means",
     "curve",
 }
 
@@ -90,21 +95,57 @@ def test_raw_is_bit_for_bit_the_references(device, scalar_device):
         assert result.differing == 0, result
 
 
-@pytest.mark.parametrize("radius", [1, 3, 7])
-def test_wide_stencils_on_small_images(device, radius):
-    settings = Settings(
-        stages=("denoise",),
-        parameters={
-            "denoise": {
-                "radius": radius,
-                "luma_sigma": 0.2,
-                "chroma_sigma": 0.3,
-                "spatial_sigma": 3,
-            }
-        },
-    )
-    _, _, largest = compare(device, settings, Kind.RGB, ((1, 1), (1, 5), (4, 3), (9, 8), (33, 70)))
-    assert largest < 2e-4
+# Noise that is loud, so that filters do something to a random image.
+LOUD = {"luma_noise": 0.1, "chroma_noise": 0.1}
+SMALL = ((1, 1), (1, 5), (40, 1), (4, 3), (9, 8), (33, 70))
+WINDOWS = [
+    (method, sizes)
+    for method in all_stages()["denoise"].methods
+    for sizes in ((1, 1), (3, 1), (1, 5), (5, 3), (15, 7))
+    if max(sizes) <= method.largest_size
+]
+
+
+@pytest.mark.parametrize(("method", "sizes"), WINDOWS, ids=lambda x: str(getattr(x, "method", x)))
+def test_windows_of_all_sizes_on_small_images(device, scalar_device, method, sizes):
+    values = {"method": method.method, "luma_size": sizes[0], "chroma_size": sizes[1], **LOUD}
+    settings = Settings(iso=3200, stages=("denoise",), parameters={"denoise": values})
+    assert compare(device, settings, Kind.RGB, SMALL)[2] < 2e-4
+    if sizes in ((5, 3), (15, 7)):
+        assert compare(scalar_device, settings, Kind.RGB, SMALL[:5])[2] < 2e-4
+
+
+@pytest.mark.parametrize("method", all_stages()["denoise"].methods, ids=lambda x: x.method)
+def test_a_strength_of_0_is_off(device, method):
+    values = {"method": method.method, "luma_strength": 0.0, "chroma_strength": 0.0, **LOUD}
+    settings = Settings(stages=("denoise",), parameters={"denoise": values})
+    runner = Runner(make_chain(settings), device, encode=False, final=True)
+    image = example(Kind.RGB, (33, 70))
+    assert np.abs(runner.run(image, "k").final - image).max() < 2e-6
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("size", [1, 7, 15])
+def test_mosaic_windows_of_all_sizes_on_small_images(device, scalar_device, pattern, size):
+    parameters = {
+        "mosaic": {"pattern": pattern},
+        "inverse_white_balance": {"red_gain": 2.0, "blue_gain": 1.5},
+        "mosaic_denoise": {"size": size, "a": 0.02, "b": 0.01},
+    }
+    before = ("mosaic", "inverse_white_balance")
+    for balance in ((), ("white_balance",)):
+        stages = (*before, *balance, "mosaic_denoise")
+        settings = Settings(stages=stages, parameters=parameters)
+        assert compare(device, settings, Kind.RGB, SMALL)[2] < 2e-4
+    assert compare(scalar_device, settings, Kind.RGB, SMALL[:4])[2] < 2e-4
+
+
+def test_sums_over_the_blocks_of_a_wide_stencil(device, scalar_device):
+    stages = ("mosaic", "mosaic_denoise", "white_balance")
+    parameters = {"mosaic_denoise": {"a": 0.02}, "white_balance": {"method": "gray_world"}}
+    settings = Settings(stages=stages, parameters=parameters)
+    for one in (device, scalar_device):
+        assert compare(one, settings, Kind.RGB, ((5, 3), (37, 150)))[2] < 2e-4
 
 
 def test_a_wrong_kernel_is_caught(device, monkeypatch):

@@ -8,6 +8,7 @@ from clpipe.image_io import read_image
 from clpipe.reference.cfa import PATTERNS, red_site
 from clpipe.registry import all_stages
 from clpipe.run import Runner
+from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import STILL_LIFE
 
 SETTINGS = [
@@ -185,13 +186,24 @@ def test_srgb_gamma(develop):
 
 
 def test_denoising_follows_the_iso_and_is_stronger_on_chroma():
-    def sigmas(iso):
-        method = make_chain(settings_from({"iso": iso})).step_named("denoise").method
-        return method.luma_sigma, method.chroma_sigma
+    def amounts(iso):
+        return make_chain(settings_from({"iso": iso})).step_named("denoise").method.amounts
 
-    low, high = sigmas(100), sigmas(3200)
+    low, high = amounts(100), amounts(3200)
     assert high[0] > 4 * low[0]
     assert high[1] > 2 * high[0]
+
+
+def test_the_law_is_explained_with_the_numbers_it_gives():
+    step = make_chain(settings_from({"iso": 3200})).step_named("denoise")
+    text = step.stage.explain(step.context)
+    assert "ISO 3200" in text and "sony-a7r2" in text
+    assert (
+        f"luma_noise = sqrt(sum of (.299, .587, .114)^2 * sigma^2) = {step.method.luma_noise:.3g}"
+        in text
+    )
+    assert f"{step.method.chroma_noise:.3g}" in text
+    assert max(map(len, text.splitlines())) <= 100
 
 
 def test_denoising_takes_noise_away_and_leaves_edges(develop):
@@ -219,3 +231,83 @@ def test_demosaicing_keeps_samples_and_leaves_flat_areas_flat(develop, method, p
         ), channel
     flat = np.full((24, 31, 3), 0.25, np.float32)
     assert np.array_equal(develop(flat, demosaic={"method": method}, **chain).final, flat)
+
+
+def psnr(one, two, peak):
+    return 10 * np.log10(peak**2 / np.mean((one.astype(np.float64) - two) ** 2))
+
+
+NOISE = ["sensor_noise", "row_noise", "column_noise"]
+
+
+@pytest.fixture(scope="module")
+def judged(device, still_life):
+    """PSNR of a picture against the same chain without noise and denoising: linear RGB, 8 bit."""
+    image = np.ascontiguousarray(still_life[160:480, 240:720])
+
+    def judge(iso, **settings):
+        def pictures(skip=(), **more):
+            values = {"iso": iso, "skip": ["tone_curve", "gamma", *skip], **more}
+            linear = runner(values, device, encode=False, final=True).run(image, "k").final
+            values["skip"] = list(skip)
+            return linear, runner(values, device).run(image, "k").encoded
+
+        clean = pictures([*NOISE, "denoise"])
+        ours = pictures(**settings)
+        return psnr(ours[0], clean[0], 1), psnr(ours[1], clean[1], 255)
+
+    return judge
+
+
+@pytest.mark.parametrize("iso", [1600, 3200, 12800])
+def test_non_local_means_is_the_best_denoiser(judged, iso):
+    noisy = judged(iso, skip=["denoise"])
+    others = {name: judged(iso, denoise={"method": name}) for name in ("mean", "median")}
+    bilateral = judged(iso)
+    best = judged(iso, denoise={"method": "non_local_means"})
+    for i in (0, 1):
+        assert best[i] > bilateral[i] + 1
+        assert best[i] > max(value[i] for value in others.values()) + 1
+        assert bilateral[i] > noisy[i] + 0.4
+
+
+def with_mosaic_denoise(after):
+    chain = list(DEFAULT_CHAIN)
+    chain.insert(chain.index(after) + 1, "mosaic_denoise")
+    return chain
+
+
+@pytest.mark.parametrize("after", ["normalize", "white_balance"])
+def test_denoising_the_mosaic_makes_a_better_picture(judged, after):
+    noisy = judged(3200, skip=["denoise"])
+    ours = judged(3200, skip=["denoise"], stages=with_mosaic_denoise(after))
+    assert ours[0] > noisy[0] + 2
+    assert ours[1] > noisy[1] + 2
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_denoising_the_mosaic_takes_noise_away_and_leaves_edges(develop, pattern):
+    image = np.full((96, 128, 3), 0.1, np.float32)
+    image[:, 64:] = 0.6
+    stages = with_mosaic_denoise("normalize")
+    stages = stages[: stages.index("mosaic_denoise") + 1]
+    result = develop(
+        image, iso=3200, stages=stages, mosaic={"pattern": pattern}, keep=("normalize",)
+    )
+    before, after = result.kept["normalize"], result.final
+    for y, x in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        flat = (slice(8 + y, -8, 2), slice(8 + x, 54, 2))
+        assert after[flat].var() < before[flat].var() / 3
+        assert after[flat].mean() == pytest.approx(before[flat].mean(), rel=0.02)
+        left, right = after[8 + y : -8 : 2, 62 + x], after[8 + y : -8 : 2, 64 + x]
+        assert right.mean() / left.mean() == pytest.approx(6, rel=0.05)
+
+
+def test_denoising_the_mosaic_keeps_what_is_below_black(develop):
+    stages = with_mosaic_denoise("normalize")
+    stages = stages[: stages.index("mosaic_denoise") + 1]
+    black = np.zeros((64, 64, 3), np.float32)
+    result = develop(black, iso=12800, stages=stages, keep=("normalize",))
+    before, after = result.kept["normalize"], result.final
+    assert before.min() < 0 and after.min() < 0
+    assert abs(after.mean() - before.mean()) < before.std() / 20

@@ -104,12 +104,12 @@ def test_a_plan_depends_on_structure_alone():
     assert one == two
     assert hash(one) == hash(two)
     assert one != plan_of(mosaic={"pattern": "BGGR"})
-    assert one != plan_of(denoise={"radius": 3})
+    assert one != plan_of(denoise={"luma_size": 7})
 
 
 def test_the_apron_is_as_wide_as_the_widest_stencil():
     assert plan_of().apron == 2
-    assert plan_of(denoise={"radius": 5}).apron == 5
+    assert plan_of(denoise={"chroma_size": 11}).apron == 5
     assert plan_of(stages=["exposure", "gamma"]).apron == 0
 
 

@@ -26,3 +26,14 @@ def tap(image: Floats, dx: int, dy: int) -> Floats:
     rows = mirror(np.arange(image.shape[0]) + dy, image.shape[0])
     columns = mirror(np.arange(image.shape[1]) + dx, image.shape[1])
     return image[rows][:, columns]
+
+
+def mirrored(image: Floats, margin: int) -> Floats:
+    """The image with a margin of that many pixels all round, mirrored at the borders.
+
+    >>> mirrored(np.float32([[1, 2, 3]]), 1).tolist()
+    [[2.0, 1.0, 2.0, 3.0, 2.0], [2.0, 1.0, 2.0, 3.0, 2.0], [2.0, 1.0, 2.0, 3.0, 2.0]]
+    """
+    rows = mirror(np.arange(-margin, image.shape[0] + margin), image.shape[0])
+    columns = mirror(np.arange(-margin, image.shape[1] + margin), image.shape[1])
+    return image[rows][:, columns]

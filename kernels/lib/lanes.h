@@ -37,6 +37,7 @@ INLINE void store(vf v, __global float *p) { *p = v; }
 INLINE vf load_half(__global const half *p) { return vload_half(0, p); }
 INLINE vi iota(void) { return 0; }
 INLINE void spill(vf v, __private float *p) { *p = v; }
+INLINE vf unspill(__private const float *p) { return *p; }
 INLINE void spill_int(vi v, __private int *p) { *p = v; }
 INLINE vf to_float(vi v) { return convert_float(v); }
 INLINE vi to_int(vf v) { return convert_int(v); }
@@ -51,6 +52,7 @@ INLINE vf load(__global const float *p) { return *(__global const unaligned_vf *
 INLINE void store(vf v, __global float *p) { *(__global unaligned_vf *)p = v; }
 INLINE vi iota(void) { return *(__constant const unaligned_vi *)LANE_NUMBERS; }
 INLINE void spill(vf v, __private float *p) { *(__private unaligned_vf *)p = v; }
+INLINE vf unspill(__private const float *p) { return *(__private const unaligned_vf *)p; }
 INLINE void spill_int(vi v, __private int *p) { *(__private unaligned_vi *)p = v; }
 INLINE vf to_float(vi v) { return __builtin_convertvector(v, vf); }
 INLINE vi to_int(vf v) { return __builtin_convertvector(v, vi); }

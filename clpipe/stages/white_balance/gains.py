@@ -1,6 +1,7 @@
 """White balance with gains that are known beforehand."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -14,6 +15,11 @@ def balanced(image: Floats, context: Context, red: np.float32, blue: np.float32)
     """The mosaic with its gains, clipped at white."""
     gains = by_site(image.shape, context.pattern, red, np.float32(1), blue)
     return np.minimum(image * gains, np.float32(1))
+
+
+def with_expected_gains(context: Context) -> Context:
+    """What is known after gains that are only found in the image: the best guess is as shot."""
+    return replace(context, applied_gains=context.gains)
 
 
 class AsShot(Method):
@@ -33,6 +39,10 @@ class AsShot(Method):
     def resolve(self, context: Context) -> "AsShot":
         red, blue = context.gains
         return self.filled(red_gain=red, blue_gain=blue)
+
+    def after(self, context: Context) -> Context:
+        assert self.red_gain is not None and self.blue_gain is not None
+        return replace(context, applied_gains=(self.red_gain, self.blue_gain))
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("white_balance", arguments=("pattern", "red_gain", "blue_gain"), cheap=True),)

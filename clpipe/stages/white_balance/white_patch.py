@@ -7,7 +7,7 @@ import numpy as np
 
 from clpipe.reference.cfa import by_site
 from clpipe.stage import Access, Argument, Context, Frame, Method, Pass, parameter
-from clpipe.stages.white_balance.gains import balanced
+from clpipe.stages.white_balance.gains import balanced, with_expected_gains
 from clpipe.types import Floats
 
 STEPS = 6144  # bins a colour: 12 octaves below 1, 512 each
@@ -67,6 +67,9 @@ class WhitePatch(Method):
     @property
     def _millionths(self) -> int:
         return max(1, round(self.percentile * 10_000))
+
+    def after(self, context: Context) -> Context:
+        return with_expected_gains(context)
 
     def passes(self) -> tuple[Pass, ...]:
         gains = ("red_gain", "blue_gain")

@@ -1,0 +1,78 @@
+"""The bilateral filter."""
+
+from collections.abc import Mapping
+from math import e, log2
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
+from clpipe.reference.image import tap
+from clpipe.stage import Context, Frame, parameter
+from clpipe.stages.denoise.law import Denoiser
+from clpipe.types import Floats
+
+RANGE = 3.0  # sigma of the range weight, in multiples of strength times noise
+
+
+class Bilateral(Denoiser):
+    """Bilateral filter (Tomasi and Manduchi, ICCV 1998) in YCbCr.
+
+    Luma weights by luma distance; both chroma planes by their common distance. A difference of
+    3 times strength * noise weighs 0.61.
+    """
+
+    method: ClassVar = "bilateral"
+    kernel: ClassVar = "denoise_bilateral"
+    summary: ClassVar = "bilateral filter on luma and, stronger, on chroma"
+    tolerance: ClassVar = 2e-4  # the kernel's exp is a short polynomial
+    function: ClassVar = "bilateral"
+    names: ClassVar = ("spatial_scale", "luma_scale", "chroma_scale")
+
+    spatial_sigma: float = parameter(
+        1.5, "Falloff of the weights with distance.", "px", gt=0, le=100
+    )
+
+    def numbers(self, context: Context) -> Mapping[str, np.float32]:
+        luma, chroma = self.amounts
+        return {
+            "spatial_scale": scale_of(self.spatial_sigma),
+            "luma_scale": scale_of(RANGE * luma),
+            "chroma_scale": scale_of(RANGE * chroma),
+        }
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        planes = rgb_to_ycbcr(image)
+        numbers = self.numbers(frame.context)
+        luma, chroma = planes[..., :1], planes[..., 1:]
+        near = numbers["spatial_scale"]
+        luma = bilateral(luma, self.reaches[0], near, numbers["luma_scale"])
+        chroma = bilateral(chroma, self.reaches[1], near, numbers["chroma_scale"])
+        return ycbcr_to_rgb(np.concatenate([luma, chroma], axis=-1))
+
+
+def bilateral(planes: Floats, reach: int, spatial_scale: np.float32, scale: np.float32) -> Floats:
+    """Bilateral filter of (height, width, plane) by the planes' common distance (eq. 5 and 6).
+
+    The scales are what squared distances, in pixels and in signal, are multiplied by to get the
+    log2 of a weight.
+
+    >>> step = np.float32([[[0], [0], [1], [1]]])
+    >>> bilateral(step, 1, scale_of(1.0), scale_of(0.1))[0, :, 0].round(3).tolist()
+    [0.0, 0.0, 1.0, 1.0]
+    """
+    total, weights = planes.copy(), np.ones_like(planes[..., :1])
+    offsets = range(-reach, reach + 1)
+    for dx, dy in ((dx, dy) for dy in offsets for dx in offsets if (dx, dy) != (0, 0)):
+        other = tap(planes, dx, dy)
+        squared = ((other - planes) ** 2).sum(-1, keepdims=True)
+        near = np.float32(dx * dx + dy * dy) * spatial_scale
+        weight = np.exp2(np.maximum(near + squared * scale, np.float32(-30)))
+        total += weight * other
+        weights += weight
+    return total / weights
+
+
+def scale_of(sigma: float) -> np.float32:
+    """What a squared difference is multiplied by to get the log2 of a Gaussian weight."""
+    return np.float32(-log2(e) / (2 * max(sigma, 1e-6) ** 2))

@@ -1,0 +1,47 @@
+"""What the mean and the median have in common: filters that do not look at the noise."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
+from clpipe.stage import Context, Frame
+from clpipe.stages.denoise.law import Denoiser
+from clpipe.types import Floats
+
+DETAIL = 0.01  # signal units: how far detail is taken to stand out from its neighbours
+
+
+def share_of(amount: float) -> np.float32:
+    """How much of such a filter is used: s^2 / (s^2 + t^2).
+
+    Wiener's shrinkage (Lee, IEEE PAMI 1980) with one variance of detail, t = 0.01, for all
+    pictures; s is ``amount``, strength times noise.
+
+    >>> [round(float(share_of(s)), 2) for s in (0, 0.002, 0.01, 0.05)]
+    [0.0, 0.04, 0.5, 0.96]
+    """
+    return np.float32(amount**2 / (amount**2 + DETAIL**2))
+
+
+class Shared(Denoiser):
+    """centre + share * (filtered - centre), the share as the noise asks for."""
+
+    names: ClassVar = ("luma_share", "chroma_share")
+
+    def window(self, image: Floats, reach: int) -> Floats:
+        """The filter: (height, width, plane) in and out, over windows of 2*reach + 1."""
+        raise NotImplementedError(type(self).__name__)
+
+    def numbers(self, context: Context) -> Mapping[str, np.float32]:
+        luma, chroma = self.amounts
+        return {"luma_share": share_of(luma), "chroma_share": share_of(chroma)}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        planes = rgb_to_ycbcr(image)
+        luma, chroma = (share_of(amount) for amount in self.amounts)
+        y, c = planes[..., :1], planes[..., 1:]
+        y = y + luma * (self.window(y, self.reaches[0]) - y)
+        c = c + chroma * (self.window(c, self.reaches[1]) - c)
+        return ycbcr_to_rgb(np.concatenate([y, c], axis=-1))
