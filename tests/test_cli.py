@@ -344,6 +344,48 @@ def test_bench(clpipe):
     assert "expected WIDTHxHEIGHT" in clpipe("bench", "--size", "big", status=2).stderr
 
 
+def test_bench_of_methods(clpipe):
+    options = ("--size", "320x200", "--repeat", 1, "--set", "denoise.luma_size=3")
+    text = clpipe("bench", "--methods", "denoise", *options).stdout
+    assert "bilateral luma_size=3" in text
+    records = json.loads(clpipe("bench", "--methods", "demosaic", *options, "--json").stdout)
+    launches = {record["method"]: record["launches"] for record in records}
+    assert launches["bilinear"] == 1
+    assert launches["edge_directed_median size=5"] == 3
+    assert all(record["mp_per_s"] > 0 for record in records)
+    assert "did you mean 'denoise'" in clpipe("bench", "--methods", "denoize", status=2).stderr
+
+
+def test_a_stage_is_explained_for_a_camera_and_an_iso(clpipe):
+    low, high = (clpipe("stages", "denoise", "--iso", iso).stdout for iso in (100, 6400))
+    assert "sony-a7r2, ISO 6400" in high
+    assert "luma_noise = sqrt(sum of" in high
+    assert low != high
+    assert "from 100 to 25600" in clpipe("stages", "denoise", "--iso", 1, status=2).stderr
+    assert "unknown camera" in clpipe("stages", "denoise", "--camera", "x", status=2).stderr
+    records = json.loads(clpipe("stages", "sensor_noise", "--iso", 800, "--json").stdout)
+    assert set(records[0]["methods"][0]["automatic"]) == {"a", "b"}
+
+
+def test_a_plan_says_what_opens_a_launch(clpipe):
+    text = clpipe("plan", "-c", "paper", "--keep", "sensor_noise").stdout
+    assert "sensor_noise is kept" in text
+    assert "denoise: stencil, radius 2" in " ".join(text.split())
+    assert "white_balance: sums" in text
+    assert "slots" in text and "bytes a pixel" in text
+    white_patch = clpipe("plan", "--set", "white_balance.method=white_patch").stdout
+    assert "white_balance: histogram" in " ".join(white_patch.split())
+
+
+def test_a_chain_printed_as_toml_makes_the_same_picture(clpipe, small, tmp_path):
+    options = ("--iso", 1600, "--set", "demosaic.method=menon2007", "--skip", "denoise")
+    (tmp_path / "mine.toml").write_text(clpipe("plan", "--toml", "-c", "paper", *options).stdout)
+    clpipe("run", small, "-o", "a", "-c", "paper", *options)
+    clpipe("run", small, "-o", "b", "-c", "mine.toml")
+    one, two = ((tmp_path / x / "small.jpg").read_bytes() for x in "ab")
+    assert one == two
+
+
 def python(code, **environment):
     return subprocess.run(
         [sys.executable, "-c", code],
