@@ -10,17 +10,17 @@ from clpipe.stage import Context, Frame
 from clpipe.stages.denoise.law import Denoiser
 from clpipe.types import Floats
 
-DETAIL = 0.01  # signal units: how far detail is taken to stand out from its neighbours
+DETAIL = 0.02  # signal units: how far detail is taken to stand out from its neighbours
 
 
 def share_of(amount: float) -> np.float32:
     """How much of such a filter is used: s^2 / (s^2 + t^2).
 
-    Wiener's shrinkage (Lee, IEEE PAMI 1980) with one variance of detail, t = 0.01, for all
+    Wiener's shrinkage (Lee, IEEE PAMI 1980) with one variance of detail, t = 0.02, for all
     pictures; s is ``amount``, strength times noise.
 
     >>> [round(float(share_of(s)), 2) for s in (0, 0.002, 0.01, 0.05)]
-    [0.0, 0.04, 0.5, 0.96]
+    [0.0, 0.01, 0.2, 0.86]
     """
     return np.float32(amount**2 / (amount**2 + DETAIL**2))
 
