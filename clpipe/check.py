@@ -146,10 +146,13 @@ def check_raw(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Check
     )
 
 
-def check_all(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Iterator[Check]:
-    """Every method of every stage, in all its variants, then the raw."""
-    for stage in all_stages().values():
+def check_all(
+    device: Device, stages: Sequence[Stage] = (), sizes: Sequence[tuple[int, int]] = SIZES
+) -> Iterator[Check]:
+    """Every method of these stages, in all its variants; if none are named, of all, and the raw."""
+    for stage in stages or all_stages().values():
         for method in stage.methods:
             for values in variants(method):
                 yield check_method(device, stage, method, sizes, values=values)
-    yield check_raw(device, sizes)
+    if not stages:
+        yield check_raw(device, sizes)

@@ -372,14 +372,24 @@ def devices(as_json: bool) -> None:
 
 
 @main.command()
+@click.argument("names", nargs=-1, metavar="[STAGE]...")
 @device_option
 @click.option("--small", is_flag=True, help="Only tiny images, for slow devices.")
 @stage_file_option
 @json_option
-def check(selector: str | None, small: bool, stage_files: tuple[Path, ...], as_json: bool) -> None:
-    """Compare every kernel with its NumPy reference on a device, and the raw bit for bit."""
+def check(
+    names: tuple[str, ...],
+    selector: str | None,
+    small: bool,
+    stage_files: tuple[Path, ...],
+    as_json: bool,
+) -> None:
+    """Compare kernels with their NumPy references on a device: of these stages, or of all, and then
+    the raw bit for bit.
+    """
     for file in stage_files:
         load_stage_file(file)
+    chosen = [stage_named("check", name) for name in names]
     device = open_device(selector)
     if device is None:
         raise RequestError("check: numpy is the reference; choose a device to compare with it")
@@ -396,7 +406,7 @@ def check(selector: str | None, small: bool, stage_files: tuple[Path, ...], as_j
         box=None,
         pad_edge=False,
     )
-    for result in check_all(device, SIZES[:5] if small else SIZES):
+    for result in check_all(device, chosen, SIZES[:5] if small else SIZES):
         checks.append(result)
         table.add_row(
             result.stage,

@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from clpipe.camera import Camera
 from clpipe.reference.cfa import PATTERNS, Pattern, red_site
+from clpipe.reference.curve import curve_index
 from clpipe.reference.random import Stream
 from clpipe.types import Array, Floats
 
@@ -178,6 +179,51 @@ class Method(BaseModel):
         """A copy in which those of ``values`` replace parameters that are None."""
         missing = {k: v for k, v in values.items() if getattr(self, k) is None}
         return self.model_copy(update=missing) if missing else self
+
+
+class Unchanged(Method):
+    """The image stays as it is, at no cost. Subclasses say how that is called."""
+
+    kernel: ClassVar = ""
+
+    def passes(self) -> tuple[Pass, ...]:
+        return ()
+
+    def reference(self, image: Floats, frame: "Frame") -> Floats:
+        return image
+
+
+class Curve(Method):
+    """A curve on each channel. Subclasses give its table, see :mod:`clpipe.reference.curve`."""
+
+    kernel: ClassVar = "curve"
+
+    def table(self) -> Floats:
+        """The table; the same object for the same parameters, so that it is uploaded once."""
+        raise NotImplementedError(type(self).__name__)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("curve", Access.CURVE, ("table",)),)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {"table": self.table()}
+
+    def reference(self, image: Floats, frame: "Frame") -> Floats:
+        return np.asarray(self.table()[curve_index(image)])
+
+
+def odd_size(size: int, largest: int) -> int:
+    """The width of a window, checked.
+
+    >>> odd_size(5, 15)
+    5
+
+    Raises:
+        ValueError: it is even, below 1 or above ``largest``.
+    """
+    if size % 2 == 0 or not 1 <= size <= largest:
+        raise ValueError(f"it must be odd, 1 to {largest}")
+    return size
 
 
 def variants(method: type[Method]) -> Iterator[dict[str, Any]]:

@@ -330,9 +330,10 @@ def test_devices(clpipe):
 
 
 def test_check(clpipe):
-    record = json.loads(clpipe("check", "--small", "--json").stdout)
+    record = json.loads(clpipe("check", "mosaic", "quantize", "--small", "--json").stdout)
     assert record["failed"] == 0
-    assert len(record["checks"]) >= 16
+    assert [c["stage"] for c in record["checks"]] == ["mosaic", "quantize"]
+    assert "unknown stage 'mosiac'" in clpipe("check", "mosiac", status=2).stderr
     assert "numpy is the reference" in clpipe("check", "--device", "numpy", status=2).stderr
 
 

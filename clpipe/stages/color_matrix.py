@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import BeforeValidator, field_validator
 
 from clpipe.camera import Matrix
-from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, Unchanged, parameter
 from clpipe.types import Floats
 
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -19,18 +19,11 @@ def _as_tuples(value: Any) -> Any:
     return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple) else value
 
 
-class Unchanged(Method):
+class Rendered(Unchanged):
     """A render's colours never were a camera's."""
 
     method: ClassVar = "none"
-    kernel: ClassVar = ""
     summary: ClassVar = "a render is in linear sRGB already"
-
-    def passes(self) -> tuple[Pass, ...]:
-        return ()
-
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        return image
 
 
 class Given(Method):
@@ -106,5 +99,5 @@ STAGE = Stage(
     "Mix colours: from what the camera's filters see to linear sRGB.",
     Kind.RGB,
     Kind.RGB,
-    (Unchanged, Camera, InverseCamera, Given),
+    (Rendered, Camera, InverseCamera, Given),
 )

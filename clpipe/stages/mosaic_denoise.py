@@ -21,6 +21,7 @@ from clpipe.stage import (
     Method,
     Pass,
     Stage,
+    odd_size,
     parameter,
 )
 from clpipe.types import Floats
@@ -73,9 +74,7 @@ class NonLocalMeans(Method):
     @field_validator("size")
     @classmethod
     def _odd(cls, size: int) -> int:
-        if size % 2 == 0 or not 1 <= size <= LARGEST:
-            raise ValueError(f"it must be odd, 1 to {LARGEST}")
-        return size
+        return odd_size(size, LARGEST)
 
     def resolve(self, context: Context) -> "NonLocalMeans":
         if self.a is not None and self.b is not None:

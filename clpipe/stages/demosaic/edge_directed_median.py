@@ -3,10 +3,11 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
+from clpipe.reference.median import median_filter
 from clpipe.stage import Access, Argument, Context, Frame, Kind, Pass
 from clpipe.stages.demosaic.common import from_differences, spread_differences
 from clpipe.stages.demosaic.edge_directed import EdgeDirected, green_or_difference
-from clpipe.stages.demosaic.median import Median, median_filter
+from clpipe.stages.demosaic.median import Median
 from clpipe.types import Floats
 
 

@@ -6,22 +6,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.reference.image import tap
+from clpipe.reference.median import median_filter
 from clpipe.stage import Access, Argument, Context, Frame, Kind, Literal, Method, Pass, parameter
 from clpipe.stages.demosaic.bilinear import bilinear
 from clpipe.stages.demosaic.common import from_differences
 from clpipe.types import Floats
-
-
-def median_filter(image: Floats, size: int) -> Floats:
-    """Median of the ``size`` x ``size`` pixels around each pixel, mirrored at borders.
-
-    >>> median_filter(np.float32([[1, 9, 2, 3, 4]]), 3).tolist()
-    [[9.0, 2.0, 3.0, 3.0, 3.0]]
-    """
-    reach = range(-(size // 2), size // 2 + 1)
-    around = [tap(image, dx, dy) for dy in reach for dx in reach]
-    return np.median(np.stack(around), axis=0).astype(np.float32)
 
 
 class Median(Method):

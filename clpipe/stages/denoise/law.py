@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import field_validator
 
 from clpipe.reference.colour import LUMA
-from clpipe.stage import Access, Argument, Context, Kind, Literal, Method, Pass, parameter
+from clpipe.stage import Access, Argument, Context, Kind, Literal, Method, Pass, odd_size, parameter
 
 MID_GREY = 0.18
 PREDICTED = "the {} noise at mid grey that a, b and the gains predict"
@@ -134,9 +134,7 @@ class Denoiser(Method):
     @field_validator("luma_size", "chroma_size")
     @classmethod
     def _odd(cls, size: int) -> int:
-        if size % 2 == 0 or not 1 <= size <= cls.largest_size:
-            raise ValueError(f"it must be odd, 1 to {cls.largest_size}")
-        return size
+        return odd_size(size, cls.largest_size)
 
     def resolve(self, context: Context) -> Self:
         luma, chroma = predicted_noise(context)

@@ -2,9 +2,7 @@
 
 from typing import ClassVar
 
-import numpy as np
-
-from clpipe.reference.image import tap
+from clpipe.reference.median import median_filter
 from clpipe.stages.denoise.law import size_of
 from clpipe.stages.denoise.share import Shared
 from clpipe.types import Floats
@@ -24,15 +22,4 @@ class Median(Shared):
     chroma_size: int = size_of("chroma", 3, 5)
 
     def window(self, image: Floats, reach: int) -> Floats:
-        return median(image, reach)
-
-
-def median(image: Floats, reach: int) -> Floats:
-    """Median of the (2*reach + 1)^2 pixels around each pixel.
-
-    >>> median(np.float32([[1, 9, 2, 3]]), 1).tolist()
-    [[9.0, 2.0, 3.0, 2.0]]
-    """
-    offsets = range(-reach, reach + 1)
-    around = np.stack([tap(image, dx, dy) for dy in offsets for dx in offsets])
-    return np.median(around, axis=0).astype(np.float32)
+        return median_filter(image, 2 * reach + 1)

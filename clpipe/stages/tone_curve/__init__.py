@@ -1,58 +1,41 @@
 """The tone curve."""
 
-from collections.abc import Mapping
 from importlib import resources
 from typing import ClassVar
 
 from pydantic import field_validator
 
-from clpipe.reference.curve import curve_index
-from clpipe.stage import Access, Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.stage import Curve, Kind, Stage, Unchanged, parameter
 from clpipe.stages.tone_curve.table import table_of
 from clpipe.types import Floats
 
 DEFAULT = str(resources.files("clpipe") / "curves" / "default.csv")
 
 
-class Default(Method):
+class Default(Curve):
     """The default curve of Adobe Camera Raw, on each channel of linear RGB, 0..1.
 
     Its knots are those of the DNG SDK (the paper's reference [15]), a monotone cubic between them.
     """
 
     method: ClassVar = "default"
-    kernel: ClassVar = "curve"
     summary: ClassVar = "the default curve of Adobe Camera Raw (DNG SDK)"
 
-    def passes(self) -> tuple[Pass, ...]:
-        return (Pass("curve", Access.CURVE, ("table",)),)
-
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
-        return {"table": table_of(DEFAULT)}
-
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        return table_of(DEFAULT)[curve_index(image)]
+    def table(self) -> Floats:
+        return table_of(DEFAULT)
 
 
-class Linear(Method):
+class Linear(Unchanged):
     """No curve: contrast as in the scene."""
 
     method: ClassVar = "linear"
-    kernel: ClassVar = ""
     summary: ClassVar = "no curve"
 
-    def passes(self) -> tuple[Pass, ...]:
-        return ()
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        return image
-
-
-class File(Method):
+class File(Curve):
     """A curve of one's own on each channel of linear RGB, 0..1."""
 
     method: ClassVar = "file"
-    kernel: ClassVar = "curve"
     summary: ClassVar = "a curve from a .csv (x,y; monotone cubic) or one-dimensional .cube file"
 
     path: str = parameter(
@@ -65,14 +48,8 @@ class File(Method):
         table_of(path)
         return path
 
-    def passes(self) -> tuple[Pass, ...]:
-        return (Pass("curve", Access.CURVE, ("table",)),)
-
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
-        return {"table": table_of(self.path)}
-
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        return table_of(self.path)[curve_index(image)]
+    def table(self) -> Floats:
+        return table_of(self.path)
 
 
 STAGE = Stage(

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.reference.cfa import by_site
-from clpipe.stage import Argument, Context, Frame, Method, Pass, parameter
+from clpipe.stage import Argument, Context, Frame, Method, Pass, Unchanged, parameter
 from clpipe.types import Floats
 
 
@@ -73,15 +73,8 @@ class Gains(AsShot):
         return self.filled(red_gain=red, blue_gain=blue)
 
 
-class Unbalanced(Method):
+class Unbalanced(Unchanged):
     """The mosaic stays as it is; with inverse_white_balance before it, as the sensor saw it."""
 
     method: ClassVar = "none"
-    kernel: ClassVar = ""
     summary: ClassVar = "no gains"
-
-    def passes(self) -> tuple[Pass, ...]:
-        return ()
-
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        return image

@@ -1,0 +1,19 @@
+"""The median filter, as ``kernels/lib/median.h`` has it."""
+
+import numpy as np
+
+from clpipe.reference.image import tap
+from clpipe.types import Floats
+
+
+def median_filter(image: Floats, size: int) -> Floats:
+    """Median of the ``size`` x ``size`` pixels around each pixel, mirrored at borders.
+
+    ``image`` is (height, width) or (height, width, plane), each plane by itself; so is the answer.
+
+    >>> median_filter(np.float32([[1, 9, 2, 3, 4]]), 3).tolist()
+    [[9.0, 2.0, 3.0, 3.0, 3.0]]
+    """
+    reach = range(-(size // 2), size // 2 + 1)
+    around = [tap(image, dx, dy) for dy in reach for dx in reach]
+    return np.median(np.stack(around), axis=0).astype(np.float32)
