@@ -203,6 +203,8 @@ def test_the_law_is_explained_with_the_numbers_it_gives():
         in text
     )
     assert f"{step.method.chroma_noise:.3g}" in text
+    luma, chroma = 3 * step.method.luma_noise, 6 * step.method.chroma_noise
+    assert f"range sigma = 3 * strength * noise: luma {luma:.3g}, chroma {chroma:.3g}" in text
     assert max(map(len, text.splitlines())) <= 100
 
 

@@ -33,6 +33,11 @@ class Bilateral(Denoiser):
         1.5, "Falloff of the weights with distance.", "px", gt=0, le=100
     )
 
+    @property
+    def effect(self) -> str:
+        luma, chroma = (f"{RANGE * amount:.3g}" for amount in self.amounts)
+        return f"range sigma = {RANGE:g} * strength * noise: luma {luma}, chroma {chroma}"
+
     def numbers(self, context: Context) -> Mapping[str, np.float32]:
         luma, chroma = self.amounts
         return {

@@ -151,6 +151,11 @@ class Denoiser(Method):
         assert self.luma_noise is not None and self.chroma_noise is not None
         return self.luma_strength * self.luma_noise, self.chroma_strength * self.chroma_noise
 
+    @property
+    def effect(self) -> str:
+        """What the (resolved) strengths and noises come to, in a few words."""
+        raise NotImplementedError(type(self).__name__)
+
     def numbers(self, context: Context) -> Mapping[str, np.float32]:
         """The run-time arguments of all passes, by name."""
         raise NotImplementedError(type(self).__name__)

@@ -54,6 +54,11 @@ class NonLocalMeans(Denoiser):
     luma_size: int = size_of("luma", 9, 15)
     chroma_size: int = size_of("chroma", 9, 15)
 
+    @property
+    def effect(self) -> str:
+        luma, chroma = (f"{FACTOR * amount:.3g}" for amount in self.amounts)
+        return f"h = {FACTOR:g} * strength * noise: luma {luma}, chroma {chroma}"
+
     def numbers(self, context: Context) -> Mapping[str, np.float32]:
         assert self.luma_noise is not None and self.chroma_noise is not None
         # The distance of two patches is the mean of both planes' d^2 / sigma^2: in these units it

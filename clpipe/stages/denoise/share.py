@@ -34,6 +34,12 @@ class Shared(Denoiser):
         """The filter: (height, width, plane) in and out, over windows of 2*reach + 1."""
         raise NotImplementedError(type(self).__name__)
 
+    @property
+    def effect(self) -> str:
+        luma, chroma = (f"{share_of(amount):.0%}" for amount in self.amounts)
+        law = f"share = s^2 / (s^2 + {DETAIL:g}^2), s = strength * noise"
+        return f"{law}: luma {luma}, chroma {chroma}"
+
     def numbers(self, context: Context) -> Mapping[str, np.float32]:
         luma, chroma = self.amounts
         return {"luma_share": share_of(luma), "chroma_share": share_of(chroma)}
