@@ -19,16 +19,6 @@ INLINE int2 fold_columns(vi v, site at) {
     const int8 half_way = v.lo + v.hi;
     const int4 quarter = half_way.lo + half_way.hi;
     return quarter.lo + quarter.hi;
-// Each work item adds up some of the bins, over all shares.
-INLINE void add_up_counts(__global const uint *counts, __global uint *histogram, uint bins,
-                          uint shares) {
-    for (uint bin = get_global_id(0); bin < bins; bin += get_global_size(0)) {
-        uint sum = 0;
-        for (uint share = 0; share < shares; ++share) sum += counts[(size_t)share * bins + bin];
-        histogram[bin] = sum;
-    }
-}
-
 #endif
 }
 
