@@ -5,7 +5,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -13,21 +13,20 @@ from pathlib import Path
 from typing import Any
 
 import clpipe
-from clpipe.config import Chain, Settings, Step, base_name, settings_from
-from clpipe.errors import ImageError, RequestError
+from clpipe.config import Chain
+from clpipe.errors import ImageError, KindError, RequestError
 from clpipe.image_io import (
     JPEG_MAX_SIDE,
     READABLE,
     SourceImage,
     Tags,
-    read_attributes,
     read_image,
     versions,
     write_beside,
     write_display,
     write_exr,
 )
-from clpipe.registry import all_stages
+from clpipe.reentry import Reentry, attributes_of, doubts, misplaced
 from clpipe.run import Result, Runner
 from clpipe.stage import Kind
 
@@ -40,6 +39,7 @@ class Job:
 
     path: Path
     key: str
+    listed: bool = True  # by name or glob; otherwise found in a folder
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,7 @@ class Outcome:
     seconds: float
     warnings: tuple[str, ...] = ()
     error: str = ""
+    left_out: bool = False  # kept after another stage than the one to go on from
 
 
 def find_jobs(inputs: Sequence[str], output: Path) -> list[Job]:
@@ -73,7 +74,7 @@ def find_jobs(inputs: Sequence[str], output: Path) -> list[Job]:
             if not files:
                 endings = ", ".join(READABLE)
                 raise RequestError(f"{path}: a folder without images (looked for {endings})")
-            jobs += [Job(p, p.relative_to(path).as_posix()) for p in files]
+            jobs += [Job(p, p.relative_to(path).as_posix(), listed=False) for p in files]
         elif glob.has_magic(text) and not os.path.exists(text):
             matches = sorted(m for m in glob.glob(text, recursive=True) if os.path.isfile(m))
             if not matches:
@@ -200,16 +201,6 @@ class Target:
         write_beside(self.path(job, "json"), lambda to: _write_text(to, text))
 
 
-def attributes_of(step: Step, chain: Chain, image_key: str) -> dict[str, str]:
-    """What a kept image says of itself, so that a chain can go on with it."""
-    return {
-        "stage": step.name,
-        "kind": step.stage.writes.label,
-        "image_key": image_key,
-        "settings": json.dumps(chain.settings.record()),
-    }
-
-
 def _write_text(path: Path, text: str) -> None:
     path.write_text(text)
 
@@ -265,62 +256,30 @@ def sidecar(
     }
 
 
-def carried_settings(attributes: Mapping[str, str]) -> Settings | None:
-    """The settings that a kept image was made with; None where it says nothing of them.
+def enter(
+    job: Job, source: SourceImage, runner: Runner, reentry: Reentry | None
+) -> tuple[Runner, SourceImage, str] | None:
+    """How to go on with an image: its runner, the image with warnings, its key.
+
+    None for one that was found in a folder of kept images and is not the one to go on from.
 
     Raises:
-        RequestError: they are damaged, or name what there is not.
+        ImageError: it cannot enter there.
     """
-    if "settings" not in attributes:
-        return None
-    try:
-        values = json.loads(attributes["settings"])
-    except ValueError as error:
-        raise RequestError(str(error)) from None
-    if not isinstance(values, dict):
-        raise RequestError(f"found {values!r}")
-    return settings_from(values)
-
-
-@dataclass(frozen=True)
-class Reentry:
-    """Going on with kept images: how to make the chain, given the settings that one carries."""
-
-    start_at: str
-    make: Callable[[Settings | None], Chain]
-
-    def first_chain(self, jobs: Sequence[Job]) -> Chain:
-        """The chain for the first image, from which it is seen early whether the request is right.
-
-        Raises:
-            RequestError: it is not.
-        """
-        try:
-            return self.make(carried_settings(read_attributes(jobs[0].path)))
-        except RequestError:
-            return self.make(None)
-
-    def chain_for(self, path: Path, source: SourceImage) -> Chain:
-        """The chain for one image.
-
-        Raises:
-            ImageError: the image is not of the kind that the first step reads, or what it says of
-                itself is of no use.
-        """
-        try:
-            chain = self.make(carried_settings(source.attributes))
-        except RequestError as error:
-            raise ImageError(f"{path}: what it was made with cannot be used: {error}") from None
-        kind = source.attributes.get("kind", chain.source.label)
-        if kind != chain.source.label:
-            stages = {name: all_stages()[base_name(name)] for name in chain.names}
-            others = [name for name, stage in stages.items() if stage.reads.label == kind]
-            raise ImageError(
-                f"{path}: holds {kind} (kept after {source.attributes.get('stage')}), but "
-                f"{self.start_at} reads {chain.source.label}; {kind} can enter at: "
-                f"{', '.join(others) or 'none of the stages'}"
-            )
-        return chain
+    kept, warnings, key = source.attributes.get("stage"), list(source.warnings), job.key
+    if reentry:
+        chain = reentry.chain_for(job.path, source.attributes)
+        if not reentry.is_next(chain, source.attributes):
+            if not job.listed:
+                return None
+            again = f"entering at {reentry.start_at} repeats stages or leaves some out"
+            warnings.append(f"was kept after {kept}; {again}")
+        reentry.check_kind(job.path, chain, source.attributes)
+        warnings += doubts(source, chain)
+        runner, key = runner.of(chain), source.attributes.get("image_key", key)
+    elif kept:
+        warnings.append(f"was kept after {kept}; is it a render? See --start-at")
+    return runner, replace(source, warnings=tuple(warnings)), key
 
 
 def run_jobs(
@@ -342,15 +301,20 @@ def run_jobs(
             try:
                 source = reading.result()
                 target.check_size(source)
-                key = job.key
-                if reentry:
-                    runner = runner.of(reentry.chain_for(job.path, source))
-                    key = source.attributes.get("image_key", key)
-                elif kept := source.attributes.get("stage"):
-                    warning = f"was kept after {kept}; is it a render? --start-at goes on from it"
-                    source = replace(source, warnings=(*source.warnings, warning))
+                entered = enter(job, source, runner, reentry)
+                if entered is None:
+                    yield Outcome(job, 0, 0, left_out=True)
+                    continue
+                runner, source, key = entered
                 result = runner.run(source.pixels, key)
                 target.write(job, key, runner, source, result)
+            except KindError as error:
+                if reentry and not job.listed:
+                    yield Outcome(job, 0, 0, left_out=True)
+                    continue
+                message = misplaced(error, runner.chain, reentry)
+                yield Outcome(job, 0, time.perf_counter() - start, error=message)
+                continue
             except (ImageError, RequestError, MemoryError) as error:
                 message = str(error) or "there is not enough memory for it"
                 if str(job.path) not in message:

@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -13,7 +13,7 @@ from rich.table import Table
 
 import clpipe
 from clpipe import describe
-from clpipe.batch import FORMATS, Reentry, Target, find_jobs, prepare_folder, run_jobs
+from clpipe.batch import FORMATS, Target, find_jobs, prepare_folder, run_jobs
 from clpipe.bench import bench as run_bench
 from clpipe.bench import bench_methods
 from clpipe.check import SIZES, check_all
@@ -31,6 +31,7 @@ from clpipe.device import find_devices, open_device
 from clpipe.errors import ClpipeError, RequestError
 from clpipe.image_io import MAX_PIXELS
 from clpipe.plan import make_plan
+from clpipe.reentry import Reentry
 from clpipe.registry import all_stages, load_stage_file
 from clpipe.run import Runner
 from clpipe.stage import Kind, Stage
@@ -116,7 +117,7 @@ def chain_options(function: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--skip", multiple=True, metavar="STAGE", help="Leave a stage out; may be repeated."
         ),
-        click.option("--start-at", metavar="STAGE", help="Enter the chain here, with kept images."),
+        click.option("--start-at", metavar="STAGE", help="Enter here, with kept images, mosaics."),
         click.option("--until", metavar="STAGE", help="Leave the chain after this stage."),
         stage_file_option,
     ]
@@ -169,7 +170,8 @@ class Request:
         """
         for file in self.stage_files:
             load_stage_file(file)
-        settings = load_settings(self.config) if self.config else carried or DEFAULTS
+        named = self.config is not None
+        settings = load_settings(str(self.config)) if named else carried or DEFAULTS
         plain = {"camera": self.camera, "iso": self.iso, "seed": self.seed}
         values: dict[str, Any] = {k: v for k, v in plain.items() if v is not None}
         if self.stages is not None:
@@ -184,13 +186,6 @@ class Request:
             if step not in chain.names:
                 raise RequestError(one_of("stage in this chain", step, chain.names))
         return chain
-
-
-def kept_names(chain: Chain, keep: Sequence[str]) -> tuple[str, ...]:
-    """The steps to keep; ``all`` is every one."""
-    if "all" in keep:
-        return tuple(step.name for step in chain.steps)
-    return tuple(chain.step_named(name).name for name in dict.fromkeys(keep))
 
 
 @click.group(
@@ -235,8 +230,8 @@ def run(
     asked = Request(**request)
     jobs = find_jobs(inputs, output)
     reentry = Reentry(asked.start_at, asked.chain) if asked.start_at else None
-    chain = reentry.first_chain(jobs) if reentry else asked.chain()
-    kept = kept_names(chain, keep)
+    chain = reentry.first_chain(jobs[0].path) if reentry else asked.chain()
+    kept = chain.kept(keep)
     whole = asked.until is None or chain.result is Kind.DISPLAY
     formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
     target = Target(output, formats)
@@ -246,7 +241,11 @@ def run(
     eight_bit = any(f != "exr" for f in formats)
     runner = Runner(chain, device, kept, encode=eight_bit, final="exr" in formats)
     failed = 0
+    left_out = 0
     for outcome in run_jobs(jobs, runner, target, reentry):
+        if outcome.left_out:
+            left_out += 1
+            continue
         if outcome.error:
             failed += 1
             click.echo(f"clpipe: {outcome.error}", err=True)
@@ -255,11 +254,14 @@ def run(
             click.echo(f"clpipe: {outcome.job.path}: warning: {warning}", err=True)
         made = target.path(outcome.job, formats[0])
         click.echo(
-            f"{outcome.job.path} -> {made}  {outcome.megapixels:.1f} MP  {outcome.seconds:.2f} s",
+            f"{outcome.job.path} -> {made}  {outcome.megapixels:.2g} MP  {outcome.seconds:.2f} s",
             err=True,
         )
+    if left_out:
+        click.echo(f"{left_out} images in folders were kept elsewhere and left out", err=True)
     if len(jobs) > 1 or failed:
-        click.echo(f"{len(jobs) - failed} of {len(jobs)} images done, {failed} failed", err=True)
+        done = len(jobs) - failed - left_out
+        click.echo(f"{done} of {len(jobs)} images done, {failed} failed", err=True)
     sys.exit(1 if failed else 0)
 
 
@@ -275,12 +277,16 @@ def plan(
     """Show the launches and buffer slots of a chain, without running it."""
     asked = Request(**request)
     if as_toml:
-        whole = replace(asked, start_at=None, until=None)
-        click.echo(describe.toml_text(whole.chain()), nl=False)
+        if asked.start_at or asked.until or as_json:
+            raise RequestError(
+                "plan: --toml prints a whole chain, which neither --start-at nor --until is part "
+                "of, and --json prints the plan"
+            )
+        click.echo(describe.toml_text(asked.chain()), nl=False)
         return
     chain = asked.chain()
     eight_bit = not formats or any(f != "exr" for f in formats)
-    made = make_plan(chain, keep=kept_names(chain, keep), encode=eight_bit, final="exr" in formats)
+    made = make_plan(chain, keep=chain.kept(keep), encode=eight_bit, final="exr" in formats)
     if as_json:
         click.echo(json.dumps(describe.plan_record(made), indent=2))
         return

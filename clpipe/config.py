@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from clpipe.camera import Camera, load_camera
 from clpipe.errors import RequestError
-from clpipe.registry import all_stages, load_stage_file
+from clpipe.registry import all_stages, blamed, check_passes, load_stage_file
 from clpipe.stage import Context, Kind, Method, Stage
 from clpipe.stages import DEFAULT_CHAIN
 from clpipe.suggest import one_of
@@ -73,6 +73,16 @@ class Chain:
     def result(self) -> Kind:
         """The kind of image that comes out."""
         return self.steps[-1].stage.writes if self.steps else self.source
+
+    def kept(self, names: Sequence[str]) -> tuple[str, ...]:
+        """The names of steps to keep, each once; ``all`` is every one.
+
+        Raises:
+            RequestError: the chain has no such step.
+        """
+        if "all" in names:
+            return tuple(step.name for step in self.steps)
+        return tuple(self.step_named(name).name for name in dict.fromkeys(names))
 
     def step_named(self, name: str) -> Step:
         """The step of that name.
@@ -240,7 +250,7 @@ def from_folder(folder: Path, stage: Stage, table: Mapping[str, Any]) -> dict[st
     for name, field_ in (method.model_fields if method else {}).items():
         extra: Any = field_.json_schema_extra
         if extra["file"] and isinstance(values.get(name), str):
-            values[name] = str(folder / values[name])
+            values[name] = str(folder / values[name]) if values[name] else ""
     return values
 
 
@@ -260,6 +270,9 @@ def stage_named(key: str, name: str) -> Stage:
         KeyedError: there is no such stage.
     """
     if name not in all_stages():
+        if base_name(name) in all_stages():
+            again = f"{name}: a stage that is to come again is listed again, as {base_name(name)}"
+            raise KeyedError(key, f"{again}; the second is then called {base_name(name)}_2")
         raise KeyedError(key, one_of("stage", name, all_stages()))
     return all_stages()[name]
 
@@ -318,9 +331,14 @@ def named_errors(name: str, method: type[Method]) -> Iterator[None]:
         key = ".".join([name, *(str(part) for part in error["loc"])])
         if error["type"] == "extra_forbidden":
             what = f"parameter of {name} ({method.method})"
-            raise KeyedError(
-                key, one_of(what, str(error["loc"][0]), ["method", *method.model_fields])
-            ) from None
+            parameter = str(error["loc"][0])
+            message = one_of(what, parameter, ["method", *method.model_fields])
+            stage = all_stages()[base_name(name)]
+            having = [m for m, other in stage.by_name.items() if parameter in other.model_fields]
+            if having:
+                message += f"; '{parameter}' is one of the method{'s' * (len(having) > 1)} "
+                message += " and ".join(having)
+            raise KeyedError(key, message) from None
         reason = error["msg"].removeprefix("Value error, ").removeprefix("Input ")
         found = f" found {error['input']!r}:" if error["loc"] else ""
         raise KeyedError(key, f"{key}:{found} {reason}") from None
@@ -367,7 +385,7 @@ def make_chain(
         raise RequestError(
             f"nothing is left to do; {start_at} comes after {until}"
             if steps
-            else "stages: nothing is left to do; every stage was skipped"
+            else "stages: nothing is left to do; no stage is listed, or every one was skipped"
         )
     if source is None:
         source = steps[first].stage.reads
@@ -393,10 +411,13 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
         if stage.reads is not (kind or stage.reads):
             raise RequestError(misfit(name, stage, before, kind or stage.reads))
         method = make_method(stage, name, settings.parameters.get(name, {}))
-        with named_errors(name, type(method)):
+        with named_errors(name, type(method)), blamed(f"stage {name}", stage.folder):
             method = method.resolve(context)
+            after = method.after(context)
+        if stage.folder:
+            check_passes(name, stage, method, context)
         steps.append(Step(name, stage, method, context))
-        context = method.after(context)
+        context = after
         kind, before = stage.writes, name
     return steps
 

@@ -169,7 +169,8 @@ def short_text(value: Any) -> str:
     """
     if isinstance(value, tuple):
         return f"[{', '.join(map(short_text, value))}]"
-    return f"{value:.4g}" if isinstance(value, float) else value_text(value)
+    plain = not isinstance(value, float) or value.is_integer()
+    return value_text(value) if plain else f"{value:.4g}"
 
 
 def context_for(stage: Stage, settings: Settings) -> Context:

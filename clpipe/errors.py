@@ -1,5 +1,8 @@
 """What can go wrong, by whose fault it is. Each class carries the exit status of the program."""
 
+from collections.abc import Mapping
+from pathlib import Path
+
 
 class ClpipeError(Exception):
     """Base of all errors that are reported as one clear message, without a traceback."""
@@ -17,6 +20,15 @@ class ImageError(ClpipeError):
     """One image cannot be read, processed or written; the others go on."""
 
     exit_status = 1
+
+
+class KindError(ImageError):
+    """A kept image has not the channels that are wanted; ``attributes`` is what it says."""
+
+    def __init__(self, path: Path, attributes: Mapping[str, str]) -> None:
+        kept = attributes.get("stage", "nothing that it names")
+        super().__init__(f"{path}: holds {attributes['kind']}, kept after {kept}")
+        self.attributes = attributes
 
 
 class DeviceError(ClpipeError):

@@ -14,7 +14,7 @@ import OpenImageIO as oiio
 from PIL import Image, ImageCms
 
 import clpipe
-from clpipe.errors import ImageError
+from clpipe.errors import ImageError, KindError
 from clpipe.types import Array, Floats
 
 READABLE = (".exr", ".hdr", ".pfm", ".tif", ".tiff")
@@ -117,10 +117,7 @@ def _read_picture(
             layer, channels = picture
             return _read_part(path, file, part, channels), layer, _warnings(spec), attributes
         if "kind" in attributes:
-            raise ImageError(
-                f"{path}: holds {attributes['kind']}, kept after {attributes.get('stage')}; "
-                "it can enter with --start-at a stage that reads this kind"
-            )
+            raise KindError(path, attributes)
         part += 1
     listed = ", ".join(name for name in found[:20] if name) or "none"
     wanted = "no single channel with a mosaic" if mosaic else "no R, G and B channels"
@@ -147,14 +144,13 @@ def read_attributes(path: Path) -> dict[str, str]:
 
 
 def mosaic_channel(names: Sequence[str]) -> tuple[str, tuple[int]] | None:
-    """The only channel, or the one called Y.
+    """The only channel that is neither alpha nor depth.
 
-    >>> mosaic_channel(["Z"]), mosaic_channel(["A", "Y"]), mosaic_channel(["R", "G", "B"])
+    >>> mosaic_channel(["Raw"]), mosaic_channel(["A", "Y"]), mosaic_channel(["X", "Y"])
     (('', (0,)), ('', (1,)), None)
     """
-    if len(names) == 1:
-        return "", (0,)
-    return ("", (list(names).index("Y"),)) if "Y" in names else None
+    places = [i for i, name in enumerate(names) if len(names) == 1 or name not in ("A", "Z")]
+    return ("", (places[0],)) if len(places) == 1 else None
 
 
 def picture_channels(names: Sequence[str]) -> tuple[str, tuple[int, int, int]] | None:

@@ -21,7 +21,7 @@ class Pipeline:
         config: a built-in configuration ("default", "paper") or a TOML file.
         device: an index or a part of a name as ``clpipe devices`` lists them, or "numpy"; None
             takes the first GPU, else the first CPU.
-        keep: steps whose image is wanted beside the last one.
+        keep: steps whose image is wanted beside the last one, or "all".
         start_at: the first step to run; images are then of the kind that it reads.
         until: the last step to run.
         **settings: what a configuration file may hold, over ``config``: ``iso=3200``,
@@ -36,18 +36,19 @@ class Pipeline:
         self,
         config: str | Path = "default",
         *,
-        device: str | None = None,
-        keep: Sequence[str] = (),
+        device: str | int | None = None,
+        keep: str | Sequence[str] = (),
         start_at: str | None = None,
         until: str | None = None,
         **settings: Any,
     ) -> None:
-        self._settings = overlay(load_settings(str(config)), settings)
+        self._settings = overlay(load_settings(str(config)), _plain(settings))
         self._ends = start_at, until
         chain = self._chain(self._settings)
-        kept = tuple(chain.step_named(name).name for name in keep)
+        kept = chain.kept([keep] if isinstance(keep, str) else keep)
         encode = chain.result is Kind.DISPLAY
-        self._runner = Runner(chain, open_device(device), kept, encode=encode, final=not encode)
+        on = open_device(None if device is None else str(device))
+        self._runner = Runner(chain, on, kept, encode=encode, final=not encode)
 
     def _chain(self, settings: Settings) -> Chain:
         start_at, until = self._ends
@@ -63,7 +64,7 @@ class Pipeline:
 
         Args:
             image: (height, width, 3) linear RGB, 1 = full scale of the sensor, of float16, float32
-                or float64; or (height, width) where the chain starts on a mosaic.
+                or float64; or (height, width) where the chain starts on a mosaic, also of uint16.
             key: what the image's noise belongs to: the same key gives the same noise.
             **settings: other values for this image alone, as for the class. Values such as ISO,
                 gains and noise parameters cost nothing; another method or size is compiled.
@@ -78,31 +79,45 @@ class Pipeline:
         """
         runner = self._runner
         if settings:
-            runner = runner.of(self._chain(overlay(self._settings, settings)))
-        return runner.run(_checked(image), key)
+            runner = runner.of(self._chain(overlay(self._settings, _plain(settings))))
+        return runner.run(_checked(image, runner.chain.source), key)
 
     def process_many(
-        self, images: Iterable[Array | tuple[Array, Mapping[str, Any]]]
+        self, images: Iterable[Array | tuple[Array, str | Mapping[str, Any]]]
     ) -> Iterator[Result]:
         """Put images through, one after the other, as they are asked for.
 
-        An item is an image, whose key is then its number ("0", "1", ...), or an image with the
-        arguments that :meth:`process` takes beside it, such as ``{"key": "a", "iso": 800}``.
+        An item is an image, whose key is then its number ("0", "1", ...), an image with its key, or
+        an image with the arguments that :meth:`process` takes beside it, such as
+        ``{"key": "a", "iso": 800}``.
         """
         for number, item in enumerate(images):
             image, arguments = item if isinstance(item, tuple) else (item, {})
-            yield self.process(image, **{"key": str(number), **arguments})
+            given = {"key": arguments} if isinstance(arguments, str) else arguments
+            yield self.process(image, **{"key": str(number), **given})
 
 
-def _checked(image: Array) -> Array:
-    """The image in a type that runs, refused where it cannot be linear light.
+def _plain(values: Any) -> Any:
+    """Settings without NumPy types: what a configuration file could hold."""
+    if isinstance(values, Mapping):
+        return {key: _plain(value) for key, value in values.items()}
+    return values.tolist() if isinstance(values, np.ndarray | np.generic) else values
+
+
+def _checked(image: Array, kind: Kind) -> Array:
+    """The image in a type that runs, refused where it cannot be what the chain starts on.
 
     Raises:
-        ImageError: it is not of floats, or not finite.
+        ImageError: it is of a wrong type, or not finite.
     """
-    if not isinstance(image, np.ndarray) or image.dtype.kind != "f":
-        found = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
-        raise ImageError(f"found an image of {found}; expected linear light in a NumPy float array")
+    if not isinstance(image, np.ndarray):
+        raise ImageError(f"found {type(image).__name__}; expected a NumPy array")
+    whole = image.dtype in (np.uint16, np.uint32) and len(kind.channels) == 1
+    if image.dtype.kind != "f" and not whole:
+        also = (
+            " (or DN as uint16)" if len(kind.channels) == 1 else "; uint8 pictures are not linear"
+        )
+        raise ImageError(f"found an image of {image.dtype}; expected {kind.label} in floats{also}")
     if image.dtype not in (np.float16, np.float32):
         image = image.astype(np.float32)
     if not np.isfinite(image).all():

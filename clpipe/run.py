@@ -13,6 +13,7 @@ from clpipe.errors import ImageError
 from clpipe.plan import Plan, make_plan
 from clpipe.reference.curve import compose, to_8_bit
 from clpipe.reference.random import Stream, stream_of
+from clpipe.registry import blamed
 from clpipe.stage import Frame, Owner
 from clpipe.types import Array, Floats
 
@@ -167,7 +168,8 @@ class Runner:
         found: dict[str, dict[str, float]] = {}
         for step in self.chain.steps:
             frame = Frame(step.context, streams(self.chain, step, image_key), {})
-            image = step.method.reference(image, frame)
+            with blamed(f"stage {step.name}", step.stage.folder):
+                image = step.method.reference(image, frame)
             if step.name in self.keep:
                 kept[step.name] = image
             if frame.found:

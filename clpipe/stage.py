@@ -135,6 +135,8 @@ def parameter(
     compiled into the kernel; all others may change from image to image at no cost. ``file`` is the
     name of a file, which a configuration gives relative to itself.
     """
+    if unknown := limits.keys() - {"ge", "gt", "le", "lt"}:
+        raise TypeError(f"parameter() got {', '.join(sorted(unknown))}; limits are ge, gt, le, lt")
     extra: dict[str, JsonValue] = {
         "unit": unit,
         "auto": auto,

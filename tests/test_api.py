@@ -92,11 +92,33 @@ def test_from_a_file_and_in_part(tmp_path, render):
     )
 
 
+def test_a_raw_in_whole_numbers(render):
+    camera = clpipe.Pipeline(keep="quantize", iso=800)
+    shot = camera.process(render, "a")
+    raw = shot.kept["quantize"].astype(np.uint16)
+    developed = clpipe.Pipeline(start_at="normalize", iso=800).process(raw, "a")
+    assert np.array_equal(developed.image, shot.image)
+    with pytest.raises(clpipe.ImageError, match=r"found an image of int8; .* raw .*uint16"):
+        clpipe.Pipeline(start_at="normalize").process(raw.astype(np.int8), "a")
+
+
+def test_what_a_user_may_write(render):
+    matrix = np.eye(3)
+    camera = clpipe.Pipeline(
+        iso=np.float32(800), keep="all", color_matrix={"method": "given", "matrix": matrix}
+    )
+    shot = camera.process(render, "a")
+    assert list(shot.kept) == [step.name for step in camera.chain.steps]
+    assert [s.image.mean() for s in camera.process_many([(render, "a")])] == [shot.image.mean()]
+    with pytest.raises(clpipe.DeviceError, match="unknown device '77'"):
+        clpipe.Pipeline(device=77)
+
+
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (np.zeros((4, 4, 3), np.uint8), "found an image of uint8; expected linear light"),
-        ([[1.0]], "found an image of list"),
+        (np.zeros((4, 4, 3), np.uint8), "found an image of uint8; expected rgb in floats"),
+        ([[1.0]], "found list; expected a NumPy array"),
         (np.zeros((4, 4), np.float32), "shape .4, 4., but the chain starts on rgb"),
         (np.zeros((4, 4, 4), np.float32), "shape .4, 4, 4."),
         (np.full((4, 4, 3), np.nan, np.float32), "NaN or infinity"),

@@ -68,7 +68,7 @@ def build(**settings):
         ),
         (
             {"color_matrix": {"method": "given", "matrix": [[1, 0, 0], [0, 1, 0]]}},
-            r"color_matrix.matrix.2: .*[Ff]ield required",
+            "color_matrix.matrix: found .*: expected three rows of three numbers",
         ),
         ({"white_balance": {"method": "white_patch", "percentile": 0}}, "percentile: found 0: "),
         ({"white_balance": {"method": "white_patch", "percentile": 101}}, "percentile: found 101"),

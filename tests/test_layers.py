@@ -21,7 +21,8 @@ LEVELS = [
     {"device"},
     {"run"},
     {"image_io", "check", "bench", "pipeline"},
-    {"batch", "describe"},
+    {"reentry", "describe"},
+    {"batch"},
     {"cli"},
 ]
 LEVEL = {name: i for i, names in enumerate(LEVELS) for name in names}

@@ -123,14 +123,18 @@ def test_a_mosaic_from_elsewhere_enters_with_pattern_and_levels(kept, tmp_path, 
         (
             "quantize",
             "white_balance",
-            "holds raw .kept after quantize., but .* at: normalize",
+            "holds raw, kept after quantize, but white_balance reads mosaic; raw can .* normalize",
         ),
-        ("mosaic", "denoise", "holds mosaic, kept after mosaic"),
-        ("demosaic", "normalize", "holds rgb, kept after demosaic"),
+        ("mosaic", "denoise", "but denoise reads rgb; mosaic can enter with --start-at inverse_"),
+        (
+            "demosaic",
+            "normalize",
+            "but normalize reads raw; rgb can enter with --start-at expo",
+        ),
         (
             "gamma",
             "denoise",
-            "holds display .kept after gamma., but denoise reads .*none of",
+            "holds display, kept after gamma, .* no stage of the chain reads display",
         ),
     ],
 )
@@ -144,6 +148,49 @@ def test_an_image_of_another_kind_is_refused_and_the_others_go_on(
     assert re.search(message, output), output
     assert (tmp_path / f"crop.{right}.jpg").is_file()
     assert not (tmp_path / f"crop.{after}.jpg").exists()
+
+
+def test_a_folder_gives_what_was_kept_right_before(kept, tmp_path):
+    output = clpipe("run", kept, "-o", tmp_path, "--start-at", "denoise")
+    assert {p.name for p in tmp_path.iterdir()} == {"crop.demosaic.jpg", "crop.demosaic.json"}
+    assert "13 images in folders were kept elsewhere and left out" in output
+    assert "1 of 14 images done, 0 failed" in output
+
+
+def test_entering_elsewhere_than_right_after_is_told(kept, tmp_path):
+    output = clpipe("run", kept / "crop.denoise.exr", "-o", tmp_path, "--start-at", "denoise")
+    assert "was kept after denoise; entering at denoise repeats stages or leaves" in output
+
+
+def test_a_kept_mosaic_is_no_render(kept, tmp_path):
+    output = clpipe("run", kept / "crop.quantize.exr", "-o", tmp_path, status=1)
+    assert "holds raw, kept after quantize; raw can enter with --start-at normalize" in output
+
+
+@pytest.mark.parametrize(
+    ("level", "start_at", "options", "messages"),
+    [
+        (0.4, "normalize", (), ("not above the black level of 512", "pattern; RGGB", "levels")),
+        (900, "white_balance", (), ("1 is the white level here", "does not say its pattern")),
+        (0.4, "white_balance", ("--set", "mosaic.pattern=RGGB"), ()),
+    ],
+)
+def test_what_looks_wrong_with_a_mosaic_is_told(tmp_path, level, start_at, options, messages):
+    write_exr(tmp_path / "m.exr", np.full((8, 8), level, np.float32), ("Y",), {})
+    output = clpipe(
+        "run", tmp_path / "m.exr", "-o", tmp_path / "out", "--start-at", start_at, *options
+    )
+    assert output.count("warning: ") == len(messages)
+    for message in messages:
+        assert message in output
+
+
+def test_an_image_of_two_channels_is_no_mosaic(tmp_path):
+    write_exr(tmp_path / "m.exr", np.zeros((8, 8, 2), np.float32), ("X", "Y"), {})
+    output = clpipe(
+        "run", tmp_path / "m.exr", "-o", tmp_path / "o", "--start-at", "normalize", status=1
+    )
+    assert "no single channel with a mosaic; found X, Y" in output
 
 
 def test_settings_that_an_image_carries_may_be_of_no_use(kept, tmp_path):
@@ -185,7 +232,7 @@ def test_until_gives_a_float_image_unless_it_is_the_end(tmp_path):
 
 def test_a_kept_image_that_is_taken_for_a_render_is_told(kept, tmp_path):
     output = clpipe("run", kept / "crop.demosaic.exr", "-o", tmp_path)
-    assert "was kept after demosaic; is it a render?" in output
+    assert "was kept after demosaic; is it a render? See --start-at" in output
 
 
 def test_a_repeated_stage_can_be_entered(tmp_path):

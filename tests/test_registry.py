@@ -60,12 +60,19 @@ def test_without_its_file_the_stage_is_unknown(clpipe):
     [
         (("class CosineFourth(Method):", "class CosineFourth(Method:"), r"vignette.py, line \d+: "),
         (("STAGE = ", "STAG = "), "vignette.py: STAGE is not there"),
-        (("import numpy as np", "import numpi as np"), "line 6 of .*vignette.py: ModuleNotFound"),
+        (("import numpy as np", "import numpi as np"), r"vignette.py, line 6: ModuleNotFound"),
         (
             ('"vignette", "Darken', '"denoise", "Darken'),
             "'denoise', but that name is taken",
         ),
         (('"vignette", "Darken', '"denoise_2", "Darken'), "no digit last"),
+        (("(CosineFourth,)", "(CosineFourth)"), r"the methods of vignette must be a tuple"),
+        (('    method: ClassVar = "cosine_fourth"\n', ""), "CosineFourth lacks method"),
+        (
+            ("Kind.RGB, Kind.RGB", "Kind.RGB, Kind.RBG"),
+            r"py, line \d\d: AttributeError: RBG",
+        ),
+        (('"px", gt=0)', '"px", gtt=0)'), r"vignette.py, line \d\d: TypeError: .*gtt; limits are"),
         (('kernel: ClassVar = "vignette"', 'kernel: ClassVar = "vig"'), "vig.cl is not there"),
     ],
 )
@@ -76,6 +83,33 @@ def test_a_stage_file_with_a_mistake(clpipe, stage_file, change, message):
     output = clpipe("stages", "--stage-file", stage_file, status=2)
     assert "Traceback" not in output
     assert re.search(message, output), output
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("self.focal_length**-2", "1 / 0"), r"vignette.py, line \d\d: ZeroDivisionError"),
+        (('"scale": scale', '"scale": "x"'), "arguments.. gives 'x' as 'scale'; allowed: float32"),
+        (('"scale": scale', '"skale": scale'), "vignette wants the argument 'scale'; .*skale"),
+        (('Pass("vignette"', 'Pass("vinette"'), "vignette.cl has no function vinette"),
+    ],
+)
+def test_a_stage_whose_parts_do_not_fit(clpipe, stage_file, change, message):
+    text = PYTHON.replace(*change)
+    assert text != PYTHON
+    stage_file.write_text(text)
+    chain = ("--stages", "exposure,vignette", "--stage-file", stage_file)
+    output = clpipe("plan", *chain, status=2)
+    assert "Traceback" not in output
+    assert re.search(message, output), output
+
+
+def test_a_reference_that_fails_is_named_with_its_line(clpipe, stage_file, tmp_path):
+    stage_file.write_text(PYTHON.replace("np.indices(", "np.indexes("))
+    chain = ("--stages", "exposure,vignette", "--stage-file", stage_file)
+    out = tmp_path / "out"
+    output = clpipe("run", STILL_LIFE, "-o", out, *chain, "--device", "numpy", status=1)
+    assert re.search(r"stage vignette: .*vignette.py, line \d\d: AttributeError", output), output
 
 
 def test_a_kernel_with_a_syntax_error_is_named_with_its_own_line(clpipe, stage_file, tmp_path):

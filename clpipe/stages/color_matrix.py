@@ -16,7 +16,14 @@ NAMES = tuple(f"{row}_{column}" for row in "rgb" for column in "rgb")
 
 def _as_tuples(value: Any) -> Any:
     """Lists, as TOML has them, as the tuples that strict validation wants."""
-    return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple) else value
+    if value is None:
+        return None
+    rows = value if isinstance(value, list | tuple) else ()
+    numbers = [x for row in rows if isinstance(row, list | tuple) and len(row) == 3 for x in row]
+    real = [x for x in numbers if isinstance(x, float | int) and not isinstance(x, bool)]
+    if len(rows) != 3 or len(real) != 9:
+        raise ValueError("expected three rows of three numbers: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]")
+    return tuple(tuple(float(x) for x in row) for row in rows)
 
 
 class Rendered(Unchanged):
@@ -66,6 +73,7 @@ class Camera(Given):
 
     method: ClassVar = "camera"
     summary: ClassVar = "camera RGB to linear sRGB, for a camera's own raws"
+    example: ClassVar = {}
 
     matrix: Annotated[Matrix, BeforeValidator(_as_tuples)] | None = parameter(
         None, "Three rows of three, camera RGB to linear sRGB.", auto="from the camera"
@@ -83,6 +91,7 @@ class InverseCamera(Given):
 
     method: ClassVar = "inverse_camera"
     summary: ClassVar = "linear sRGB to camera RGB, for a render, before mosaic"
+    example: ClassVar = {}
 
     matrix: Annotated[Matrix, BeforeValidator(_as_tuples)] | None = parameter(
         None, "Three rows of three, linear sRGB to camera RGB.", auto="from the camera"

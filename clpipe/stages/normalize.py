@@ -38,7 +38,10 @@ class Linear(Method):
     def _ordered(self) -> "Linear":
         black, white = self.black_level, self.white_level
         if black is not None and white is not None and white <= black:
-            raise ValueError("white_level must be above black_level")
+            raise ValueError(
+                f"white_level must be above black_level; "
+                f"found {self.white_level} and {self.black_level}"
+            )
         return self
 
     def resolve(self, context: Context) -> "Linear":

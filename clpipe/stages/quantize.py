@@ -28,7 +28,10 @@ class Linear(Method):
     @model_validator(mode="after")
     def _ordered(self) -> "Linear":
         if None not in (self.black_level, self.white_level) and self._range <= 0:
-            raise ValueError("white_level must be above black_level")
+            raise ValueError(
+                f"white_level must be above black_level; "
+                f"found {self.white_level} and {self.black_level}"
+            )
         return self
 
     @property

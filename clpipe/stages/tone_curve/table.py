@@ -125,7 +125,8 @@ def parse_cube(text: str) -> Knots:
             case _:
                 rows.append(values[0])
     if size is None or size != len(rows) or size < 2:
-        raise ValueError(f"LUT_1D_SIZE is {size}, at least 2 is needed; found {len(rows)} rows")
+        said = "no LUT_1D_SIZE" if size is None else f"LUT_1D_SIZE {size}"
+        raise ValueError(f"{said}, but {len(rows)} rows; they must agree, and be at least 2")
     if not low < high or not np.isfinite([low, high, *rows]).all():
         raise ValueError(f"its domain goes from {low:g} to {high:g}; all must be finite and ascend")
     return np.stack([np.linspace(low, high, size), rows], axis=1)
