@@ -274,7 +274,11 @@ def run(
 def plan(
     keep: tuple[str, ...], formats: tuple[str, ...], as_json: bool, as_toml: bool, **request: Any
 ) -> None:
-    """Show the launches and buffer slots of a chain, without running it."""
+    """Show the launches and buffer slots of a chain, without running it.
+
+    A launch is one kernel call over the image. Stages that look at a pixel alone join the launch
+    before them; a stencil, a reduction and a kept image open one. A slot is a buffer of one plane.
+    """
     asked = Request(**request)
     if as_toml:
         if asked.start_at or asked.until or as_json:

@@ -26,6 +26,16 @@ def _as_tuples(value: Any) -> Any:
     return tuple(tuple(float(x) for x in row) for row in rows)
 
 
+def mixed(image: Floats, matrix: Floats) -> Floats:
+    """A (height, width, 3) image, each pixel times a (3, 3) matrix.
+
+    >>> mixed(np.float32([[[1, 2, 4]]]), np.float32([[0, 1, 0], [1, 0, 0], [1, 1, 1]])).tolist()
+    [[[2.0, 1.0, 7.0]]]
+    """
+    red, green, blue = np.moveaxis(image, -1, 0)
+    return np.stack([r * red + g * green + b * blue for r, g, b in matrix], axis=-1)
+
+
 class Rendered(Unchanged):
     """A render's colours never were a camera's."""
 
@@ -63,9 +73,7 @@ class Given(Method):
         return dict(zip(NAMES, self._rows.ravel(), strict=True))
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        red, green, blue = np.moveaxis(image, -1, 0)
-        mixed = [row[0] * red + row[1] * green + row[2] * blue for row in self._rows]
-        return np.stack(mixed, axis=-1)
+        return mixed(image, self._rows)
 
 
 class Camera(Given):

@@ -144,14 +144,30 @@ class NonLocalMeans(Method):
         one = np.float32(1)
         sensor = image * by_site(shape, pattern, n["red_inverse"], one, n["blue_inverse"])
         stable = stabilized(sensor, n["a"], n["offset"], n["root_of_offset"])
-        total, weights = np.zeros_like(image), np.zeros_like(image)
-        for dx, dy, distance in patch_distances(stable[..., None], self.reach, step=2):
-            excess = np.maximum(distance - n["bias"], np.float32(0))
-            weight = np.exp2(np.maximum(excess * n["scale"], np.float32(-30)))
-            total += weight * tap(sensor, dx, dy)
-            weights += weight
-        filtered: Floats = total / weights
+        filtered = like_samples_mean(sensor, stable, self.reach, n["bias"], n["scale"])
         return filtered * by_site(shape, pattern, n["red_gain"], one, n["blue_gain"])
+
+
+def like_samples_mean(
+    samples: Floats, stable: Floats, reach: int, bias: np.float32, scale: np.float32
+) -> Floats:
+    """Non-local means of a (height, width) mosaic over even offsets (IPOL 2011, eq. 1 to 3).
+
+    Weights come from the 3x3 patches of ``stable``: ``bias`` is taken off their squared distance,
+    and what is left, times ``scale``, is the log2 of the weight.
+
+    >>> noisy = np.float32([[0, 5, 1, 5, 0, 5, 1]])  # two colours
+    >>> filtered = like_samples_mean(noisy, noisy / 9, 2, np.float32(2), np.float32(-1))
+    >>> (100 * filtered).round().astype(int).tolist()
+    [[67, 500, 33, 500, 67, 500, 33]]
+    """
+    total, weights = np.zeros_like(samples), np.zeros_like(samples)
+    for dx, dy, distance in patch_distances(stable[..., None], reach, step=2):
+        excess = np.maximum(distance - bias, np.float32(0))
+        weight = np.exp2(np.maximum(excess * scale, np.float32(-30)))
+        total += weight * tap(samples, dx, dy)
+        weights += weight
+    return total / weights
 
 
 def stabilized(y: Floats, a: np.float32, offset: np.float32, root_of_offset: np.float32) -> Floats:

@@ -86,17 +86,41 @@ class NonLocalMeans(Denoiser):
         planes = rgb_to_ycbcr(image) / units
         level = np.maximum(patch_sum(planes[..., 0]), np.float32(0))
         variance = level * n["noise_slope"] + n["noise_offset"]
-        biases = np.array([n["luma_bias"], *[n["chroma_bias"]] * 2], np.float32)
-        scales = np.array([n["luma_scale"], *[n["chroma_scale"]] * 2], np.float32)
-        luma_reach, chroma_reach = self.reaches
-        reach = max(self.reaches)
-        total, weights = np.zeros_like(planes), np.zeros_like(planes)
-        for dx, dy, distance in patch_distances(planes, reach):
-            distance /= variance
-            excess = np.maximum(distance[..., None] - biases, np.float32(0))
-            weight = np.exp2(np.maximum(excess * scales, np.float32(-30)))
-            away = max(abs(dx), abs(dy))
-            weight *= np.array([away <= luma_reach, *[away <= chroma_reach] * 2], np.float32)
-            total += weight * tap(planes, dx, dy)
-            weights += weight
-        return ycbcr_to_rgb((total / weights * units).astype(np.float32))
+        biases, scales = (n["luma_bias"], n["chroma_bias"]), (n["luma_scale"], n["chroma_scale"])
+        filtered = non_local_means(planes, self.reaches, variance, biases, scales)
+        return ycbcr_to_rgb(filtered * units)
+
+
+def non_local_means(
+    planes: Floats,
+    reaches: tuple[int, int],
+    variance: Floats,
+    biases: tuple[np.float32, np.float32],
+    scales: tuple[np.float32, np.float32],
+) -> Floats:
+    """The filter on (height, width, 3) luma and chroma in noise units (IPOL 2011, eq. 1 to 3).
+
+    Args:
+        planes: Y, Cb and Cr, so scaled that squares add up to a distance.
+        reaches: of the windows of luma and of chroma, px.
+        variance: (height, width), what distances are divided by.
+        biases: taken off the distance, for luma and for chroma.
+        scales: times what is left, the log2 of a weight, for luma and for chroma.
+
+    >>> noisy_edge = np.float32([0, 1, 0, 9, 8, 9])[None, :, None].repeat(3, axis=2)
+    >>> biases, scales = (np.float32(2), np.float32(2)), (np.float32(-1), np.float32(-1))
+    >>> variance = np.full((1, 6), 9, np.float32)
+    >>> filtered = non_local_means(noisy_edge, (1, 1), variance, biases, scales)
+    >>> (10 * filtered[0, :, 0]).round().astype(int).tolist()
+    [5, 7, 0, 90, 83, 85]
+    """
+    of_planes = np.array([0, 1, 1])
+    bias, scale, reach = (np.array(pair)[of_planes] for pair in (biases, scales, reaches))
+    total, weights = np.zeros_like(planes), np.zeros_like(planes)
+    for dx, dy, distance in patch_distances(planes, max(reaches)):
+        excess = np.maximum((distance / variance)[..., None] - bias, np.float32(0))
+        weight = np.exp2(np.maximum(excess * scale, np.float32(-30)))
+        weight *= max(abs(dx), abs(dy)) <= reach
+        total += weight * tap(planes, dx, dy)
+        weights += weight
+    return total / weights

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.reference.cfa import red_site
+from clpipe.reference.cfa import Pattern, by_site
 from clpipe.stage import Access, Argument, Context, Frame, Method, Pass
 from clpipe.stages.white_balance.gains import balanced, with_expected_gains
 from clpipe.types import Floats
@@ -42,24 +42,26 @@ class GrayWorld(Method):
         return {"pattern": context.cfa}
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        steps = np.rint(np.clip(image, np.float32(-1), np.float32(1)) * np.float32(2**20))
-        red_x, red_y = red_site(frame.context.pattern)
+        red, blue = gray_world_gains(image, frame.context.pattern)
+        frame.found["red_gain"], frame.found["blue_gain"] = float(red), float(blue)
+        return balanced(image, frame.context, red, blue)
 
-        def total(x: int, y: int) -> tuple[int, int]:
-            samples = steps[y::2, x::2]
-            return int(samples.astype(np.int64).sum()), samples.size
 
-        red, blue = total(red_x, red_y), total(1 - red_x, 1 - red_y)
-        green1, green2 = total(1 - red_x, red_y), total(red_x, 1 - red_y)
-        green = (green1[0] + green2[0], green1[1] + green2[1])
+def gray_world_gains(image: Floats, pattern: Pattern) -> tuple[np.float32, np.float32]:
+    """mean(G) / mean(R) and mean(G) / mean(B) of a (height, width) mosaic; 1 for a dark colour.
 
-        def mean(colour: tuple[int, int]) -> np.float32:
-            return np.float32(colour[0]) / np.float32(colour[1])
+    >>> gray_world_gains(np.float32([[0.125, 0.25], [0.5, 0.75]]), "RGGB")
+    (np.float32(3.0), np.float32(0.5))
+    """
+    steps = np.rint(np.clip(image, np.float32(-1), np.float32(1)) * np.float32(2**20))
+    site = by_site(image.shape, pattern, np.float32(0), np.float32(1), np.float32(2))
+    samples = [steps[site == colour].astype(np.int64) for colour in range(3)]
+    red, green, blue = ((int(s.sum()), s.size) for s in samples)
 
-        def gain(colour: tuple[int, int]) -> np.float32:
-            if green[0] <= 0 or colour[0] <= 0:
-                return np.float32(1)
-            return mean(green) / mean(colour)
+    def gain(colour: tuple[int, int]) -> np.float32:
+        if green[0] <= 0 or colour[0] <= 0:
+            return np.float32(1)
+        mean_green = np.float32(green[0]) / np.float32(green[1])
+        return mean_green / (np.float32(colour[0]) / np.float32(colour[1]))
 
-        frame.found["red_gain"], frame.found["blue_gain"] = float(gain(red)), float(gain(blue))
-        return balanced(image, frame.context, gain(red), gain(blue))
+    return gain(red), gain(blue)

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.reference.cfa import by_site
+from clpipe.reference.cfa import Pattern, by_site
 from clpipe.stage import Access, Argument, Context, Frame, Method, Pass, parameter
 from clpipe.stages.white_balance.gains import balanced, with_expected_gains
 from clpipe.types import Floats
@@ -94,17 +94,29 @@ class WhitePatch(Method):
         }
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        site = by_site(
-            image.shape, frame.context.pattern, np.float32(0), np.float32(1), np.float32(2)
+        red, blue = white_patch_gains(
+            image, frame.context.pattern, np.float32(self.clip), self._millionths
         )
-        unclipped = cell_maximum(image) < np.float32(self.clip)
-        red, green, blue = (
-            percentile_level(image[unclipped & (site == colour)], self._millionths)
-            for colour in range(3)
-        )
+        frame.found["red_gain"], frame.found["blue_gain"] = float(red), float(blue)
+        return balanced(image, frame.context, red, blue)
 
-        def gain(level: np.float32) -> np.float32:
-            return green / level if green > 0 and level > 0 else np.float32(1)
 
-        frame.found["red_gain"], frame.found["blue_gain"] = float(gain(red)), float(gain(blue))
-        return balanced(image, frame.context, gain(red), gain(blue))
+def white_patch_gains(
+    image: Floats, pattern: Pattern, clip: np.float32, millionths: int
+) -> tuple[np.float32, np.float32]:
+    """White of G over white of R, and over white of B, of a (height, width) mosaic.
+
+    >>> cells = np.float32([[0.2, 0.4, 1.0, 1.0], [0.4, 0.1, 1.0, 0.3]])
+    >>> [gain.item() for gain in white_patch_gains(cells, "RGGB", np.float32(0.99), 1_000_000)]
+    [2.0, 4.0]
+    """
+    site = by_site(image.shape, pattern, np.float32(0), np.float32(1), np.float32(2))
+    unclipped = cell_maximum(image) < clip
+    red, green, blue = (
+        percentile_level(image[unclipped & (site == colour)], millionths) for colour in range(3)
+    )
+
+    def gain(level: np.float32) -> np.float32:
+        return green / level if green > 0 and level > 0 else np.float32(1)
+
+    return gain(red), gain(blue)
