@@ -16,10 +16,10 @@ from typing import Any, ClassVar, Self, get_args, get_origin
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
-from clpipe.camera import Camera
+from clpipe.camera import Camera, load_camera
 from clpipe.reference.cfa import PATTERNS, Pattern, red_site
 from clpipe.reference.curve import curve_index
-from clpipe.reference.random import Stream
+from clpipe.reference.random import Stream, stream_of
 from clpipe.types import Array, Floats
 
 
@@ -257,6 +257,17 @@ class Frame:
     context: Context
     stream: Mapping[Owner, Stream]
     found: dict[str, float]
+
+
+def alone(method: Method, image: Floats, iso: float = 100, pattern: Pattern = "RGGB") -> Floats:
+    """A method's reference on an image, as the first stage after a mosaic of the default camera.
+
+    For examples and for trying things out; noise is that of the image key "".
+    """
+    context = Context(load_camera("sony-a7r2"), iso, pattern)
+    resolved = method.resolve(context)
+    stream = {owner: stream_of(owner.value, resolved.method) for owner in Owner}
+    return resolved.reference(image, Frame(context, stream, {}))
 
 
 @dataclass(frozen=True)

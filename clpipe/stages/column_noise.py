@@ -22,7 +22,13 @@ from clpipe.types import Floats
 
 
 class Gaussian(Method):
-    """One Gaussian offset a column, the same in every image of a camera."""
+    """One Gaussian offset a column, the same in every image of a camera.
+
+    >>> from clpipe.stage import alone
+    >>> noisy = alone(Gaussian(sigma=0.01), np.zeros((2, 1000), np.float32))
+    >>> round(float(noisy.std()), 3), bool((noisy[0] == noisy[1]).all())
+    (0.01, True)
+    """
 
     method: ClassVar = "gaussian"
     kernel: ClassVar = "line_noise"

@@ -10,7 +10,12 @@ from clpipe.types import Floats
 
 
 class Gain(Method):
-    """Linear light times 2^EV."""
+    """Linear light times 2^EV.
+
+    >>> from clpipe.stage import alone
+    >>> alone(Gain(ev=-1.0), np.float32([[[0.5, 1, 4]]])).tolist()
+    [[[0.25, 0.5, 2.0]]]
+    """
 
     method: ClassVar = "gain"
     kernel: ClassVar = "exposure"

@@ -12,7 +12,12 @@ from clpipe.types import Floats
 
 
 class Gains(Method):
-    """Each colour divided by the gain that white balance would give it (green = 1)."""
+    """Each colour divided by the gain that white balance would give it (green = 1).
+
+    >>> from clpipe.stage import alone
+    >>> alone(Gains(red_gain=2.0, blue_gain=4.0), np.ones((2, 2), np.float32)).tolist()
+    [[0.5, 1.0], [1.0, 0.25]]
+    """
 
     method: ClassVar = "gains"
     kernel: ClassVar = "site_gains"

@@ -12,7 +12,13 @@ from clpipe.types import Floats
 
 
 class Bayer(Method):
-    """A Bayer pattern (US patent 3,971,065, 1976): a pixel keeps one of its three colours."""
+    """A Bayer pattern (US patent 3,971,065, 1976): a pixel keeps one of its three colours.
+
+    >>> from clpipe.stage import alone
+    >>> image = np.float32([1, 2, 3]) * np.ones((2, 2, 1), np.float32)
+    >>> alone(Bayer(pattern="GRBG"), image).tolist()
+    [[2.0, 1.0], [3.0, 2.0]]
+    """
 
     method: ClassVar = "bayer"
     kernel: ClassVar = "mosaic"

@@ -11,7 +11,12 @@ from clpipe.types import Floats
 
 
 class Linear(Method):
-    """(DN - black) / (white - black); what lies below black stays negative."""
+    """(DN - black) / (white - black); what lies below black stays negative.
+
+    >>> from clpipe.stage import alone
+    >>> alone(Linear(black_level=100, white_level=1124), np.float32([[36, 100, 612]])).tolist()
+    [[-0.0625, 0.0, 0.5]]
+    """
 
     method: ClassVar = "linear"
     kernel: ClassVar = "normalize"

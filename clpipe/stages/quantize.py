@@ -12,7 +12,13 @@ from clpipe.types import Floats
 
 
 class Linear(Method):
-    """Signal to whole DN, rounded to nearest, clipped to 0..white level."""
+    """Signal to whole DN, rounded to nearest, clipped to 0..white level.
+
+    >>> from clpipe.stage import alone
+    >>> signal = np.float32([[-1, 0, 0.1, 0.5, 7]])
+    >>> alone(Linear(black_level=100, white_level=1124), signal).tolist()
+    [[0.0, 100.0, 202.0, 612.0, 1124.0]]
+    """
 
     method: ClassVar = "linear"
     kernel: ClassVar = "quantize"

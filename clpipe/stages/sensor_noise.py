@@ -7,12 +7,28 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.reference.random import normal_at, square_root
-from clpipe.stage import Argument, Context, Frame, Kind, Method, Owner, Pass, Stage, parameter
+from clpipe.stage import (
+    Argument,
+    Context,
+    Frame,
+    Kind,
+    Method,
+    Owner,
+    Pass,
+    Stage,
+    parameter,
+)
 from clpipe.types import Floats
 
 
 class Gaussian(Method):
-    """Heteroscedastic Gaussian, Var[y] = a*y + b (Foi et al., IEEE TIP 2008, eq. 2)."""
+    """Heteroscedastic Gaussian, Var[y] = a*y + b (Foi et al., IEEE TIP 2008, eq. 2).
+
+    >>> from clpipe.stage import alone
+    >>> noisy = alone(Gaussian(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
+    >>> round(float(noisy.mean()), 2), round(float(noisy.var()), 4)
+    (0.5, 0.0006)
+    """
 
     method: ClassVar = "gaussian"
     kernel: ClassVar = "sensor_noise_gaussian"

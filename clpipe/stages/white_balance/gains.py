@@ -23,7 +23,12 @@ def with_expected_gains(context: Context) -> Context:
 
 
 class AsShot(Method):
-    """The gains that inverse_white_balance took out (none, if it did not run)."""
+    """The gains that inverse_white_balance took out (none, if it did not run).
+
+    >>> from clpipe.stage import alone
+    >>> alone(AsShot(red_gain=2.0, blue_gain=4.0), np.full((2, 2), 0.375, np.float32)).tolist()
+    [[0.75, 0.375], [0.375, 1.0]]
+    """
 
     method: ClassVar = "as_shot"
     kernel: ClassVar = "site_gains"
