@@ -36,6 +36,10 @@ def carried_settings(attributes: Mapping[str, str]) -> Settings | None:
         raise RequestError(str(error)) from None
     if not isinstance(values, dict):
         raise RequestError(f"found {values!r}")
+    if "stage_files" in values:
+        raise RequestError(
+            "it names stage files; code comes from --stage-file, never from an image"
+        )
     return settings_from(values)
 
 
@@ -95,11 +99,9 @@ def entries_of(kind: str, chain: Chain) -> str:
     """Where an image of a kind can enter a chain."""
     stages = {name: all_stages()[base_name(name)] for name in chain.names}
     names = [name for name, stage in stages.items() if stage.reads.label == kind]
-    return (
-        f"{kind} can enter with --start-at {' or '.join(names)}"
-        if names
-        else (f"no stage of the chain reads {kind}")
-    )
+    if not names:
+        return f"no stage of the chain reads {kind}"
+    return f"{kind} can enter with --start-at {' or '.join(names)}"
 
 
 def doubts(source: SourceImage, chain: Chain) -> list[str]:
@@ -118,16 +120,15 @@ def doubts(source: SourceImage, chain: Chain) -> list[str]:
             "a raw in DN enters with --start-at normalize"
         )
     if chain.source in (Kind.RAW, Kind.MOSAIC) and "settings" not in source.attributes:
-        given = chain.settings.parameters
-        if "pattern" not in given.get("mosaic", {}):
+        given = {
+            f"{step}.{name}" for step, table in chain.settings.parameters.items() for name in table
+        }
+        if "mosaic.pattern" not in given:
             pattern = chain.steps[0].context.pattern
             found.append(f"it does not say its pattern; {pattern} is taken (--set mosaic.pattern)")
-        if (
-            black is not None
-            and not {"black_level", "white_level"}
-            <= given.get("normalize", {}).keys() | given.get("quantize", {}).keys()
-        ):
-            white = getattr(first, "white_level", None)
+        levels = {"normalize.black_level", "normalize.white_level"}
+        if black is not None and not levels <= given:
+            white = getattr(first, "white_level", 1)
             found.append(
                 f"it does not say its levels; black {black:g} and white {white:g} are taken "
                 "(--set normalize.black_level, normalize.white_level)"
