@@ -195,9 +195,10 @@ def test_an_image_of_two_channels_is_no_mosaic(tmp_path):
 
 def test_settings_that_an_image_carries_may_be_of_no_use(kept, tmp_path):
     image = read_image(kept / "crop.denoise.exr")
-    for number, settings in enumerate(
-        ('{"iso": 1}', '{"nonsense": 1}', "{", "[1]", '{"camera": "x"}')
-    ):
+    (tmp_path / "evil.py").write_text("raise SystemExit(7)")
+    evil = json.dumps({"stage_files": [str(tmp_path / "evil.py")]})
+    useless = (evil, '{"iso": 1}', '{"nonsense": 1}', "{", "[1]", '{"camera": "x"}')
+    for number, settings in enumerate(useless):
         attributes = {**image.attributes, "settings": settings}
         path = tmp_path / f"{number}.exr"
         write_exr(path, image.pixels, ("R", "G", "B"), attributes)
