@@ -127,13 +127,15 @@ def bench_methods(
 
     A figure is the sum of the best times of a method's launches. A first launch that brings the
     image into planes, with what is pointwise in it, is not counted: in a chain the stage before
-    does that. The settings' parameters of the stage hold for every method that has them.
+    does that. The settings' parameters of the stage hold for every method that has them; where
+    they name a method, it alone is timed.
     """
     picture = scene(width, height).astype(np.float32)
     image = picture if len(stage.reads.channels) == 3 else np.ascontiguousarray(picture[..., 1])
     given = settings.parameters.get(stage.name, {})
     speeds = []
-    for method, choice in ((m, choice) for m in stage.methods for choice in variants(m)):
+    methods = [m for m in stage.methods if given.get("method", m.method) == m.method]
+    for method, choice in ((m, choice) for m in methods for choice in variants(m)):
         own = {name: value for name, value in given.items() if name in method.model_fields}
         table = {"method": method.method, **method.example, **own, **choice}
         alone = replace(settings, stages=(stage.name,), skip=(), parameters={stage.name: table})

@@ -202,9 +202,10 @@ def write_kernel(plan: Plan, launch: AnyLaunch, index: int, lanes: int) -> Kerne
     signature = ",\n    ".join(p.declaration for p in writer.parameters.values())
     size = 1 if isinstance(launch, Find) else LOCAL_SIZE
     setup = "".join(f"    {line}\n" for line in writer.setup)
+    # The hint keeps Intel's compiler from making vectors of our vectors, up to nine times slower.
     text += (
         f'#line 1 "{launch.name}"\n'
-        f"__kernel __attribute__((reqd_work_group_size({size}, 1, 1)))\n"
+        f"__kernel __attribute__((vec_type_hint(vf), reqd_work_group_size({size}, 1, 1)))\n"
         f"void {name}(\n    {signature})\n{{\n"
         f"    const extent e = {{width, height, pitch}};\n{setup}{body}}}\n"
     )

@@ -357,6 +357,9 @@ def test_bench_of_methods(clpipe):
     assert launches["bilinear"] == 1
     assert launches["edge_directed_median size=5"] == 3
     assert all(record["mp_per_s"] > 0 for record in records)
+    one = ("--set", "denoise.method=mean", "--set", "denoise.chroma_size=9", "--json")
+    records = json.loads(clpipe("bench", "--methods", "denoise", *options, *one).stdout)
+    assert [record["method"] for record in records] == ["mean luma_size=3 chroma_size=9"]
     assert "did you mean 'denoise'" in clpipe("bench", "--methods", "denoize", status=2).stderr
 
 
