@@ -336,8 +336,7 @@ def named_errors(name: str, method: type[Method]) -> Iterator[None]:
             stage = all_stages()[base_name(name)]
             having = [m for m, other in stage.by_name.items() if parameter in other.model_fields]
             if having:
-                message += f"; '{parameter}' is one of the method{'s' * (len(having) > 1)} "
-                message += " and ".join(having)
+                message += f"; '{parameter}' is a parameter of {' and '.join(having)}"
             raise KeyedError(key, message) from None
         reason = error["msg"].removeprefix("Value error, ").removeprefix("Input ")
         found = f" found {error['input']!r}:" if error["loc"] else ""

@@ -3,17 +3,14 @@
 Usage: .venv/bin/python tools/readme_picture.py
 """
 
-import tempfile
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from clpipe.batch import Job, Target, run_jobs
-from clpipe.config import make_chain, settings_from
-from clpipe.device import Device, choose, find_devices
+import clpipe
 from clpipe.image_io import read_image
-from clpipe.run import Runner
+from clpipe.types import Array
 
 ROOT = Path(__file__).resolve().parent.parent
 RENDER = ROOT / "tests" / "data" / "still_life.exr"
@@ -22,19 +19,10 @@ SCALE = 3
 ISOS = (800, 6400)
 
 
-def develop(folder: Path, device: Device, iso: float) -> Image.Image:
-    """The render through the camera at an ISO."""
-    pipeline = make_chain(settings_from({"iso": iso}))
-    job, target = Job(RENDER, RENDER.name), Target(folder, ("png",))
-    list(run_jobs([job], Runner(pipeline, device), target))
-    with Image.open(target.path(job, "png")) as image:
-        return image.convert("RGB")
-
-
-def plain(render: Path) -> Image.Image:
-    """The render as a viewer shows it: clipped, gamma 2.2."""
-    pixels = np.clip(read_image(render).pixels.astype(np.float32), 0, 1) ** (1 / 2.2)
-    return Image.fromarray(np.rint(pixels * 255).astype(np.uint8))
+def plain(pixels: Array) -> Array:
+    """Linear RGB as a viewer shows it: clipped, gamma 2.2, eight bits."""
+    encoded = np.clip(pixels.astype(np.float32), 0, 1) ** (1 / 2.2)
+    return np.rint(encoded * 255).astype(np.uint8)
 
 
 def sheet(columns: list[tuple[str, Image.Image]]) -> Image.Image:
@@ -57,13 +45,13 @@ def sheet(columns: list[tuple[str, Image.Image]]) -> Image.Image:
 
 def main() -> None:
     """Write the picture."""
-    device = Device(choose(None, find_devices()))
-    with tempfile.TemporaryDirectory() as folder:
-        columns = [("render, gamma 2.2", plain(RENDER))]
-        for iso in ISOS:
-            image = develop(Path(folder) / str(iso), device, iso)
-            columns.append((f"clpipe, ISO {iso}", image))
-        sheet(columns).save(ROOT / "docs" / "before_after.png", optimize=True)
+    render = read_image(RENDER).pixels
+    pictures = [("render, gamma 2.2", plain(render))]
+    for iso in ISOS:
+        shot = clpipe.Pipeline(iso=iso).process(render, RENDER.name)
+        pictures.append((f"clpipe, ISO {iso}", shot.image))
+    columns = [(caption, Image.fromarray(pixels)) for caption, pixels in pictures]
+    sheet(columns).save(ROOT / "docs" / "before_after.png", optimize=True)
 
 
 if __name__ == "__main__":
