@@ -105,7 +105,7 @@ def entries_of(kind: str, chain: Chain) -> str:
 
 
 def doubts(source: SourceImage, chain: Chain) -> list[str]:
-    """What looks wrong with a mosaic that enters, and what was taken for what it does not say."""
+    """What looks wrong with an image that enters, and what was taken for what it does not say."""
     first = chain.steps[0].method
     brightest = float(source.pixels.max())
     found: list[str] = []
@@ -119,7 +119,11 @@ def doubts(source: SourceImage, chain: Chain) -> list[str]:
             f"its largest sample is {brightest:g}, but 1 is the white level here; "
             "a raw in DN enters with --start-at normalize"
         )
-    if chain.source in (Kind.RAW, Kind.MOSAIC) and "settings" not in source.attributes:
+    if "settings" in source.attributes:
+        return found
+    if chain.settings.iso == Settings().iso and any(s.stage.name == "denoise" for s in chain.steps):
+        found.append(f"it does not say its ISO; {chain.settings.iso:g} is taken (--iso)")
+    if chain.source in (Kind.RAW, Kind.MOSAIC):
         given = {
             f"{step}.{name}" for step, table in chain.settings.parameters.items() for name in table
         }
