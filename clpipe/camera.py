@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from clpipe.errors import RequestError
 from clpipe.suggest import one_of
 
+DEFAULT_CAMERA = "sony-a7r2"
 Row = tuple[float, float, float]
 Matrix = tuple[Row, Row, Row]
 

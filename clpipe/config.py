@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from clpipe.camera import Camera, load_camera
+from clpipe.camera import DEFAULT_CAMERA, Camera, load_camera
 from clpipe.errors import RequestError
 from clpipe.registry import all_stages, blamed, check_passes, load_stage_file
 from clpipe.stage import Context, Kind, Method, Stage
@@ -25,7 +25,7 @@ KEYS = ("camera", "iso", "seed", "stages", "skip", "stage_files")
 class Settings:
     """A request as it was written, names checked but nothing resolved yet."""
 
-    camera: str = "sony-a7r2"
+    camera: str = DEFAULT_CAMERA
     iso: float = 100.0
     seed: int = 0
     stages: tuple[str, ...] = DEFAULT_CHAIN

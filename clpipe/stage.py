@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Self, get_args, get_origin
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
-from clpipe.camera import Camera, load_camera
+from clpipe.camera import DEFAULT_CAMERA, Camera, load_camera
 from clpipe.reference.cfa import PATTERNS, Pattern, red_site
 from clpipe.reference.curve import curve_index
 from clpipe.reference.random import Stream, stream_of
@@ -264,7 +264,7 @@ def alone(method: Method, image: Floats, iso: float = 100, pattern: Pattern = "R
 
     For examples and for trying things out; noise is that of the image key "".
     """
-    context = Context(load_camera("sony-a7r2"), iso, pattern)
+    context = Context(load_camera(DEFAULT_CAMERA), iso, pattern)
     resolved = method.resolve(context)
     stream = {owner: stream_of(owner.value, resolved.method) for owner in Owner}
     return resolved.reference(image, Frame(context, stream, {}))
