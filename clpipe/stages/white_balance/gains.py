@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.reference.cfa import by_site
+from clpipe.reference.cfa import Pattern, by_site
 from clpipe.stage import Argument, Context, Frame, Method, Pass, Unchanged, parameter
 from clpipe.types import Floats
 
@@ -17,9 +17,32 @@ def balanced(image: Floats, context: Context, red: np.float32, blue: np.float32)
     return np.minimum(image * gains, np.float32(1))
 
 
-def with_expected_gains(context: Context) -> Context:
-    """What is known after gains that are only found in the image: the best guess is as shot."""
-    return replace(context, applied_gains=context.gains)
+class FoundGains(Method):
+    """Gains that are found in the image itself. Subclasses say how."""
+
+    tolerance: ClassVar = 1e-6  # of the gains: division is not exact on every device
+
+    def after(self, context: Context) -> Context:
+        # What the image will ask for is not known yet; the gains as shot are the best guess.
+        return replace(context, applied_gains=context.gains)
+
+    def search(self) -> Pass:
+        """The pass that finds "red_gain" and "blue_gain"."""
+        raise NotImplementedError(type(self).__name__)
+
+    def gains(self, image: Floats, pattern: Pattern) -> tuple[np.float32, np.float32]:
+        """The gains of red and blue for a (height, width) mosaic."""
+        raise NotImplementedError(type(self).__name__)
+
+    def passes(self) -> tuple[Pass, ...]:
+        search = self.search()
+        apply = Pass("white_balance", arguments=("pattern", *search.found), cheap=True)
+        return search, apply
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        red, blue = self.gains(image, frame.context.pattern)
+        frame.found["red_gain"], frame.found["blue_gain"] = float(red), float(blue)
+        return balanced(image, frame.context, red, blue)
 
 
 class AsShot(Method):

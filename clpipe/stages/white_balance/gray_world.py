@@ -6,12 +6,12 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.reference.cfa import Pattern, by_site
-from clpipe.stage import Access, Argument, Context, Frame, Method, Pass
-from clpipe.stages.white_balance.gains import balanced, with_expected_gains
+from clpipe.stage import Access, Argument, Context, Pass
+from clpipe.stages.white_balance.gains import FoundGains
 from clpipe.types import Floats
 
 
-class GrayWorld(Method):
+class GrayWorld(FoundGains):
     """k_c = mean(G) / mean(c) (Buchsbaum, J. Franklin Institute 1980).
 
     Samples are clipped to -1..1 and summed as integers in steps of 2^-20, so the sums are exact.
@@ -20,31 +20,21 @@ class GrayWorld(Method):
     method: ClassVar = "gray_world"
     kernel: ClassVar = "gray_world"
     summary: ClassVar = "make the means of the three colours equal"
-    tolerance: ClassVar = 1e-6  # of the gains: division is not exact on every device
 
-    def after(self, context: Context) -> Context:
-        return with_expected_gains(context)
-
-    def passes(self) -> tuple[Pass, ...]:
-        gains = ("red_gain", "blue_gain")
-        return (
-            Pass(
-                "gray_world_sample",
-                Access.SUMS,
-                finish="gray_world",
-                finish_arguments=("pattern",),
-                found=gains,
-            ),
-            Pass("white_balance", arguments=("pattern", *gains), cheap=True),
+    def search(self) -> Pass:
+        return Pass(
+            "gray_world_sample",
+            Access.SUMS,
+            finish="gray_world",
+            finish_arguments=("pattern",),
+            found=("red_gain", "blue_gain"),
         )
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"pattern": context.cfa}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        red, blue = gray_world_gains(image, frame.context.pattern)
-        frame.found["red_gain"], frame.found["blue_gain"] = float(red), float(blue)
-        return balanced(image, frame.context, red, blue)
+    def gains(self, image: Floats, pattern: Pattern) -> tuple[np.float32, np.float32]:
+        return gray_world_gains(image, pattern)
 
 
 def gray_world_gains(image: Floats, pattern: Pattern) -> tuple[np.float32, np.float32]:

@@ -6,8 +6,8 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.reference.cfa import Pattern, by_site
-from clpipe.stage import Access, Argument, Context, Frame, Method, Pass, parameter
-from clpipe.stages.white_balance.gains import balanced, with_expected_gains
+from clpipe.stage import Access, Argument, Context, Pass, parameter
+from clpipe.stages.white_balance.gains import FoundGains
 from clpipe.types import Floats
 
 STEPS = 6144  # bins a colour: 12 octaves below 1, 512 each
@@ -41,7 +41,7 @@ def percentile_level(samples: Floats, millionths: int) -> np.float32:
     return np.int32(_FIRST + (bin_ << 14) + (1 << 13)).view(np.float32)
 
 
-class WhitePatch(Method):
+class WhitePatch(FoundGains):
     """k_c = max(G) / max(c), the maximum as a percentile (Land and McCann, J. Opt. Soc. Am. 1971).
 
     Cells of 2x2 samples that clip are left out: of a burnt-out light nothing is known but that it
@@ -51,7 +51,6 @@ class WhitePatch(Method):
     method: ClassVar = "white_patch"
     kernel: ClassVar = "white_patch"
     summary: ClassVar = "make the brightest samples that do not clip equal"
-    tolerance: ClassVar = 1e-6  # of the gains: division is not exact on every device
 
     percentile: float = parameter(
         99.0, "Share of a colour's samples that are darker than its white.", "%", gt=0, le=100
@@ -68,22 +67,15 @@ class WhitePatch(Method):
     def _millionths(self) -> int:
         return max(1, round(self.percentile * 10_000))
 
-    def after(self, context: Context) -> Context:
-        return with_expected_gains(context)
-
-    def passes(self) -> tuple[Pass, ...]:
-        gains = ("red_gain", "blue_gain")
-        return (
-            Pass(
-                "white_patch_bin",
-                Access.HISTOGRAM,
-                ("pattern", "clip"),
-                finish="white_patch",
-                finish_arguments=("millionths",),
-                found=gains,
-                bins=3 * STEPS,
-            ),
-            Pass("white_balance", arguments=("pattern", *gains), cheap=True),
+    def search(self) -> Pass:
+        return Pass(
+            "white_patch_bin",
+            Access.HISTOGRAM,
+            ("pattern", "clip"),
+            finish="white_patch",
+            finish_arguments=("millionths",),
+            found=("red_gain", "blue_gain"),
+            bins=3 * STEPS,
         )
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
@@ -93,12 +85,8 @@ class WhitePatch(Method):
             "millionths": np.uint32(self._millionths),
         }
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        red, blue = white_patch_gains(
-            image, frame.context.pattern, np.float32(self.clip), self._millionths
-        )
-        frame.found["red_gain"], frame.found["blue_gain"] = float(red), float(blue)
-        return balanced(image, frame.context, red, blue)
+    def gains(self, image: Floats, pattern: Pattern) -> tuple[np.float32, np.float32]:
+        return white_patch_gains(image, pattern, np.float32(self.clip), self._millionths)
 
 
 def white_patch_gains(
