@@ -179,7 +179,9 @@ def write_kernel(plan: Plan, launch: AnyLaunch, index: int, lanes: int) -> Kerne
         writer.parameter(dimension, "uint", "extent", item=dimension)
     seen: set[str] = set()
     left = apron_left(plan.apron, lanes)
+    columns = launch.columns if isinstance(launch, Launch) else 1
     text = f"#define LANES {lanes}\n#define APRON {plan.apron}\n#define APRON_LEFT {left}\n"
+    text += f"#define COLUMNS {columns}\n"
     text += files_text([f"lib/{part}.h" for part in LIBRARY], seen)
     match launch:
         case Launch():

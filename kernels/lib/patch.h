@@ -1,11 +1,11 @@
-// What non-local means over 3x3 patches share: a block of 4 rows and COLUMNS vectors at once. Columns
-// of three squared differences are written down once, and added up across from wherever a patch
-// begins. The first patch begins a pixel to the left of the block and the last one ends a pixel to
-// its right, so there are more columns of differences than of pixels.
+// What non-local means over 3x3 patches share: a block of 4 rows and COLUMNS vectors at once, which
+// is the block that the pass declares. Columns of three squared differences are written down once,
+// and added up across from wherever a patch begins. The first patch begins a pixel to the left of
+// the block and the last one ends a pixel to its right, so there are more columns of differences
+// than of pixels.
 #ifndef CLPIPE_PATCH_H
 #define CLPIPE_PATCH_H
 
-#define COLUMNS 4
 #define WITH_MARGIN (LANES == 1 ? COLUMNS + 2 : COLUMNS + 1)
 
 INLINE vf across(const float *down) { return unspill(down) + unspill(down + 1) + unspill(down + 2); }
