@@ -1,6 +1,7 @@
 """Cameras: what a sensor does at an ISO, from a small TOML file with the source of every number."""
 
 import tomllib
+from functools import cached_property
 from importlib import resources
 from pathlib import Path
 from typing import Annotated
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from clpipe.errors import RequestError
+from clpipe.noise_model import NoiseModel
 from clpipe.suggest import one_of
 
 DEFAULT_CAMERA = "sony-a7r2"
@@ -26,6 +28,8 @@ SRGB_TO_XYZ = np.array(
 )
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=0.1)]
 
 
 class GainStage(BaseModel):
@@ -35,31 +39,75 @@ class GainStage(BaseModel):
 
     iso: Annotated[tuple[Positive, ...], Field(min_length=1)]
     system_gain: tuple[Positive, ...]  # DN/e-
-    read_noise: tuple[Positive, ...]  # DN
+    read_noise: tuple[Positive, ...]  # DN, of a pixel, before it is rounded to whole DN
+    row_noise: tuple[NotNegative, ...] | None = None  # DN, new in each frame
+    column_noise: tuple[NotNegative, ...] | None = None  # DN, fixed
 
     @model_validator(mode="after")
     def _aligned(self) -> "GainStage":
-        if not len(self.iso) == len(self.system_gain) == len(self.read_noise):
-            raise ValueError("iso, system_gain and read_noise must be equally long")
+        for name in ("system_gain", "read_noise", "row_noise", "column_noise"):
+            values = getattr(self, name)
+            if values is not None and len(values) != len(self.iso):
+                raise ValueError(
+                    f"{name} must be as long as iso; found {len(values)} and {len(self.iso)}"
+                )
         if list(self.iso) != sorted(set(self.iso)):
             raise ValueError("iso must ascend")
         return self
 
+    def at(self, iso: float, values: tuple[float, ...]) -> float:
+        """One of its tables in DN at an ISO, interpolated in electrons, linearly in log ISO.
+
+        Before the first and after the last ISO, electrons stay what they are there.
+        """
+        electrons = np.interp(np.log(iso), np.log(self.iso), np.divide(values, self.system_gain))
+        return float(electrons) * self.gain_at(iso)
+
+    def gain_at(self, iso: float) -> float:
+        """The system gain in DN/e-, interpolated in proportion to the ISO."""
+        per_iso = np.divide(self.system_gain, self.iso)
+        return float(np.interp(np.log(iso), np.log(self.iso), per_iso)) * iso
+
+    @cached_property
+    def adc_noise(self) -> float:
+        """The part of the read noise that arises after the gain, in DN; never above the least one.
+
+        Least squares of read_noise^2 = gain^2 * before^2 + after^2, each ISO by its own figure
+        (EMVA 1288); 0 where fewer than three ISOs leave it open.
+        """
+        if len(self.iso) < 3:
+            return 0.0
+        read2 = np.square(self.read_noise)
+        terms = np.stack([np.square(self.system_gain) / read2, 1 / read2], axis=1)
+        _, after2 = np.linalg.lstsq(terms, np.ones(len(read2)))[0]
+        return float(np.sqrt(np.clip(after2, 0, read2.min())))
+
 
 class Camera(BaseModel):
-    """A camera profile. Levels and read noise in DN, gains with green = 1."""
+    """A camera profile. Levels in DN, gains with green = 1.
+
+    What is None or 0 is either so or not known; ``sources`` says which, and where each figure is
+    from.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     make: str
     model: str
-    black_level: Annotated[float, Field(ge=0)]
-    white_level: Positive
+    black_level: Annotated[float, Field(ge=0, le=65535)]
+    white_level: Annotated[float, Field(gt=0, le=65535)]
     white_balance_gains: tuple[Positive, Positive]  # red, blue
     xyz_to_camera: Matrix | None = None  # XYZ to camera RGB at D65, as a DNG's ColorMatrix2
-    row_noise_ratio: Annotated[float, Field(ge=0)]  # row sigma over read noise sigma
-    column_noise_ratio: Annotated[float, Field(ge=0)]
+    row_noise_ratio: NotNegative = 0.0  # row sigma over read noise, where there is no table
+    column_noise_ratio: NotNegative = 0.0
+    full_well: Positive | None = None  # e-; None: the ADC clips first
+    tukey_lambda: Annotated[float, Field(gt=-0.5, le=1)] | None = None  # None: Gaussian
+    prnu: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # standard deviation over mean
+    dsnu: NotNegative = 0.0  # e-
+    hot_pixel_share: Share = 0.0
+    hot_pixel_level: NotNegative = 0.0  # e-, least extra charge of a hot pixel
+    dead_pixel_share: Share = 0.0
     iso_range: tuple[Positive, Positive]
     gain_stages: Annotated[tuple[GainStage, ...], Field(min_length=1)]
     sources: dict[str, str]
@@ -70,7 +118,27 @@ class Camera(BaseModel):
             raise ValueError("white_level must be above black_level")
         if self.xyz_to_camera and abs(np.linalg.det(self.xyz_to_camera)) < 1e-6:
             raise ValueError("xyz_to_camera is singular")
+        low, high = self.iso_range
+        if low > high:
+            raise ValueError(f"iso_range must ascend; found {low:g} and {high:g}")
+        isos = [iso for stage in self.gain_stages for iso in stage.iso]
+        if isos != sorted(set(isos)):
+            raise ValueError("gain_stages must ascend in iso and not overlap")
+        if high < isos[0]:
+            raise ValueError(
+                f"iso_range ends at {high:g}, before the first gain stage, {isos[0]:g}"
+            )
         return self
+
+    @property
+    def signal_range(self) -> float:
+        """The white level above black, in DN."""
+        return self.white_level - self.black_level
+
+    @property
+    def bits(self) -> int:
+        """The bit depth that its white level needs."""
+        return int(self.white_level).bit_length()
 
     def srgb_to_camera(self) -> NDArray[np.float64]:
         """The matrix from linear sRGB to white-balanced camera RGB; a grey stays what it is.
@@ -86,13 +154,50 @@ class Camera(BaseModel):
         matrix = np.array(self.xyz_to_camera) @ SRGB_TO_XYZ
         return matrix / matrix.sum(1, keepdims=True)
 
-    def noise(self, iso: float) -> tuple[float, float]:
-        """The a and b of Var[y] = a*y + b at an ISO, in signal units (y = 1 at the white level).
+    def noise(self, iso: float) -> NoiseModel:
+        """Shot and read noise at an ISO: a = K / range, b = (read noise / range)^2 (EMVA 1288).
 
-        a = K / range and b = (read noise / range)^2, K the system gain in DN/e- (EMVA 1288).
-        Between the ISOs of a gain stage, K is interpolated in proportion to the ISO and read noise
-        in electrons linearly in log ISO; a gain stage holds until the next one begins.
+        Between the ISOs of a gain stage, the system gain K is interpolated in proportion to the ISO
+        and read noise in electrons linearly in log ISO; a gain stage holds until the next begins.
         Beyond the last measured ISO, K goes on in proportion and read noise stays in electrons.
+
+        Raises:
+            RequestError: the ISO is outside the camera's range.
+        """
+        stage = self.gain_stage(iso)
+        unit = self.signal_range
+        gain, read_noise = stage.gain_at(iso), stage.at(iso, stage.read_noise)
+        base = self.gain_stages[0].gain_at(self.iso_range[0])
+        return NoiseModel(
+            a=gain / unit,
+            b=(read_noise / unit) ** 2,
+            signal_range=unit,
+            after=min(stage.adc_noise, read_noise) ** 2 / unit**2,
+            theta=gain / base,
+        )
+
+    def row_noise(self, iso: float) -> float:
+        """Standard deviation of the offsets that rows share, signal units; errors as ``noise``."""
+        stage = self.gain_stage(iso)
+        return self._line_noise(iso, stage, stage.row_noise, self.row_noise_ratio)
+
+    def column_noise(self, iso: float) -> float:
+        """Standard deviation of the offsets that columns share, as ``row_noise``."""
+        stage = self.gain_stage(iso)
+        return self._line_noise(iso, stage, stage.column_noise, self.column_noise_ratio)
+
+    def _line_noise(
+        self, iso: float, stage: GainStage, table: tuple[float, ...] | None, ratio: float
+    ) -> float:
+        dn = stage.at(iso, table) if table else ratio * stage.at(iso, stage.read_noise)
+        return dn / self.signal_range
+
+    def signal_of(self, electrons: float, iso: float) -> float:
+        """What a charge in e- is worth at an ISO, in signal units; errors as ``noise``."""
+        return electrons * self.noise(iso).a
+
+    def gain_stage(self, iso: float) -> GainStage:
+        """The gain stage that an ISO belongs to: the last one that begins at or below it.
 
         Raises:
             RequestError: the ISO is outside the camera's range.
@@ -102,12 +207,8 @@ class Camera(BaseModel):
             raise RequestError(
                 f"iso: found {iso:g}, but camera {self.name} goes from {low:g} to {high:g}"
             )
-        stage = [s for s in self.gain_stages if s.iso[0] <= iso or s is self.gain_stages[0]][-1]
-        log_iso = np.log(stage.iso)
-        gain = np.interp(np.log(iso), log_iso, np.divide(stage.system_gain, stage.iso)) * iso
-        electrons = np.interp(np.log(iso), log_iso, np.divide(stage.read_noise, stage.system_gain))
-        signal_range = self.white_level - self.black_level
-        return float(gain / signal_range), float((electrons * gain / signal_range) ** 2)
+        begun = [s for s in self.gain_stages if s.iso[0] <= iso]
+        return begun[-1] if begun else self.gain_stages[0]
 
 
 def built_in_cameras() -> dict[str, Path]:

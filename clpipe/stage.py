@@ -113,6 +113,13 @@ class Context:
     black_level: float | None = None  # DN, as quantize used them
     white_level: float | None = None
 
+    def known_noise(self) -> tuple[float, float]:
+        """The a and b of the sensor noise: as they were used, else as the camera has them."""
+        if self.noise:
+            return self.noise
+        model = self.camera.noise(self.iso)
+        return model.a, model.b
+
     @property
     def cfa(self) -> Literal:
         """The pattern as a compiled-in kernel argument."""

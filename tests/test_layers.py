@@ -9,7 +9,7 @@ from tests.conftest import ROOT
 PACKAGE = ROOT / "clpipe"
 # Lower ones first; a module imports only from lower levels.
 LEVELS = [
-    {"errors", "types", "suggest"},
+    {"errors", "types", "suggest", "noise_model"},
     {"reference"},
     {"camera"},
     {"stage"},

@@ -79,7 +79,7 @@ class NonLocalMeans(Method):
     def resolve(self, context: Context) -> "NonLocalMeans":
         if self.a is not None and self.b is not None:
             return self
-        a, b = context.noise or context.camera.noise(context.iso)
+        a, b = context.known_noise()
         return self.filled(a=a, b=b)
 
     @property

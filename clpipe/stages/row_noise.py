@@ -38,7 +38,7 @@ class Gaussian(Method):
         None,
         "Standard deviation of the offsets.",
         "signal",
-        "row_noise_ratio of the camera times its read noise",
+        "from the camera and ISO",
         ge=0,
         le=1,
     )
@@ -46,8 +46,7 @@ class Gaussian(Method):
     def resolve(self, context: Context) -> "Gaussian":
         if self.sigma is not None:
             return self
-        _, b = context.camera.noise(context.iso)
-        return self.filled(sigma=context.camera.row_noise_ratio * b**0.5)
+        return self.filled(sigma=context.camera.row_noise(context.iso))
 
     def passes(self) -> tuple[Pass, ...]:
         return (

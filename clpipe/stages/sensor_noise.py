@@ -54,8 +54,8 @@ class Gaussian(Method):
     def resolve(self, context: Context) -> "Gaussian":
         if self.a is not None and self.b is not None:
             return self
-        a, b = context.camera.noise(context.iso)
-        return self.filled(a=a, b=b)
+        model = context.camera.noise(context.iso)
+        return self.filled(a=model.a, b=model.b)
 
     def after(self, context: Context) -> Context:
         assert self.a is not None and self.b is not None

@@ -44,7 +44,7 @@ def noise_of_colours(context: Context) -> tuple[Variance, Variance, Variance]:
     Grey of level v is v/k at a colour with gain k; its variance there, a*v/k + b, comes out k^2
     times as large. Noise that demosaicing takes away is not counted.
     """
-    a, b = context.noise or context.camera.noise(context.iso)
+    a, b = context.known_noise()
     red, blue = context.applied_gains
     one, two, three = (Variance(a * k, b * k * k) for k in (red, 1.0, blue))
     return one, two, three
@@ -72,7 +72,7 @@ def predicted_noise(context: Context) -> tuple[float, float]:
 
 def explain(context: Context) -> str:
     """The law in a few lines, with the numbers of a context."""
-    a, b = context.noise or context.camera.noise(context.iso)
+    a, b = context.known_noise()
     red, blue = context.applied_gains
     sigmas = [sqrt(colour.at(MID_GREY)) for colour in noise_of_colours(context)]
     luma, chroma = predicted_noise(context)
