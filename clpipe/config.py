@@ -4,7 +4,7 @@ import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from clpipe.camera import DEFAULT_CAMERA, Camera, load_camera
 from clpipe.errors import RequestError
+from clpipe.noise_model import NoiseModel
 from clpipe.registry import all_stages, blamed, check_passes, load_stage_file
 from clpipe.stage import Context, Kind, Method, Stage
 from clpipe.stages import DEFAULT_CHAIN
@@ -73,6 +74,23 @@ class Chain:
     def result(self) -> Kind:
         """The kind of image that comes out."""
         return self.steps[-1].stage.writes if self.steps else self.source
+
+    @property
+    def noise(self) -> NoiseModel | None:
+        """The sensor noise in the image that comes out; None where none was added."""
+        last = self.steps[-1]
+        return last.method.after(last.context).noise
+
+    def clean(self) -> "Chain":
+        """The chain without the steps that draw random numbers; the others as they are.
+
+        Raises:
+            RequestError: no step does.
+        """
+        steps = tuple(s for s in self.steps if not any(p.random for p in s.method.passes()))
+        if len(steps) == len(self.steps):
+            raise RequestError("no stage of this chain adds noise; every frame would be the same")
+        return replace(self, steps=steps)
 
     def kept(self, names: Sequence[str]) -> tuple[str, ...]:
         """The names of steps to keep, each once; ``all`` is every one.

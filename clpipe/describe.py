@@ -5,12 +5,27 @@ import types
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+from clpipe.camera import Camera
 from clpipe.config import Chain, Settings, make_chain
 from clpipe.device import Found, choose
 from clpipe.errors import ClpipeError, DeviceError
 from clpipe.plan import AnyLaunch, Launch, Lines, Plan, launch_bytes, reads_of
 from clpipe.stage import Context, Method, Stage
 
+# What a camera has at every ISO, with units.
+FIXED = {
+    "black_level": "DN",
+    "white_level": "DN",
+    "bits": "",
+    "white_balance_gains": "red, blue",
+    "full_well": "e-",
+    "tukey_lambda": "",
+    "prnu": "",
+    "dsnu": "e-",
+    "hot_pixel_share": "",
+    "hot_pixel_level": "e-",
+    "dead_pixel_share": "",
+}
 LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 
@@ -213,6 +228,106 @@ def stage_record(stage: Stage, context: Context) -> dict[str, Any]:
             }
             for method in stage.methods
         ],
+    }
+
+
+def make_and_model(camera: Camera) -> str:
+    """What is written on a camera; some makers begin the model with their name."""
+    model, make = camera.model, camera.make
+    return model if model.startswith(make) else f"{make} {model}"
+
+
+def camera_row(camera: Camera) -> tuple[str, ...]:
+    """A camera in a line: name, make and model, ISOs, where its gain stages begin."""
+    stages = ", ".join(f"{stage.iso[0]:g}" for stage in camera.gain_stages)
+    low, high = camera.iso_range
+    return camera.name, make_and_model(camera), f"{low:g} to {high:g}", stages
+
+
+Rows = list[tuple[str, ...]]
+
+
+def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[str, ...], Rows]]:
+    """A camera's noise at an ISO, or at all that were measured, as titles, headings and rows.
+
+    Raises:
+        RequestError: the camera has not that ISO.
+    """
+    isos = [iso] if iso else [i for stage in camera.gain_stages for i in stage.iso]
+    signal: Rows = []
+    paper: Rows = []
+    for i in isos:
+        record = noise_at(camera, i)
+        emva, lines = record["emva1288"].values(), (record["row_noise"], record["column_noise"])
+        signal.append(figures(i, *record["signal"].values(), *emva, *lines))
+        paper.append(figures(i, *record["paper"].values()))
+    return [
+        (
+            f"{make_and_model(camera)}: Var[y] = a*y + b, y = 1 at the white level; EMVA 1288",
+            (
+                "ISO",
+                "a",
+                "b",
+                "system_gain",
+                "read_noise",
+                "adc_noise",
+                "row_noise",
+                "column_noise",
+            ),
+            [("", "", "", "DN/e-", "e-", "DN", "DN", "DN"), *signal],
+        ),
+        (
+            "The paper's: a = theta/chi, b = theta^2 b' + b'' - theta^2 p0/chi",
+            ("ISO", "chi", "theta", "b'", "b''", "p0"),
+            paper,
+        ),
+        (
+            "At every ISO",
+            ("", "found", "unit"),
+            [
+                (key, short_text(value) if value is not None else "none known", unit)
+                for key, unit in FIXED.items()
+                for value in (getattr(camera, key),)
+            ],
+        ),
+    ]
+
+
+def figures(iso: float, *values: float) -> tuple[str, ...]:
+    """An ISO, and numbers with four digits."""
+    return (f"{iso:g}", *(f"{value:.4g}" for value in values))
+
+
+def noise_at(camera: Camera, iso: float) -> dict[str, Any]:
+    """Noise at an ISO in all three ways, and that of rows and columns in DN, as JSON values.
+
+    Raises:
+        RequestError: the camera has not that ISO.
+    """
+    unit = camera.signal_range
+    return {
+        "iso": iso,
+        **camera.noise(iso).record(),
+        "row_noise": camera.row_noise(iso) * unit,
+        "column_noise": camera.column_noise(iso) * unit,
+    }
+
+
+def camera_record(camera: Camera, iso: float | None = None) -> dict[str, Any]:
+    """A camera as JSON values, with its noise at an ISO or at all that were measured.
+
+    Raises:
+        RequestError: the camera has not that ISO.
+    """
+    isos = [iso] if iso else [i for stage in camera.gain_stages for i in stage.iso]
+    return {
+        "name": camera.name,
+        "make": camera.make,
+        "model": camera.model,
+        "iso_range": camera.iso_range,
+        **{key: getattr(camera, key) for key in FIXED},
+        "noise": [noise_at(camera, i) for i in isos],
+        "sources": camera.sources,
     }
 
 
