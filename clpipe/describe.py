@@ -154,6 +154,8 @@ def toml_text(chain: Chain) -> str:
         given = settings.parameters.get(step.name, {})
         for name, field in type(step.method).model_fields.items():
             extra: Any = field.json_schema_extra
+            if getattr(step.method, name) is None:
+                continue
             line = f"{name} = {value_text(getattr(step.method, name))}"
             if name not in given and field.default is None:
                 line = f"# {line}  # automatic: {extra['auto']}"
@@ -184,6 +186,8 @@ def short_text(value: Any) -> str:
     """
     if isinstance(value, tuple):
         return f"[{', '.join(map(short_text, value))}]"
+    if value is None:
+        return "none"
     plain = not isinstance(value, float) or value.is_integer()
     return value_text(value) if plain else f"{value:.4g}"
 
