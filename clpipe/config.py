@@ -87,10 +87,11 @@ class Chain:
         Raises:
             RequestError: no step does.
         """
-        steps = tuple(s for s in self.steps if not any(p.random for p in s.method.passes()))
+        steps = [s for s in self.steps if not any(p.random for p in s.method.passes())]
         if len(steps) == len(self.steps):
             raise RequestError("no stage of this chain adds noise; every frame would be the same")
-        return replace(self, steps=steps)
+        quiet = (replace(s, context=replace(s.context, noise=None)) for s in steps)
+        return replace(self, steps=tuple(quiet))
 
     def kept(self, names: Sequence[str]) -> tuple[str, ...]:
         """The names of steps to keep, each once; ``all`` is every one.
