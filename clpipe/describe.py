@@ -107,7 +107,10 @@ def type_text(annotation: Any) -> str:
     if get_origin(annotation) is Annotated:
         return type_text(get_args(annotation)[0])
     if get_origin(annotation) is tuple:
-        return f"{len(get_args(annotation))} x {type_text(get_args(annotation)[0])}"
+        first, *more = get_args(annotation)
+        if Ellipsis in more:
+            return f"list of {type_text(first)}s"
+        return f"{1 + len(more)} x {type_text(first)}"
     if get_origin(annotation) in (Union, types.UnionType):
         return " | ".join(type_text(a) for a in get_args(annotation) if a is not type(None))
     return {"float": "number", "int": "whole number"}.get(annotation.__name__, annotation.__name__)
@@ -160,7 +163,7 @@ def resolved(method: type[Method], context: Context) -> dict[str, str]:
     return {
         name: short_text(getattr(values, name))
         for name, field in method.model_fields.items()
-        if field.default is None
+        if field.default is None and name not in method.example
     }
 
 

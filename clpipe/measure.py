@@ -237,7 +237,10 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> Report:
     if not start.any():
         raise nothing_counts(first)
     span = clean[start]
-    edges = bin_edges(float(span.min()), float(span.max()), first.kind != "display")
+    low, high = float(span.min()), float(span.max())
+    if high > 0:  # what overshoots black is in the first bin, else the shadows had but a few
+        low = max(low, 0.0)
+    edges = bin_edges(low, high, first.kind != "display")
     parts = mosaic_channels if clean.ndim == 2 else picture_channels
     share, channels, correlations = parts(first, clean, noise, clipped, start, edges, freedom)
     return Report(

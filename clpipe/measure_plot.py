@@ -10,7 +10,7 @@ from matplotlib.image import AxesImage
 
 from clpipe.image_io import write_beside
 from clpipe.measure import UNITS, Report
-from clpipe.statistics import HISTOGRAM, LAGS, Channel
+from clpipe.statistics import HISTOGRAM, LAGS, Channel, gaussian_beyond
 
 INK = {
     "R": "#c8102e",
@@ -33,7 +33,7 @@ def draw(report: Report, path: Path) -> None:
     Raises:
         ImageError: the file cannot be written.
     """
-    figure = Figure(figsize=(16, 10.5), dpi=100, layout="constrained")
+    figure = Figure(figsize=(16, 11), dpi=100, layout="constrained")
     grid = figure.add_gridspec(2, 1, height_ratios=(1.15, 1))
     above, below = figure.add_subfigure(grid[0]), figure.add_subfigure(grid[1])
     intensity, tails = above.subplots(1, 2)
@@ -48,15 +48,22 @@ def draw(report: Report, path: Path) -> None:
     for axis, one in zip(axes, shown, strict=True):
         picture = draw_autocorrelation(axis, one, limit, report)
     below.colorbar(picture, ax=axes, shrink=0.85, label="correlation (lag 0 is 1)")
-    images = len(report.images)
-    figure.suptitle(
-        f"Noise of {Path(report.images[0]).name}{f' and {images - 1} more' if images > 1 else ''}"
-        f" against {Path(report.truth).name if report.truth else 'their mean'}"
-        f" ({report.share:.0%} of the {report.kind} pixels count)",
-        fontsize=15,
-    )
+    first, *more = report.images
+    of = short_name(first) + (f" and {len(more)} more" if more else "")
+    against = short_name(report.truth) if report.truth else "their mean"
+    title = f"Noise of {of} against {against} ({report.kind}, {report.share:.0%} of it counts)"
+    figure.suptitle(title, fontsize=15)
     FigureCanvasAgg(figure)
     write_beside(path, figure.savefig)
+
+
+def short_name(path: str) -> str:
+    """The end of a path: the file and its folder, which tell truth and noisy image apart.
+
+    >>> short_name("a/b/c.exr")
+    'b/c.exr'
+    """
+    return "/".join(Path(path).parts[-2:])
 
 
 def peak(one: Channel) -> float:
@@ -94,27 +101,24 @@ def draw_intensity(axes: Axes, report: Report) -> None:
 
 
 def draw_tails(axes: Axes, report: Report) -> None:
-    """The distribution of standardised noise on a logarithmic scale, over a Gaussian."""
-    middle = (HISTOGRAM[1:] + HISTOGRAM[:-1]) / 2
-    width = HISTOGRAM[1] - HISTOGRAM[0]
-    axes.fill_between(
-        middle,
-        np.exp(-(middle**2) / 2) / np.sqrt(2 * np.pi),
-        1e-12,
-        color="0.85",
-        label="Gaussian",
-    )
-    floor = 1.0
+    """The share of standardised noise beyond each value, on its side of 0, over a Gaussian's."""
+    beyond = [gaussian_beyond(abs(z)) / 2 for z in HISTOGRAM]
+    axes.fill_between(HISTOGRAM, beyond, 1e-12, color="0.85", label="Gaussian")
     for one in report.channels:
-        counts = one.tails.histogram
-        density = np.where(counts > 0, counts / (one.count * width), np.nan)
-        floor = min(floor, 1 / (one.count * width))
-        axes.plot(middle, density, color=INK[one.name], linewidth=1.5, label=one.name)
+        below = np.concatenate([[0], np.cumsum(one.tails.histogram)]) / one.count
+        share = np.minimum(below, 1 - below)
+        axes.plot(
+            HISTOGRAM,
+            np.where(share * one.count > 0.5, share, np.nan),
+            color=INK[one.name],
+            linewidth=1.5,
+            label=one.name,
+        )
     axes.set_yscale("log")
-    axes.set_ylim(floor / 2, 1)
+    axes.set_ylim(0.3 / max(one.count for one in report.channels), 0.7)
     axes.set_xlim(-6, 6)
     axes.set_xlabel("noise / its sigma at that intensity", fontsize=12)
-    axes.set_ylabel("density", fontsize=12)
+    axes.set_ylabel("share of samples further out", fontsize=12)
     axes.set_title("Tails", fontsize=13)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=12)

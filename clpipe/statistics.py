@@ -19,7 +19,7 @@ Mask = NDArray[np.bool_]
 
 LAGS = 8
 BINS = 24
-FEWEST = 30  # samples, below which a bin's sigma is worth nothing
+FEWEST = 100  # samples, below which a bin's sigma is worth nothing
 CLIPPED = 1e-3  # share of a bin's samples from which clipping bends its statistics
 WINDOW = 5  # pixels, in which a flat place has to be flat
 FLATTEST = 0.25  # share of a picture that counts as flat whatever its noise
@@ -64,7 +64,7 @@ class Tails:
     skewness: float
     excess_kurtosis: float
     beyond: tuple[float, ...]  # share of samples further from 0 than each of SIGMAS
-    histogram: NDArray[np.int64]  # counts between the edges of HISTOGRAM
+    histogram: NDArray[np.int64]  # counts between HISTOGRAM's edges; the end bins take the rest
 
 
 @dataclass(frozen=True)
@@ -312,7 +312,7 @@ def energy_left(standard: Floats, mask: Mask) -> float:
 def tails(standard: Floats, mask: Mask) -> Tails:
     """The distribution of standardised noise: third and fourth moment, far samples, histogram."""
     values = standard[:, mask].astype(np.float64).ravel()
-    histogram = np.histogram(values, HISTOGRAM)[0]
+    histogram = np.histogram(values.clip(HISTOGRAM[0], HISTOGRAM[-1]), HISTOGRAM)[0]
     if not values.any():
         return Tails(math.nan, math.nan, (math.nan,) * len(SIGMAS), histogram)
     beyond = tuple(float((np.abs(values) > k).mean()) for k in SIGMAS)

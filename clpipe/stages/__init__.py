@@ -21,6 +21,7 @@ DEFAULT_CHAIN = (
     "color_matrix",
     "tone_curve",
     "gamma",
+    "picture_noise",
 )
 
 
