@@ -308,7 +308,7 @@ def picture_channels(
     names = (*Kind.RGB.channels, *Kind.YCBCR.channels)
     channels, standards = [], {}
     for i, (name, plane) in enumerate(zip(names, planes, strict=True)):
-        curve, without, standard = by_intensity(plane, noises[..., i], mask, edges)
+        curve, without, standard = by_intensity(plane, noises[..., i], mask, edges, 1 - freedom)
         lawful = first.kind == "rgb" and name in Kind.RGB.channels
         channels.append(channel(name, curve, without, standard, mask, lawful, freedom))
         standards[name] = standard
@@ -338,7 +338,9 @@ def mosaic_channels(
         mask = unclipped(clean[at], clipped[at], edges, start[at])
         if not mask.any():
             raise nothing_counts(first, f" at the sites of {name}")
-        curve, without[at], standard[at] = by_intensity(clean[at], noise[at], mask, edges)
+        curve, without[at], standard[at] = by_intensity(
+            clean[at], noise[at], mask, edges, 1 - freedom
+        )
         whole_mask[at] = mask
         curves.append(curve)
         channels.append(channel(name, curve, without[at], standard[at], mask, True, freedom))
