@@ -29,6 +29,7 @@ from clpipe.statistics import (
     correlation,
     flat,
     gaussian_beyond,
+    pairs_of,
     pooled,
     unclipped,
 )
@@ -306,14 +307,15 @@ def picture_channels(
     planes = [clean[..., 0], clean[..., 1], clean[..., 2], luma, luma, luma]
     noises = np.concatenate([noise, rgb_to_ycbcr(noise)], axis=-1)
     names = (*Kind.RGB.channels, *Kind.YCBCR.channels)
+    pairs = pairs_of(mask)
     channels, standards = [], {}
     for i, (name, plane) in enumerate(zip(names, planes, strict=True)):
         curve, without, standard = by_intensity(plane, noises[..., i], mask, edges, 1 - freedom)
         lawful = first.kind == "rgb" and name in Kind.RGB.channels
-        channels.append(channel(name, curve, without, standard, mask, lawful, freedom))
+        channels.append(channel(name, curve, without, standard, mask, pairs, lawful, freedom))
         standards[name] = standard
-    pairs = [*combinations(Kind.RGB.channels, 2), *combinations(Kind.YCBCR.channels, 2)]
-    correlations = {(a, b): correlation(standards[a], standards[b], mask) for a, b in pairs}
+    both = [*combinations(Kind.RGB.channels, 2), *combinations(Kind.YCBCR.channels, 2)]
+    correlations = {(a, b): correlation(standards[a], standards[b], mask) for a, b in both}
     return float(mask.mean()), tuple(channels), correlations
 
 
@@ -343,9 +345,11 @@ def mosaic_channels(
         )
         whole_mask[at] = mask
         curves.append(curve)
-        channels.append(channel(name, curve, without[at], standard[at], mask, True, freedom))
+        pairs = pairs_of(mask)
+        channels.append(channel(name, curve, without[at], standard[at], mask, pairs, True, freedom))
     everything = pooled(curves)
-    channels.append(channel(WHOLE, everything, without, standard, whole_mask, True, freedom))
+    pairs = pairs_of(whole_mask)
+    channels.append(channel(WHOLE, everything, without, standard, whole_mask, pairs, True, freedom))
     correlations = {}
     for a, b in combinations(SITES, 2):
         both = whole_mask[slices[a]] & whole_mask[slices[b]]

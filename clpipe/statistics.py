@@ -272,26 +272,40 @@ def fit_law(curve: Curve, independent: float = 1.0) -> Law | None:
     return Law(float(a), float(b), float(errors[0]), float(errors[1]))
 
 
-def autocorrelation(standard: Floats, mask: Mask) -> Doubles:
+def lag_sums(planes: NDArray[np.floating[Any]]) -> Doubles:
+    """Sums of the products of all places a lag apart, lags of -8 to 8 down and right, (17, 17).
+
+    By Fourier transform (Wiener-Khinchin), with a margin so that nothing meets the other side.
+    Of a mask as 0 and 1 they are the numbers of pairs.
+    """
+    height, width = planes.shape[1:]
+    shape = (height + LAGS, width + LAGS)
+    lag = np.arange(-LAGS, LAGS + 1)
+    total = np.zeros((lag.size, lag.size))
+    for plane in planes:
+        whole = np.fft.irfft2(np.abs(np.fft.rfft2(plane, shape)) ** 2, shape)
+        total += whole[np.ix_(lag % shape[0], lag % shape[1])]
+    return total
+
+
+def pairs_of(mask: Mask) -> Doubles:
+    """How many pairs of pixels that both count there are at each lag, (17, 17)."""
+    return np.rint(lag_sums(mask[None].astype(np.float64)))
+
+
+def autocorrelation(standard: Floats, pairs: Doubles) -> Doubles:
     """The autocorrelation of standardised noise for lags of -8 to 8 down and right, (17, 17).
 
-    A lag takes all pairs of pixels that both count, by Fourier transform (Wiener-Khinchin).
+    Args:
+        standard: (frame, height, width), 0 where a pixel does not count.
+        pairs: :func:`pairs_of` the mask.
 
     >>> plane = np.random.default_rng(0).normal(size=(1, 200, 200)).astype(np.float32)
-    >>> table = autocorrelation(plane, np.ones((200, 200), bool))
-    >>> float(table[8, 8]), bool(abs(table[8, 9]) < 0.03)
+    >>> table = autocorrelation(plane, pairs_of(np.ones((200, 200), bool)))
+    >>> round(float(table[8, 8]), 6), bool(abs(table[8, 9]) < 0.03)
     (1.0, True)
     """
-    height, width = mask.shape
-    shape = (height + LAGS, width + LAGS)
-
-    def correlate(plane: NDArray[np.floating[Any]]) -> Doubles:
-        whole = np.fft.irfft2(np.abs(np.fft.rfft2(plane, shape)) ** 2, shape)
-        lag = np.arange(-LAGS, LAGS + 1)
-        return whole[np.ix_(lag % shape[0], lag % shape[1])]
-
-    products = np.sum([correlate(plane) for plane in standard], axis=0)
-    pairs = np.rint(correlate(mask.astype(np.float64))) * len(standard)
+    products = lag_sums(standard)
     covariance = np.divide(products, pairs, out=np.full_like(products, np.nan), where=pairs > 0)
     variance = covariance[LAGS, LAGS]
     return covariance / variance if variance > 0 else np.full_like(covariance, np.nan)
@@ -339,11 +353,14 @@ def energy_left(standard: Floats, mask: Mask) -> float:
 def tails(standard: Floats, mask: Mask) -> Tails:
     """The distribution of standardised noise: third and fourth moment, far samples, histogram."""
     values = standard[:, mask].astype(np.float64).ravel()
-    histogram = np.histogram(values.clip(HISTOGRAM[0], HISTOGRAM[-1]), HISTOGRAM)[0]
+    ends = float(HISTOGRAM[0]), float(HISTOGRAM[-1])
+    histogram = np.histogram(values.clip(*ends), len(HISTOGRAM) - 1, ends)[0]
     if not values.any():
         return Tails(math.nan, math.nan, (math.nan,) * len(SIGMAS), histogram)
-    beyond = tuple(float((np.abs(values) > k).mean()) for k in SIGMAS)
-    return Tails(float((values**3).mean()), float((values**4).mean()) - 3, beyond, histogram)
+    square, size = values * values, np.abs(values)
+    beyond = tuple(np.count_nonzero(size > k) / values.size for k in SIGMAS)
+    third, fourth = (square * values).mean(), (square * square).mean()
+    return Tails(float(third), float(fourth) - 3, beyond, histogram)
 
 
 def gaussian_beyond(sigmas: float) -> float:
@@ -368,6 +385,7 @@ def channel(
     noise: Floats,
     standard: Floats,
     mask: Mask,
+    pairs: Doubles,
     lawful: bool,
     freedom: float = 1.0,
 ) -> Channel:
@@ -379,10 +397,11 @@ def channel(
         noise: (frame, height, width), the shift taken out.
         standard: the same, standardised.
         mask: (height, width), the pixels that count; at least one.
+        pairs: :func:`pairs_of` the mask.
         lawful: whether variance = a*intensity + b is to be fitted.
         freedom: the share of samples that are free, below 1 where the truth is a mean of frames.
     """
-    table = autocorrelation(standard, mask)
+    table = autocorrelation(standard, pairs)
     # Correlated samples tell less of a variance (Bartlett 1946): by the sum of squares.
     independent = freedom / float(np.nansum(table**2)) if np.isfinite(table).any() else freedom
     samples = noise[:, mask].astype(np.float64)

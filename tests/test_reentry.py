@@ -155,7 +155,7 @@ def test_a_folder_gives_what_was_kept_right_before(kept, tmp_path):
     output = clpipe("run", kept, "-o", tmp_path, "--start-at", "denoise")
     assert {p.name for p in tmp_path.iterdir()} == {"crop.demosaic.jpg", "crop.demosaic.json"}
     assert "14 images in folders were kept elsewhere and left out" in output
-    assert "1 of 14 images done, 0 failed" in output
+    assert "1 of 15 images done, 0 failed" in output
 
 
 def test_entering_elsewhere_than_right_after_is_told(kept, tmp_path):

@@ -17,6 +17,7 @@ from clpipe.statistics import (
     fit_law,
     flat,
     line_noise,
+    pairs_of,
     pooled,
     tails,
     unclipped,
@@ -47,7 +48,7 @@ def box(noise):
 
 def test_white_noise_is_white():
     white = normal(1, *SIZE)
-    table = autocorrelation(white, ALL)
+    table = autocorrelation(white, pairs_of(ALL))
     assert table[LAGS, LAGS] == pytest.approx(1)
     table[LAGS, LAGS] = 0
     assert np.abs(table).max() < 5 / sqrt(white.size)
@@ -65,7 +66,7 @@ def test_blurred_noise_has_the_autocorrelation_of_its_kernel(share):
     # A 3x3 box: 1, 2/3, 1/3, 0 in each direction, the product of both on a diagonal.
     mask = RANDOM.random(SIZE) < share
     blurred = np.where(mask, box(normal(1, *SIZE)), 0)
-    table = autocorrelation(blurred, mask)
+    table = autocorrelation(blurred, pairs_of(mask))
     line = np.zeros(LAGS + 1)
     line[:3] = 1, 2 / 3, 1 / 3
     expected = np.concatenate([line[:0:-1], line])
@@ -77,7 +78,7 @@ def test_blurred_noise_has_the_autocorrelation_of_its_kernel(share):
 
 def test_a_lag_right_is_not_a_lag_down():
     noise = normal(1, *SIZE)
-    table = autocorrelation(noise + np.roll(noise, (2, 3), (1, 2)), ALL)
+    table = autocorrelation(noise + np.roll(noise, (2, 3), (1, 2)), pairs_of(ALL))
     assert table[LAGS + 2, LAGS + 3] == pytest.approx(0.5, abs=0.01)
     assert table[LAGS - 2, LAGS - 3] == pytest.approx(0.5, abs=0.01)
     assert abs(table[LAGS + 2, LAGS - 3]) < 0.01
@@ -109,7 +110,7 @@ def test_standard_errors_are_honest():
         for _ in range(40):
             noise = blur(normal(1, *ramp.shape)) * np.sqrt(a * ramp + b)
             curve, without, standard = by_intensity(ramp, noise, mask, EDGES)
-            law = channel("R", curve, without, standard, mask, lawful=True).law
+            law = channel("R", curve, without, standard, mask, pairs_of(mask), lawful=True).law
             off += [(law.a - a) / law.a_error, (law.b - b) / law.b_error]
         assert 0.7 < np.std(off) < 1.35
         assert abs(np.mean(off)) < 0.4
@@ -184,7 +185,7 @@ def test_tiny_images(shape):
     mask = np.ones(shape[1:], bool)
     intensity = RANDOM.random(shape[1:], np.float32)
     curve, without, standard = by_intensity(intensity, normal(*shape), mask, EDGES)
-    one = channel("R", curve, without, standard, mask, lawful=True)
+    one = channel("R", curve, without, standard, mask, pairs_of(mask), lawful=True)
     assert one.count == np.prod(shape)
     assert one.sigma > 0
     assert one.law is None
@@ -192,7 +193,7 @@ def test_tiny_images(shape):
 
 def test_no_noise_at_all():
     curve, without, standard = by_intensity(RAMP, np.zeros((1, *SIZE), np.float32), ALL, EDGES)
-    one = channel("R", curve, without, standard, ALL, lawful=True)
+    one = channel("R", curve, without, standard, ALL, pairs_of(ALL), lawful=True)
     assert one.sigma == 0
     assert one.law is None
     assert np.isnan([one.energy_left, one.tails.skewness, one.autocorrelation[8, 8]]).all()
