@@ -39,7 +39,7 @@ SITES = ("R", "G1", "G2", "B")  # G1 stands in the rows of red
 WHOLE = "mosaic"  # the channel that is all sites together
 UNITS = {
     "display": "of full scale, display values",
-    "rgb": "linear",
+    "rgb": "RGB before gamma",
     "mosaic": "signal: 0 = black level, 1 = white level",
     "values": "as in the file",
 }

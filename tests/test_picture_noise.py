@@ -55,6 +55,14 @@ def test_no_noise_costs_nothing():
     assert with_it == without
 
 
+def test_a_chain_may_end_before_the_display():
+    linear = settings_from({"skip": ["tone_curve", "gamma"]})
+    assert make_chain(linear).names[-1] == "color_matrix"
+    loud = {"method": "iid_gaussian", "sigma": 0.1}
+    with pytest.raises(RequestError, match="picture_noise reads display, but color_matrix gives"):
+        make_chain(settings_from({"skip": ["tone_curve", "gamma"], "picture_noise": loud}))
+
+
 def test_sigma_is_as_given_and_channels_are_independent(develop, grey):
     image = noisy(develop, grey, method="iid_gaussian", sigma=[0.01, 0.02, 0.04]) - grey
     assert image.std((0, 1)) == pytest.approx([0.01, 0.02, 0.04], rel=0.01)

@@ -121,7 +121,8 @@ class IntensityDependent(Matched):
     """Independent Gaussian noise whose sigma follows the intensity of each channel.
 
     As SyB3R adds it to finished pictures (Ley, Haensch, Hellwich, "SyB3R: A realistic synthetic
-    benchmark for 3D reconstruction from images", ECCV 2016): sigma by intensity, as a table.
+    benchmark for 3D reconstruction from images", ECCV 2016): sigma by intensity, as a table. Beyond
+    the intensities that were measured the last sigma holds.
 
     >>> from clpipe.stage import alone
     >>> grey = np.full((300, 300, 3), 0.5, np.float32)
