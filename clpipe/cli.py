@@ -31,8 +31,11 @@ from clpipe.config import (
 from clpipe.device import find_devices, open_device
 from clpipe.errors import ClpipeError, RequestError
 from clpipe.image_io import MAX_PIXELS
+from clpipe.measure import load
+from clpipe.measure import measure as measure_images
 from clpipe.plan import make_plan
 from clpipe.reentry import Reentry
+from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.registry import all_stages, load_stage_file
 from clpipe.run import Runner
 from clpipe.stage import Kind, Stage
@@ -563,3 +566,61 @@ def bench(
         f"{report.bytes_per_pixel:.1f} bytes a pixel, first run {report.first_run_s:.2f} s"
     )
     console().print(table)
+
+
+@main.command()
+@click.argument(
+    "images", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE..."
+)
+@click.option(
+    "--truth", type=click.Path(path_type=Path), metavar="FILE", help="The same image without noise."
+)
+@click.option(
+    "--pattern",
+    default="RGGB",
+    show_default=True,
+    type=click.Choice(PATTERNS),
+    help="Of mosaics that do not say their own.",
+)
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    metavar="FILE.png",
+    help="Draw noise by intensity, autocorrelation and tails.",
+)
+@json_option
+def measure(
+    images: tuple[Path, ...], truth: Path | None, pattern: Pattern, plot: Path | None, as_json: bool
+) -> None:
+    """Measure the noise of images: how large, how correlated, how Gaussian.
+
+    IMAGE is a kept EXR of any stage, a mosaic, or a finished picture (JPEG, PNG, TIFF). Noise is
+    the difference from --truth, or, of two or more frames of one scene, from their mean.
+
+    \b
+    clpipe run render.exr -o noisy --iso 3200 --until quantize
+    clpipe run render.exr -o clean --iso 3200 --until quantize \\
+        --skip sensor_noise --skip row_noise --skip column_noise
+    clpipe measure noisy/render.exr --truth clean/render.exr
+    """
+    if plot is not None and plot.suffix != ".png":
+        raise RequestError(f"--plot: found {plot}; expected a name that ends in .png")
+    report = measure_images(
+        [load(path, pattern) for path in images], load(truth, pattern) if truth else None
+    )
+    if plot is not None:
+        from clpipe.measure_plot import draw
+
+        draw(report, plot)
+    if as_json:
+        click.echo(json.dumps(report.record(), indent=2))
+        return
+    click.echo(describe.measure_heading(report))
+    for title, (headings, *rows) in describe.measure_tables(report):
+        table = Table(box=None, pad_edge=False)
+        for i, heading in enumerate(headings):
+            table.add_column(heading, justify="right" if i or heading else "left")
+        for row in rows:
+            table.add_row(*row)
+        click.echo(f"\n{title}")
+        console().print(table)

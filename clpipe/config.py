@@ -15,7 +15,7 @@ from clpipe.camera import DEFAULT_CAMERA, Camera, load_camera
 from clpipe.errors import RequestError
 from clpipe.noise_model import NoiseModel
 from clpipe.registry import all_stages, blamed, check_passes, load_stage_file
-from clpipe.stage import Context, Kind, Method, Stage
+from clpipe.stage import Context, Kind, Method, Stage, Unchanged
 from clpipe.stages import DEFAULT_CHAIN
 from clpipe.suggest import one_of
 
@@ -413,6 +413,8 @@ def make_chain(
 def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:
     """The steps of the settings, in order, for an image of a kind; None is what the first reads.
 
+    A step that does nothing is left out where it does not fit.
+
     Raises:
         RequestError: image kinds do not fit.
     """
@@ -426,9 +428,11 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
         name = stage_name if count[stage_name] == 1 else f"{stage_name}_{count[stage_name]}"
         if name in settings.skip:
             continue
-        if stage.reads is not (kind or stage.reads):
-            raise RequestError(misfit(name, stage, before, kind or stage.reads))
         method = make_method(stage, name, settings.parameters.get(name, {}))
+        if stage.reads is not (kind or stage.reads):
+            if isinstance(method, Unchanged) and stage.reads is stage.writes:
+                continue  # so that gamma can be skipped without picture_noise, which does nothing
+            raise RequestError(misfit(name, stage, before, kind or stage.reads))
         with named_errors(name, type(method)), blamed(f"stage {name}", stage.folder):
             method = method.resolve(context)
             after = method.after(context)

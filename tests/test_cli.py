@@ -379,6 +379,8 @@ def test_a_stage_is_explained_for_a_camera_and_an_iso(clpipe):
     records = json.loads(clpipe("stages", "sensor_noise", "--iso", 800, "--json").stdout)
     automatic = records[0]["methods"][0]["automatic"]
     assert {k for k, v in automatic.items() if v != "none"} == {"a", "b"}
+    rows = json.loads(clpipe("stages", "row_noise", "--iso", 800, "--json").stdout)
+    assert rows[0]["methods"][0]["automatic"] == {"sigma": f"{0.12 * 2.94 / 15871:.4g}"}
 
 
 def test_cameras_are_listed_and_shown(clpipe):

@@ -46,6 +46,8 @@ KERNELS = {
     "denoise_non_local_means",
     "mosaic_denoise_non_local_means",
     "curve",
+    "picture_noise_iid_gaussian",
+    "picture_noise_intensity_dependent",
 }
 
 

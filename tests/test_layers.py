@@ -11,7 +11,7 @@ PACKAGE = ROOT / "clpipe"
 LEVELS = [
     {"errors", "types", "suggest", "noise_model"},
     {"reference"},
-    {"camera"},
+    {"camera", "statistics"},
     {"stage"},
     {"stages"},
     {"registry"},
@@ -21,8 +21,9 @@ LEVELS = [
     {"device"},
     {"run"},
     {"image_io", "check", "bench", "pipeline"},
-    {"reentry", "describe"},
-    {"batch"},
+    {"reentry"},
+    {"measure"},
+    {"batch", "describe", "measure_plot"},
     {"cli"},
 ]
 LEVEL = {name: i for i, names in enumerate(LEVELS) for name in names}
@@ -32,6 +33,7 @@ DOORS = {
     "PIL": {"image_io"},
     "click": {"cli"},
     "rich": {"cli"},
+    "matplotlib": {"measure_plot"},
 }
 
 

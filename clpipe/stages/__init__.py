@@ -24,6 +24,7 @@ DEFAULT_CHAIN = (
     "color_matrix",
     "tone_curve",
     "gamma",
+    "picture_noise",
 )
 
 
