@@ -48,12 +48,12 @@ def test_the_raw_has_the_noise_of_the_camera(clpipe, measured):
     noisy = run(clpipe, "noisy", "--until", "quantize")
     clean = run(clpipe, "clean", "--until", "quantize", *NOISELESS)
     report = measured(f"{noisy}.exr", "--truth", f"{clean}.exr")
-    a, b = load_camera("sony-a7r2").noise(3200)
+    noise = load_camera("sony-a7r2").noise(3200)
     assert list(report["channels"]) == ["R", "G1", "G2", "B", "mosaic"]
     for name, one in report["channels"].items():
         law = one["law"]
-        assert law["a"] == pytest.approx(a, rel=0.03)
-        assert law["b"] == pytest.approx(b, rel=0.1)
+        assert law["a"] == pytest.approx(noise.a, rel=0.03)
+        assert law["b"] == pytest.approx(noise.b, rel=0.1)
         assert one["column"]["sigma"] <= one["column"]["limit"]
         assert abs(one["excess_kurtosis"]) < 0.06
         assert one["energy_left_2x2"] == pytest.approx(0.25, abs=0.006)
