@@ -1,0 +1,162 @@
+"""What stays put from frame to frame: column offsets, DSNU, PRNU, hot and dead pixels."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from clpipe.line_fit import Estimate, Line
+from clpipe.repeats import Sensor, Stack
+from clpipe.types import Array, Floats
+
+SURE = 6.0  # standard deviations that no pixel of a sensor lies out by chance
+BLOCK = 16  # pixels of one colour, a side
+LEAST_BLOCKS = 30
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Bad pixels: rows and columns, how far each lies above its neighbours in DN, and the share of
+    the sensor on which one would have been seen.
+    """
+
+    rows: Array
+    columns: Array
+    excess: Array
+    seen_on: float
+
+    def record(self) -> dict[str, object]:
+        """Positions as [column, row], and the share of the pixels that could be judged."""
+        at = np.stack([self.columns, self.rows], axis=1).tolist()
+        return {"positions": at, "excess_dn": np.round(self.excess, 2).tolist()}
+
+
+def _found(mask: Array, excess: Array, seen_on: float) -> Pixels:
+    rows, columns = np.nonzero(mask)
+    return Pixels(rows, columns, excess[mask].astype(np.float64), seen_on)
+
+
+def hot_in_dark(dark: Floats, sensor: Sensor) -> Pixels:
+    """Hot pixels of a mean dark frame: 6 robust standard deviations (median absolute deviation)
+    above the median of the 3x3 pixels of the same colour.
+    """
+    from scipy.ndimage import median_filter
+
+    excess = np.empty(dark.shape, np.float32)
+    hot = np.empty(dark.shape, bool)
+    for site in sensor.sites().values():
+        excess[site] = dark[site] - median_filter(dark[site], 3, mode="mirror")
+        deviation = np.median(np.abs(excess[site])) / 0.6745
+        hot[site] = excess[site] > SURE * max(deviation, float(excess[site].std()) * 1e-3, 1e-6)
+    return _found(hot, excess, 1.0)
+
+
+def hot_in_scene(stack: Stack, line: Line) -> Pixels:
+    """Hot pixels of a scene: brighter than the brightest of the 8 neighbours of the same colour by
+    6 standard deviations of the mean and by all that these differ among themselves.
+    """
+    low, high = _extremes(stack)
+    deviation = np.sqrt(line.at(np.maximum(high, 0)) / len(stack.rest))
+    excess = stack.light - high
+    return _found(stack.used & (excess > SURE * deviation + (high - low)), excess, 1.0)
+
+
+def dead_in_scene(stack: Stack, line: Line) -> Pixels:
+    """Dead pixels: without light, in places where all 8 neighbours of the same colour have much."""
+    low, _ = _extremes(stack)
+    nothing = SURE * float(np.sqrt(line.at(np.zeros(1))[0] / len(stack.rest)))
+    lit = low > 4 * nothing
+    return _found(lit & (stack.light < nothing), stack.light - low, float(lit.mean()))
+
+
+def _extremes(stack: Stack) -> tuple[Floats, Floats]:
+    """The least and the largest of each pixel's 8 neighbours of the same colour."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    around = np.ones((3, 3), bool)
+    around[1, 1] = False
+    low, high = np.empty_like(stack.light), np.empty_like(stack.light)
+    for site in stack.sensor.sites().values():
+        low[site] = minimum_filter(stack.light[site], footprint=around, mode="mirror")
+        high[site] = maximum_filter(stack.light[site], footprint=around, mode="mirror")
+    return low, high
+
+
+def dark_pattern(
+    dark: Floats, temporal: Estimate, bad: Pixels, sensor: Sensor
+) -> tuple[Estimate, Estimate]:
+    """The variances of column offsets and of pixels (DSNU) in a mean dark frame, in DN^2.
+
+    Args:
+        dark: the mean of the dark frames, DN.
+        temporal: the variance that a pixel of it has from its frames' noise, row noise apart, DN^2.
+        bad: hot pixels, which are left out.
+        sensor: its pattern; each channel's mean is taken out, as channels may differ in black.
+
+    Returns:
+        Columns, corrected for what all pixel scatter leaves in a column's mean; DSNU, after
+        columns and rows are taken out, corrected for the temporal noise that is left.
+    """
+    values = dark.astype(np.float64)
+    good = np.ones(dark.shape, bool)
+    good[bad.rows, bad.columns] = False
+    for site in sensor.sites().values():
+        values[site] -= values[site][good[site]].mean()
+    values[~good] = 0
+    height, width = dark.shape
+    values -= (values.sum(axis=1) / good.sum(axis=1).clip(1))[:, None] * good
+    in_column = good.sum(axis=0).clip(1)
+    columns = values.sum(axis=0) / in_column
+    values -= columns * good
+    # Rows and columns took degrees of freedom along.
+    freedom = good.sum() * (1 - 1 / height) * (1 - 1 / width)
+    scatter = (values**2).sum() / freedom
+    scatter_error = np.sqrt(max((values**4).sum() / freedom - scatter**2, 0) / freedom)
+    columns2 = (columns**2).sum() / max(width - 2, 1)  # even and odd columns have their own mean
+    left = float((scatter / in_column).mean())
+    return (
+        Estimate(float(columns2 - left), float(columns2 * np.sqrt(2 / max(width - 2, 1)))),
+        Estimate(float(scatter - temporal.value), float(np.hypot(scatter_error, temporal.error))),
+    )
+
+
+def response_pattern(stack: Stack, line: Line, dsnu: float) -> Estimate | None:
+    """PRNU squared, from places where the scene is flat; None where it has too few.
+
+    In blocks of 16x16 pixels of one colour, row and column means are taken out (and with them
+    gradients, row and column noise). What then scatters, less temporal noise and DSNU, is
+    (PRNU * light)^2. A block is flat where diagonal neighbours do not scatter together.
+
+    Args:
+        stack: the frames of a scene.
+        line: their noise, DN^2, rounding included.
+        dsnu: variance of DSNU in DN^2, 0 where it is not known.
+    """
+    squares, lights, whites = [], [], []
+    for site in stack.sensor.sites().values():
+        light, used = _blocks(stack.light[site]), _blocks(stack.used[site])
+        mean = light.mean(axis=(1, 2))
+        chosen = used.all(axis=(1, 2)) & (mean > 0.05 * stack.sensor.unit)
+        light = light[chosen].astype(np.float64)
+        rest = light - light.mean(axis=1, keepdims=True) - light.mean(axis=2, keepdims=True)
+        rest += mean[chosen, None, None]
+        squares.append((rest**2).sum(axis=(1, 2)) / (BLOCK - 1) ** 2)
+        whites.append((rest[:, 1:, 1:] * rest[:, :-1, :-1]).mean(axis=(1, 2)))
+        lights.append(mean[chosen])
+    square, white, light = (np.concatenate(x) for x in (squares, whites, lights))
+    flat = np.abs(white) < 3 / (BLOCK - 1) * square
+    square, white, light = square[flat], white[flat], light[flat]
+    if len(light) < LEAST_BLOCKS or abs(white.sum() / square.sum()) > 0.05:
+        return None
+    noise = line.at(light) / len(stack.rest) + dsnu
+    ratio = (square - noise) / light**2
+    weight = light**4 / (np.median(square / light**2) * light**2) ** 2
+    value = float(weight @ ratio / weight.sum())
+    error = float(np.sqrt(weight**2 @ (ratio - value) ** 2) / weight.sum())
+    return Estimate(value, error)
+
+
+def _blocks(plane: Array) -> Array:
+    """A plane cut into whole blocks, (blocks, BLOCK, BLOCK)."""
+    rows, columns = (n // BLOCK for n in plane.shape)
+    cut = plane[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK)
+    return cut.swapaxes(1, 2).reshape(-1, BLOCK, BLOCK)
