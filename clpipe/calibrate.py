@@ -6,7 +6,7 @@ zero is the black level.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from clpipe.types import Floats
 ROUNDING = 1 / 12  # variance of rounding to whole DN
 ROUGH = 0.4  # DN of noise below which rounding is not independent of the noise
 LEAST_USED = 0.1  # of the pixels
+LEVEL_APART = 1.0  # DN
 CLIPPED = 1e-3  # share of a dark frame's samples at 0 DN
 
 
@@ -116,9 +117,9 @@ def _alone(
     darkness = _Dark.of(dark, sensor, notes)
     known = None
     if darkness and darkness.stack:
-        level, deviation = darkness.light / unit, darkness.temporal.value**0.5 / unit
-        known = LevelSets(*(np.array([x]) for x in (level, deviation, float(frame.size))))
-    light = frame - np.float32(sensor.black_level)
+        deviation = darkness.temporal.value**0.5 / unit
+        known = LevelSets(np.zeros(1), np.array([deviation]), np.array([float(frame.size)]))
+    light = frame - np.float32(darkness.level if darkness else sensor.black_level)
     lines, pooled, sets = single_image.single_image(light, sensor, known)
     lines = {name: _positive(line, name).lowered(rounding) for name, line in lines.items()}
     pooled = _positive(pooled, "of all channels").lowered(rounding)
@@ -150,13 +151,16 @@ def _repeated(
     top = repeats.ceiling(scene, sensor)
     if top < sensor.white_level:
         notes.append(f"samples clip at {top:g} DN, below the white level of {sensor.white_level:g}")
-    stack = _enough(repeats.unclipped(repeats.stacked(scene, sensor), None, top))
+    darkness = _Dark.of(dark, sensor, notes)
+    from_black = replace(sensor, black_level=darkness.level) if darkness else sensor
+    stack = _enough(repeats.unclipped(repeats.stacked(scene, from_black), None, top))
+    if darkness:
+        stack = stack.without_columns(darkness.columns())
     stack, brighter = repeats.without_flicker(stack)
     if brighter.any():
         spread = f"{brighter.min():+.2%} to {brighter.max():+.2%}"
         notes.append(f"brightness flickers by {spread}; frames were scaled to the same mean")
     line = fit_line(list(stack.tables(stack.variance()).values()))
-    darkness = _Dark.of(dark, sensor, notes)
     hot = darkness.hot if darkness else fixed_pattern.hot_in_scene(stack, line)
     dead = fixed_pattern.dead_in_scene(stack, line)
     for bad in (hot, dead):
@@ -198,14 +202,14 @@ def _repeated(
 
 @dataclass(frozen=True)
 class _Dark:
-    """Dark frames: their mean in DN and its level above black, what varies in them, hot pixels.
+    """Dark frames: their mean and its level in DN, what varies in them, hot pixels.
 
     ``temporal`` is the variance of a pixel of one frame, row noise apart, rounding included; that
     and ``stack`` are there if two frames or more tell it.
     """
 
     mean: Floats
-    light: float
+    level: float
     frames: int
     hot: Pixels
     stack: Stack | None
@@ -219,11 +223,13 @@ class _Dark:
             return None
         mean = dark.mean(axis=0, dtype=np.float64)
         hot = fixed_pattern.hot_in_dark(mean, sensor)
-        light = float(np.median(mean)) - sensor.black_level
-        if abs(light) > 1:
+        good = np.ones(mean.shape, bool)
+        good[hot.rows, hot.columns] = False
+        level = float(mean[good].mean())
+        if abs(level - sensor.black_level) > LEVEL_APART:
             notes.append(
-                f"dark frames lie at {light:+.2f} DN from the black level of "
-                f"{sensor.black_level:g}; b holds at the black level"
+                f"dark frames lie at {level:.2f} DN, not at the black level of "
+                f"{sensor.black_level:g}; light is counted from there"
             )
         zeros = float((dark <= 0).mean())
         stack, temporal = None, Estimate(0.0, 0.0)
@@ -232,12 +238,18 @@ class _Dark:
         elif len(dark) > 1:
             stack = repeats.stacked(dark.copy(), sensor)
             stack.used[hot.rows, hot.columns] = False
-            stack.around[...] = 0  # no light
+            stack.light[...] = stack.around[...] = 0
             rest = stack.rest - stack.rest.mean(axis=2, keepdims=True)
             freedom = stack.used.sum() * stack.degrees * (1 - 1 / mean.shape[1])
             square = float((rest[:, stack.used] ** 2).sum(dtype=np.float64) / freedom)
             temporal = Estimate(square, square * float(np.sqrt(2 / freedom)))
-        return _Dark(mean, light, len(dark), hot, stack, temporal, sensor)
+        return _Dark(mean, level, len(dark), hot, stack, temporal, sensor)
+
+    def columns(self) -> Floats:
+        """The offset of each column, (width,), DN."""
+        good = np.ones(self.mean.shape, bool)
+        good[self.hot.rows, self.hot.columns] = False
+        return np.mean(self.mean - self.level, axis=0, where=good).astype(np.float32)
 
     def row_noise(self) -> Estimate | None:
         """Row noise in DN, where there are frames to tell it."""

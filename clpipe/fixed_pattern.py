@@ -11,6 +11,9 @@ from clpipe.types import Array, Floats
 SURE = 6.0  # standard deviations that no pixel of a sensor lies out by chance
 BLOCK = 16  # pixels of one colour, a side
 LEAST_BLOCKS = 30
+DARKEST = 0.05  # signal of a block that tells PRNU
+UNEVEN = 0.03  # relative standard deviation of the scene in a block
+LEAST_DEVIATION = 0.05  # DN, in a mean dark frame
 
 
 @dataclass(frozen=True)
@@ -36,17 +39,18 @@ def _found(mask: Array, excess: Array, seen_on: float) -> Pixels:
 
 
 def hot_in_dark(dark: Floats, sensor: Sensor) -> Pixels:
-    """Hot pixels of a mean dark frame: 6 robust standard deviations (median absolute deviation)
-    above the median of the 3x3 pixels of the same colour.
+    """Hot pixels of a mean dark frame: 6 standard deviations above the median of the 3x3 pixels of
+    the same colour; the deviation is a quarter of what the middle 95 % of all pixels span.
     """
     from scipy.ndimage import median_filter
+    from scipy.stats import norm
 
     excess = np.empty(dark.shape, np.float32)
     hot = np.empty(dark.shape, bool)
     for site in sensor.sites().values():
         excess[site] = dark[site] - median_filter(dark[site], 3, mode="mirror")
-        deviation = np.median(np.abs(excess[site])) / 0.6745
-        hot[site] = excess[site] > SURE * max(deviation, float(excess[site].std()) * 1e-3, 1e-6)
+        low, high = np.quantile(excess[site], norm.cdf([-2, 2]))
+        hot[site] = excess[site] > SURE * max((high - low) / 4, LEAST_DEVIATION)
     return _found(hot, excess, 1.0)
 
 
@@ -122,37 +126,55 @@ def dark_pattern(
 def response_pattern(stack: Stack, line: Line, dsnu: float) -> Estimate | None:
     """PRNU squared, from places where the scene is flat; None where it has too few.
 
-    In blocks of 16x16 pixels of one colour, row and column means are taken out (and with them
-    gradients, row and column noise). What then scatters, less temporal noise and DSNU, is
-    (PRNU * light)^2. A block is flat where diagonal neighbours do not scatter together.
+    In blocks of 16x16 pixels of one colour, a smooth surface and the means of rows and columns are
+    taken out. What then scatters, less temporal noise and DSNU, is (PRNU * light)^2. A block is
+    flat where that surface is nearly level and diagonal neighbours do not scatter together; and all
+    flat blocks must tell the same PRNU, else it is the scene's texture.
 
     Args:
         stack: the frames of a scene.
         line: their noise, DN^2, rounding included.
         dsnu: variance of DSNU in DN^2, 0 where it is not known.
     """
-    squares, lights, whites = [], [], []
+    surface = _surface()
+    freedom = BLOCK**2 - surface.shape[1]
+    squares, lights = [], []
     for site in stack.sensor.sites().values():
-        light, used = _blocks(stack.light[site]), _blocks(stack.used[site])
-        mean = light.mean(axis=(1, 2))
-        chosen = used.all(axis=(1, 2)) & (mean > 0.05 * stack.sensor.unit)
-        light = light[chosen].astype(np.float64)
-        rest = light - light.mean(axis=1, keepdims=True) - light.mean(axis=2, keepdims=True)
-        rest += mean[chosen, None, None]
-        squares.append((rest**2).sum(axis=(1, 2)) / (BLOCK - 1) ** 2)
-        whites.append((rest[:, 1:, 1:] * rest[:, :-1, :-1]).mean(axis=(1, 2)))
-        lights.append(mean[chosen])
-    square, white, light = (np.concatenate(x) for x in (squares, whites, lights))
-    flat = np.abs(white) < 3 / (BLOCK - 1) * square
-    square, white, light = square[flat], white[flat], light[flat]
-    if len(light) < LEAST_BLOCKS or abs(white.sum() / square.sum()) > 0.05:
+        used = _blocks(stack.used[site]).all(axis=(1, 2))
+        pixels = _blocks(stack.light[site])[used].reshape(-1, BLOCK**2).astype(np.float64)
+        mean = pixels.mean(axis=1)
+        shape = pixels @ surface
+        uneven = (shape**2).sum(axis=1) - mean**2 * BLOCK**2
+        rest = pixels - shape @ surface.T
+        square = (rest**2).sum(axis=1) / freedom
+        rest = rest.reshape(-1, BLOCK, BLOCK)
+        together = np.abs((rest[:, 1:, 1:] * rest[:, :-1, :-1]).mean(axis=(1, 2)))
+        flat = (together < 3 / BLOCK * square) & (mean > DARKEST * stack.sensor.unit)
+        flat &= uneven < (UNEVEN * mean) ** 2 * BLOCK**2 + square * surface.shape[1]
+        squares.append(square[flat])
+        lights.append(mean[flat])
+    square, light = np.concatenate(squares), np.concatenate(lights)
+    if len(light) < LEAST_BLOCKS:
         return None
     noise = line.at(light) / len(stack.rest) + dsnu
-    ratio = (square - noise) / light**2
-    weight = light**4 / (np.median(square / light**2) * light**2) ** 2
-    value = float(weight @ ratio / weight.sum())
-    error = float(np.sqrt(weight**2 @ (ratio - value) ** 2) / weight.sum())
-    return Estimate(value, error)
+    value = 0.0
+    for _ in range(5):
+        expected = 2 * ((noise + value * light**2) / light**2) ** 2 / freedom
+        weight = 1 / expected / (1 / expected).sum()
+        value = max(float(weight @ ((square - noise) / light**2)), 0.0)
+    apart = (((square - noise) / light**2 - value) ** 2 / expected).mean()
+    return Estimate(value, float(np.sqrt(weight**2 @ expected))) if apart < 2 else None
+
+
+def _surface() -> Array:
+    """What is taken out of a block, as orthonormal columns: each row's and each column's mean, and
+    a surface of the fourth degree.
+    """
+    one = np.linspace(-1, 1, BLOCK)
+    row, column = np.repeat(np.eye(BLOCK), BLOCK, axis=0), np.tile(np.eye(BLOCK), (BLOCK, 1))
+    mixed = [np.outer(one**i, one**j).ravel() for i in range(1, 4) for j in range(1, 5 - i)]
+    basis, sizes, _ = np.linalg.svd(np.column_stack([row, column, *mixed]), full_matrices=False)
+    return basis[:, sizes > 1e-9 * sizes[0]]
 
 
 def _blocks(plane: Array) -> Array:

@@ -76,6 +76,11 @@ class Stack:
         """The sample variance of each pixel over the frames, DN^2."""
         return np.einsum("kij,kij->ij", self.rest, self.rest) / self.degrees
 
+    def without_columns(self, offsets: Floats) -> "Stack":
+        """The stack without the columns' own offsets, (width,), which are no light."""
+        light = self.light - offsets
+        return replace(self, light=light, around=neighbours(light))
+
     def tables(self, variance: Array) -> dict[str, Table]:
         """A table of variances a channel."""
         found = {}
