@@ -40,7 +40,9 @@ class Calibration:
     lines: dict[str, Line]
     pooled: Line
     bins: dict[str, tuple[Bin, ...]]
-    used: float  # share of the pixels
+    size: int  # pixels of a frame
+    used: float  # the share of them that counts
+    rounding: float  # variance of rounding to whole DN, which ``bins`` still have
     row_noise: Estimate | None = None
     column_noise: Estimate | None = None
     dsnu: Estimate | None = None
@@ -122,7 +124,7 @@ def _alone(
     light = frame - np.float32(darkness.level if darkness else sensor.black_level)
     lines, pooled, sets = single_image.single_image(light, sensor, known)
     lines = {name: _positive(line, name).lowered(rounding) for name, line in lines.items()}
-    pooled = _positive(pooled, "of all channels").lowered(rounding)
+    pooled = _seen(pooled).lowered(rounding)
     variance = (sets.deviation * unit) ** 2
     points = zip(
         sets.mean * unit, variance, variance * np.sqrt(2 / sets.count), sets.count, strict=True
@@ -135,7 +137,9 @@ def _alone(
         lines=lines,
         pooled=pooled,
         bins={"all": tuple(Bin(float(m), float(v), float(e), int(n)) for m, v, e, n in points)},
+        size=light.size,
         used=min(pooled.pixels / light.size, 1.0),
+        rounding=rounding,
         row_noise=darkness.row_noise() if darkness else None,
         **(darkness.pattern(pooled, rounding) if darkness else {}),
         notes=(*notes, *_doubts(pooled, rounding)),
@@ -179,7 +183,7 @@ def _repeated(
     _static(stack, line)
     for name in CHANNELS:
         _positive(lines[name], name)
-    pooled = line.lowered(rounding)
+    pooled = _seen(line).lowered(rounding)
     pattern = darkness.pattern(pooled, rounding) if darkness else {}
     dsnu = pattern["dsnu"].value if darkness else 0.0
     prnu2 = fixed_pattern.response_pattern(stack, line, dsnu**2)
@@ -191,7 +195,9 @@ def _repeated(
         lines={name: own.lowered(rounding) for name, own in lines.items()},
         pooled=pooled,
         bins={name: binned(table) for name, table in tables[0].items()},
+        size=stack.light.size,
         used=float(stack.used.mean()),
+        rounding=rounding,
         row_noise=repeats.row_variance(rows).root(),
         prnu=prnu2.root() if prnu2 and prnu2.seen else None,
         dead=dead,
@@ -308,6 +314,20 @@ def _positive(line: Line, channel: str) -> Line:
             f"channel {channel}: variance does not rise with light (a = "
             f"{line.gain.value:.3g} +- {line.gain.error:.2g} DN); is it raw, and is the scene both "
             "dark and bright?"
+        )
+    return line
+
+
+def _seen(line: Line) -> Line:
+    """The line of all channels, if its slope is more than a guess.
+
+    Raises:
+        ImageError: it is not.
+    """
+    if not _positive(line, "of all").gain.seen:
+        raise ImageError(
+            f"the scene has too little light or range to tell a: found {line.gain.value:.3g} +- "
+            f"{line.gain.error:.2g} DN; it should be dark in some places and bright in others"
         )
     return line
 

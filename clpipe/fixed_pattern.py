@@ -65,10 +65,12 @@ def hot_in_scene(stack: Stack, line: Line) -> Pixels:
 
 
 def dead_in_scene(stack: Stack, line: Line) -> Pixels:
-    """Dead pixels: without light, in places where all 8 neighbours of the same colour have much."""
-    low, _ = _extremes(stack)
+    """Dead pixels: without light, where all 8 neighbours of the same colour have much, and more than
+    they differ among themselves.
+    """
+    low, high = _extremes(stack)
     nothing = SURE * float(np.sqrt(line.at(np.zeros(1))[0] / len(stack.rest)))
-    lit = low > 4 * nothing
+    lit = low > np.maximum(4 * nothing, high - low)
     return _found(lit & (stack.light < nothing), stack.light - low, float(lit.mean()))
 
 

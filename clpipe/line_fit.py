@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from clpipe.types import Array
 
 CLASSES = 2048
+BINS = 32  # for pictures
+LEAST_IN_BIN = 50
 ROUNDS = 12  # of weights from the line before
 
 
@@ -168,12 +170,11 @@ class Bin:
     pixels: int
 
 
-def binned(table: Table, bins: int = 24, pixels: int = 50) -> tuple[Bin, ...]:
+def binned(table: Table) -> tuple[Bin, ...]:
     """A table in few bins of equal width in the root of the light, those with enough pixels."""
-    parts = table.sums.reshape(7, -1, CLASSES // (bins * 2) if CLASSES % (bins * 2) == 0 else 64)
     found = []
-    for count, _, m, _, s, _, s2 in parts.sum(-1).T:
-        if count >= pixels:
+    for count, _, m, _, s, _, s2 in table.sums.reshape(7, BINS, -1).sum(axis=-1).T:
+        if count >= LEAST_IN_BIN:
             scatter = max(s2 / count - (s / count) ** 2, 0.0)
             error = float(np.sqrt(scatter / count))
             found.append(Bin(float(m / count), float(s / count), error, int(count)))

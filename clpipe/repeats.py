@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from hashlib import blake2b
 
 import numpy as np
 
@@ -97,11 +98,13 @@ def stacked(frames: Floats, sensor: Sensor) -> Stack:
     Raises:
         ImageError: two frames are equal sample by sample.
     """
-    for k in range(1, len(frames)):
-        if np.array_equal(frames[k], frames[k - 1]):
+    seen: dict[bytes, int] = {}
+    for k, frame in enumerate(frames, 1):
+        first = seen.setdefault(blake2b(np.ascontiguousarray(frame).data).digest(), k)
+        if first != k:
             raise ImageError(
-                f"frames {k} and {k + 1} are identical in every sample; the same frame was given "
-                "twice, or was made with the same seed and image key"
+                f"frames {first} and {k} are identical in every sample; one frame was given "
+                "twice, or both were made with one seed and image key"
             )
     mean = frames.mean(axis=0, dtype=np.float64).astype(np.float32)
     rest = np.subtract(frames, mean, out=frames)

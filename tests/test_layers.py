@@ -10,19 +10,19 @@ PACKAGE = ROOT / "clpipe"
 # Lower ones first; a module imports only from lower levels.
 LEVELS = [
     {"errors", "types", "suggest", "noise_model"},
-    {"reference"},
-    {"camera"},
-    {"stage"},
-    {"stages"},
-    {"registry"},
+    {"reference", "line_fit"},
+    {"camera", "repeats"},
+    {"stage", "fixed_pattern", "single_image"},
+    {"stages", "calibrate"},
+    {"registry", "profile", "calibration_plot"},
     {"config"},
     {"plan"},
     {"codegen"},
     {"device"},
     {"run"},
-    {"image_io", "check", "bench", "pipeline"},
+    {"image_io", "raw_io", "check", "bench", "pipeline"},
     {"reentry", "describe"},
-    {"batch"},
+    {"batch", "calibration_frames"},
     {"cli"},
 ]
 LEVEL = {name: i for i, names in enumerate(LEVELS) for name in names}
@@ -32,6 +32,10 @@ DOORS = {
     "PIL": {"image_io"},
     "click": {"cli"},
     "rich": {"cli"},
+    "rawpy": {"raw_io"},
+    "exifread": {"raw_io"},
+    "matplotlib": {"calibration_plot"},
+    "scipy": {"repeats", "fixed_pattern", "single_image"},
 }
 
 
