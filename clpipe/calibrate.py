@@ -22,7 +22,6 @@ from clpipe.types import Floats
 ROUNDING = 1 / 12  # variance of rounding to whole DN
 ROUGH = 0.4  # DN of noise below which rounding is not independent of the noise
 LEAST_USED = 0.1  # of the pixels
-LEVEL_APART = 1.0  # DN
 CLIPPED = 1e-3  # share of a dark frame's samples at 0 DN
 
 
@@ -152,12 +151,14 @@ def _repeated(
     """From two or more frames of a scene."""
     notes: list[str] = []
     rounding = ROUNDING if whole else 0.0
+    _enough(float(((scene > 0) & (scene < sensor.white_level)).mean()))
     top = repeats.ceiling(scene, sensor)
     if top < sensor.white_level:
         notes.append(f"samples clip at {top:g} DN, below the white level of {sensor.white_level:g}")
     darkness = _Dark.of(dark, sensor, notes)
     from_black = replace(sensor, black_level=darkness.level) if darkness else sensor
-    stack = _enough(repeats.unclipped(repeats.stacked(scene, from_black), None, top))
+    stack = repeats.unclipped(repeats.stacked(scene, from_black), None, top)
+    _enough(float(stack.used.mean()))
     if darkness:
         stack = stack.without_columns(darkness.columns())
     stack, brighter = repeats.without_flicker(stack)
@@ -166,10 +167,15 @@ def _repeated(
         notes.append(f"brightness flickers by {spread}; frames were scaled to the same mean")
     line = fit_line(list(stack.tables(stack.variance()).values()))
     hot = darkness.hot if darkness else fixed_pattern.hot_in_scene(stack, line)
+    if not darkness and len(hot.rows):
+        notes.append(
+            "hot pixels are judged on the scene, where a glint of one pixel looks the same"
+        )
     dead = fixed_pattern.dead_in_scene(stack, line)
     for bad in (hot, dead):
         stack.used[bad.rows, bad.columns] = False
-    stack = _enough(repeats.unclipped(stack, line, top))
+    stack = repeats.unclipped(stack, line, top)
+    _enough(float(stack.used.mean()))
     stacks = [stack, *([darkness.stack] if darkness and darkness.stack else [])]
     row2 = repeats.row_variance([repeats.row_offsets(each, line)[2] for each in stacks])
     line = line.lowered(max(row2.value, 0))
@@ -232,7 +238,7 @@ class _Dark:
         good = np.ones(mean.shape, bool)
         good[hot.rows, hot.columns] = False
         level = float(mean[good].mean())
-        if abs(level - sensor.black_level) > LEVEL_APART:
+        if abs(level - sensor.black_level) > max(1.0, 0.1 * float(dark[0].std())):
             notes.append(
                 f"dark frames lie at {level:.2f} DN, not at the black level of "
                 f"{sensor.black_level:g}; light is counted from there"
@@ -272,19 +278,17 @@ class _Dark:
         return {"column_noise": column2.root(), "dsnu": dsnu2.root(), "hot": self.hot}
 
 
-def _enough(stack: Stack) -> Stack:
-    """The stack, if enough of its pixels count.
+def _enough(share: float) -> None:
+    """See that enough of the pixels count.
 
     Raises:
         ImageError: they do not.
     """
-    share = float(stack.used.mean())
     if share < LEAST_USED:
         raise ImageError(
             f"{1 - share:.0%} of the pixels are clipped, or so near to it that their noise is; "
             "expose less, or check the levels"
         )
-    return stack
 
 
 def _static(stack: Stack, line: Line) -> None:

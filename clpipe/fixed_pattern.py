@@ -55,18 +55,27 @@ def hot_in_dark(dark: Floats, sensor: Sensor) -> Pixels:
 
 
 def hot_in_scene(stack: Stack, line: Line) -> Pixels:
-    """Hot pixels of a scene: brighter than the brightest of the 8 neighbours of the same colour by
-    6 standard deviations of the mean and by all that these differ among themselves.
+    """Hot pixels of a scene, brighter than the brightest of the 8 neighbours of the same colour.
+
+    They are so by 6 standard deviations of the mean, by all that these neighbours differ among
+    themselves, and by three times what any adjacent pixel differs from its own.
     """
+    from scipy.ndimage import maximum_filter
+
     low, high = _extremes(stack)
     deviation = np.sqrt(line.at(np.maximum(high, 0)) / len(stack.rest))
     excess = stack.light - high
-    return _found(stack.used & (excess > SURE * deviation + (high - low)), excess, 1.0)
+    out = np.maximum(np.abs(excess), np.abs(stack.light - low))
+    nearby = np.ones((3, 3), bool)
+    nearby[1, 1] = False
+    hot = excess > np.maximum(SURE * deviation + (high - low), 0)
+    hot &= excess > 3 * maximum_filter(out, footprint=nearby, mode="mirror")
+    return _found(stack.used & hot, excess, 1.0)
 
 
 def dead_in_scene(stack: Stack, line: Line) -> Pixels:
-    """Dead pixels: without light, where all 8 neighbours of the same colour have much, and more than
-    they differ among themselves.
+    """Dead pixels: without light, where all 8 neighbours of the same colour have much, and more
+    than they differ among themselves.
     """
     low, high = _extremes(stack)
     nothing = SURE * float(np.sqrt(line.at(np.zeros(1))[0] / len(stack.rest)))

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from clpipe.types import Array
 
 CLASSES = 2048
+GROUPS = 64  # of rows
 BINS = 32  # for pictures
 LEAST_IN_BIN = 50
+DARKEST = 0.01  # of the pixels
 ROUNDS = 12  # of weights from the line before
 
 
@@ -83,29 +85,39 @@ class Line:
 
 @dataclass(frozen=True)
 class Table:
-    """Sums over pixels by classes of the instrument, (7, CLASSES): count, instrument z, light m,
-    m^2, variance s, s*m, s^2. ``degrees`` of freedom are those of each pixel's variance.
+    """Sums over pixels by classes of the instrument, in groups of rows.
+
+    ``sums`` is (GROUPS, 4, CLASSES): count, instrument, light and variance; ``squares`` (CLASSES,)
+    has the variance squared. ``degrees`` of freedom are those of each pixel's variance.
     """
 
     sums: NDArray[np.float64] = field(repr=False)
+    squares: NDArray[np.float64] = field(repr=False)
     degrees: int
 
     @staticmethod
-    def of(variance: Array, light: Array, instrument: Array, unit: float, degrees: int) -> "Table":
+    def of(
+        variance: Array, light: Array, instrument: Array, rows: Array, unit: float, degrees: int
+    ) -> "Table":
         """The table of some pixels, all arrays alike.
 
         Args:
             variance: of each pixel over the frames, DN^2, unbiased.
             light: mean of each pixel above black, DN.
             instrument: what follows the light without sharing the pixel's noise, DN.
+            rows: of each pixel; pixels of one row may share noise.
             unit: white level above black, DN.
             degrees: frames less one.
         """
-        s, m, z = (x.ravel().astype(np.float64) for x in (variance, light, instrument))
-        place = class_of(z, unit)
-        columns = (None, z, m, m * m, s, s * m, s * s)
-        sums = [np.bincount(place, weights=c, minlength=CLASSES) for c in columns]
-        return Table(np.array(sums, np.float64), degrees)
+        place = class_of(instrument, unit)
+        grouped = place + CLASSES * (rows % GROUPS)
+        sums = [
+            np.bincount(grouped, weights, GROUPS * CLASSES)
+            for weights in (None, instrument, light, variance)
+        ]
+        sums_by_group = np.array(sums, np.float64).reshape(4, GROUPS, CLASSES).swapaxes(0, 1)
+        squares = np.bincount(place, np.square(variance, dtype=np.float64), CLASSES)
+        return Table(sums_by_group, squares.astype(np.float64), degrees)
 
 
 def class_of(instrument: Array, unit: float) -> NDArray[np.intp]:
@@ -122,41 +134,49 @@ def fit_line(tables: Sequence[Table]) -> Line:
     """The line through tables, and its standard errors.
 
     Weighted by the inverse variance of a sample variance, degrees/(2 variance^2), with the variance
-    from the line itself. Errors by the sandwich formula (White, Econometrica 1980), so they hold
-    for noise that is not Gaussian too.
+    from the line itself. Errors by the sandwich formula over groups of rows (Liang and Zeger,
+    Biometrika 1986), so they hold for noise that is not Gaussian, and for what rows share.
 
-    >>> light = np.linspace(0, 900, 1001)
-    >>> line = fit_line([Table.of(0.5 * light + 4, light, light, 1000, 7)])
+    >>> light, rows = np.linspace(0, 900, 1001), np.arange(1001)
+    >>> line = fit_line([Table.of(0.5 * light + 4, light, light, rows, 1000, 7)])
     >>> round(line.gain.value, 6), round(line.floor.value, 6)
     (0.5, 4.0)
 
     Raises:
         ValueError: no line is defined: fewer than three pixels, or all alike in light.
     """
-    count, z, m, m2, s, sm, s2 = np.concatenate([t.sums for t in tables], axis=1)
+    groups = np.concatenate([t.sums for t in tables], axis=2)
     degrees = np.repeat([float(t.degrees) for t in tables], CLASSES)
-    used = count > 0
-    count, z, m, m2, s, sm, s2, degrees = (x[used] for x in (count, z, m, m2, s, sm, s2, degrees))
+    used = groups[:, 0].sum(axis=0) > 0
+    groups, degrees = groups[..., used], degrees[used]
+    count, z, m, s = groups.sum(axis=0)
     z = z / count
-    if count.sum() < 3 or np.ptp(z) == 0:
+    total = count.sum()
+    if total < 3 or np.ptp(z) == 0:
         raise ValueError("all pixels have the same light")
+    # Weights start from a rising line through the darkest pixels and all; they never take a
+    # variance for less than half of the darkest pixels', or few of these could run away with all.
+    order = np.argsort(z)
+    darkest = order[np.cumsum(count[order]) <= max(DARKEST * total, count[order[0]], LEAST_IN_BIN)]
+    dark = s[darkest].sum() / count[darkest].sum()
+    slope = max(s.sum() / total - dark, 0.0) / max((z @ count) / total - z.min(), 1e-9)
+    least = max(0.5 * dark, 1e-9)
+    variance = np.maximum(dark + slope * (z - z.min()), least)
     instruments = np.stack([z, np.ones_like(z)])
-    least = 1e-4 * s.sum() / count.sum()
-    variance = np.maximum(s / count, least)
     for _ in range(ROUNDS):
         weighted = instruments * degrees / variance**2
         matrix = np.stack([weighted @ m, weighted @ count], axis=1)
         gain, floor = np.linalg.solve(matrix, weighted @ s)
         variance = np.maximum(gain * z + floor, least)
-    residual2 = s2 - 2 * gain * sm - 2 * floor * s
-    residual2 += gain**2 * m2 + 2 * gain * floor * m + floor**2 * count
-    meat = (weighted * np.maximum(residual2, 0)) @ weighted.T
+    scores = (groups[:, 3] - gain * groups[:, 2] - floor * groups[:, 0]) @ weighted.T
+    filled = np.count_nonzero(groups[:, 0].any(axis=1))
     inverse = np.linalg.inv(matrix)
-    errors = np.sqrt(np.diag(inverse @ meat @ inverse.T))
+    covariance = inverse @ scores.T @ scores @ inverse.T * filled / max(filled - 2, 1)
+    errors = np.sqrt(np.diag(covariance))
     return Line(
         Estimate(float(gain), float(errors[0])),
         Estimate(float(floor), float(errors[1])),
-        int(count.sum()),
+        int(total),
     )
 
 
@@ -172,10 +192,11 @@ class Bin:
 
 def binned(table: Table) -> tuple[Bin, ...]:
     """A table in few bins of equal width in the root of the light, those with enough pixels."""
+    sums = np.vstack([table.sums.sum(axis=0), table.squares]).reshape(5, BINS, -1).sum(axis=-1)
     found = []
-    for count, _, m, _, s, _, s2 in table.sums.reshape(7, BINS, -1).sum(axis=-1).T:
+    for count, _, light, variance, square in sums.T:
         if count >= LEAST_IN_BIN:
-            scatter = max(s2 / count - (s / count) ** 2, 0.0)
+            scatter = max(square / count - (variance / count) ** 2, 0.0)
             error = float(np.sqrt(scatter / count))
-            found.append(Bin(float(m / count), float(s / count), error, int(count)))
+            found.append(Bin(float(light / count), float(variance / count), error, int(count)))
     return tuple(found)

@@ -87,8 +87,9 @@ class Stack:
         found = {}
         for name, site in self.sensor.sites().items():
             used = self.used[site]
+            rows = 2 * np.nonzero(used)[0] + site[0].start
             s, light, around = (x[site][used] for x in (variance, self.light, self.around))
-            found[name] = Table.of(s, light, around, self.sensor.unit, self.degrees)
+            found[name] = Table.of(s, light, around, rows, self.sensor.unit, self.degrees)
         return found
 
 

@@ -27,8 +27,9 @@ from clpipe.types import Floats
 # norm 1, the scaling function of sum 1.
 WAVELET = np.array([0.035226, 0.085441, -0.135011, -0.459878, 0.806892, -0.332671])
 SCALING = np.array([0.332671, 0.806892, 0.459878, -0.135011, -0.085441, 0.035226]) / np.sqrt(2)
-LEVELS = 300  # level sets up to the white level (sec. II-B)
-LEAST = 100  # places in a level set
+LEVELS = 150  # level sets of a colour, at most
+LEAST = 400  # places in a level set
+LEAST_EXPLAINED = 40  # of them
 WINDOW = 7  # of the smoothing, and of local variances
 EDGE = 1.0  # tau, in standard deviations of the details (sec. II-B1)
 EXPLAINED = 1.4  # times the line's variance, two standard deviations of a local variance
@@ -47,11 +48,9 @@ class Places:
     variance: Values
 
     def sets(self) -> list[NDArray[np.intp]]:
-        """The level sets with enough places, as indices."""
-        level = np.floor(self.smooth * LEVELS)
-        order = np.argsort(level, kind="stable")
-        _, starts = np.unique(level[order], return_index=True)
-        return [part for part in np.split(order, starts[1:]) if len(part) >= LEAST]
+        """The level sets, as indices: places in order of their smoothed signal, cut evenly."""
+        order = np.argsort(self.smooth, kind="stable")
+        return np.array_split(order, min(LEVELS, len(order) // LEAST) or 1)
 
 
 @dataclass(frozen=True)
@@ -123,8 +122,9 @@ def explained_line(
         a, b, errors = most_likely_line(sets, low)
         found = []
         for part, i in places:
-            i = i[part.variance[i] < EXPLAINED * max(a * part.signal[i].mean() + b, 1e-12)]
-            if len(i) >= LEAST:
+            i = i[part.variance[i] < EXPLAINED * np.maximum(a * part.smooth[i] + b, 1e-12)]
+            # Not more: sets that lose places by chance would go, those that keep them stay.
+            if len(i) >= LEAST_EXPLAINED:
                 found.append((part.signal[i].mean(), part.variance[i].mean() / cut, len(i)))
     return a, b, sets, errors
 
