@@ -207,13 +207,13 @@ def grouped(scene: Sequence[Frame], dark: Sequence[Frame]) -> list[Group]:
     first = frames[0]
     for frame in frames:
         for what, one, other in (
-            ("camera", f"{first.make} {first.model}", f"{frame.make} {frame.model}"),
-            ("pattern", first.sensor.pattern, frame.sensor.pattern),
-            ("levels", _levels(first.sensor), _levels(frame.sensor)),
+            ("the camera", f"{first.make} {first.model}", f"{frame.make} {frame.model}"),
+            ("the pattern", first.sensor.pattern, frame.sensor.pattern),
+            ("the levels", _levels(first.sensor), _levels(frame.sensor)),
         ):
             if one != other:
                 raise RequestError(
-                    f"{frame.path}: its {what} is {other}, that of {first.path} is {one}; "
+                    f"{frame.path} has {what} {other}, but {first.path} has {one}; "
                     "calibrate one camera at a time"
                 )
     if first.sensor.unit <= 0:

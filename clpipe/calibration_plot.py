@@ -25,11 +25,12 @@ def plot_calibration(path: Path, found: Sequence[Calibration], title: str) -> No
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    rows = math.ceil(len(found) / COLUMNS)
+    columns = min(COLUMNS, len(found))
+    rows = math.ceil(len(found) / columns)
     figure = Figure(figsize=(16, 7.5 + 4.2 * rows), dpi=WIDTH / 16, layout="constrained")
     figure.suptitle(title, fontsize=17)
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[4.2 * rows, 7]).ravel()
-    panels = np.ravel(upper.subplots(rows, COLUMNS, squeeze=False))
+    panels = np.ravel(upper.subplots(rows, columns, squeeze=False))
     for panel, one in zip(panels, found, strict=False):
         _variance_over_mean(panel, one)
     for panel in panels[len(found) :]:
