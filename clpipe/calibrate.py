@@ -22,6 +22,7 @@ from clpipe.types import Floats
 ROUNDING = 1 / 12  # variance of rounding to whole DN
 ROUGH = 0.4  # DN of noise below which rounding is not independent of the noise
 LEAST_USED = 0.1  # of the pixels
+BENT = 0.1  # of the variance
 CLIPPED = 1e-3  # share of a dark frame's samples at 0 DN
 
 
@@ -112,7 +113,9 @@ def _alone(
     iso: float, frame: Floats, dark: Floats | None, sensor: Sensor, whole: bool
 ) -> Calibration:
     """From a single frame of a scene."""
-    notes = ["a single frame: texture that looks like noise is counted as noise"]
+    notes = [
+        "a single frame: texture that looks like noise counts as noise; errors do not cover it"
+    ]
     rounding = ROUNDING if whole else 0.0
     unit = sensor.unit
     darkness = _Dark.of(dark, sensor, notes)
@@ -192,6 +195,8 @@ def _repeated(
     pooled = _seen(line).lowered(rounding)
     pattern = darkness.pattern(pooled, rounding) if darkness else {}
     dsnu = pattern["dsnu"].value if darkness else 0.0
+    bins = {name: binned(table) for name, table in tables[0].items()}
+    every = [one for own in bins.values() for one in own]
     prnu2 = fixed_pattern.response_pattern(stack, line, dsnu**2)
     return Calibration(
         iso=iso,
@@ -200,7 +205,7 @@ def _repeated(
         dark_frames=0 if dark is None else len(dark),
         lines={name: own.lowered(rounding) for name, own in lines.items()},
         pooled=pooled,
-        bins={name: binned(table) for name, table in tables[0].items()},
+        bins=bins,
         size=stack.light.size,
         used=float(stack.used.mean()),
         rounding=rounding,
@@ -208,7 +213,7 @@ def _repeated(
         prnu=prnu2.root() if prnu2 and prnu2.seen else None,
         dead=dead,
         **({"hot": hot} | pattern),
-        notes=(*notes, *_doubts(pooled, rounding, lines)),
+        notes=(*notes, *_doubts(pooled, rounding, lines), *_bent(pooled, rounding, every)),
     )
 
 
@@ -342,18 +347,39 @@ def _doubts(pooled: Line, rounding: float, lines: dict[str, Line] | None = None)
     gain, floor = pooled.gain, pooled.floor
     if gain.error > 0.1 * gain.value:
         found.append(f"a is only known to {gain.error / gain.value:.0%}; give more frames or light")
-    if not floor.seen:
-        found.append("b is not above zero by two standard errors; dark frames (--dark) would help")
-    elif rounding and floor.value < ROUGH**2:
+    if rounding and abs(floor.value) < ROUGH**2:
         found.append(
-            f"read noise is {floor.value**0.5:.2f} DN; below {ROUGH} DN rounding depends on it, "
-            "and b is rough"
+            f"b is {floor.value:.2f} DN^2; below {ROUGH} DN of noise rounding depends on it, and b "
+            "is rough"
         )
+    elif floor.value < -2 * floor.error:
+        found.append(
+            "b is below zero: there is less noise in the dark than a line can have, so the black "
+            "level is too low, or the raws were processed"
+        )
+    elif not floor.seen:
+        found.append("b is not above zero by two standard errors; dark frames (--dark) would help")
     for name, line in (lines or {}).items():
         apart = line.gain.value - gain.value
         if abs(apart) > max(5 * line.gain.error, 0.03 * gain.value):
             found.append(f"a of {name} is {apart / gain.value:+.0%} from that of all channels")
     return found
+
+
+def _bent(pooled: Line, rounding: float, bins: Sequence[Bin]) -> list[str]:
+    """What a user should know where the points leave the line."""
+    worst, where = 0.0, 0.0
+    for one in bins:
+        expected = pooled.gain.value * one.light + pooled.floor.value + rounding
+        apart = one.variance - expected
+        if abs(apart) > max(BENT * expected, 6 * one.error) and abs(apart / expected) > abs(worst):
+            worst, where = apart / expected, one.light
+    if not worst:
+        return []
+    return [
+        f"variance is {worst:+.0%} from the line at {where:.0f} DN above black; the sensor is not "
+        "linear there, or the levels are wrong"
+    ]
 
 
 def gain_stages(found: Sequence[Calibration]) -> list[list[Calibration]]:

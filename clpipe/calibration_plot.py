@@ -59,7 +59,8 @@ def _variance_over_mean(panel: object, one: Calibration) -> None:
     gain, floor = one.pooled.gain, one.pooled.floor
     for name, line in one.lines.items():
         own = line.gain.value * ends + line.floor.value
-        panel.plot(ends, own, color=COLOURS[name], lw=0.8, alpha=0.7)
+        label = None if name in one.bins else f"fit, {name}"
+        panel.plot(ends, own, color=COLOURS[name], lw=0.8, alpha=0.7, label=label)
     panel.plot(ends, gain.value * ends + floor.value, color="black", lw=1.3, label="fit, all")
     panel.set_title(f"ISO {one.iso:g}: variance = {gain.value:.4g} · mean + {floor.value:.3g}")
     panel.set_xlabel("mean above black, DN")

@@ -167,7 +167,7 @@ def test_b_is_the_noise_before_rounding():
     assert off(found.pooled.floor, 0.49)[0] < 0.01
     coarse = calibrate(100, frames(scene(), 8, 0.3, 0.2), frames(scene() * 0, 8, 0.3, 0.2, seed=1),
                        SENSOR)  # fmt: skip
-    assert any("below 0.4 DN" in note or "not above zero" in note for note in coarse.notes)
+    assert any("below 0.4 DN of noise" in note for note in coarse.notes)
     assert calibrate(100, frames(scene()), None, SENSOR, whole=False).rounding == 0
     assert found.rounding == ROUNDING
 
@@ -237,6 +237,16 @@ def test_clipped_pixels_do_not_bend_the_line():
     dim = Sensor("RGGB", 5, 4095)
     found = calibrate(100, frames(scene(), sensor=dim, read=3.0), None, dim)
     assert off(found.pooled.gain, 2)[0] < 0.01
+
+
+def test_a_wrong_black_level_and_a_bent_response_are_told():
+    shots = frames(scene())
+    wrong = calibrate(100, shots.copy(), None, Sensor("RGGB", 480, 16383))
+    assert any("b is below zero" in note for note in wrong.notes)
+    light = shots - 512
+    bent = np.rint(512 + np.where(light > 4000, 4000 + (light - 4000) * 0.6, light))
+    found = calibrate(100, bent.astype(np.float32), None, SENSOR)
+    assert any("from the line at" in note for note in found.notes)
 
 
 def test_a_lamp_may_flicker_and_no_more():
