@@ -122,11 +122,45 @@ def prepare_folder(folder: Path) -> None:
 
 
 @dataclass(frozen=True)
+class Burst:
+    """How many frames are made of each image; None is one, without anything beside it."""
+
+    frames: int | None = None
+
+    def names(self) -> tuple[str, ...]:
+        """What stands behind the image's name for each picture that is made of it.
+
+        >>> Burst(2).names(), Burst().names()
+        (('.truth', '.frame0', '.frame1'), ('',))
+        """
+        if self.frames is None:
+            return ("",)
+        digits = len(str(self.frames - 1))
+        return (".truth", *(f".frame{i:0{digits}}" for i in range(self.frames)))
+
+    def shots(self, runner: Runner, key: str) -> Iterator[tuple[str, Runner, str]]:
+        """For each picture its name, how it is made, and its image key.
+
+        The first frame is the picture that there is without a burst; the truth has no noise.
+        """
+        first, *others = self.names()
+        if not others:
+            yield first, runner, key
+            return
+        clean = runner.chain.clean()
+        kept = [step.name for step in clean.steps if step.name in runner.keep]
+        yield first, Runner(clean, runner.device, kept, runner.encode, runner.final), key
+        for number, name in enumerate(others):
+            yield name, runner, f"{key}#{number}" if number else key
+
+
+@dataclass(frozen=True)
 class Target:
-    """Where results go, and in which formats."""
+    """Where results go, in which formats, and how many of each image."""
 
     folder: Path
     formats: tuple[str, ...]
+    burst: Burst = Burst()
 
     def check(self, chain: Chain, jobs: Sequence[Job], keep: Sequence[str]) -> None:
         """See that the results can be written in these formats, over no input and no other result.
@@ -142,9 +176,10 @@ class Target:
             )
         inputs = {os.path.realpath(job.path) for job in jobs}
         makers: dict[Path, Job] = {}
+        endings = ("json", *self.formats, *(f"{step}.exr" for step in keep))
+        names = self.burst.names()
         for job in jobs:
-            for ending in ("json", *self.formats, *(f"{step}.exr" for step in keep)):
-                path = self.path(job, ending)
+            for path in (self.path(job, e, name) for name in names for e in endings):
                 if os.path.realpath(path) in inputs:
                     raise RequestError(
                         f"{path} is an input and would be overwritten; choose another output folder"
@@ -156,9 +191,9 @@ class Target:
                     )
                 makers[path] = job
 
-    def path(self, job: Job, ending: str) -> Path:
-        """The output of a job with that ending."""
-        return self.folder / f"{Path(job.key).with_suffix('')}.{ending}"
+    def path(self, job: Job, ending: str, name: str = "") -> Path:
+        """The output of a job with that ending; ``name`` is one of the burst's."""
+        return self.folder / f"{Path(job.key).with_suffix('')}{name}.{ending}"
 
     def check_size(self, source: SourceImage) -> None:
         """See that an image fits into the formats.
@@ -170,9 +205,15 @@ class Target:
             raise ImageError(f"JPEG holds at most {JPEG_MAX_SIDE} pixels a side; use --format png")
 
     def write(
-        self, job: Job, key: str, runner: Runner, source: SourceImage, result: Result
+        self,
+        job: Job,
+        name: str,
+        key: str,
+        runner: Runner,
+        source: SourceImage,
+        result: Result,
     ) -> None:
-        """Write a job's images, then its sidecar.
+        """Write a job's images, or those of one picture of its burst, then the sidecar.
 
         Raises:
             ImageError: a file cannot be written.
@@ -182,12 +223,12 @@ class Target:
         outputs = []
         for step in chain.steps:
             if step.name in runner.keep:
-                path = self.path(job, f"{step.name}.exr")
+                path = self.path(job, f"{step.name}.exr", name)
                 attributes = attributes_of(step, chain, key)
                 write_exr(path, result.kept[step.name], step.stage.writes.channels, attributes)
                 outputs.append(path.name)
         for format_ in self.formats:
-            path = self.path(job, format_)
+            path = self.path(job, format_, name)
             if format_ == "exr":
                 assert result.final is not None
                 attributes = attributes_of(chain.steps[-1], chain, key)
@@ -198,7 +239,7 @@ class Target:
             outputs.append(path.name)
         record = sidecar(job, key, runner, source, result, outputs)
         text = json.dumps(record, indent=2) + "\n"
-        write_beside(self.path(job, "json"), lambda to: _write_text(to, text))
+        write_beside(self.path(job, "json", name), lambda to: _write_text(to, text))
 
 
 def _write_text(path: Path, text: str) -> None:
@@ -227,6 +268,7 @@ def sidecar(
         "height": source.pixels.shape[0],
         "camera": chain.camera.name,
         "iso": chain.iso,
+        "noise": chain.noise.record() if chain.noise else None,
         "starts_on": chain.source.label,
         "stages": [
             {
@@ -306,8 +348,9 @@ def run_jobs(
                     yield Outcome(job, 0, 0, left_out=True)
                     continue
                 runner, source, key = entered
-                result = runner.run(source.pixels, key)
-                target.write(job, key, runner, source, result)
+                for name, shot, shot_key in target.burst.shots(runner, key):
+                    result = shot.run(source.pixels, shot_key)
+                    target.write(job, name, shot_key, shot, source, result)
             except KindError as error:
                 if reentry and not job.listed:
                     yield Outcome(job, 0, 0, left_out=True)

@@ -123,21 +123,33 @@ def check_method(
     )
 
 
-def check_raw(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Check:
-    """The whole way to the raw, all patterns: after quantize, device and NumPy must be equal."""
+# Every source of noise at work.
+NOISE: Mapping[str, Mapping[str, Any]] = {
+    "prnu": {"sigma": 0.01},
+    "defect_pixels": {"hot_share": 0.01, "hot_level": 0.1, "dead_share": 0.01},
+    "dsnu": {"sigma": 0.001},
+    "row_noise": {"sigma": 0.003},
+    "column_noise": {"sigma": 0.002},
+}
+
+
+def check_raw(device: Device, noise: str, sizes: Sequence[tuple[int, int]] = SIZES) -> Check:
+    """The whole way to the raw, all patterns: after quantize, device and NumPy must be equal.
+
+    ``noise`` is the method of sensor_noise.
+    """
     names = list(all_stages())
     chain = tuple(names[: names.index("quantize") + 1])
     samples, differing, largest = 0, 0, 0.0
     for pattern in PATTERNS:
-        noise = {"row_noise": {"sigma": 0.003}, "column_noise": {"sigma": 0.002}}
-        settings = Settings(
-            iso=3200, stages=chain, parameters={"mosaic": {"pattern": pattern}, **noise}
-        )
+        own: dict[str, dict[str, Any]] = {"mosaic": {"pattern": pattern}}
+        own["sensor_noise"] = {"method": noise}
+        settings = Settings(iso=3200, stages=chain, parameters={**NOISE, **own})
         more = compare(device, settings, Kind.RGB, sizes)
         samples, differing, largest = samples + more[0], differing + more[1], max(largest, more[2])
     return Check(
         "exposure..quantize",
-        "the raw",
+        f"the raw, {noise}",
         len(PATTERNS) * len(sizes),
         samples,
         differing,
@@ -155,4 +167,5 @@ def check_all(
             for values in variants(method):
                 yield check_method(device, stage, method, sizes, values=values)
     if not stages:
-        yield check_raw(device, sizes)
+        for noise in all_stages()["sensor_noise"].by_name:
+            yield check_raw(device, noise, sizes)

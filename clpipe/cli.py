@@ -13,11 +13,12 @@ from rich.table import Table
 
 import clpipe
 from clpipe import describe
-from clpipe.batch import FORMATS, Target, find_jobs, prepare_folder, run_jobs
+from clpipe.batch import FORMATS, Burst, Target, find_jobs, prepare_folder, run_jobs
 from clpipe.bench import bench as run_bench
 from clpipe.bench import bench_methods
 from clpipe.calibrate import Calibration
 from clpipe.calibration_frames import Given, calibrate_files, check_name, write_profile
+from clpipe.camera import built_in_cameras, load_camera
 from clpipe.check import SIZES, check_all
 from clpipe.config import (
     Chain,
@@ -33,6 +34,8 @@ from clpipe.device import find_devices, open_device
 from clpipe.errors import ClpipeError, RequestError
 from clpipe.image_io import MAX_PIXELS
 from clpipe.line_fit import Estimate
+from clpipe.measure import load
+from clpipe.measure import measure as measure_images
 from clpipe.plan import make_plan
 from clpipe.reentry import Reentry
 from clpipe.reference.cfa import PATTERNS, Pattern
@@ -216,12 +219,19 @@ def main() -> None:
     help="The folder for what comes out; made if need be.",
 )
 @chain_options
+@click.option(
+    "--frames",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Make a burst of N frames of each image, each with noise of its own, and the truth.",
+)
 @keep_option
 @format_option
 @device_option
 def run(
     inputs: tuple[str, ...],
     output: Path,
+    frames: int | None,
     keep: tuple[str, ...],
     formats: tuple[str, ...],
     selector: str | None,
@@ -229,7 +239,8 @@ def run(
 ) -> None:
     """Run images through the chain: files, folders or globs of linear float images (EXR).
 
-    Each makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used.
+    Each makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used. With
+    --frames: OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise.
     """
     asked = Request(**request)
     jobs = find_jobs(inputs, output)
@@ -238,7 +249,9 @@ def run(
     kept = chain.kept(keep)
     whole = asked.until is None or chain.result is Kind.DISPLAY
     formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
-    target = Target(output, formats)
+    target = Target(output, formats, Burst(frames))
+    if frames:
+        chain.clean()  # refuses a chain in which frames would be the same
     target.check(chain, jobs, kept)
     device = open_device(selector)
     prepare_folder(output)
@@ -256,7 +269,7 @@ def run(
             continue
         for warning in outcome.warnings:
             click.echo(f"clpipe: {outcome.job.path}: warning: {warning}", err=True)
-        made = target.path(outcome.job, formats[0])
+        made = target.path(outcome.job, formats[0], target.burst.names()[-1])
         click.echo(
             f"{outcome.job.path} -> {made}  {outcome.megapixels:.2g} MP  {outcome.seconds:.2f} s",
             err=True,
@@ -369,6 +382,43 @@ def explain_stage(stage: Stage, settings: Settings) -> None:
             console().print(table)
     if stage.explain:
         click.echo(f"\n{stage.explain(context)}")
+
+
+@main.command()
+@click.argument("name", required=False, metavar="[NAME|FILE]")
+@click.option("--iso", type=float, help="The ISO. [default: those that were measured]")
+@json_option
+def cameras(name: str | None, iso: float | None, as_json: bool) -> None:
+    """List the cameras, or show one: its noise in all three ways, and its sources."""
+    if name is None:
+        if iso is not None:
+            raise RequestError("--iso: name the camera that it is of")
+        records = [describe.camera_record(load_camera(n)) for n in built_in_cameras()]
+        if as_json:
+            click.echo(json.dumps(records, indent=2))
+            return
+        table = Table(
+            "camera", "make and model", "ISO", "gain stages from", box=None, pad_edge=False
+        )
+        for row in map(describe.camera_row, map(load_camera, built_in_cameras())):
+            table.add_row(*row)
+        console().print(table)
+        return
+    camera = load_camera(name)
+    if as_json:
+        click.echo(json.dumps(describe.camera_record(camera, iso), indent=2))
+        return
+    for title, headings, rows in describe.camera_tables(camera, iso):
+        click.echo(title)
+        table = Table(box=None, pad_edge=False)
+        for heading in headings:
+            table.add_column(heading, justify="left" if heading == headings[0] else "right")
+        for row in rows:
+            table.add_row(*row)
+        console().print(table)
+        click.echo("")
+    for key, source in camera.sources.items():
+        click.echo(f"{key}: {source}")
 
 
 @main.command()
@@ -612,3 +662,61 @@ def calibration_table(found: Sequence[Calibration]) -> Table:
             f"{one.used:.1%}",
         )
     return table
+
+
+@main.command()
+@click.argument(
+    "images", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE..."
+)
+@click.option(
+    "--truth", type=click.Path(path_type=Path), metavar="FILE", help="The same image without noise."
+)
+@click.option(
+    "--pattern",
+    default="RGGB",
+    show_default=True,
+    type=click.Choice(PATTERNS),
+    help="Of mosaics that do not say their own.",
+)
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    metavar="FILE.png",
+    help="Draw noise by intensity, autocorrelation and tails.",
+)
+@json_option
+def measure(
+    images: tuple[Path, ...], truth: Path | None, pattern: Pattern, plot: Path | None, as_json: bool
+) -> None:
+    """Measure the noise of images: how large, how correlated, how Gaussian.
+
+    IMAGE is a kept EXR of any stage, a mosaic, or a finished picture (JPEG, PNG, TIFF). Noise is
+    the difference from --truth, or, of two or more frames of one scene, from their mean.
+
+    \b
+    clpipe run render.exr -o noisy --iso 3200 --until quantize
+    clpipe run render.exr -o clean --iso 3200 --until quantize \\
+        --skip sensor_noise --skip row_noise --skip column_noise
+    clpipe measure noisy/render.exr --truth clean/render.exr
+    """
+    if plot is not None and plot.suffix != ".png":
+        raise RequestError(f"--plot: found {plot}; expected a name that ends in .png")
+    report = measure_images(
+        [load(path, pattern) for path in images], load(truth, pattern) if truth else None
+    )
+    if plot is not None:
+        from clpipe.measure_plot import draw
+
+        draw(report, plot)
+    if as_json:
+        click.echo(json.dumps(report.record(), indent=2))
+        return
+    click.echo(describe.measure_heading(report))
+    for title, (headings, *rows) in describe.measure_tables(report):
+        table = Table(box=None, pad_edge=False)
+        for i, heading in enumerate(headings):
+            table.add_column(heading, justify="right" if i or heading else "left")
+        for row in rows:
+            table.add_row(*row)
+        click.echo(f"\n{title}")
+        console().print(table)

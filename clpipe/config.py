@@ -4,7 +4,7 @@ import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,9 @@ from pydantic import ValidationError
 
 from clpipe.camera import DEFAULT_CAMERA, Camera, load_camera
 from clpipe.errors import RequestError
+from clpipe.noise_model import NoiseModel
 from clpipe.registry import all_stages, blamed, check_passes, load_stage_file
-from clpipe.stage import Context, Kind, Method, Stage
+from clpipe.stage import Context, Kind, Method, Stage, Unchanged
 from clpipe.stages import DEFAULT_CHAIN
 from clpipe.suggest import one_of
 
@@ -73,6 +74,24 @@ class Chain:
     def result(self) -> Kind:
         """The kind of image that comes out."""
         return self.steps[-1].stage.writes if self.steps else self.source
+
+    @property
+    def noise(self) -> NoiseModel | None:
+        """The sensor noise in the image that comes out; None where none was added."""
+        last = self.steps[-1]
+        return last.method.after(last.context).noise
+
+    def clean(self) -> "Chain":
+        """The chain without the steps that draw random numbers; the others as they are.
+
+        Raises:
+            RequestError: no step does.
+        """
+        steps = [s for s in self.steps if not any(p.random for p in s.method.passes())]
+        if len(steps) == len(self.steps):
+            raise RequestError("no stage of this chain adds noise; every frame would be the same")
+        quiet = (replace(s, context=replace(s.context, noise=None)) for s in steps)
+        return replace(self, steps=tuple(quiet))
 
     def kept(self, names: Sequence[str]) -> tuple[str, ...]:
         """The names of steps to keep, each once; ``all`` is every one.
@@ -394,6 +413,8 @@ def make_chain(
 def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:
     """The steps of the settings, in order, for an image of a kind; None is what the first reads.
 
+    A step that does nothing is left out where it does not fit.
+
     Raises:
         RequestError: image kinds do not fit.
     """
@@ -407,9 +428,11 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
         name = stage_name if count[stage_name] == 1 else f"{stage_name}_{count[stage_name]}"
         if name in settings.skip:
             continue
-        if stage.reads is not (kind or stage.reads):
-            raise RequestError(misfit(name, stage, before, kind or stage.reads))
         method = make_method(stage, name, settings.parameters.get(name, {}))
+        if stage.reads is not (kind or stage.reads):
+            if isinstance(method, Unchanged) and stage.reads is stage.writes:
+                continue  # so that gamma can be skipped without picture_noise, which does nothing
+            raise RequestError(misfit(name, stage, before, kind or stage.reads))
         with named_errors(name, type(method)), blamed(f"stage {name}", stage.folder):
             method = method.resolve(context)
             after = method.after(context)

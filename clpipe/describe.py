@@ -1,16 +1,37 @@
 """Plans, stages and devices in words, for people and for programs."""
 
 import json
+import math
 import types
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+from pydantic import ValidationError
+
+from clpipe.camera import Camera
 from clpipe.config import Chain, Settings, make_chain
 from clpipe.device import Found, choose
 from clpipe.errors import ClpipeError, DeviceError
+from clpipe.measure import UNITS, Report
 from clpipe.plan import AnyLaunch, Launch, Lines, Plan, launch_bytes, reads_of
 from clpipe.stage import Context, Method, Stage
+from clpipe.statistics import LAGS, SIGMAS, LineNoise, gaussian_beyond
 
+# What a camera has at every ISO, with units.
+FIXED = {
+    "black_level": "DN",
+    "white_level": "DN",
+    "bits": "",
+    "white_balance_gains": "red, blue",
+    "full_well": "e-",
+    "tukey_lambda": "",
+    "prnu": "",
+    "dsnu": "e-",
+    "hot_pixel_share": "",
+    "hot_pixel_level": "e-",
+    "dead_pixel_share": "",
+}
+Rows = list[tuple[str, ...]]
 LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 
@@ -104,7 +125,10 @@ def type_text(annotation: Any) -> str:
     if get_origin(annotation) is Annotated:
         return type_text(get_args(annotation)[0])
     if get_origin(annotation) is tuple:
-        return f"{len(get_args(annotation))} x {type_text(get_args(annotation)[0])}"
+        first, *more = get_args(annotation)
+        if Ellipsis in more:
+            return f"list of {type_text(first)}s"
+        return f"{1 + len(more)} x {type_text(first)}"
     if get_origin(annotation) in (Union, types.UnionType):
         return " | ".join(type_text(a) for a in get_args(annotation) if a is not type(None))
     return {"float": "number", "int": "whole number"}.get(annotation.__name__, annotation.__name__)
@@ -139,6 +163,8 @@ def toml_text(chain: Chain) -> str:
         given = settings.parameters.get(step.name, {})
         for name, field in type(step.method).model_fields.items():
             extra: Any = field.json_schema_extra
+            if getattr(step.method, name) is None:
+                continue
             line = f"{name} = {value_text(getattr(step.method, name))}"
             if name not in given and field.default is None:
                 line = f"# {line}  # automatic: {extra['auto']}"
@@ -150,15 +176,15 @@ def toml_text(chain: Chain) -> str:
 
 def resolved(method: type[Method], context: Context) -> dict[str, str]:
     """The values that automatic parameters of a method take in a context, as text."""
+    automatic = [name for name, field in method.model_fields.items() if field.default is None]
     try:
+        values = method().resolve(context)
+    except ValidationError:  # it must be given something
         values = method.model_validate(method.example).resolve(context)
+        automatic = [name for name in automatic if name not in method.example]
     except ClpipeError as error:
-        return {name: str(error) for name, f in method.model_fields.items() if f.default is None}
-    return {
-        name: short_text(getattr(values, name))
-        for name, field in method.model_fields.items()
-        if field.default is None
-    }
+        return dict.fromkeys(automatic, str(error))
+    return {name: short_text(getattr(values, name)) for name in automatic}
 
 
 def short_text(value: Any) -> str:
@@ -169,6 +195,8 @@ def short_text(value: Any) -> str:
     """
     if isinstance(value, tuple):
         return f"[{', '.join(map(short_text, value))}]"
+    if value is None:
+        return "none"
     plain = not isinstance(value, float) or value.is_integer()
     return value_text(value) if plain else f"{value:.4g}"
 
@@ -216,6 +244,103 @@ def stage_record(stage: Stage, context: Context) -> dict[str, Any]:
     }
 
 
+def make_and_model(camera: Camera) -> str:
+    """What is written on a camera; some makers begin the model with their name."""
+    model, make = camera.model, camera.make
+    return model if model.startswith(make) else f"{make} {model}"
+
+
+def camera_row(camera: Camera) -> tuple[str, ...]:
+    """A camera in a line: name, make and model, ISOs, where its gain stages begin."""
+    stages = ", ".join(f"{stage.iso[0]:g}" for stage in camera.gain_stages)
+    low, high = camera.iso_range
+    return camera.name, make_and_model(camera), f"{low:g} to {high:g}", stages
+
+
+def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[str, ...], Rows]]:
+    """A camera's noise at an ISO, or at all that were measured, as titles, headings and rows.
+
+    Raises:
+        RequestError: the camera has not that ISO.
+    """
+    isos = [iso] if iso else [i for stage in camera.gain_stages for i in stage.iso]
+    signal: Rows = []
+    paper: Rows = []
+    for i in isos:
+        record = noise_at(camera, i)
+        emva, lines = record["emva1288"].values(), (record["row_noise"], record["column_noise"])
+        signal.append(figures(i, *record["signal"].values(), *emva, *lines))
+        paper.append(figures(i, *record["paper"].values()))
+    return [
+        (
+            f"{make_and_model(camera)}: Var[y] = a*y + b, y = 1 at the white level; EMVA 1288",
+            (
+                "ISO",
+                "a",
+                "b",
+                "system_gain",
+                "read_noise",
+                "adc_noise",
+                "row_noise",
+                "column_noise",
+            ),
+            [("", "", "", "DN/e-", "e-", "DN", "DN", "DN"), *signal],
+        ),
+        (
+            "The paper's: a = theta/chi, b = theta^2 b' + b'' - theta^2 p0/chi",
+            ("ISO", "chi", "theta", "b'", "b''", "p0"),
+            paper,
+        ),
+        (
+            "At every ISO",
+            ("", "found", "unit"),
+            [
+                (key, short_text(value) if value is not None else "none known", unit)
+                for key, unit in FIXED.items()
+                for value in (getattr(camera, key),)
+            ],
+        ),
+    ]
+
+
+def figures(iso: float, *values: float) -> tuple[str, ...]:
+    """An ISO, and numbers with four digits."""
+    return (f"{iso:g}", *(f"{value:.4g}" for value in values))
+
+
+def noise_at(camera: Camera, iso: float) -> dict[str, Any]:
+    """Noise at an ISO in all three ways, and that of rows and columns in DN, as JSON values.
+
+    Raises:
+        RequestError: the camera has not that ISO.
+    """
+    unit = camera.signal_range
+    return {
+        "iso": iso,
+        **camera.noise(iso).record(),
+        "row_noise": camera.row_noise(iso) * unit,
+        "column_noise": camera.column_noise(iso) * unit,
+    }
+
+
+def camera_record(camera: Camera, iso: float | None = None) -> dict[str, Any]:
+    """A camera as JSON values, with its noise at an ISO or at all that were measured.
+
+    Raises:
+        RequestError: the camera has not that ISO.
+    """
+    isos = [iso] if iso else [i for stage in camera.gain_stages for i in stage.iso]
+    return {
+        "name": camera.name,
+        "make": camera.make,
+        "model": camera.model,
+        "iso_range": camera.iso_range,
+        **{key: getattr(camera, key) for key in FIXED},
+        "noise": [noise_at(camera, i) for i in isos],
+        "sources": camera.sources,
+    }
+
+
 def device_rows(devices: Sequence[Found]) -> list[dict[str, Any]]:
     """A row a device with its status: used, usable, or why it is passed over; NumPy comes last."""
     try:
@@ -255,3 +380,72 @@ def device_rows(devices: Sequence[Found]) -> list[dict[str, Any]]:
         | {"status": numpy}
     )
     return rows
+
+
+def number(value: float, form: str = ".3g") -> str:
+    """A measured number; a dash where it could not be told.
+
+    >>> number(0.01234), number(math.nan)
+    ('0.0123', '-')
+    """
+    return "-" if math.isnan(value) else f"{value:{form}}"
+
+
+def line_text(lines: LineNoise) -> str:
+    """What rows or columns share, or what it is below where chance alone could be all of it."""
+    if lines.sigma > lines.limit:
+        return number(lines.sigma)
+    return "-" if math.isnan(lines.limit) else f"< {number(lines.limit)}"
+
+
+def measure_heading(report: Report) -> str:
+    """What was measured, of what, over which pixels, in a line or two."""
+    against = report.truth or "their mean"
+    what = "samples" if report.kind in ("mosaic", "values") else "pixels (flat, not clipped)"
+    lines = [
+        f"{len(report.images)} x {report.kind}, {report.width}x{report.height}, against {against}; "
+        f"unit: {UNITS[report.kind]}",
+        f"{report.share:.1%} of the {what} count",
+        *(f"note: {note}" for note in report.notes),
+    ]
+    return "\n".join(lines)
+
+
+def measure_tables(report: Report) -> list[tuple[str, Rows]]:
+    """The tables of a report: a title and rows of text, the first row being the headings."""
+    names = [one.name for one in report.channels]
+    laws = ["a", "b"] if any(one.law for one in report.channels) else []
+    size: Rows = [("", "samples", "sigma", *laws, "row sigma", "column sigma")]
+    shape: Rows = [("", *(f"{k}" for k in range(1, LAGS + 1)), "diagonal 1", "left after 2x2")]
+    far: Rows = [("", "skewness", "excess kurtosis", *(f"> {k} sigma" for k in SIGMAS))]
+    for one in report.channels:
+        found = [""] * len(laws)
+        if law := one.law:
+            found = [f"{law.a:.4g} ± {law.a_error:.1g}", f"{law.b:.4g} ± {law.b_error:.1g}"]
+        lines = line_text(one.rows), line_text(one.columns)
+        size.append((one.name, str(one.count), number(one.sigma, ".4g"), *found, *lines))
+        table, middle = one.autocorrelation, slice(LAGS + 1, None)
+        right = [number(r, ".3f") for r in table[LAGS, middle]]
+        down = [number(r, ".3f") for r in table[middle, LAGS]]
+        diagonal = number(table[LAGS + 1, LAGS + 1], ".3f")
+        shape.append((f"{one.name} right", *right, diagonal, number(one.energy_left, ".3f")))
+        shape.append((f"{one.name} down", *down, "", ""))
+        tails = one.tails
+        moments = number(tails.skewness, ".3f"), number(tails.excess_kurtosis, ".3f")
+        far.append((one.name, *moments, *(number(p, ".2g") for p in tails.beyond)))
+    far.append(("Gaussian", "0", "0", *(f"{gaussian_beyond(k):.2g}" for k in SIGMAS)))
+    sigmas = [dict(zip(one.curve.bins, one.curve.sigma, strict=True)) for one in report.channels]
+    curve: Rows = [("intensity", *names)]
+    for i in sorted(set().union(*sigmas)):
+        middle_of_bin = (report.edges[i] + report.edges[i + 1]) / 2
+        values = (f"{s[i]:.4g}" if i in s else "" for s in sigmas)
+        curve.append((f"{middle_of_bin:.3f}", *values))
+    pairs = [f"{a}-{b}" for a, b in report.correlations]
+    across: Rows = [tuple(pairs), tuple(number(r, ".3f") for r in report.correlations.values())]
+    return [
+        ("noise" + ("; variance = a * intensity + b" if laws else ""), size),
+        ("autocorrelation (independent noise: 0; left after 2x2: 0.25)", shape),
+        ("correlation between channels", across),
+        ("tails of standardised noise", far),
+        ("sigma by intensity", curve),
+    ]

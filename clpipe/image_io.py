@@ -4,7 +4,7 @@ import contextlib
 import hashlib
 import io
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,6 +56,63 @@ def read_image(path: Path, mosaic: bool = False) -> SourceImage:
         ImageError: the file is missing, empty, damaged, no image, not linear float, deep, or has
             not the channels; the message names the file and the reason.
     """
+    with _opened(path) as (data, file):
+        pixels, layer, warnings, attributes = _read_picture(path, file, mosaic)
+    pixels, count = without_non_finite(pixels)
+    if count:
+        warnings.append(f"{count} samples were NaN or infinite and were set to 0")
+    if (
+        not mosaic
+        and pixels.dtype == np.float32
+        and (beyond := int((np.abs(pixels) > HALF_MAX).sum()))
+    ):
+        pixels = np.clip(pixels, -HALF_MAX, HALF_MAX)
+        warnings.append(f"{beyond} samples beyond {HALF_MAX:g}, the range of half, were clipped")
+    digest = hashlib.sha256(data).hexdigest()
+    return SourceImage(pixels, digest, layer, tuple(warnings), attributes)
+
+
+def read_finished(path: Path) -> Floats | None:
+    """A finished picture (JPEG, PNG, TIFF), (height, width, 3), 0..1, as it is encoded.
+
+    None if the file holds no red, green and blue in whole numbers of 8 or 16 bits, and so is for
+    :func:`read_image`. Alpha is left alone.
+
+    Raises:
+        ImageError: the file is missing, empty, damaged or no image.
+    """
+    with _opened(path) as (_, file):
+        spec = file.spec()
+        picture = picture_channels(list(spec.channelnames))
+        if picture is None or spec.format.basetype not in (oiio.UINT8, oiio.UINT16):
+            return None
+        pixels = file.read_image(oiio.FLOAT)  # scales whole numbers to 0..1
+        problem = file.geterror()
+        if pixels is None or problem:
+            raise ImageError(f"{path}: damaged: {_reason(problem)}")
+        return np.ascontiguousarray(np.asarray(pixels)[..., list(picture[1])])
+
+
+def holds_mosaic(path: Path) -> bool:
+    """Whether a file has no red, green and blue, but one channel that may be a mosaic.
+
+    Raises:
+        ImageError: the file is missing, empty, damaged or no image.
+    """
+    with _opened(path) as (_, file):
+        parts: list[list[str]] = []
+        while file.seek_subimage(len(parts), 0):
+            parts.append(list(file.spec().channelnames))
+    return not any(map(picture_channels, parts)) and any(map(mosaic_channel, parts))
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[tuple[bytes, Any]]:
+    """A file's bytes, and the same file open in OpenImageIO.
+
+    Raises:
+        ImageError: the file is missing, empty, or of no known format.
+    """
     try:
         str(path).encode()
     except UnicodeEncodeError:
@@ -72,21 +129,9 @@ def read_image(path: Path, mosaic: bool = False) -> SourceImage:
     if file is None:
         raise ImageError(f"{path}: cannot be read as an image: {_reason(oiio.geterror())}")
     try:
-        pixels, layer, warnings, attributes = _read_picture(path, file, mosaic)
+        yield data, file
     finally:
         file.close()
-    pixels, count = without_non_finite(pixels)
-    if count:
-        warnings.append(f"{count} samples were NaN or infinite and were set to 0")
-    if (
-        not mosaic
-        and pixels.dtype == np.float32
-        and (beyond := int((np.abs(pixels) > HALF_MAX).sum()))
-    ):
-        pixels = np.clip(pixels, -HALF_MAX, HALF_MAX)
-        warnings.append(f"{beyond} samples beyond {HALF_MAX:g}, the range of half, were clipped")
-    digest = hashlib.sha256(data).hexdigest()
-    return SourceImage(pixels, digest, layer, tuple(warnings), attributes)
 
 
 def _reason(text: str) -> str:

@@ -44,8 +44,8 @@ class Paper:
     def signal(self) -> tuple[float, float]:
         """a = theta/chi and b = theta^2 b' + b'' - theta^2 p0/chi.
 
-        >>> Paper(chi=1000, theta=2, b_before=1e-6, b_after=1e-6, p0=5e-4).signal()
-        (0.002, 3e-06)
+        >>> Paper(chi=1024, theta=2, b_before=0.25, b_after=0.125, p0=128).signal()
+        (0.001953125, 0.625)
         """
         theta2 = self.theta**2
         return (
@@ -84,8 +84,8 @@ class NoiseModel:
     def paper(self) -> Paper | None:
         """The same in the paper's parameters, with p0 = 0; None without shot noise.
 
-        >>> NoiseModel(0.002, 3e-6, 1000, after=1e-6, theta=2).paper()
-        Paper(chi=1000.0, theta=2, b_before=5e-07, b_after=1e-06, p0=0.0)
+        >>> NoiseModel(0.125, 0.75, 1000, after=0.25, theta=2).paper()
+        Paper(chi=16.0, theta=2, b_before=0.125, b_after=0.25, p0=0.0)
         """
         if self.a == 0:
             return None

@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from clpipe.camera import DEFAULT_CAMERA, Camera, load_camera
+from clpipe.noise_model import NoiseModel
 from clpipe.reference.cfa import PATTERNS, Pattern, red_site
 from clpipe.reference.curve import curve_index
 from clpipe.reference.random import Stream, stream_of
@@ -109,15 +110,13 @@ class Context:
     pattern: Pattern = "RGGB"
     gains: tuple[float, float] = (1.0, 1.0)  # red, blue: taken out by inverse_white_balance
     applied_gains: tuple[float, float] = (1.0, 1.0)  # red, blue: put back by white_balance
-    noise: tuple[float, float] | None = None  # a, b of the sensor noise that was added
+    noise: NoiseModel | None = None  # of the sensor noise that was added
     black_level: float | None = None  # DN, as quantize used them
     white_level: float | None = None
 
     def known_noise(self) -> tuple[float, float]:
         """The a and b of the sensor noise: as they were used, else as the camera has them."""
-        if self.noise:
-            return self.noise
-        model = self.camera.noise(self.iso)
+        model = self.noise or self.camera.noise(self.iso)
         return model.a, model.b
 
     @property
@@ -163,6 +162,7 @@ class Method(BaseModel):
     summary: ClassVar[str]
     tolerance: ClassVar[float] = 0.0  # of the kernel against the reference; 0: bit for bit
     example: ClassVar[Mapping[str, Any]] = {}  # to be checked with, where defaults do nothing
+    other_examples: ClassVar[tuple[Mapping[str, Any], ...]] = ()  # that take another way
 
     def resolve(self, context: Context) -> Self:
         """The same method with every parameter that was left to the camera or the chain filled."""
@@ -236,7 +236,8 @@ def odd_size(size: int, largest: int) -> int:
 
 
 def variants(method: type[Method]) -> Iterator[dict[str, Any]]:
-    """What is compiled differently: the defaults, then each other choice of a structural parameter.
+    """What is compiled differently: the defaults, then each other choice of a structural parameter,
+    then the method's other examples.
 
     The CFA pattern is not among them: whoever goes through variants goes through patterns anyway.
     """
@@ -247,6 +248,7 @@ def variants(method: type[Method]) -> Iterator[dict[str, Any]]:
         named = get_origin(field.annotation) is typing.Literal and choices != PATTERNS
         if extra["structural"] and named:
             yield from ({name: choice} for choice in choices if choice != field.default)
+    yield from map(dict, method.other_examples)
 
 
 def variant_label(method: type[Method], values: Mapping[str, Any]) -> str:

@@ -63,7 +63,13 @@ def test_the_main_job(clpipe, tmp_path):
     stages = {s["name"]: s for s in sidecar["stages"]}
     assert stages["sensor_noise"]["parameters"]["a"] == pytest.approx(5.0419 / 15871)
     assert stages["white_balance"]["parameters"] == {"red_gain": 2.77, "blue_gain": 1.36}
+    unused = stages.pop("sensor_noise")["parameters"]
+    assert {k for k, v in unused.items() if v is not None} == {"a", "b"}
     assert None not in [v for s in stages.values() for v in s["parameters"].values()]
+    noise = sidecar["noise"]
+    assert noise["signal"]["a"] == pytest.approx(5.0419 / 15871)
+    assert noise["emva1288"]["system_gain"] == pytest.approx(5.0419)
+    assert noise["paper"]["theta"] / noise["paper"]["chi"] == pytest.approx(5.0419 / 15871)
 
 
 def test_numpy_gives_the_same_picture(clpipe, small, tmp_path):
@@ -371,7 +377,54 @@ def test_a_stage_is_explained_for_a_camera_and_an_iso(clpipe):
     assert "from 100 to 25600" in clpipe("stages", "denoise", "--iso", 1, status=2).stderr
     assert "unknown camera" in clpipe("stages", "denoise", "--camera", "x", status=2).stderr
     records = json.loads(clpipe("stages", "sensor_noise", "--iso", 800, "--json").stdout)
-    assert set(records[0]["methods"][0]["automatic"]) == {"a", "b"}
+    automatic = records[0]["methods"][0]["automatic"]
+    assert {k for k, v in automatic.items() if v != "none"} == {"a", "b"}
+    rows = json.loads(clpipe("stages", "row_noise", "--iso", 800, "--json").stdout)
+    assert rows[0]["methods"][0]["automatic"] == {"sigma": f"{0.12 * 2.94 / 15871:.4g}"}
+
+
+def test_cameras_are_listed_and_shown(clpipe):
+    listed = clpipe("cameras").stdout
+    for name in ("sony-a7r2", "sony-a7s2", "canon-5d2", "oppo-reno-10x"):
+        assert name in listed
+    shown = clpipe("cameras", "sony-a7s2", "--iso", 3200).stdout
+    # K, sigGs and sigR of PMN's table at ISO 3200.
+    assert "3.06" in shown and "0.4454" in shown and "PMN" in shown
+    record = json.loads(clpipe("cameras", "sony-a7s2", "--iso", 3200, "--json").stdout)
+    (noise,) = record["noise"]
+    emva, paper = noise["emva1288"], noise["paper"]
+    dark = (emva["system_gain"] * emva["read_noise"]) ** 2 + emva["adc_noise"] ** 2
+    assert dark**0.5 == pytest.approx(3.91938)
+    assert noise["row_noise"] == pytest.approx(0.445435)
+    b = paper["theta"] ** 2 * paper["b_before"] + paper["b_after"]
+    assert b == pytest.approx(noise["signal"]["b"]) == pytest.approx((3.91938 / 15871) ** 2)
+    assert len(json.loads(clpipe("cameras", "--json").stdout)) >= 4
+    text = clpipe("cameras", "canon-5d2", "--iso", 12800, status=2).stderr
+    assert "found 12800, but camera canon-5d2 goes from 100 to 6400" in text
+    assert "did you mean 'sony-a7s2'" in clpipe("cameras", "sony-a7s", status=2).stderr
+    assert "name the camera" in clpipe("cameras", "--iso", 100, status=2).stderr
+
+
+def test_a_burst_is_frames_and_one_truth(clpipe, write_exr, tmp_path):
+    render = write_exr("scene.exr", np.full((16, 24, 3), 0.2, np.float32))
+    out = tmp_path / "out"
+    clpipe("run", render, "-o", out, "--iso", 3200, "--frames", 3, "--keep", "normalize")
+    names = [f"scene.{name}" for name in ("truth", "frame0", "frame1", "frame2")]
+    for name in names:
+        assert {f"{name}.jpg", f"{name}.json", f"{name}.normalize.exr"} <= set(os.listdir(out))
+    assert len(os.listdir(out)) == 12
+    truth, *frames = [read_exr(out / f"{name}.normalize.exr")[0] for name in names]
+    assert len(np.unique(truth[::2, ::2])) == 1
+    for i, one in enumerate(frames):
+        assert 0.5 < (one - truth).std() / np.sqrt(6.35e-4 * 0.13) < 1.5
+        assert not any(np.array_equal(one, other) for other in frames[:i])
+    keys = [json.loads((out / f"{name}.json").read_text())["image_key"] for name in names]
+    assert keys == ["scene.exr", "scene.exr", "scene.exr#1", "scene.exr#2"]
+    assert json.loads((out / "scene.truth.json").read_text())["noise"] is None
+    clpipe("run", render, "-o", tmp_path / "one", "--iso", 3200)
+    assert (tmp_path / "one" / "scene.jpg").read_bytes() == (out / "scene.frame0.jpg").read_bytes()
+    quiet = ("--skip", "sensor_noise", "--skip", "row_noise", "--frames", 2)
+    assert "adds noise" in clpipe("run", render, "-o", out, *quiet, status=2).stderr
 
 
 def test_a_plan_says_what_opens_a_launch(clpipe):

@@ -8,7 +8,15 @@ import pytest
 from PIL import Image, ImageCms
 
 from clpipe.errors import ImageError
-from clpipe.image_io import Tags, display_window, picture_channels, read_image, write_display
+from clpipe.image_io import (
+    Tags,
+    display_window,
+    holds_mosaic,
+    picture_channels,
+    read_finished,
+    read_image,
+    write_display,
+)
 from tests.conftest import STILL_LIFE
 
 
@@ -125,6 +133,32 @@ def test_eight_bit_files_are_not_linear(tmp_path):
     Image.new("RGB", (4, 4)).save(path)
     with pytest.raises(ImageError, match=r"photo\.png: holds uint8 samples, not linear float"):
         read_image(path)
+
+
+def test_finished_pictures_are_read_as_they_are_encoded(tmp_path, write_exr):
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
+    for name in ("a.png", "a.tif", "a.jpg"):
+        Image.fromarray(pixels).save(tmp_path / name, quality=100, subsampling=0)
+        found = read_finished(tmp_path / name)
+        assert found.dtype == np.float32
+        near = 5 if name == "a.jpg" else 1e-4
+        assert np.abs(found * 255 - pixels).max() < near
+    with_alpha = np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=-1)
+    Image.fromarray(with_alpha).save(tmp_path / "alpha.png")
+    assert np.abs(read_finished(tmp_path / "alpha.png") * 255 - pixels).max() < 1e-4
+    assert read_finished(write_exr("linear.exr", ramp())) is None
+    Image.fromarray(pixels[..., 0]).save(tmp_path / "grey.png")
+    assert read_finished(tmp_path / "grey.png") is None
+    (tmp_path / "cut.png").write_bytes((tmp_path / "a.png").read_bytes()[:2000])
+    with pytest.raises(ImageError, match=r"cut\.png: damaged"):
+        read_finished(tmp_path / "cut.png")
+
+
+def test_what_may_be_a_mosaic(write_exr):
+    assert holds_mosaic(write_exr("y.exr", ramp(channels=1), "Y"))
+    assert holds_mosaic(write_exr("ya.exr", ramp(channels=2), "Y,A"))
+    assert not holds_mosaic(write_exr("rgb.exr", ramp()))
+    assert not holds_mosaic(write_exr("xy.exr", ramp(channels=2), "x,y"))
 
 
 def test_jpeg_is_as_a_camera_writes_it(tmp_path):

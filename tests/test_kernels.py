@@ -24,6 +24,10 @@ KERNELS = {
     "mosaic",
     "site_gains",
     "sensor_noise_gaussian",
+    "sensor_noise_poisson",
+    "prnu",
+    "dsnu",
+    "defect_pixels",
     "line_noise",
     "quantize",
     "normalize",
@@ -42,6 +46,8 @@ KERNELS = {
     "denoise_non_local_means",
     "mosaic_denoise_non_local_means",
     "curve",
+    "picture_noise_iid_gaussian",
+    "picture_noise_intensity_dependent",
 }
 
 
@@ -89,9 +95,10 @@ def test_median_of_zeros_and_ones(device, size):
     assert np.array_equal(one, two)
 
 
-def test_raw_is_bit_for_bit_the_references(device, scalar_device):
+@pytest.mark.parametrize("noise", ["gaussian", "poisson"])
+def test_raw_is_bit_for_bit_the_references(device, scalar_device, noise):
     for any_device in (device, scalar_device):
-        result = check_raw(any_device)
+        result = check_raw(any_device, noise)
         assert result.differing == 0, result
 
 

@@ -11,7 +11,7 @@ PACKAGE = ROOT / "clpipe"
 LEVELS = [
     {"errors", "types", "suggest", "noise_model"},
     {"reference", "line_fit"},
-    {"camera", "repeats"},
+    {"camera", "statistics", "repeats"},
     {"stage", "fixed_pattern", "single_image"},
     {"stages", "calibrate"},
     {"registry", "profile", "calibration_plot"},
@@ -21,8 +21,9 @@ LEVELS = [
     {"device"},
     {"run"},
     {"image_io", "raw_io", "check", "bench", "pipeline"},
-    {"reentry", "describe"},
-    {"batch", "calibration_frames"},
+    {"reentry"},
+    {"measure"},
+    {"batch", "describe", "measure_plot", "calibration_frames"},
     {"cli"},
 ]
 LEVEL = {name: i for i, names in enumerate(LEVELS) for name in names}
@@ -34,7 +35,7 @@ DOORS = {
     "rich": {"cli"},
     "rawpy": {"raw_io"},
     "exifread": {"raw_io"},
-    "matplotlib": {"calibration_plot"},
+    "matplotlib": {"calibration_plot", "measure_plot"},
     "scipy": {"repeats", "fixed_pattern", "single_image"},
 }
 

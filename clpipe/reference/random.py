@@ -7,15 +7,12 @@ from hashlib import blake2b
 import numpy as np
 from numpy.typing import NDArray
 
+from clpipe.reference.math import estrin, negative_log, square_root
 from clpipe.types import Floats
 
 Words = NDArray[np.uint32]
 
 # Lowest power first.
-LOG_COEFFICIENTS = np.array(
-    [1.0000032, -0.50001967, 0.33303297, -0.24881342, 0.20604694, -0.18901953, 0.118273675],
-    np.float32,
-)
 NORMAL_COEFFICIENTS = np.array(
     [
         2.9601128,
@@ -75,49 +72,15 @@ def philox(c0: Words, c1: Words, c2: Words, c3: Words, stream: Stream) -> tuple[
     return tuple(w.astype(np.uint32) for w in (w0, w1, w2, w3))
 
 
-def negative_log(t: Floats) -> Floats:
-    """-ln(t), t > 0, float32, relative error 3e-7, by multiplication and addition alone."""
-    bits = t.view(np.int32)
-    exponent = (bits - np.int32(0x3F3504F3)) >> np.int32(23)
-    y = (bits - (exponent << np.int32(23))).view(np.float32) - np.float32(1)
-    return exponent.astype(np.float32) * np.float32(-0.6931472) - y * estrin(LOG_COEFFICIENTS, y)
+def tail_probability(words: Words) -> Floats:
+    """The distance of a uniform number to the nearer of 0 and 1, from 31 bits; (0, 1/2]."""
+    low = words.view(np.int32) & np.int32(0x7FFFFFFF)
+    return (low.astype(np.float32) + np.float32(0.5)) * np.float32(2.3283064e-10)
 
 
-def square_root(x: Floats) -> Floats:
-    """sqrt(x), x >= 0, float32, relative error 5e-6, by two Newton steps (Lomont 2003).
-
-    >>> square_root(np.float32([0, 1, 4])).round(4).tolist()
-    [0.0, 1.0, 2.0]
-    """
-    half_x = x * np.float32(0.5)
-    r = (np.int32(0x5F375A86) - (x.view(np.int32) >> np.int32(1))).view(np.float32)
-    for _ in range(2):
-        r = r * (np.float32(1.5) - half_x * r * r)
-    return x * r
-
-
-def estrin(coefficients: Floats, x: Floats) -> Floats:
-    """The polynomial with these coefficients, lowest power first, in float32, pair by pair.
-
-    Estrin's scheme: pairs, then pairs of pairs, then sums of these from the lowest up.
-
-    >>> estrin(np.float32([1, 2, 3, 4, 5]), np.float32([2])).tolist()
-    [129.0]
-    """
-    x2 = x * x
-    x4 = x2 * x2
-    total = np.zeros_like(x)
-    power = np.ones_like(x)
-    for i in range(0, len(coefficients), 4):
-        c = coefficients[i : i + 4]
-        group = x * c[1] + c[0] if len(c) > 1 else np.full_like(x, c[0])
-        if len(c) == 3:
-            group = group + x2 * c[2]
-        elif len(c) == 4:
-            group = group + (x * c[3] + c[2]) * x2
-        total = group if i == 0 else total + group * power
-        power = x4 if i == 0 else power * x4
-    return total
+def in_upper_half(words: Words) -> NDArray[np.bool_]:
+    """Whether that uniform number is above 1/2."""
+    return words.view(np.int32) >= 0
 
 
 def normal_of(words: Words) -> Floats:
@@ -126,18 +89,16 @@ def normal_of(words: Words) -> Floats:
     >>> normal_of(np.uint32([0x7fffffff, 0x14514514, 0x94514514])).round(3).tolist()
     [0.0, 1.409000039100647, -1.409000039100647]
     """
-    bits = words.view(np.int32)
-    p = ((bits & np.int32(0x7FFFFFFF)).astype(np.float32) + np.float32(0.5)) * np.float32(
-        2.3283064e-10
-    )
+    p = tail_probability(words)
     w = negative_log(np.float32(4) * p * (np.float32(1) - p))
     s = square_root(np.maximum(w, np.float32(0))) - np.float32(2.25)
     z = estrin(NORMAL_COEFFICIENTS, s) * (np.float32(1) - np.float32(2) * p)
-    return (z.view(np.int32) ^ (bits & np.int32(-0x80000000))).view(np.float32)
+    sign = words.view(np.int32) & np.int32(-0x80000000)
+    return (z.view(np.int32) ^ sign).view(np.float32)
 
 
-def normal_at(shape: tuple[int, ...], draw: int, stream: Stream) -> Floats:
-    """One standard normal a pixel: counter (x, y // 4, draw, stage), word y % 4."""
+def word_at(shape: tuple[int, ...], draw: int, stream: Stream) -> Words:
+    """One random word a pixel: counter (x, y // 4, draw, stage), word y % 4."""
     height, width = shape[:2]
     quarter = np.arange((height + 3) // 4, dtype=np.uint32)[:, None]
     words = philox(
@@ -147,7 +108,12 @@ def normal_at(shape: tuple[int, ...], draw: int, stream: Stream) -> Floats:
         np.full((1, 1), stream.stage, np.uint32),
         stream,
     )
-    return normal_of(np.stack(words, axis=1).reshape(-1, width)[:height])
+    return np.stack(words, axis=1).reshape(-1, width)[:height]
+
+
+def normal_at(shape: tuple[int, ...], draw: int, stream: Stream) -> Floats:
+    """One standard normal a pixel."""
+    return normal_of(word_at(shape, draw, stream))
 
 
 def normal_of_line(count: int, stream: Stream) -> Floats:

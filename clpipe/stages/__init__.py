@@ -10,7 +10,10 @@ DEFAULT_CHAIN = (
     "exposure",
     "mosaic",
     "inverse_white_balance",
+    "prnu",
+    "defect_pixels",
     "sensor_noise",
+    "dsnu",
     "row_noise",
     "column_noise",
     "quantize",
@@ -21,6 +24,7 @@ DEFAULT_CHAIN = (
     "color_matrix",
     "tone_curve",
     "gamma",
+    "picture_noise",
 )
 
 

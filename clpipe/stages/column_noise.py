@@ -34,6 +34,8 @@ class Gaussian(Method):
     kernel: ClassVar = "line_noise"
     summary: ClassVar = "add one Gaussian offset a column, the same in every image of a camera"
 
+    example: ClassVar = {"sigma": 0.01}
+
     sigma: float | None = parameter(
         None,
         "Standard deviation of the offsets.",
@@ -44,11 +46,11 @@ class Gaussian(Method):
     )
 
     def resolve(self, context: Context) -> "Gaussian":
-        if self.sigma is not None:
-            return self
         return self.filled(sigma=context.camera.column_noise(context.iso))
 
     def passes(self) -> tuple[Pass, ...]:
+        if not self.sigma:
+            return ()
         return (
             Pass(
                 "noise_of_lines",

@@ -9,8 +9,8 @@ from pydantic import field_validator
 
 from clpipe.reference.cfa import by_site
 from clpipe.reference.image import tap
+from clpipe.reference.math import square_root
 from clpipe.reference.patch import bias_of, decay_of, patch_distances
-from clpipe.reference.random import square_root
 from clpipe.stage import (
     Access,
     Argument,

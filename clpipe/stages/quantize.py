@@ -24,6 +24,9 @@ class Linear(Method):
     kernel: ClassVar = "quantize"
     summary: ClassVar = "round to whole DN and clip to 0..white_level"
 
+    bits: int | None = parameter(
+        None, "Bit depth; the camera's levels are scaled to it.", "", "from the levels", ge=8, le=16
+    )
     black_level: float | None = parameter(
         None, "DN without light.", "DN", "from the camera", ge=0, le=65535
     )
@@ -38,6 +41,11 @@ class Linear(Method):
                 f"white_level must be above black_level; "
                 f"found {self.white_level} and {self.black_level}"
             )
+        if self.bits and self.white_level and self.white_level >= 2**self.bits:
+            raise ValueError(
+                f"white_level must be below {2**self.bits}, which {self.bits} bits hold; "
+                f"found {self.white_level}"
+            )
         return self
 
     @property
@@ -46,9 +54,14 @@ class Linear(Method):
         return self.white_level - self.black_level
 
     def resolve(self, context: Context) -> "Linear":
-        filled = self.filled(
-            black_level=context.camera.black_level, white_level=context.camera.white_level
-        )
+        camera = context.camera
+        black, white = camera.black_level, camera.white_level
+        if self.bits and self.bits != camera.bits:
+            scale = (2**self.bits - 1) / (2**camera.bits - 1)
+            black, white = float(round(black * scale)), float(round(white * scale))
+        filled = self.filled(black_level=black, white_level=white)
+        assert filled.white_level is not None
+        filled = filled.filled(bits=max(int(filled.white_level).bit_length(), 8))
         return type(self).model_validate(filled.model_dump())
 
     def after(self, context: Context) -> Context:

@@ -2,11 +2,18 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
+from math import isclose
+from typing import ClassVar, Self
 
 import numpy as np
+from pydantic import model_validator
 
-from clpipe.reference.random import normal_at, square_root
+from clpipe.errors import RequestError
+from clpipe.noise_model import Emva, NoiseModel, Paper
+from clpipe.reference.math import square_root
+from clpipe.reference.poisson import poisson_of
+from clpipe.reference.random import normal_at, word_at
+from clpipe.reference.tukey_lambda import shape_and_scale, tukey_lambda_of
 from clpipe.stage import (
     Argument,
     Context,
@@ -20,19 +27,16 @@ from clpipe.stage import (
 )
 from clpipe.types import Floats
 
+EMVA = ("system_gain", "read_noise", "adc_noise")
+PAPER = ("chi", "theta", "b_before", "b_after", "p0")
+NEVER_FULL = 1e30
 
-class Gaussian(Method):
-    """Heteroscedastic Gaussian, Var[y] = a*y + b (Foi et al., IEEE TIP 2008, eq. 2).
 
-    >>> from clpipe.stage import alone
-    >>> noisy = alone(Gaussian(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
-    >>> round(float(noisy.mean()), 2), round(float(noisy.var()), 4)
-    (0.5, 0.0006)
+class SensorNoise(Method):
+    """How strong the noise is, said in one of three ways, and what bounds it.
+
+    What is left out follows from the camera and the ISO. Subclasses draw the noise.
     """
-
-    method: ClassVar = "gaussian"
-    kernel: ClassVar = "sensor_noise_gaussian"
-    summary: ClassVar = "add Gaussian noise of variance a*y + b"
 
     a: float | None = parameter(
         None,
@@ -50,28 +54,219 @@ class Gaussian(Method):
         ge=0,
         le=1,
     )
+    system_gain: float | None = parameter(
+        None, "Instead of a: what an electron is worth (EMVA 1288).", "DN/e-", "not used", gt=0
+    )
+    read_noise: float | None = parameter(
+        None, "Instead of b: noise before the gain (EMVA 1288).", "e-", "not used", ge=0
+    )
+    adc_noise: float | None = parameter(
+        None, "With read_noise: noise after the gain.", "DN", "not used", ge=0
+    )
+    chi: float | None = parameter(
+        None, "Instead of a and b: electrons at y = 1, theta = 1.", "e-", "not used", gt=0
+    )
+    theta: float | None = parameter(None, "With chi: the analogue gain.", "", "not used", gt=0)
+    b_before: float | None = parameter(
+        None, "With chi: b', variance before the gain.", "signal^2", "not used", ge=0
+    )
+    b_after: float | None = parameter(
+        None, "With chi: b'', variance after the gain.", "signal^2", "not used", ge=0
+    )
+    p0: float | None = parameter(None, "With chi: the pedestal.", "signal", "not used", ge=0)
+    full_well: float | None = parameter(
+        None, "The most electrons that a pixel holds.", "e-", "from the camera; else no limit", gt=0
+    )
+    tukey_lambda: float | None = parameter(
+        None,
+        "Shape of the read noise; 0.14 is nearly Gaussian, below it has heavier tails.",
+        "",
+        "from the camera; else Gaussian",
+        gt=-0.5,
+        le=1,
+    )
 
-    def resolve(self, context: Context) -> "Gaussian":
-        if self.a is not None and self.b is not None:
-            return self
-        model = context.camera.noise(context.iso)
-        return self.filled(a=model.a, b=model.b)
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        emva, paper = self._given(EMVA), self._given(PAPER)
+        if emva and paper:
+            raise ValueError(
+                f"noise is given in one way, EMVA 1288's or the paper's; "
+                f"found {', '.join(emva)} and {', '.join(paper)}"
+            )
+        if paper and (self.chi is None or self.theta is None):
+            raise ValueError(f"{', '.join(paper)} need both chi and theta")
+        return self
+
+    def _given(self, names: tuple[str, ...]) -> list[str]:
+        return [name for name in names if getattr(self, name) is not None]
+
+    def model(self, context: Context) -> NoiseModel:
+        """The noise, from what is given and, for the rest, from the camera at the ISO.
+
+        Raises:
+            RequestError: a and b are given and do not agree with what else is given, or b comes
+                out negative, or the ISO is outside the camera's range.
+        """
+        camera = context.camera.noise(context.iso)
+        unit = camera.signal_range
+        other = self._given(EMVA) or self._given(PAPER)
+        if self._given(PAPER):
+            assert self.chi and self.theta
+            before, after = self.b_before or 0.0, self.b_after or 0.0
+            a, b = Paper(self.chi, self.theta, before, after, self.p0 or 0.0).signal()
+            if b < 0:
+                raise RequestError(f"sensor_noise: p0 = {self.p0:g} makes b negative, {b:.4g}")
+            model = NoiseModel(a, b, unit, min(after, b), self.theta)
+        elif self._given(EMVA):
+            known = camera.emva()
+            assert known
+            if self.read_noise is None and self.adc_noise is None:
+                dark = known.read_noise, known.adc_noise
+            else:
+                dark = self.read_noise or 0.0, self.adc_noise or 0.0
+            a, b = Emva(self.system_gain or known.system_gain, *dark).signal(unit)
+            model = NoiseModel(a, b, unit, (dark[1] / unit) ** 2, camera.theta)
+        else:
+            a = camera.a if self.a is None else self.a
+            b = camera.b if self.b is None else self.b
+            own = (a, b) == (camera.a, camera.b)
+            return camera if own else NoiseModel(a, b, unit)
+        for name, given, found in (("a", self.a, model.a), ("b", self.b, model.b)):
+            if given is not None and not isclose(given, found, rel_tol=1e-6):
+                raise RequestError(
+                    f"sensor_noise: noise is given in one way; found {name} = {given:g}, but "
+                    f"{', '.join(other)} make it {found:g}"
+                )
+        return model
+
+    def resolve(self, context: Context) -> Self:
+        model, camera = self.model(context), context.camera
+        filled = self.filled(a=model.a, b=model.b, tukey_lambda=camera.tukey_lambda)
+        return filled.filled(full_well=camera.full_well)
 
     def after(self, context: Context) -> Context:
-        assert self.a is not None and self.b is not None
-        return replace(context, noise=(self.a, self.b))
+        return replace(context, noise=self.model(context))
 
-    def passes(self) -> tuple[Pass, ...]:
-        return (Pass("sensor_noise", arguments=("a", "b"), random=Owner.IMAGE),)
+    def values(self) -> dict[str, np.float32]:
+        """The kernel's arguments, by name."""
+        raise NotImplementedError(type(self).__name__)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
-        assert self.a is not None and self.b is not None
-        return {"a": np.float32(self.a), "b": np.float32(self.b)}
+        return self.values()
+
+    def read_values(self) -> dict[str, np.float32]:
+        """Those of read noise: its sigma and, where it is no Gaussian, its law."""
+        assert self.b is not None
+        sigma = {"read_noise": np.float32(self.b**0.5)}
+        if self.tukey_lambda is None:
+            return sigma
+        shape, scale = shape_and_scale(self.tukey_lambda)
+        return {**sigma, "shape": shape, "scale": scale}
+
+    def read_reference(self, image: Floats, frame: Frame) -> Floats:
+        """Read noise of variance 1, in NumPy."""
+        stream = frame.stream[Owner.IMAGE]
+        if self.tukey_lambda is None:
+            return normal_at(image.shape, 1, stream)
+        words = word_at(image.shape, 1, stream)
+        return tukey_lambda_of(words, *shape_and_scale(self.tukey_lambda))
+
+
+class Gaussian(SensorNoise):
+    """Heteroscedastic Gaussian, Var[y] = a*y + b (Foi et al., IEEE TIP 2008, eq. 2).
+
+    >>> from clpipe.stage import alone
+    >>> noisy = alone(Gaussian(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
+    >>> round(float(noisy.mean()), 2), round(float(noisy.var()), 4)
+    (0.5, 0.0006)
+    """
+
+    method: ClassVar = "gaussian"
+    kernel: ClassVar = "sensor_noise_gaussian"
+    summary: ClassVar = "add Gaussian noise of variance a*y + b"
+    other_examples: ClassVar = ({"tukey_lambda": -0.2, "full_well": 1000.0},)
+
+    def passes(self) -> tuple[Pass, ...]:
+        if self.tukey_lambda is None:
+            return (Pass("sensor_noise", arguments=("a", "b", "full_well"), random=Owner.IMAGE),)
+        names = ("a", "full_well", "read_noise", "shape", "scale")
+        return (Pass("sensor_noise_tukey", arguments=names, random=Owner.IMAGE),)
+
+    def values(self) -> dict[str, np.float32]:
+        assert self.a is not None
+        full_well = NEVER_FULL if self.full_well is None else self.full_well * self.a
+        signal = {"a": np.float32(self.a), "full_well": np.float32(full_well)}
+        if self.tukey_lambda is None:
+            return {**signal, "b": np.float32(self.b)}
+        return {**signal, **self.read_values()}
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        assert self.a is not None and self.b is not None
-        variance = np.maximum(np.float32(self.a) * image + np.float32(self.b), np.float32(0))
-        return image + normal_at(image.shape, 0, frame.stream[Owner.IMAGE]) * square_root(variance)
+        given = self.values()
+        normals = normal_at(image.shape, 0, frame.stream[Owner.IMAGE])
+        variance = given["a"] * image + given.get("b", np.float32(0))
+        noise = normals * square_root(np.maximum(variance, np.float32(0)))
+        noisy = np.minimum(image + noise, given["full_well"])
+        if self.tukey_lambda is None:
+            return noisy
+        return noisy + self.read_reference(image, frame) * given["read_noise"]
 
 
-STAGE = Stage("sensor_noise", "Add shot and read noise.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,))
+class Poisson(SensorNoise):
+    """Whole photo-electrons, Poisson at mean y / a, plus read noise of variance b (EMVA 1288).
+
+    Light below 0 gives no electrons. Drawn by inverse CDF (Giles, ACM TOMS 42(1), 2016).
+
+    >>> from clpipe.stage import alone
+    >>> noisy = alone(Poisson(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
+    >>> round(float(noisy.mean()), 2), round(float(noisy.var()), 4)
+    (0.5, 0.0006)
+    """
+
+    method: ClassVar = "poisson"
+    kernel: ClassVar = "sensor_noise_poisson"
+    summary: ClassVar = "draw whole photo-electrons at the gain and add read noise"
+    other_examples: ClassVar = (
+        {"a": 0.05, "b": 1e-4},
+        {"tukey_lambda": -0.2, "full_well": 1000.0},
+    )
+
+    def resolve(self, context: Context) -> Self:
+        resolved = super().resolve(context)
+        if not resolved.a:
+            raise RequestError(
+                "sensor_noise: poisson needs an a above 0; without shot noise use gaussian"
+            )
+        return resolved
+
+    def passes(self) -> tuple[Pass, ...]:
+        gaussian = self.tukey_lambda is None
+        names = ("chi", "full_well", "a", "read_noise")
+        return (
+            Pass(
+                "sensor_noise_poisson" if gaussian else "sensor_noise_poisson_tukey",
+                arguments=names if gaussian else (*names, "shape", "scale"),
+                random=Owner.IMAGE,
+            ),
+        )
+
+    def values(self) -> dict[str, np.float32]:
+        assert self.a
+        return {
+            "chi": np.float32(1 / self.a),
+            "full_well": np.float32(self.full_well or NEVER_FULL),
+            "a": np.float32(self.a),
+            **self.read_values(),
+        }
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        given = self.values()
+        words = word_at(image.shape, 0, frame.stream[Owner.IMAGE])
+        mean = np.maximum(image, np.float32(0)) * given["chi"]
+        electrons = np.minimum(poisson_of(mean, words), given["full_well"])
+        return electrons * given["a"] + self.read_reference(image, frame) * given["read_noise"]
+
+
+STAGE = Stage(
+    "sensor_noise", "Add shot and read noise.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian, Poisson)
+)

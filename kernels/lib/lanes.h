@@ -70,6 +70,22 @@ INLINE vi most_int(vi a, vi b) { return a > b ? a : b; }
 // To the nearest whole number, ties to even, for |v| < 2^22.
 INLINE vf nearest(vf v) { return (v + 12582912.0f) - 12582912.0f; }
 
+// Whether a comparison holds in any lane.
+#if LANES == 1
+INLINE bool any_lane(vi mask) { return mask != 0; }
+#elif LANES == 8
+INLINE bool any_lane(vi mask) {
+    const int4 h = mask.lo | mask.hi;
+    return (h.x | h.y | h.z | h.w) != 0;
+}
+#else
+INLINE bool any_lane(vi mask) {
+    const int8 q = mask.lo | mask.hi;
+    const int4 h = q.lo | q.hi;
+    return (h.x | h.y | h.z | h.w) != 0;
+}
+#endif
+
 #if LANES == 1
 INLINE vh even_lanes(vu v) { return v; }
 INLINE vh odd_lanes(vu v) { return v; }

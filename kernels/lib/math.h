@@ -15,14 +15,39 @@ INLINE vf negative_log(vf t) {
     return to_float(exponent) * -0.6931472f - y * p;
 }
 
-// sqrt(x) for x >= 0; relative error 5e-6. Two Newton steps for 1/sqrt(x) from the exponent halved by
-// a shift (Lomont, "Fast inverse square root", 2003). The built-in one is not exact on all devices.
-INLINE vf square_root(vf x) {
+// 1/sqrt(x) for x > 0; relative error 5e-6. Two Newton steps from the exponent halved by a shift
+// (Lomont, "Fast inverse square root", 2003). The built-in one is not exact on all devices.
+INLINE vf inverse_root(vf x) {
     const vf half_x = x * 0.5f;
     vf r = bits_to_float((vi)(0x5f375a86) - (float_bits(x) >> 1));
     r = r * (1.5f - half_x * r * r);
-    r = r * (1.5f - half_x * r * r);
-    return x * r;
+    return r * (1.5f - half_x * r * r);
+}
+
+// sqrt(x) for x >= 0; relative error 5e-6.
+INLINE vf square_root(vf x) { return x * inverse_root(x); }
+
+// 2^x = s * (1 + e) for |x| < 126: s, a whole power, and e, which is small where x is. Only * and +.
+INLINE vf power_of_two(vf x, __private vf *e) {
+    const vf whole = nearest(x);
+    const vf f = x - whole;
+    const vf f2 = f * f;
+    const vf low = (f * 0.24022651f + 0.69314719f) + (f * 0.0096180567f + 0.055503571f) * f2;
+    *e = f * (low + (f * 0.00015461448f + 0.0013390867f) * (f2 * f2));
+    return bits_to_float((to_int(whole) + 127) << 23);
+}
+
+// e^x and e^x - 1 for |x| < 87; relative error 1e-6, the latter near 0 too.
+INLINE vf exponential(vf x) {
+    vf e;
+    const vf s = power_of_two(x * 1.442695f, &e);
+    return s + s * e;
+}
+
+INLINE vf exponential_minus_1(vf x) {
+    vf e;
+    const vf s = power_of_two(x * 1.442695f, &e);
+    return s * e + (s - 1.0f);
 }
 
 // 2^x for x <= 0; relative error 8e-5. Below 2^-30 it stays there: a filter weight that small is

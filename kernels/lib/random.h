@@ -40,28 +40,37 @@ INLINE words philox(vu x, uint y, uint draw, stream s) {
     return w;
 }
 
-// Standard normal from one random word, by inverse CDF: 31 bits give the tail probability p in
-// (0, 1/2], the top bit the side. Form after Giles ("Approximating the erfinv function", GPU
-// Computing Gems 2011), a polynomial in sqrt(w), w = -ln(4p(1-p)); our own fit, relative error
-// 4e-5 out to 6.2 sigma. Only * + and bit operations, so NumPy gives the same bits.
+// A random word as a probability u: its lower 31 bits give the tail probability in (0, 1/2], which is
+// u or 1 - u, and its top bit the half of the distribution.
+INLINE vf tail_probability(vu word) {
+    return (to_float(signed_bits(word) & 0x7fffffff) + 0.5f) * 2.3283064e-10f;
+}
+
+INLINE vi in_upper_half(vu word) { return signed_bits(word) >= 0; }
+
+// Standard normal from one random word, by inverse CDF. Form after Giles ("Approximating the erfinv
+// function", GPU Computing Gems 2011), a polynomial in sqrt(w), w = -ln(4p(1-p)); our own fit,
+// relative error 4e-5 out to 6.2 sigma. Only * + and bit operations, so NumPy gives the same bits.
 INLINE vf normal_of(vu word) {
-    const vi bits = signed_bits(word);
-    const vf p = (to_float(bits & 0x7fffffff) + 0.5f) * 2.3283064e-10f;
+    const vf p = tail_probability(word);
     const vf s = square_root(most(negative_log(4.0f * p * (1.0f - p)), (vf)(0.0f))) - 2.25f;
     const vf s2 = s * s, s4 = s2 * s2, s8 = s4 * s4;
     const vf z0 = (s * 1.3548409f + 2.9601128f) + (s * -0.076602094f + 0.09441337f) * s2;
     const vf z4 = (s * 0.0062090177f + 0.028542647f) + (s * -0.00031167656f + -0.0069498117f) * s2;
     const vf z8 = (s * 1.8514459e-06f + 0.0008937495f) + s2 * -4.68934e-05f;
     const vf z = ((z0 + z4 * s4) + z8 * s8) * (1.0f - 2.0f * p);
-    return bits_to_float(float_bits(z) ^ (bits & (int)0x80000000));
+    return bits_to_float(float_bits(z) ^ (signed_bits(word) & (int)0x80000000));
 }
 
-// The normal of a pixel. Four rows share one Philox call, which the compiler finds by itself.
-INLINE vf normal_at(site at, uint draw, stream s) {
+// The random word of a pixel. Four rows share one Philox call, which the compiler finds by itself.
+INLINE vu word_at(site at, uint draw, stream s) {
     const words w = philox(lane_indices(at.x), at.y >> 2, draw, s);
     const vu upper = (at.y & 1) ? w.word1 : w.word0, lower = (at.y & 1) ? w.word3 : w.word2;
-    return normal_of((at.y & 2) ? lower : upper);
+    return (at.y & 2) ? lower : upper;
 }
+
+// The normal of a pixel.
+INLINE vf normal_at(site at, uint draw, stream s) { return normal_of(word_at(at, draw, s)); }
 
 // The normal of a row or a column, by its number.
 INLINE vf normal_of_line(vu line, stream s) { return normal_of(philox(line, 0, 0, s).word0); }

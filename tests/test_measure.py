@@ -1,0 +1,284 @@
+"""clpipe measure, from the outside: real runs, other people's files, refusals."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from clpipe.camera import load_camera
+from clpipe.cli import main
+from clpipe.describe import measure_tables
+from clpipe.measure import Picture, load, measure
+from tests.conftest import STILL_LIFE
+
+NOISELESS = ("--skip", "sensor_noise", "--skip", "row_noise", "--skip", "column_noise")
+
+
+@pytest.fixture
+def clpipe(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments, status=0):
+        result = CliRunner().invoke(main, [str(a) for a in arguments])
+        if result.exception and not isinstance(result.exception, SystemExit):
+            raise result.exception
+        assert result.exit_code == status, result.output
+        return result
+
+    return call
+
+
+@pytest.fixture
+def measured(clpipe):
+    """The JSON report on images."""
+    return lambda *arguments: json.loads(clpipe("measure", *arguments, "--json").stdout)
+
+
+def run(clpipe, folder, *options):
+    clpipe("run", STILL_LIFE, "-o", folder, "--iso", 3200, *options)
+    return f"{folder}/still_life"
+
+
+def test_the_raw_has_the_noise_of_the_camera(clpipe, measured):
+    noisy = run(clpipe, "noisy", "--until", "quantize")
+    clean = run(clpipe, "clean", "--until", "quantize", *NOISELESS)
+    report = measured(f"{noisy}.exr", "--truth", f"{clean}.exr")
+    noise = load_camera("sony-a7r2").noise(3200)
+    assert list(report["channels"]) == ["R", "G1", "G2", "B", "mosaic"]
+    for name, one in report["channels"].items():
+        law = one["law"]
+        assert law["a"] == pytest.approx(noise.a, rel=0.03)
+        assert law["b"] == pytest.approx(noise.b, rel=0.1)
+        assert one["column"]["sigma"] <= one["column"]["limit"]
+        assert abs(one["excess_kurtosis"]) < 0.06
+        assert one["energy_left_2x2"] == pytest.approx(0.25, abs=0.006)
+        pixels = 960 * 640 if name == "mosaic" else 480 * 320
+        assert 0.95 * pixels < one["samples"] <= pixels
+
+
+def test_row_noise_is_found_and_shared_by_the_sites_of_a_row(clpipe, measured):
+    noisy = run(clpipe, "noisy", "--until", "quantize", "--set", "row_noise.sigma=0.004")
+    clean = run(clpipe, "clean", "--until", "quantize", *NOISELESS)
+    report = measured(f"{noisy}.exr", "--truth", f"{clean}.exr")
+    for one in report["channels"].values():
+        assert one["row"]["sigma"] == pytest.approx(0.004, rel=0.1)
+        assert one["row"]["limit"] < 0.003
+    across = report["correlation"]
+    assert across["R-G1"] > 0.1 > 0.05 > abs(across["R-B"])
+    assert across["G2-B"] > 0.1 > 0.05 > abs(across["G1-G2"])
+    whole = report["channels"]["mosaic"]["autocorrelation"]
+    assert whole[8][9] > 0.1 > 0.05 > abs(whole[9][8])
+
+
+def test_the_law_of_a_raw_within_one_percent():
+    random, a, b = np.random.default_rng(1), 6e-4, 1e-4
+    clean = np.tile(np.linspace(0, 0.8, 1600, dtype=np.float32), (1200, 1))
+    noise = random.standard_normal(clean.shape, np.float32) * np.sqrt(a * clean + b)
+    pictures = [
+        Picture(Path(p), "mosaic", x, white=1.0) for p, x in (("n", clean + noise), ("c", clean))
+    ]
+    *_, whole = measure(pictures[:1], pictures[1]).channels
+    assert whole.law.a == pytest.approx(a, rel=0.01)
+    assert whole.law.b == pytest.approx(b, rel=0.01)
+    assert abs(whole.law.a - a) < 3 * whole.law.a_error
+    assert abs(whole.law.b - b) < 3 * whole.law.b_error
+
+
+def test_repeats_measure_what_the_truth_does(clpipe, measured):
+    names = [
+        run(clpipe, str(seed), "--until", "normalize", "--seed", seed) + ".exr" for seed in range(4)
+    ]
+    clean = run(clpipe, "clean", "--until", "normalize", *NOISELESS)
+    repeats, against = measured(*names), measured(*names, "--truth", f"{clean}.exr")
+    assert repeats["truth"] is None
+    for name, one in repeats["channels"].items():
+        other = against["channels"][name]
+        assert one["sigma"] == pytest.approx(other["sigma"], rel=0.01)
+        assert one["law"]["a"] == pytest.approx(other["law"]["a"], rel=0.02)
+        assert one["law"]["b"] == pytest.approx(other["law"]["b"], rel=0.06)
+        assert abs(one["energy_left_2x2"] - 0.25) < 0.01
+    pair = measured(*names[:2])
+    assert pair["channels"]["G1"]["sigma"] == pytest.approx(
+        against["channels"]["G1"]["sigma"], rel=0.01
+    )
+    assert "two frames" in " ".join(pair["notes"])
+
+
+def test_processing_correlates_noise(clpipe, measured):
+    formats = ("--format", "jpg", "--format", "png", "--format", "exr", "--keep", "demosaic")
+    noisy = run(clpipe, "noisy", *formats)
+    clean = run(clpipe, "clean", *formats, *NOISELESS, "--skip", "denoise")
+    reports = {
+        ending: measured(f"{noisy}.{ending}", "--truth", f"{clean}.{ending}")
+        for ending in ("jpg", "png", "exr", "demosaic.exr")
+    }
+    for ending, report in reports.items():
+        channels = report["channels"]
+        assert list(channels) == ["R", "G", "B", "Y", "Cb", "Cr"]
+        assert 0.2 < report["share_used"] < 0.6
+        assert channels["Cb"]["energy_left_2x2"] > 0.8 > 0.7 > channels["Y"]["energy_left_2x2"]
+        assert channels["Cr"]["autocorrelation"][8][9] > 0.8
+        assert report["correlation"]["R-G"] > 0.3
+        linear = ending == "demosaic.exr"
+        assert report["kind"] == ("rgb" if linear else "display")
+        assert (channels["G"]["law"] is not None) == linear
+        assert channels["Y"]["law"] is None
+    # Eight bits hide little of this noise; JPEG at quality 97 neither.
+    sigma = {ending: report["channels"]["Y"]["sigma"] for ending, report in reports.items()}
+    assert sigma["png"] == pytest.approx(sigma["exr"], rel=0.1)
+    assert sigma["jpg"] == pytest.approx(sigma["png"], rel=0.15)
+
+
+def test_the_tables_and_the_picture(clpipe, tmp_path):
+    noisy = run(clpipe, "noisy", "--until", "quantize")
+    clean = run(clpipe, "clean", "--until", "quantize", *NOISELESS)
+    text = clpipe(
+        "measure", f"{noisy}.exr", "--truth", f"{clean}.exr", "--plot", "plots/noise.png"
+    ).stdout
+    for part in ("variance = a * intensity + b", "left after 2x2", "R-G1", "Gaussian", "99."):
+        assert part in text
+    with Image.open("plots/noise.png") as picture:
+        assert picture.size[0] == 1600
+        colours = picture.convert("RGB").getcolors(1 << 20)
+        assert len(colours) > 500
+    result = clpipe(
+        "measure", f"{noisy}.exr", "--truth", f"{clean}.exr", "--plot", "a.jpg", status=2
+    )
+    assert "ends in .png" in result.stderr
+
+
+def png(path, pixels):
+    Image.fromarray(pixels).save(path)
+    return path
+
+
+def test_finished_pictures_of_others(tmp_path, measured):
+    random = np.random.default_rng(2)
+    clean = np.tile(np.linspace(40, 200, 256), (256, 1))[..., None].repeat(3, -1)
+    noisy = clean + random.normal(0, (4, 6, 8), clean.shape)
+    paths = []
+    for name, pixels in (("clean", clean), ("noisy", noisy)):
+        spec = oiio.ImageSpec(256, 256, 3, oiio.UINT16)
+        path = tmp_path / f"{name}.tif"
+        file = oiio.ImageOutput.create(str(path))
+        assert file.open(str(path), spec)
+        file.write_image((pixels * 257).astype(np.uint16))
+        file.close()
+        paths.append(path)
+        png(tmp_path / f"{name}.png", pixels.round().astype(np.uint8))
+    for ending, near in ((".tif", 0.01), (".png", 0.02)):
+        clean_path, noisy_path = (path.with_suffix(ending) for path in paths)
+        report = measured(noisy_path, "--truth", clean_path)
+        found = [report["channels"][name]["sigma"] * 255 for name in "RGB"]
+        assert found == pytest.approx([4, 6, 8], rel=near)
+        assert report["share_used"] > 0.95
+        assert report["channels"]["Y"]["energy_left_2x2"] == pytest.approx(0.25, abs=0.01)
+
+
+def test_a_mosaic_that_says_nothing_is_taken_as_it_is(write_exr, measured):
+    random = np.random.default_rng(3)
+    scene = np.tile(np.linspace(600, 3000, 200), (200, 1))
+    scene[::2, ::2] *= 0.5  # blue stands first in BGGR
+    frames = [
+        write_exr(
+            f"{i}.exr", (scene + random.normal(0, 20, scene.shape))[..., None], "Y", half=False
+        )
+        for i in range(3)
+    ]
+    report = measured(*frames, "--pattern", "BGGR")
+    assert report["kind"] == "values"
+    channels = report["channels"]
+    assert channels["mosaic"]["sigma"] == pytest.approx(20, rel=0.02)
+    assert max(channels["B"]["intensity"]["mean"]) < 1600 < max(channels["R"]["intensity"]["mean"])
+
+
+def test_no_noise_is_said_not_divided_by(clpipe, measured):
+    clean = run(clpipe, "clean", "--format", "png", *NOISELESS)
+    report = measured(f"{clean}.png", "--truth", f"{clean}.png")
+    assert "identical" in " ".join(report["notes"])
+    for one in report["channels"].values():
+        assert one["sigma"] == 0
+        assert one["energy_left_2x2"] is None
+    text = clpipe("measure", f"{clean}.png", f"{clean}.png", "--plot", "flat.png").stdout
+    assert "identical" in text
+
+
+def test_refusals(clpipe, tmp_path, write_exr):
+    half = np.full((20, 30, 3), 128, np.uint8)
+    one = png(tmp_path / "one.png", half)
+    small = png(tmp_path / "small.png", half[:10])
+    white = png(tmp_path / "white.png", half | 255)
+    linear = write_exr("linear.exr", half / np.float32(255))
+    mosaic = write_exr("mosaic.exr", np.full((20, 30, 1), 0.5, np.float32), "Y")
+    broken = tmp_path / "broken.jpg"
+    broken.write_bytes(b"\xff\xd8\xff\xe0" + b"no" * 99)
+    for arguments, status, message in (
+        ((one,), 2, "one image, and nothing to measure it against"),
+        ((one, small), 2, "small.png is display, 30x10, but .*one.png is display, 30x20"),
+        ((one, "--truth", small), 2, "small.png is display, 30x10"),
+        ((one, linear), 2, "linear.exr is rgb, 30x20"),
+        ((one, "--truth", mosaic), 2, "mosaic that does not say its levels RGGB"),
+        ((white, white), 1, "white.png: nothing to measure: every sample is clipped"),
+        ((one, tmp_path / "missing.png"), 1, "missing.png: no such file"),
+        ((broken, broken), 1, "broken.jpg: "),
+        ((one, one, "--pattern", "XYZ"), 2, "RGGB"),
+    ):
+        result = clpipe("measure", *arguments, status=status)
+        assert re.search(message, result.stderr), result.stderr
+        assert "Traceback" not in result.stderr
+
+
+def test_settings_that_cannot_be_used(write_exr, clpipe, tmp_path):
+    clpipe("run", STILL_LIFE, "-o", "a", "--until", "quantize")
+    file = oiio.ImageInput.open("a/still_life.exr")
+    spec, pixels = file.spec(), file.read_image(oiio.FLOAT)
+    file.close()
+    spec.attribute("clpipe:settings", '{"camera": "box"}')
+    out = oiio.ImageOutput.create("bad.exr")
+    out.open("bad.exr", spec)
+    out.write_image(pixels)
+    out.close()
+    result = clpipe("measure", "bad.exr", "bad.exr", status=1)
+    assert "bad.exr: what it was made with cannot be used: unknown camera 'box'" in result.stderr
+
+
+def test_odd_and_tiny_mosaics():
+    random = np.random.default_rng(4)
+    for shape in ((2, 2), (3, 5), (31, 47)):
+        frames = [
+            Picture(Path(str(i)), "values", random.random(shape, np.float32)) for i in range(3)
+        ]
+        try:
+            report = measure(frames)
+        except Exception as error:
+            assert "nothing to measure" in str(error)  # of four pixels the extremes are two
+            assert max(shape) < 10
+            continue
+        json.dumps(report.record(), allow_nan=False)
+        assert measure_tables(report)
+
+
+def test_load_says_what_it_read(clpipe, tmp_path):
+    clpipe("run", STILL_LIFE, "-o", "a", "--keep", "all", "--set", "mosaic.pattern=GBRG")
+    kinds = {
+        "exposure": "rgb",
+        "mosaic": "mosaic",
+        "quantize": "mosaic",
+        "white_balance": "mosaic",
+        "demosaic": "rgb",
+        "gamma": "display",
+        "picture_noise": "display",
+    }
+    for stage, kind in kinds.items():
+        picture = load(tmp_path / f"a/still_life.{stage}.exr")
+        assert picture.kind == kind
+        assert picture.pattern == ("GBRG" if kind == "mosaic" else "RGGB")
+        assert picture.black == {"mosaic": None}.get(stage, picture.black)
+    raw = load(tmp_path / "a/still_life.quantize.exr")
+    assert raw.black == pytest.approx(-512 / 15871)
+    assert raw.pixels.max() <= 1

@@ -1,0 +1,213 @@
+"""Noise on the finished picture: as given, or as measured on another."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from clpipe.cli import main
+from clpipe.config import make_chain, settings_from
+from clpipe.errors import RequestError
+from clpipe.plan import make_plan
+from clpipe.stage import Kind
+from clpipe.stages.picture_noise import measured_noise
+from tests.conftest import STILL_LIFE
+
+CLEAN = ("sensor_noise", "row_noise", "column_noise", "denoise")
+
+
+def chain(**values):
+    return make_chain(settings_from({"stages": ["picture_noise"], "picture_noise": values}))
+
+
+def noisy(develop, image, key="k", **values):
+    settings = {"stages": ["picture_noise"], "picture_noise": values}
+    return develop(image, key, source=Kind.DISPLAY, **settings).final
+
+
+@pytest.fixture
+def grey():
+    return np.full((300, 400, 3), 0.5, np.float32)
+
+
+@pytest.fixture
+def report(tmp_path):
+    """A report as clpipe measure writes one, with changes."""
+
+    def write(name="report.json", **changes):
+        levels = {"R": 0.01, "G": 0.02, "B": 0.03}
+        channels = {
+            name: {"sigma": level, "intensity": {"mean": [0.25, 0.75], "sigma": [level, level * 3]}}
+            for name, level in levels.items()
+        }
+        path = tmp_path / name
+        path.write_text(json.dumps({"kind": "display", "channels": channels} | changes))
+        return str(path)
+
+    return write
+
+
+def test_no_noise_costs_nothing():
+    with_it, without = (
+        make_plan(make_chain(settings_from({"skip": skip}))) for skip in ([], ["picture_noise"])
+    )
+    assert with_it == without
+
+
+def test_a_chain_may_end_before_the_display():
+    linear = settings_from({"skip": ["tone_curve", "gamma"]})
+    assert make_chain(linear).names[-1] == "color_matrix"
+    loud = {"method": "iid_gaussian", "sigma": 0.1}
+    with pytest.raises(RequestError, match="picture_noise reads display, but color_matrix gives"):
+        make_chain(settings_from({"skip": ["tone_curve", "gamma"], "picture_noise": loud}))
+
+
+def test_sigma_is_as_given_and_channels_are_independent(develop, grey):
+    image = noisy(develop, grey, method="iid_gaussian", sigma=[0.01, 0.02, 0.04]) - grey
+    assert image.std((0, 1)) == pytest.approx([0.01, 0.02, 0.04], rel=0.01)
+    assert np.abs(np.corrcoef(image.reshape(-1, 3).T) - np.eye(3)).max() < 0.015
+    one = noisy(develop, grey, method="iid_gaussian", sigma=0.02) - grey
+    assert one.std((0, 1)) == pytest.approx([0.02] * 3, rel=0.01)
+
+
+def test_noise_is_new_in_each_image(develop, grey):
+    one, again, other = (
+        noisy(develop, grey, key, method="iid_gaussian", sigma=0.02) - grey for key in "aab"
+    )
+    assert np.array_equal(one, again)
+    assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 0.01
+
+
+def test_sigma_follows_intensity(develop, grey):
+    for level, sigma in ((-1, 0.01), (0, 0.01), (0.25, 0.03), (0.5, 0.05), (0.75, 0.025), (1, 0)):
+        image = np.full_like(grey, level)
+        values = {"method": "intensity_dependent", "sigma": [0.01, 0.05, 0]}
+        assert (noisy(develop, image, **values) - image).std() == pytest.approx(sigma, rel=0.02)
+
+
+def test_measured_sigma(develop, grey, report):
+    path = report()
+    image = noisy(develop, grey, method="iid_gaussian", measured=path) - grey
+    assert image.std((0, 1)) == pytest.approx([0.01, 0.02, 0.03], rel=0.01)
+    for level, factor in ((0.0, 1), (0.5, 2), (1.0, 3)):
+        image = np.full_like(grey, level)
+        found = noisy(develop, image, method="intensity_dependent", measured=path) - image
+        assert found.std((0, 1)) == pytest.approx(np.multiply(factor, [0.01, 0.02, 0.03]), rel=0.02)
+
+
+def test_a_report_that_changes_is_read_again(report):
+    before = measured_noise(report())[0].sigma
+    path = report(channels=json.loads('{"R": 0}'))
+    assert before == 0.01
+    with pytest.raises(ValueError, match="not a report"):
+        measured_noise(path)
+
+
+@pytest.mark.parametrize("method", ["iid_gaussian", "intensity_dependent"])
+def test_what_is_refused(method, report, tmp_path):
+    broken = tmp_path / "broken.json"
+    broken.write_text("{")
+    sigma = [0.1, 0.2, 0.3]
+    for values, message in (
+        ({}, "picture_noise: needs sigma, or measured"),
+        ({"sigma": sigma, "measured": report()}, "both sigma and measured"),
+        ({"measured": "nowhere.json"}, r"picture_noise\.measured.*cannot be read: No such file"),
+        ({"measured": str(tmp_path)}, "cannot be read"),
+        ({"measured": str(broken)}, "not a report of clpipe measure --json"),
+        (
+            {"measured": report("raw.json", kind="mosaic")},
+            "reports on mosaic.*measure finished pictures",
+        ),
+        ({"sigma": [0.1, 0.2, 1.5]}, r"picture_noise\.sigma.*1\.5.*less than or equal to 1"),
+        ({"sigma": [0.1, -0.2, 0.3]}, "greater than or equal to 0"),
+        ({"sigma": [0.1]}, "sigma"),
+        ({"sigma": "loud"}, "sigma"),
+    ):
+        with pytest.raises(RequestError, match=message):
+            chain(method=method, **values)
+    for records in ({"R": {}}, {"R": {"sigma": None}}, [], dict.fromkeys("RGB", 1)):
+        with pytest.raises(RequestError, match="not a report"):
+            chain(method=method, measured=report(channels=records))
+    no_numbers = {"sigma": 0.1, "intensity": {"mean": [], "sigma": []}}
+    with pytest.raises(RequestError, match="not a report"):
+        chain(method=method, measured=report(channels=dict.fromkeys("RGB", no_numbers)))
+
+
+def test_a_configuration_names_the_report_relative_to_itself(report, tmp_path):
+    report()
+    text = '[picture_noise]\nmethod = "iid_gaussian"\nmeasured = "report.json"\n'
+    (tmp_path / "baseline.toml").write_text(text)
+    printed = CliRunner().invoke(main, ["plan", "--toml", "-c", str(tmp_path / "baseline.toml")])
+    assert printed.exit_code == 0, printed.output
+    assert "# sigma = [0.01, 0.02, 0.03]  # automatic: as measured" in printed.output
+
+
+def clpipe(*arguments):
+    result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def loop(tmp_path_factory):
+    """A camera's noise measured, put on clean pictures by each method, and measured there."""
+    folder = tmp_path_factory.mktemp("loop")
+    clean = [x for name in CLEAN for x in ("--skip", name)]
+
+    def run(name, *options):
+        formats = ("--iso", 3200, "--format", "exr", "--format", "png")
+        clpipe("run", STILL_LIFE, "-o", folder / name, *formats, *options)
+
+    def measure(name):
+        paths = (folder / n / "still_life.exr" for n in (name, "clean"))
+        frame, truth = paths
+        return clpipe("measure", frame, "--truth", truth, "--json")
+
+    run("camera")
+    run("clean", *clean)
+    reports = {"camera": json.loads(measure("camera"))}
+    (folder / "camera.json").write_text(json.dumps(reports["camera"]))
+    for method in ("iid_gaussian", "intensity_dependent"):
+        noise = ("--set", f"picture_noise.method={method}")
+        noise += ("--set", f"picture_noise.measured={folder / 'camera.json'}")
+        run(method, *clean, *noise)
+        reports[method] = json.loads(measure(method))
+    return reports
+
+
+def test_the_matched_variance_is_measured_again(loop):
+    for name in "RGB":
+        camera, baseline = (loop[x]["channels"][name] for x in ("camera", "iid_gaussian"))
+        assert baseline["sigma"] == pytest.approx(camera["sigma"], rel=0.01)
+        assert np.std(baseline["intensity"]["sigma"]) < 0.1 * np.std(camera["intensity"]["sigma"])
+
+
+def test_the_matched_curve_is_measured_again(loop):
+    for name in "RGB":
+        camera, baseline = (
+            loop[x]["channels"][name]["intensity"] for x in ("camera", "intensity_dependent")
+        )
+        mean, sigma = np.array(camera["mean"]), np.array(camera["sigma"])
+        enough = np.array(camera["samples"]) > 2000
+        found = np.interp(mean, baseline["mean"], baseline["sigma"])
+        assert enough.sum() > 8
+        off = np.abs(found / sigma - 1)
+        assert np.average(off, weights=camera["samples"]) < 0.03
+        assert off[enough].max() < 0.15  # next to a peak the bins, means, differ more
+
+
+def test_baselines_have_the_size_but_not_the_shape_of_camera_noise(loop):
+    for name in ("R", "G", "B", "Y", "Cb", "Cr"):
+        camera = loop["camera"]["channels"][name]
+        assert camera["energy_left_2x2"] > 0.55
+        for method in ("iid_gaussian", "intensity_dependent"):
+            baseline = loop[method]["channels"][name]
+            table = np.array(baseline["autocorrelation"])
+            table[8, 8] = 0
+            assert np.abs(table).max() < 0.015
+            assert baseline["energy_left_2x2"] == pytest.approx(0.25, abs=0.005)
+            # Colour differences mix sigmas of three intensities, and so are no Gaussian.
+            assert abs(baseline["excess_kurtosis"]) < (0.05 if name in "RGB" else 0.3)
+    assert loop["camera"]["correlation"]["R-G"] > 0.3
+    assert abs(loop["iid_gaussian"]["correlation"]["R-G"]) < 0.01
