@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from clpipe.calibrate import Calibration, calibrate
-from clpipe.calibration_plot import plot_calibration
+from clpipe.calibration.calibrate import Calibration, calibrate
+from clpipe.calibration.plot import plot_calibration
+from clpipe.calibration.profile import profile_text
+from clpipe.calibration.repeats import Sensor
 from clpipe.camera import Matrix, load_camera
 from clpipe.config import make_chain
 from clpipe.errors import ImageError, RequestError
 from clpipe.image_io import READABLE, read_attributes, read_image, write_beside
-from clpipe.profile import profile_text
 from clpipe.raw_io import ENDINGS, RawFacts, read_facts, read_raw
 from clpipe.reentry import carried_settings
 from clpipe.reference.cfa import Pattern
-from clpipe.repeats import Sensor
 from clpipe.stage import Kind
 from clpipe.types import Floats
 

@@ -16,7 +16,8 @@ from clpipe import describe
 from clpipe.batch import FORMATS, Burst, Target, find_jobs, prepare_folder, run_jobs
 from clpipe.bench import bench as run_bench
 from clpipe.bench import bench_methods
-from clpipe.calibrate import Calibration
+from clpipe.calibration.calibrate import Calibration
+from clpipe.calibration.line_fit import Estimate
 from clpipe.calibration_frames import Given, calibrate_files, check_name, write_profile
 from clpipe.camera import built_in_cameras, load_camera
 from clpipe.check import SIZES, check_all
@@ -33,7 +34,6 @@ from clpipe.config import (
 from clpipe.device import find_devices, open_device
 from clpipe.errors import ClpipeError, RequestError
 from clpipe.image_io import MAX_PIXELS
-from clpipe.line_fit import Estimate
 from clpipe.measure import load
 from clpipe.measure import measure as measure_images
 from clpipe.plan import make_plan

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from clpipe import Pipeline
-from clpipe.calibrate import ROUNDING, Calibration, calibrate, gain_stages
+from clpipe.calibration.calibrate import ROUNDING, Calibration, calibrate, gain_stages
+from clpipe.calibration.line_fit import Estimate, Line, Table, fit_line
+from clpipe.calibration.repeats import CHANNELS, Sensor, neighbours
 from clpipe.camera import load_camera
 from clpipe.errors import ImageError
-from clpipe.line_fit import Estimate, Line, Table, fit_line
 from clpipe.reference.cfa import PATTERNS
-from clpipe.repeats import CHANNELS, Sensor, neighbours
 
 SENSOR = Sensor("RGGB", 512, 16383)
 

@@ -10,11 +10,11 @@ PACKAGE = ROOT / "clpipe"
 # Lower ones first; a module imports only from lower levels.
 LEVELS = [
     {"errors", "types", "suggest", "noise_model"},
-    {"reference", "line_fit"},
-    {"camera", "statistics", "repeats"},
-    {"stage", "fixed_pattern", "single_image"},
-    {"stages", "calibrate"},
-    {"registry", "profile", "calibration_plot"},
+    {"reference"},
+    {"camera", "statistics"},
+    {"stage", "calibration"},
+    {"stages"},
+    {"registry"},
     {"config"},
     {"plan"},
     {"codegen"},
@@ -35,8 +35,8 @@ DOORS = {
     "rich": {"cli"},
     "rawpy": {"raw_io"},
     "exifread": {"raw_io"},
-    "matplotlib": {"calibration_plot", "measure_plot"},
-    "scipy": {"repeats", "fixed_pattern", "single_image"},
+    "matplotlib": {"calibration", "measure_plot"},
+    "scipy": {"calibration"},
 }
 
 

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from clpipe import fixed_pattern, repeats, single_image
+from clpipe.calibration import fixed_pattern, repeats, single_image
+from clpipe.calibration.fixed_pattern import Pixels
+from clpipe.calibration.line_fit import Bin, Estimate, Line, binned, fit_line
+from clpipe.calibration.repeats import CHANNELS, Sensor, Stack
+from clpipe.calibration.single_image import LevelSets
 from clpipe.errors import ImageError
-from clpipe.fixed_pattern import Pixels
-from clpipe.line_fit import Bin, Estimate, Line, binned, fit_line
-from clpipe.repeats import CHANNELS, Sensor, Stack
-from clpipe.single_image import LevelSets
 from clpipe.types import Floats
 
 ROUNDING = 1 / 12  # variance of rounding to whole DN

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from clpipe.calibrate import Calibration
+from clpipe.calibration.calibrate import Calibration
 
 COLOURS = {"R": "#c8312b", "G1": "#2f9e44", "G2": "#8fb339", "B": "#2b62c8", "all": "#6b6b6b"}
 WIDTH = 1600  # px

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clpipe.line_fit import Estimate, Line
-from clpipe.repeats import Sensor
+from clpipe.calibration.line_fit import Estimate, Line
+from clpipe.calibration.repeats import Sensor
 from clpipe.types import Floats
 
 # Daubechies' scaling and wavelet functions with three vanishing moments (sec. II-A): the wavelet of

@@ -6,8 +6,8 @@ from hashlib import blake2b
 
 import numpy as np
 
+from clpipe.calibration.line_fit import Estimate, Line, Table
 from clpipe.errors import ImageError
-from clpipe.line_fit import Estimate, Line, Table
 from clpipe.reference.cfa import Pattern, red_site
 from clpipe.types import Array, Floats
 

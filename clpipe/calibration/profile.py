@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.calibrate import Calibration, gain_stages
+from clpipe.calibration.calibrate import Calibration, gain_stages
+from clpipe.calibration.line_fit import Estimate
 from clpipe.camera import Matrix
-from clpipe.line_fit import Estimate
 
 Gains = tuple[float, float]
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clpipe.line_fit import Estimate, Line
-from clpipe.repeats import Sensor, Stack
+from clpipe.calibration.line_fit import Estimate, Line
+from clpipe.calibration.repeats import Sensor, Stack
 from clpipe.types import Array, Floats
 
 SURE = 6.0  # standard deviations that no pixel of a sensor lies out by chance
