@@ -251,6 +251,12 @@ def calibrate_group(group: Group) -> Calibration:
     dark = stack(group.dark) if group.dark else None
     if dark is not None and dark.shape[1:] != scene.shape[1:]:
         raise RequestError(_sizes(group.dark[0], dark[0], group.scene[0], scene[0]))
+    brightest, black = float(scene.max()), group.scene[0].sensor.black_level
+    if brightest <= black:
+        raise ImageError(
+            f"{group.scene[0].path}: its largest sample is {brightest:g}, not above the black "
+            f"level of {black:g} DN; dark frames are given with --dark"
+        )
     whole = bool((scene[0] == np.rint(scene[0])).all())
     return calibrate(group.iso, scene, dark, group.scene[0].sensor, whole)
 

@@ -590,7 +590,11 @@ def bench(
 @click.option("--black-level", type=float, metavar="DN", help="Instead of what the files say.")
 @click.option("--white-level", type=float, metavar="DN", help="Instead of what the files say.")
 @click.option("--pattern", type=click.Choice(PATTERNS), help="Instead of what the files say.")
-@click.option("--iso", type=float, help="Of all frames, instead of what the files say.")
+@click.option(
+    "--iso",
+    type=click.FloatRange(0, min_open=True),
+    help="Of all frames, instead of what the files say.",
+)
 @json_option
 def calibrate(
     inputs: tuple[str, ...],

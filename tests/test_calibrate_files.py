@@ -183,6 +183,13 @@ def test_what_is_no_frame(shots, tmp_path):
     assert find_frames([str(same), str(same)]) == [same]
 
 
+def test_signal_that_is_taken_for_dn_is_told(tmp_path):
+    for k in range(2):
+        write(tmp_path / f"{k}.exr", np.random.default_rng(k).random((32, 32), np.float32))
+    message = call("calibrate", tmp_path, "-o", tmp_path / "p.toml", *LEVELS, status=1).stderr
+    assert "not above the black level of 512 DN" in message
+
+
 def test_options_win_over_what_the_file_says(shots):
     frame = describe(shots / "scene" / "500_0.exr", Given(500, 16000, "BGGR", 1234))
     assert (frame.iso, frame.sensor.black_level, frame.sensor.pattern) == (1234, 500, "BGGR")

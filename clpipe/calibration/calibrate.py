@@ -13,7 +13,7 @@ import numpy as np
 
 from clpipe.calibration import fixed_pattern, repeats, single_image
 from clpipe.calibration.fixed_pattern import Pixels
-from clpipe.calibration.line_fit import Bin, Estimate, Line, binned, fit_line
+from clpipe.calibration.line_fit import Bin, Estimate, Line, Table, binned, fit_line
 from clpipe.calibration.repeats import CHANNELS, Sensor, Stack
 from clpipe.calibration.single_image import LevelSets
 from clpipe.errors import ImageError
@@ -187,11 +187,9 @@ def _repeated(
         variance, own = repeats.without_rows(each, line)
         tables.append(each.tables(variance))
         rows.append(own)
-    lines = {name: fit_line([table[name] for table in tables]) for name in CHANNELS}
     line = fit_line([table[name] for table in tables for name in CHANNELS])
     _static(stack, line)
-    for name in CHANNELS:
-        _positive(lines[name], name)
+    lines = {name: _positive(_line(tables, name), name) for name in CHANNELS}
     pooled = _seen(line).lowered(rounding)
     pattern = darkness.pattern(pooled, rounding) if darkness else {}
     dsnu = pattern["dsnu"].value if darkness else 0.0
@@ -253,7 +251,7 @@ class _Dark:
         if zeros > CLIPPED:
             notes.append(f"{zeros:.1%} of the dark samples are 0 DN; of noise they say nothing")
         elif len(dark) > 1:
-            stack = repeats.stacked(dark.copy(), sensor)
+            stack = repeats.stacked(dark.copy(), sensor, "dark frames")
             stack.used[hot.rows, hot.columns] = False
             stack.light[...] = stack.around[...] = 0
             rest = stack.rest - stack.rest.mean(axis=2, keepdims=True)
@@ -310,6 +308,18 @@ def _static(stack: Stack, line: Line) -> None:
             f"their variance, and {share:.1%} of the pixels vary more than noise does; the scene "
             "or the camera moved, the light changed, or the raws were denoised"
         )
+
+
+def _line(tables: Sequence[dict[str, Table]], channel: str) -> Line:
+    """The line of one channel.
+
+    Raises:
+        ImageError: its pixels define none.
+    """
+    try:
+        return fit_line([table[channel] for table in tables])
+    except ValueError as error:
+        raise ImageError(f"channel {channel}: {error}") from None
 
 
 def _positive(line: Line, channel: str) -> Line:

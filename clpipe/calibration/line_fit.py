@@ -153,7 +153,7 @@ def fit_line(tables: Sequence[Table]) -> Line:
     z = z / count
     total = count.sum()
     if total < 3 or np.ptp(z) == 0:
-        raise ValueError("all pixels have the same light")
+        raise ValueError("too few pixels count, or all have the same light")
     # Weights start from a rising line through the darkest pixels and all; they never take a
     # variance for less than half of the darkest pixels', or few of these could run away with all.
     order = np.argsort(z)

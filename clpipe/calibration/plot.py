@@ -1,4 +1,4 @@
-"""The picture of a calibration. The only importer of matplotlib for it."""
+"""The picture of a calibration."""
 
 import math
 from collections.abc import Sequence

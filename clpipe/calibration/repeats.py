@@ -93,8 +93,10 @@ class Stack:
         return found
 
 
-def stacked(frames: Floats, sensor: Sensor) -> Stack:
+def stacked(frames: Floats, sensor: Sensor, what: str = "frames") -> Stack:
     """Frames (frames, height, width) in DN, which are used up, as a stack; all pixels count.
+
+    ``what`` the frames are called in messages.
 
     Raises:
         ImageError: two frames are equal sample by sample.
@@ -104,7 +106,7 @@ def stacked(frames: Floats, sensor: Sensor) -> Stack:
         first = seen.setdefault(blake2b(np.ascontiguousarray(frame).data).digest(), k)
         if first != k:
             raise ImageError(
-                f"frames {first} and {k} are identical in every sample; one frame was given "
+                f"{what} {first} and {k} are identical in every sample; one frame was given "
                 "twice, or both were made with one seed and image key"
             )
     mean = frames.mean(axis=0, dtype=np.float64).astype(np.float32)
@@ -244,7 +246,9 @@ def common_motion(stack: Stack, line: Line) -> Estimate:
         squares += float(np.vdot(standard, standard))
     pairs = int((stack.used[2:] & stack.used[:-2]).sum())
     scale = stack.used.sum() / max(pairs, 1)
-    return Estimate(products / squares * scale, 1 / np.sqrt(max(pairs, 1) * stack.degrees))
+    return Estimate(
+        products / max(squares, 1e-30) * scale, 1 / np.sqrt(max(pairs, 1) * stack.degrees)
+    )
 
 
 def share_beyond_noise(stack: Stack, line: Line) -> float:
