@@ -16,6 +16,9 @@ from clpipe import describe
 from clpipe.batch import FORMATS, Burst, Target, find_jobs, prepare_folder, run_jobs
 from clpipe.bench import bench as run_bench
 from clpipe.bench import bench_methods
+from clpipe.calibration.calibrate import Calibration
+from clpipe.calibration.line_fit import Estimate
+from clpipe.calibration_frames import Given, calibrate_files, check_name, write_profile
 from clpipe.camera import built_in_cameras, load_camera
 from clpipe.check import SIZES, check_all
 from clpipe.config import (
@@ -566,6 +569,103 @@ def bench(
         f"{report.bytes_per_pixel:.1f} bytes a pixel, first run {report.first_run_s:.2f} s"
     )
     console().print(table)
+
+
+@main.command()
+@click.argument("inputs", nargs=-1, required=True, metavar="FRAMES...")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=click.Path(path_type=Path),
+    metavar="CAMERA.toml",
+    help="The profile; CAMERA.png, a picture of the fit, is written beside it.",
+)
+@click.option(
+    "--dark",
+    multiple=True,
+    metavar="FILES",
+    help="Frames without light, or a quoted glob; may be repeated.",
+)
+@click.option("--black-level", type=float, metavar="DN", help="Instead of what the files say.")
+@click.option("--white-level", type=float, metavar="DN", help="Instead of what the files say.")
+@click.option("--pattern", type=click.Choice(PATTERNS), help="Instead of what the files say.")
+@click.option(
+    "--iso",
+    type=click.FloatRange(0, min_open=True),
+    help="Of all frames, instead of what the files say.",
+)
+@json_option
+def calibrate(
+    inputs: tuple[str, ...],
+    output: Path,
+    dark: tuple[str, ...],
+    black_level: float | None,
+    white_level: float | None,
+    pattern: Pattern | None,
+    iso: float | None,
+    as_json: bool,
+) -> None:
+    """Measure a sensor's noise from raw frames, and write it as a camera profile.
+
+    FRAMES are camera raws, mosaics that clpipe kept, or mosaics from elsewhere (EXR, 16-bit TIFF or
+    PNG, with the options for what they do not say): two or more of one static scene that has dark
+    and bright places, at each ISO. Dark frames (lens cap on) give column noise, DSNU, hot pixels
+    and a better b. A single frame at an ISO is judged alone, which is less exact.
+
+    \b
+    clpipe calibrate scene/*.CR2 --dark 'dark/*.CR2' -o my_camera.toml
+    clpipe run render.exr -o out --camera my_camera.toml --iso 800
+    """
+    check_name(output)
+    given = Given(black_level, white_level, pattern, iso)
+    frames, found = calibrate_files(inputs, dark, given)
+    picture = write_profile(output, frames, found)
+    if as_json:
+        record = {
+            "profile": str(output),
+            "picture": str(picture),
+            "make": frames.make,
+            "model": frames.model,
+            "isos": [c.record() for c in found],
+        }
+        click.echo(json.dumps(record, indent=2))
+        return
+    console().print(calibration_table(found))
+    for one in found:
+        for note in one.notes:
+            click.echo(f"ISO {one.iso:g}: {note}")
+    click.echo(f"\nwrote {output} and {picture}")
+
+
+def calibration_table(found: Sequence[Calibration]) -> Table:
+    """Calibrations, an ISO a line, figures with their standard errors."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("ISO", justify="right")
+    headings = ("frames", "K, DN/e-", "read, DN", "row, DN", "column, DN", "DSNU, e-", "PRNU, %")
+    for heading in (*headings, "hot", "dead", "pixels used"):
+        table.add_column(heading, justify="right")
+
+    def told(estimate: Estimate | None, factor: float = 1) -> str:
+        if estimate is None:
+            return "-"
+        return f"{estimate.value * factor:.4g} ± {estimate.error * factor:.1g}"
+
+    for one in found:
+        table.add_row(
+            f"{one.iso:g}",
+            f"{one.scene_frames} + {one.dark_frames} dark",
+            told(one.pooled.gain),
+            told(one.read_noise),
+            told(one.row_noise),
+            told(one.column_noise),
+            told(one.dsnu, 1 / one.pooled.gain.value),
+            told(one.prnu, 100),
+            str(len(one.hot.rows)) if one.hot else "-",
+            str(len(one.dead.rows)) if one.dead else "-",
+            f"{one.used:.1%}",
+        )
+    return table
 
 
 @main.command()

@@ -1,4 +1,4 @@
-"""A report of measured noise as a picture. The only importer of matplotlib."""
+"""A report of measured noise as a picture."""
 
 from pathlib import Path
 

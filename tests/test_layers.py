@@ -12,7 +12,7 @@ LEVELS = [
     {"errors", "types", "suggest", "noise_model"},
     {"reference"},
     {"camera", "statistics"},
-    {"stage"},
+    {"stage", "calibration"},
     {"stages"},
     {"registry"},
     {"config"},
@@ -20,10 +20,10 @@ LEVELS = [
     {"codegen"},
     {"device"},
     {"run"},
-    {"image_io", "check", "bench", "pipeline"},
+    {"image_io", "raw_io", "check", "bench", "pipeline"},
     {"reentry"},
     {"measure"},
-    {"batch", "describe", "measure_plot"},
+    {"batch", "describe", "measure_plot", "calibration_frames"},
     {"cli"},
 ]
 LEVEL = {name: i for i, names in enumerate(LEVELS) for name in names}
@@ -33,7 +33,10 @@ DOORS = {
     "PIL": {"image_io"},
     "click": {"cli"},
     "rich": {"cli"},
-    "matplotlib": {"measure_plot"},
+    "rawpy": {"raw_io"},
+    "exifread": {"raw_io"},
+    "matplotlib": {"calibration", "measure_plot"},
+    "scipy": {"calibration"},
 }
 
 
