@@ -78,6 +78,25 @@ def test_a_profile_that_loads_and_runs(shots, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mine.png", "mine.toml", "out"]
 
 
+def test_hot_and_dead_pixels_come_back(shots, tmp_path):
+    light = np.full((128, 128, 3), 0.3, np.float32)
+    write(tmp_path / "scene.exr", light * np.linspace(0.1, 1, 128, dtype=np.float32)[None, :, None])
+    write(tmp_path / "dark.exr", light * 0)
+    level = 200 * load_camera("sony-a7r2").noise(800).a  # 200 e-
+    given = {"hot_share": 5e-3, "hot_level": level, "dead_share": 3e-3}
+    options = [x for key, v in given.items() for x in ("--set", f"defect_pixels.{key}={v}")]
+    for name in ("scene", "dark"):
+        for seed in range(3):
+            call("run", tmp_path / f"{name}.exr", "-o", tmp_path / name / str(seed), "--iso", 800,
+                 "--seed", seed, "--until", "quantize", "--device", "numpy", *options)  # fmt: skip
+    call("calibrate", f"{tmp_path}/scene/*/*.exr", "--dark", f"{tmp_path}/dark/*/*.exr", "-o",
+         tmp_path / "p.toml")  # fmt: skip
+    camera = load_camera(str(tmp_path / "p.toml"))
+    assert camera.hot_pixel_share == pytest.approx(5e-3, rel=0.3)
+    assert camera.hot_pixel_level == pytest.approx(200, rel=0.2)
+    assert camera.dead_pixel_share == pytest.approx(3e-3, rel=0.4)
+
+
 def test_json_has_every_figure_with_its_error(shots, tmp_path):
     scene_frames = (f"{shots}/scene/*.exr", "-o", tmp_path / "p.toml", "--json")
     record = json.loads(call("calibrate", *scene_frames, "--dark", shots / "dark").output)

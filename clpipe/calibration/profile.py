@@ -1,6 +1,7 @@
 """A camera profile from calibrations: TOML text, with the source of every figure."""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -156,12 +157,12 @@ def _fixed_pattern(found: Sequence[Calibration]) -> dict[str, tuple[float | None
     if prnu:
         mean = _weighted(prnu)
         result["prnu"] = mean.value, f"flat places of the mean frame: {_plus_minus(mean)}"
-    dsnu = [c.dsnu.scaled(1 / c.pooled.gain.value) for c in found if c.dsnu]
+    dsnu = {c.iso: c.dsnu.scaled(1 / c.pooled.gain.value) for c in found if c.dsnu}
     result["dsnu"] = (None, "not known, for want of dark frames")
     if dsnu:
-        mean = _weighted(dsnu)
-        told = f"pixels of the mean dark frame, temporal noise apart: {_plus_minus(mean, 'e-')}"
-        result["dsnu"] = _seen(mean), told
+        each = "; ".join(f"ISO {iso:g} {_plus_minus(e, 'e-')}" for iso, e in dsnu.items())
+        told = f"pixels of the mean dark frame, temporal noise apart: {each}"
+        result["dsnu"] = _seen(_weighted(list(dsnu.values()))), told
     result |= _hot(found)
     judged = [c for c in found if c.dead and c.dead.seen_on > 0.05]
     result["dead_pixel_share"] = (None, "not known: too little light in the frames")
@@ -188,6 +189,10 @@ def _hot(found: Sequence[Calibration]) -> dict[str, tuple[float | None, str]]:
     share = (count / best.size, f"{count} among {best.size} pixels, {frames} of ISO {best.iso:g}")
     if not count:
         return {"hot_pixel_share": share}
-    level = float(best.hot.excess.mean()) / best.pooled.gain.value / 2
-    told = f"half the mean charge of {count} hot pixels, as level*(1 + Exp(1)) has the mean 2*level"
+    # The median of level*(1 + Exp(1)); it does not mind that the hottest ones clip.
+    median = float(np.median(best.hot.excess))
+    level = median / best.pooled.gain.value / (1 + math.log(2))
+    told = f"median charge of {count} hot pixels over 1 + ln 2, as level*(1 + Exp(1)) has it"
+    if median > 0.95 * best.sensor.unit:
+        told += "; most of them clip, so it is more"
     return {"hot_pixel_share": share, "hot_pixel_level": (level, told)}
