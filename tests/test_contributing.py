@@ -1,11 +1,14 @@
-"""The example in CONTRIBUTING.md, run as it stands there."""
+"""The examples in CONTRIBUTING.md and README.md, run as they stand there."""
 
 import re
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
 from click.testing import CliRunner
 
+from clpipe.camera import load_camera
 from clpipe.check import check_method
 from clpipe.cli import main
 from clpipe.config import make_chain, read_settings
@@ -43,6 +46,21 @@ def test_the_commands_it_shows_work(tmp_path, monkeypatch):
         result = CliRunner().invoke(main, command, catch_exceptions=False)
         assert result.exit_code == 0, result.output
     assert (tmp_path / "out" / "render.jpg").is_file()
+
+
+def test_the_commands_of_the_readme_on_noise_work(tmp_path):
+    text = (ROOT / "README.md").read_text()
+    text = text[text.index("## Noise that can be trusted") : text.index("## From Python")]
+    blocks = [b for b in re.findall(r"```sh\n(.*?)```", text, re.DOTALL) if "CR2" not in b]
+    (tmp_path / "render.exr").write_bytes(STILL_LIFE.read_bytes())
+    script = f'clpipe() {{ "{sys.executable}" -m clpipe "$@"; }}\n' + "".join(blocks)
+    done = subprocess.run(["sh", "-eu", "-c", script], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert load_camera(str(tmp_path / "again.toml")).noise(800).a == pytest.approx(
+        1.5884e-4, rel=0.02
+    )
+    for name in ("noise.png", "again.png", "baseline/render.png"):
+        assert (tmp_path / name).stat().st_size > 10_000
 
 
 def test_every_file_it_names_is_there():

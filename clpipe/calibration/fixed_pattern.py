@@ -8,7 +8,7 @@ from clpipe.calibration.line_fit import Estimate, Line
 from clpipe.calibration.repeats import Sensor, Stack
 from clpipe.types import Array, Floats
 
-SURE = 6.0  # standard deviations that no pixel of a sensor lies out by chance
+SURE = 7.0  # standard deviations that none of 1e8 pixels lies out by chance
 BLOCK = 16  # pixels of one colour, a side
 LEAST_BLOCKS = 30
 DARKEST = 0.05  # signal of a block that tells PRNU
@@ -39,7 +39,7 @@ def _found(mask: Array, excess: Array, seen_on: float) -> Pixels:
 
 
 def hot_in_dark(dark: Floats, sensor: Sensor) -> Pixels:
-    """Hot pixels of a mean dark frame: 6 standard deviations above the median of the 3x3 pixels of
+    """Hot pixels of a mean dark frame: 7 standard deviations above the median of the 3x3 pixels of
     the same colour; the deviation is a quarter of what the middle 95 % of all pixels span.
     """
     from scipy.ndimage import median_filter
@@ -57,7 +57,7 @@ def hot_in_dark(dark: Floats, sensor: Sensor) -> Pixels:
 def hot_in_scene(stack: Stack, line: Line) -> Pixels:
     """Hot pixels of a scene, brighter than the brightest of the 8 neighbours of the same colour.
 
-    They are so by 6 standard deviations of the mean, by all that these neighbours differ among
+    They are so by 7 standard deviations of the mean, by all that these neighbours differ among
     themselves, and by three times what any adjacent pixel differs from its own.
     """
     from scipy.ndimage import maximum_filter
