@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -16,8 +16,6 @@ from clpipe import describe
 from clpipe.batch import FORMATS, Burst, Target, find_jobs, prepare_folder, run_jobs
 from clpipe.bench import bench as run_bench
 from clpipe.bench import bench_methods
-from clpipe.calibration.calibrate import Calibration
-from clpipe.calibration.line_fit import Estimate
 from clpipe.calibration_frames import Given, calibrate_files, check_name, write_profile
 from clpipe.camera import built_in_cameras, load_camera
 from clpipe.check import SIZES, check_all
@@ -73,6 +71,21 @@ def fail(error: ClpipeError) -> NoReturn:
 def console() -> Console:
     """Where tables go. A pipe gets room for whole lines."""
     return Console(width=None if sys.stdout.isatty() else 140, highlight=False)
+
+
+def show(headings: Sequence[str], rows: Iterable[Sequence[str]], left: int | None = None) -> None:
+    """Print a table whose first ``left`` columns stand left and the others right; None is all."""
+    table = Table(box=None, pad_edge=False)
+    for number, heading in enumerate(headings):
+        table.add_column(heading, justify="left" if left is None or number < left else "right")
+    for row in rows:
+        table.add_row(*row)
+    console().print(table)
+
+
+def show_json(values: Any) -> None:
+    """Print values as JSON."""
+    click.echo(json.dumps(values, indent=2))
 
 
 stage_file_option = click.option(
@@ -309,14 +322,10 @@ def plan(
     eight_bit = not formats or any(f != "exr" for f in formats)
     made = make_plan(chain, keep=chain.kept(keep), encode=eight_bit, final="exr" in formats)
     if as_json:
-        click.echo(json.dumps(describe.plan_record(made), indent=2))
+        show_json(describe.plan_record(made))
         return
-    table = Table(
-        "launch", "opened by", "stages", "reads", "writes", "bytes/px", box=None, pad_edge=False
-    )
-    for row in describe.plan_rows(made):
-        table.add_row(*row)
-    console().print(table)
+    headings = ("launch", "opened by", "stages", "reads", "writes", "bytes/px")
+    show(headings, describe.plan_rows(made))
     click.echo(
         f"\n{len(made.launches)} launches, {made.slot_count} slots, "
         f"{made.bytes_per_pixel(8):.1f} bytes a pixel on the device"
@@ -346,21 +355,12 @@ def stages(
     chosen = [all_stages()[name]] if name else list(all_stages().values())
     if as_json:
         records = [describe.stage_record(s, describe.context_for(s, settings)) for s in chosen]
-        click.echo(json.dumps(records, indent=2))
+        show_json(records)
     elif name is None:
-        console().print(stage_table(chosen))
+        headings = ("stage", "reads", "writes", "what it does", "methods (first is default)")
+        show(headings, map(describe.stage_row, chosen))
     else:
         explain_stage(chosen[0], settings)
-
-
-def stage_table(chosen: Sequence[Stage]) -> Table:
-    """The stages, a line each."""
-    headings = ("stage", "reads", "writes", "what it does", "methods (first is default)")
-    table = Table(*headings, box=None, pad_edge=False)
-    for stage in chosen:
-        methods = ", ".join(stage.by_name)
-        table.add_row(stage.name, stage.reads.label, stage.writes.label, stage.summary, methods)
-    return table
 
 
 def explain_stage(stage: Stage, settings: Settings) -> None:
@@ -374,12 +374,10 @@ def explain_stage(stage: Stage, settings: Settings) -> None:
         rows = describe.parameter_rows(method)
         automatic = describe.resolved(method, context)
         headings = ["parameter", "default", *([place] if automatic else []), "unit", "allowed", ""]
-        table = Table(*headings, box=None, pad_edge=False)
-        for parameter, default, *rest in rows:
-            value = [automatic.get(parameter, "")] if automatic else []
-            table.add_row(parameter, default, *value, *rest)
+        if automatic:
+            rows = [(row[0], row[1], automatic.get(row[0], ""), *row[2:]) for row in rows]
         if rows:
-            console().print(table)
+            show(headings, rows)
     if stage.explain:
         click.echo(f"\n{stage.explain(context)}")
 
@@ -395,27 +393,20 @@ def cameras(name: str | None, iso: float | None, as_json: bool) -> None:
             raise RequestError("--iso: name the camera that it is of")
         records = [describe.camera_record(load_camera(n)) for n in built_in_cameras()]
         if as_json:
-            click.echo(json.dumps(records, indent=2))
+            show_json(records)
             return
-        table = Table(
-            "camera", "make and model", "ISO", "gain stages from", box=None, pad_edge=False
+        every = map(load_camera, built_in_cameras())
+        show(
+            ("camera", "make and model", "ISO", "gain stages from"), map(describe.camera_row, every)
         )
-        for row in map(describe.camera_row, map(load_camera, built_in_cameras())):
-            table.add_row(*row)
-        console().print(table)
         return
     camera = load_camera(name)
     if as_json:
-        click.echo(json.dumps(describe.camera_record(camera, iso), indent=2))
+        show_json(describe.camera_record(camera, iso))
         return
     for title, headings, rows in describe.camera_tables(camera, iso):
         click.echo(title)
-        table = Table(box=None, pad_edge=False)
-        for heading in headings:
-            table.add_column(heading, justify="left" if heading == headings[0] else "right")
-        for row in rows:
-            table.add_row(*row)
-        console().print(table)
+        show(headings, rows, left=1)
         click.echo("")
     for key, source in camera.sources.items():
         click.echo(f"{key}: {source}")
@@ -427,12 +418,9 @@ def devices(as_json: bool) -> None:
     """List the OpenCL devices, which one is used, and why others are passed over."""
     rows = describe.device_rows(find_devices())
     if as_json:
-        click.echo(json.dumps(rows, indent=2))
+        show_json(rows)
         return
-    table = Table(*(key.replace("_", " ") for key in rows[0]), box=None, pad_edge=False)
-    for row in rows:
-        table.add_row(*map(str, row.values()))
-    console().print(table)
+    show([key.replace("_", " ") for key in rows[0]], [[*map(str, r.values())] for r in rows])
 
 
 @main.command()
@@ -457,46 +445,15 @@ def check(
     device = open_device(selector)
     if device is None:
         raise RequestError("check: numpy is the reference; choose a device to compare with it")
-    checks = []
-    table = Table(
-        "stage",
-        "method",
-        "cases",
-        "samples",
-        "differing",
-        "largest",
-        "allowed",
-        "",
-        box=None,
-        pad_edge=False,
-    )
-    for result in check_all(device, chosen, SIZES[:5] if small else SIZES):
-        checks.append(result)
-        table.add_row(
-            result.stage,
-            result.method,
-            str(result.cases),
-            str(result.samples),
-            str(result.differing),
-            f"{result.largest:.2g}",
-            f"{result.tolerance:.2g}",
-            "ok" if result.passed else "FAILED",
-        )
+    checks = list(check_all(device, chosen, SIZES[:5] if small else SIZES))
     failed = sum(not c.passed for c in checks)
     if as_json:
-        click.echo(
-            json.dumps(
-                {
-                    "device": device.info.label,
-                    "failed": failed,
-                    "checks": [c.record() for c in checks],
-                },
-                indent=2,
-            )
-        )
+        records = [c.record() for c in checks]
+        show_json({"device": device.info.label, "failed": failed, "checks": records})
     else:
         click.echo(f"{device.info.label}, driver {device.info.driver}, {device.info.lanes} lanes")
-        console().print(table)
+        headings = ("stage", "method", "cases", "samples", "differing", "largest", "allowed", "")
+        show(headings, map(describe.check_row, checks))
         click.echo(f"{len(checks) - failed} passed, {failed} failed")
     sys.exit(1 if failed else 0)
 
@@ -538,37 +495,34 @@ def bench(
         stage = stage_named("--methods", methods)
         speeds = bench_methods(device, stage, chain.settings, int(width), int(height), repeat)
         if as_json:
-            click.echo(json.dumps([asdict(speed) for speed in speeds], indent=2))
+            show_json([asdict(speed) for speed in speeds])
             return
         click.echo(f"{device.info.label}: {stage.name}, {width}x{height}, planes to planes")
-        table = Table("method", box=None, pad_edge=False)
-        for heading in ("launches", "ms", "MP/s"):
-            table.add_column(heading, justify="right")
-        for row in speeds:
-            table.add_row(row.method, str(row.launches), f"{row.ms:.1f}", f"{row.mp_per_s:.0f}")
-        console().print(table)
+        rows = [(s.method, f"{s.launches}", f"{s.ms:.1f}", f"{s.mp_per_s:.0f}") for s in speeds]
+        show(("method", "launches", "ms", "MP/s"), rows, left=1)
         return
     report = run_bench(device, chain, int(width), int(height), repeat)
     if as_json:
-        click.echo(json.dumps(report.record(), indent=2))
+        show_json(report.record())
         return
-    table = Table(box=None, pad_edge=False)
-    table.add_column("launch")
-    for heading in ("ms", "MP/s", "GB/s", "of copy"):
-        table.add_column(heading, justify="right")
-    for speed in (*report.launches, report.chain):
-        table.add_row(
-            speed.name,
-            f"{speed.ms:.1f}",
-            f"{speed.mp_per_s:.0f}",
-            f"{speed.gb_per_s:.1f}",
-            f"{speed.share_of_copy:.0%}",
-        )
     click.echo(
         f"{report.device}: {report.width}x{report.height}, copy {report.copy_gb_per_s:.1f} GB/s, "
         f"{report.bytes_per_pixel:.1f} bytes a pixel, first run {report.first_run_s:.2f} s"
     )
-    console().print(table)
+    show(
+        ("launch", "ms", "MP/s", "GB/s", "of copy"),
+        (
+            (
+                speed.name,
+                f"{speed.ms:.1f}",
+                f"{speed.mp_per_s:.0f}",
+                f"{speed.gb_per_s:.1f}",
+                f"{speed.share_of_copy:.0%}",
+            )
+            for speed in (*report.launches, report.chain)
+        ),
+        left=1,
+    )
 
 
 @main.command()
@@ -629,43 +583,13 @@ def calibrate(
             "model": frames.model,
             "isos": [c.record() for c in found],
         }
-        click.echo(json.dumps(record, indent=2))
+        show_json(record)
         return
-    console().print(calibration_table(found))
+    show(describe.CALIBRATION, map(describe.calibration_row, found), left=0)
     for one in found:
         for note in one.notes:
             click.echo(f"ISO {one.iso:g}: {note}")
     click.echo(f"\nwrote {output} and {picture}")
-
-
-def calibration_table(found: Sequence[Calibration]) -> Table:
-    """Calibrations, an ISO a line, figures with their standard errors."""
-    table = Table(box=None, pad_edge=False)
-    table.add_column("ISO", justify="right")
-    headings = ("frames", "K, DN/e-", "read, DN", "row, DN", "column, DN", "DSNU, e-", "PRNU, %")
-    for heading in (*headings, "hot", "dead", "pixels used"):
-        table.add_column(heading, justify="right")
-
-    def told(estimate: Estimate | None, factor: float = 1) -> str:
-        if estimate is None:
-            return "-"
-        return f"{estimate.value * factor:.4g} ± {estimate.error * factor:.1g}"
-
-    for one in found:
-        table.add_row(
-            f"{one.iso:g}",
-            f"{one.scene_frames} + {one.dark_frames} dark",
-            told(one.pooled.gain),
-            told(one.read_noise),
-            told(one.row_noise),
-            told(one.column_noise),
-            told(one.dsnu, 1 / one.pooled.gain.value),
-            told(one.prnu, 100),
-            str(len(one.hot.rows)) if one.hot else "-",
-            str(len(one.dead.rows)) if one.dead else "-",
-            f"{one.used:.1%}",
-        )
-    return table
 
 
 @main.command()
@@ -713,14 +637,9 @@ def measure(
 
         draw(report, plot)
     if as_json:
-        click.echo(json.dumps(report.record(), indent=2))
+        show_json(report.record())
         return
     click.echo(describe.measure_heading(report))
     for title, (headings, *rows) in describe.measure_tables(report):
-        table = Table(box=None, pad_edge=False)
-        for i, heading in enumerate(headings):
-            table.add_column(heading, justify="right" if i or heading else "left")
-        for row in rows:
-            table.add_row(*row)
         click.echo(f"\n{title}")
-        console().print(table)
+        show(headings, rows, left=0 if headings[0] else 1)

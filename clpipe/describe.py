@@ -8,7 +8,10 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import ValidationError
 
+from clpipe.calibration.calibrate import Calibration
+from clpipe.calibration.line_fit import Estimate
 from clpipe.camera import Camera
+from clpipe.check import Check
 from clpipe.config import Chain, Settings, make_chain
 from clpipe.device import Found, choose
 from clpipe.errors import ClpipeError, DeviceError
@@ -339,6 +342,55 @@ def camera_record(camera: Camera, iso: float | None = None) -> dict[str, Any]:
         "noise": [noise_at(camera, i) for i in isos],
         "sources": camera.sources,
     }
+
+
+def stage_row(stage: Stage) -> tuple[str, ...]:
+    """A stage in a line: name, what it reads and writes, what it does, its methods."""
+    methods = ", ".join(stage.by_name)
+    return stage.name, stage.reads.label, stage.writes.label, stage.summary, methods
+
+
+def check_row(check: Check) -> tuple[str, ...]:
+    """A comparison of a kernel with its reference, in a line."""
+    return (
+        check.stage,
+        check.method,
+        str(check.cases),
+        str(check.samples),
+        str(check.differing),
+        f"{check.largest:.2g}",
+        f"{check.tolerance:.2g}",
+        "ok" if check.passed else "FAILED",
+    )
+
+
+CALIBRATION = (
+    *("ISO", "frames", "K, DN/e-", "read, DN", "row, DN", "column, DN", "DSNU, e-", "PRNU, %"),
+    *("hot", "dead", "pixels used"),
+)
+
+
+def calibration_row(one: Calibration) -> tuple[str, ...]:
+    """What was found at an ISO in a line, figures with their standard errors."""
+
+    def told(estimate: Estimate | None, factor: float = 1) -> str:
+        if estimate is None:
+            return "-"
+        return f"{estimate.value * factor:.4g} ± {estimate.error * factor:.1g}"
+
+    return (
+        f"{one.iso:g}",
+        f"{one.scene_frames} + {one.dark_frames} dark",
+        told(one.pooled.gain),
+        told(one.read_noise),
+        told(one.row_noise),
+        told(one.column_noise),
+        told(one.dsnu, 1 / one.pooled.gain.value),
+        told(one.prnu, 100),
+        str(len(one.hot.rows)) if one.hot else "-",
+        str(len(one.dead.rows)) if one.dead else "-",
+        f"{one.used:.1%}",
+    )
 
 
 def device_rows(devices: Sequence[Found]) -> list[dict[str, Any]]:

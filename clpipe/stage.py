@@ -221,6 +221,35 @@ class Curve(Method):
         return np.asarray(self.table()[curve_index(image)])
 
 
+class GaussianNoise(Method):
+    """Gaussian noise of one sigma; where that is 0, the image stays as it is, at no cost.
+
+    Subclasses say where the sigma comes from, how it is drawn, and what it is in NumPy.
+    """
+
+    method: ClassVar = "gaussian"
+    example: ClassVar = {"sigma": 0.01}
+
+    sigma: float | None = parameter(
+        None,
+        "Standard deviation of the offsets.",
+        "signal",
+        "from the camera and ISO",
+        ge=0,
+        le=1,
+    )
+
+    def draw(self) -> tuple[Pass, ...]:
+        """The kernel functions, where there is noise."""
+        raise NotImplementedError(type(self).__name__)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return self.draw() if self.sigma else ()
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {"sigma": np.float32(self.sigma)}
+
+
 def odd_size(size: int, largest: int) -> int:
     """The width of a window, checked.
 

@@ -1,27 +1,15 @@
 """Noise that a whole column shares."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
 
 from clpipe.reference.random import normal_of_line
-from clpipe.stage import (
-    Access,
-    Argument,
-    Context,
-    Frame,
-    Kind,
-    Method,
-    Owner,
-    Pass,
-    Stage,
-    parameter,
-)
+from clpipe.stage import Access, Context, Frame, GaussianNoise, Kind, Owner, Pass, Stage
 from clpipe.types import Floats
 
 
-class Gaussian(Method):
+class Gaussian(GaussianNoise):
     """One Gaussian offset a column, the same in every image of a camera.
 
     >>> from clpipe.stage import alone
@@ -30,27 +18,13 @@ class Gaussian(Method):
     (0.01, True)
     """
 
-    method: ClassVar = "gaussian"
     kernel: ClassVar = "line_noise"
     summary: ClassVar = "add one Gaussian offset a column, the same in every image of a camera"
-
-    example: ClassVar = {"sigma": 0.01}
-
-    sigma: float | None = parameter(
-        None,
-        "Standard deviation of the offsets.",
-        "signal",
-        "from the camera and ISO",
-        ge=0,
-        le=1,
-    )
 
     def resolve(self, context: Context) -> "Gaussian":
         return self.filled(sigma=context.camera.column_noise(context.iso))
 
-    def passes(self) -> tuple[Pass, ...]:
-        if not self.sigma:
-            return ()
+    def draw(self) -> tuple[Pass, ...]:
         return (
             Pass(
                 "noise_of_lines",
@@ -63,12 +37,7 @@ class Gaussian(Method):
             Pass("column_noise", arguments=("lines",)),
         )
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
-        assert self.sigma is not None
-        return {"sigma": np.float32(self.sigma)}
-
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        assert self.sigma is not None
         normals = normal_of_line(image.shape[1], frame.stream[Owner.CAMERA])
         return image + (normals * np.float32(self.sigma))[None, :]
 

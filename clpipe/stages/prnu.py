@@ -1,26 +1,15 @@
 """Photo-response non-uniformity."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
 
 from clpipe.reference.random import normal_at
-from clpipe.stage import (
-    Argument,
-    Context,
-    Frame,
-    Kind,
-    Method,
-    Owner,
-    Pass,
-    Stage,
-    parameter,
-)
+from clpipe.stage import Context, Frame, GaussianNoise, Kind, Owner, Pass, Stage, parameter
 from clpipe.types import Floats
 
 
-class Gaussian(Method):
+class Gaussian(GaussianNoise):
     """A sensitivity of its own for each pixel, fixed for a camera (EMVA 1288, PRNU).
 
     >>> from clpipe.stage import alone
@@ -29,10 +18,8 @@ class Gaussian(Method):
     0.005
     """
 
-    method: ClassVar = "gaussian"
     kernel: ClassVar = "prnu"
     summary: ClassVar = "give each pixel of a camera a sensitivity of its own"
-    example: ClassVar = {"sigma": 0.01}
 
     sigma: float | None = parameter(
         None,
@@ -46,11 +33,8 @@ class Gaussian(Method):
     def resolve(self, context: Context) -> "Gaussian":
         return self.filled(sigma=context.camera.prnu)
 
-    def passes(self) -> tuple[Pass, ...]:
-        return (Pass("prnu", arguments=("sigma",), random=Owner.CAMERA),) if self.sigma else ()
-
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
-        return {"sigma": np.float32(self.sigma)}
+    def draw(self) -> tuple[Pass, ...]:
+        return (Pass("prnu", arguments=("sigma",), random=Owner.CAMERA),)
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
         normals = normal_at(image.shape, 0, frame.stream[Owner.CAMERA])
