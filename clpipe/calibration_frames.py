@@ -1,7 +1,7 @@
 """Frames for a calibration: which files, what each says of its camera, in groups of one ISO."""
 
 import glob
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,28 +72,33 @@ class Frame:
 
 
 def find_frames(inputs: Sequence[str]) -> list[Path]:
-    """The files that inputs name: files, folders (all mosaics and raws right in them) and globs.
+    """The files that inputs name, each once: files, folders and globs.
+
+    Of what is right in a folder, or matches a glob, those count that end as mosaics and raws do.
 
     Raises:
-        RequestError: nothing matches, or a file is named twice.
+        RequestError: nothing matches.
     """
     found: list[Path] = []
     for text in inputs:
         path = Path(text)
         if path.is_dir():
-            files = sorted(
-                p
-                for p in path.iterdir()
-                if p.suffix.lower() in (*MOSAICS, *ENDINGS) and not p.name.startswith(".")
-            )
+            files = _frames_among(path.iterdir())
         elif glob.has_magic(text) and not path.exists():
-            files = sorted(Path(p) for p in glob.glob(text, recursive=True) if Path(p).is_file())
+            files = _frames_among(Path(p) for p in glob.glob(text, recursive=True))
         else:
             files = [path]
         if not files:
             raise RequestError(f"{text}: no mosaic or raw file there")
         found += files
     return list(dict.fromkeys(found))
+
+
+def _frames_among(paths: Iterable[Path]) -> list[Path]:
+    """Those that are files and end as mosaics or raws do, by name."""
+    endings = (*MOSAICS, *ENDINGS)
+    known = (p for p in paths if p.suffix.lower() in endings and not p.name.startswith("."))
+    return sorted(p for p in known if p.is_file())
 
 
 def describe(path: Path, given: Given) -> Frame:

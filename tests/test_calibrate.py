@@ -271,6 +271,15 @@ def test_a_scene_that_moves_is_refused():
         calibrate(400, part, None, SENSOR)
 
 
+def test_a_picture_without_noise_among_the_frames_is_refused():
+    shots = np.concatenate([frames(scene(), 6), frames(scene(), 1, gain=1e-6, read=0.0)])
+    with pytest.raises(ImageError, match=r"frame 7 of 7 .* has 0\.\d+ times the others' variance"):
+        calibrate(100, shots, None, SENSOR)
+    dark = np.concatenate([frames(scene() * 0, 4), frames(scene() * 0, 1, read=0.3)])
+    with pytest.raises(ImageError, match="dark frame 5 of 5"):
+        calibrate(100, frames(scene()), dark, SENSOR)
+
+
 def test_frames_that_cannot_tell_are_refused():
     whole = frames(scene())
     with pytest.raises(ImageError, match="frames 1 and 3 are identical"):

@@ -22,6 +22,7 @@ from clpipe.types import Floats
 ROUNDING = 1 / 12  # variance of rounding to whole DN
 ROUGH = 0.4  # DN of noise below which rounding is not independent of the noise
 LEAST_USED = 0.1  # of the pixels
+UNALIKE = 0.2  # of the variance about the mean
 BENT = 0.1  # of the variance
 CLIPPED = 1e-3  # share of a dark frame's samples at 0 DN
 
@@ -189,6 +190,8 @@ def _repeated(
         rows.append(own)
     line = fit_line([table[name] for table in tables for name in CHANNELS])
     _static(stack, line)
+    for each, what in zip(stacks, ("frame", "dark frame"), strict=False):
+        _alike(each, line, what)
     lines = {name: _positive(_line(tables, name), name) for name in CHANNELS}
     pooled = _seen(line).lowered(rounding)
     pattern = darkness.pattern(pooled, rounding) if darkness else {}
@@ -308,6 +311,22 @@ def _static(stack: Stack, line: Line) -> None:
             f"their variance, and {share:.1%} of the pixels vary more than noise does; the scene "
             "or the camera moved, the light changed, or the raws were denoised"
         )
+
+
+def _alike(stack: Stack, line: Line, what: str) -> None:
+    """See that all frames are equally noisy.
+
+    Raises:
+        ImageError: one is not.
+    """
+    noise = repeats.noise_by_frame(stack, line)
+    for k, share in enumerate(noise, 1):
+        if abs(share - 1) > UNALIKE:
+            raise ImageError(
+                f"{what} {k} of {len(noise)} (in the order given, folders by name) has {share:.2f} "
+                "times the others' variance about the mean; is it a picture without noise, a mean "
+                "of frames, or from another setting?"
+            )
 
 
 def _line(tables: Sequence[dict[str, Table]], channel: str) -> Line:

@@ -251,6 +251,16 @@ def common_motion(stack: Stack, line: Line) -> Estimate:
     )
 
 
+def noise_by_frame(stack: Stack, line: Line) -> Array:
+    """How strong each frame's own noise is, as variance over that of the median frame, (frames,).
+
+    All frames have the same, up to a per mille; the mean of others, or a clean picture, has less.
+    """
+    weight = np.where(stack.used, 1 / line.at(stack.around), 0)
+    squares = np.einsum("ij,kij,kij->k", weight, stack.rest, stack.rest, dtype=np.float64)
+    return squares / np.median(squares)
+
+
 def share_beyond_noise(stack: Stack, line: Line) -> float:
     """The share of pixels whose variance no noise has (one in a million would), from a line that
     is first brought down to the median pixel.
