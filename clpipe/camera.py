@@ -118,6 +118,8 @@ class Camera(BaseModel):
             raise ValueError("white_level must be above black_level")
         if self.xyz_to_camera and abs(np.linalg.det(self.xyz_to_camera)) < 1e-6:
             raise ValueError("xyz_to_camera is singular")
+        if self.hot_pixel_share and not self.hot_pixel_level:
+            raise ValueError("hot_pixel_share needs hot_pixel_level, the least charge of one in e-")
         low, high = self.iso_range
         if low > high:
             raise ValueError(f"iso_range must ascend; found {low:g} and {high:g}")
@@ -234,7 +236,19 @@ def load_camera(name: str) -> Camera:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise RequestError(f"{path}: not valid TOML: {error}") from None
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        reason = first["msg"].removeprefix("Value error, ")
-        raise RequestError(f"{path}: {key + ': ' if key else ''}{reason}") from None
+        raise RequestError(f"{path}: {_reason(error)}") from None
+
+
+def _reason(error: ValidationError) -> str:
+    """What is wrong with a profile first, with the key, what was found and what is allowed."""
+    first = error.errors()[0]
+    key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in first["loc"]).lstrip(".")
+    last = str(first["loc"][-1]) if first["loc"] else ""
+    if first["type"] == "extra_forbidden":
+        model = GainStage if "." in key else Camera
+        return f"{key.removesuffix(last)}{one_of('key', last, model.model_fields)}"
+    if first["type"] == "missing":
+        return f"{key}: it is missing, and a profile needs it"
+    reason = first["msg"].removeprefix("Value error, ").removeprefix("Input ")
+    found = "" if isinstance(first["input"], dict) else f" found {first['input']!r}:"
+    return f"{key}:{found} {reason}" if key else reason

@@ -82,16 +82,20 @@ class Chain:
         return last.method.after(last.context).noise
 
     def clean(self) -> "Chain":
-        """The chain without the steps that draw random numbers; the others as they are.
+        """The chain without what its steps draw at random; all else as it is.
 
         Raises:
-            RequestError: no step does.
+            RequestError: no step draws anything.
         """
-        steps = [s for s in self.steps if not any(p.random for p in s.method.passes())]
-        if len(steps) == len(self.steps):
+        left = [(step, step.method.clean()) for step in self.steps]
+        if all(method is step.method for step, method in left):
             raise RequestError("no stage of this chain adds noise; every frame would be the same")
-        quiet = (replace(s, context=replace(s.context, noise=None)) for s in steps)
-        return replace(self, steps=tuple(quiet))
+        steps = tuple(
+            replace(step, method=method, context=replace(step.context, noise=None))
+            for step, method in left
+            if method
+        )
+        return replace(self, steps=steps)
 
     def kept(self, names: Sequence[str]) -> tuple[str, ...]:
         """The names of steps to keep, each once; ``all`` is every one.

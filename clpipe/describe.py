@@ -266,13 +266,13 @@ def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[st
     Raises:
         RequestError: the camera has not that ISO.
     """
-    isos = [iso] if iso else [i for stage in camera.gain_stages for i in stage.iso]
+    isos = [iso] if iso is not None else [i for stage in camera.gain_stages for i in stage.iso]
     signal: Rows = []
     paper: Rows = []
     for i in isos:
         record = noise_at(camera, i)
-        emva, lines = record["emva1288"].values(), (record["row_noise"], record["column_noise"])
-        signal.append(figures(i, *record["signal"].values(), *emva, *lines))
+        lines = record["dark_noise"], record["row_noise"], record["column_noise"]
+        signal.append(figures(i, *record["signal"].values(), *record["emva1288"].values(), *lines))
         paper.append(figures(i, *record["paper"].values()))
     return [
         (
@@ -284,10 +284,11 @@ def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[st
                 "system_gain",
                 "read_noise",
                 "adc_noise",
-                "row_noise",
-                "column_noise",
+                "both",
+                "row",
+                "column",
             ),
-            [("", "", "", "DN/e-", "e-", "DN", "DN", "DN"), *signal],
+            [("", "", "", "DN/e-", "e-", "DN", "DN", "DN", "DN"), *signal],
         ),
         (
             "The paper's: a = theta/chi, b = theta^2 b' + b'' - theta^2 p0/chi",
@@ -312,15 +313,16 @@ def figures(iso: float, *values: float) -> tuple[str, ...]:
 
 
 def noise_at(camera: Camera, iso: float) -> dict[str, Any]:
-    """Noise at an ISO in all three ways, and that of rows and columns in DN, as JSON values.
+    """Noise at an ISO in all three ways; in the dark, of rows and of columns in DN; JSON values.
 
     Raises:
         RequestError: the camera has not that ISO.
     """
-    unit = camera.signal_range
+    unit, model = camera.signal_range, camera.noise(iso)
     return {
         "iso": iso,
-        **camera.noise(iso).record(),
+        **model.record(),
+        "dark_noise": model.b**0.5 * unit,
         "row_noise": camera.row_noise(iso) * unit,
         "column_noise": camera.column_noise(iso) * unit,
     }
@@ -332,7 +334,7 @@ def camera_record(camera: Camera, iso: float | None = None) -> dict[str, Any]:
     Raises:
         RequestError: the camera has not that ISO.
     """
-    isos = [iso] if iso else [i for stage in camera.gain_stages for i in stage.iso]
+    isos = [iso] if iso is not None else [i for stage in camera.gain_stages for i in stage.iso]
     return {
         "name": camera.name,
         "make": camera.make,

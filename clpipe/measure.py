@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -60,6 +60,8 @@ class Picture:
     pattern: Pattern = "RGGB"
     black: float | None = None
     white: float | None = None
+    balance: str = ""  # which white balance gains a kept mosaic is without and with
+    iso: float | None = None  # of an image that clpipe kept
 
     @property
     def what(self) -> str:
@@ -164,24 +166,30 @@ def load(path: Path, pattern: Pattern = "RGGB") -> Picture:
     source = read_image(path, mosaic)
     pixels = source.pixels.astype(np.float32)
     kind = source.attributes.get("kind")
-    if not mosaic:
-        if kind == Kind.DISPLAY.label:
-            return Picture(path, "display", pixels, black=0.0, white=1.0)
-        return Picture(path, "rgb", pixels, white=1.0)
     try:
         settings = carried_settings(source.attributes)
         context = context_after(settings, source.attributes.get("stage")) if settings else None
     except RequestError as error:
         raise ImageError(f"{path}: what it was made with cannot be used: {error}") from None
+    iso = context.iso if context else None
+    if not mosaic:
+        if kind == Kind.DISPLAY.label:
+            return Picture(path, "display", pixels, black=0.0, white=1.0, iso=iso)
+        return Picture(path, "rgb", pixels, white=1.0, iso=iso)
     if context is None:
         return Picture(path, "values", pixels, pattern)
+    without, with_ = (
+        f"red {red:g}, blue {blue:g}" for red, blue in (context.gains, context.applied_gains)
+    )
+    balance = f"without the gains {without} and with the gains {with_}"
     black, white = context.black_level, context.white_level
     if black is None or white is None:  # not digitised: nothing clips below
-        return Picture(path, "mosaic", pixels, context.pattern, white=1.0)
+        clean = Picture(path, "mosaic", pixels, context.pattern, white=1.0)
+        return replace(clean, balance=balance, iso=iso)
     lowest = -black / (white - black)
     if kind == Kind.RAW.label:
         pixels = (pixels - np.float32(black)) / np.float32(white - black)
-    return Picture(path, "mosaic", pixels, context.pattern, lowest, 1.0)
+    return Picture(path, "mosaic", pixels, context.pattern, lowest, 1.0, balance, iso)
 
 
 def context_after(settings: Settings, stage: str | None) -> Context:
@@ -219,6 +227,16 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> Report:
     for other in (*images[1:], *([truth] if truth else [])):
         if other.what != first.what:
             raise RequestError(f"{other.path} is {other.what}, but {first.path} is {first.what}")
+        if other.balance and first.balance and other.balance != first.balance:
+            raise RequestError(
+                f"{other.path} is {other.balance}, but {first.path} is {first.balance}; "
+                "keep both after the same stage of the same camera"
+            )
+        if other is not truth and other.iso != first.iso:
+            raise RequestError(
+                f"{other.path} was made at ISO {other.iso}, {first.path} at {first.iso}; "
+                "repeats have one ISO"
+            )
     if min(first.pixels.shape[:2]) < 2:
         raise ImageError(f"{first.path}: {first.what}: too small to measure")
     frames = np.stack([image.pixels for image in images])
@@ -234,6 +252,8 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> Report:
         clean = frames.mean(0, dtype=np.float64).astype(np.float32)
         noise = (frames - clean) / np.float32(freedom**0.5)
     start = ~truth.clipped() if truth else np.ones(clean.shape, bool)
+    if truth is None:
+        refuse_the_odd_one(images, noise)
     notes = list(warnings_of(images, truth, noise))
     if not start.any():
         raise nothing_counts(first)
@@ -261,6 +281,22 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> Report:
 Parts = tuple[float, tuple[Channel, ...], dict[tuple[str, str], float]]
 
 
+def refuse_the_odd_one(images: Sequence[Picture], noise: Floats) -> None:
+    """See that no repeat has much less noise than the others: a truth among the frames.
+
+    Raises:
+        RequestError: one has.
+    """
+    energy = np.square(noise).mean(axis=tuple(range(1, noise.ndim)), dtype=np.float64)
+    least = int(energy.argmin())
+    others = float(np.median(np.delete(energy, least)))
+    if len(images) > 2 and noise[0].size >= 1000 and energy[least] < 0.6 * others:
+        raise RequestError(
+            f"{images[least].path} has {energy[least] / others:.2g} times the others' noise; "
+            "if it is their clean truth, give it as --truth"
+        )
+
+
 def warnings_of(images: Sequence[Picture], truth: Picture | None, noise: Floats) -> list[str]:
     """What a reader of the report must know."""
     notes = []
@@ -272,6 +308,10 @@ def warnings_of(images: Sequence[Picture], truth: Picture | None, noise: Floats)
         )
         if len(images) == 2:
             notes.append("with two frames every sample comes with its negative: skewness is 0")
+    if images[0].kind == "values":
+        notes.append("levels are not known: intensity counts from 0, so b holds a times black too")
+    if images[0].kind == "mosaic":
+        notes.append("b holds what rows and, against a truth, columns add to the read noise")
     if images[0].kind == "display":
         notes.append(
             "display values: variance is no straight line over intensity, a and b left out"

@@ -176,6 +176,10 @@ class Method(BaseModel):
         """The kernel functions, in order; none where the image stays as it is."""
         raise NotImplementedError(type(self).__name__)
 
+    def clean(self) -> "Method | None":
+        """What is left of this (resolved) method without noise; None where that is nothing."""
+        return None if any(each.random for each in self.passes()) else self
+
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         """Kernel arguments by name, from the resolved parameters."""
         return {}

@@ -6,7 +6,7 @@ unit, and ``mask`` (height, width), True where a pixel counts. What a function c
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -405,14 +405,24 @@ def channel(
     # Correlated samples tell less of a variance (Bartlett 1946): by the sum of squares.
     independent = freedom / float(np.nansum(table**2)) if np.isfinite(table).any() else freedom
     samples = noise[:, mask].astype(np.float64)
+    rows, columns = line_noise(noise, mask), line_noise(noise.swapaxes(1, 2), mask.T)
+    law = fit_law(curve, min(independent, freedom)) if lawful else None
+    if law:
+        # Each line has one offset: of its variance, lines tell no more than their number allows.
+        frames, height, width = noise.shape
+        in_rows, in_columns = rows.sigma**2 * (2 / (frames * height)) ** 0.5, 0.0
+        if columns.sigma > columns.limit:
+            in_columns = columns.sigma**2 * (2 / width) ** 0.5
+        shared = [x for x in (in_rows, in_columns) if np.isfinite(x)]
+        law = replace(law, b_error=float(np.hypot.reduce([law.b_error, *shared])))
     return Channel(
         name=name,
         count=samples.size,
         sigma=float(np.sqrt((samples**2).mean())),
         curve=curve,
-        law=fit_law(curve, min(independent, freedom)) if lawful else None,
-        rows=line_noise(noise, mask),
-        columns=line_noise(noise.swapaxes(1, 2), mask.T),
+        law=law,
+        rows=rows,
+        columns=columns,
         autocorrelation=table,
         energy_left=energy_left(standard, mask),
         tails=tails(standard, mask),

@@ -113,16 +113,22 @@ def test_what_arises_after_the_gain_is_what_the_fit_says(own):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("system_gain = [0.1, 0.2, 0.4]\n", "", r"gain_stages\.0\.system_gain: Field required"),
+        ("system_gain = [0.1, 0.2, 0.4]\n", "", r"gain_stages\[0\]\.system_gain: it is missing"),
         (
             "[0.1, 0.2, 0.4]",
             "[0.1, -0.2, 0.4]",
-            r"gain_stages\.0\.system_gain\.1: .*greater than 0",
+            r"gain_stages\[0\]\.system_gain\[1\]: found -0.2: .*greater than 0",
         ),
         ("[0.10, 0.12, 0.14]", "[0.10]", "row_noise must be as long as iso; found 1 and 3"),
         ("dsnu = 1.0", "dsnu = -1", "dsnu: .*greater than or equal to 0"),
         ("dsnu = 1.0", 'dsnu = "much"', "dsnu: .*valid number"),
-        ("dsnu = 1.0", "full_wel = 1", "full_wel: Extra inputs"),
+        ("dsnu = 1.0", "hot_pixel_share = 1e-5", "hot_pixel_share needs hot_pixel_level"),
+        (
+            "[sources]",
+            "[[gain_stages]]\nios = [1]\n\n[sources]",
+            "gain_stages.2.*(missing|unknown)",
+        ),
+        ("dsnu = 1.0", "full_wel = 1", "unknown key 'full_wel' .did you mean 'full_well'"),
         (
             "iso = [800, 1600]",
             "iso = [300, 1600]",
@@ -131,7 +137,7 @@ def test_what_arises_after_the_gain_is_what_the_fit_says(own):
         ("iso_range = [100, 6400]", "iso_range = [6400, 100]", "iso_range must ascend"),
         ("iso_range = [100, 6400]", "iso_range = [10, 50]", "before the first gain stage"),
         ("white_level = 1023", "white_level = 70000", "white_level: .*65535"),
-        ("[sources]", "[source]", "sources: Field required"),
+        ("[sources]", "[source]", "sources: it is missing"),
     ],
 )
 def test_a_profile_that_cannot_be_is_refused(own, old, new, message):

@@ -236,9 +236,9 @@ def test_a_camera_of_ones_own(tmp_path):
         (
             "read_noise = [1.413, ",
             "read_noise = [",
-            "gain_stages.0: read_noise must be as long as iso; found 7 and 8",
+            "gain_stages.0.: read_noise must be as long as iso; found 7 and 8",
         ),
-        ("iso = [100, 125,", "iso = [125, 100,", "gain_stages.0: iso must ascend"),
+        ("iso = [100, 125,", "iso = [125, 100,", "gain_stages.0.: iso must ascend"),
         ("white_level = 16383", "white_level = 512", "white_level must be above black_level"),
     ):
         own.write_text(text.replace(old, new))

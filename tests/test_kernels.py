@@ -28,6 +28,7 @@ KERNELS = {
     "prnu",
     "dsnu",
     "defect_pixels",
+    "full_well",
     "line_noise",
     "quantize",
     "normalize",

@@ -282,3 +282,21 @@ def test_load_says_what_it_read(clpipe, tmp_path):
     raw = load(tmp_path / "a/still_life.quantize.exr")
     assert raw.black == pytest.approx(-512 / 15871)
     assert raw.pixels.max() <= 1
+
+
+def test_wrong_partners_are_refused(clpipe):
+    noisy = run(clpipe, "noisy", "--until", "quantize", "--iso", 800)
+    other = run(clpipe, "other", "--until", "quantize", "--iso", 1600, "--seed", 1)
+    before = run(clpipe, "before", "--until", "mosaic")
+    found = clpipe("measure", f"{noisy}.exr", f"{other}.exr", status=2)
+    assert "repeats have one ISO" in found.stderr
+    found = clpipe("measure", f"{noisy}.exr", "--truth", f"{before}.exr", status=2)
+    assert "keep both after the same stage" in found.stderr
+
+
+def test_a_truth_among_the_repeats_is_refused(clpipe, tmp_path):
+    clpipe("run", STILL_LIFE, "-o", "burst", "--iso", 3200, "--frames", 3, "--until", "quantize")
+    images = sorted((tmp_path / "burst").glob("*.exr"))
+    assert len(images) == 4
+    found = clpipe("measure", *images, status=2)
+    assert "truth.exr has 0." in found.stderr and "give it as --truth" in found.stderr

@@ -12,6 +12,7 @@ from clpipe.errors import RequestError
 from clpipe.plan import make_plan
 from clpipe.reference.poisson import poisson_of
 from clpipe.reference.tukey_lambda import shape_and_scale, tukey_lambda_of
+from clpipe.run import Runner
 from clpipe.stage import Kind
 
 MEANS = (0.1, 1, 5, 9.9, 10.1, 50, 1000, 1e5)
@@ -151,10 +152,41 @@ def test_three_ways_to_say_the_same():
     assert (found.a, found.b) == pytest.approx((2e-4, 12e-6 + 1e-6 - 4e-6))
 
 
+def test_what_is_left_out_is_the_cameras():
+    camera = load_camera("sony-a7r2").noise(800)
+    emva, paper, unit = camera.emva(), camera.paper(), camera.signal_range
+    found = model(adc_noise=5.0)
+    assert found.a == pytest.approx(camera.a)
+    assert found.b * unit**2 == pytest.approx((2.521 * emva.read_noise) ** 2 + 25)
+    assert model(read_noise=4.0).emva().adc_noise == pytest.approx(emva.adc_noise)
+    found = model(chi=1e4, theta=2.0)
+    assert found.b == pytest.approx(4 * paper.b_before + paper.b_after)
+
+
+def test_a_full_well_stays_in_the_truth(develop):
+    given = {
+        "sensor_noise": {"a": 1e-3, "full_well": 500.0},
+        "stages": ["sensor_noise", "quantize"],
+    }
+    chain = make_chain(settings_from(given), Kind.MOSAIC)
+    bright = np.full((8, 8), 0.9, np.float32)
+    truth = Runner(chain.clean(), None, encode=False, final=True).run(bright, "k").final
+    assert np.all(truth == np.rint(np.float32(0.5) * 15871 + 512))
+    assert chain.clean().noise is None
+    # Without a gain an electron is worth nothing, and a full well says nothing.
+    dim = draw(develop, 0.1, 10_000, a=0.0, b=0.0, full_well=4e4)
+    assert np.all(dim == np.float32(0.1))
+
+
+def test_hot_pixels_can_be_seen_where_the_camera_does_not_say_how_hot(develop):
+    image = fixed(develop, defect_pixels={"hot_share": 0.01}).final
+    assert (image >= 0.1).mean() == pytest.approx(0.01, rel=0.2)
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"chi": 100.0}, "sensor_noise: .*chi need both chi and theta"),
+        ({"chi": 100.0}, "sensor_noise: .*need both chi and theta; found .'chi'"),
         ({"chi": 1e3, "theta": 1.0, "system_gain": 2.0}, "noise is given in one way"),
         ({"a": 1e-3, "system_gain": 2.0}, "sensor_noise: noise is given in one way; found a"),
         ({"chi": 1e3, "theta": 1.0, "p0": 0.1}, "sensor_noise: p0 = 0.1 makes b negative"),

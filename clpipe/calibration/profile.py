@@ -177,16 +177,19 @@ def _fixed_pattern(found: Sequence[Calibration]) -> dict[str, tuple[float | None
 
 
 def _hot(found: Sequence[Calibration]) -> dict[str, tuple[float | None, str]]:
-    """Hot pixels, from the ISO that shows most of them, dark frames before scenes."""
-    judged = [c for c in found if c.hot and c.dark_frames] or [c for c in found if c.hot]
+    """Hot pixels, from the dark frames of the ISO that shows most of them."""
+    judged = [c for c in found if c.hot and c.dark_frames]
     if not judged:
-        unknown = (None, "not known: a single frame does not tell")
-        return {"hot_pixel_share": unknown, "hot_pixel_level": unknown}
+        seen = max((len(c.hot.rows) for c in found if c.hot), default=0)
+        told = "not known, for want of dark frames"
+        if seen:
+            told += f"; {seen} pixels of a scene look hot, but a glint of one pixel does so too"
+        return {"hot_pixel_share": (None, told), "hot_pixel_level": (None, told)}
     best = max(judged, key=lambda c: len(c.hot.rows) if c.hot else 0)
     assert best.hot
     count = len(best.hot.rows)
-    frames = "dark frames" if best.dark_frames else "frames of the scene"
-    share = (count / best.size, f"{count} among {best.size} pixels, {frames} of ISO {best.iso:g}")
+    told = f"{count} among {best.size} pixels, dark frames of ISO {best.iso:g}"
+    share = (count / best.size, told)
     if not count:
         return {"hot_pixel_share": share}
     # The median of level*(1 + Exp(1)); it does not mind that the hottest ones clip.

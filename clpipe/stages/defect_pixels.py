@@ -21,6 +21,7 @@ from clpipe.stage import (
 from clpipe.types import Floats
 
 WORDS = 1 << 31  # as many random words tell pixels apart
+VISIBLE = 0.1  # signal of a hot pixel where the camera does not say its charge
 
 
 class Random(Method):
@@ -45,7 +46,11 @@ class Random(Method):
         None, "Hot pixels, as a share of all.", "", "from the camera", ge=0, le=0.1
     )
     hot_level: float | None = parameter(
-        None, "The least that a hot pixel adds.", "signal", "from the camera and ISO", ge=0
+        None,
+        "The least that a hot pixel adds.",
+        "signal",
+        "from the camera and ISO; else 0.1",
+        ge=0,
     )
     dead_share: float | None = parameter(
         None, "Dead pixels, as a share of all.", "", "from the camera", ge=0, le=0.1
@@ -55,7 +60,7 @@ class Random(Method):
         camera = context.camera
         return self.filled(
             hot_share=camera.hot_pixel_share,
-            hot_level=camera.signal_of(camera.hot_pixel_level, context.iso),
+            hot_level=camera.signal_of(camera.hot_pixel_level, context.iso) or VISIBLE,
             dead_share=camera.dead_pixel_share,
         )
 

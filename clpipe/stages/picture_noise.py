@@ -30,9 +30,11 @@ from clpipe.stage import (
 from clpipe.types import Floats
 
 ENTRIES = 256
+RESOLVED = 65  # entries of a measured curve, as the sidecar has it
 CHANNELS = Kind.DISPLAY.channels
 
 Sigma = Annotated[float, Field(ge=0, le=1)]
+Sigmas = Annotated[tuple[Sigma, ...], Field(min_length=2, max_length=ENTRIES)]
 
 
 class NoNoise(Unchanged):
@@ -49,9 +51,9 @@ def _as_three(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _as_tuple(value: Any) -> Any:
-    """A list, as TOML has it, as the tuple that strict validation wants."""
-    return tuple(value) if isinstance(value, list) else value
+def _as_tuples(value: Any) -> Any:
+    """Lists, as TOML has them, as the tuples that strict validation wants."""
+    return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple) else value
 
 
 class Matched(Method):
@@ -136,24 +138,27 @@ class IntensityDependent(Matched):
     summary: ClassVar = "independent Gaussian noise, sigma by intensity as a table (SyB3R)"
     example: ClassVar = {"sigma": [0.01, 0.08, 0.03]}
 
-    sigma: (
-        Annotated[
-            tuple[Sigma, ...], Field(min_length=2, max_length=ENTRIES), BeforeValidator(_as_tuple)
-        ]
-        | None
-    ) = parameter(
-        None,
-        "Standard deviations at intensities evenly spaced from 0 to 1, straight lines between.",
-        "of full scale",
-        "as measured",
+    sigma: Annotated[Sigmas | tuple[Sigmas, Sigmas, Sigmas], BeforeValidator(_as_tuples)] | None = (
+        parameter(
+            None,
+            "Standard deviations at intensities evenly spaced from 0 to 1, lines between; one "
+            "list, or one each for red, green and blue.",
+            "of full scale",
+            "as measured",
+        )
     )
+
+    def resolve(self, context: Context) -> "IntensityDependent":
+        if self.sigma is not None:
+            return self
+        places = np.linspace(0, 1, RESOLVED)
+        curves = (np.interp(places, c.intensity, c.sigmas) for c in measured_noise(self.measured))
+        return self.filled(sigma=tuple(tuple(curve.round(6).tolist()) for curve in curves))
 
     def table(self) -> Floats:
         """Sigma at 256 intensities of red, of green and of blue, (768,)."""
-        if self.sigma is None:
-            return _table(measured_noise(self.measured))
-        places = tuple(np.linspace(0, 1, len(self.sigma)).tolist())
-        return _table((ChannelNoise(0.0, places, self.sigma),) * 3)
+        assert self.sigma is not None
+        return _table(self.sigma)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("picture_noise", arguments=("sigmas",), random=Owner.IMAGE),)
@@ -173,10 +178,11 @@ def _normals(image: Floats, frame: Frame) -> Floats:
 
 
 @lru_cache(maxsize=16)
-def _table(noise: tuple["ChannelNoise", ...]) -> Floats:
+def _table(sigma: tuple[Any, ...]) -> Floats:
     places = np.linspace(0, 1, ENTRIES)
-    curves = [np.interp(places, one.intensity, one.sigmas) for one in noise]
-    return np.concatenate(curves).astype(np.float32)
+    curves = sigma if isinstance(sigma[0], tuple) else (sigma,) * 3
+    each = [np.interp(places, np.linspace(0, 1, len(curve)), curve) for curve in curves]
+    return np.concatenate(each).astype(np.float32)
 
 
 class ChannelNoise(NamedTuple):

@@ -32,6 +32,11 @@ PAPER = ("chi", "theta", "b_before", "b_after", "p0")
 NEVER_FULL = 1e30
 
 
+def _or(given: float | None, known: float) -> float:
+    """What is given, else what is known."""
+    return known if given is None else given
+
+
 class SensorNoise(Method):
     """How strong the noise is, said in one of three ways, and what bounds it.
 
@@ -95,7 +100,7 @@ class SensorNoise(Method):
                 f"found {', '.join(emva)} and {', '.join(paper)}"
             )
         if paper and (self.chi is None or self.theta is None):
-            raise ValueError(f"{', '.join(paper)} need both chi and theta")
+            raise ValueError(f"the paper's parameters need both chi and theta; found {paper}")
         return self
 
     def _given(self, names: tuple[str, ...]) -> list[str]:
@@ -110,33 +115,28 @@ class SensorNoise(Method):
         """
         camera = context.camera.noise(context.iso)
         unit = camera.signal_range
+        known, law = camera.emva(), camera.paper()
+        assert known and law  # a camera's gain is above 0
         other = self._given(EMVA) or self._given(PAPER)
-        if self._given(PAPER):
-            assert self.chi and self.theta
-            before, after = self.b_before or 0.0, self.b_after or 0.0
+        if self.chi and self.theta:
+            before, after = _or(self.b_before, law.b_before), _or(self.b_after, law.b_after)
             a, b = Paper(self.chi, self.theta, before, after, self.p0 or 0.0).signal()
             if b < 0:
                 raise RequestError(f"sensor_noise: p0 = {self.p0:g} makes b negative, {b:.4g}")
             model = NoiseModel(a, b, unit, min(after, b), self.theta)
-        elif self._given(EMVA):
-            known = camera.emva()
-            assert known
-            if self.read_noise is None and self.adc_noise is None:
-                dark = known.read_noise, known.adc_noise
-            else:
-                dark = self.read_noise or 0.0, self.adc_noise or 0.0
-            a, b = Emva(self.system_gain or known.system_gain, *dark).signal(unit)
-            model = NoiseModel(a, b, unit, (dark[1] / unit) ** 2, camera.theta)
+        elif other:
+            gain = _or(self.system_gain, known.system_gain)
+            after = _or(self.adc_noise, known.adc_noise)
+            a, b = Emva(gain, _or(self.read_noise, known.read_noise), after).signal(unit)
+            model = NoiseModel(a, b, unit, (after / unit) ** 2, camera.theta)
         else:
-            a = camera.a if self.a is None else self.a
-            b = camera.b if self.b is None else self.b
-            own = (a, b) == (camera.a, camera.b)
-            return camera if own else NoiseModel(a, b, unit)
+            a, b = _or(self.a, camera.a), _or(self.b, camera.b)
+            return camera if (a, b) == (camera.a, camera.b) else NoiseModel(a, b, unit)
         for name, given, found in (("a", self.a, model.a), ("b", self.b, model.b)):
             if given is not None and not isclose(given, found, rel_tol=1e-6):
                 raise RequestError(
-                    f"sensor_noise: noise is given in one way; found {name} = {given:g}, but "
-                    f"{', '.join(other)} make it {found:g}"
+                    f"sensor_noise: noise is given in one way; found {name} = {given:g} beside "
+                    f"{', '.join(other)}, which comes to {name} = {found:g}"
                 )
         return model
 
@@ -147,6 +147,17 @@ class SensorNoise(Method):
 
     def after(self, context: Context) -> Context:
         return replace(context, noise=self.model(context))
+
+    def clean(self) -> Method | None:
+        full = self.full_signal
+        return None if full is None else NoNoise(full_signal=full)
+
+    @property
+    def full_signal(self) -> float | None:
+        """The signal at which the well is full; None without a limit, or where a is 0 and an
+        electron is worth nothing.
+        """
+        return self.full_well * self.a if self.full_well and self.a else None
 
     def values(self) -> dict[str, np.float32]:
         """The kernel's arguments, by name."""
@@ -194,9 +205,8 @@ class Gaussian(SensorNoise):
         return (Pass("sensor_noise_tukey", arguments=names, random=Owner.IMAGE),)
 
     def values(self) -> dict[str, np.float32]:
-        assert self.a is not None
-        full_well = NEVER_FULL if self.full_well is None else self.full_well * self.a
-        signal = {"a": np.float32(self.a), "full_well": np.float32(full_well)}
+        full = np.float32(_or(self.full_signal, NEVER_FULL))
+        signal = {"a": np.float32(self.a), "full_well": full}
         if self.tukey_lambda is None:
             return {**signal, "b": np.float32(self.b)}
         return {**signal, **self.read_values()}
@@ -267,6 +277,46 @@ class Poisson(SensorNoise):
         return electrons * given["a"] + self.read_reference(image, frame) * given["read_noise"]
 
 
+class NoNoise(Method):
+    """No noise; but a full well is no noise, and stays.
+
+    >>> from clpipe.stage import alone
+    >>> alone(NoNoise(full_signal=0.5), np.float32([[0.25, 0.75]])).tolist()
+    [[0.25, 0.5]]
+    """
+
+    method: ClassVar = "none"
+    kernel: ClassVar = "full_well"
+    summary: ClassVar = "no noise; only a full well clips"
+    example: ClassVar = {"full_signal": 0.5}
+
+    full_signal: float | None = parameter(
+        None,
+        "The signal at which the well is full.",
+        "signal",
+        "from the camera and ISO; else no limit",
+        gt=0,
+    )
+
+    def resolve(self, context: Context) -> "NoNoise":
+        camera = context.camera
+        known = camera.signal_of(camera.full_well, context.iso) if camera.full_well else None
+        return self.filled(full_signal=known)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("full_well", arguments=("full_signal",)),) if self.full_signal else ()
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {"full_signal": np.float32(_or(self.full_signal, NEVER_FULL))}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        return np.minimum(image, np.float32(_or(self.full_signal, NEVER_FULL)))
+
+
 STAGE = Stage(
-    "sensor_noise", "Add shot and read noise.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian, Poisson)
+    "sensor_noise",
+    "Add shot and read noise.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (Gaussian, Poisson, NoNoise),
 )
