@@ -33,6 +33,21 @@ class Given:
     pattern: Pattern | None = None
     iso: float | None = None
 
+    def check(self) -> None:
+        """See that the numbers can be.
+
+        Raises:
+            RequestError: one cannot.
+        """
+        for name, value, low in (
+            ("--iso", self.iso, 1.0),
+            ("--black-level", self.black_level, 0.0),
+            ("--white-level", self.white_level, 1.0),
+        ):
+            high = 1e7 if name == "--iso" else 65535.0
+            if value is not None and not low <= value <= high:
+                raise RequestError(f"{name}: found {value:g}; allowed: {low:g} to {high:g}")
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -309,6 +324,7 @@ def calibrate_files(
         RequestError: the frames do not belong together, or do not say what must be known.
         ImageError: a file cannot be read, or nothing can be found from the frames.
     """
+    given.check()
     dark_paths = find_frames(dark)
     without_light = {path.resolve() for path in dark_paths}
     scene_paths = [p for p in find_frames(inputs) if p.resolve() not in without_light]
@@ -326,7 +342,7 @@ def check_name(path: Path) -> None:
         RequestError: it does not end in .toml.
     """
     if path.suffix != ".toml":
-        raise RequestError(f"{path}: a camera profile's name ends in .toml")
+        raise RequestError(f"{path}: a camera profile's name ends in .toml, such as camera.toml")
 
 
 def write_profile(path: Path, frame: Frame, found: Sequence[Calibration]) -> Path:

@@ -282,7 +282,10 @@ def run(
             continue
         for warning in outcome.warnings:
             click.echo(f"clpipe: {outcome.job.path}: warning: {warning}", err=True)
-        made = target.path(outcome.job, formats[0], target.burst.names()[-1])
+        first, *others = target.burst.names()
+        made = str(target.path(outcome.job, formats[0], first))
+        if others:
+            made += f" and {len(others)} frames"
         click.echo(
             f"{outcome.job.path} -> {made}  {outcome.megapixels:.2g} MP  {outcome.seconds:.2f} s",
             err=True,

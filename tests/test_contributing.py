@@ -63,6 +63,16 @@ def test_the_commands_of_the_readme_on_noise_work(tmp_path):
         assert (tmp_path / name).stat().st_size > 10_000
 
 
+def test_the_profile_in_the_readme_is_valid_and_complete(tmp_path):
+    blocks = re.findall(r"```toml\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    (text,) = (block for block in blocks if "[[gain_stages]]" in block)
+    (tmp_path / "mine.toml").write_text(text)
+    camera = load_camera(str(tmp_path / "mine.toml"))
+    assert camera.noise(400).a == pytest.approx(1.08 / (16383 - 512))
+    left_out = type(camera).model_fields.keys() - camera.model_fields_set
+    assert left_out == {"row_noise_ratio", "column_noise_ratio"}
+
+
 def test_every_file_it_names_is_there():
     for name in re.findall(r"`((?:clpipe|kernels|tests|tools)/[\w./]+)`", TEXT):
         if "vignette" not in name and "<" not in name:
