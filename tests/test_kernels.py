@@ -28,6 +28,7 @@ KERNELS = {
     "prnu",
     "dsnu",
     "defect_pixels",
+    "restore_highlights",
     "line_noise",
     "quantize",
     "normalize",
