@@ -20,6 +20,7 @@ from clpipe.image_io import (
     READABLE,
     SourceImage,
     Tags,
+    read_finished,
     read_image,
     versions,
     write_beside,
@@ -54,7 +55,7 @@ class Outcome:
     left_out: bool = False  # kept after another stage than the one to go on from
 
 
-def find_jobs(inputs: Sequence[str], output: Path) -> list[Job]:
+def find_jobs(inputs: Sequence[str], output: Path, endings: Sequence[str] = READABLE) -> list[Job]:
     """The files that inputs name: files, folders (all images in them, at any depth) and globs.
 
     The image key of a file in a folder is its path relative to that folder, that of a file given
@@ -70,10 +71,10 @@ def find_jobs(inputs: Sequence[str], output: Path) -> list[Job]:
             raise RequestError("an input is empty; give files, folders or globs")
         path = Path(text)
         if os.path.isdir(text):
-            files = images_in(path, output)
+            files = images_in(path, output, endings)
             if not files:
-                endings = ", ".join(READABLE)
-                raise RequestError(f"{path}: a folder without images (looked for {endings})")
+                listed = ", ".join(endings)
+                raise RequestError(f"{path}: a folder without images (looked for {listed})")
             jobs += [Job(p, p.relative_to(path).as_posix(), listed=False) for p in files]
         elif glob.has_magic(text) and not os.path.exists(text):
             matches = sorted(m for m in glob.glob(text, recursive=True) if os.path.isfile(m))
@@ -85,9 +86,9 @@ def find_jobs(inputs: Sequence[str], output: Path) -> list[Job]:
     return jobs
 
 
-def images_in(folder: Path, output: Path) -> list[Path]:
-    """The image files in a folder at any depth, sorted; hidden ones and a folder in it that is the
-    output aside, links followed.
+def images_in(folder: Path, output: Path, endings: Sequence[str]) -> list[Path]:
+    """The files in a folder at any depth that end so, sorted; hidden ones and a folder in it that
+    is the output aside, links followed.
     """
     found: list[Path] = []
     seen: set[str] = set()
@@ -101,7 +102,7 @@ def images_in(folder: Path, output: Path) -> list[Path]:
         found += [
             Path(place, n)
             for n in names
-            if not n.startswith(".") and os.path.splitext(n)[1].lower() in READABLE
+            if not n.startswith(".") and os.path.splitext(n)[1].lower() in endings
         ]
     return sorted(path for path in found if path.is_file())
 
@@ -298,6 +299,25 @@ def sidecar(
     }
 
 
+def read_source(path: Path, kind: Kind) -> SourceImage:
+    """The image of a file, as a chain that starts on this kind wants it.
+
+    Raises:
+        ImageError: it cannot be read, or holds another kind.
+    """
+    if kind is not Kind.DISPLAY:
+        return read_image(path, mosaic=len(kind.channels) == 1)
+    finished = read_finished(path)
+    if finished is None:
+        finished = read_image(path)
+        if finished.attributes.get("kind") != kind.label:
+            raise ImageError(
+                f"{path}: holds linear light, but the chain starts on finished pictures "
+                "(JPEG, PNG or TIFF, 8 or 16 bits)"
+            )
+    return finished
+
+
 def enter(
     job: Job, source: SourceImage, runner: Runner, reentry: Reentry | None
 ) -> tuple[Runner, SourceImage, str] | None:
@@ -331,14 +351,14 @@ def run_jobs(
 
     The next file is read, and the first one read while the kernels compile, in a second thread.
     """
-    mosaic = len(runner.chain.source.channels) == 1
+    kind = runner.chain.source
     with ThreadPoolExecutor(1) as reader:
-        ahead = reader.submit(read_image, jobs[0].path, mosaic)
-        runner.warm_up(half=reentry is None)
+        ahead = reader.submit(read_source, jobs[0].path, kind)
+        runner.warm_up(half=reentry is None and kind is Kind.RGB)
         for i, job in enumerate(jobs):
             reading = ahead
             if i + 1 < len(jobs):
-                ahead = reader.submit(read_image, jobs[i + 1].path, mosaic)
+                ahead = reader.submit(read_source, jobs[i + 1].path, kind)
             start = time.perf_counter()
             try:
                 source = reading.result()

@@ -31,7 +31,7 @@ from clpipe.config import (
 )
 from clpipe.device import find_devices, open_device
 from clpipe.errors import ClpipeError, RequestError
-from clpipe.image_io import MAX_PIXELS
+from clpipe.image_io import FINISHED, MAX_PIXELS, READABLE
 from clpipe.measure import load
 from clpipe.measure import measure as measure_images
 from clpipe.plan import make_plan
@@ -256,9 +256,14 @@ def run(
     --frames: OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise.
     """
     asked = Request(**request)
-    jobs = find_jobs(inputs, output)
     reentry = Reentry(asked.start_at, asked.chain) if asked.start_at else None
-    chain = reentry.first_chain(jobs[0].path) if reentry else asked.chain()
+    if reentry:
+        jobs = find_jobs(inputs, output)
+        chain = reentry.first_chain(jobs[0].path)
+    else:
+        chain = asked.chain()
+        finished = chain.source is Kind.DISPLAY
+        jobs = find_jobs(inputs, output, FINISHED if finished else READABLE)
     kept = chain.kept(keep)
     whole = asked.until is None or chain.result is Kind.DISPLAY
     formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))

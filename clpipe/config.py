@@ -378,8 +378,8 @@ def make_chain(
 
     Args:
         settings: the request.
-        source: the kind of image that enters; None is linear RGB, or, with ``start_at``, what that
-            step reads.
+        source: the kind of image that enters; None is what :func:`entry` says, or, with
+            ``start_at``, what that step reads.
         start_at: the first step to run. The steps before it are resolved all the same: what they
             say of the image (pattern, gains, noise, levels) holds.
         until: the last step to run.
@@ -390,7 +390,7 @@ def make_chain(
     """
     camera = load_camera(settings.camera)
     camera.noise(settings.iso)  # refuses an ISO that the camera has not
-    steps = resolved_steps(settings, camera, source or (None if start_at else Kind.RGB))
+    steps = resolved_steps(settings, camera, source or (None if start_at else entry(settings)))
     names = [step.name for step in steps]
     for name in settings.parameters:
         if name not in names and name not in all_stages():
@@ -412,6 +412,17 @@ def make_chain(
     if source is None:
         source = steps[first].stage.reads
     return Chain(tuple(steps[first:last]), source, camera, settings, tuple(names))
+
+
+def entry(settings: Settings) -> Kind:
+    """What enters a whole chain: linear RGB, or a finished picture where the first stage reads it.
+
+    >>> entry(Settings(stages=("inverse_gamma", "mosaic"))).label, entry(Settings()).label
+    ('display', 'rgb')
+    """
+    stages = (all_stages().get(base_name(name)) for name in settings.stages)
+    first = next((s for s in stages if s and s.name not in settings.skip), None)
+    return Kind.DISPLAY if first and first.reads is Kind.DISPLAY else Kind.RGB
 
 
 def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:

@@ -18,6 +18,7 @@ from clpipe.errors import ImageError, KindError
 from clpipe.types import Array, Floats
 
 READABLE = (".exr", ".hdr", ".pfm", ".tif", ".tiff")
+FINISHED = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
 JPEG_QUALITY = 97
 JPEG_MAX_SIDE = 65500
 HALF_MAX = np.float32(65504)  # so bright that nothing is lost, and no square overflows
@@ -72,7 +73,7 @@ def read_image(path: Path, mosaic: bool = False) -> SourceImage:
     return SourceImage(pixels, digest, layer, tuple(warnings), attributes)
 
 
-def read_finished(path: Path) -> Floats | None:
+def read_finished(path: Path) -> SourceImage | None:
     """A finished picture (JPEG, PNG, TIFF), (height, width, 3), 0..1, as it is encoded.
 
     None if the file holds no red, green and blue in whole numbers of 8 or 16 bits, and so is for
@@ -81,7 +82,7 @@ def read_finished(path: Path) -> Floats | None:
     Raises:
         ImageError: the file is missing, empty, damaged or no image.
     """
-    with _opened(path) as (_, file):
+    with _opened(path) as (data, file):
         spec = file.spec()
         picture = picture_channels(list(spec.channelnames))
         if picture is None or spec.format.basetype not in (oiio.UINT8, oiio.UINT16):
@@ -90,7 +91,8 @@ def read_finished(path: Path) -> Floats | None:
         problem = file.geterror()
         if pixels is None or problem:
             raise ImageError(f"{path}: damaged: {_reason(problem)}")
-        return np.ascontiguousarray(np.asarray(pixels)[..., list(picture[1])])
+        rgb = np.ascontiguousarray(np.asarray(pixels)[..., list(picture[1])])
+        return SourceImage(rgb, hashlib.sha256(data).hexdigest(), "", (), {})
 
 
 def holds_mosaic(path: Path) -> bool:
@@ -229,7 +231,7 @@ def _read_part(path: Path, file: Any, part: int, channels: tuple[int, ...]) -> A
     if not whole and not types <= {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}:
         raise ImageError(
             f"{path}: holds {spec.format} samples, not linear float ones; "
-            "give an OpenEXR file (or Radiance HDR, PFM, float TIFF)"
+            "give an OpenEXR file (Radiance HDR, PFM, float TIFF); a photograph: -c unprocess"
         )
     width, height = spec.full_width, spec.full_height
     if not 0 < width * height <= MAX_PIXELS or spec.width * spec.height > MAX_PIXELS:

@@ -161,7 +161,7 @@ def load(path: Path, pattern: Pattern = "RGGB") -> Picture:
     """
     finished = read_finished(path)
     if finished is not None:
-        return Picture(path, "display", finished, black=0.0, white=1.0)
+        return Picture(path, "display", finished.pixels, black=0.0, white=1.0)
     mosaic = holds_mosaic(path)
     source = read_image(path, mosaic)
     pixels = source.pixels.astype(np.float32)

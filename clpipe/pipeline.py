@@ -64,7 +64,8 @@ class Pipeline:
 
         Args:
             image: (height, width, 3) linear RGB, 1 = full scale of the sensor, of float16, float32
-                or float64; or (height, width) where the chain starts on a mosaic, also of uint16.
+                or float64; or (height, width) where the chain starts on a mosaic, also of uint16;
+                or a finished picture, also of uint8, where it starts on one.
             key: what the image's noise belongs to: the same key gives the same noise.
             **settings: other values for this image alone, as for the class. Values such as ISO,
                 gains and noise parameters cost nothing; another method or size is compiled.
@@ -112,6 +113,8 @@ def _checked(image: Array, kind: Kind) -> Array:
     """
     if not isinstance(image, np.ndarray):
         raise ImageError(f"found {type(image).__name__}; expected a NumPy array")
+    if kind is Kind.DISPLAY and image.dtype in (np.uint8, np.uint16):
+        return image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
     whole = image.dtype in (np.uint16, np.uint32) and len(kind.channels) == 1
     if image.dtype.kind != "f" and not whole:
         also = (

@@ -139,13 +139,13 @@ def test_finished_pictures_are_read_as_they_are_encoded(tmp_path, write_exr):
     pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
     for name in ("a.png", "a.tif", "a.jpg"):
         Image.fromarray(pixels).save(tmp_path / name, quality=100, subsampling=0)
-        found = read_finished(tmp_path / name)
+        found = read_finished(tmp_path / name).pixels
         assert found.dtype == np.float32
         near = 5 if name == "a.jpg" else 1e-4
         assert np.abs(found * 255 - pixels).max() < near
     with_alpha = np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=-1)
     Image.fromarray(with_alpha).save(tmp_path / "alpha.png")
-    assert np.abs(read_finished(tmp_path / "alpha.png") * 255 - pixels).max() < 1e-4
+    assert np.abs(read_finished(tmp_path / "alpha.png").pixels * 255 - pixels).max() < 1e-4
     assert read_finished(write_exr("linear.exr", ramp())) is None
     Image.fromarray(pixels[..., 0]).save(tmp_path / "grey.png")
     assert read_finished(tmp_path / "grey.png") is None

@@ -29,6 +29,7 @@ KERNELS = {
     "dsnu",
     "defect_pixels",
     "full_well",
+    "restore_highlights",
     "line_noise",
     "quantize",
     "normalize",

@@ -1,0 +1,82 @@
+"""The tone curve, undone."""
+
+from functools import lru_cache
+from typing import ClassVar
+
+import numpy as np
+from pydantic import field_validator
+
+from clpipe.reference.curve import tabulate
+from clpipe.stage import Curve, Kind, Stage, Unchanged, parameter
+from clpipe.stages.tone_curve import DEFAULT
+from clpipe.stages.tone_curve.table import table_of
+from clpipe.types import Floats
+
+
+@lru_cache(maxsize=16)
+def inverse_table(path: str) -> Floats:
+    """The table that undoes a file's curve; where that is level, its darkest value.
+
+    Raises:
+        ValueError: the file holds no curve, or one that falls somewhere or stays at 0 at white.
+    """
+    table = table_of(path).astype(np.float64)
+    if np.any(np.diff(table) < 0) or table[-1] <= table[0]:
+        raise ValueError(f"{path}: only a curve that rises can be undone")
+    linear = tabulate(lambda x: x).astype(np.float64)
+    # What comes out between two entries lies between the light of both.
+    value, first = np.unique(table, return_index=True)
+    return tabulate(lambda y: np.interp(y, value, linear[first]))
+
+
+class Default(Curve):
+    """Undoes the default curve of Adobe Camera Raw.
+
+    >>> from clpipe.stages.tone_curve import Default as Forward
+    >>> x = np.float32([0.01, 0.1, 0.5, 1.0])
+    >>> there = Forward().table()[curve_index(x)]
+    >>> Default().table()[curve_index(there)].round(3).tolist()
+    [0.009999999776482582, 0.10000000149011612, 0.5, 1.0]
+    """
+
+    method: ClassVar = "default"
+    summary: ClassVar = "undo the default curve of Adobe Camera Raw (DNG SDK)"
+
+    def table(self) -> Floats:
+        return inverse_table(DEFAULT)
+
+
+class Linear(Unchanged):
+    """No curve was there."""
+
+    method: ClassVar = "linear"
+    summary: ClassVar = "no curve to undo"
+
+
+class File(Curve):
+    """Undoes a curve of one's own."""
+
+    method: ClassVar = "file"
+    summary: ClassVar = "undo a curve from a .csv or one-dimensional .cube file"
+
+    path: str = parameter(
+        DEFAULT, "The file; in a configuration, relative to it.", auto="default.csv", file=True
+    )
+
+    @field_validator("path")
+    @classmethod
+    def _readable(cls, path: str) -> str:
+        inverse_table(path)
+        return path
+
+    def table(self) -> Floats:
+        return inverse_table(self.path)
+
+
+STAGE = Stage(
+    "inverse_tone_curve",
+    "Undo the contrast of a photograph.",
+    Kind.RGB,
+    Kind.RGB,
+    (Default, Linear, File),
+)

@@ -1,0 +1,69 @@
+"""Highlights of a photograph, before its white balance is undone."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.types import Floats
+
+
+class Brooks2019(Method):
+    """What is white stays white in the raw, although red and blue are divided by their gains.
+
+    A camera's white is where the sensor clips, in all three colours; dividing by the gains alone
+    would tint it. So red and blue are raised to m*gain + 1 - m times what they are, with
+    m = (max(grey - 0.9, 0) / 0.1)^2; inverse_white_balance divides later (Brooks et al.,
+    "Unprocessing images for learned raw denoising", CVPR 2019, sec. 3.3).
+
+    >>> from clpipe.stage import alone
+    >>> image = np.float32([[[1, 1, 1], [0.5, 0.5, 0.5]]])
+    >>> alone(Brooks2019(red_gain=2.0, blue_gain=1.5), image).tolist()
+    [[[2.0, 1.0, 1.5], [0.5, 0.5, 0.5]]]
+    """
+
+    method: ClassVar = "brooks2019"
+    kernel: ClassVar = "restore_highlights"
+    summary: ClassVar = "raise red and blue of what is nearly white by the gains"
+
+    red_gain: float | None = parameter(
+        None, "White balance gain of red, green = 1.", auto="from the camera", gt=0, le=64
+    )
+    blue_gain: float | None = parameter(
+        None, "White balance gain of blue, green = 1.", auto="from the camera", gt=0, le=64
+    )
+
+    def resolve(self, context: Context) -> "Brooks2019":
+        red, blue = context.camera.white_balance_gains
+        return self.filled(red_gain=red, blue_gain=blue)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("restore_highlights", arguments=("red_gain", "blue_gain")),)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {
+            "red_gain": np.float32(self.red_gain),
+            "blue_gain": np.float32(self.blue_gain),
+        }
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        one = np.float32(1)
+        red, green, blue = np.moveaxis(image, -1, 0)
+        grey = ((red + green) + blue) * np.float32(1 / 3)
+        m = np.maximum(grey - np.float32(0.9), np.float32(0)) * np.float32(10)
+        m = np.minimum(m * m, one)
+        raised = [
+            colour * np.maximum(m * np.float32(gain) + (one - m), one)
+            for colour, gain in ((red, self.red_gain), (blue, self.blue_gain))
+        ]
+        return np.stack([raised[0], green, raised[1]], axis=-1)
+
+
+STAGE = Stage(
+    "restore_highlights",
+    "Give a photograph's white back what clipping took from red and blue.",
+    Kind.RGB,
+    Kind.RGB,
+    (Brooks2019,),
+)

@@ -1,0 +1,111 @@
+"""From a finished picture back to a raw, and through another camera."""
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from clpipe import Pipeline
+from clpipe.cli import main
+from clpipe.errors import RequestError
+from clpipe.reference.curve import curve_index
+from clpipe.stages.gamma import Power, Srgb
+from clpipe.stages.inverse_gamma import Power as InversePower
+from clpipe.stages.inverse_gamma import Srgb as InverseSrgb
+from clpipe.stages.inverse_tone_curve import Default as InverseTone
+from clpipe.stages.inverse_tone_curve import File as InverseFile
+from clpipe.stages.tone_curve import Default as Tone
+
+QUIET = ["sensor_noise", "row_noise", "denoise"]
+
+
+def smooth(height: int = 96, width: int = 128) -> np.ndarray:
+    """A smooth picture in sRGB, eight bits, with a white patch and a black one."""
+    y, x = np.mgrid[0:height, 0:width]
+    red = 40 + 180 * x / width
+    green = 200 - 120 * y / height
+    blue = 90 + 60 * np.sin(x / 20) * np.cos(y / 25)
+    picture = np.stack([red, green, blue], axis=-1)
+    picture[20:50, 20:50] = 255
+    picture[60:90, 80:110] = 0
+    return np.rint(picture).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("there", "back"),
+    [(Srgb(), InverseSrgb()), (Power(), InversePower()), (Tone(), InverseTone())],
+)
+def test_what_is_undone_was_there(there, back):
+    x = np.linspace(0, 1, 4001, dtype=np.float32)
+    light = x if isinstance(there, Tone) else x**2
+    again = back.table()[curve_index(there.table()[curve_index(light)])]
+    # Entries of both tables are 2^-13 apart, and where a curve is flat that is more light.
+    assert np.abs(again - light).max() < 2e-3
+    assert np.abs(again - light)[light > 0.01].mean() < 2e-4
+
+
+def test_a_curve_that_falls_cannot_be_undone(tmp_path):
+    (tmp_path / "falling.csv").write_text("0,0\n0.5,0.8\n1,0.6\n")
+    with pytest.raises(ValueError, match="only a curve that rises can be undone"):
+        InverseFile(path=str(tmp_path / "falling.csv"))
+
+
+def test_a_picture_comes_back_as_it_was():
+    picture = smooth()
+    pipeline = Pipeline("unprocess", skip=QUIET)
+    again = pipeline.process(picture, "p").image
+    inside = np.zeros(picture.shape[:2], bool)
+    inside[4:-4, 4:-4] = True
+    for top, left in ((20, 20), (60, 80)):  # edges, where demosaicing has to guess
+        inside[top - 6 : top + 36, left - 6 : left + 36] = False
+        inside[top + 6 : top + 24, left + 6 : left + 24] = True
+    assert np.abs(again[inside].astype(int) - picture[inside]).max() <= 3
+    assert np.abs(again[inside].astype(int) - picture[inside]).mean() < 0.6
+
+
+def test_white_is_where_the_sensor_clips():
+    raw = Pipeline("unprocess", skip=QUIET, until="quantize").process(smooth(), "p").image
+    assert np.all(raw[22:48, 22:48] == 16383)
+    tinted = Pipeline("unprocess", skip=[*QUIET, "restore_highlights"], until="quantize")
+    assert tinted.process(smooth(), "p").image[22:48, 22:48].min() < 8000
+
+
+def test_another_camera_has_its_own_noise():
+    noisy = Pipeline("unprocess", camera="canon-5d2", iso=3200, until="normalize")
+    clean = Pipeline("unprocess", camera="canon-5d2", iso=3200, until="normalize", skip=QUIET[:2])
+    noise = noisy.process(smooth(), "p").image - clean.process(smooth(), "p").image
+    dark = noise[64:88, 84:108]
+    known = clean.chain.steps[0].context.camera.noise(3200).b
+    assert dark.var() == pytest.approx(known, rel=0.2)
+
+
+def test_pictures_from_the_command_line(tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    Image.fromarray(smooth()).save(folder / "one.jpg", quality=95)
+    Image.fromarray(smooth()).save(folder / "two.png")
+    (folder / "three.jpg").write_bytes(b"\xff\xd8\xff not a picture")
+    out = tmp_path / "out"
+    arguments = ["run", str(folder), "-o", str(out), "-c", "unprocess", "--iso", "1600"]
+    result = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert result.exit_code == 1
+    assert "three.jpg" in result.output and "2 of 3 images done" in result.output
+    assert sorted(p.name for p in out.iterdir()) == ["one.jpg", "one.json", "two.jpg", "two.json"]
+
+
+def test_each_chain_wants_its_own_kind(tmp_path, write_exr):
+    render = write_exr("render.exr", smooth() / 255)
+    Image.fromarray(smooth()).save(tmp_path / "photo.png")
+    for path, more, message in (
+        (render, ["-c", "unprocess"], "holds linear light, but the chain starts on finished"),
+        (tmp_path / "photo.png", [], "a photograph: -c unprocess"),
+    ):
+        arguments = ["run", str(path), "-o", str(tmp_path / "out"), *more]
+        result = CliRunner().invoke(main, arguments, catch_exceptions=False)
+        assert result.exit_code == 1
+        assert message in result.output
+
+
+def test_a_chain_that_does_not_fit_a_picture():
+    with pytest.raises(RequestError, match="mosaic"):
+        Pipeline(stages=["inverse_gamma", "sensor_noise"])
