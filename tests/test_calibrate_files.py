@@ -236,7 +236,7 @@ def test_a_real_raw(shared_data, tmp_path):
         ("exiftool_DNG.dng", "there are no pixels in it"),
         ("magicknet_DSC8695.dng", "holds every colour at every pixel"),
         ("bep_truncated.cr2", "damaged, or no raw"),
-        ("mei_issue247-1.nef", "damaged, or no raw"),
+        ("mei_issue247-1.nef", "it is a JPEG, not a camera's raw"),
         ("mushfiq_DSC_1339_768x512_rggb.raw", "a dump of samples"),
     ],
 )
