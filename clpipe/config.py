@@ -96,6 +96,11 @@ class Chain:
         last = self.steps[-1]
         return last.method.after(last.context).noise
 
+    @property
+    def is_noisy(self) -> bool:
+        """Whether a step draws random numbers."""
+        return any(p.random for s in self.steps for p in s.method.passes())
+
     def clean(self) -> "Chain":
         """The chain without the steps that draw random numbers; the others as they are.
 

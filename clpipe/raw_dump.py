@@ -48,8 +48,8 @@ class Dump:
         """
         if len(data) != self.byte_count:
             raise ImageError(
-                f"{len(data)} bytes, but {self.width}x{self.height} {self.type} has {self.byte_count}; "
-                f"{fitting(len(data), self)}"
+                f"{len(data)} bytes, but {self.width}x{self.height} {self.type} has "
+                f"{self.byte_count}; {fitting(len(data), self)}"
             )
         if self.type in ("uint16le", "uint16be"):
             samples: Array = np.frombuffer(data, "<u2" if self.type == "uint16le" else ">u2")

@@ -156,8 +156,6 @@ def _opened(path: Path) -> Iterator[Any]:
     """
     import rawpy
 
-    if not path.is_file():
-        raise ImageError(f"{path}: no such file")
     try:
         with path.open("rb") as file:
             start = file.read(8)
@@ -236,6 +234,8 @@ def _exif(path: Path) -> _Exif:
                 head = file.read(1 << 20)
                 for mark in (m for m in EXIF_MARKS if m in head):
                     tags |= _tags(io.BytesIO(head[head.index(mark) + len(mark) :]))
+    except FileNotFoundError:
+        raise ImageError(f"{path}: no such file") from None
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror or error}") from None
     return _Exif(tags)
