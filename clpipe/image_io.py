@@ -391,7 +391,7 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> None:
     numbers = {0x829A: tags.exposure, 0x829D: tags.aperture, 0x920A: tags.focal_length}
     for tag, number in numbers.items():
         if number:
-            own[tag] = TiffImagePlugin.IFDRational(Fraction(number).limit_denominator(100_000))
+            own[tag] = TiffImagePlugin.IFDRational(Fraction(number).limit_denominator(1_000_000))
     if tags.taken:
         exif[0x0132] = own[0x9003] = tags.taken
     options: dict[str, Any] = {"exif": exif.tobytes()}

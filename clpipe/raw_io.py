@@ -5,6 +5,8 @@ The only importer of rawpy and exifread.
 
 import io
 import logging
+import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -30,6 +32,8 @@ ORIENTATIONS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
 # Where the EXIF of files begins that are no TIFF: in a CR3's boxes, in a RAF's JPEG.
 EXIF_MARKS = (b"CMT1", b"CMT2", b"Exif\0\0")
 PARTS = ("EXIF", "Image")  # of EXIF, where exifread finds tags
+DATE_TAGS = ("DateTimeOriginal", "DateTime")
+DATE = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")
 OTHERS = {b"\xff\xd8\xff": "a JPEG", b"\x89PNG": "a PNG", b"v/1\x01": "an OpenEXR image"}
 
 
@@ -44,6 +48,7 @@ class RawFacts:
     model: str
     iso: float | None
     exposure: float | None  # s
+    visible_area: tuple[int, int, int, int]  # of the sensor: left, top, width, height; px
     pattern: Pattern  # of the visible area
     black_levels: tuple[int, int, int, int]  # of the pattern's four sites, row by row
     white_level: int
@@ -79,6 +84,7 @@ def read_facts(path: Path) -> RawFacts:
                 f"{path}: names no camera, ISO or exposure; a dump of samples, not a camera's raw "
                 "(clpipe run takes it with --raw-size and --raw-type)"
             )
+        size = raw.sizes
         by_colour = raw.black_level_per_channel
         cell = raw.raw_colors_visible[:2, :2].ravel()
         first, second, third, fourth = (int(by_colour[c]) for c in cell)
@@ -94,6 +100,7 @@ def read_facts(path: Path) -> RawFacts:
             model=said.text("Model") or "unknown",
             iso=iso or None,
             exposure=exposure,
+            visible_area=(size.left_margin, size.top_margin, size.width, size.height),
             pattern=pattern,
             black_levels=(first, second, third, fourth),
             white_level=int(raw.white_level),
@@ -102,10 +109,10 @@ def read_facts(path: Path) -> RawFacts:
             daylight_gains=_gains(*raw.daylight_whitebalance[:3]) if to_srgb else None,
             xyz_to_camera=matrix,
             camera_to_srgb=to_srgb,
-            orientation=ORIENTATIONS.get(raw.sizes.flip, 1),
+            orientation=ORIENTATIONS.get(size.flip, 1),
             aperture=said.number("FNumber", raw.other.aperture),
             focal_length=said.number("FocalLength", raw.other.focal_length),
-            taken=said.text("DateTimeOriginal") or said.text("DateTime"),
+            taken=next(filter(DATE.fullmatch, map(said.text, DATE_TAGS)), ""),
         )
 
 
@@ -210,14 +217,16 @@ class _Exif:
         return next((text for text in both if text), "")
 
     def number(self, name: str, otherwise: float) -> float | None:
-        """A tag's first number, or what holds where there is no such tag; None for 0."""
+        """A tag's first number, or what holds where there is no such tag; None if not above 0."""
+        found = otherwise
         for part in PARTS:
             if tag := self.tags.get(f"{part} {name}"):
                 try:
-                    return float(tag.values[0]) or None
+                    found = float(tag.values[0])
                 except (AttributeError, IndexError, TypeError, ValueError, ZeroDivisionError):
-                    return None
-        return otherwise or None
+                    found = 0
+                break
+        return found if 0 < found < math.inf else None
 
 
 def _exif(path: Path) -> _Exif:
