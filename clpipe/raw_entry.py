@@ -104,7 +104,10 @@ class RawEntry:
     def _chain(self, path: Path, said: RawFacts | Dump) -> tuple[Chain, list[str]]:
         """The chain for a raw, and what was taken for what it does not say, or says wrongly."""
         brought, found = brought_by(said)
-        settings = self.settings(brought)
+        parameters = dict(brought.parameters)
+        if "white_balance" in found and self.settings(Settings()).parameters.get("white_balance"):
+            del parameters["white_balance"]  # the user's own, not what stands in for the file's
+        settings = self.settings(replace(brought, parameters=parameters))
         camera = load_camera(settings.camera)
         low, high = camera.iso_range
         iso = min(max(settings.iso, low), high)
