@@ -7,7 +7,7 @@ import platform
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,17 +16,20 @@ import clpipe
 from clpipe.config import Chain
 from clpipe.errors import ImageError, KindError, RequestError
 from clpipe.image_io import (
+    CARRIED,
     JPEG_MAX_SIDE,
     READABLE,
     SourceImage,
     Tags,
-    read_finished,
-    read_image,
+    carried,
+    upright,
     versions,
     write_beside,
     write_display,
     write_exr,
 )
+from clpipe.raw_entry import RawEntry, RawImage
+from clpipe.raw_io import ENDINGS
 from clpipe.reentry import Reentry, attributes_of, doubts, misplaced
 from clpipe.run import Result, Runner
 from clpipe.stage import Kind
@@ -73,8 +76,9 @@ def find_jobs(inputs: Sequence[str], output: Path, endings: Sequence[str] = READ
         if os.path.isdir(text):
             files = images_in(path, output, endings)
             if not files:
-                listed = ", ".join(endings)
-                raise RequestError(f"{path}: a folder without images (looked for {listed})")
+                listed = ", ".join(e for e in endings if e not in ENDINGS)
+                raws = " and camera raws" if set(ENDINGS) & set(endings) else ""
+                raise RequestError(f"{path}: a folder without images (looked for {listed}{raws})")
             jobs += [Job(p, p.relative_to(path).as_posix(), listed=False) for p in files]
         elif glob.has_magic(text) and not os.path.exists(text):
             matches = sorted(m for m in glob.glob(text, recursive=True) if os.path.isfile(m))
@@ -220,23 +224,30 @@ class Target:
             ImageError: a file cannot be written.
         """
         chain = runner.chain
-        tags = Tags(chain.camera.make, chain.camera.model, chain.iso)
+        own = Tags(chain.camera.make, chain.camera.model, chain.iso)
+        tags, orientation = carried(source.attributes, own)
+        brought = {name: source.attributes[name] for name in CARRIED if name in source.attributes}
+        if chain.result in (Kind.RAW, Kind.MOSAIC):
+            orientation = 1  # to turn a mosaic would be to change its pattern
         outputs = []
         for step in chain.steps:
             if step.name in runner.keep:
                 path = self.path(job, f"{step.name}.exr", name)
-                attributes = attributes_of(step, chain, key)
+                attributes = attributes_of(step, chain, key) | brought
                 write_exr(path, result.kept[step.name], step.stage.writes.channels, attributes)
                 outputs.append(path.name)
         for format_ in self.formats:
             path = self.path(job, format_, name)
             if format_ == "exr":
                 assert result.final is not None
-                attributes = attributes_of(chain.steps[-1], chain, key)
-                write_exr(path, result.final, chain.result.channels, attributes)
+                attributes = attributes_of(chain.steps[-1], chain, key) | brought
+                if orientation != 1:
+                    attributes["orientation"] = "1"
+                pixels = upright(result.final, orientation)
+                write_exr(path, pixels, chain.result.channels, attributes)
             else:
                 assert result.encoded is not None
-                write_display(path, result.encoded, tags)
+                write_display(path, upright(result.encoded, orientation), tags)
             outputs.append(path.name)
         record = sidecar(job, key, runner, source, result, outputs)
         text = json.dumps(record, indent=2) + "\n"
@@ -258,6 +269,8 @@ def sidecar(
     """Everything that is needed to make the same files again."""
     chain = runner.chain
     device = runner.device
+    raw = source.said if isinstance(source, RawImage) else None
+    noise = chain.noise if not raw or chain.is_noisy else None
     return {
         "clpipe": clpipe.__version__,
         "input": str(job.path),
@@ -269,8 +282,9 @@ def sidecar(
         "height": source.pixels.shape[0],
         "camera": chain.camera.name,
         "iso": chain.iso,
-        "noise": chain.noise.record() if chain.noise else None,
+        "noise": noise.record() if noise else None,
         "starts_on": chain.source.label,
+        **({"raw": asdict(raw)} if raw else {}),
         "stages": [
             {
                 "name": step.name,
@@ -299,27 +313,8 @@ def sidecar(
     }
 
 
-def read_source(path: Path, kind: Kind) -> SourceImage:
-    """The image of a file, as a chain that starts on this kind wants it.
-
-    Raises:
-        ImageError: it cannot be read, or holds another kind.
-    """
-    if kind is not Kind.DISPLAY:
-        return read_image(path, mosaic=len(kind.channels) == 1)
-    finished = read_finished(path)
-    if finished is None:
-        finished = read_image(path)
-        if finished.attributes.get("kind") != kind.label:
-            raise ImageError(
-                f"{path}: holds linear light, but the chain starts on finished pictures "
-                "(JPEG, PNG or TIFF, 8 or 16 bits)"
-            )
-    return finished
-
-
 def enter(
-    job: Job, source: SourceImage, runner: Runner, reentry: Reentry | None
+    job: Job, source: SourceImage, runner: Runner, reentry: Reentry | None, raws: RawEntry
 ) -> tuple[Runner, SourceImage, str] | None:
     """How to go on with an image: its runner, the image with warnings, its key.
 
@@ -328,6 +323,10 @@ def enter(
     Raises:
         ImageError: it cannot enter there.
     """
+    if isinstance(source, RawImage):
+        chain, source = raws.enter(job.path, source)
+        keep = [name for name in runner.keep if name in {s.name for s in chain.steps}]
+        return Runner(chain, runner.device, keep, runner.encode, runner.final), source, job.key
     kept, warnings, key = source.attributes.get("stage"), list(source.warnings), job.key
     if reentry:
         chain = reentry.chain_for(job.path, source.attributes)
@@ -345,7 +344,11 @@ def enter(
 
 
 def run_jobs(
-    jobs: Sequence[Job], runner: Runner, target: Target, reentry: Reentry | None = None
+    jobs: Sequence[Job],
+    runner: Runner,
+    target: Target,
+    raws: RawEntry,
+    reentry: Reentry | None = None,
 ) -> Iterator[Outcome]:
     """Put every job through; one that fails is reported and the others go on.
 
@@ -353,22 +356,22 @@ def run_jobs(
     """
     kind = runner.chain.source
     with ThreadPoolExecutor(1) as reader:
-        ahead = reader.submit(read_source, jobs[0].path, kind)
+        ahead = reader.submit(raws.read, jobs[0].path, kind)
         runner.warm_up(half=reentry is None and kind is Kind.RGB)
         for i, job in enumerate(jobs):
             reading = ahead
             if i + 1 < len(jobs):
-                ahead = reader.submit(read_source, jobs[i + 1].path, kind)
+                ahead = reader.submit(raws.read, jobs[i + 1].path, kind)
             start = time.perf_counter()
             try:
                 source = reading.result()
                 target.check_size(source)
-                entered = enter(job, source, runner, reentry)
+                entered = enter(job, source, runner, reentry, raws)
                 if entered is None:
                     yield Outcome(job, 0, 0, left_out=True)
                     continue
-                runner, source, key = entered
-                for name, shot, shot_key in target.burst.shots(runner, key):
+                own, source, key = entered
+                for name, shot, shot_key in target.burst.shots(own, key):
                     result = shot.run(source.pixels, shot_key)
                     target.write(job, name, shot_key, shot, source, result)
             except KindError as error:

@@ -23,6 +23,7 @@ from clpipe.config import (
     Chain,
     Settings,
     built_in_configs,
+    entry,
     load_settings,
     make_chain,
     overlay,
@@ -31,10 +32,12 @@ from clpipe.config import (
 )
 from clpipe.device import find_devices, open_device
 from clpipe.errors import ClpipeError, RequestError
-from clpipe.image_io import FINISHED, MAX_PIXELS, READABLE
+from clpipe.image_io import FINISHED, MAX_PIXELS
 from clpipe.measure import load
 from clpipe.measure import measure as measure_images
 from clpipe.plan import make_plan
+from clpipe.raw_dump import TYPES
+from clpipe.raw_entry import RawEntry
 from clpipe.reentry import Reentry
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.registry import all_stages, load_stage_file
@@ -182,17 +185,21 @@ class Request:
     start_at: str | None
     until: str | None
     stage_files: Sequence[Path]
+    raw_size: str | None = None
+    raw_type: str | None = None
 
-    def chain(self, carried: Settings | None = None) -> Chain:
-        """The chain that a configuration and the options over it ask for.
+    def settings(self, under: Settings = DEFAULTS, carried: Settings | None = None) -> Settings:
+        """The settings of a configuration and the options over it.
 
-        ``carried`` are the settings of a kept image; they hold where no configuration is named.
+        ``under`` are settings that hold where these say nothing. ``carried`` are those of a kept
+        image; they hold where no configuration is named.
         """
         for file in self.stage_files:
             load_stage_file(file)
         named = self.config is not None
-        settings = load_settings(str(self.config)) if named else carried or DEFAULTS
+        settings = load_settings(str(self.config), under) if named else carried or under
         plain = {"camera": self.camera, "iso": self.iso, "seed": self.seed}
+        plain |= {"raw_size": self.raw_size, "raw_type": self.raw_type}
         values: dict[str, Any] = {k: v for k, v in plain.items() if v is not None}
         if self.stages is not None:
             values["stages"] = [s.strip() for s in self.stages.split(",") if s.strip()]
@@ -200,7 +207,15 @@ class Request:
         for text in self.assignments:
             stage, parameter, value = parse_assignment(text)
             values.setdefault(stage, {})[parameter] = value
-        chain = make_chain(overlay(settings, values), start_at=self.start_at, until=self.until)
+        return overlay(settings, values)
+
+    def chain(self, carried: Settings | None = None) -> Chain:
+        """The chain that they ask for; ``carried`` as for :meth:`settings`."""
+        return self.chain_of(self.settings(carried=carried), self.start_at)
+
+    def chain_of(self, settings: Settings, start_at: str | None) -> Chain:
+        """The chain of such settings, entered at a step."""
+        chain = make_chain(settings, start_at=start_at, until=self.until)
         for text in self.assignments:
             step = parse_assignment(text)[0]
             if step not in chain.names:
@@ -238,6 +253,10 @@ def main() -> None:
     metavar="N",
     help="Make a burst of N frames of each image, each with noise of its own, and the truth.",
 )
+@click.option("--raw-size", metavar="WxH", help="Of headerless dumps (.raw): width and height.")
+@click.option(
+    "--raw-type", type=click.Choice(list(TYPES)), help="And how their samples are stored."
+)
 @keep_option
 @format_option
 @device_option
@@ -250,20 +269,21 @@ def run(
     selector: str | None,
     **request: Any,
 ) -> None:
-    """Run images through the chain: files, folders or globs of linear float images (EXR).
+    """Run images through the chain: files, folders or globs of linear float images (EXR), and of
+    camera raws, which are developed as they are: they enter at normalize, where noise is past.
 
     Each makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used. With
     --frames: OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise.
     """
     asked = Request(**request)
     reentry = Reentry(asked.start_at, asked.chain) if asked.start_at else None
-    if reentry:
-        jobs = find_jobs(inputs, output)
-        chain = reentry.first_chain(jobs[0].path)
+    raws = RawEntry(asked.settings, asked.chain_of, asked.start_at, asked.settings().dump)
+    finished = reentry is None and entry(asked.settings()) is Kind.DISPLAY
+    jobs = find_jobs(inputs, output, *([FINISHED] if finished else []))
+    if all(raws.takes(job.path) for job in jobs):
+        chain = raws.first_chain(jobs[0].path)
     else:
-        chain = asked.chain()
-        finished = chain.source is Kind.DISPLAY
-        jobs = find_jobs(inputs, output, FINISHED if finished else READABLE)
+        chain = reentry.first_chain(jobs[0].path) if reentry else asked.chain()
     kept = chain.kept(keep)
     whole = asked.until is None or chain.result is Kind.DISPLAY
     formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
@@ -277,7 +297,7 @@ def run(
     runner = Runner(chain, device, kept, encode=eight_bit, final="exr" in formats)
     failed = 0
     left_out = 0
-    for outcome in run_jobs(jobs, runner, target, reentry):
+    for outcome in run_jobs(jobs, runner, target, raws, reentry):
         if outcome.left_out:
             left_out += 1
             continue

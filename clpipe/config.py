@@ -14,12 +14,13 @@ from pydantic import ValidationError
 from clpipe.camera import DEFAULT_CAMERA, Camera, load_camera
 from clpipe.errors import RequestError
 from clpipe.noise_model import NoiseModel
+from clpipe.raw_dump import Dump, dump_of
 from clpipe.registry import all_stages, blamed, check_passes, load_stage_file
 from clpipe.stage import Context, Kind, Method, Stage, Unchanged
 from clpipe.stages import DEFAULT_CHAIN
 from clpipe.suggest import one_of
 
-KEYS = ("camera", "iso", "seed", "stages", "skip", "stage_files")
+KEYS = ("camera", "iso", "seed", "raw_size", "raw_type", "stages", "skip", "stage_files")
 
 
 @dataclass(frozen=True)
@@ -29,15 +30,29 @@ class Settings:
     camera: str = DEFAULT_CAMERA
     iso: float = 100.0
     seed: int = 0
+    raw_size: str = ""  # of headerless dumps: WIDTHxHEIGHT
+    raw_type: str = ""  # and how their samples are stored
     stages: tuple[str, ...] = DEFAULT_CHAIN
     skip: tuple[str, ...] = ()
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """The settings as nested values, from which :func:`settings_from` makes them again."""
-        plain = {"camera": self.camera, "iso": self.iso, "seed": self.seed}
+        plain: dict[str, Any] = {"camera": self.camera, "iso": self.iso, "seed": self.seed}
+        if self.dump:
+            plain |= {"raw_size": self.raw_size, "raw_type": self.raw_type}
         lists = {"stages": list(self.stages), "skip": list(self.skip)}
         return {**plain, **lists, **{name: dict(t) for name, t in self.parameters.items()}}
+
+    @property
+    def dump(self) -> Dump | None:
+        """The geometry of headerless dumps, where it is given.
+
+        Raises:
+            RequestError: it is given in part, or is not allowed.
+        """
+        given = self.raw_size or self.raw_type
+        return dump_of(self.raw_size, self.raw_type) if given else None
 
 
 @dataclass(frozen=True)
@@ -80,6 +95,11 @@ class Chain:
         """The sensor noise in the image that comes out; None where none was added."""
         last = self.steps[-1]
         return last.method.after(last.context).noise
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether a step draws random numbers."""
+        return any(p.random for s in self.steps for p in s.method.passes())
 
     def clean(self) -> "Chain":
         """The chain without what its steps draw at random; all else as it is.
@@ -125,8 +145,10 @@ def built_in_configs() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
-def load_settings(name: str) -> Settings:
+def load_settings(name: str, under: Settings = Settings()) -> Settings:
     """A built-in configuration by its name, or a file by its path (ending in .toml).
+
+    ``under`` are the settings that hold where it says nothing.
 
     Raises:
         RequestError: there is no such configuration or file, or it is not valid.
@@ -135,11 +157,11 @@ def load_settings(name: str) -> Settings:
     path = built_in.get(name, Path(name))
     if path.suffix != ".toml" and not path.is_file():
         raise RequestError(one_of("configuration", name, built_in) + ", or a .toml file")
-    return read_settings(path)
+    return read_settings(path, under)
 
 
-def read_settings(path: Path) -> Settings:
-    """Settings from a TOML file. Files that it names are looked for relative to it.
+def read_settings(path: Path, under: Settings = Settings()) -> Settings:
+    """Settings from a TOML file, laid over others. Files that it names are relative to it.
 
     Raises:
         RequestError: the file cannot be read, is not TOML, or names what there is not; the message
@@ -147,7 +169,9 @@ def read_settings(path: Path) -> Settings:
     """
     try:
         text = path.read_text("utf-8-sig")
-        return settings_from(tomllib.loads(text), path.parent)
+        values = tomllib.loads(text)
+        own = settings_from(values, path.parent).record()
+        return overlay(under, {key: own[key] for key in values if key in own})
     except OSError as error:
         raise RequestError(f"{path}: cannot read this configuration: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -204,11 +228,13 @@ def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Sett
             raise KeyedError(key, f"{key}: found {plain[key]!r}, but a stage is a table: [{key}]")
         if key not in KEYS:
             raise KeyedError(key, one_of("key", key, (*KEYS, *all_stages())))
-    for key, expected in (("camera", str), ("iso", (int, float)), ("seed", int)):
+    texts = dict.fromkeys(("camera", "raw_size", "raw_type"), str)
+    types: dict[str, Any] = {**texts, "iso": (int, float), "seed": int}
+    for key, expected in types.items():
         value = plain.get(key)
         if key in plain and (not isinstance(value, expected) or isinstance(value, bool)):
-            kinds = {"camera": "text", "iso": "a number", "seed": "a whole number"}
-            raise KeyedError(key, f"{key}: found {value!r}, but it is {kinds[key]}")
+            kind = {"iso": "a number", "seed": "a whole number"}.get(key, "text")
+            raise KeyedError(key, f"{key}: found {value!r}, but it is {kind}")
     for key in {"stages", "skip"} & plain.keys():
         names = names_in(plain, key, "stage names")
         for name in names:
@@ -222,6 +248,11 @@ def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Sett
         plain["iso"] = float(plain["iso"])
     if str(plain.get("camera", "")).endswith(".toml"):
         plain["camera"] = str(folder / plain["camera"])
+    if {"raw_size", "raw_type"} & plain.keys():
+        try:
+            dump_of(plain.get("raw_size", ""), plain.get("raw_type", ""))
+        except RequestError as error:
+            raise KeyedError(str(error).partition(":")[0], str(error)) from None
     return Settings(parameters=tables, **plain)
 
 

@@ -157,6 +157,7 @@ def toml_text(chain: Chain) -> str:
         f"camera = {value_text(settings.camera)}",
         f"iso = {value_text(settings.iso)}",
         f"seed = {value_text(settings.seed)}",
+        *(f"{key} = {value_text(v)}" for key, v in settings.record().items() if key[:4] == "raw_"),
         "stages = [",
         *(f"    {value_text(step.stage.name)}," for step in chain.steps),
         "]",

@@ -3,18 +3,23 @@
 import contextlib
 import hashlib
 import io
+import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
-from PIL import Image, ImageCms
+from PIL import Image, ImageCms, TiffImagePlugin
+from pydantic import TypeAdapter
 
 import clpipe
+from clpipe.camera import Positive
 from clpipe.errors import ImageError, KindError
+from clpipe.stage import Kind
 from clpipe.types import Array, Floats
 
 READABLE = (".exr", ".hdr", ".pfm", ".tif", ".tiff")
@@ -71,6 +76,25 @@ def read_image(path: Path, mosaic: bool = False) -> SourceImage:
         warnings.append(f"{beyond} samples beyond {HALF_MAX:g}, the range of half, were clipped")
     digest = hashlib.sha256(data).hexdigest()
     return SourceImage(pixels, digest, layer, tuple(warnings), attributes)
+
+
+def read_source(path: Path, kind: Kind) -> SourceImage:
+    """The image of a file, as a chain that starts on this kind wants it.
+
+    Raises:
+        ImageError: it cannot be read, or holds another kind.
+    """
+    if kind is not Kind.DISPLAY:
+        return read_image(path, mosaic=len(kind.channels) == 1)
+    finished = read_finished(path)
+    if finished is None:
+        finished = read_image(path)
+        if finished.attributes.get("kind") != kind.label:
+            raise ImageError(
+                f"{path}: holds linear light, but the chain starts on finished pictures "
+                "(JPEG, PNG or TIFF, 8 or 16 bits)"
+            )
+    return finished
 
 
 def read_finished(path: Path) -> SourceImage | None:
@@ -313,11 +337,65 @@ def write_beside(path: Path, write: Callable[[Path], None]) -> None:
 
 @dataclass(frozen=True)
 class Tags:
-    """What goes into a picture's EXIF."""
+    """What goes into a picture's EXIF; None is not known."""
 
     make: str
     model: str
-    iso: float
+    iso: Positive
+    exposure: Positive | None = None  # s
+    aperture: Positive | None = None
+    focal_length: Positive | None = None  # mm
+    taken: str = ""  # "YYYY:MM:DD HH:MM:SS"
+
+
+CARRIED = ("exif", "orientation")  # attributes that go with an image from stage to stage
+
+
+def carry(tags: Tags, orientation: int) -> dict[str, str]:
+    """The attributes by which an image carries its tags and its orientation (as EXIF has it)."""
+    return {"exif": json.dumps(asdict(tags)), "orientation": str(orientation)}
+
+
+def carried(attributes: Mapping[str, str], otherwise: Tags) -> tuple[Tags, int]:
+    """The tags and the orientation that an image carries; where none, others, and upright.
+
+    Raises:
+        ImageError: they are damaged.
+    """
+    try:
+        text = attributes.get("exif")
+        tags = TypeAdapter(Tags).validate_json(text) if text else otherwise
+        orientation = int(attributes.get("orientation", 1))
+        if orientation not in FLIPS:
+            raise ValueError
+    except ValueError:
+        raise ImageError("its attributes clpipe:exif and clpipe:orientation are damaged") from None
+    return tags, orientation
+
+
+# By EXIF's orientation: whether to flip left to right, upside down, and then to transpose.
+FLIPS = {
+    1: (False, False, False),
+    2: (True, False, False),
+    3: (True, True, False),
+    4: (False, True, False),
+    5: (False, False, True),
+    6: (False, True, True),
+    7: (True, True, True),
+    8: (True, False, True),
+}
+
+
+def upright(image: Array, orientation: int) -> Array:
+    """An image, (height, width[, channel]), turned as EXIF's orientation says.
+
+    >>> upright(np.array([[1, 2], [3, 4]]), 6).tolist()  # its right side is now at the bottom
+    [[3, 1], [4, 2]]
+    """
+    mirrored, upside_down, transposed = FLIPS[orientation]
+    image = image[:, ::-1] if mirrored else image
+    image = image[::-1] if upside_down else image
+    return np.ascontiguousarray(image.swapaxes(0, 1) if transposed else image)
 
 
 def write_display(path: Path, pixels: Array, tags: Tags) -> None:
@@ -330,7 +408,14 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> None:
     exif = Image.Exif()
     exif[0x010F], exif[0x0110] = tags.make, tags.model
     exif[0x0131] = f"clpipe {clpipe.__version__}"
-    exif.get_ifd(0x8769)[0x8827] = round(tags.iso)
+    own = exif.get_ifd(0x8769)
+    own[0x8827] = round(tags.iso)
+    numbers = {0x829A: tags.exposure, 0x829D: tags.aperture, 0x920A: tags.focal_length}
+    for tag, number in numbers.items():
+        if number:
+            own[tag] = TiffImagePlugin.IFDRational(Fraction(number).limit_denominator(1_000_000))
+    if tags.taken:
+        exif[0x0132] = own[0x9003] = tags.taken
     options: dict[str, Any] = {"exif": exif.tobytes()}
     if pixels.ndim == 3:
         options["icc_profile"] = srgb_profile()

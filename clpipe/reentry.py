@@ -104,8 +104,8 @@ def entries_of(kind: str, chain: Chain) -> str:
     return f"{kind} can enter with --start-at {' or '.join(names)}"
 
 
-def doubts(source: SourceImage, chain: Chain) -> list[str]:
-    """What looks wrong with an image that enters, and what was taken for what it does not say."""
+def brightness_doubts(source: SourceImage, chain: Chain) -> list[str]:
+    """What looks wrong with the values of an image that enters."""
     first = chain.steps[0].method
     brightest = float(source.pixels.max())
     found: list[str] = []
@@ -119,8 +119,16 @@ def doubts(source: SourceImage, chain: Chain) -> list[str]:
             f"its largest sample is {brightest:g}, but 1 is the white level here; "
             "a raw in DN enters with --start-at normalize"
         )
+    return found
+
+
+def doubts(source: SourceImage, chain: Chain) -> list[str]:
+    """What looks wrong with an image that enters, and what was taken for what it does not say."""
+    found = brightness_doubts(source, chain)
     if "settings" in source.attributes:
         return found
+    first = chain.steps[0].method
+    black = getattr(first, "black_level", None)
     if chain.settings.iso == Settings().iso and any(s.stage.name == "denoise" for s in chain.steps):
         found.append(f"it does not say its ISO; {chain.settings.iso:g} is taken (--iso)")
     if chain.source in (Kind.RAW, Kind.MOSAIC):

@@ -11,7 +11,7 @@ PACKAGE = ROOT / "clpipe"
 LEVELS = [
     {"errors", "types", "suggest", "noise_model"},
     {"reference"},
-    {"camera", "statistics"},
+    {"camera", "statistics", "raw_dump"},
     {"stage", "calibration"},
     {"stages"},
     {"registry"},
@@ -22,6 +22,7 @@ LEVELS = [
     {"run"},
     {"image_io", "raw_io", "check", "bench", "pipeline"},
     {"reentry"},
+    {"raw_entry"},
     {"measure"},
     {"batch", "describe", "measure_plot", "calibration_frames"},
     {"cli"},

@@ -1,0 +1,506 @@
+"""Camera raws and headerless dumps: the right picture, or the right refusal."""
+
+import json
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from clpipe.cli import main
+from clpipe.errors import ImageError, RequestError
+from clpipe.image_io import read_image, upright, write_exr
+from clpipe.raw_dump import dump_of
+from clpipe.raw_io import read_facts, read_raw
+from clpipe.reference.cfa import PATTERNS, by_site
+from tests.conftest import STILL_LIFE
+from tests.dng import field, write_dng
+
+MEASURE = ("--device", "numpy", "--skip", "denoise")  # so that colours can be compared exactly
+
+
+def clpipe(*arguments, status=0):
+    result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == status, result.output
+    assert "Traceback" not in result.output
+    return result.output
+
+
+def colours(height=48, width=64):
+    """Linear camera RGB after white balance: smooth, every colour different, no symmetry."""
+    y, x = np.mgrid[:height, :width] / np.float64((height, width)).reshape(2, 1, 1)
+    return np.stack([0.1 + 0.4 * x, 0.3 + 0.2 * y * x, 0.45 - 0.3 * y], axis=-1)
+
+
+def mosaic(pattern="RGGB", black=512, white=16383, gains=(2.0, 1.6), image=None):
+    """The DN in which a camera with these gains sees the colours; exact but for rounding."""
+    image = colours() if image is None else image
+    red, green, blue = np.moveaxis(image / (gains[0], 1, gains[1]), -1, 0)
+    plane = by_site(image.shape, pattern, red, green, blue)
+    return np.rint(plane * (white - black) + black)
+
+
+def developed(path):
+    return oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT)
+
+
+def exif(path):
+    """The tags of a picture, and those of its EXIF part."""
+    with Image.open(path) as image:
+        tags = image.getexif()
+        return dict(tags), dict(tags.get_ifd(0x8769))
+
+
+def sidecar(path):
+    return json.loads(path.read_text())
+
+
+def parameters(path):
+    return {stage["name"]: stage["parameters"] for stage in sidecar(path)["stages"]}
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_a_raw_is_developed_with_what_it_says(tmp_path, pattern):
+    write_dng(tmp_path / "a.dng", mosaic(pattern), pattern)
+    options = (*MEASURE, "--until", "demosaic", "--keep", "normalize")
+    output = clpipe("run", tmp_path / "a.dng", "-o", tmp_path / "out", *options)
+    assert "warning" not in output
+    found = developed(tmp_path / "out" / "a.exr")
+    assert np.abs(found - colours())[4:-4, 4:-4].max() < 2e-3
+    record = sidecar(tmp_path / "out" / "a.json")
+    names = [stage["name"] for stage in record["stages"]]
+    assert names == ["normalize", "white_balance", "demosaic"]
+    assert record["noise"] is None and record["camera"] == "canon-5d2" and record["iso"] == 400
+    assert record["raw"]["pattern"] == pattern and record["raw"]["exposure"] == 0.02
+    known = parameters(tmp_path / "out" / "a.json")
+    assert known["normalize"] == {"black_level": 512, "white_level": 16383}
+    assert known["white_balance"] == pytest.approx({"red_gain": 2, "blue_gain": 1.6}, rel=1e-4)
+
+
+def test_the_matrix_of_the_file_takes_its_colours_to_srgb(tmp_path):
+    srgb = np.broadcast_to((0.3, 0.2, 0.1), (48, 64, 3))
+    xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    to_camera = np.array(((0.7, -0.1, -0.05), (-0.4, 1.2, 0.2), (-0.05, 0.15, 0.6))) @ xyz
+    to_camera /= to_camera.sum(1, keepdims=True)
+    matrix = ((0.7, -0.1, -0.05), (-0.4, 1.2, 0.2), (-0.05, 0.15, 0.6))
+    write_dng(tmp_path / "a.dng", mosaic(image=srgb @ to_camera.T), matrix=matrix)
+    clpipe("run", tmp_path / "a.dng", "-o", tmp_path, *MEASURE, "--until", "color_matrix")
+    assert np.abs(developed(tmp_path / "a.exr") - srgb)[4:-4, 4:-4].max() < 2e-3
+
+
+def test_without_a_matrix_the_profile_has_one_or_colours_stay(tmp_path):
+    write_dng(tmp_path / "a.dng", mosaic(), matrix=None)
+    assert "warning" not in clpipe("run", tmp_path / "a.dng", "-o", tmp_path)
+    known = read_facts(write_dng(tmp_path / "b.dng", mosaic())).camera_to_srgb
+    assert np.allclose(parameters(tmp_path / "a.json")["color_matrix"]["matrix"], known, atol=2e-3)
+    write_dng(tmp_path / "c.dng", mosaic(), matrix=None, model=b"Nonesuch")
+    output = clpipe("run", tmp_path / "c.dng", "-o", tmp_path)
+    assert "its colour matrix is not known" in output
+    assert "there is no profile of Canon Nonesuch; denoising takes the noise of sony-a7r2" in output
+    output = clpipe("run", tmp_path / "c.dng", "-o", tmp_path, "--camera", "canon-5d2")
+    assert "profile" not in output
+
+
+def test_each_channel_has_its_own_black_level_and_what_lies_below_stays(tmp_path):
+    black = (500, 520, 540, 480)
+    dn = mosaic(black=512) + np.tile(np.reshape(black, (2, 2)) - 512, (24, 32))
+    dn[10, 10] = 100
+    facts = read_facts(write_dng(tmp_path / "a.dng", dn, black=black))
+    assert (facts.black_levels, facts.black_level) == (black, 510)
+    assert np.array_equal(read_raw(tmp_path / "a.dng", facts)[11:], mosaic(black=512)[11:] - 2)
+    clpipe("run", tmp_path / "a.dng", "-o", tmp_path, *MEASURE, "--until", "normalize")
+    assert developed(tmp_path / "a.exr")[10, 10, 0] == pytest.approx((110 - 510) / (16383 - 510))
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_orientation_is_applied_once(tmp_path, orientation):
+    write_dng(tmp_path / "a.dng", mosaic(), orientation=orientation)
+    options = ("--format", "png", "--format", "exr", "--keep", "demosaic", "--keep", "normalize")
+    clpipe("run", tmp_path / "a.dng", "-o", tmp_path, *MEASURE, *options)
+    write_dng(tmp_path / "b.dng", mosaic())
+    clpipe("run", tmp_path / "b.dng", "-o", tmp_path, *MEASURE, *options)
+    # As Pillow turns it, which has its own code for that.
+    with Image.open(tmp_path / "b.png") as image:
+        plain = image.copy()
+    turn = {
+        **{2: "FLIP_LEFT_RIGHT", 3: "ROTATE_180", 4: "FLIP_TOP_BOTTOM", 5: "TRANSPOSE"},
+        **{6: "ROTATE_270", 7: "TRANSVERSE", 8: "ROTATE_90"},
+    }.get(orientation)
+    expected = plain.transpose(Image.Transpose[turn]) if turn else plain
+    with Image.open(tmp_path / "a.png") as found:
+        assert np.array_equal(np.asarray(found), np.asarray(expected))
+    assert exif(tmp_path / "a.png")[0].get(0x0112, 1) == 1
+    as_float = developed(tmp_path / "a.exr")
+    assert np.array_equal(as_float, upright(developed(tmp_path / "b.exr"), orientation))
+    for kept in ("demosaic", "normalize"):  # stays as the sensor saw it
+        one, other = (developed(tmp_path / f"{name}.{kept}.exr") for name in "ab")
+        assert np.array_equal(one, other)
+    # Going on from there turns it, and from the last image, which is turned, does not again.
+    again = tmp_path / "again"
+    go_on = ("--device", "numpy", "-o", again, "--format", "png")
+    clpipe("run", tmp_path / "a.demosaic.exr", "--start-at", "color_matrix", *go_on)
+    assert np.array_equal(developed(again / "a.demosaic.png"), developed(tmp_path / "a.png"))
+    assert read_image(tmp_path / "a.exr").attributes["orientation"] == "1"
+
+
+def test_exif_goes_through_also_by_way_of_a_kept_image(tmp_path):
+    write_dng(tmp_path / "a.dng", mosaic())
+    clpipe("run", tmp_path / "a.dng", "-o", tmp_path / "out", "--keep", "demosaic")
+    kept = tmp_path / "out" / "a.demosaic.exr"
+    clpipe("run", kept, "-o", tmp_path / "again", "--start-at", "denoise")
+    one, other = tmp_path / "out" / "a.jpg", tmp_path / "again" / "a.demosaic.jpg"
+    assert one.read_bytes() == other.read_bytes()
+    tags, own = exif(one)
+    assert (tags[0x010F], tags[0x0110]) == ("Canon", "Canon EOS 5D Mark II")
+    assert tags[0x0132] == "2024:05:06 07:08:09"
+    assert own[0x8827] == 400 and own[0x829A] == 0.02
+    assert own[0x829D] == pytest.approx(2.8) and own[0x920A] == 35
+    assert own[0x9003] == "2024:05:06 07:08:09"
+
+
+def test_exif_that_a_kept_image_carries_may_be_damaged(tmp_path):
+    write_dng(tmp_path / "a.dng", mosaic())
+    clpipe("run", tmp_path / "a.dng", "-o", tmp_path / "out", "--keep", "demosaic")
+    image = read_image(tmp_path / "out" / "a.demosaic.exr")
+    for name, value in (("exif", "{"), ("exif", '{"iso": -1}'), ("orientation", "9")):
+        attributes = {**image.attributes, name: value}
+        write_exr(tmp_path / "b.exr", image.pixels, ("R", "G", "B"), attributes)
+        output = clpipe(
+            "run", tmp_path / "b.exr", "-o", tmp_path, "--start-at", "denoise", status=1
+        )
+        assert "clpipe:exif and clpipe:orientation are damaged" in output
+
+
+def test_options_and_configuration_win_over_the_file(tmp_path):
+    write_dng(tmp_path / "a.dng", mosaic("GRBG"), "GRBG")
+    (tmp_path / "c.toml").write_text("iso = 1600\n[normalize]\nblack_level = 600\n")
+    options = ("-c", tmp_path / "c.toml", "--set", "white_balance.red_gain=3")
+    clpipe("run", tmp_path / "a.dng", "-o", tmp_path, *options)
+    known = parameters(tmp_path / "a.json")
+    assert known["normalize"] == {"black_level": 600, "white_level": 16383}
+    assert known["white_balance"]["red_gain"] == 3
+    assert known["white_balance"]["blue_gain"] == pytest.approx(1.6, rel=1e-4)
+    record = sidecar(tmp_path / "a.json")
+    assert (record["iso"], record["camera"]) == (1600, "canon-5d2")
+    assert exif(tmp_path / "a.jpg")[1][0x8827] == 1600
+    # A configuration that says nothing of the ISO leaves the file's; one of 100 is one of 100.
+    clpipe("run", tmp_path / "a.dng", "-o", tmp_path, "-c", "paper")
+    record = sidecar(tmp_path / "a.json")
+    assert (record["iso"], record["camera"]) == (400, "sony-a7r2")
+    assert [s["method"] for s in record["stages"] if s["name"] == "white_balance"] == ["gray_world"]
+    (tmp_path / "c.toml").write_text("iso = 100\n")
+    clpipe("run", tmp_path / "a.dng", "-o", tmp_path, "-c", tmp_path / "c.toml")
+    assert sidecar(tmp_path / "a.json")["iso"] == 100
+
+
+def test_raws_and_renders_of_a_folder_go_their_own_ways(tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    render = read_image(STILL_LIFE).pixels[200:248, 300:364].astype(np.float32)
+    for name in ("a", "z"):
+        write_exr(folder / f"{name}.exr", render, ("R", "G", "B"), {})
+    write_dng(folder / "b.dng", mosaic("GBRG"), "GBRG", orientation=6)
+    write_dng(folder / "c.DNG", mosaic("BGGR"), "BGGR")
+    (folder / "d.nef").write_bytes(b"\xff\xd8\xff\xe0 nothing")
+    out = tmp_path / "out"
+    output = clpipe("run", folder, "-o", out, "--keep", "all", "--iso", 800, status=1)
+    assert "d.nef: it is a JPEG, not a camera's raw" in output
+    assert "4 of 5 images done, 1 failed" in output
+    alone = tmp_path / "alone"
+    clpipe("run", folder / "b.dng", folder / "c.DNG", "-o", alone, "--iso", 800)
+    clpipe("run", folder / "a.exr", folder / "z.exr", "-o", alone, "--iso", 800)
+    for name in "abcz":
+        assert (out / f"{name}.jpg").read_bytes() == (alone / f"{name}.jpg").read_bytes()
+    assert not (out / "b.sensor_noise.exr").exists() and (out / "a.sensor_noise.exr").exists()
+
+
+def test_noise_can_be_added_to_a_raw_where_that_is_asked_for(tmp_path):
+    write_dng(tmp_path / "a.dng", mosaic())
+    stages = "mosaic,quantize,normalize,sensor_noise,white_balance,demosaic,gamma"
+    clpipe("run", tmp_path / "a.dng", "-o", tmp_path, "--stages", stages, "--iso", 6400)
+    record = sidecar(tmp_path / "a.json")
+    assert record["stages"][1]["name"] == "sensor_noise" and record["noise"] is not None
+
+
+@pytest.mark.parametrize(
+    ("neutral", "matrix", "method", "red", "message"),
+    [
+        ((-0.5, 1, 0.6), True, "as_shot", 2.57, "-2, 1, 1.667; those of daylight are taken"),
+        ((0.5, 1, 0.01), True, "as_shot", 2.57, "2, 1, 100; those of daylight are taken"),
+        ((0.5, 1, -3), False, "gray_world", None, "gray_world finds others"),
+    ],
+)
+def test_gains_that_cannot_be(tmp_path, neutral, matrix, method, red, message):
+    kind = {} if matrix else {"matrix": None, "model": b"Nonesuch"}
+    write_dng(tmp_path / "a.dng", mosaic(), neutral=neutral, **kind)
+    output = clpipe("run", tmp_path / "a.dng", "-o", tmp_path)
+    assert message in output
+    record = sidecar(tmp_path / "a.json")
+    step = next(s for s in record["stages"] if s["name"] == "white_balance")
+    assert step["method"] == method and any(message in w for w in record["warnings"])
+    if red:  # what the matrix makes of D65, as the profile of the same camera has it
+        assert step["parameters"]["red_gain"] == pytest.approx(red, rel=5e-3)
+    fixed = ("white_balance.red_gain=2", "white_balance.blue_gain=1.5")
+    options = [o for text in fixed for o in ("--set", text)]
+    assert message not in clpipe("run", tmp_path / "a.dng", "-o", tmp_path, *options)
+
+
+def test_levels_that_cannot_be(tmp_path):
+    write_dng(tmp_path / "a.dng", mosaic(), white=300)
+    output = clpipe("run", tmp_path / "a.dng", "-o", tmp_path, status=1)
+    assert "its levels cannot be: black 512, white 300" in output
+    levels = ("--set", "normalize.black_level=512", "--set", "normalize.white_level=16383")
+    clpipe("run", tmp_path / "a.dng", "-o", tmp_path, *levels)
+    write_dng(tmp_path / "b.dng", mosaic(), white=1000)
+    output = clpipe("run", tmp_path / "b.dng", "-o", tmp_path)
+    assert "most of its samples are not below the white level of 1000 DN" in output
+    write_dng(tmp_path / "c.dng", mosaic(), black=(12000,) * 4)
+    output = clpipe("run", tmp_path / "c.dng", "-o", tmp_path)
+    assert "not above the black level of 12000 DN" in output
+
+
+def test_an_iso_that_is_not_said_or_is_beyond_the_camera(tmp_path):
+    write_dng(tmp_path / "a.dng", mosaic(), iso=0)
+    assert "does not say its ISO; 100 is taken" in clpipe("run", tmp_path / "a.dng", "-o", tmp_path)
+    assert "ISO" not in clpipe("run", tmp_path / "a.dng", "-o", tmp_path, "--iso", 200)
+    write_dng(tmp_path / "b.dng", mosaic(), iso=50)
+    output = clpipe("run", tmp_path / "b.dng", "-o", tmp_path)
+    assert "its ISO of 50 is beyond camera canon-5d2, 100 to 6400; 100 is taken" in output
+    assert exif(tmp_path / "b.jpg")[1][0x8827] == 50
+
+
+XTRANS = "GGRGGBGGBGGRBRGRBGGGBGGRGGRGGBRBGBRG"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("linear", "holds every colour at every pixel"),
+        ("x-trans", "its colours repeat every 6x6 pixels"),
+        ("one colour", "its colours repeat every 1x1 pixels"),
+        ("half", "damaged, or no raw that LibRaw knows"),
+        ("no pixels", "there are no pixels in it"),
+        ("empty", "the file is empty"),
+        ("jpeg", "it is a JPEG, not a camera's raw"),
+        ("text", "damaged, or no raw that LibRaw knows"),
+        ("missing", "no such file"),
+    ],
+)
+def test_what_only_looks_like_a_raw(tmp_path, change, message):
+    path = tmp_path / "a.dng"
+    if change == "linear":
+        write_dng(path, np.rint(colours() * 16383))
+    elif change == "x-trans":
+        cfa = field(33422, 1, *("RGB".index(c) for c in XTRANS))
+        write_dng(path, mosaic(), changes=(field(33421, 3, 6, 6), cfa))
+    elif change == "one colour":
+        write_dng(path, mosaic(), "RRRR")
+    elif change == "no pixels":
+        write_dng(path, mosaic() * 0)
+    elif change != "missing":
+        data = write_dng(path, mosaic()).read_bytes()
+        cut = {"half": data[: len(data) // 2], "empty": b"", "text": b"a raw, honestly " * 99}
+        path.write_bytes(cut.get(change, b"\xff\xd8\xff\xe1" + data))
+    output = clpipe("run", path, "-o", tmp_path / "out", status=1)
+    assert f"{path}: {message}" in output
+    assert not list((tmp_path / "out").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--start-at", "denoise"), "a raw enters at normalize; denoise reads rgb"),
+        (("--keep", "sensor_noise"), "unknown stage in this chain 'sensor_noise'"),
+        (("--stages", "mosaic,demosaic,gamma"), "no stage of the chain reads a raw"),
+        (("--until", "quantize"), "normalize comes after quantize"),
+        (("--frames", "2"), "no stage of this chain adds noise"),
+        (("--raw-size", "10x10"), "raw_type: found ''; expected one of uint8"),
+        (("--iso", "7"), "iso: found 7"),
+    ],
+)
+def test_a_request_that_a_raw_cannot_fulfil(tmp_path, options, message):
+    write_dng(tmp_path / "a.dng", mosaic("GRBG"), "GRBG")
+    status = 1 if "denoise" in options else 2
+    output = clpipe("run", tmp_path / "a.dng", "-o", tmp_path / "out", *options, status=status)
+    assert message in output
+
+
+def test_a_chain_without_mosaic_cannot_know_the_pattern(tmp_path):
+    write_dng(tmp_path / "a.dng", mosaic("GRBG"), "GRBG")
+    options = ("--stages", "normalize,white_balance,demosaic,gamma")
+    output = clpipe("run", tmp_path / "a.dng", "-o", tmp_path, *options, status=1)
+    assert "its pattern is GRBG, which the mosaic stage says, but the chain has none" in output
+
+
+def test_exif_is_found_in_files_that_are_no_tiff(tmp_path):
+    from clpipe.raw_io import _exif
+
+    tiff = write_dng(tmp_path / "a.dng", mosaic()).read_bytes()
+    for start in (b"\0\0\0\x18ftypcrx " + bytes(60) + b"CMT1", b"FUJIFILM" * 9 + b"Exif\0\0"):
+        (tmp_path / "b.raf").write_bytes(start + tiff)
+        said = _exif(tmp_path / "b.raf")
+        assert said.text("Model") == "Canon EOS 5D Mark II"
+        assert said.number("ISOSpeedRatings", 0) == 400
+
+
+# Dumps
+
+
+def packed(dn, type_):
+    """The bytes of a dump, sample by sample, as the MIPI specification draws them."""
+    if type_ in ("uint8", "uint16le", "uint16be"):
+        return dn.astype({"uint8": "u1", "uint16le": "<u2", "uint16be": ">u2"}[type_]).tobytes()
+    count, low = (4, 2) if type_ == "raw10" else (2, 4)
+    data = bytearray()
+    for group in dn.astype(int).reshape(-1, count):
+        data += bytes(int(s) >> low for s in group)
+        bits = "".join(f"{int(s) % (1 << low):0{low}b}" for s in reversed(group))
+        data.append(int(bits, 2))
+    return bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("type_", "white"),
+    [("uint8", 255), ("uint16le", 16383), ("uint16be", 16383), ("raw10", 1023), ("raw12", 4095)],
+)
+@pytest.mark.parametrize("ending", ["raw", "bin"])
+def test_dumps(tmp_path, type_, white, ending):
+    dn = mosaic("GBRG", black=16, white=white)
+    path = tmp_path / f"a.{ending}"
+    path.write_bytes(packed(dn, type_))
+    levels = ("mosaic.pattern=GBRG", "normalize.black_level=16", f"normalize.white_level={white}")
+    fixed = (
+        "white_balance.method=gains",
+        "white_balance.red_gain=2",
+        "white_balance.blue_gain=1.6",
+    )
+    options = [o for text in (*levels, *fixed) for o in ("--set", text)]
+    size = ("--raw-size", "64x48", "--raw-type", type_)
+    out = tmp_path / "out"
+    output = clpipe("run", path, "-o", out, *size, *options, *MEASURE, "--until", "demosaic")
+    assert "warning" not in output
+    assert np.abs(developed(out / "a.exr") - colours())[4:-4, 4:-4].max() < 4 / white + 2e-3
+    assert sidecar(out / "a.json")["raw"] == {"width": 64, "height": 48, "type": type_}
+
+
+def test_a_dump_by_configuration_and_what_it_does_not_say(tmp_path):
+    (tmp_path / "a.raw").write_bytes(packed(mosaic(), "uint16le"))
+    (tmp_path / "c.toml").write_text('raw_size = "64x48"\nraw_type = "uint16le"\n')
+    command = ("run", tmp_path / "a.raw", "-o", tmp_path / "out", "-c", tmp_path / "c.toml")
+    output = clpipe(*command)
+    for message in (
+        "does not say its pattern; RGGB is taken",
+        "does not say its levels; black 512 and white 16383 are taken",
+        "does not say its ISO; 100 is taken",
+        "does not say its white balance; gray_world finds it",
+        "its colour matrix is not known",
+    ):
+        assert output.count(message) == 1
+    assert clpipe("plan", "-c", tmp_path / "c.toml", "--toml").count('raw_size = "64x48"') == 1
+    (tmp_path / "c.toml").write_text('raw_size = "64x48"\n\nraw_type = "uint12"\n')
+    assert "c.toml, line 3: raw_type: found 'uint12'" in clpipe(*command, status=2)
+
+
+def test_a_dump_of_another_size_is_told_what_would_fit(tmp_path):
+    (tmp_path / "a.raw").write_bytes(bytes(64 * 48 * 2))
+    options = ("--raw-size", "64x40", "--raw-type", "uint16le")
+    output = clpipe("run", tmp_path / "a.raw", "-o", tmp_path, *options, status=1)
+    assert "a.raw: 6144 bytes, but 64x40 uint16le has 5120; it would fit 64x48 uint16le" in output
+    output = clpipe("run", tmp_path / "a.raw", "-o", tmp_path, status=1)
+    assert "no raw that LibRaw knows" in output or "--raw-size" in output
+
+
+@pytest.mark.parametrize(
+    ("size", "type_"),
+    [("64", "uint8"), ("0x4", "uint8"), ("4x1", "uint8"), ("6x4", "raw10"), ("5x4", "raw12")],
+)
+def test_geometries_that_cannot_be(size, type_):
+    with pytest.raises(RequestError, match=f"raw_size: found '{size}'"):
+        dump_of(size, type_)
+
+
+# Files of real cameras, and of real accidents.
+
+DUMP = ("--raw-type", "uint16le", "--raw-size")
+MUSHFIQ = ("--set", "normalize.black_level=600", "--set", "normalize.white_level=16383")
+REAL = {
+    "bep_truncated.cr2": "damaged, or no raw that LibRaw knows",
+    "exiftool_DNG.dng": "there are no pixels in it",
+    "exiftool_Nikon.nef": "damaged, or no raw that LibRaw knows",
+    "infisp_BlackImage_1920x1080_12bits_BGGR.raw": (*DUMP, "1920x1080"),
+    "magicknet_DSC8695.dng": "holds every colour at every pixel",
+    "magicknet_RAW_KODAK_DC50.KDC": (),
+    "mei_issue247-1.nef": "it is a JPEG, not a camera's raw",
+    **{
+        f"mushfiq_DSC_1339_768x512_{pattern.lower()}.raw": (
+            *(*DUMP, "768x512", *MUSHFIQ, "--set", f"mosaic.pattern={pattern}"),
+        )
+        for pattern in PATTERNS
+    },
+    "tinydng_colorchart.dng": (),
+}
+
+
+def test_every_file_is_in_the_table(shared_data):
+    assert {path.name for path in (shared_data / "raw").iterdir()} == set(REAL)
+
+
+@pytest.mark.parametrize(("name", "expected"), REAL.items())
+def test_real_files(shared_data, tmp_path, name, expected):
+    path = shared_data / "raw" / name
+    if isinstance(expected, str):
+        assert f"{path}: {expected}" in clpipe("run", path, "-o", tmp_path, status=1)
+        return
+    if "--raw-size" in expected:
+        assert "a dump of samples" in clpipe("run", path, "-o", tmp_path, status=1)
+    clpipe("run", path, "-o", tmp_path, *expected, "--format", "png")
+    picture = developed(tmp_path / f"{path.stem}.png")
+    size = {"inf": (1080, 1920), "mus": (512, 768), "mag": (512, 768), "tin": (1156, 1734)}
+    assert picture.shape == (*size[name[:3]], 3)
+    if name[:3] == "inf":
+        return  # a dark frame
+    assert 0.1 < picture.mean() < 0.7
+    blue_to_red = picture[..., 2].mean() / picture[..., 0].mean()
+    assert 0.7 < blue_to_red < 1.5
+
+
+def test_four_phases_of_one_picture(shared_data, tmp_path):
+    """The files hold one picture whose samples changed places within each 2x2 cell."""
+    pictures, cells = [], []
+    for name, options in REAL.items():
+        if not name.startswith("mushfiq"):
+            continue
+        path = shared_data / "raw" / name
+        clpipe("run", path, "-o", tmp_path, *options, "--format", "png")
+        picture = developed(tmp_path / f"{path.stem}.png")[8:-8, 8:-8]
+        pictures.append(picture.reshape(124, 4, 188, 4, 3).mean((1, 3)))
+        pattern = name[-8:-4].upper()
+        dn = dump_of("768x512", "uint16le").unpack(path.read_bytes())
+        samples = dn.reshape(256, 2, 384, 2).transpose(0, 2, 1, 3).reshape(256, 384, 4)
+        cells.append(np.stack([samples[..., pattern.index(c)] for c in "RB"], axis=-1))
+    for picture, cell in zip(pictures[1:], cells[1:], strict=True):
+        assert np.array_equal(cell, cells[0])
+        apart = np.abs(picture - pictures[0])
+        assert np.median(apart) < 1 / 255 and apart.mean() < 3 / 255
+        assert np.abs(picture.mean((0, 1)) - pictures[0].mean((0, 1))).max() < 1 / 255
+
+
+def test_colours_are_those_that_libraw_makes(shared_data, tmp_path):
+    import rawpy
+
+    path = shared_data / "raw" / "tinydng_colorchart.dng"
+    clpipe("run", path, "-o", tmp_path, "--until", "color_matrix")
+    own = developed(tmp_path / "tinydng_colorchart.exr")
+    with rawpy.imread(str(path)) as raw:
+        plain = {"gamma": (1, 1), "no_auto_bright": True, "use_camera_wb": True, "output_bps": 16}
+        other = raw.postprocess(**plain) / 65535
+    patches = {"white": (930, 704), "grey": (930, 812), "red": (810, 920), "green": (825, 812)}
+    for name, (y, x) in patches.items():
+        one, two = (i[y - 20 : y + 20, x - 20 : x + 20].mean((0, 1)) for i in (own, other))
+        assert one / one.sum() == pytest.approx(two / two.sum(), abs=0.01), name
+
+
+def test_a_raw_that_says_too_little_is_refused_by_the_library_too(shared_data):
+    with pytest.raises(ImageError, match="names no camera, ISO or exposure"):
+        read_facts(shared_data / "raw" / "infisp_BlackImage_1920x1080_12bits_BGGR.raw")
