@@ -58,7 +58,9 @@ class Outcome:
     left_out: bool = False  # kept after another stage than the one to go on from
 
 
-def find_jobs(inputs: Sequence[str], output: Path, endings: Sequence[str] = READABLE) -> list[Job]:
+def find_jobs(
+    inputs: Sequence[str], output: Path, endings: Sequence[str] = (*READABLE, *ENDINGS)
+) -> list[Job]:
     """The files that inputs name: files, folders (all images in them, at any depth) and globs.
 
     The image key of a file in a folder is its path relative to that folder, that of a file given
