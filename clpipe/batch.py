@@ -5,7 +5,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -14,6 +14,8 @@ from typing import Any
 
 import clpipe
 from clpipe.config import Chain
+from clpipe.device import Device
+from clpipe.dng import negative_of, write_dng
 from clpipe.errors import ImageError, KindError, RequestError
 from clpipe.image_io import (
     CARRIED,
@@ -31,10 +33,32 @@ from clpipe.image_io import (
 from clpipe.raw_entry import RawEntry, RawImage
 from clpipe.raw_io import ENDINGS
 from clpipe.reentry import Reentry, attributes_of, doubts, misplaced
+from clpipe.reference.curve import to_16_bit
 from clpipe.run import Result, Runner
 from clpipe.stage import Kind
 
-FORMATS = ("jpg", "png", "exr")
+
+@dataclass(frozen=True)
+class Format:
+    """A kind of file: how its name ends, and how many bits its samples have; floats or not."""
+
+    ending: str
+    bits: int
+    floats: bool = False
+
+
+FORMATS = {
+    "jpg": Format("jpg", 8),
+    "png": Format("png", 8),
+    "png16": Format("png", 16),
+    "tif": Format("tif", 8),
+    "tif16": Format("tif", 16),
+    "tif32": Format("tif", 32, floats=True),
+    "exr": Format("exr", 32, floats=True),
+    "exr16": Format("exr", 16, floats=True),
+}
+DNG = "dng"  # not of the last image, but of the raw
+EVERY_FORMAT = (*FORMATS, DNG)
 
 
 @dataclass(frozen=True)
@@ -163,30 +187,53 @@ class Burst:
 
 @dataclass(frozen=True)
 class Target:
-    """Where results go, in which formats, and how many of each image."""
+    """Where results go, in which formats, how many of each image, and which stages' images too."""
 
     folder: Path
     formats: tuple[str, ...]
     burst: Burst = Burst()
+    keep: tuple[str, ...] = ()
 
-    def check(self, chain: Chain, jobs: Sequence[Job], keep: Sequence[str]) -> None:
+    def runner(self, chain: Chain, device: Device | None) -> Runner:
+        """What makes all that is to be written, and nothing else."""
+        made = [FORMATS[f] for f in self.formats if f != DNG]
+        raw = negative_of(chain).step if DNG in self.formats else None
+        return Runner(
+            chain,
+            device,
+            tuple(dict.fromkeys([*self.keep, *([raw] if raw else [])])),
+            encode=any(f.bits == 8 for f in made),
+            final=any(f.bits > 8 for f in made),
+        )
+
+    def check(self, chain: Chain, jobs: Sequence[Job]) -> None:
         """See that the results can be written in these formats, over no input and no other result.
 
         Raises:
             RequestError: they cannot.
         """
-        eight_bit = [f for f in self.formats if f != "exr"]
-        if eight_bit and chain.result is Kind.RAW:
+        few = [f for f in self.formats if f != DNG and FORMATS[f].bits < 32]
+        if few and chain.result is Kind.RAW:
             raise RequestError(
-                f"the chain ends in DN, which {eight_bit[0]} cannot hold; "
-                "end it with normalize or a later stage, or use --format exr"
+                f"the chain ends in DN, which {few[0]} cannot hold; "
+                "end it with normalize or a later stage, or use --format dng or exr"
             )
+        if DNG in self.formats:
+            negative_of(chain)  # refuses a chain without a raw
+        endings: dict[str, str] = {}
+        for format_ in self.formats:
+            other = endings.setdefault(ending_of(format_), format_)
+            if other != format_:
+                raise RequestError(
+                    f"--format {other} and {format_} would both write NAME.{ending_of(format_)}; "
+                    "run them into different folders"
+                )
         inputs = {os.path.realpath(job.path) for job in jobs}
         makers: dict[Path, Job] = {}
-        endings = ("json", *self.formats, *(f"{step}.exr" for step in keep))
+        every = ("json", *endings, *(f"{step}.exr" for step in self.keep))
         names = self.burst.names()
         for job in jobs:
-            for path in (self.path(job, e, name) for name in names for e in endings):
+            for path in (self.path(job, e, name) for name in names for e in every):
                 if os.path.realpath(path) in inputs:
                     raise RequestError(
                         f"{path} is an input and would be overwritten; choose another output folder"
@@ -225,35 +272,70 @@ class Target:
         Raises:
             ImageError: a file cannot be written.
         """
-        chain = runner.chain
-        own = Tags(chain.camera.make, chain.camera.model, chain.iso)
+        chain, camera = runner.chain, runner.chain.camera
+        own = Tags(camera.make, camera.model, chain.iso)
         tags, orientation = carried(source.attributes, own)
+        how = chain.settings.output.filled({**source.shot, **tags.shot})
+        tags = replace(tags, output=how)
         brought = {name: source.attributes[name] for name in CARRIED if name in source.attributes}
-        if chain.result in (Kind.RAW, Kind.MOSAIC):
-            orientation = 1  # to turn a mosaic would be to change its pattern
+        mosaic = chain.result in (Kind.RAW, Kind.MOSAIC)
+        turn = 1 if mosaic else orientation  # to turn a mosaic would be to change its pattern
         outputs = []
         for step in chain.steps:
-            if step.name in runner.keep:
+            if step.name in self.keep:
                 path = self.path(job, f"{step.name}.exr", name)
                 attributes = attributes_of(step, chain, key) | brought
                 write_exr(path, result.kept[step.name], step.stage.writes.channels, attributes)
                 outputs.append(path.name)
         for format_ in self.formats:
-            path = self.path(job, format_, name)
-            if format_ == "exr":
-                assert result.final is not None
-                attributes = attributes_of(chain.steps[-1], chain, key) | brought
-                if orientation != 1:
-                    attributes["orientation"] = "1"
-                pixels = upright(result.final, orientation)
-                write_exr(path, pixels, chain.result.channels, attributes)
+            path = self.path(job, ending_of(format_), name)
+            if format_ == DNG:
+                negative = negative_of(chain)
+                raw = result.kept[negative.step] if negative.step else source.pixels
+                write_dng(path, raw, negative, tags, orientation)
             else:
-                assert result.encoded is not None
-                write_display(path, upright(result.encoded, orientation), tags)
+                attributes = attributes_of(chain.steps[-1], chain, key) | brought
+                write_last(path, FORMATS[format_], result, chain, attributes, tags, turn)
             outputs.append(path.name)
         record = sidecar(job, key, runner, source, result, outputs)
         text = json.dumps(record, indent=2) + "\n"
         write_beside(self.path(job, "json", name), lambda to: _write_text(to, text))
+
+
+def ending_of(format_: str) -> str:
+    """How the name of a file of a format ends."""
+    return DNG if format_ == DNG else FORMATS[format_].ending
+
+
+def write_last(
+    path: Path,
+    format_: Format,
+    result: Result,
+    chain: Chain,
+    attributes: Mapping[str, str],
+    tags: Tags,
+    orientation: int,
+) -> None:
+    """Write the last image of a chain, turned as EXIF's ``orientation`` says.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    pixels = result.encoded
+    if format_.bits > 8:
+        assert result.final is not None
+        pixels = result.final if format_.floats else to_16_bit(result.final)
+    if format_.ending == "exr":
+        pixels = result.final
+    assert pixels is not None
+    pixels = upright(pixels, orientation)
+    if format_.ending == "exr":
+        if orientation != 1:
+            attributes = {**attributes, "orientation": "1"}
+        channels = chain.result.channels
+        write_exr(path, pixels, channels, attributes, half=format_.bits == 16)
+    else:
+        write_display(path, pixels, tags)
 
 
 def _write_text(path: Path, text: str) -> None:
@@ -284,6 +366,7 @@ def sidecar(
         "height": source.pixels.shape[0],
         "camera": chain.camera.name,
         "iso": chain.iso,
+        "output": chain.settings.output.filled(source.shot).model_dump(),
         "noise": noise.record() if noise else None,
         "starts_on": chain.source.label,
         **({"raw": asdict(raw)} if raw else {}),

@@ -18,6 +18,8 @@ DEFAULT_CAMERA = "sony-a7r2"
 Row = tuple[float, float, float]
 Matrix = tuple[Row, Row, Row]
 
+IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
 # Linear sRGB to XYZ, D65 (IEC 61966-2-1, 1999).
 SRGB_TO_XYZ = np.array(
     [

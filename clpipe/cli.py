@@ -13,13 +13,14 @@ from rich.table import Table
 
 import clpipe
 from clpipe import describe
-from clpipe.batch import FORMATS, Burst, Target, find_jobs, prepare_folder, run_jobs
+from clpipe.batch import EVERY_FORMAT, Burst, Target, ending_of, find_jobs, prepare_folder, run_jobs
 from clpipe.bench import bench as run_bench
 from clpipe.bench import bench_methods
 from clpipe.calibration_frames import Given, calibrate_files, check_name, write_profile
 from clpipe.camera import built_in_cameras, load_camera
 from clpipe.check import SIZES, check_all
 from clpipe.config import (
+    OUTPUT,
     Chain,
     Settings,
     built_in_configs,
@@ -35,13 +36,11 @@ from clpipe.errors import ClpipeError, RequestError
 from clpipe.image_io import FINISHED, MAX_PIXELS
 from clpipe.measure import load
 from clpipe.measure import measure as measure_images
-from clpipe.plan import make_plan
 from clpipe.raw_dump import TYPES
 from clpipe.raw_entry import RawEntry
 from clpipe.reentry import Reentry
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.registry import all_stages, load_stage_file
-from clpipe.run import Runner
 from clpipe.stage import Kind, Stage
 from clpipe.suggest import one_of
 
@@ -165,8 +164,9 @@ format_option = click.option(
     "--format",
     "formats",
     multiple=True,
-    type=click.Choice(FORMATS),
-    help="Of the last image; may be repeated. [default: jpg; exr where --until cuts it off]",
+    type=click.Choice(EVERY_FORMAT),
+    help="Of the last image (dng: of the raw, as quantize makes it); may be repeated. "
+    "[default: jpg; exr where --until cuts it off]",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
@@ -218,7 +218,7 @@ class Request:
         chain = make_chain(settings, start_at=start_at, until=self.until)
         for text in self.assignments:
             step = parse_assignment(text)[0]
-            if step not in chain.names:
+            if step not in (*chain.names, OUTPUT):
                 raise RequestError(one_of("stage in this chain", step, chain.names))
         return chain
 
@@ -287,14 +287,13 @@ def run(
     kept = chain.kept(keep)
     whole = asked.until is None or chain.result is Kind.DISPLAY
     formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
-    target = Target(output, formats, Burst(frames))
+    target = Target(output, formats, Burst(frames), kept)
     if frames:
         chain.clean()  # refuses a chain in which frames would be the same
-    target.check(chain, jobs, kept)
+    target.check(chain, jobs)
     device = open_device(selector)
     prepare_folder(output)
-    eight_bit = any(f != "exr" for f in formats)
-    runner = Runner(chain, device, kept, encode=eight_bit, final="exr" in formats)
+    runner = target.runner(chain, device)
     failed = 0
     left_out = 0
     for outcome in run_jobs(jobs, runner, target, raws, reentry):
@@ -308,7 +307,7 @@ def run(
         for warning in outcome.warnings:
             click.echo(f"clpipe: {outcome.job.path}: warning: {warning}", err=True)
         first, *others = target.burst.names()
-        made = str(target.path(outcome.job, formats[0], first))
+        made = str(target.path(outcome.job, ending_of(formats[0]), first))
         if others:
             made += f" and {len(others)} frames"
         click.echo(
@@ -347,8 +346,8 @@ def plan(
         click.echo(describe.toml_text(asked.chain()), nl=False)
         return
     chain = asked.chain()
-    eight_bit = not formats or any(f != "exr" for f in formats)
-    made = make_plan(chain, keep=chain.kept(keep), encode=eight_bit, final="exr" in formats)
+    target = Target(Path(), formats or ("jpg",), keep=chain.kept(keep))
+    made = target.runner(chain, None).plan()
     if as_json:
         show_json(describe.plan_record(made))
         return

@@ -14,12 +14,14 @@ from pydantic import ValidationError
 from clpipe.camera import DEFAULT_CAMERA, Camera, load_camera
 from clpipe.errors import RequestError
 from clpipe.noise_model import NoiseModel
+from clpipe.output import Output
 from clpipe.raw_dump import Dump, dump_of
 from clpipe.registry import all_stages, blamed, check_passes, load_stage_file
 from clpipe.stage import Context, Kind, Method, Stage, Unchanged
 from clpipe.stages import DEFAULT_CHAIN
 from clpipe.suggest import one_of
 
+OUTPUT = "output"  # the table that is no stage's
 KEYS = ("camera", "iso", "seed", "raw_size", "raw_type", "stages", "skip", "stage_files")
 
 
@@ -35,6 +37,7 @@ class Settings:
     stages: tuple[str, ...] = DEFAULT_CHAIN
     skip: tuple[str, ...] = ()
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    output: Output = field(default_factory=Output)
 
     def record(self) -> dict[str, Any]:
         """The settings as nested values, from which :func:`settings_from` makes them again."""
@@ -42,7 +45,9 @@ class Settings:
         if self.dump:
             plain |= {"raw_size": self.raw_size, "raw_type": self.raw_type}
         lists = {"stages": list(self.stages), "skip": list(self.skip)}
-        return {**plain, **lists, **{name: dict(t) for name, t in self.parameters.items()}}
+        output = self.output.model_dump(exclude_defaults=True)
+        tables = {**self.parameters, **({OUTPUT: output} if output else {})}
+        return {**plain, **lists, **{name: dict(t) for name, t in tables.items()}}
 
     @property
     def dump(self) -> Dump | None:
@@ -126,6 +131,11 @@ class Chain:
         if "all" in names:
             return tuple(step.name for step in self.steps)
         return tuple(self.step_named(name).name for name in dict.fromkeys(names))
+
+    def through(self, names: Sequence[str]) -> "Chain":
+        """The chain up to the last of these steps; all of it where none is named."""
+        places = [place for place, step in enumerate(self.steps) if step.name in names]
+        return replace(self, steps=self.steps[: places[-1] + 1]) if places else self
 
     def step_named(self, name: str) -> Step:
         """The step of that name.
@@ -219,15 +229,18 @@ def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Sett
     """
     folder = folder or Path()
     tables = {key: value for key, value in values.items() if isinstance(value, Mapping)}
-    plain = {key: value for key, value in values.items() if key not in tables}
+    output = make_output(tables.pop(OUTPUT, {}))
+    plain = {key: value for key, value in values.items() if not isinstance(value, Mapping)}
     for path in names_in(plain, "stage_files", "files"):
         load_stage_file(folder / path)
     plain.pop("stage_files", None)
     for key in plain:
         if key in all_stages():
             raise KeyedError(key, f"{key}: found {plain[key]!r}, but a stage is a table: [{key}]")
+        if key == OUTPUT:
+            raise KeyedError(key, f"{key}: found {plain[key]!r}, but it is a table: [{key}]")
         if key not in KEYS:
-            raise KeyedError(key, one_of("key", key, (*KEYS, *all_stages())))
+            raise KeyedError(key, one_of("key", key, (*KEYS, OUTPUT, *all_stages())))
     texts = dict.fromkeys(("camera", "raw_size", "raw_type"), str)
     types: dict[str, Any] = {**texts, "iso": (int, float), "seed": int}
     for key, expected in types.items():
@@ -253,7 +266,7 @@ def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Sett
             dump_of(plain.get("raw_size", ""), plain.get("raw_type", ""))
         except RequestError as error:
             raise KeyedError(str(error).partition(":")[0], str(error)) from None
-    return Settings(parameters=tables, **plain)
+    return Settings(parameters=tables, output=output, **plain)
 
 
 def overlay(settings: Settings, values: Mapping[str, Any]) -> Settings:
@@ -369,6 +382,24 @@ def make_method(stage: Stage, name: str, table: Mapping[str, Any]) -> Method:
     method = stage.by_name[chosen]
     with named_errors(name, method):
         return method.model_validate({k: v for k, v in table.items() if k != "method"})
+
+
+def make_output(table: Mapping[str, Any]) -> Output:
+    """How results are written, from the table of that name.
+
+    Raises:
+        KeyedError: an unknown key, or a value that is not allowed.
+    """
+    try:
+        return Output.model_validate(dict(table))
+    except ValidationError as errors:
+        error = errors.errors()[0]
+        name = str(error["loc"][0])
+        key = f"{OUTPUT}.{name}"
+        if error["type"] == "extra_forbidden":
+            raise KeyedError(key, one_of("key of output", name, Output.model_fields)) from None
+        reason = error["msg"].removeprefix("Input ")
+        raise KeyedError(key, f"{key}: found {error['input']!r}: {reason}") from None
 
 
 @contextmanager

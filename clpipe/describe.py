@@ -12,7 +12,7 @@ from clpipe.calibration.calibrate import Calibration
 from clpipe.calibration.line_fit import Estimate
 from clpipe.camera import Camera
 from clpipe.check import Check
-from clpipe.config import Chain, Settings, make_chain
+from clpipe.config import OUTPUT, Chain, Settings, make_chain
 from clpipe.device import Found, choose
 from clpipe.errors import ClpipeError, DeviceError
 from clpipe.measure import UNITS, Report
@@ -175,6 +175,8 @@ def toml_text(chain: Chain) -> str:
             lines.append(
                 line + (f"  # {extra['unit']}" if extra["unit"] and line[0] != "#" else "")
             )
+    if output := settings.output.model_dump(exclude_defaults=True):
+        lines += ["", f"[{OUTPUT}]", *(f"{k} = {value_text(v)}" for k, v in output.items())]
     return "\n".join(lines) + "\n"
 
 

@@ -2,31 +2,31 @@
 
 import contextlib
 import hashlib
-import io
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from fractions import Fraction
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
-from PIL import Image, ImageCms, TiffImagePlugin
+from PIL import Image, ImageCms
 from pydantic import TypeAdapter
 
 import clpipe
 from clpipe.camera import Positive
 from clpipe.errors import ImageError, KindError
+from clpipe.output import Output, exif
 from clpipe.stage import Kind
 from clpipe.types import Array, Floats
 
 READABLE = (".exr", ".hdr", ".pfm", ".tif", ".tiff")
 FINISHED = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
-JPEG_QUALITY = 97
 JPEG_MAX_SIDE = 65500
 HALF_MAX = np.float32(65504)  # so bright that nothing is lost, and no square overflows
+# Else the time of writing is put in, and no two runs make the same bytes.
+NO_TIME = "1970:01:01 00:00:00"
 ATTRIBUTES = "clpipe:"  # what the names of our own begin with
 MAX_PIXELS = 1_000_000_000
 # Layers that hold the finished picture, in order of preference: no layer, then common names.
@@ -38,7 +38,8 @@ class SourceImage:
     """An image as it came from a file.
 
     ``pixels`` is (height, width, 3) linear RGB or a (height, width) mosaic, float16 or float32,
-    finite and C-contiguous. ``attributes`` are those that clpipe gives to a kept image.
+    finite and C-contiguous. ``attributes`` are those that clpipe gives to a kept image, ``shot``
+    what the file says of exposure_time (s), focal_length and sensor_width (mm).
     """
 
     pixels: Array
@@ -46,6 +47,7 @@ class SourceImage:
     layer: str
     warnings: tuple[str, ...]
     attributes: Mapping[str, str]
+    shot: Mapping[str, float] = field(default_factory=dict)
 
 
 def read_image(path: Path, mosaic: bool = False) -> SourceImage:
@@ -64,6 +66,7 @@ def read_image(path: Path, mosaic: bool = False) -> SourceImage:
     """
     with _opened(path) as (data, file):
         pixels, layer, warnings, attributes = _read_picture(path, file, mosaic)
+        shot = shot_of(file.spec())
     pixels, count = without_non_finite(pixels)
     if count:
         warnings.append(f"{count} samples were NaN or infinite and were set to 0")
@@ -75,7 +78,7 @@ def read_image(path: Path, mosaic: bool = False) -> SourceImage:
         pixels = np.clip(pixels, -HALF_MAX, HALF_MAX)
         warnings.append(f"{beyond} samples beyond {HALF_MAX:g}, the range of half, were clipped")
     digest = hashlib.sha256(data).hexdigest()
-    return SourceImage(pixels, digest, layer, tuple(warnings), attributes)
+    return SourceImage(pixels, digest, layer, tuple(warnings), attributes, shot)
 
 
 def read_source(path: Path, kind: Kind) -> SourceImage:
@@ -202,6 +205,18 @@ def _attributes(spec: Any) -> dict[str, str]:
         for a in spec.extra_attribs
         if a.name.startswith(ATTRIBUTES)
     }
+
+
+def shot_of(spec: Any) -> dict[str, float]:
+    """What OpenEXR's standard attributes say of a shot, as far as it can be true."""
+    size = spec.getattribute("sensorOverallDimensions")
+    said = {
+        "exposure_time": spec.getattribute("ExposureTime"),
+        "focal_length": spec.getattribute("effectiveFocalLength")
+        or spec.getattribute("nominalFocalLength"),
+        "sensor_width": max(size) if isinstance(size, tuple) else None,
+    }
+    return {k: v for k, v in said.items() if isinstance(v, float) and 0 < v <= 10_000}
 
 
 def read_attributes(path: Path) -> dict[str, str]:
@@ -337,7 +352,7 @@ def write_beside(path: Path, write: Callable[[Path], None]) -> None:
 
 @dataclass(frozen=True)
 class Tags:
-    """What goes into a picture's EXIF; None is not known."""
+    """What goes into a picture's EXIF, and how it is encoded; None is not known."""
 
     make: str
     model: str
@@ -346,6 +361,13 @@ class Tags:
     aperture: Positive | None = None
     focal_length: Positive | None = None  # mm
     taken: str = ""  # "YYYY:MM:DD HH:MM:SS"
+    output: Output = field(default_factory=Output)
+
+    @property
+    def shot(self) -> dict[str, float]:
+        """What is known of the shot, by the names of :class:`clpipe.output.Output`."""
+        found = {"exposure_time": self.exposure, "focal_length": self.focal_length}
+        return {name: value for name, value in found.items() if value}
 
 
 CARRIED = ("exif", "orientation")  # attributes that go with an image from stage to stage
@@ -353,7 +375,8 @@ CARRIED = ("exif", "orientation")  # attributes that go with an image from stage
 
 def carry(tags: Tags, orientation: int) -> dict[str, str]:
     """The attributes by which an image carries its tags and its orientation (as EXIF has it)."""
-    return {"exif": json.dumps(asdict(tags)), "orientation": str(orientation)}
+    own = {name: value for name, value in asdict(tags).items() if name != "output"}
+    return {"exif": json.dumps(own), "orientation": str(orientation)}
 
 
 def carried(attributes: Mapping[str, str], otherwise: Tags) -> tuple[Tags, int]:
@@ -399,60 +422,83 @@ def upright(image: Array, orientation: int) -> Array:
 
 
 def write_display(path: Path, pixels: Array, tags: Tags) -> None:
-    """Write eight-bit pixels, (height, width[, 3]), as JPEG (quality 97, 4:2:2) or PNG, with EXIF
-    and an sRGB profile.
+    """Write a picture, (height, width[, 3]), as JPEG, PNG or TIFF, with EXIF.
 
-    Raises:
-        ImageError: the file cannot be written.
-    """
-    exif = Image.Exif()
-    exif[0x010F], exif[0x0110] = tags.make, tags.model
-    exif[0x0131] = f"clpipe {clpipe.__version__}"
-    own = exif.get_ifd(0x8769)
-    own[0x8827] = round(tags.iso)
-    numbers = {0x829A: tags.exposure, 0x829D: tags.aperture, 0x920A: tags.focal_length}
-    for tag, number in numbers.items():
-        if number:
-            own[tag] = TiffImagePlugin.IFDRational(Fraction(number).limit_denominator(1_000_000))
-    if tags.taken:
-        exif[0x0132] = own[0x9003] = tags.taken
-    options: dict[str, Any] = {"exif": exif.tobytes()}
-    if pixels.ndim == 3:
-        options["icc_profile"] = srgb_profile()
-    if path.suffix == ".jpg":
-        options |= {"quality": JPEG_QUALITY, "subsampling": "4:2:2"}
-    image = Image.fromarray(pixels)
-
-    def write(to: Path) -> None:
-        with io.BytesIO() as buffer:
-            image.save(buffer, "JPEG" if path.suffix == ".jpg" else "PNG", **options)
-            to.write_bytes(buffer.getvalue())
-
-    write_beside(path, write)
-
-
-def write_exr(
-    path: Path, pixels: Floats, channels: Sequence[str], attributes: Mapping[str, str]
-) -> None:
-    """Write a float image, (height, width[, channel]), as OpenEXR (ZIP), channels named.
-
-    The names of ``attributes`` get clpipe's prefix in the file.
+    Whole numbers of 8 or 16 bits get an sRGB profile; float samples (TIFF) do not. JPEG is encoded
+    as ``tags.output`` says. A TIFF's EXIF is without the ISO, for which OpenImageIO has no way.
 
     Raises:
         ImageError: the file cannot be written.
     """
     height, width = pixels.shape[:2]
-    spec = oiio.ImageSpec(width, height, len(channels), oiio.FLOAT)
+    channels = pixels.shape[2] if pixels.ndim == 3 else 1
+    samples = "float" if pixels.dtype.kind == "f" else pixels.dtype.name
+    spec = oiio.ImageSpec(width, height, channels, samples)
+    output = tags.output
+    jpeg = path.suffix == ".jpg"
+    spec.attribute("compression", f"jpeg:{output.jpeg_quality}" if jpeg else "zip")
+    if jpeg:
+        spec.attribute("jpeg:subsampling", output.jpeg_subsampling)
+        spec.attribute("jpeg:progressive", int(output.jpeg_progressive))
+    if channels == 3 and pixels.dtype.kind == "u":
+        icc = np.frombuffer(srgb_profile(), np.uint8)
+        spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(icc)}]"), icc)
+        spec.attribute("Exif:ColorSpace", 1)  # sRGB
+    spec.attribute("Make", tags.make)
+    spec.attribute("Model", tags.model)
+    spec.attribute("Software", f"clpipe {clpipe.__version__}")
+    for name, value in exif(tags.iso, output, max(height, width)).items():
+        if name == "ExposureTime":
+            # OpenImageIO cuts off after the sixth digit, and 0.01 is 0.0099999998 in float.
+            above = float(np.nextafter(np.float32(value), np.float32(np.inf)))
+            spec.attribute(name, above)
+        else:
+            spec.attribute(f"Exif:{name}", value)
+    if tags.aperture:
+        spec.attribute("FNumber", tags.aperture)
+    if tags.taken:
+        spec.attribute("Exif:DateTimeOriginal", tags.taken)
+    if tags.taken or path.suffix == ".tif":
+        spec.attribute("DateTime", tags.taken or NO_TIME)
+    _write(path, spec, pixels.reshape(height, width, channels))
+
+
+def write_exr(
+    path: Path,
+    pixels: Floats,
+    channels: Sequence[str],
+    attributes: Mapping[str, str],
+    half: bool = False,
+) -> None:
+    """Write a float image, (height, width[, channel]), as OpenEXR (ZIP), channels named.
+
+    The names of ``attributes`` get clpipe's prefix in the file. Half holds 11 bits and at most
+    65504; what is beyond is clipped.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    height, width = pixels.shape[:2]
+    spec = oiio.ImageSpec(width, height, len(channels), oiio.HALF if half else oiio.FLOAT)
     spec.channelnames = tuple(channels)
     spec.attribute("compression", "zip")
-    # Else the time of writing is put in, and no two runs make the same bytes.
-    spec.attribute("DateTime", "1970:01:01 00:00:00")
+    spec.attribute("DateTime", NO_TIME)
     for name, value in attributes.items():
         spec.attribute(ATTRIBUTES + name, value)
+    data = np.clip(pixels, -HALF_MAX, HALF_MAX) if half else pixels
+    _write(path, spec, data.reshape(height, width, len(channels)))
+
+
+def _write(path: Path, spec: Any, pixels: Array) -> None:
+    """Write (height, width, channel) as OpenImageIO does, which does not hold the GIL.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
 
     def write(to: Path) -> None:
         file = oiio.ImageOutput.create(str(to))
-        data = np.ascontiguousarray(pixels).reshape(height, width, len(channels))
+        data = np.ascontiguousarray(pixels)
         if file is None or not file.open(str(to), spec) or not file.write_image(data):
             raise OSError(0, _reason(file.geterror() if file else oiio.geterror()))
         if not file.close():

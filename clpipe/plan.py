@@ -247,7 +247,8 @@ def make_plan(
         half: the source holds half floats, not floats.
         keep: steps whose image is wanted.
         encode: the last image is wanted in eight bits.
-        final: the last image is wanted in float.
+        final: the last image is wanted in float. If it is not wanted at all, the plan ends with
+            the last step to keep.
         fold: let a stencil redo cheap passes at its taps. It must be off for images one pixel
             wide or high: mirroring cannot keep the Bayer phase there.
 
@@ -256,6 +257,8 @@ def make_plan(
     """
     for name in keep:
         chain.step_named(name)
+    if not (encode or final):
+        chain = chain.through(keep)
     last = chain.steps[-1].name
     final = final or last in keep
     planner = _Planner(chain.source, fold)

@@ -5,7 +5,7 @@ It enters where DN are read, so nothing is added to it. Configuration and option
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ UNKNOWN_COLOURS = "its colour matrix is not known; its colours stay those of the
 class RawImage(SourceImage):
     """A mosaic in DN, (height, width), and what the file says of itself, or is told of a dump."""
 
-    said: RawFacts | Dump
+    said: RawFacts | Dump = field(kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class RawEntry:
         except OSError as error:
             raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
         pixels = read_dump(data, path, said) if isinstance(said, Dump) else read_raw(path, said)
-        return RawImage(pixels, hashlib.sha256(data).hexdigest(), "", (), {}, said)
+        return RawImage(pixels, hashlib.sha256(data).hexdigest(), "", (), {}, said=said)
 
     def first_chain(self, path: Path) -> Chain:
         """The chain for the first raw, from which it is seen early whether the request is right.

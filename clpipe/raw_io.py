@@ -17,6 +17,7 @@ import numpy as np
 
 from clpipe.camera import SRGB_TO_XYZ, Matrix
 from clpipe.errors import ImageError
+from clpipe.output import SIMULATED
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.types import Floats
 
@@ -97,7 +98,7 @@ def read_facts(path: Path) -> RawFacts:
             to_srgb = _matrix(np.linalg.inv(to_camera / to_camera.sum(1, keepdims=True)))
         return RawFacts(
             make=said.text("Make") or "unknown",
-            model=said.text("Model") or "unknown",
+            model=said.text("Model").removeprefix(SIMULATED) or "unknown",
             iso=iso or None,
             exposure=exposure,
             visible_area=(size.left_margin, size.top_margin, size.width, size.height),

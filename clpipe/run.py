@@ -121,6 +121,8 @@ class Runner:
                 f"found an image of shape {image.shape}, but the chain starts on "
                 f"{self.chain.source.label} with {channels} channel(s)"
             )
+        if not (self.encode or self.final or self.keep):
+            return Result(None, None, {}, {})
         if not self.device:
             return self._run_numpy(np.asarray(image, np.float32), image_key)
         if image.dtype not in (np.float16, np.float32):
@@ -166,7 +168,9 @@ class Runner:
     def _run_numpy(self, image: Floats, image_key: str) -> Result:
         kept: dict[str, Floats] = {}
         found: dict[str, dict[str, float]] = {}
-        for step in self.chain.steps:
+        whole = self.encode or self.final
+        steps = (self.chain if whole else self.chain.through(self.keep)).steps
+        for step in steps:
             frame = Frame(step.context, streams(self.chain, step, image_key), {})
             with blamed(f"stage {step.name}", step.stage.folder):
                 image = step.method.reference(image, frame)
@@ -175,7 +179,7 @@ class Runner:
             if frame.found:
                 found[step.name] = frame.found
         return Result(
-            final=image if self.final or self.chain.steps[-1].name in self.keep else None,
+            final=image if self.final or steps[-1].name in self.keep else None,
             encoded=to_8_bit(image) if self.encode else None,
             kept=kept,
             found=found,

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Self, get_args, get_origin
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
-from clpipe.camera import DEFAULT_CAMERA, Camera, load_camera
+from clpipe.camera import DEFAULT_CAMERA, IDENTITY, Camera, Matrix, load_camera
 from clpipe.noise_model import NoiseModel
 from clpipe.reference.cfa import PATTERNS, Pattern, red_site
 from clpipe.reference.curve import curve_index
@@ -110,6 +110,7 @@ class Context:
     pattern: Pattern = "RGGB"
     gains: tuple[float, float] = (1.0, 1.0)  # red, blue: taken out by inverse_white_balance
     applied_gains: tuple[float, float] = (1.0, 1.0)  # red, blue: put back by white_balance
+    colours: Matrix = IDENTITY  # linear sRGB to what red, green and blue are, white-balanced
     noise: NoiseModel | None = None  # of the sensor noise that was added
     black_level: float | None = None  # DN, as quantize used them
     white_level: float | None = None

@@ -9,7 +9,7 @@ from tests.conftest import ROOT
 PACKAGE = ROOT / "clpipe"
 # Lower ones first; a module imports only from lower levels.
 LEVELS = [
-    {"errors", "types", "suggest", "noise_model"},
+    {"errors", "types", "suggest", "noise_model", "output"},
     {"reference"},
     {"camera", "statistics", "raw_dump"},
     {"stage", "calibration"},
@@ -21,7 +21,7 @@ LEVELS = [
     {"device"},
     {"run"},
     {"image_io", "raw_io", "check", "bench", "pipeline"},
-    {"reentry"},
+    {"reentry", "dng"},
     {"raw_entry"},
     {"measure"},
     {"batch", "describe", "measure_plot", "calibration_frames"},

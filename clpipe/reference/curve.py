@@ -42,5 +42,18 @@ def compose(first: Floats, second: Array) -> Array:
 
 def to_8_bit(values: Floats) -> NDArray[np.uint8]:
     """0..1 to 0..255, rounded to nearest (ties to even), clipped."""
+    return _scaled(values, 255).astype(np.uint8)
+
+
+def to_16_bit(values: Floats) -> NDArray[np.uint16]:
+    """0..1 to 0..65535, as :func:`to_8_bit`.
+
+    >>> to_16_bit(np.float32([-1, 0.25, 1, 7])).tolist()
+    [0, 16384, 65535, 65535]
+    """
+    return _scaled(values, 65535).astype(np.uint16)
+
+
+def _scaled(values: Floats, largest: int) -> Floats:
     clipped = np.minimum(np.maximum(np.nan_to_num(values), np.float32(0)), np.float32(1))
-    return np.rint(clipped * np.float32(255)).astype(np.uint8)
+    return np.rint(clipped * np.float32(largest))

@@ -1,16 +1,16 @@
 """From the camera's colours to those of linear sRGB."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import BeforeValidator, field_validator
 
-from clpipe.camera import Matrix
+from clpipe.camera import IDENTITY, Matrix
 from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, Unchanged, parameter
 from clpipe.types import Floats
 
-IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 NAMES = tuple(f"{row}_{column}" for row in "rgb" for column in "rgb")
 
 
@@ -61,6 +61,10 @@ class Given(Method):
         if matrix is not None and abs(np.linalg.det(matrix)) < 1e-6:
             raise ValueError("the matrix is singular: different colours would become the same")
         return matrix
+
+    def after(self, context: Context) -> Context:
+        colours = np.array(self.matrix) @ context.colours
+        return replace(context, colours=_as_tuples(colours.tolist()))
 
     @property
     def _rows(self) -> Floats:

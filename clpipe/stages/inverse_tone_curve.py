@@ -32,6 +32,7 @@ def inverse_table(path: str) -> Floats:
 class Default(Curve):
     """Undoes the default curve of Adobe Camera Raw.
 
+    >>> from clpipe.reference.curve import curve_index
     >>> from clpipe.stages.tone_curve import Default as Forward
     >>> x = np.float32([0.01, 0.1, 0.5, 1.0])
     >>> there = Forward().table()[curve_index(x)]

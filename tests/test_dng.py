@@ -1,0 +1,292 @@
+"""DNGs, as programs read them that no one here wrote: LibRaw, Pillow, ExifRead."""
+
+import io
+import json
+import re
+
+import exifread
+import numpy as np
+import pytest
+import rawpy
+from click.testing import CliRunner
+from PIL import Image
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+from clpipe.camera import SRGB_TO_XYZ, load_camera
+from clpipe.cli import main
+from clpipe.config import make_chain, settings_from
+from clpipe.dng import negative_of, write_dng
+from clpipe.errors import ImageError
+from clpipe.image_io import Tags, read_image
+from clpipe.raw_io import read_facts, read_raw
+from clpipe.reference.cfa import PATTERNS
+from tests.conftest import STILL_LIFE
+
+LINEAR = ("--skip", "denoise", "--skip", "tone_curve", "--set", "gamma.exponent=1")
+THROUGH_FILTERS = (
+    *("--stages", "color_matrix,mosaic,inverse_white_balance,quantize,normalize,white_balance"),
+    *("--set", "color_matrix.method=inverse_camera"),
+)
+
+
+@pytest.fixture
+def clpipe():
+    def run(*arguments, status=0):
+        result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
+        assert result.exit_code == status, result.output
+        assert "Traceback" not in result.output
+        return result.output
+
+    return run
+
+
+@pytest.fixture
+def scene(write_exr):
+    """A render of any size, with all kinds of colours and light beyond white."""
+
+    def write(height, width, name="scene.exr"):
+        random = np.random.default_rng(height * width)
+        return write_exr(name, random.random((height, width, 3)).astype(np.float32) * 1.2)
+
+    return write
+
+
+def read_dn(path):
+    with rawpy.imread(str(path)) as raw:
+        return raw.raw_image.copy()
+
+
+def directories(path):
+    """The first directory of a DNG and the mosaic's, as Pillow reads them."""
+    data = io.BytesIO(path.read_bytes())
+    with Image.open(data) as image:
+        first = dict(image.tag_v2)
+        below = ImageFileDirectory_v2(b"II*\0\0\0\0\0")
+        data.seek(first[330][0])
+        below.load(data)
+        return first, dict(below)
+
+
+def strip(path):
+    """The mosaic of a DNG, by its directory."""
+    _, raw = directories(path)
+    data = np.frombuffer(path.read_bytes(), "<u2", raw[279][0] // 2, raw[273][0])
+    return data.reshape(raw[257], raw[256])
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("size", [(24, 30), (37, 51)])
+def test_libraw_reads_the_very_dn(clpipe, scene, tmp_path, pattern, size):
+    options = ("--iso", 3200, "--set", f"mosaic.pattern={pattern}", "--keep", "quantize")
+    clpipe("run", scene(*size), "-o", tmp_path / "o", *options, "--format", "dng")
+    kept = read_image(tmp_path / "o" / "scene.quantize.exr", mosaic=True).pixels
+    path = tmp_path / "o" / "scene.dng"
+    assert np.array_equal(read_dn(path), kept)
+    assert kept.max() == 16383
+    facts = read_facts(path)
+    assert facts.pattern == pattern
+    assert facts.black_levels == (512,) * 4
+    assert facts.white_level == 16383
+    assert facts.gains == pytest.approx((2.77, 1.36), rel=1e-6)
+    assert (facts.make, facts.model, facts.iso) == ("Sony", "ILCE-7RM2", 3200)
+    assert facts.xyz_to_camera is None  # the real camera's is not the render's
+    assert np.array_equal(read_raw(path, facts), kept)
+    with rawpy.imread(str(path)) as raw:
+        assert raw.color_desc == b"RGBG"
+        thumb = raw.extract_thumb()
+    assert thumb.data.shape == (size[0] // 2, size[1] // 2, 3)
+
+
+def test_what_it_says_of_itself(clpipe, tmp_path):
+    shot = {"focal_length": 24, "sensor_width": 18, "exposure_time": 0.008}
+    options = [o for k, v in shot.items() for o in ("--set", f"output.{k}={v}")]
+    clpipe("run", STILL_LIFE, "-o", tmp_path, "--iso", 1600, "--format", "dng", *options)
+    path = tmp_path / "still_life.dng"
+    first, raw = directories(path)
+    noise = load_camera("sony-a7r2").noise(1600)
+    assert first[50706] == b"\1\4\0\0"
+    assert first[50778] == 21
+    assert first[50708] == "clpipe Sony ILCE-7RM2"
+    assert first[51041] == raw[51041] == (noise.a, noise.b) * 3
+    assert [float(x) for x in first[50728]] == pytest.approx([1 / 2.77, 1, 1 / 1.36])
+    assert (raw[254], raw[262], raw[258]) == (0, 32803, (16,))
+    with path.open("rb") as file:
+        exif = exifread.process_file(file, details=False)
+    found = {name: exif[f"EXIF {name}"].values[0] for name in ("ExposureTime", "FocalLength")}
+    assert {name: float(value) for name, value in found.items()} == {
+        "ExposureTime": 1 / 125,
+        "FocalLength": 24,
+    }
+    assert exif["EXIF FocalLengthIn35mmFilm"].values == [48]
+    assert exif["EXIF ISOSpeedRatings"].values == [1600]
+    assert float(exif["EXIF FocalPlaneXResolution"].values[0]) == pytest.approx(960 / 1.8)
+    assert str(exif["Image Software"]).startswith("clpipe ")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        (),
+        ("--skip", "inverse_white_balance"),
+        ("--set", "inverse_white_balance.red_gain=1.4", "--set", "mosaic.pattern=GBRG"),
+        ("-c", "canon-5d2-jpeg", "--iso", 100),
+    ],
+)
+def test_a_converter_gives_the_colours_of_our_own_picture(clpipe, tmp_path, options):
+    formats = ("--format", "dng", "--format", "exr")
+    clpipe("run", STILL_LIFE, "-o", tmp_path, *LINEAR, *formats, *options)
+    ours = read_image(tmp_path / "still_life.exr").pixels
+    with rawpy.imread(str(tmp_path / "still_life.dng")) as raw:
+        theirs = raw.postprocess(
+            gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True
+        ) / np.float32(65535)
+        preview = raw.extract_thumb().data / np.float32(255)
+    means = [x.reshape(20, 32, 30, 32, 3).mean((1, 3)) for x in (ours, theirs)]
+    usable = (means[0].max(-1) < 0.9) & (means[0].min(-1) > 0.03)
+    assert usable.sum() > 400
+    ratio = means[1][usable] / means[0][usable]
+    assert np.abs(np.median(ratio, axis=0) - 1).max() < 0.002
+    assert np.abs(np.percentile(ratio, [5, 95], axis=0) - 1).max() < 0.03
+    linear = np.where(preview < 0.04045, preview / 12.92, ((preview + 0.055) / 1.055) ** 2.4)
+    small = linear.reshape(20, 16, 30, 16, 3).mean((1, 3))
+    assert np.abs(np.median(small[usable] / means[0][usable], axis=0) - 1).max() < 0.01
+
+
+def test_the_colour_matrix_is_of_what_the_mosaic_holds():
+    camera = load_camera("sony-a7r2")
+    rendered = negative_of(make_chain(settings_from({})))
+    white = rendered.xyz_to_camera @ SRGB_TO_XYZ @ np.ones(3)
+    assert white / white[1] == pytest.approx([1 / 2.77, 1, 1 / 1.36])  # AsShotNeutral is D65's
+    red = rendered.xyz_to_camera @ SRGB_TO_XYZ @ [1, 0, 0]
+    assert red / red[0] == pytest.approx([1, 0, 0], abs=1e-6)
+    stages = THROUGH_FILTERS[1].split(",")
+    through = {"stages": stages, "color_matrix": {"method": "inverse_camera"}}
+    filtered = negative_of(make_chain(settings_from(through)))
+    assert filtered.xyz_to_camera == pytest.approx(np.array(camera.xyz_to_camera), abs=3e-3)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (2, 3), (3, 1100)])
+def test_any_size_is_written(clpipe, scene, tmp_path, size):
+    clpipe(
+        *("run", scene(*size), "-o", tmp_path / "o", "--keep", "quantize", "--format", "dng"),
+        *("--device", "numpy"),
+    )
+    kept = read_image(tmp_path / "o" / "scene.quantize.exr", mosaic=True).pixels
+    assert np.array_equal(strip(tmp_path / "o" / "scene.dng"), kept)
+    first, _ = directories(tmp_path / "o" / "scene.dng")
+    assert 1 <= first[256] <= 512
+
+
+def test_the_same_file_whatever_else_is_written(clpipe, scene, tmp_path):
+    render = scene(30, 40)
+    others = ("jpg", "png16", "tif", "exr")
+    every = [o for name in others for o in ("--format", name)]
+    clpipe("run", render, "-o", tmp_path / "a", "--format", "dng")
+    clpipe("run", render, "-o", tmp_path / "b", "--format", "dng", *every, "--keep", "all")
+    clpipe("run", render, "-o", tmp_path / "c", "--format", "dng", "--device", "numpy")
+    clpipe("run", render, "-o", tmp_path / "d", "--format", "dng", "--until", "quantize")
+    clpipe("run", render, "-o", tmp_path / "e", "--format", "dng", "--until", "normalize")
+    alone = (tmp_path / "a" / "scene.dng").read_bytes()
+    assert {p.name for p in (tmp_path / "a").iterdir()} == {"scene.dng", "scene.json"}
+    for folder in "bcde":
+        assert (tmp_path / folder / "scene.dng").read_bytes() == alone
+    for name in ("jpg", "png", "tif", "exr"):
+        assert (tmp_path / "b" / f"scene.{name}").is_file()
+    record = json.loads((tmp_path / "b" / "scene.json").read_text())
+    assert {"scene.dng", "scene.jpg", "scene.png"} <= set(record["outputs"])
+
+
+def test_only_what_it_takes_is_run(clpipe):
+    launches = json.loads(clpipe("plan", "--format", "dng", "--json"))["launches"]
+    assert launches[-1]["stages"].endswith("quantize")
+    whole = json.loads(clpipe("plan", "--format", "dng", "--format", "jpg", "--json"))["launches"]
+    assert len(whole) > len(launches)
+
+
+def test_a_burst_has_a_dng_of_each_frame_and_of_the_truth(clpipe, scene, tmp_path):
+    clpipe("run", scene(24, 30), "-o", tmp_path / "o", "--frames", 2, "--format", "dng")
+    names = {name: tmp_path / "o" / f"scene.{name}.dng" for name in ("truth", "frame0", "frame1")}
+    assert set((tmp_path / "o").glob("*.dng")) == set(names.values())
+    truth, *frames = (read_dn(path).astype(float) for path in names.values())
+    assert 51041 in directories(names["frame0"])[1]
+    assert 51041 not in directories(names["truth"])[1]
+    assert (frames[0] != frames[1]).mean() > 0.5
+    assert np.abs(np.mean(frames, axis=0) - truth).mean() < 100
+
+
+def test_a_kept_raw_as_a_dng_loses_nothing(clpipe, scene, tmp_path):
+    options = ("--iso", 800, "--set", "mosaic.pattern=GRBG", "--keep", "quantize")
+    clpipe("run", scene(24, 30), "-o", tmp_path / "a", *options, "--format", "dng")
+    kept = tmp_path / "a" / "scene.quantize.exr"
+    again = ("--start-at", "normalize", "--format", "dng")
+    clpipe("run", kept, "-o", tmp_path / "b", *again)
+    one, two = (tmp_path / "a" / "scene.dng", tmp_path / "b" / "scene.quantize.dng")
+    assert one.read_bytes() == two.read_bytes()
+
+
+def test_a_mosaic_from_elsewhere_as_a_dng(clpipe, write_exr, tmp_path):
+    dn = np.random.default_rng(0).integers(0, 4096, (25, 31, 1)).astype(np.float32)
+    mosaic = write_exr("m.exr", dn, "Y", half=False)
+    matrix = "[[1.8, -0.6, -0.2], [-0.2, 1.5, -0.3], [0, -0.5, 1.5]]"
+    values = ("mosaic.pattern=BGGR", "normalize.black_level=0", "normalize.white_level=4000")
+    values += ("color_matrix.method=given", f"color_matrix.matrix={matrix}")
+    values += (
+        "white_balance.method=gains",
+        "white_balance.red_gain=2",
+        "white_balance.blue_gain=3",
+    )
+    options = [o for value in values for o in ("--set", value)]
+    clpipe(
+        "run", mosaic, "-o", tmp_path / "o", "--start-at", "normalize", "--format", "dng", *options
+    )
+    path = tmp_path / "o" / "m.dng"
+    facts = read_facts(path)
+    assert np.array_equal(read_dn(path), dn[..., 0])
+    assert (facts.pattern, facts.black_levels, facts.white_level) == ("BGGR", (0,) * 4, 4000)
+    assert facts.gains == pytest.approx((2, 3))
+    with rawpy.imread(str(path)) as raw:
+        to_srgb = raw.color_matrix[:, :3]
+    given = np.array(json.loads(matrix))
+    inverse = np.linalg.inv(given)
+    balanced = np.linalg.inv(inverse / inverse.sum(1, keepdims=True))
+    assert to_srgb == pytest.approx(balanced, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--stages", "exposure,gamma"), "starts on rgb and has no quantize"),
+        (("--until", "sensor_noise"), "the raw in DN that quantize makes"),
+        (("--until", "quantize", "--format", "jpg"), "ends in DN, which jpg cannot hold"),
+        (("--set", "quantize.white_level=1000.5"), r"white level of 1000\.5, but DNG wants whole"),
+    ],
+)
+def test_a_chain_without_a_raw_is_refused(clpipe, scene, tmp_path, options, message):
+    out = tmp_path / "o"
+    output = clpipe("run", scene(8, 8), "-o", out, "--format", "dng", *options, status=2)
+    assert re.search(message, output), output
+    assert not out.exists()
+
+
+def test_entering_after_the_raw_is_refused(clpipe, write_exr, tmp_path):
+    mosaic = write_exr("m.exr", np.full((8, 8, 1), 0.5, np.float32), "Y")
+    options = ("--start-at", "white_balance", "--format", "dng")
+    output = clpipe("run", mosaic, "-o", tmp_path / "o", *options, status=2)
+    assert "starts on mosaic and has no quantize" in output
+
+
+@pytest.mark.parametrize("value", [0.5, -1, 65536, np.inf])
+def test_samples_that_are_no_dn_are_refused(tmp_path, value):
+    chain = make_chain(settings_from({}))
+    mosaic = np.full((4, 4), 600, np.float32)
+    mosaic[2, 1] = value
+    with pytest.raises(ImageError, match=r"a\.dng: holds samples that are not whole DN"):
+        write_dng(tmp_path / "a.dng", mosaic, negative_of(chain), Tags("a", "b", 100))
+    assert not list(tmp_path.iterdir())
+
+
+def test_one_that_cannot_be_written_leaves_nothing(clpipe, scene, tmp_path):
+    (tmp_path / "o" / "scene.dng" / "in the way").mkdir(parents=True)
+    output = clpipe("run", scene(8, 8), "-o", tmp_path / "o", "--format", "dng", status=1)
+    assert "scene.dng: cannot be written" in output
+    assert {p.name for p in (tmp_path / "o").iterdir()} == {"scene.dng"}

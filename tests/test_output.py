@@ -1,0 +1,192 @@
+"""The formats that results are written in, and what [output] says of them."""
+
+import json
+import re
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from clpipe.cli import main
+from clpipe.config import overlay, read_settings, settings_from
+from clpipe.image_io import read_image
+from tests.conftest import STILL_LIFE
+
+FORMATS = ("jpg", "png", "png16", "tif", "tif16", "tif32", "exr", "exr16")
+
+
+def clpipe(*arguments, status=0):
+    result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == status, result.output
+    assert "Traceback" not in result.output
+    return result.output
+
+
+@pytest.fixture
+def scene(write_exr):
+    return write_exr("scene.exr", np.random.default_rng(0).random((21, 33, 3)).astype(np.float32))
+
+
+def pixels(path, kind):
+    file = oiio.ImageInput.open(str(path))
+    return file.spec().format.basetype, file.read_image(kind)
+
+
+def test_every_format_holds_the_same_picture(scene, tmp_path):
+    for name in FORMATS:
+        clpipe("run", scene, "-o", tmp_path / name, "--format", name)
+    made = {name: tmp_path / name / f"scene.{re.sub('[0-9]', '', name)}" for name in FORMATS}
+    kind, exact = pixels(made["exr"], oiio.FLOAT)
+    assert kind == oiio.FLOAT
+    for name in ("png", "tif"):
+        kind, found = pixels(made[name], oiio.UINT8)
+        assert kind == oiio.UINT8
+        assert np.array_equal(found, np.rint(exact * np.float32(255)))
+    for name in ("png16", "tif16"):
+        kind, found = pixels(made[name], oiio.UINT16)
+        assert kind == oiio.UINT16
+        assert np.array_equal(found, np.rint(exact * np.float32(65535)))
+        assert len(np.unique(found)) > 1000  # not eight bits made wide
+    kind, found = pixels(made["tif32"], oiio.FLOAT)
+    assert kind == oiio.FLOAT
+    assert np.array_equal(found, exact)
+    kind, found = pixels(made["exr16"], oiio.FLOAT)
+    assert kind == oiio.HALF
+    assert np.array_equal(found, exact.astype(np.float16))
+
+
+def test_several_at_once_are_the_same_as_one_by_one(scene, tmp_path):
+    several = ("jpg", "png16", "tif", "exr")
+    options = [o for name in several for o in ("--format", name)]
+    clpipe("run", scene, "-o", tmp_path / "all", *options)
+    for name in several:
+        clpipe("run", scene, "-o", tmp_path / name, "--format", name)
+        file = f"scene.{name.removesuffix('16')}"
+        assert (tmp_path / "all" / file).read_bytes() == (tmp_path / name / file).read_bytes()
+    outputs = json.loads((tmp_path / "all" / "scene.json").read_text())["outputs"]
+    assert outputs == ["scene.jpg", "scene.png", "scene.tif", "scene.exr"]
+
+
+def test_light_beyond_half_is_clipped_in_half(write_exr, tmp_path):
+    bright = write_exr("bright.exr", np.full((4, 4, 3), 60000, np.float32))
+    options = ("--set", "exposure.ev=4", "--until", "exposure", "--format", "exr16")
+    clpipe("run", bright, "-o", tmp_path / "o", *options)
+    assert read_image(tmp_path / "o" / "bright.exr").pixels.max() == 65504
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--format", "png", "--format", "png16"), r"png and png16 would both write NAME\.png"),
+        (("--format", "exr16", "--until", "quantize"), "ends in DN, which exr16 cannot hold"),
+        (("--set", "output.jpeg_quality=101"), "output.jpeg_quality: found 101: .* less than or"),
+        (("--set", "output.jpeg_qualty=9"), "unknown key of output 'jpeg_qualty'.*jpeg_quality"),
+        (("--set", "output.jpeg_subsampling=4:1:1"), "found '4:1:1': .*'4:4:4', '4:2:2' or"),
+        (("--set", "output.focal_length=0"), "output.focal_length: found 0: .* greater than 0"),
+        (("--set", "output.exposure_time=fast"), "output.exposure_time: found 'fast': .* number"),
+    ],
+)
+def test_refusals(scene, tmp_path, options, message):
+    output = clpipe("run", scene, "-o", tmp_path / "o", *options, status=2)
+    assert re.search(message, output), output
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_configuration_says_how_files_are_written(scene, tmp_path):
+    config = tmp_path / "c.toml"
+    lines = ("jpeg_quality = 60", 'jpeg_subsampling = "4:2:0"', "jpeg_progressive = true")
+    config.write_text("\n".join(["iso = 400", "[output]", *lines, "focal_length = 35"]))
+    clpipe("run", scene, "-o", tmp_path / "o", "-c", config, "--set", "output.jpeg_quality=50")
+    with Image.open(tmp_path / "o" / "scene.jpg") as image:
+        assert image.quantization[0][0] == 16  # that of the standard's table, quality 50
+        assert image.layer[0][1:3] == (2, 2)
+        assert image.info["progressive"]
+        assert image.getexif().get_ifd(0x8769)[0x920A] == 35
+    record = json.loads((tmp_path / "o" / "scene.json").read_text())
+    assert record["output"]["jpeg_quality"] == 50
+    assert record["output"]["focal_length"] == 35
+    text = clpipe("plan", "--toml", "-c", config)
+    (tmp_path / "again.toml").write_text(text)
+    assert read_settings(tmp_path / "again.toml").output == read_settings(config).output
+
+
+def test_a_kept_image_knows_how_it_was_to_be_written(scene, tmp_path):
+    set_ = ("--set", "output.jpeg_quality=50")
+    clpipe("run", scene, "-o", tmp_path / "a", *set_, "--keep", "denoise")
+    clpipe("run", tmp_path / "a" / "scene.denoise.exr", "-o", tmp_path / "b", "--start-at", "gamma")
+    assert (
+        json.loads((tmp_path / "b" / "scene.denoise.json").read_text())["output"]["jpeg_quality"]
+        == 50
+    )
+
+
+def test_settings_of_output_are_overlaid_and_recorded():
+    settings = overlay(
+        settings_from({"output": {"focal_length": 24}}), {"output": {"sensor_width": 36}}
+    )
+    assert settings.record()["output"] == {"focal_length": 24, "sensor_width": 36}
+    assert settings_from(settings.record()) == settings
+    assert "output" not in settings_from({}).record()
+
+
+@pytest.mark.parametrize(("text", "line"), [("output = 3", 1), ("[output]\nquality = 3", 2)])
+def test_a_bad_output_table_is_named_with_its_line(tmp_path, text, line):
+    (tmp_path / "c.toml").write_text(text)
+    output = clpipe("run", STILL_LIFE, "-o", tmp_path, "-c", tmp_path / "c.toml", status=2)
+    assert f"c.toml, line {line}: " in output
+
+
+@pytest.mark.parametrize("name", ["jpg", "png", "tif"])
+def test_exif_and_profile(scene, tmp_path, name):
+    shot = {"focal_length": 50, "sensor_width": 24, "exposure_time": 0.01}
+    options = [o for key, value in shot.items() for o in ("--set", f"output.{key}={value}")]
+    clpipe("run", scene, "-o", tmp_path, "--iso", 25600, "--format", name, *options)
+    with Image.open(tmp_path / f"scene.{name}") as image:
+        exif = image.getexif()
+        inner = exif.get_ifd(0x8769)
+        assert "icc_profile" in image.info
+    assert (exif[0x010F], exif[0x0110]) == ("Sony", "ILCE-7RM2")
+    assert exif[0x0131].startswith("clpipe ")
+    assert inner[0x829A] == pytest.approx(0.01)
+    assert inner[0xA001] == 1
+    assert (inner[0x920A], inner[0xA405]) == (50, 75)
+    assert (inner[0xA20E], inner[0xA210]) == (pytest.approx(33 / 2.4), 3)
+    if name != "tif":  # OpenImageIO has no way to put it there
+        assert inner[0x8827] == 25600
+
+
+def test_a_render_may_say_its_shot_and_a_request_wins(tmp_path):
+    spec = oiio.ImageSpec(30, 20, 3, oiio.HALF)
+    said = {"ExposureTime": 0.5, "effectiveFocalLength": 35.0, "isoSpeed": 50.0}
+    for name, value in said.items():
+        spec.attribute(name, value)
+    spec.attribute("sensorOverallDimensions", oiio.TypeDesc("vector2"), (36.0, 24.0))
+    path = tmp_path / "shot.exr"
+    file = oiio.ImageOutput.create(str(path))
+    assert file.open(str(path), spec) and file.write_image(np.ones((20, 30, 3), np.float32))
+    assert file.close()
+    assert dict(read_image(path).shot) == {
+        "exposure_time": 0.5,
+        "focal_length": 35.0,
+        "sensor_width": 36.0,
+    }
+    clpipe("run", path, "-o", tmp_path / "o", "--set", "output.focal_length=70")
+    with Image.open(tmp_path / "o" / "shot.jpg") as image:
+        inner = image.getexif().get_ifd(0x8769)
+    assert (inner[0x829A], inner[0x920A], inner[0xA405]) == (0.5, 70, 70)
+    record = json.loads((tmp_path / "o" / "shot.json").read_text())
+    assert record["output"]["exposure_time"] == 0.5
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("inf"), float("nan")])
+def test_a_shot_that_cannot_be_true_is_not_believed(tmp_path, value):
+    spec = oiio.ImageSpec(8, 8, 3, oiio.HALF)
+    spec.attribute("ExposureTime", value)
+    spec.attribute("nominalFocalLength", value)
+    path = tmp_path / "shot.exr"
+    file = oiio.ImageOutput.create(str(path))
+    assert file.open(str(path), spec) and file.write_image(np.ones((8, 8, 3), np.float32))
+    assert file.close()
+    assert not read_image(path).shot
