@@ -21,6 +21,7 @@ from clpipe.image_io import Tags, read_image
 from clpipe.raw_io import read_facts, read_raw
 from clpipe.reference.cfa import PATTERNS
 from tests.conftest import STILL_LIFE
+from tests.dng import write_dng as write_raw
 
 LINEAR = ("--skip", "denoise", "--skip", "tone_curve", "--set", "gamma.exponent=1")
 THROUGH_FILTERS = (
@@ -290,3 +291,20 @@ def test_one_that_cannot_be_written_leaves_nothing(clpipe, scene, tmp_path):
     output = clpipe("run", scene(8, 8), "-o", tmp_path / "o", "--format", "dng", status=1)
     assert "scene.dng: cannot be written" in output
     assert {p.name for p in (tmp_path / "o").iterdir()} == {"scene.dng"}
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_a_cameras_raw_as_a_dng_loses_nothing(clpipe, tmp_path, pattern):
+    dn = np.random.default_rng(4).integers(400, 16384, (46, 62)).astype(np.uint16)
+    write_raw(tmp_path / "shot.dng", dn, pattern, orientation=6)
+    clpipe("run", tmp_path / "shot.dng", "-o", tmp_path / "out", "--format", "dng")
+    again = tmp_path / "out" / "shot.dng"
+    assert np.array_equal(read_dn(again), dn)
+    with rawpy.imread(str(tmp_path / "shot.dng")) as one, rawpy.imread(str(again)) as other:
+        assert np.array_equal(one.raw_colors_visible, other.raw_colors_visible)
+        assert one.black_level_per_channel == other.black_level_per_channel
+        assert one.white_level == other.white_level
+        assert one.sizes.flip == other.sizes.flip == 6
+        ours, its = np.array(other.camera_whitebalance[:3]), np.array(one.camera_whitebalance[:3])
+        assert ours / ours[1] == pytest.approx(its / its[1], rel=1e-4)
+        assert np.abs(other.color_matrix - one.color_matrix).max() < 0.01
