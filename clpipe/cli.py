@@ -309,7 +309,7 @@ def run(
         first, *others = target.burst.names()
         made = str(target.path(outcome.job, ending_of(formats[0]), first))
         if others:
-            made += f" and {len(others)} frames"
+            made += f" and {len(others)} frame{'s' * (len(others) > 1)}"
         click.echo(
             f"{outcome.job.path} -> {made}  {outcome.megapixels:.2g} MP  {outcome.seconds:.2f} s",
             err=True,
