@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from clpipe.image_io import (
     CARRIED,
     JPEG_MAX_SIDE,
     READABLE,
+    USUAL_MAX_PIXELS,
     SourceImage,
     Tags,
     carried,
@@ -434,19 +436,23 @@ def run_jobs(
     target: Target,
     raws: RawEntry,
     reentry: Reentry | None = None,
+    layer: str | None = None,
+    max_pixels: int = USUAL_MAX_PIXELS,
 ) -> Iterator[Outcome]:
     """Put every job through; one that fails is reported and the others go on.
 
     The next file is read, and the first one read while the kernels compile, in a second thread.
+    ``layer`` and ``max_pixels`` are those of :func:`clpipe.image_io.read_image`.
     """
     kind = runner.chain.source
+    reading_of = partial(raws.read, kind=kind, layer=layer, max_pixels=max_pixels)
     with ThreadPoolExecutor(1) as reader:
-        ahead = reader.submit(raws.read, jobs[0].path, kind)
+        ahead = reader.submit(reading_of, jobs[0].path)
         runner.warm_up(half=reentry is None and kind is Kind.RGB)
         for i, job in enumerate(jobs):
             reading = ahead
             if i + 1 < len(jobs):
-                ahead = reader.submit(raws.read, jobs[i + 1].path, kind)
+                ahead = reader.submit(reading_of, jobs[i + 1].path)
             start = time.perf_counter()
             try:
                 source = reading.result()

@@ -33,7 +33,7 @@ from clpipe.config import (
 )
 from clpipe.device import find_devices, open_device
 from clpipe.errors import ClpipeError, RequestError
-from clpipe.image_io import FINISHED, MAX_PIXELS
+from clpipe.image_io import FINISHED, MAX_PIXELS, USUAL_MAX_PIXELS
 from clpipe.measure import load
 from clpipe.measure import measure as measure_images
 from clpipe.raw_dump import TYPES
@@ -257,6 +257,15 @@ def main() -> None:
 @click.option(
     "--raw-type", type=click.Choice(list(TYPES)), help="And how their samples are stored."
 )
+@click.option("--layer", metavar="NAME", help="The layer or part of an EXR that is the picture.")
+@click.option(
+    "--max-pixels",
+    default=USUAL_MAX_PIXELS,
+    show_default=True,
+    type=click.IntRange(1, MAX_PIXELS),
+    metavar="N",
+    help="Refuse files that claim more, before memory is taken.",
+)
 @keep_option
 @format_option
 @device_option
@@ -264,6 +273,8 @@ def run(
     inputs: tuple[str, ...],
     output: Path,
     frames: int | None,
+    layer: str | None,
+    max_pixels: int,
     keep: tuple[str, ...],
     formats: tuple[str, ...],
     selector: str | None,
@@ -284,6 +295,10 @@ def run(
         chain = raws.first_chain(jobs[0].path)
     else:
         chain = reentry.first_chain(jobs[0].path) if reentry else asked.chain()
+    if layer is not None and chain.source is not Kind.RGB:
+        raise RequestError(
+            f"--layer: it is one of a render, but the chain reads {chain.source.label}"
+        )
     kept = chain.kept(keep)
     whole = asked.until is None or chain.result is Kind.DISPLAY
     formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
@@ -296,7 +311,7 @@ def run(
     runner = target.runner(chain, device)
     failed = 0
     left_out = 0
-    for outcome in run_jobs(jobs, runner, target, raws, reentry):
+    for outcome in run_jobs(jobs, runner, target, raws, reentry, layer, max_pixels):
         if outcome.left_out:
             left_out += 1
             continue

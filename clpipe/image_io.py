@@ -17,7 +17,10 @@ from pydantic import TypeAdapter
 import clpipe
 from clpipe.camera import Positive
 from clpipe.errors import ImageError, KindError
+from clpipe.exr_colour import CIE_XYZ, SRGB, to_linear_srgb
+from clpipe.luminance_chroma import read_luminance_chroma
 from clpipe.output import Output, exif
+from clpipe.printable import printable
 from clpipe.stage import Kind
 from clpipe.types import Array, Floats
 
@@ -28,7 +31,8 @@ HALF_MAX = np.float32(65504)  # so bright that nothing is lost, and no square ov
 # Else the time of writing is put in, and no two runs make the same bytes.
 NO_TIME = "1970:01:01 00:00:00"
 ATTRIBUTES = "clpipe:"  # what the names of our own begin with
-MAX_PIXELS = 1_000_000_000
+MAX_PIXELS = 1_000_000_000  # what a device is ever given
+USUAL_MAX_PIXELS = 200_000_000  # what a file may claim, where nobody says otherwise
 # Layers that hold the finished picture, in order of preference: no layer, then common names.
 PICTURE_LAYERS = ("", "combined", "beauty", "rgba", "rgb", "color", "default")
 
@@ -50,26 +54,61 @@ class SourceImage:
     shot: Mapping[str, float] = field(default_factory=dict)
 
 
-def read_image(path: Path, mosaic: bool = False) -> SourceImage:
-    """Read the picture of a file: R, G and B by name, the display window, everything finite.
+def read_image(
+    path: Path,
+    mosaic: bool = False,
+    layer: str | None = None,
+    max_pixels: int = USUAL_MAX_PIXELS,
+) -> SourceImage:
+    """Read the picture of a file as linear sRGB: the display window, everything finite.
 
-    Half stays half. Alpha, depth and other layers are left alone. NaN and infinity become 0,
-    counted in a warning. What the data window leaves out of the display window is black.
+    R, G and B are found by name; else X, Y and Z; else luminance alone is grey. Other primaries
+    than those of sRGB are converted. Half stays half where nothing is. Alpha, depth and other
+    layers are left alone. NaN and infinity become 0, counted in a warning. What the data window
+    leaves out of the display window is black.
 
     Args:
         path: the file.
         mosaic: read a single channel instead, which may hold whole numbers of 16 or 32 bits.
+        layer: the layer or part that is the picture; None chooses (:data:`PICTURE_LAYERS`).
+        max_pixels: a file that claims more is refused before memory is taken.
 
     Raises:
-        ImageError: the file is missing, empty, damaged, no image, not linear float, deep, or has
-            not the channels; the message names the file and the reason.
+        ImageError: the file is missing, empty, damaged, no image, not linear float, deep, a cube
+            map or texture, too large, or has not the channels or the layer; the message names the
+            file and the reason.
     """
-    with _opened(path) as (data, file):
-        pixels, layer, warnings, attributes = _read_picture(path, file, mosaic)
-        shot = shot_of(file.spec())
+    try:
+        with _opened(path) as (data, file):
+            picture = _find_picture(path, file, mosaic, layer)
+            spec, pixels = file.spec(), _read_part(path, file, picture, mosaic, max_pixels)
+        chromaticities = CIE_XYZ if picture.xyz else spec.getattribute("chromaticities")
+        neutral = spec.getattribute("adoptedNeutral")
+        attributes, name, shot = _attributes(spec), picture.layer, shot_of(spec)
+    except SubsampledError:
+        if mosaic or layer is not None:
+            raise
+        window = read_luminance_chroma(path, max_pixels)
+        pixels = display_window(window.pixels, window.x, window.y, window.width, window.height)
+        data, attributes, name, shot = path.read_bytes(), {}, "", {}
+        chromaticities = window.attributes.get("chromaticities")
+        neutral = window.attributes.get("adoptedNeutral")
+    warnings = []
     pixels, count = without_non_finite(pixels)
     if count:
         warnings.append(f"{count} samples were NaN or infinite and were set to 0")
+    if pixels.ndim == 2 and not mosaic:
+        pixels = np.stack([pixels] * 3, axis=-1)
+        warnings.append("it holds luminance alone; the picture is grey")
+    elif not mosaic:
+        try:
+            matrix = to_linear_srgb(SRGB if chromaticities is None else chromaticities, neutral)
+        except ImageError as error:
+            raise ImageError(f"{path}: {error}") from None
+        if matrix is not None:
+            with np.errstate(all="ignore"):  # what overflows is clipped below
+                pixels = np.nan_to_num(pixels.astype(np.float32) @ matrix.T)
+            warnings.append("its colours were converted to linear sRGB")
     if (
         not mosaic
         and pixels.dtype == np.float32
@@ -78,20 +117,24 @@ def read_image(path: Path, mosaic: bool = False) -> SourceImage:
         pixels = np.clip(pixels, -HALF_MAX, HALF_MAX)
         warnings.append(f"{beyond} samples beyond {HALF_MAX:g}, the range of half, were clipped")
     digest = hashlib.sha256(data).hexdigest()
-    return SourceImage(pixels, digest, layer, tuple(warnings), attributes, shot)
+    return SourceImage(pixels, digest, name, tuple(warnings), attributes, shot)
 
 
-def read_source(path: Path, kind: Kind) -> SourceImage:
+def read_source(
+    path: Path, kind: Kind, layer: str | None = None, max_pixels: int = USUAL_MAX_PIXELS
+) -> SourceImage:
     """The image of a file, as a chain that starts on this kind wants it.
+
+    ``layer`` and ``max_pixels`` are those of :func:`read_image`.
 
     Raises:
         ImageError: it cannot be read, or holds another kind.
     """
     if kind is not Kind.DISPLAY:
-        return read_image(path, mosaic=len(kind.channels) == 1)
+        return read_image(path, len(kind.channels) == 1, layer, max_pixels)
     finished = read_finished(path)
     if finished is None:
-        finished = read_image(path)
+        finished = read_image(path, layer=layer, max_pixels=max_pixels)
         if finished.attributes.get("kind") != kind.label:
             raise ImageError(
                 f"{path}: holds linear light, but the chain starts on finished pictures "
@@ -154,48 +197,142 @@ def _opened(path: Path) -> Iterator[tuple[bytes, Any]]:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
     if not data:
         raise ImageError(f"{path}: the file is empty")
-    file = oiio.ImageInput.open(str(path))
-    if file is None:
-        raise ImageError(f"{path}: cannot be read as an image: {_reason(oiio.geterror())}")
     try:
-        yield data, file
-    finally:
-        file.close()
+        hints = oiio.ImageSpec()
+        hints.attribute("pnm:pfmflip", 1)  # else OpenImageIO 3.2 has PFM upside down
+        file = oiio.ImageInput.open(str(path), hints)
+        if file is None:
+            reason = _reason(oiio.geterror())
+            failure = SubsampledError if reason.startswith("Subsampled channels") else ImageError
+            raise failure(f"{path}: cannot be read as an image: {reason}")
+        with contextlib.closing(file):
+            yield data, file
+    except UnicodeDecodeError:  # out of any call that gives text from the file
+        raise ImageError(f"{path}: damaged: a name or attribute in it is not UTF-8") from None
 
 
 def _reason(text: str) -> str:
     """An error of OpenImageIO, in one line."""
     if not text or "could not find a format reader" in text:
         return "it is damaged, or of no known format"
-    return " ".join(text.split())
+    return printable(text)
 
 
-def _read_picture(
-    path: Path, file: Any, mosaic: bool
-) -> tuple[Array, str, list[str], dict[str, str]]:
-    """The pixels of the part and layer that hold the picture, the layer, warnings, attributes."""
+class SubsampledError(ImageError):
+    """OpenImageIO cannot read a file, for its channels are not all of one size."""
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """Where in a file the picture is: the part, the layer as it is called, the channels."""
+
+    part: int
+    layer: str
+    channels: tuple[int, ...]
+    xyz: bool = False
+
+    @property
+    def rank(self) -> tuple[bool, int, int, str]:
+        """Pictures in order of preference: colour, then a known name, then as in the file."""
+        known = self.layer.lower().rpartition(".")[2]
+        names = [*PICTURE_LAYERS, known]
+        return len(self.channels) < 3, names.index(known), self.part, self.layer
+
+
+def _find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> _Picture:
+    """The picture of a file, which is then at its part.
+
+    Raises:
+        ImageError: there is none, or it is of a kind that cannot be read.
+    """
     found: list[str] = []
+    pictures: list[_Picture] = []
+    refusals: list[str] = []
+    several = file.seek_subimage(1, 0)
     part = 0
     while file.seek_subimage(part, 0):
         spec = file.spec()
-        if spec.deep:
-            raise ImageError(
-                f"{path}: a deep image (many samples a pixel); flatten it in the renderer first"
-            )
-        if "CubeFace" in (spec.getattribute("textureformat") or ""):
-            raise ImageError(f"{path}: a cube map, not a picture")
+        part += 1
+        if refusal := _no_picture(spec, file.seek_subimage(part - 1, 1)):
+            refusals.append(refusal)
+            continue
         names = list(spec.channelnames)
         found += [name for name in names if name not in found]
-        attributes = _attributes(spec)
-        if picture := mosaic_channel(names) if mosaic else picture_channels(names):
-            layer, channels = picture
-            return _read_part(path, file, part, channels), layer, _warnings(spec), attributes
-        if "kind" in attributes:
-            raise KindError(path, attributes)
-        part += 1
-    listed = ", ".join(name for name in found[:20] if name) or "none"
-    wanted = "no single channel with a mosaic" if mosaic else "no R, G and B channels"
-    raise ImageError(f"{path}: {wanted}; found {listed}")
+        kept = "kind" in _attributes(spec)
+        called = str(spec.getattribute("oiio:subimagename") or "") if several else ""
+        if mosaic:
+            channel = mosaic_channel(names)
+            here = [_Picture(part - 1, *channel)] if channel else []
+        else:
+            here = [
+                _Picture(part - 1, _joined(called, own), channels, xyz)
+                for own, channels, xyz in _layers(names, kept)
+            ]
+        if kept and not here:
+            raise KindError(path, _attributes(spec))
+        pictures += here
+    if layer is not None and pictures:
+        named = [p for p in pictures if p.layer.lower() == layer.lower()]
+        if not named:
+            listed = ", ".join(dict.fromkeys(p.layer or "one without a name" for p in pictures))
+            raise ImageError(
+                f"{path}: no layer {layer!r} with a picture; its layers: {printable(listed)}"
+            )
+        pictures = named
+    if not pictures and refusals:
+        raise ImageError(f"{path}: {refusals[0]}")
+    if not pictures:
+        listed = ", ".join(name for name in found[:20] if name) or "none"
+        wanted = "no single channel with a mosaic" if mosaic else "no R, G and B channels"
+        raise ImageError(f"{path}: {wanted}; found {printable(listed)}")
+    best = min(pictures, key=lambda picture: picture.rank)
+    file.seek_subimage(best.part, 0)
+    file.geterror()  # of parts and levels that were looked for and are not there
+    return best
+
+
+def _no_picture(spec: Any, has_levels: bool) -> str:
+    """Why a part is no picture, whatever its channels; "" where it may be one."""
+    if spec.deep:
+        return "a deep image (many samples a pixel); flatten it in the renderer first"
+    if "CubeFace" in str(spec.getattribute("textureformat")):
+        return "a cube map, not a picture"
+    return "a texture (one image in several sizes), not a picture" if has_levels else ""
+
+
+def _joined(part: str, layer: str) -> str:
+    """A layer's name with its part's, unless it begins with that.
+
+    >>> _joined("left", ""), _joined("left", "beauty"), _joined("View", "View.Combined")
+    ('left', 'left.beauty', 'View.Combined')
+    """
+    if f"{layer}.".startswith(f"{part}."):
+        return layer
+    return f"{part}.{layer}" if part and layer else part or layer
+
+
+def _layers(names: Sequence[str], kept: bool) -> Iterator[tuple[str, tuple[int, ...], bool]]:
+    """The layers that can be a picture: their names, channels, and whether those are X, Y and Z.
+
+    Only a layer without a name is a picture in X, Y and Z; others are positions and normals. Only
+    one that has nothing beside it is luminance, and none that clpipe kept is.
+    """
+    for layer in dict.fromkeys(name.rpartition(".")[0] for name in names):
+        place = {
+            name.rpartition(".")[2].lower(): i
+            for i, name in enumerate(names)
+            if name.rpartition(".")[0].lower() == layer.lower()
+        }
+        here = set(place)
+        if here >= set("rgb"):
+            wanted = "rgb"
+        elif not kept and not layer and here - {"a"} == set("xyz"):
+            wanted = "xyz"
+        elif not kept and here - {"a", "z"} == {"y"}:
+            wanted = "y"
+        else:
+            continue
+        yield layer, tuple(place[c] for c in wanted), wanted == "xyz"
 
 
 def _attributes(spec: Any) -> dict[str, str]:
@@ -222,11 +359,13 @@ def shot_of(spec: Any) -> dict[str, float]:
 def read_attributes(path: Path) -> dict[str, str]:
     """The attributes that clpipe gave to a kept image; none if the file is no such image."""
     file = oiio.ImageInput.open(str(path)) if path.is_file() else None
-    if file is None:
-        oiio.geterror()  # it would be told at the next call
-        return {}
-    with contextlib.closing(file):
-        return _attributes(file.spec())
+    with contextlib.suppress(UnicodeDecodeError):
+        if file is None:
+            oiio.geterror()  # it would be told at the next call
+            return {}
+        with contextlib.closing(file):
+            return _attributes(file.spec())
+    return {}
 
 
 def mosaic_channel(names: Sequence[str]) -> tuple[str, tuple[int]] | None:
@@ -239,47 +378,41 @@ def mosaic_channel(names: Sequence[str]) -> tuple[str, tuple[int]] | None:
     return ("", (places[0],)) if len(places) == 1 else None
 
 
-def picture_channels(names: Sequence[str]) -> tuple[str, tuple[int, int, int]] | None:
+def picture_channels(names: Sequence[str]) -> tuple[str, tuple[int, ...]] | None:
     """The layer that holds the picture, and where its R, G and B stand among the channels.
 
     >>> picture_channels(["View.Depth.Z", "View.Combined.B", "View.Combined.G", "View.Combined.R"])
     ('View.Combined', (3, 2, 1))
     """
-    place = {name.lower(): i for i, name in enumerate(names)}
-    layers = {name.rpartition(".")[0] for name in names}
-
-    def rank(layer: str) -> tuple[int, str]:
-        last = layer.lower().rpartition(".")[2]
-        known = PICTURE_LAYERS.index(last) if last in PICTURE_LAYERS else len(PICTURE_LAYERS)
-        return known, layer
-
-    for layer in sorted(layers, key=rank):
-        prefix = f"{layer.lower()}." if layer else ""
-        if all(prefix + c in place for c in "rgb"):
-            red, green, blue = (place[prefix + c] for c in "rgb")
-            return layer, (red, green, blue)
-    return None
+    pictures = [_Picture(0, *layer) for layer in _layers(names, kept=True)]
+    best = min(pictures, key=lambda picture: picture.rank, default=None)
+    return (best.layer, best.channels) if best else None
 
 
-def _read_part(path: Path, file: Any, part: int, channels: tuple[int, ...]) -> Array:
-    """Three channels of one part, or one, in its display window."""
-    spec = file.spec()
+def _read_part(path: Path, file: Any, picture: _Picture, mosaic: bool, max_pixels: int) -> Array:
+    """Three channels of one part, or one, in its display window.
+
+    Raises:
+        ImageError: they are not linear float (a mosaic may be whole), too many, or damaged.
+    """
+    spec, channels = file.spec(), picture.channels
     formats = spec.channelformats or [spec.format] * spec.nchannels
     types = {formats[i].basetype for i in channels}
-    whole = len(channels) == 1 and types <= {oiio.UINT16, oiio.UINT32}
+    whole = mosaic and types <= {oiio.UINT16, oiio.UINT32}
     if not whole and not types <= {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}:
         raise ImageError(
             f"{path}: holds {spec.format} samples, not linear float ones; "
             "give an OpenEXR file (Radiance HDR, PFM, float TIFF); a photograph: -c unprocess"
         )
     width, height = spec.full_width, spec.full_height
-    if not 0 < width * height <= MAX_PIXELS or spec.width * spec.height > MAX_PIXELS:
-        raise ImageError(f"{path}: {width}x{height} pixels; at most {MAX_PIXELS} can be read")
+    for wide, high in ((width, height), (spec.width, spec.height)):
+        if not 0 < wide * high <= max_pixels:
+            raise ImageError(f"{path}: {wide}x{high} pixels; at most {max_pixels} are read")
     half = types == {oiio.HALF}
     first, last = min(channels), max(channels) + 1
     # Asked for as float, whole numbers would come scaled to 0..1.
     wanted = types.pop() if whole else oiio.HALF if half else oiio.FLOAT
-    data = file.read_image(part, 0, first, last, wanted)
+    data = file.read_image(picture.part, 0, first, last, wanted)
     problem = file.geterror()
     if data is None or problem:
         raise ImageError(f"{path}: damaged: {_reason(problem)}")
@@ -289,8 +422,9 @@ def _read_part(path: Path, file: Any, part: int, channels: tuple[int, ...]) -> A
     order = [i - first for i in channels]
     if order != list(range(last - first)):
         pixels = pixels[..., order]
-    if (spec.x, spec.y, spec.width, spec.height) != (spec.full_x, spec.full_y, width, height):
-        pixels = display_window(pixels, spec.x - spec.full_x, spec.y - spec.full_y, width, height)
+    x, y = spec.x - spec.full_x, spec.y - spec.full_y
+    if (x, y, spec.width, spec.height) != (0, 0, width, height):
+        pixels = display_window(pixels, x, y, width, height)
     return np.ascontiguousarray(pixels if len(channels) > 1 else pixels[..., 0])
 
 
@@ -314,15 +448,6 @@ def without_non_finite(pixels: Array) -> tuple[Array, int]:
     if count:
         pixels = np.where(bad, pixels.dtype.type(0), pixels)
     return pixels, count
-
-
-def _warnings(spec: Any) -> list[str]:
-    """What a user should know of how the picture is read."""
-    primaries = spec.getattribute("chromaticities")
-    srgb = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-    if primaries is not None and not np.allclose(primaries, srgb, atol=2e-3):
-        return ["its chromaticities are not those of linear sRGB; its values are used as they are"]
-    return []
 
 
 def srgb_profile() -> bytes:

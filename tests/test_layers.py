@@ -9,10 +9,10 @@ from tests.conftest import ROOT
 PACKAGE = ROOT / "clpipe"
 # Lower ones first; a module imports only from lower levels.
 LEVELS = [
-    {"errors", "types", "suggest", "noise_model", "output"},
+    {"errors", "types", "suggest", "noise_model", "output", "printable"},
     {"reference"},
-    {"camera", "statistics", "raw_dump"},
-    {"stage", "calibration"},
+    {"camera", "statistics", "raw_dump", "exr_colour"},
+    {"stage", "calibration", "luminance_chroma"},
     {"stages"},
     {"registry"},
     {"config"},
@@ -30,6 +30,7 @@ LEVELS = [
 LEVEL = {name: i for i, names in enumerate(LEVELS) for name in names}
 DOORS = {
     "pyopencl": {"device"},
+    "OpenEXR": {"luminance_chroma"},
     "OpenImageIO": {"image_io"},
     "PIL": {"image_io"},
     "click": {"cli"},

@@ -1,0 +1,356 @@
+"""Renders as users have them: every real file gives the right picture or the right refusal."""
+
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from click.testing import CliRunner
+
+from clpipe.cli import main
+from clpipe.errors import ImageError
+from clpipe.exr_colour import CIE_XYZ, SRGB, rgb_to_xyz, to_linear_srgb
+from clpipe.image_io import read_image
+from tests.conftest import ROOT, STILL_LIFE
+
+# Height, width, means of red, green and blue. Sizes and means of those that are RGB as they are
+# were found with the OpenEXR package; the others are converted from its values.
+PICTURES = {
+    "exr/Beachball_multipart.0001.exr": (1556, 2048, 0.054262, 0.044184, 0.061408),
+    "exr/Chromaticities_XYZ.exr": (406, 610, 0.36526, 0.27779, 0.11534),
+    "exr/ScanLines_Cannon.exr": (566, 780, 0.34709, 0.35931, 0.34587),
+    "exr/ScanLines_Carrots.exr": (400, 600, 0.20892, 0.13207, 0.052943),
+    "exr/ScanLines_Desk.exr": (874, 644, 6.064, 6.0484, 2.8502),
+    "exr/Tiles_GoldenGate.exr": (860, 1262, 0.091795, 0.097724, 0.28013),
+    "exr/blender_world_forest.exr": (512, 1024, 0.72915, 0.78062, 0.8972),
+    "exr/blender_world_interior.exr": (512, 1024, 0.99463, 0.87383, 0.72128),
+    "exr/blender_world_night.exr": (512, 1024, 0.14056, 0.1186, 0.087739),
+    "exr_odd/DisplayWindow_t03.exr": (280, 370, 0.0053378, 0.0062066, 0.74247),
+    "exr_odd/DisplayWindow_t08.exr": (401, 501, 0.0044798, 0.0054853, 0.44204),
+    "exr_odd/DisplayWindow_t13.exr": (101, 101, 0, 9.803e-05, 0),
+    "exr_odd/LuminanceChroma_Flowers.exr": (734, 784, 0.7045, 0.72126, 1.7451),
+    "exr_odd/TestImages_AllHalfValues.exr": (256, 256, 0, 0, 0),
+    "exr_odd/TestImages_BrightRingsNanInf.exr": (800, 800, 27.585, 27.585, 27.585),
+    "exr_odd/TestImages_GrayRampsHorizontal.exr": (800, 800, 0.64293, 0.64293, 0.64293),
+    "exr_odd/TestImages_WideColorGamut.exr": (800, 800, 1.0991, 0.96227, 1.0819),
+}
+REFUSALS = {
+    "exr_odd/MultiResolution_WavyLinesCube.exr": "a cube map",
+    "exr_odd/v2_LowResLeftView_Trunks.exr": "a deep image",
+}
+ACES = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+
+
+def test_every_real_file_is_in_the_table(shared_data):
+    found = {f"{d}/{p.name}" for d in ("exr", "exr_odd") for p in (shared_data / d).iterdir()}
+    assert found == {*PICTURES, *REFUSALS}
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_the_right_picture(shared_data, name):
+    height, width, *means = PICTURES[name]
+    pixels = read_image(shared_data / name).pixels
+    assert pixels.shape == (height, width, 3)
+    found = pixels.mean((0, 1), dtype=np.float64)
+    assert np.allclose(found, means, rtol=2e-4, atol=1e-7), found
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_the_right_refusal(shared_data, name):
+    with pytest.raises(ImageError, match=REFUSALS[name]):
+        read_image(shared_data / name)
+
+
+REFUSED_IN_PEACE = """
+import resource, sys, time
+from pathlib import Path
+from clpipe.errors import ImageError
+from clpipe.image_io import read_image
+for path in map(Path, sys.argv[1:]):
+    start = time.perf_counter()
+    try:
+        read_image(path)
+        sys.exit(f"{path}: was read")
+    except ImageError as error:
+        assert str(path) in str(error) and str(error).isprintable(), error
+    assert time.perf_counter() - start < 5, path
+kilobytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+assert kilobytes < 2 << 20, kilobytes
+"""
+
+
+def refused(*paths: Path) -> None:
+    """Read files in a process of their own: all refused, each within 5 s, and 2 GiB for all."""
+    command = [sys.executable, "-W", "error", "-c", REFUSED_IN_PEACE, *map(str, paths)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+
+
+def test_damaged_files_cost_nothing(shared_data, tmp_path):
+    """As they are called, and called .exr, which is when they are read as such."""
+    damaged = sorted((shared_data / "exr_damaged").iterdir())
+    assert len(damaged) == 23
+    called = [tmp_path / f"{path.name}.exr" for path in damaged]
+    for path, copy in zip(damaged, called, strict=True):
+        copy.write_bytes(path.read_bytes())
+    refused(*damaged, *called)
+
+
+def exr(channels, width, height, display=None, attributes=()):
+    """An uncompressed EXR of half channels, {name: (plane, sampling)}, sizes as claimed."""
+
+    def attribute(name, kind, data):
+        return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(data)) + data
+
+    listed = b"".join(
+        name.encode() + b"\0" + struct.pack("<iB3xii", 1, 0, step, step)
+        for name, (_, step) in sorted(channels.items())
+    )
+    box = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    wide, high = display or (width, height)
+    out = struct.pack("<ii", 20000630, 2)
+    out += attribute("channels", "chlist", listed + b"\0") + attribute(
+        "compression", "compression", b"\0"
+    )
+    out += attribute("dataWindow", "box2i", box)
+    out += attribute("displayWindow", "box2i", struct.pack("<4i", 0, 0, wide - 1, high - 1))
+    out += attribute("lineOrder", "lineOrder", b"\0")
+    out += attribute("pixelAspectRatio", "float", struct.pack("<f", 1))
+    out += attribute("screenWindowCenter", "v2f", bytes(8))
+    out += attribute("screenWindowWidth", "float", struct.pack("<f", 1))
+    out += b"".join(attribute(*a) for a in attributes) + b"\0"
+    rows = []
+    for y in range(min(height, 1000)):
+        data = b"".join(
+            np.asarray(plane[y // step], np.float16).tobytes()
+            for _, (plane, step) in sorted(channels.items())
+            if y % step == 0
+        )
+        rows.append(struct.pack("<ii", y, len(data)) + data)
+    place = len(out) + 8 * len(rows)
+    offsets = np.cumsum([place, *map(len, rows)])[:-1].astype("<u8")
+    return out + offsets.tobytes() + b"".join(rows)
+
+
+def test_too_many_pixels_are_refused_before_memory_is_taken(tmp_path):
+    planes = {c: (np.zeros((1000, 1)), 1) for c in "RGB"}
+    chroma = {"Y": (np.zeros((1000, 2)), 1), "RY": (np.zeros((500, 1)), 2)}
+    chroma["BY"] = chroma["RY"]
+    files = {
+        "data": exr(planes, 40_000, 25_000),
+        "display": exr(planes, 1, 4, display=(40_000, 25_000)),
+        "tall": exr(planes, 1, 1_000_000_000),
+        "chroma": exr(chroma, 40_000, 25_000),
+        "chroma_display": exr(chroma, 2, 4, display=(40_000, 25_000)),
+    }
+    for name, data in files.items():
+        (tmp_path / f"{name}.exr").write_bytes(data)
+        if "display" in name or "chroma" in name:  # OpenImageIO doubts the others by itself
+            with pytest.raises(ImageError, match="40000x25000 pixels; at most 200000000 are read"):
+                read_image(tmp_path / f"{name}.exr")
+    refused(*(tmp_path / f"{name}.exr" for name in files))
+
+
+def test_max_pixels_on_the_command_line(tmp_path, write_exr):
+    path = write_exr("a.exr", np.zeros((6, 9, 3)))
+    command = ["run", str(path), "-o", str(tmp_path / "out"), "--max-pixels"]
+    done = CliRunner().invoke(main, [*command, "53"])
+    assert done.exit_code == 1
+    assert "a.exr: 9x6 pixels; at most 53 are read" in done.output
+    assert CliRunner().invoke(main, [*command, "54"]).exit_code == 0
+
+
+def test_luminance_and_chroma(tmp_path):
+    """A picture comes back from luminance and chroma where its colours change linearly."""
+    height, width = 12, 18
+    y = np.random.default_rng(0).uniform(0.2, 2, (height, width)).astype(np.float16)
+    across = np.arange(width) / width / 2
+    red = np.broadcast_to(across, y.shape)
+    blue = -np.broadcast_to(across, y.shape)
+    path = tmp_path / "yc.exr"
+    channels = {"Y": (y, 1), "RY": (red[::2, ::2], 2), "BY": (blue[::2, ::2], 2)}
+    path.write_bytes(exr(channels, width, height))
+    source = read_image(path)
+    r, g, b = np.moveaxis(source.pixels[:, :-1], -1, 0)
+    y, red, blue = y[:, :-1], red[:, :-1], blue[:, :-1]
+    assert np.allclose(r, (red + 1) * y, rtol=1e-3)
+    assert np.allclose(b, (blue + 1) * y, rtol=1e-3)
+    assert np.allclose(0.2126 * r + 0.7152 * g + 0.0722 * b, y, rtol=1e-3)
+    for cut in (300, 400, len(path.read_bytes()) - 9):
+        path.write_bytes(path.read_bytes()[:cut])
+        with pytest.raises(ImageError, match=r"yc\.exr: .*(damaged|cannot be read)"):
+            read_image(path)
+    path.write_bytes(exr({"Y": (y[:, :2], 1), "U": (red[::2, :1], 2)}, 2, height))
+    with pytest.raises(ImageError, match=r"subsampled channels .* Y, RY, BY only; found U, Y"):
+        read_image(path)
+
+
+def with_chromaticities(pixels, path, *chromaticities, **more):
+    channels = {c: (pixels[..., i], 1) for i, c in enumerate("RGB")}
+    kinds = {8: "chromaticities", 2: "v2f"}
+    given = {"chromaticities": chromaticities, **more} if chromaticities else more
+    attributes = [(n, kinds[len(v)], struct.pack(f"<{len(v)}f", *v)) for n, v in given.items()]
+    path.write_bytes(exr(channels, pixels.shape[1], pixels.shape[0], attributes=attributes))
+    return read_image(path)
+
+
+def test_other_primaries_become_those_of_srgb(tmp_path):
+    grey = np.full((4, 6, 3), 0.5)
+    path = tmp_path / "a.exr"
+    source = with_chromaticities(grey, path, *ACES)
+    assert np.allclose(source.pixels, 0.5, atol=1e-6)  # white stays white
+    assert source.warnings == ("its colours were converted to linear sRGB",)
+    srgb = np.random.default_rng(0).random((4, 6, 3))
+    source = with_chromaticities(srgb @ rgb_to_xyz(SRGB).T, path, *CIE_XYZ)
+    assert np.allclose(source.pixels, srgb, atol=4e-3)
+    source = with_chromaticities(srgb, path, *SRGB)
+    assert source.pixels.dtype == np.float16
+    assert not source.warnings
+    for primaries in (SRGB, ()):
+        source = with_chromaticities(grey, path, *primaries, adoptedNeutral=(0.3457, 0.3585))
+        assert source.pixels[0, 0, 2] > source.pixels[0, 0, 0]  # what D50 is becomes neutral
+    for wrong in ((0,) * 8, (np.nan,) * 8, (*SRGB[:6], 0.3, 0), (*SRGB[:2] * 3, 0.3, 0.3)):
+        with pytest.raises(ImageError, match=r"a\.exr: its chromaticities are no red"):
+            with_chromaticities(grey, path, *wrong)
+
+
+def test_the_matrix_of_aces_is_the_usual_one():
+    """ACES2065-1 to linear sRGB with Bradford, as other programs have it built in."""
+    usual = [
+        [2.52169, -1.13413, -0.38756],
+        [-0.27648, 1.37272, -0.09624],
+        [-0.01538, -0.15298, 1.16835],
+    ]
+    assert np.allclose(to_linear_srgb(ACES), usual, atol=5e-4)
+
+
+def test_xyz_channels_are_a_picture_but_normals_are_not(write_exr):
+    srgb = np.random.default_rng(0).random((4, 6, 3)).astype(np.float32)
+    xyz = srgb @ rgb_to_xyz(SRGB).T
+    assert np.allclose(read_image(write_exr("x.exr", xyz, "X,Y,Z", False)).pixels, srgb, atol=1e-5)
+    with pytest.raises(ImageError, match=r"no R, G and B channels; found N\.X, N\.Y, N\.Z"):
+        read_image(write_exr("n.exr", xyz, "N.X,N.Y,N.Z"))
+
+
+def test_luminance_alone_is_grey(write_exr):
+    pixels = np.arange(24, dtype=np.float32).reshape(4, 6, 1)
+    source = read_image(write_exr("y.exr", pixels, "Y"))
+    assert np.array_equal(source.pixels, np.repeat(pixels, 3, axis=-1))
+    assert source.warnings == ("it holds luminance alone; the picture is grey",)
+    with pytest.raises(ImageError, match="no R, G and B channels; found Y, Cb, Cr"):
+        read_image(write_exr("ycc.exr", np.repeat(pixels, 3, axis=-1), "Y,Cb,Cr"))
+
+
+def multipart(path, parts):
+    """An EXR of parts, {name: channels}; part i holds i + 1."""
+    specs = []
+    for name, channels in parts.items():
+        spec = oiio.ImageSpec(6, 4, len(channels), oiio.HALF)
+        spec.channelnames = tuple(channels)
+        spec.attribute("oiio:subimagename", name)
+        specs.append(spec)
+    file = oiio.ImageOutput.create(str(path))
+    assert file.open(str(path), tuple(specs))
+    for i, spec in enumerate(specs):
+        assert i == 0 or file.open(str(path), spec, "AppendSubimage")
+        assert file.write_image(np.full((4, 6, spec.nchannels), i + 1, np.float32))
+    assert file.close()
+    return path
+
+
+def test_the_layer(tmp_path, write_exr):
+    channels = [f"{layer}.{c}" for layer in ("diffuse", "Beauty", "N") for c in "RGB"]
+    pixels = np.repeat(np.arange(1, 4, dtype=np.float32), 3) * np.ones((4, 6, 9), np.float32)
+    one = write_exr("one.exr", pixels, ",".join(channels))
+    parts = {
+        "right": "RGBA",
+        "depth": "Z",
+        "left": "RGB",
+        "View.Combined": ["View.Combined." + c for c in "RGB"],
+    }
+    many = multipart(tmp_path / "many.exr", parts)
+    for path, layer, value, called in (
+        (one, None, 2, "Beauty"),
+        (one, "Diffuse", 1, "diffuse"),
+        (many, None, 4, "View.Combined"),
+        (many, "left", 3, "left"),
+    ):
+        source = read_image(path, layer=layer)
+        assert (source.pixels[0, 0, 0], source.layer) == (value, called)
+    for path, listed in ((one, "Beauty, N, diffuse"), (many, "right, left, View.Combined")):
+        with pytest.raises(ImageError, match=f"no layer 'x' with a picture; its layers: {listed}"):
+            read_image(path, layer="x")
+    run = ["run", str(one), "-o", str(tmp_path / "out"), "--layer"]
+    done = CliRunner().invoke(main, [*run, "depth"])
+    assert done.exit_code == 1
+    assert "its layers: Beauty, N, diffuse" in done.output
+    assert CliRunner().invoke(main, [*run, "diffuse"]).exit_code == 0
+    done = CliRunner().invoke(main, [*run, "diffuse", "--start-at", "normalize"])
+    assert done.exit_code == 2
+    assert "--layer" in done.output
+
+
+def test_textures_are_refused(tmp_path):
+    pixels = oiio.ImageBuf(oiio.ImageSpec(64, 64, 3, oiio.HALF))
+    path = tmp_path / "texture.exr"
+    assert oiio.ImageBufAlgo.make_texture(oiio.MakeTxTexture, pixels, str(path))
+    with pytest.raises(ImageError, match=r"texture\.exr: a texture .*not a picture"):
+        read_image(path)
+
+
+@pytest.mark.parametrize(
+    "compression", ["none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab"]
+)
+@pytest.mark.parametrize("tile", [0, 16])
+@pytest.mark.parametrize("format_", [oiio.HALF, oiio.FLOAT])
+def test_compressions(tmp_path, compression, tile, format_):
+    across = np.linspace(0, 1, 50, dtype=np.float32)[None, :, None]
+    pixels = across * np.linspace(0.5, 1, 40, dtype=np.float32)[:, None, None] * [1, 0.5, 0.2]
+    spec = oiio.ImageSpec(50, 40, 3, format_)
+    spec.attribute("compression", compression)
+    spec.tile_width = spec.tile_height = tile
+    path = tmp_path / "a.exr"
+    file = oiio.ImageOutput.create(str(path))
+    assert file.open(str(path), spec)
+    assert file.write_image(pixels.astype(np.float32))
+    assert file.close()
+    assert np.allclose(read_image(path).pixels, pixels, atol=0.01)
+
+
+def test_pfm_stands_on_its_feet(tmp_path):
+    """Rows go from bottom to top (Debevec's PFM), in the byte order that the sign says."""
+    pixels = np.random.default_rng(0).random((8, 10, 3)).astype(np.float32)
+    for sign, order in ((-1, "<f4"), (1, ">f4")):
+        data = pixels[::-1].astype(order).tobytes()
+        (tmp_path / "a.pfm").write_bytes(b"PF\n10 8\n%d.0\n" % sign + data)
+        assert np.array_equal(read_image(tmp_path / "a.pfm").pixels, pixels)
+
+
+@pytest.mark.parametrize("ending", ["hdr", "tif"])
+def test_other_formats(tmp_path, ending):
+    pixels = np.random.default_rng(0).random((8, 10, 3)).astype(np.float32)
+    path = tmp_path / f"a.{ending}"
+    file = oiio.ImageOutput.create(str(path))
+    assert file.open(str(path), oiio.ImageSpec(10, 8, 3, oiio.FLOAT))
+    assert file.write_image(pixels)
+    assert file.close()
+    found = read_image(path).pixels
+    assert np.allclose(found, pixels, atol=0.005)
+    assert found.dtype == np.float32
+
+
+def test_mutated_files_make_no_traceback_hang_or_crash(tmp_path):
+    planes = {c: (np.random.default_rng(0).random((8, 6)), 1) for c in "RGB"}
+    (tmp_path / "rgb.exr").write_bytes(exr(planes, 6, 8))
+    half = np.zeros((4, 3))
+    chroma = {"Y": (np.ones((8, 6)), 1), "RY": (half, 2), "BY": (half, 2)}
+    primaries = [("chromaticities", "chromaticities", struct.pack("<8f", *ACES))]
+    (tmp_path / "yc.exr").write_bytes(exr(chroma, 6, 8, attributes=primaries))
+    files = [*tmp_path.iterdir(), STILL_LIFE, *(ROOT / "clpipe" / "cameras").glob("*.toml")]
+    command = [sys.executable, ROOT / "tools" / "fuzz", "--cases", "300", *files]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "refused" in done.stdout
