@@ -78,8 +78,9 @@ def read_facts(path: Path) -> RawFacts:
     said = _exif(path)
     with _opened(path) as raw:
         pattern = _pattern(path, raw)
-        iso = raw.other.iso_speed or said.number("ISOSpeedRatings", 0)
-        exposure = said.number("ExposureTime", raw.other.shutter_speed)
+        speed, shutter, aperture, focal_length = _shot(raw)
+        iso = speed or said.number("ISOSpeedRatings", 0)
+        exposure = said.number("ExposureTime", shutter)
         if not (said.tags or iso or exposure):
             raise ImageError(
                 f"{path}: names no camera, ISO or exposure; a dump of samples, not a camera's raw "
@@ -111,8 +112,8 @@ def read_facts(path: Path) -> RawFacts:
             xyz_to_camera=matrix,
             camera_to_srgb=to_srgb,
             orientation=ORIENTATIONS.get(size.flip, 1),
-            aperture=said.number("FNumber", raw.other.aperture),
-            focal_length=said.number("FocalLength", raw.other.focal_length),
+            aperture=said.number("FNumber", aperture),
+            focal_length=said.number("FocalLength", focal_length),
             taken=next(filter(DATE.fullmatch, map(said.text, DATE_TAGS)), ""),
         )
 
@@ -179,6 +180,15 @@ def _opened(path: Path) -> Iterator[Any]:
         raise ImageError(f"{path}: damaged, or no raw that LibRaw knows: {reason}") from None
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def _shot(raw: Any) -> tuple[float, float, float, float]:
+    """ISO, exposure (s), aperture and focal length (mm) as LibRaw has them; 0 is not known."""
+    try:
+        other = raw.other
+    except (ValueError, OverflowError, OSError):  # of a date that cannot be
+        return 0.0, 0.0, 0.0, 0.0
+    return other.iso_speed, other.shutter_speed, other.aperture, other.focal_length
 
 
 def _pattern(path: Path, raw: Any) -> Pattern:

@@ -504,3 +504,11 @@ def test_colours_are_those_that_libraw_makes(shared_data, tmp_path):
 def test_a_raw_that_says_too_little_is_refused_by_the_library_too(shared_data):
     with pytest.raises(ImageError, match="names no camera, ISO or exposure"):
         read_facts(shared_data / "raw" / "infisp_BlackImage_1920x1080_12bits_BGGR.raw")
+
+
+def test_a_date_that_cannot_be_stops_nobody(tmp_path):
+    """Year 20224: a digit too many."""
+    path = tmp_path / "a.dng"
+    write_dng(path, mosaic(), changes=[field(306, 2, b"20224:5:06 07:08:09")])
+    clpipe("run", path, "-o", tmp_path / "out")
+    assert (tmp_path / "out" / "a.jpg").is_file()
