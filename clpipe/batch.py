@@ -22,7 +22,7 @@ from clpipe.image_io import (
     CARRIED,
     JPEG_MAX_SIDE,
     READABLE,
-    USUAL_MAX_PIXELS,
+    Reading,
     SourceImage,
     Tags,
     carried,
@@ -435,17 +435,15 @@ def run_jobs(
     runner: Runner,
     target: Target,
     raws: RawEntry,
+    how: Reading,
     reentry: Reentry | None = None,
-    layer: str | None = None,
-    max_pixels: int = USUAL_MAX_PIXELS,
 ) -> Iterator[Outcome]:
     """Put every job through; one that fails is reported and the others go on.
 
     The next file is read, and the first one read while the kernels compile, in a second thread.
-    ``layer`` and ``max_pixels`` are those of :func:`clpipe.image_io.read_image`.
     """
     kind = runner.chain.source
-    reading_of = partial(raws.read, kind=kind, layer=layer, max_pixels=max_pixels)
+    reading_of = partial(raws.read, kind=kind, how=how)
     with ThreadPoolExecutor(1) as reader:
         ahead = reader.submit(reading_of, jobs[0].path)
         runner.warm_up(half=reentry is None and kind is Kind.RGB)

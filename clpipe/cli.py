@@ -33,11 +33,19 @@ from clpipe.config import (
 )
 from clpipe.device import find_devices, open_device
 from clpipe.errors import ClpipeError, RequestError
-from clpipe.image_io import FINISHED, MAX_PIXELS, USUAL_MAX_PIXELS
+from clpipe.image_io import (
+    FINISHED,
+    MAX_PIXELS,
+    READABLE,
+    TRANSFERS,
+    USUAL_MAX_PIXELS,
+    Reading,
+)
 from clpipe.measure import load
 from clpipe.measure import measure as measure_images
 from clpipe.raw_dump import TYPES
 from clpipe.raw_entry import RawEntry
+from clpipe.raw_io import ENDINGS
 from clpipe.reentry import Reentry
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.registry import all_stages, load_stage_file
@@ -257,6 +265,11 @@ def main() -> None:
 @click.option(
     "--raw-type", type=click.Choice(list(TYPES)), help="And how their samples are stored."
 )
+@click.option(
+    "--transfer",
+    type=click.Choice(list(TRANSFERS)),
+    help="Of renders in whole numbers (PNG, TIFF of 8 or 16 bits), which do not say it.",
+)
 @click.option("--layer", metavar="NAME", help="The layer or part of an EXR that is the picture.")
 @click.option(
     "--max-pixels",
@@ -273,6 +286,7 @@ def run(
     inputs: tuple[str, ...],
     output: Path,
     frames: int | None,
+    transfer: str | None,
     layer: str | None,
     max_pixels: int,
     keep: tuple[str, ...],
@@ -290,15 +304,18 @@ def run(
     reentry = Reentry(asked.start_at, asked.chain) if asked.start_at else None
     raws = RawEntry(asked.settings, asked.chain_of, asked.start_at, asked.settings().dump)
     finished = reentry is None and entry(asked.settings()) is Kind.DISPLAY
-    jobs = find_jobs(inputs, output, *([FINISHED] if finished else []))
+    how = Reading(layer, max_pixels, transfer)
+    pictures = FINISHED if finished else (*READABLE, *(FINISHED if transfer else ()))
+    jobs = find_jobs(inputs, output, (*pictures, *(() if finished else ENDINGS)))
     if all(raws.takes(job.path) for job in jobs):
         chain = raws.first_chain(jobs[0].path)
     else:
         chain = reentry.first_chain(jobs[0].path) if reentry else asked.chain()
-    if layer is not None and chain.source is not Kind.RGB:
-        raise RequestError(
-            f"--layer: it is one of a render, but the chain reads {chain.source.label}"
-        )
+    for option, value in (("--layer", layer), ("--transfer", transfer)):
+        if value is not None and chain.source is not Kind.RGB:
+            raise RequestError(
+                f"{option}: it is one of a render, but the chain reads {chain.source.label}"
+            )
     kept = chain.kept(keep)
     whole = asked.until is None or chain.result is Kind.DISPLAY
     formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
@@ -311,7 +328,7 @@ def run(
     runner = target.runner(chain, device)
     failed = 0
     left_out = 0
-    for outcome in run_jobs(jobs, runner, target, raws, reentry, layer, max_pixels):
+    for outcome in run_jobs(jobs, runner, target, raws, how, reentry):
         if outcome.left_out:
             left_out += 1
             continue

@@ -5,12 +5,13 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
+from numpy.typing import NDArray
 from PIL import Image, ImageCms
 from pydantic import TypeAdapter
 
@@ -22,6 +23,7 @@ from clpipe.luminance_chroma import read_luminance_chroma
 from clpipe.output import Output, exif
 from clpipe.printable import printable
 from clpipe.stage import Kind
+from clpipe.stages.inverse_gamma import inverse_srgb_curve
 from clpipe.types import Array, Floats
 
 READABLE = (".exr", ".hdr", ".pfm", ".tif", ".tiff")
@@ -120,21 +122,39 @@ def read_image(
     return SourceImage(pixels, digest, name, tuple(warnings), attributes, shot)
 
 
-def read_source(
-    path: Path, kind: Kind, layer: str | None = None, max_pixels: int = USUAL_MAX_PIXELS
-) -> SourceImage:
-    """The image of a file, as a chain that starts on this kind wants it.
+TRANSFERS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+    "linear": lambda x: x,
+    "srgb": inverse_srgb_curve,
+}
 
-    ``layer`` and ``max_pixels`` are those of :func:`read_image`.
+
+@dataclass(frozen=True)
+class Reading:
+    """How files are read, where that is not left to them.
+
+    ``layer`` and ``max_pixels`` are those of :func:`read_image`. ``transfer`` is that of renders in
+    whole numbers (PNG, TIFF), one of :data:`TRANSFERS`; None refuses them.
+    """
+
+    layer: str | None = None
+    max_pixels: int = USUAL_MAX_PIXELS
+    transfer: str | None = None
+
+
+def read_source(path: Path, kind: Kind, how: Reading) -> SourceImage:
+    """The image of a file, as a chain that starts on this kind wants it.
 
     Raises:
         ImageError: it cannot be read, or holds another kind.
     """
+    if kind is Kind.RGB and how.transfer and (whole := read_finished(path)):
+        linear = TRANSFERS[how.transfer](whole.pixels.astype(np.float64))
+        return replace(whole, pixels=linear.astype(np.float32))
     if kind is not Kind.DISPLAY:
-        return read_image(path, len(kind.channels) == 1, layer, max_pixels)
+        return read_image(path, len(kind.channels) == 1, how.layer, how.max_pixels)
     finished = read_finished(path)
     if finished is None:
-        finished = read_image(path, layer=layer, max_pixels=max_pixels)
+        finished = read_image(path, False, how.layer, how.max_pixels)
         if finished.attributes.get("kind") != kind.label:
             raise ImageError(
                 f"{path}: holds linear light, but the chain starts on finished pictures "
@@ -402,7 +422,7 @@ def _read_part(path: Path, file: Any, picture: _Picture, mosaic: bool, max_pixel
     if not whole and not types <= {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}:
         raise ImageError(
             f"{path}: holds {spec.format} samples, not linear float ones; "
-            "give an OpenEXR file (Radiance HDR, PFM, float TIFF); a photograph: -c unprocess"
+            "give an OpenEXR file, or say --transfer linear or srgb; a photograph: -c unprocess"
         )
     width, height = spec.full_width, spec.full_height
     for wide, high in ((width, height), (spec.width, spec.height)):

@@ -14,7 +14,7 @@ import numpy as np
 from clpipe.camera import DEFAULT_CAMERA, Camera, built_in_cameras, load_camera
 from clpipe.config import Chain, Settings
 from clpipe.errors import ImageError, RequestError
-from clpipe.image_io import READABLE, USUAL_MAX_PIXELS, SourceImage, Tags, carry, read_source
+from clpipe.image_io import READABLE, Reading, SourceImage, Tags, carry, read_source
 from clpipe.raw_dump import Dump, read_dump
 from clpipe.raw_io import ENDINGS, RawFacts, read_facts, read_raw
 from clpipe.reentry import brightness_doubts, doubts
@@ -54,20 +54,14 @@ class RawEntry:
         others = (*READABLE, *(e for e in ENDINGS if e != ".raw"))
         return self.dump is not None and path.suffix.lower() not in others
 
-    def read(
-        self,
-        path: Path,
-        kind: Kind,
-        layer: str | None = None,
-        max_pixels: int = USUAL_MAX_PIXELS,
-    ) -> SourceImage:
+    def read(self, path: Path, kind: Kind, how: Reading) -> SourceImage:
         """A raw, a dump, or what else there is of a kind.
 
         Raises:
             ImageError: it cannot be read, or holds no Bayer mosaic.
         """
         if not self.takes(path):
-            return read_source(path, kind, layer, max_pixels)
+            return read_source(path, kind, how)
         said = self.dump if self.dump and self.takes_as_dump(path) else read_facts(path)
         try:
             data = path.read_bytes()

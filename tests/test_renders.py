@@ -13,7 +13,8 @@ from click.testing import CliRunner
 from clpipe.cli import main
 from clpipe.errors import ImageError
 from clpipe.exr_colour import CIE_XYZ, SRGB, rgb_to_xyz, to_linear_srgb
-from clpipe.image_io import read_image
+from clpipe.image_io import Reading, read_image, read_source
+from clpipe.stage import Kind
 from tests.conftest import ROOT, STILL_LIFE
 
 # Height, width, means of red, green and blue. Sizes and means of those that are RGB as they are
@@ -68,7 +69,8 @@ REFUSED_IN_PEACE = """
 import resource, sys, time
 from pathlib import Path
 from clpipe.errors import ImageError
-from clpipe.image_io import read_image
+from clpipe.image_io import Reading, read_image, read_source
+from clpipe.stage import Kind
 for path in map(Path, sys.argv[1:]):
     start = time.perf_counter()
     try:
@@ -354,3 +356,50 @@ def test_mutated_files_make_no_traceback_hang_or_crash(tmp_path):
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "refused" in done.stdout
+
+
+@pytest.mark.parametrize(("transfer", "light"), [("linear", 0.5), ("srgb", 0.21404)])
+@pytest.mark.parametrize("ending", ["png", "tif"])
+def test_renders_in_whole_numbers_with_a_stated_transfer(tmp_path, ending, transfer, light):
+    path = tmp_path / f"render.{ending}"
+    pixels = np.full((8, 12, 3), 32768, np.uint16)
+    file = oiio.ImageOutput.create(str(path))
+    assert file.open(str(path), oiio.ImageSpec(12, 8, 3, oiio.UINT16))
+    assert file.write_image(pixels) and file.close()
+    found = read_source(path, Kind.RGB, Reading(transfer=transfer)).pixels
+    assert found.shape == (8, 12, 3) and found == pytest.approx(light, abs=1e-4)
+    command = ["run", str(tmp_path), "-o", str(tmp_path / "out"), "--transfer", transfer]
+    result = CliRunner().invoke(main, command, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "out" / "render.jpg").is_file()
+    without = CliRunner().invoke(main, ["run", str(path), "-o", str(tmp_path / "out")])
+    assert without.exit_code == 1 and "--transfer linear or srgb" in without.output
+
+
+def test_a_transfer_is_that_of_a_render(tmp_path):
+    command = ["run", "a.png", "-o", str(tmp_path), "--transfer", "srgb", "-c", "unprocess"]
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 2 and "--transfer: it is one of a render" in result.output
+
+
+@pytest.mark.parametrize(
+    "compression", ["none", "rle", "zip", "zips", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab"]
+)
+@pytest.mark.parametrize("tiled", [False, True])
+def test_every_compression_in_scanlines_and_tiles(tmp_path, compression, tiled):
+    path = tmp_path / "render.exr"
+    y, x = np.mgrid[0:40, 0:56] / 56
+    pixels = np.stack([x, y, 0.5 + 0 * x], axis=-1).astype(np.float32)
+    spec = oiio.ImageSpec(56, 40, 3, oiio.HALF)
+    spec.attribute("compression", compression)
+    buffer = oiio.ImageBuf(spec)
+    assert buffer.set_pixels(oiio.ROI(), pixels)
+    if tiled:
+        buffer.set_write_tiles(16, 16)
+    assert buffer.write(str(path)), buffer.geterror()
+    written = oiio.ImageInput.open(str(path)).spec()
+    assert (written.tile_width == 16) is tiled
+    assert written.getattribute("compression").split(":")[0] == compression
+    found = read_image(path).pixels.astype(np.float32)
+    lossy = compression in ("b44", "b44a", "dwaa", "dwab")
+    assert np.abs(found - pixels).max() < (0.03 if lossy else 6e-4)
