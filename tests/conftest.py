@@ -5,7 +5,10 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from click.testing import CliRunner
+from click.testing import Result as ClickResult
 
+from clpipe.cli import main
 from clpipe.config import make_chain, settings_from
 from clpipe.device import Device, choose, find_devices
 from clpipe.run import Result, Runner
@@ -74,3 +77,18 @@ def write_exr(tmp_path: Path) -> Callable[..., Path]:
         return path
 
     return write
+
+
+@pytest.fixture
+def clpipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., ClickResult]:
+    """The command line in an empty folder: arguments in, the result out, its status checked."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: object, status: int = 0) -> ClickResult:
+        result = CliRunner().invoke(main, [str(a) for a in arguments])
+        if result.exception and not isinstance(result.exception, SystemExit):
+            raise result.exception
+        assert result.exit_code == status, result.output
+        return result
+
+    return call

@@ -8,26 +8,10 @@ import sys
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
-from clpipe.cli import main
 from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import ROOT, STILL_LIFE
-
-
-@pytest.fixture
-def clpipe(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments, status=0):
-        result = CliRunner().invoke(main, [str(a) for a in arguments])
-        if result.exception and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        assert result.exit_code == status, result.output
-        return result
-
-    return call
 
 
 @pytest.fixture

@@ -7,30 +7,14 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
 from clpipe.camera import load_camera
-from clpipe.cli import main
 from clpipe.describe import measure_tables
 from clpipe.measure import Picture, load, measure
 from tests.conftest import STILL_LIFE
 
 NOISELESS = ("--skip", "sensor_noise", "--skip", "row_noise", "--skip", "column_noise")
-
-
-@pytest.fixture
-def clpipe(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments, status=0):
-        result = CliRunner().invoke(main, [str(a) for a in arguments])
-        if result.exception and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        assert result.exit_code == status, result.output
-        return result
-
-    return call
 
 
 @pytest.fixture
