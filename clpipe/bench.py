@@ -132,6 +132,7 @@ def bench_methods(
     """
     picture = scene(width, height).astype(np.float32)
     image = picture if len(stage.reads.channels) == 3 else np.ascontiguousarray(picture[..., 1])
+    settings = settings.drawn("")
     given = settings.parameters.get(stage.name, {})
     speeds = []
     methods = [m for m in stage.methods if given.get("method", m.method) == m.method]

@@ -137,7 +137,8 @@ def chain_options(function: Callable[..., Any]) -> Callable[..., Any]:
             "assignments",
             multiple=True,
             metavar="STAGE.PARAM=VALUE",
-            help="Set a parameter; may be repeated. STAGE.method=NAME chooses a method.",
+            help="Set a parameter; may be repeated. STAGE.method=NAME chooses a method. "
+            "'{uniform=[1, 2]}' draws a value for each image.",
         ),
         click.option(
             "--stages",

@@ -83,14 +83,16 @@ class RawEntry:
             settings = self.settings(Settings())
             return self.chain(settings, self.start_at or entrance(settings))
 
-    def enter(self, path: Path, image: RawImage) -> tuple[Chain, RawImage]:
+    def enter(self, path: Path, image: RawImage, key: str = "") -> tuple[Chain, RawImage]:
         """The chain for a raw, and the raw with its warnings and what it carries to the output.
+
+        What its settings draw belongs to its image key.
 
         Raises:
             ImageError: it cannot enter there, or its levels cannot be.
             RequestError: the chain cannot be made.
         """
-        chain, found = self._chain(path, image.said)
+        chain, found = self._chain(path, image.said, key)
         if isinstance(image.said, Dump):
             found += doubts(image, chain)
             return chain, replace(image, warnings=tuple(found))
@@ -101,13 +103,14 @@ class RawEntry:
         attributes = carry(tags_of(image.said, chain), image.said.orientation)
         return chain, replace(image, warnings=tuple(found), attributes=attributes)
 
-    def _chain(self, path: Path, said: RawFacts | Dump) -> tuple[Chain, list[str]]:
+    def _chain(self, path: Path, said: RawFacts | Dump, key: str = "") -> tuple[Chain, list[str]]:
         """The chain for a raw, and what was taken for what it does not say, or says wrongly."""
         brought, found = brought_by(said)
         parameters = dict(brought.parameters)
-        if "white_balance" in found and self.settings(Settings()).parameters.get("white_balance"):
+        own = self.settings(Settings()).drawn(key)
+        if "white_balance" in found and own.parameters.get("white_balance"):
             del parameters["white_balance"]  # the user's own, not what stands in for the file's
-        settings = self.settings(replace(brought, parameters=parameters))
+        settings = self.settings(replace(brought, parameters=parameters)).drawn(key)
         camera = load_camera(settings.camera)
         low, high = camera.iso_range
         iso = min(max(settings.iso, low), high)

@@ -11,7 +11,7 @@ PACKAGE = ROOT / "clpipe"
 LEVELS = [
     {"errors", "types", "suggest", "noise_model", "output", "printable"},
     {"reference"},
-    {"camera", "statistics", "raw_dump", "exr_colour"},
+    {"camera", "draws", "statistics", "raw_dump", "exr_colour"},
     {"stage", "calibration", "luminance_chroma"},
     {"stages"},
     {"registry"},
