@@ -489,7 +489,6 @@ def write_beside(path: Path, write: Callable[[Path], object]) -> None:
     beside = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
     _unfinished.add(beside)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         write(beside)
         beside.replace(path)
     except OSError as error:
@@ -498,6 +497,19 @@ def write_beside(path: Path, write: Callable[[Path], object]) -> None:
         with contextlib.suppress(OSError):
             beside.unlink(missing_ok=True)
         _unfinished.discard(beside)
+
+
+def write_new(path: Path, write: Callable[[Path], object]) -> None:
+    """The same, where the folders above it may have to be made.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be written: {error.strerror}") from None
+    write_beside(path, write)
 
 
 def drop_unfinished() -> None:

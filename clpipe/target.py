@@ -181,6 +181,21 @@ class Target:
         if "jpg" in self.formats and max(source.pixels.shape[:2]) > JPEG_MAX_SIDE:
             raise ImageError(f"JPEG holds at most {JPEG_MAX_SIDE} pixels a side; use --format png")
 
+    def _make_folder_of(self, job: Job) -> None:
+        """Make the folders between the output folder, which must be there, and a job's files.
+
+        Raises:
+            OutputError: the output folder is not there any more.
+            ImageError: they cannot be made.
+        """
+        if not self.folder.is_dir():
+            raise OutputError(f"{self.folder}: the folder has gone; {RESUMABLE}")
+        place = self.path(job, "").parent
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ImageError(f"{place}: cannot be made: {error.strerror}") from None
+
     def outputs(self, job: Job, name: str) -> list[Path]:
         """The images of one picture that are there in any case; an image that enters behind a kept
         step has not that one.
@@ -194,9 +209,7 @@ class Target:
             OutputError: it cannot.
         """
         if reason := trouble_with(self.folder):
-            raise OutputError(
-                f"{self.folder}: {reason}; what is finished is there, and the same command goes on"
-            )
+            raise OutputError(f"{self.folder}: {reason}; {RESUMABLE}")
 
     def write(self, job: Job, shot: Shot, source: SourceImage, result: Result) -> list[Path]:
         """Write the images of one picture; the files.
@@ -205,8 +218,7 @@ class Target:
             ImageError: a file cannot be written.
             OutputError: the output folder is not there any more.
         """
-        if not self.folder.is_dir():
-            raise OutputError(f"{self.folder}: the folder has gone")
+        self._make_folder_of(job)
         chain, camera = shot.chain, shot.chain.camera
         own = Tags(camera.make, camera.model, chain.iso)
         tags, orientation = carried(source.attributes, own)
@@ -234,6 +246,7 @@ class Target:
         return outputs
 
 
+RESUMABLE = "what is finished is there, and the same command goes on"
 ROOM = 8 * 2**20  # bytes; a disk with less is full
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.batch import STEPS, Outcome
-from clpipe.image_io import write_beside
+from clpipe.image_io import write_new
 
 
 class Trace:
@@ -55,4 +55,4 @@ class Trace:
             for worker, number in self._threads.items()
         ]
         text = json.dumps({"traceEvents": [*names, *events], "displayTimeUnit": "ms"})
-        write_beside(path, lambda to: to.write_text(text))
+        write_new(path, lambda to: to.write_text(text))
