@@ -1,481 +1,435 @@
-"""Many image files through one chain: which files, under which names, with which sidecars."""
+"""Many images through devices: threads that decode, develop and encode, a few images in flight.
 
-import glob
-import json
+An image is decoded, then each picture of it is made by a device's thread and written by another.
+A job is let in only when one before it has left, so memory does not grow with their number.
+"""
+
 import os
-import platform
+import queue
+import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
-from functools import partial
-from importlib.metadata import version
-from pathlib import Path
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
-import clpipe
+import numpy as np
+
 from clpipe.config import Chain
-from clpipe.device import Device
-from clpipe.dng import negative_of, write_dng
-from clpipe.errors import ImageError, KindError, RequestError
-from clpipe.image_io import (
-    CARRIED,
-    JPEG_MAX_SIDE,
-    READABLE,
-    Reading,
-    SourceImage,
-    Tags,
-    carried,
-    upright,
-    versions,
-    write_beside,
-    write_display,
-    write_exr,
-)
-from clpipe.raw_entry import RawEntry, RawImage
-from clpipe.raw_io import ENDINGS
-from clpipe.reentry import Reentry, attributes_of, doubts, misplaced
-from clpipe.reference.curve import to_16_bit
+from clpipe.device import Device, Timing
+from clpipe.entrance import Entrance
+from clpipe.errors import ImageError, OutputError, RequestError
+from clpipe.image_io import SourceImage
+from clpipe.jobs import Job
 from clpipe.run import Result, Runner
+from clpipe.sidecar import is_done, sidecar, stamp_of, wanted, write_sidecar
 from clpipe.stage import Kind
+from clpipe.target import DNG, SIDECAR, Shot, Target
+
+DONE, SKIPPED, LEFT_OUT, FAILED = "done", "skipped", "left out", "failed"
+STEPS = ("decode", "device", "encode")
 
 
 @dataclass(frozen=True)
-class Format:
-    """A kind of file: how its name ends, and how many bits its samples have; floats or not."""
+class Span:
+    """When something was done to an image, by which thread, and for how long.
 
-    ending: str
-    bits: int
-    floats: bool = False
+    ``step`` is one of :data:`STEPS`, or the name of a launch or a transfer within "device". Times
+    are in s, of time.perf_counter.
+    """
 
-
-FORMATS = {
-    "jpg": Format("jpg", 8),
-    "png": Format("png", 8),
-    "png16": Format("png", 16),
-    "tif": Format("tif", 8),
-    "tif16": Format("tif", 16),
-    "tif32": Format("tif", 32, floats=True),
-    "exr": Format("exr", 32, floats=True),
-    "exr16": Format("exr", 16, floats=True),
-}
-DNG = "dng"  # not of the last image, but of the raw
-EVERY_FORMAT = (*FORMATS, DNG)
-
-
-@dataclass(frozen=True)
-class Job:
-    """One input file, and its name relative to the input root: the image key, with its ending."""
-
-    path: Path
-    key: str
-    listed: bool = True  # by name or glob; otherwise found in a folder
+    step: str
+    worker: str
+    start: float
+    seconds: float
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one job."""
+    """What became of one job.
+
+    ``status`` is "done", "skipped" (all was there already), "left out" (kept after another stage
+    than the one to go on from) or "failed". ``outputs`` are the files that were written, relative
+    to the output folder; ``began`` is in s since 1970.
+    """
 
     job: Job
-    megapixels: float
-    seconds: float
+    status: str
+    megapixels: float = 0.0
     warnings: tuple[str, ...] = ()
     error: str = ""
-    left_out: bool = False  # kept after another stage than the one to go on from
+    outputs: tuple[str, ...] = ()
+    began: float = 0.0
+    spans: tuple[Span, ...] = ()
+
+    def seconds(self, step: str) -> float:
+        """How long a step took, over all pictures of the image."""
+        return sum(span.seconds for span in self.spans if span.step == step)
 
 
-def find_jobs(
-    inputs: Sequence[str], output: Path, endings: Sequence[str] = (*READABLE, *ENDINGS)
-) -> list[Job]:
-    """The files that inputs name: files, folders (all images in them, at any depth) and globs.
+@dataclass
+class _Work:
+    """A job on its way."""
 
-    The image key of a file in a folder is its path relative to that folder, that of a file given
-    by name or found by a glob is its name. A file that does not exist is a job too: it fails later,
-    alone. Where the output folder lies inside an input folder, what is in it is no input.
+    job: Job
+    entrance: Entrance
+    began: float = field(default_factory=time.time)
+    spans: list[Span] = field(default_factory=list)
+    source: SourceImage | None = None
+    stamp: tuple[int, int] = (0, 0)
+    wanted: Mapping[str, Any] = field(default_factory=dict)
+    shots: list[Shot] = field(default_factory=list)
+    unwritten: int = 0
+    status: str = DONE
+    error: str = ""
+    outputs: list[str] = field(default_factory=list)
 
-    Raises:
-        RequestError: an empty name, a folder without images, or a glob that no file matches.
-    """
-    jobs: list[Job] = []
-    for text in inputs:
-        if not text:
-            raise RequestError("an input is empty; give files, folders or globs")
-        path = Path(text)
-        if os.path.isdir(text):
-            files = images_in(path, output, endings)
-            if not files:
-                listed = ", ".join(e for e in endings if e not in ENDINGS)
-                raws = " and camera raws" if set(ENDINGS) & set(endings) else ""
-                raise RequestError(f"{path}: a folder without images (looked for {listed}{raws})")
-            jobs += [Job(p, p.relative_to(path).as_posix(), listed=False) for p in files]
-        elif glob.has_magic(text) and not os.path.exists(text):
-            matches = sorted(m for m in glob.glob(text, recursive=True) if os.path.isfile(m))
-            if not matches:
-                raise RequestError(f"{text}: no file matches")
-            jobs += [Job(Path(m), Path(m).name) for m in matches]
-        else:
-            jobs.append(Job(path, path.name))
-    return jobs
+    @contextmanager
+    def timed(self, step: str) -> Iterator[None]:
+        """Note when a step was done, and by which thread."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            name = threading.current_thread().name
+            self.spans.append(Span(step, name, start, time.perf_counter() - start))
 
-
-def images_in(folder: Path, output: Path, endings: Sequence[str]) -> list[Path]:
-    """The files in a folder at any depth that end so, sorted; hidden ones and a folder in it that
-    is the output aside, links followed.
-    """
-    found: list[Path] = []
-    seen: set[str] = set()
-    for place, folders, names in os.walk(folder, followlinks=True):
-        real = os.path.realpath(place)
-        led_back = real in seen
-        if led_back or (seen and real == os.path.realpath(output)):
-            folders.clear()
-            continue
-        seen.add(real)
-        found += [
-            Path(place, n)
-            for n in names
-            if not n.startswith(".") and os.path.splitext(n)[1].lower() in endings
-        ]
-    return sorted(path for path in found if path.is_file())
-
-
-def prepare_folder(folder: Path) -> None:
-    """Make the output folder, and see that it can be written.
-
-    Raises:
-        RequestError: it cannot.
-    """
-    probe = folder / f".clpipe.{os.getpid()}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise RequestError(f"{folder}: cannot write there: {error.strerror}") from None
-
-
-@dataclass(frozen=True)
-class Burst:
-    """How many frames are made of each image; None is one, without anything beside it."""
-
-    frames: int | None = None
-
-    def names(self) -> tuple[str, ...]:
-        """What stands behind the image's name for each picture that is made of it.
-
-        >>> Burst(2).names(), Burst().names()
-        (('.truth', '.frame0', '.frame1'), ('',))
-        """
-        if self.frames is None:
-            return ("",)
-        digits = len(str(self.frames - 1))
-        return (".truth", *(f".frame{i:0{digits}}" for i in range(self.frames)))
-
-    def shots(self, runner: Runner, key: str) -> Iterator[tuple[str, Runner, str]]:
-        """For each picture its name, how it is made, and its image key.
-
-        The first frame is the picture that there is without a burst; the truth has no noise.
-        """
-        first, *others = self.names()
-        if not others:
-            yield first, runner, key
-            return
-        clean = runner.chain.clean()
-        kept = [step.name for step in clean.steps if step.name in runner.keep]
-        yield first, Runner(clean, runner.device, kept, runner.encode, runner.final), key
-        for number, name in enumerate(others):
-            yield name, runner, f"{key}#{number}" if number else key
-
-
-@dataclass(frozen=True)
-class Target:
-    """Where results go, in which formats, how many of each image, and which stages' images too."""
-
-    folder: Path
-    formats: tuple[str, ...]
-    burst: Burst = Burst()
-    keep: tuple[str, ...] = ()
-
-    def runner(self, chain: Chain, device: Device | None) -> Runner:
-        """What makes all that is to be written, and nothing else."""
-        made = [FORMATS[f] for f in self.formats if f != DNG]
-        raw = negative_of(chain).step if DNG in self.formats else None
-        return Runner(
-            chain,
-            device,
-            tuple(dict.fromkeys([*self.keep, *([raw] if raw else [])])),
-            encode=any(f.bits == 8 for f in made),
-            final=any(f.bits > 8 for f in made),
+    def outcome(self) -> Outcome:
+        """What became of it."""
+        width, height = self.source.pixels.shape[1::-1] if self.source else (0, 0)
+        return Outcome(
+            self.job,
+            FAILED if self.error else self.status,
+            width * height / 1e6,
+            self.source.warnings if self.source else (),
+            self.error,
+            tuple(self.outputs),
+            self.began,
+            tuple(self.spans),
         )
 
-    def check(self, chain: Chain, jobs: Sequence[Job]) -> None:
-        """See that the results can be written in these formats, over no input and no other result.
 
-        Raises:
-            RequestError: they cannot.
-        """
-        few = [f for f in self.formats if f != DNG and FORMATS[f].bits < 32]
-        if few and chain.result is Kind.RAW:
-            raise RequestError(
-                f"the chain ends in DN, which {few[0]} cannot hold; "
-                "end it with normalize or a later stage, or use --format dng or exr"
-            )
-        if DNG in self.formats:
-            negative_of(chain)  # refuses a chain without a raw
-        endings: dict[str, str] = {}
-        for format_ in self.formats:
-            other = endings.setdefault(ending_of(format_), format_)
-            if other != format_:
-                raise RequestError(
-                    f"--format {other} and {format_} would both write NAME.{ending_of(format_)}; "
-                    "run them into different folders"
-                )
-        inputs = {os.path.realpath(job.path) for job in jobs}
-        makers: dict[Path, Job] = {}
-        every = ("json", *endings, *(f"{step}.exr" for step in self.keep))
-        names = self.burst.names()
-        for job in jobs:
-            for path in (self.path(job, e, name) for name in names for e in every):
-                if os.path.realpath(path) in inputs:
-                    raise RequestError(
-                        f"{path} is an input and would be overwritten; choose another output folder"
-                    )
-                if path in makers:
-                    raise RequestError(
-                        f"{makers[path].path} and {job.path} would both write {path}; "
-                        "run them into different folders"
-                    )
-                makers[path] = job
+@dataclass
+class _Made:
+    """A picture on its way from a device to its files."""
 
-    def path(self, job: Job, ending: str, name: str = "") -> Path:
-        """The output of a job with that ending; ``name`` is one of the burst's."""
-        return self.folder / f"{Path(job.key).with_suffix('')}{name}.{ending}"
+    work: _Work
+    shot: Shot
+    result: Result
+    device: Device | None
 
-    def check_size(self, source: SourceImage) -> None:
-        """See that an image fits into the formats.
 
-        Raises:
-            ImageError: it is too large for one.
-        """
-        if "jpg" in self.formats and max(source.pixels.shape[:2]) > JPEG_MAX_SIDE:
-            raise ImageError(f"JPEG holds at most {JPEG_MAX_SIDE} pixels a side; use --format png")
+class Batch:
+    """A run over many images.
 
-    def write(
+    Args:
+        entrance: what is asked for, and how files are read.
+        target: where the pictures go.
+        devices: where to develop, a thread for each; [None] is NumPy.
+        chain: that of the first image, for which kernels are compiled while it is decoded.
+        threads: how many decode, and how many encode; None is one for each processor.
+        overwrite: make what is there already, too.
+        trace: note each launch and transfer.
+    """
+
+    def __init__(
         self,
-        job: Job,
-        name: str,
-        key: str,
-        runner: Runner,
-        source: SourceImage,
-        result: Result,
+        entrance: Entrance,
+        target: Target,
+        devices: Sequence[Device | None],
+        chain: Chain,
+        threads: int | None = None,
+        overwrite: bool = False,
+        trace: bool = False,
     ) -> None:
-        """Write a job's images, or those of one picture of its burst, then the sidecar.
+        self.devices = list(devices)
+        self.threads = threads or len(os.sched_getaffinity(0))
+        self.in_flight = self.threads + len(self.devices) + 1
+        self._entrance = entrance
+        self._target = target
+        self._chain = chain
+        self._overwrite = overwrite
+        self._trace = trace
+        self._stopping = threading.Event()
+
+    @property
+    def stopping(self) -> bool:
+        """Whether no more images are let in."""
+        return self._stopping.is_set()
+
+    def stop(self) -> None:
+        """Let no more images in; those in flight are finished."""
+        self._stopping.set()
+
+    def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
+        """Put every job through; one that fails is reported and the others go on.
+
+        Outcomes come as jobs are finished, in any order.
 
         Raises:
-            ImageError: a file cannot be written.
+            OutputError: nothing can be written any more. What was in flight is reported before.
+            DeviceError: a kernel does not compile.
         """
-        chain, camera = runner.chain, runner.chain.camera
-        own = Tags(camera.make, camera.model, chain.iso)
-        tags, orientation = carried(source.attributes, own)
-        how = chain.settings.output.filled({**source.shot, **tags.shot})
-        tags = replace(tags, output=how)
-        brought = {name: source.attributes[name] for name in CARRIED if name in source.attributes}
-        mosaic = chain.result in (Kind.RAW, Kind.MOSAIC)
-        turn = 1 if mosaic else orientation  # to turn a mosaic would be to change its pattern
-        outputs = []
-        for step in chain.steps:
-            if step.name in self.keep:
-                path = self.path(job, f"{step.name}.exr", name)
-                attributes = attributes_of(step, chain, key) | brought
-                write_exr(path, result.kept[step.name], step.stage.writes.channels, attributes)
-                outputs.append(path.name)
-        for format_ in self.formats:
-            path = self.path(job, ending_of(format_), name)
-            if format_ == DNG:
-                negative = negative_of(chain)
-                raw = result.kept[negative.step] if negative.step else source.pixels
-                write_dng(path, raw, negative, tags, orientation)
-            else:
-                attributes = attributes_of(chain.steps[-1], chain, key) | brought
-                write_last(path, FORMATS[format_], result, chain, attributes, tags, turn)
-            outputs.append(path.name)
-        record = sidecar(job, key, runner, source, result, outputs)
-        text = json.dumps(record, indent=2) + "\n"
-        write_beside(self.path(job, "json", name), lambda to: _write_text(to, text))
+        run = _Run(self, jobs)
+        try:
+            yield from run.outcomes()
+        finally:
+            run.close()
 
+    def _runners(self, device: Device | None) -> Callable[[Chain], Runner]:
+        """What makes the runner of a chain on a device; the kernels of the first are compiled."""
+        entrance, target = self._entrance, self._target
+        first = target.runner(self._chain, device)
+        first.warm_up(half=entrance.reentry is None and self._chain.source is Kind.RGB)
+        latest = [(self._chain, first)]
 
-def ending_of(format_: str) -> str:
-    """How the name of a file of a format ends."""
-    return DNG if format_ == DNG else FORMATS[format_].ending
+        def runner(chain: Chain) -> Runner:
+            for known, its in latest:
+                if known is chain:
+                    return its
+            made = first.of(chain) if chain.names == self._chain.names else None
+            if made is None or target.kept_of(chain) != target.kept_of(self._chain):
+                made = target.runner(chain, device)
+            latest.insert(1, (chain, made))
+            del latest[4:]
+            return made
 
+        return runner
 
-def write_last(
-    path: Path,
-    format_: Format,
-    result: Result,
-    chain: Chain,
-    attributes: Mapping[str, str],
-    tags: Tags,
-    orientation: int,
-) -> None:
-    """Write the last image of a chain, turned as EXIF's ``orientation`` says.
+    def _decode(self, job: Job, begin: Callable[[], None]) -> _Work:
+        """A job's image and what to make of it, without what is there already.
 
-    Raises:
-        ImageError: the file cannot be written.
-    """
-    pixels = result.encoded
-    if format_.bits > 8:
-        assert result.final is not None
-        pixels = result.final if format_.floats else to_16_bit(result.final)
-    if format_.ending == "exr":
-        pixels = result.final
-    assert pixels is not None
-    pixels = upright(pixels, orientation)
-    if format_.ending == "exr":
-        if orientation != 1:
-            attributes = {**attributes, "orientation": "1"}
-        channels = chain.result.channels
-        write_exr(path, pixels, channels, attributes, half=format_.bits == 16)
-    else:
-        write_display(path, pixels, tags)
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.write_text(text)
-
-
-def sidecar(
-    job: Job,
-    key: str,
-    runner: Runner,
-    source: SourceImage,
-    result: Result,
-    outputs: Sequence[str],
-) -> dict[str, Any]:
-    """Everything that is needed to make the same files again."""
-    chain = runner.chain
-    device = runner.device
-    raw = source.said if isinstance(source, RawImage) else None
-    noise = chain.noise if not raw or chain.is_noisy else None
-    return {
-        "clpipe": clpipe.__version__,
-        "input": str(job.path),
-        "sha256": source.sha256,
-        "layer": source.layer,
-        "image_key": key,
-        "seed": chain.seed,
-        "width": source.pixels.shape[1],
-        "height": source.pixels.shape[0],
-        "camera": chain.camera.name,
-        "iso": chain.iso,
-        "output": chain.settings.output.filled(source.shot).model_dump(),
-        "noise": noise.record() if noise else None,
-        "starts_on": chain.source.label,
-        **({"raw": asdict(raw)} if raw else {}),
-        "stages": [
-            {
-                "name": step.name,
-                "stage": step.stage.name,
-                "method": step.method.method,
-                "parameters": step.method.model_dump(),
-                **({"found": result.found[step.name]} if step.name in result.found else {}),
-            }
-            for step in chain.steps
-        ],
-        "outputs": list(outputs),
-        "warnings": list(source.warnings),
-        "device": {
-            "name": device.info.name if device else "numpy",
-            "platform": device.info.platform if device else "numpy",
-            "version": device.info.version if device else version("numpy"),
-            "driver": device.info.driver if device else "",
-            "lanes": device.info.lanes if device else 0,
-        },
-        "versions": {
-            "python": platform.python_version(),
-            "numpy": version("numpy"),
-            "pyopencl": version("pyopencl"),
-            **versions(),
-        },
-    }
-
-
-def enter(
-    job: Job, source: SourceImage, runner: Runner, reentry: Reentry | None, raws: RawEntry
-) -> tuple[Runner, SourceImage, str] | None:
-    """How to go on with an image: its runner, the image with warnings, its key.
-
-    None for one that was found in a folder of kept images and is not the one to go on from.
-
-    Raises:
-        ImageError: it cannot enter there.
-    """
-    if isinstance(source, RawImage):
-        chain, source = raws.enter(job.path, source)
-        keep = [name for name in runner.keep if name in {s.name for s in chain.steps}]
-        return Runner(chain, runner.device, keep, runner.encode, runner.final), source, job.key
-    kept, warnings, key = source.attributes.get("stage"), list(source.warnings), job.key
-    if reentry:
-        chain = reentry.chain_for(job.path, source.attributes)
-        if not reentry.is_next(chain, source.attributes):
-            if not job.listed:
-                return None
-            again = f"entering at {reentry.start_at} repeats stages or leaves some out"
-            warnings.append(f"was kept after {kept}; {again}")
-        reentry.check_kind(job.path, chain, source.attributes)
-        warnings += doubts(source, chain)
-        runner, key = runner.of(chain), source.attributes.get("image_key", key)
-    elif kept:
-        warnings.append(f"was kept after {kept}; is it a render? See --start-at")
-    return runner, replace(source, warnings=tuple(warnings)), key
-
-
-def run_jobs(
-    jobs: Sequence[Job],
-    runner: Runner,
-    target: Target,
-    raws: RawEntry,
-    how: Reading,
-    reentry: Reentry | None = None,
-) -> Iterator[Outcome]:
-    """Put every job through; one that fails is reported and the others go on.
-
-    The next file is read, and the first one read while the kernels compile, in a second thread.
-    """
-    kind = runner.chain.source
-    reading_of = partial(raws.read, kind=kind, how=how)
-    with ThreadPoolExecutor(1) as reader:
-        ahead = reader.submit(reading_of, jobs[0].path)
-        runner.warm_up(half=reentry is None and kind is Kind.RGB)
-        for i, job in enumerate(jobs):
-            reading = ahead
-            if i + 1 < len(jobs):
-                ahead = reader.submit(reading_of, jobs[i + 1].path)
-            start = time.perf_counter()
+        ``begin`` is called where anything is to be made.
+        """
+        work = _Work(job, self._entrance)
+        with work.timed("decode"):
             try:
-                source = reading.result()
-                target.check_size(source)
-                entered = enter(job, source, runner, reentry, raws)
-                if entered is None:
-                    yield Outcome(job, 0, 0, left_out=True)
-                    continue
-                own, source, key = entered
-                for name, shot, shot_key in target.burst.shots(own, key):
-                    result = shot.run(source.pixels, shot_key)
-                    target.write(job, name, shot_key, shot, source, result)
-            except KindError as error:
-                if reentry and not job.listed:
-                    yield Outcome(job, 0, 0, left_out=True)
-                    continue
-                message = misplaced(error, runner.chain, reentry)
-                yield Outcome(job, 0, time.perf_counter() - start, error=message)
-                continue
+                work.entrance = self._entrance.of(job)
+                work.wanted = {**self._wanted_of(work.entrance), "image_key": job.key}
+                names = self._missing(work)
+                if names:
+                    begin()
+                    self._read(work, names)
+                else:
+                    work.status = SKIPPED
             except (ImageError, RequestError, MemoryError) as error:
-                message = str(error) or "there is not enough memory for it"
-                if str(job.path) not in message:
-                    message = f"{job.path}: {message}"
-                yield Outcome(job, 0, time.perf_counter() - start, error=message)
+                if work.entrance.is_left_out(job, error):
+                    work.status = LEFT_OUT
+                else:
+                    work.error = work.entrance.explain(job, error)
+        return work
+
+    def _wanted_of(self, entrance: Entrance) -> Mapping[str, Any]:
+        if entrance is self._entrance:
+            return self._wanted
+        return wanted(entrance.asked, entrance.reading, self._target)
+
+    @cached_property
+    def _wanted(self) -> Mapping[str, Any]:
+        return wanted(self._entrance.asked, self._entrance.reading, self._target)
+
+    def _missing(self, work: _Work) -> list[str]:
+        """The names of the pictures that are to be made, which are not there already."""
+        job, target = work.job, self._target
+        names = target.burst_of(job).names()
+        if self._overwrite:
+            return list(names)
+        return [
+            name
+            for name in names
+            if not is_done(
+                target.path(job, SIDECAR, name), job, work.wanted, target.outputs(job, name)
+            )
+        ]
+
+    def _read(self, work: _Work, names: Sequence[str]) -> None:
+        """Read a job's image, and see what pictures are to be made of it.
+
+        Raises:
+            ImageError, RequestError, MemoryError: it cannot be read, or cannot enter.
+        """
+        job = work.job
+        work.stamp = stamp_of(job.path)
+        source = work.entrance.read(job)
+        self._target.check_size(source)
+        entered = work.entrance.enter(job, source)
+        if entered is None:
+            work.status = LEFT_OUT
+            return
+        work.source = entered.source
+        shots = self._target.burst_of(job).shots(entered.chain, entered.key)
+        work.shots = [shot for shot in shots if shot.name in names]
+        work.unwritten = len(work.shots)
+
+    def _develop(self, work: _Work, shot: Shot, runner: Runner) -> Result | None:
+        """One picture; None where it cannot be made."""
+        assert work.source
+        timings: list[Timing] | None = [] if self._trace and runner.device else None
+        with work.timed("device"):
+            try:
+                result = runner.run(work.source.pixels, shot.key, timings)
+            except (ImageError, RequestError, MemoryError) as error:
+                work.error = work.entrance.explain(work.job, error)
+                return None
+        name = threading.current_thread().name
+        work.spans += [Span(t.name, name, t.start, t.seconds) for t in timings or []]
+        if shot is work.shots[-1] and DNG not in self._target.formats:
+            # From here on only its shape is wanted.
+            shape = work.source.pixels.shape
+            work.source = replace(work.source, pixels=np.broadcast_to(np.float16(0), shape))
+        return result
+
+    def _encode(self, made: _Made) -> None:
+        """Write one picture and then its sidecar.
+
+        Raises:
+            OutputError: nothing can be written any more.
+        """
+        work, shot, target = made.work, made.shot, self._target
+        assert work.source
+        with work.timed("encode"):
+            try:
+                files = target.write(work.job, shot, work.source, made.result)
+                path = target.path(work.job, SIDECAR, shot.name)
+                names = [file.name for file in files]
+                record = sidecar(
+                    work.job, work.stamp, shot, made.device, work.source, made.result, names
+                )
+                write_sidecar(path, {**record, "asked": work.wanted})
+                work.outputs += [str(f.relative_to(target.folder)) for f in (*files, path)]
+            except (ImageError, MemoryError) as error:
+                target.check_folder()
+                work.error = work.entrance.explain(work.job, error)
+
+
+class _Run:
+    """The threads of one run, and what passes between them."""
+
+    def __init__(self, batch: Batch, jobs: Sequence[Job]) -> None:
+        self._batch = batch
+        self._todo = deque(jobs)
+        self._admitted = 0
+        self._failure: Exception | None = None
+        self._broken = self._closing = False
+        self._begun = threading.Event()
+        self._lock = threading.Lock()
+        self._places = threading.Semaphore(batch.in_flight)
+        self._results = threading.Semaphore(batch.threads + len(batch.devices))
+        self._decoded: queue.SimpleQueue[_Work | None] = queue.SimpleQueue()
+        self._made: queue.SimpleQueue[_Made | None] = queue.SimpleQueue()
+        self._news: queue.SimpleQueue[Outcome | None] = queue.SimpleQueue()
+        self._decoders = [self._thread(f"decode {i}", self._decoding) for i in range(batch.threads)]
+        self._developers = [
+            self._thread(f"device {i}", self._developing, device)
+            for i, device in enumerate(batch.devices)
+        ]
+        self._encoders = [self._thread(f"encode {i}", self._encoding) for i in range(batch.threads)]
+
+    def _thread(self, name: str, work: Callable[..., None], *arguments: Any) -> threading.Thread:
+        """A thread; what it cannot handle ends the run."""
+
+        def guarded() -> None:
+            try:
+                work(*arguments)
+            except Exception as error:
+                self._fail(error)
+                self._broken = True
+                self._news.put(None)
+
+        thread = threading.Thread(target=guarded, name=name, daemon=True)
+        thread.start()
+        return thread
+
+    def _fail(self, error: Exception) -> None:
+        """Let nothing more in, and remember why."""
+        self._failure = self._failure or error
+        self._batch.stop()
+
+    def outcomes(self) -> Iterator[Outcome]:
+        """Each job's outcome, as they come, until no job is in flight and none is to come."""
+        finished = ended = 0
+        while not self._broken and (ended < len(self._decoders) or finished < self._admitted):
+            news = self._news.get()
+            if news is None:
+                ended += 1
                 continue
-            height, width = source.pixels.shape[:2]
-            seconds = time.perf_counter() - start
-            yield Outcome(job, width * height / 1e6, seconds, source.warnings)
+            finished += 1
+            self._places.release()
+            yield news
+        if self._failure:
+            raise self._failure
+
+    def close(self) -> None:
+        """Let the threads end, also those that wait."""
+        self._batch.stop()
+        self._closing = True
+        self._begun.set()
+        for _ in self._decoders:
+            self._places.release()
+        for _ in self._developers:
+            self._decoded.put(None)
+        for thread in [*self._decoders, *self._developers]:
+            thread.join()
+        for _ in self._encoders:
+            self._made.put(None)
+        for thread in self._encoders:
+            thread.join()
+
+    def _next(self) -> Job | None:
+        """The next job to let in, once there is a place for it; None where none is to come."""
+        self._places.acquire()
+        with self._lock:
+            if not self._todo or self._batch.stopping:
+                return None
+            self._admitted += 1
+            return self._todo.popleft()
+
+    def _decoding(self) -> None:
+        while job := self._next():
+            work = self._batch._decode(job, self._begun.set)
+            if work.shots:
+                self._decoded.put(work)
+            else:
+                self._news.put(work.outcome())
+            del work
+        self._places.release()  # for the next thread, which has nothing to do either
+        self._news.put(None)
+
+    def _developing(self, device: Device | None) -> None:
+        self._begun.wait()  # where nothing is to be made, nothing is compiled
+        if self._closing:
+            return
+        runners = self._batch._runners(device)
+        while work := self._decoded.get():
+            for shot in work.shots:
+                self._results.acquire()
+                result = None
+                if not work.error:
+                    result = self._batch._develop(work, shot, runners(shot.chain))
+                if result:
+                    self._made.put(_Made(work, shot, result, device))
+                else:
+                    self._written(work)
+                del result
+            del work, shot
+
+    def _encoding(self) -> None:
+        while made := self._made.get():
+            try:
+                self._batch._encode(made)
+            except OutputError as error:
+                made.work.error = str(error)
+                self._fail(error)
+            self._written(made.work)
+            del made
+
+    def _written(self, work: _Work) -> None:
+        """One picture less to wait for; with its last one a job is finished."""
+        self._results.release()
+        with self._lock:
+            work.unwritten -= 1
+            finished = work.unwritten == 0
+        if finished:
+            self._news.put(work.outcome())

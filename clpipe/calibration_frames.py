@@ -14,7 +14,7 @@ from clpipe.calibration.repeats import Sensor
 from clpipe.camera import Matrix, load_camera
 from clpipe.config import make_chain
 from clpipe.errors import ImageError, RequestError
-from clpipe.image_io import READABLE, read_attributes, read_image, write_beside
+from clpipe.image_io import READABLE, read_attributes, read_image, write_new
 from clpipe.raw_io import ENDINGS, RawFacts, read_facts, read_raw
 from clpipe.reentry import carried_settings
 from clpipe.reference.cfa import Pattern
@@ -362,9 +362,9 @@ def write_profile(path: Path, frame: Frame, found: Sequence[Calibration]) -> Pat
 
     picture = path.with_suffix(".png")
     title = f"{frame.make} {frame.model}"
-    write_beside(picture, lambda to: plot_calibration(to, found, title))
+    write_new(picture, lambda to: plot_calibration(to, found, title))
     try:
-        write_beside(path, write)
+        write_new(path, write)
     except RequestError as error:
         raise ImageError(f"what was found makes no valid profile: {error}") from None
     return picture

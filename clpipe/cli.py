@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -13,46 +13,32 @@ from rich.table import Table
 
 import clpipe
 from clpipe import describe
-from clpipe.batch import EVERY_FORMAT, Burst, Target, ending_of, find_jobs, prepare_folder, run_jobs
+from clpipe.asked import DEFAULTS, asked_for
+from clpipe.batch import Batch
 from clpipe.bench import bench as run_bench
 from clpipe.bench import bench_methods
 from clpipe.calibration_frames import Given, calibrate_files, check_name, write_profile
 from clpipe.camera import built_in_cameras, load_camera
 from clpipe.check import SIZES, check_all
-from clpipe.config import (
-    OUTPUT,
-    Chain,
-    Settings,
-    built_in_configs,
-    entry,
-    load_settings,
-    make_chain,
-    overlay,
-    parse_assignment,
-    stage_named,
-)
+from clpipe.config import Settings, built_in_configs, overlay, stage_named
 from clpipe.device import find_devices, open_device
+from clpipe.entrance import Entrance
 from clpipe.errors import ClpipeError, RequestError
-from clpipe.image_io import (
-    FINISHED,
-    MAX_PIXELS,
-    READABLE,
-    TRANSFERS,
-    USUAL_MAX_PIXELS,
-    Reading,
-)
+from clpipe.image_io import MAX_PIXELS, TRANSFERS, USUAL_MAX_PIXELS, Reading
+from clpipe.interrupt import interruptible
+from clpipe.jobs import Shard, find_jobs, parse_shard
 from clpipe.measure import load
 from clpipe.measure import measure as measure_images
+from clpipe.output_folder import output_folder, remove_unfinished
+from clpipe.progress import Reporter
 from clpipe.raw_dump import TYPES
-from clpipe.raw_entry import RawEntry
-from clpipe.raw_io import ENDINGS
-from clpipe.reentry import Reentry
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.registry import all_stages, load_stage_file
+from clpipe.run_log import RunLog, Summary, log_name
 from clpipe.stage import Kind, Stage
 from clpipe.suggest import one_of
-
-DEFAULTS = Settings()
+from clpipe.target import EVERY_FORMAT, Burst, Target
+from clpipe.trace import Trace
 
 
 class Group(click.Group):
@@ -180,58 +166,6 @@ format_option = click.option(
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 
-@dataclass(frozen=True)
-class Request:
-    """The options that say what chain to run, as :func:`chain_options` declares them."""
-
-    config: str | None
-    camera: str | None
-    iso: float | None
-    seed: int | None
-    assignments: Sequence[str]
-    stages: str | None
-    skip: Sequence[str]
-    start_at: str | None
-    until: str | None
-    stage_files: Sequence[Path]
-    raw_size: str | None = None
-    raw_type: str | None = None
-
-    def settings(self, under: Settings = DEFAULTS, carried: Settings | None = None) -> Settings:
-        """The settings of a configuration and the options over it.
-
-        ``under`` are settings that hold where these say nothing. ``carried`` are those of a kept
-        image; they hold where no configuration is named.
-        """
-        for file in self.stage_files:
-            load_stage_file(file)
-        named = self.config is not None
-        settings = load_settings(str(self.config), under) if named else carried or under
-        plain = {"camera": self.camera, "iso": self.iso, "seed": self.seed}
-        plain |= {"raw_size": self.raw_size, "raw_type": self.raw_type}
-        values: dict[str, Any] = {k: v for k, v in plain.items() if v is not None}
-        if self.stages is not None:
-            values["stages"] = [s.strip() for s in self.stages.split(",") if s.strip()]
-        values["skip"] = list(self.skip)
-        for text in self.assignments:
-            stage, parameter, value = parse_assignment(text)
-            values.setdefault(stage, {})[parameter] = value
-        return overlay(settings, values)
-
-    def chain(self, carried: Settings | None = None) -> Chain:
-        """The chain that they ask for; ``carried`` as for :meth:`settings`."""
-        return self.chain_of(self.settings(carried=carried), self.start_at)
-
-    def chain_of(self, settings: Settings, start_at: str | None) -> Chain:
-        """The chain of such settings, entered at a step."""
-        chain = make_chain(settings, start_at=start_at, until=self.until)
-        for text in self.assignments:
-            step = parse_assignment(text)[0]
-            if step not in (*chain.names, OUTPUT):
-                raise RequestError(one_of("stage in this chain", step, chain.names))
-        return chain
-
-
 @click.group(
     cls=Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
 )
@@ -283,6 +217,28 @@ def main() -> None:
 @keep_option
 @format_option
 @device_option
+@click.option(
+    "--jobs",
+    "threads",
+    type=click.IntRange(1, 1024),
+    metavar="N",
+    help="Images that are decoded at a time, and as many encoded. [default: one a processor]",
+)
+@click.option(
+    "--shard",
+    default="1/1",
+    metavar="I/N",
+    callback=lambda _context, _option, text: parse_shard(text),
+    help="Do the I-th of N parts of the images, for job arrays.",
+)
+@click.option("--overwrite", is_flag=True, help="Make what is there already and up to date, too.")
+@click.option("--quiet", is_flag=True, help="Tell of failures alone.")
+@click.option(
+    "--trace",
+    type=click.Path(path_type=Path),
+    metavar="FILE.json",
+    help="Write what was done when, for Perfetto or chrome://tracing.",
+)
 def run(
     inputs: tuple[str, ...],
     output: Path,
@@ -293,6 +249,11 @@ def run(
     keep: tuple[str, ...],
     formats: tuple[str, ...],
     selector: str | None,
+    threads: int | None,
+    shard: Shard,
+    overwrite: bool,
+    quiet: bool,
+    trace: Path | None,
     **request: Any,
 ) -> None:
     """Run images through the chain: files, folders or globs of linear float images (EXR), and of
@@ -301,58 +262,48 @@ def run(
     Each makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used. With
     --frames: OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise.
     """
-    asked = Request(**request)
-    reentry = Reentry(asked.start_at, asked.chain) if asked.start_at else None
-    raws = RawEntry(asked.settings, asked.chain_of, asked.start_at, asked.settings().dump)
-    finished = reentry is None and entry(asked.settings()) is Kind.DISPLAY
-    how = Reading(layer, max_pixels, transfer)
-    pictures = FINISHED if finished else (*READABLE, *(FINISHED if transfer else ()))
-    jobs = find_jobs(inputs, output, (*pictures, *(() if finished else ENDINGS)))
-    if all(raws.takes(job.path) for job in jobs):
-        chain = raws.first_chain(jobs[0].path)
-    else:
-        chain = reentry.first_chain(jobs[0].path) if reentry else asked.chain()
+    entrance = Entrance(asked_for(**request), Reading(layer, max_pixels, transfer))
+    jobs = shard.take(find_jobs(inputs, output, entrance.endings()))
+    if not jobs:
+        raise RequestError(f"shard {shard.number} of {shard.of} has no image")
+    chain = entrance.first_chain(jobs)
     for option, value in (("--layer", layer), ("--transfer", transfer)):
         if value is not None and chain.source is not Kind.RGB:
             raise RequestError(
                 f"{option}: it is one of a render, but the chain reads {chain.source.label}"
             )
-    kept = chain.kept(keep)
-    whole = asked.until is None or chain.result is Kind.DISPLAY
+    whole = entrance.asked.until is None or chain.result is Kind.DISPLAY
     formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
-    target = Target(output, formats, Burst(frames), kept)
-    if frames:
-        chain.clean()  # refuses a chain in which frames would be the same
+    target = Target(output, formats, Burst(frames), chain.kept(keep))
     target.check(chain, jobs)
     device = open_device(selector)
-    prepare_folder(output)
-    runner = target.runner(chain, device)
-    failed = 0
-    left_out = 0
-    for outcome in run_jobs(jobs, runner, target, raws, how, reentry):
-        if outcome.left_out:
-            left_out += 1
-            continue
-        if outcome.error:
-            failed += 1
-            click.echo(f"clpipe: {outcome.error}", err=True)
-            continue
-        for warning in outcome.warnings:
-            click.echo(f"clpipe: {outcome.job.path}: warning: {warning}", err=True)
-        first, *others = target.burst.names()
-        made = str(target.path(outcome.job, ending_of(formats[0]), first))
-        if others:
-            made += f" and {len(others)} frame{'s' * (len(others) > 1)}"
-        click.echo(
-            f"{outcome.job.path} -> {made}  {outcome.megapixels:.2g} MP  {outcome.seconds:.2f} s",
-            err=True,
-        )
-    if left_out:
-        click.echo(f"{left_out} images in folders were kept elsewhere and left out", err=True)
-    if len(jobs) > 1 or failed:
-        done = len(jobs) - failed - left_out
-        click.echo(f"{done} of {len(jobs)} images done, {failed} failed", err=True)
-    sys.exit(1 if failed else 0)
+    summary = Summary(len(jobs))
+    with output_folder(output, shard):
+        remove_unfinished(output, jobs)
+        batch = Batch(entrance, target, [device], chain, threads, overwrite, trace is not None)
+        events = Trace() if trace else None
+        start = {"arguments": sys.argv[1:], "images": len(jobs)}
+        with (
+            RunLog(output / log_name(shard), start) as log,
+            interruptible(batch.stop),
+            Reporter(summary, target, Console(stderr=True), quiet) as reporter,
+        ):
+            try:
+                for outcome in batch.run(jobs):
+                    summary.add(outcome)
+                    log.add(outcome)
+                    reporter.tell(outcome)
+                    if events:
+                        events.add(outcome)
+            finally:
+                summary.interrupted = summary.finished < summary.total
+                log.end(summary)
+                reporter.end()
+    if events and trace:
+        events.write(trace)
+    if summary.interrupted:
+        sys.exit(130)
+    sys.exit(1 if summary.failures else 0)
 
 
 @main.command()
@@ -369,7 +320,7 @@ def plan(
     A launch is one kernel call over the image. Stages that look at a pixel alone join the launch
     before them; a stencil, a reduction and a kept image open one. A slot is a buffer of one plane.
     """
-    asked = Request(**request)
+    asked = asked_for(**request)
     if as_toml:
         if asked.start_at or asked.until or as_json:
             raise RequestError(
@@ -547,7 +498,7 @@ def bench(
             f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 6000x4000, "
             f"at most {MAX_PIXELS} pixels"
         )
-    chain = Request(**request).chain()
+    chain = asked_for(**request).chain()
     device = open_device(selector)
     if device is None:
         raise RequestError("bench: it times the kernels of a device; numpy has none")

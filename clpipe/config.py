@@ -211,25 +211,27 @@ def load_settings(name: str, under: Settings = Settings()) -> Settings:
     Raises:
         RequestError: there is no such configuration or file, or it is not valid.
     """
+    return overlay(under, own_values(name))
+
+
+def own_values(name: str) -> dict[str, Any]:
+    """What a configuration says, nested as in its file. Files that it names are relative to it.
+
+    Args:
+        name: of a built-in configuration, or the path of a file (ending in .toml).
+
+    Raises:
+        RequestError: there is no such configuration or file, it cannot be read, is not TOML, or
+            names what there is not; the message gives the file and, where there is one, the line.
+    """
     built_in = built_in_configs()
     path = built_in.get(name, Path(name))
     if path.suffix != ".toml" and not path.is_file():
         raise RequestError(one_of("configuration", name, built_in) + ", or a .toml file")
-    return read_settings(path, under)
-
-
-def read_settings(path: Path, under: Settings = Settings()) -> Settings:
-    """Settings from a TOML file, laid over others. Files that it names are relative to it.
-
-    Raises:
-        RequestError: the file cannot be read, is not TOML, or names what there is not; the message
-            gives the file and, where there is one, the line.
-    """
     try:
         text = path.read_text("utf-8-sig")
         values = tomllib.loads(text)
         own = settings_from(values, path.parent).record()
-        return overlay(under, {key: own[key] for key in values if key in own})
     except OSError as error:
         raise RequestError(f"{path}: cannot read this configuration: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -240,6 +242,10 @@ def read_settings(path: Path, under: Settings = Settings()) -> Settings:
         line = line_of(text, error.key)
         place = f"{path}, line {line}" if line else str(path)
         raise RequestError(f"{place}: {error}") from None
+    said = {key: own[key] for key in values if key in own}
+    if files := values.get("stage_files"):
+        said["stage_files"] = [str((path.parent / file).resolve()) for file in files]
+    return said
 
 
 def line_of(text: str, key: str) -> int | None:
@@ -503,6 +509,19 @@ def joined(folder: Path, value: Any, only: str = "") -> Any:
         return {**value, "choice": [joined(folder, one, only) for one in value["choice"]]}
     named = isinstance(value, str) and value and value.endswith(only)
     return str(folder / value) if named else value
+
+
+def files_of(settings: Settings) -> list[str]:
+    """The files that settings name, whose contents so are a part of them."""
+    files = [settings.camera] if settings.camera.endswith(".toml") else []
+    for name, table in settings.parameters.items():
+        stage = stage_named(name, base_name(name))
+        method = stage.by_name.get(str(table.get("method", stage.methods[0].method)))
+        for parameter, field_ in (method.model_fields if method else {}).items():
+            extra: Any = field_.json_schema_extra
+            if extra["file"] and isinstance(value := table.get(parameter), str) and value:
+                files.append(value)
+    return files
 
 
 def base_name(step: str) -> str:

@@ -43,3 +43,9 @@ class DeviceError(ClpipeError):
     """There is no usable device, or the one that was asked for cannot be used."""
 
     exit_status = 3
+
+
+class OutputError(ClpipeError):
+    """Nothing can be written any more: the disk is full, or the folder has gone."""
+
+    exit_status = 1

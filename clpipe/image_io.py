@@ -3,7 +3,7 @@
 import contextlib
 import hashlib
 import json
-import os
+import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -477,15 +477,18 @@ def srgb_profile() -> bytes:
     return bytes(profile)
 
 
-def write_beside(path: Path, write: Callable[[Path], None]) -> None:
+_unfinished: set[Path] = set()
+
+
+def write_beside(path: Path, write: Callable[[Path], object]) -> None:
     """Write a file under a temporary name beside ``path``, then rename it: never half a file.
 
     Raises:
         ImageError: the file cannot be written.
     """
-    beside = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    beside = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
+    _unfinished.add(beside)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         write(beside)
         beside.replace(path)
     except OSError as error:
@@ -493,6 +496,27 @@ def write_beside(path: Path, write: Callable[[Path], None]) -> None:
     finally:
         with contextlib.suppress(OSError):
             beside.unlink(missing_ok=True)
+        _unfinished.discard(beside)
+
+
+def write_new(path: Path, write: Callable[[Path], object]) -> None:
+    """The same, where the folders above it may have to be made.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be written: {error.strerror}") from None
+    write_beside(path, write)
+
+
+def drop_unfinished() -> None:
+    """Remove the halves of files that are being written now, before the process is ended."""
+    for path in list(_unfinished):
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)

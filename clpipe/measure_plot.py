@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from clpipe.image_io import write_beside
+from clpipe.image_io import write_new
 from clpipe.measure import UNITS, Report
 from clpipe.statistics import HISTOGRAM, LAGS, Channel, gaussian_beyond
 
@@ -54,7 +54,7 @@ def draw(report: Report, path: Path) -> None:
     title = f"Noise of {of} against {against} ({report.kind}, {report.share:.0%} of it counts)"
     figure.suptitle(title, fontsize=15)
     FigureCanvasAgg(figure)
-    write_beside(path, figure.savefig)
+    write_new(path, figure.savefig)
 
 
 def short_name(path: str) -> str:

@@ -19,6 +19,12 @@ STILL_LIFE = ROOT / "tests" / "data" / "still_life.exr"
 SHARED = ROOT.parent / "shared" / "data"
 
 
+def written(folder: Path) -> list[str]:
+    """The files in a folder at any depth, sorted, but for the run's log."""
+    files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+    return sorted(files - {"run.jsonl"})
+
+
 @pytest.fixture(scope="session")
 def device() -> Device:
     return Device(choose(None, find_devices()))

@@ -11,17 +11,13 @@ import pytest
 from PIL import Image
 
 from clpipe.stages import DEFAULT_CHAIN
-from tests.conftest import ROOT, STILL_LIFE
+from tests.conftest import ROOT, STILL_LIFE, written
 
 
 @pytest.fixture
 def small(write_exr):
     pixels = np.random.default_rng(0).random((24, 32, 3)).astype(np.float32)
     return write_exr("in/small.exr", pixels)
-
-
-def files(folder):
-    return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
 
 
 def read_exr(path):
@@ -37,7 +33,7 @@ def read_png(path):
 
 def test_the_main_job(clpipe, tmp_path):
     clpipe("run", STILL_LIFE, "-o", "out", "--iso", 1600)
-    assert files(tmp_path / "out") == ["still_life.jpg", "still_life.json"]
+    assert written(tmp_path / "out") == ["still_life.jpg", "still_life.json"]
     with Image.open("out/still_life.jpg") as image:
         assert image.size == (960, 640)
     sidecar = json.loads((tmp_path / "out" / "still_life.json").read_text())
@@ -72,7 +68,7 @@ def test_numpy_gives_the_same_picture(clpipe, small, tmp_path):
         "--device",
         "numpy",
     )
-    assert files(tmp_path / "a") == ["small.json", "small.png", "small.quantize.exr"]
+    assert written(tmp_path / "a") == ["small.json", "small.png", "small.quantize.exr"]
     one, two = (read_png(f"{f}/small.png").astype(int) for f in "ab")
     assert np.abs(one - two).max() <= 1
     assert np.array_equal(*(read_exr(f"{f}/small.quantize.exr")[0] for f in "ab"))
@@ -95,9 +91,9 @@ def test_a_second_run_makes_the_same_bytes(clpipe, small, tmp_path):
             "--keep",
             "all",
         )
-    assert files(tmp_path / "a") == files(tmp_path / "b")
-    assert len(files(tmp_path / "a")) == 3 + len(DEFAULT_CHAIN)
-    for name in files(tmp_path / "a"):
+    assert written(tmp_path / "a") == written(tmp_path / "b")
+    assert len(written(tmp_path / "a")) == 3 + len(DEFAULT_CHAIN)
+    for name in written(tmp_path / "a"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 
@@ -168,7 +164,7 @@ def test_a_folder_keeps_its_structure_and_a_bad_file_stops_nobody(clpipe, write_
     assert "nowhere.exr: no such file" in result.stderr
     assert "3 of 5 images done, 2 failed" in result.stderr
     made = ["a.jpg", "a.json", "sub/b.jpg", "sub/b.json", "sub/deep/a.jpg", "sub/deep/a.json"]
-    assert files(tmp_path / "out") == made
+    assert written(tmp_path / "out") == made
     keys = [
         json.loads((tmp_path / "out" / m).read_text())["image_key"] for m in made if "json" in m
     ]
@@ -255,14 +251,14 @@ def test_links_to_folders_are_followed_once(clpipe, write_exr, tmp_path):
     (tmp_path / "in" / "linked").symlink_to(tmp_path / "real")
     (tmp_path / "real" / "back").symlink_to(tmp_path / "in")
     clpipe("run", "in", "-o", "out")
-    assert files(tmp_path / "out") == ["linked/a.jpg", "linked/a.json"]
+    assert written(tmp_path / "out") == ["linked/a.jpg", "linked/a.json"]
 
 
 def test_an_output_folder_inside_the_input_is_no_input(clpipe, small, tmp_path):
     for _ in range(2):
         clpipe("run", "in", "-o", "in/out", "--format", "exr", "--keep", "mosaic")
     made = ["small.exr", "small.json", "small.mosaic.exr"]
-    assert files(tmp_path / "in" / "out") == made
+    assert written(tmp_path / "in" / "out") == made
 
 
 def test_odd_names(clpipe, write_exr, tmp_path):
@@ -270,7 +266,7 @@ def test_odd_names(clpipe, write_exr, tmp_path):
     (tmp_path / os.fsdecode(b"in/bad\xff.exr")).write_bytes(b"x")
     result = clpipe("run", "in", "-o", "out", status=1)
     assert "its name is not UTF-8" in result.stderr
-    assert files(tmp_path / "out") == ["sp ace \u00e9\u4e2d.jpg", "sp ace \u00e9\u4e2d.json"]
+    assert written(tmp_path / "out") == ["sp ace \u00e9\u4e2d.jpg", "sp ace \u00e9\u4e2d.json"]
     assert "File name too long" in clpipe("run", "a" * 300, "-o", "out", status=1).stderr
     assert "an input is empty" in clpipe("run", "", "-o", "out", status=2).stderr
 
@@ -288,7 +284,7 @@ def test_nothing_is_left_half_written(clpipe, small, tmp_path, monkeypatch):
     monkeypatch.setattr("pathlib.Path.replace", no_space)
     result = clpipe("run", small, "-o", "out", status=1)
     assert "No space left on device" in result.stderr
-    assert files(tmp_path / "out") == []
+    assert written(tmp_path / "out") == []
 
 
 def test_a_jpeg_has_its_limit(clpipe, write_exr):
@@ -395,8 +391,8 @@ def test_a_burst_is_frames_and_one_truth(clpipe, write_exr, tmp_path):
     clpipe("run", render, "-o", out, "--iso", 3200, "--frames", 3, "--keep", "normalize")
     names = [f"scene.{name}" for name in ("truth", "frame0", "frame1", "frame2")]
     for name in names:
-        assert {f"{name}.jpg", f"{name}.json", f"{name}.normalize.exr"} <= set(os.listdir(out))
-    assert len(os.listdir(out)) == 12
+        assert {f"{name}.jpg", f"{name}.json", f"{name}.normalize.exr"} <= set(written(out))
+    assert len(written(out)) == 12
     truth, *frames = [read_exr(out / f"{name}.normalize.exr")[0] for name in names]
     assert len(np.unique(truth[::2, ::2])) == 1
     for i, one in enumerate(frames):

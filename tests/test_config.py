@@ -11,7 +11,6 @@ from clpipe.config import (
     make_chain,
     overlay,
     parse_assignment,
-    read_settings,
     settings_from,
 )
 from clpipe.describe import toml_text
@@ -97,15 +96,15 @@ def test_a_mistake_in_a_file_is_named_with_its_line(tmp_path, text, message):
     path = tmp_path / "pipeline.toml"
     path.write_text(text)
     with pytest.raises(RequestError, match=f"pipeline.toml.*{message}"):
-        read_settings(path)
+        load_settings(str(path))
 
 
 def test_a_file_that_cannot_be_read(tmp_path):
     with pytest.raises(RequestError, match="cannot read"):
-        read_settings(Path(tmp_path / "no.toml"))
+        load_settings(str(Path(tmp_path / "no.toml")))
     (tmp_path / "bad.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(RequestError, match="not a text file"):
-        read_settings(tmp_path / "bad.toml")
+        load_settings(str(tmp_path / "bad.toml"))
 
 
 @pytest.mark.parametrize("text", ["", "a", "a.b", "=3", "stage=3", "a.b.c=3"])
@@ -216,7 +215,7 @@ def test_a_chain_as_toml_is_the_chain_again(tmp_path):
     )
     path = tmp_path / "pipeline.toml"
     path.write_text(toml_text(make_chain(settings)))
-    one, two = make_chain(settings), make_chain(read_settings(path))
+    one, two = make_chain(settings), make_chain(load_settings(str(path)))
     assert [(s.name, s.method) for s in one.steps] == [(s.name, s.method) for s in two.steps]
     assert "\n# b = " in path.read_text()
     assert "\na = 0.001" in path.read_text()

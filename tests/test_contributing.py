@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from clpipe.camera import load_camera
 from clpipe.check import check_method
 from clpipe.cli import main
-from clpipe.config import make_chain, read_settings
+from clpipe.config import load_settings, make_chain
 from clpipe.device import Device
 from clpipe.registry import load_stage_file
 from tests.conftest import ROOT, STILL_LIFE
@@ -91,7 +91,7 @@ def test_the_configurations_in_the_readme_are_valid(tmp_path):
     for text in re.findall(r"```toml\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL):
         if "[[gain_stages]]" not in text:
             path.write_text(text)
-            chains.append(make_chain(read_settings(path)))
+            chains.append(make_chain(load_settings(str(path))))
     output, whole = chains
     assert output.settings.output.focal_length == 35
     assert whole.iso == 1600

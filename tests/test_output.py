@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from clpipe.cli import main
-from clpipe.config import overlay, read_settings, settings_from
+from clpipe.config import load_settings, overlay, settings_from
 from clpipe.image_io import read_image
 from tests.conftest import STILL_LIFE
 
@@ -109,7 +109,7 @@ def test_a_configuration_says_how_files_are_written(scene, tmp_path):
     assert record["output"]["focal_length"] == 35
     text = clpipe("plan", "--toml", "-c", config)
     (tmp_path / "again.toml").write_text(text)
-    assert read_settings(tmp_path / "again.toml").output == read_settings(config).output
+    assert load_settings(str(tmp_path / "again.toml")).output == load_settings(str(config)).output
 
 
 def test_a_kept_image_knows_how_it_was_to_be_written(scene, tmp_path):

@@ -14,7 +14,7 @@ from clpipe.image_io import read_image, upright, write_exr
 from clpipe.raw_dump import dump_of
 from clpipe.raw_io import read_facts, read_raw
 from clpipe.reference.cfa import PATTERNS, by_site
-from tests.conftest import STILL_LIFE
+from tests.conftest import STILL_LIFE, written
 from tests.dng import field, write_dng
 
 MEASURE = ("--device", "numpy", "--skip", "denoise")  # so that colours can be compared exactly
@@ -304,7 +304,7 @@ def test_what_only_looks_like_a_raw(tmp_path, change, message):
         path.write_bytes(cut.get(change, b"\xff\xd8\xff\xe1" + data))
     output = clpipe("run", path, "-o", tmp_path / "out", status=1)
     assert f"{path}: {message}" in output
-    assert not list((tmp_path / "out").iterdir())
+    assert not written(tmp_path / "out")
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from clpipe.cli import main
 from clpipe.image_io import read_image, write_exr
 from clpipe.stages import DEFAULT_CHAIN
-from tests.conftest import STILL_LIFE
+from tests.conftest import STILL_LIFE, written
 
 OPTIONS = ("--iso", "3200", "--seed", "5", "--set", "mosaic.pattern=GBRG")
 OPTIONS += ("--set", "white_balance.method=gray_world", "--set", "gamma.exponent=1.9")
@@ -153,7 +153,7 @@ def test_an_image_of_another_kind_is_refused_and_the_others_go_on(
 
 def test_a_folder_gives_what_was_kept_right_before(kept, tmp_path):
     output = clpipe("run", kept, "-o", tmp_path, "--start-at", "denoise")
-    assert {p.name for p in tmp_path.iterdir()} == {"crop.demosaic.jpg", "crop.demosaic.json"}
+    assert written(tmp_path) == ["crop.demosaic.jpg", "crop.demosaic.json"]
     assert "17 images in folders were kept elsewhere and left out" in output
     assert "1 of 18 images done, 0 failed" in output
 
@@ -227,7 +227,7 @@ def test_a_part_that_cannot_be_run(kept, tmp_path, options, message):
 def test_until_gives_a_float_image_unless_it_is_the_end(tmp_path):
     image = crop(tmp_path)
     clpipe("run", image, "-o", tmp_path / "a", "--until", "white_balance")
-    assert {p.name for p in (tmp_path / "a").iterdir()} == {"crop.exr", "crop.json"}
+    assert written(tmp_path / "a") == ["crop.exr", "crop.json"]
     assert read_image(tmp_path / "a" / "crop.exr", mosaic=True).attributes["kind"] == "mosaic"
     clpipe("run", image, "-o", tmp_path / "b", "--until", "gamma")
     assert (tmp_path / "b" / "crop.jpg").is_file()

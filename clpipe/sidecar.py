@@ -1,0 +1,188 @@
+"""The sidecar: everything that is needed to make a picture again, and whether it must be."""
+
+import hashlib
+import json
+import os
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import clpipe
+from clpipe.asked import Asked
+from clpipe.config import files_of
+from clpipe.device import Device
+from clpipe.errors import ImageError
+from clpipe.image_io import Reading, SourceImage, versions, write_beside
+from clpipe.jobs import Job
+from clpipe.raw_entry import RawImage
+from clpipe.run import Result
+from clpipe.target import Shot, Target
+
+OWN = "clpipe"  # the key that every sidecar has
+
+
+def wanted(asked: Asked, reading: Reading, target: Target) -> dict[str, Any]:
+    """What is to be made, as far as it is known before the image is read.
+
+    What is equal here makes the same bytes of the same image under the same image key.
+    """
+    record = {
+        **asked.record(),
+        "layer": reading.layer,
+        "transfer": reading.transfer,
+        "formats": target.formats,
+        "keep": target.keep,
+        "files": digests([*files_of(asked.settings()), *asked.stage_files]),
+    }
+    found: dict[str, Any] = json.loads(json.dumps(record))  # as a sidecar will have it
+    return found
+
+
+def stamp_of(path: Path) -> tuple[int, int]:
+    """The size of a file and its time of change (ns); zeros where it cannot be seen."""
+    try:
+        info = path.stat()
+    except OSError:
+        return (0, 0)
+    return info.st_size, info.st_mtime_ns
+
+
+def digests(files: Iterable[str]) -> dict[str, str]:
+    """The SHA-256 of each of these files that can be read."""
+    found = {}
+    for file in files:
+        with suppress(OSError):
+            found[file] = _digest(file, *stamp_of(Path(file)))
+    return found
+
+
+@lru_cache(maxsize=1024)
+def _digest(file: str, size: int, modified: int) -> str:
+    with open(file, "rb") as data:
+        return hashlib.file_digest(data, "sha256").hexdigest()
+
+
+def is_done(path: Path, job: Job, wanted: Mapping[str, Any], outputs: Sequence[Path]) -> bool:
+    """Whether a picture is there already, made of the same input, in the same way, by this version.
+
+    An input of the same size and time of change is taken for the same; else its SHA-256 decides.
+
+    Args:
+        path: of the sidecar.
+        job: the image.
+        wanted: what is to be made, as :func:`wanted` says it, and the image key.
+        outputs: the files that must be there.
+
+    Raises:
+        ImageError: the sidecar is somebody else's file.
+    """
+    try:
+        found = read_sidecar(path)
+    except FileNotFoundError:
+        return False
+    same = found[OWN] == clpipe.__version__ and found.get("asked") == wanted
+    if not same or not all(map(os.path.exists, outputs)):
+        return False
+    size, modified = stamp_of(job.path)
+    if found.get("input_size") != size:
+        return False
+    if found.get("input_modified") == modified:
+        return True
+    return found.get("sha256") in digests([str(job.path)]).values()
+
+
+def read_sidecar(path: Path) -> dict[str, Any]:
+    """A sidecar's values.
+
+    Raises:
+        FileNotFoundError: it is not there.
+        ImageError: it cannot be read, or clpipe did not write it.
+    """
+    try:
+        found = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError:
+        found = None
+    if not isinstance(found, dict) or OWN not in found:
+        raise ImageError(
+            f"{path}: clpipe did not write this file, and would overwrite it with its sidecar; "
+            "move it, choose another output folder, or say --overwrite"
+        )
+    return found
+
+
+def write_sidecar(path: Path, record: Mapping[str, Any]) -> None:
+    """Write the sidecar of a picture, whose files are all there.
+
+    Raises:
+        ImageError: it cannot be written.
+    """
+    text = json.dumps(record, indent=2) + "\n"
+    write_beside(path, lambda to: to.write_text(text))
+
+
+def sidecar(
+    job: Job,
+    stamp: tuple[int, int],
+    shot: Shot,
+    device: Device | None,
+    source: SourceImage,
+    result: Result,
+    outputs: Sequence[str],
+) -> dict[str, Any]:
+    """Everything that is needed to make the same files again."""
+    chain = shot.chain
+    raw = source.said if isinstance(source, RawImage) else None
+    noise = chain.noise if not raw or chain.is_noisy else None
+    size, modified = stamp
+    return {
+        OWN: clpipe.__version__,
+        "input": str(job.path),
+        "input_size": size,
+        "input_modified": modified,
+        "sha256": source.sha256,
+        "layer": source.layer,
+        "image_key": shot.key,
+        "seed": chain.seed,
+        "width": source.pixels.shape[1],
+        "height": source.pixels.shape[0],
+        "camera": chain.camera.name,
+        "iso": chain.iso,
+        "output": chain.settings.output.filled(source.shot).model_dump(),
+        "noise": noise.record() if noise else None,
+        "starts_on": chain.source.label,
+        **({"raw": asdict(raw)} if raw else {}),
+        "stages": [
+            {
+                "name": step.name,
+                "stage": step.stage.name,
+                "method": step.method.method,
+                "parameters": step.method.model_dump(),
+                **({"found": result.found[step.name]} if step.name in result.found else {}),
+            }
+            for step in chain.steps
+        ],
+        "outputs": list(outputs),
+        "warnings": list(source.warnings),
+        "device": {
+            "name": device.info.name if device else "numpy",
+            "platform": device.info.platform if device else "numpy",
+            "version": device.info.version if device else version("numpy"),
+            "driver": device.info.driver if device else "",
+            "lanes": device.info.lanes if device else 0,
+        },
+        "versions": {
+            "python": platform.python_version(),
+            "numpy": version("numpy"),
+            "pyopencl": version("pyopencl"),
+            **versions(),
+        },
+    }

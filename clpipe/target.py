@@ -1,0 +1,300 @@
+"""Where the pictures of a run go: names, formats, bursts."""
+
+import contextlib
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from clpipe.config import Chain
+from clpipe.device import Device
+from clpipe.dng import negative_of, write_dng
+from clpipe.errors import ImageError, OutputError, RequestError
+from clpipe.image_io import (
+    CARRIED,
+    JPEG_MAX_SIDE,
+    SourceImage,
+    Tags,
+    carried,
+    upright,
+    write_display,
+    write_exr,
+)
+from clpipe.jobs import Job
+from clpipe.reentry import attributes_of
+from clpipe.reference.curve import to_16_bit
+from clpipe.run import Result, Runner
+from clpipe.stage import Kind
+
+
+@dataclass(frozen=True)
+class Format:
+    """A kind of file: how its name ends, and how many bits its samples have; floats or not."""
+
+    ending: str
+    bits: int
+    floats: bool = False
+
+
+FORMATS = {
+    "jpg": Format("jpg", 8),
+    "png": Format("png", 8),
+    "png16": Format("png", 16),
+    "tif": Format("tif", 8),
+    "tif16": Format("tif", 16),
+    "tif32": Format("tif", 32, floats=True),
+    "exr": Format("exr", 32, floats=True),
+    "exr16": Format("exr", 16, floats=True),
+}
+DNG = "dng"  # not of the last image, but of the raw
+EVERY_FORMAT = (*FORMATS, DNG)
+SIDECAR = "json"
+
+
+def ending_of(format_: str) -> str:
+    """How the name of a file of a format ends."""
+    return DNG if format_ == DNG else FORMATS[format_].ending
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture of an image: what stands behind the image's name, how it is made, its key."""
+
+    name: str
+    chain: Chain
+    key: str
+
+
+@dataclass(frozen=True)
+class Burst:
+    """How many frames are made of each image; None is one, without anything beside it."""
+
+    frames: int | None = None
+
+    def names(self) -> tuple[str, ...]:
+        """What stands behind the image's name for each picture that is made of it.
+
+        >>> Burst(2).names(), Burst().names()
+        (('.truth', '.frame0', '.frame1'), ('',))
+        """
+        if self.frames is None:
+            return ("",)
+        digits = len(str(self.frames - 1))
+        return (".truth", *(f".frame{i:0{digits}}" for i in range(self.frames)))
+
+    def shots(self, chain: Chain, key: str) -> list[Shot]:
+        """The pictures of an image.
+
+        The first frame is the picture that there is without a burst; the truth has no noise.
+        """
+        first, *others = self.names()
+        if not others:
+            return [Shot(first, chain, key)]
+        frames = [Shot(n, chain, f"{key}#{i}" if i else key) for i, n in enumerate(others)]
+        return [Shot(first, chain.clean(), key), *frames]
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where results go, in which formats, how many of each image, and which stages' images too."""
+
+    folder: Path
+    formats: tuple[str, ...]
+    burst: Burst = Burst()
+    keep: tuple[str, ...] = ()
+
+    def burst_of(self, job: Job) -> Burst:
+        """How many frames are made of a job's image."""
+        return self.burst if job.frames is None else Burst(job.frames)
+
+    def runner(self, chain: Chain, device: Device | None) -> Runner:
+        """What makes all that is to be written, and nothing else."""
+        made = [FORMATS[f] for f in self.formats if f != DNG]
+        raw = negative_of(chain).step if DNG in self.formats else None
+        return Runner(
+            chain,
+            device,
+            tuple(dict.fromkeys([*self.kept_of(chain), *([raw] if raw else [])])),
+            encode=any(f.bits == 8 for f in made),
+            final=any(f.bits > 8 for f in made),
+        )
+
+    def kept_of(self, chain: Chain) -> list[str]:
+        """The steps of a chain whose image is written too."""
+        return [step.name for step in chain.steps if step.name in self.keep]
+
+    def check(self, chain: Chain, jobs: Sequence[Job]) -> None:
+        """See that the results can be written in these formats, over no input and no other result.
+
+        Raises:
+            RequestError: they cannot.
+        """
+        few = [f for f in self.formats if f != DNG and FORMATS[f].bits < 32]
+        if few and chain.result is Kind.RAW:
+            raise RequestError(
+                f"the chain ends in DN, which {few[0]} cannot hold; "
+                "end it with normalize or a later stage, or use --format dng or exr"
+            )
+        if DNG in self.formats:
+            negative_of(chain)  # refuses a chain without a raw
+        if any(self.burst_of(job).frames for job in jobs):
+            chain.clean()  # refuses a chain in which frames would be the same
+        endings: dict[str, str] = {}
+        for format_ in self.formats:
+            other = endings.setdefault(ending_of(format_), format_)
+            if other != format_:
+                raise RequestError(
+                    f"--format {other} and {format_} would both write NAME.{ending_of(format_)}; "
+                    "run them into different folders"
+                )
+        real_folder = os.path.realpath(self.folder)
+        inputs = {os.path.realpath(job.path) for job in jobs}
+        inside = {path for path in inputs if path.startswith(real_folder + os.sep)}
+        makers: dict[str, Job] = {}
+        every = (SIDECAR, *endings, *(f"{step}.exr" for step in self.keep))
+        for job in jobs:
+            for name in self.burst_of(job).names():
+                for ending in every:
+                    path = f"{job.stem}{name}.{ending}"
+                    if inside and os.path.realpath(self.folder / path) in inside:
+                        raise RequestError(
+                            f"{self.folder / path} is an input and would be overwritten; "
+                            "choose another output folder"
+                        )
+                    if path in makers:
+                        raise RequestError(
+                            f"{named(makers[path])} and {named(job)} would both write "
+                            f"{self.folder / path}; run them into different folders"
+                        )
+                    makers[path] = job
+
+    def path(self, job: Job, ending: str, name: str = "") -> Path:
+        """The output of a job with that ending; ``name`` is one of the burst's."""
+        return self.folder / f"{job.stem}{name}.{ending}"
+
+    def check_size(self, source: SourceImage) -> None:
+        """See that an image fits into the formats.
+
+        Raises:
+            ImageError: it is too large for one.
+        """
+        if "jpg" in self.formats and max(source.pixels.shape[:2]) > JPEG_MAX_SIDE:
+            raise ImageError(f"JPEG holds at most {JPEG_MAX_SIDE} pixels a side; use --format png")
+
+    def _make_folder_of(self, job: Job) -> None:
+        """Make the folders between the output folder, which must be there, and a job's files.
+
+        Raises:
+            OutputError: the output folder is not there any more.
+            ImageError: they cannot be made.
+        """
+        if not self.folder.is_dir():
+            raise OutputError(f"{self.folder}: the folder has gone; {RESUMABLE}")
+        place = self.path(job, "").parent
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ImageError(f"{place}: cannot be made: {error.strerror}") from None
+
+    def outputs(self, job: Job, name: str) -> list[Path]:
+        """The images of one picture that are there in any case; an image that enters behind a kept
+        step has not that one.
+        """
+        return [self.path(job, ending_of(format_), name) for format_ in self.formats]
+
+    def check_folder(self) -> None:
+        """See that the output folder can still be written to.
+
+        Raises:
+            OutputError: it cannot.
+        """
+        if reason := trouble_with(self.folder):
+            raise OutputError(f"{self.folder}: {reason}; {RESUMABLE}")
+
+    def write(self, job: Job, shot: Shot, source: SourceImage, result: Result) -> list[Path]:
+        """Write the images of one picture; the files.
+
+        Raises:
+            ImageError: a file cannot be written.
+            OutputError: the output folder is not there any more.
+        """
+        self._make_folder_of(job)
+        chain, camera = shot.chain, shot.chain.camera
+        own = Tags(camera.make, camera.model, chain.iso)
+        tags, orientation = carried(source.attributes, own)
+        how = chain.settings.output.filled({**source.shot, **tags.shot})
+        tags = replace(tags, output=how)
+        brought = {name: source.attributes[name] for name in CARRIED if name in source.attributes}
+        mosaic = chain.result in (Kind.RAW, Kind.MOSAIC)
+        turn = 1 if mosaic else orientation  # to turn a mosaic would be to change its pattern
+        outputs: list[Path] = []
+        for step in (chain.step_named(name) for name in self.kept_of(chain)):
+            path = self.path(job, f"{step.name}.exr", shot.name)
+            attributes = attributes_of(step, chain, shot.key) | brought
+            write_exr(path, result.kept[step.name], step.stage.writes.channels, attributes)
+            outputs.append(path)
+        for format_ in self.formats:
+            path = self.path(job, ending_of(format_), shot.name)
+            if format_ == DNG:
+                negative = negative_of(chain)
+                raw = result.kept[negative.step] if negative.step else source.pixels
+                write_dng(path, raw, negative, tags, orientation)
+            else:
+                attributes = attributes_of(chain.steps[-1], chain, shot.key) | brought
+                write_last(path, FORMATS[format_], result, chain, attributes, tags, turn)
+            outputs.append(path)
+        return outputs
+
+
+RESUMABLE = "what is finished is there, and the same command goes on"
+ROOM = 8 * 2**20  # bytes; a disk with less is full
+
+
+def trouble_with(folder: Path) -> str:
+    """Why nothing can be written to a folder, "" where it can."""
+    probe = folder / f".clpipe.{os.getpid()}"
+    try:
+        with open(probe, "wb") as file:
+            os.posix_fallocate(file.fileno(), 0, ROOM)
+    except OSError as error:
+        return f"cannot write there: {error.strerror}"
+    finally:
+        with contextlib.suppress(OSError):
+            probe.unlink()
+    return ""
+
+
+def named(job: Job) -> str:
+    """A job as an error names it."""
+    return f"{job.path} ({job.place})" if job.place else str(job.path)
+
+
+def write_last(
+    path: Path,
+    format_: Format,
+    result: Result,
+    chain: Chain,
+    attributes: Mapping[str, str],
+    tags: Tags,
+    orientation: int,
+) -> None:
+    """Write the last image of a chain, turned as EXIF's ``orientation`` says.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    pixels = result.encoded
+    if format_.bits > 8:
+        assert result.final is not None
+        pixels = result.final if format_.floats else to_16_bit(result.final)
+    if format_.ending == "exr":
+        pixels = result.final
+    assert pixels is not None
+    pixels = upright(pixels, orientation)
+    if format_.ending == "exr":
+        if orientation != 1:
+            attributes = {**attributes, "orientation": "1"}
+        channels = chain.result.channels
+        write_exr(path, pixels, channels, attributes, half=format_.bits == 16)
+    else:
+        write_display(path, pixels, tags)

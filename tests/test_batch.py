@@ -1,0 +1,360 @@
+"""Many images: resuming, failing alone, being stopped, being looked at."""
+
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clpipe import image_io, sidecar, target
+from clpipe.errors import RequestError
+from clpipe.jobs import Job, Shard, parse_shard
+from clpipe.output_folder import LOCK, output_folder, remove_unfinished
+from clpipe.run_log import read_log
+from tests.conftest import ROOT, written
+
+# A chain that other tests compile too.
+RUN = ("-o", "out", "--iso", 3200)
+
+
+@pytest.fixture
+def renders(write_exr):
+    """A folder of small renders of two sizes."""
+
+    def write(count=6, folder="in"):
+        rng = np.random.default_rng(0)
+        for i in range(count):
+            size = (24, 32) if i % 2 else (17, 40)
+            write_exr(f"{folder}/r{i:03}.exr", rng.random((*size, 3)).astype(np.float32))
+        return folder
+
+    return write
+
+
+def contents(folder):
+    """Each file's bytes, by name."""
+    return {name: (Path(folder) / name).read_bytes() for name in written(Path(folder))}
+
+
+def statuses(folder):
+    """What the last run in a folder made of each image, by its log."""
+    lines = read_log(Path(folder) / "run.jsonl")
+    last = max(i for i, line in enumerate(lines) if line["event"] == "start")
+    return {x["image_key"]: x["status"] for x in lines[last:] if x["event"] == "image"}
+
+
+def stamps(folder):
+    return {name: (Path(folder) / name).stat().st_mtime_ns for name in written(Path(folder))}
+
+
+def test_a_second_run_makes_nothing(clpipe, renders):
+    clpipe("run", renders(), *RUN)
+    before = stamps("out")
+    result = clpipe("run", "in", *RUN)
+    assert stamps("out") == before
+    assert "6 of 6 images done (6 of them were there already), 0 failed" in result.stderr
+    assert set(statuses("out").values()) == {"skipped"}
+
+
+def test_what_is_missing_or_changed_is_made_again(clpipe, renders, write_exr):
+    clpipe("run", renders(), *RUN)
+    whole, before = contents("out"), stamps("out")
+    Path("out/r000.jpg").unlink()
+    Path("out/r001.json").unlink()
+    touched = Path("in/r002.exr")
+    os.utime(touched, ns=(1, 1))  # the same bytes
+    write_exr("in/r003.exr", np.full((24, 32, 3), 0.3, np.float32))
+    clpipe("run", "in", *RUN)
+    made = {name for name, at in stamps("out").items() if before.get(name) != at}
+    assert made == {f"r00{i}.{e}" for i in (0, 1, 3) for e in ("jpg", "json")}
+    after = contents("out")
+    assert {n for n in whole if whole[n] != after[n]} == {"r003.jpg", "r003.json"}
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        ("--seed", 1),
+        ("--set", "exposure.ev=1"),
+        ("--format", "png"),
+        ("--keep", "normalize"),
+        ("--set", "output.jpeg_quality=50"),
+        ("--iso", 100),
+    ],
+)
+def test_another_request_is_a_change(clpipe, renders, more):
+    clpipe("run", renders(2), *RUN)
+    clpipe("run", "in", *RUN, *more)
+    assert set(statuses("out").values()) == {"done"}
+    clpipe("run", "in", *RUN, *more)
+    assert set(statuses("out").values()) == {"skipped"}
+
+
+def test_the_content_of_a_file_that_is_named_is_a_part_of_the_request(clpipe, renders):
+    camera = Path("mine.toml")
+    camera.write_text((ROOT / "clpipe/cameras/sony-a7r2.toml").read_text())
+    clpipe("run", renders(2), *RUN, "--camera", "mine.toml")
+    clpipe("run", "in", *RUN, "--camera", "mine.toml")
+    assert set(statuses("out").values()) == {"skipped"}
+    camera.write_text(re.sub("black_level = 512", "black_level = 500", camera.read_text()))
+    clpipe("run", "in", *RUN, "--camera", "mine.toml")
+    assert set(statuses("out").values()) == {"done"}
+
+
+def test_another_version_makes_everything_again(clpipe, renders, monkeypatch):
+    clpipe("run", renders(2), *RUN)
+    monkeypatch.setattr(sidecar.clpipe, "__version__", "9.9.9")
+    clpipe("run", "in", *RUN)
+    assert set(statuses("out").values()) == {"done"}
+
+
+def test_overwrite(clpipe, renders):
+    clpipe("run", renders(2), *RUN)
+    before = stamps("out")
+    clpipe("run", "in", *RUN, "--overwrite")
+    assert all(before[name] != at for name, at in stamps("out").items())
+
+
+def test_frames_that_are_missing_are_made_alone(clpipe, renders):
+    clpipe("run", renders(1), *RUN, "--frames", 3)
+    before, whole = stamps("out"), contents("out")
+    Path("out/r000.frame1.jpg").unlink()
+    clpipe("run", "in", *RUN, "--frames", 3)
+    made = {name for name, at in stamps("out").items() if before[name] != at}
+    assert made == {"r000.frame1.jpg", "r000.frame1.json"}
+    assert contents("out") == whole
+
+
+@pytest.mark.parametrize("text", ['{"annotations": []}', "[1, 2]", "no JSON", ""])
+def test_a_file_of_another_hand_is_not_written_over(clpipe, renders, text):
+    renders(2)
+    Path("out").mkdir()
+    Path("out/r000.json").write_text(text)
+    result = clpipe("run", "in", *RUN, status=1)
+    assert "out/r000.json: clpipe did not write this file" in result.stderr
+    assert Path("out/r000.json").read_text() == text
+    assert statuses("out") == {"r000.exr": "failed", "r001.exr": "done"}
+    clpipe("run", "in", *RUN, "--overwrite")
+    assert json.loads(Path("out/r000.json").read_text())["clpipe"]
+
+
+def test_order_threads_and_shards_do_not_change_a_byte(clpipe, renders):
+    renders(7)
+    names = sorted(str(p) for p in Path("in").iterdir())
+    clpipe("run", *names, *RUN)
+    clpipe("run", *reversed(names), "-o", "b", *RUN[2:], "--jobs", 1)
+    for i in (3, 1, 2):
+        clpipe("run", *names, "-o", "c", *RUN[2:], "--jobs", 5, "--shard", f"{i}/3")
+    one, two, three = (contents(f) for f in ("out", "b", "c"))
+    assert one == two
+    logs = {f"run.{i}-of-3.jsonl" for i in (1, 2, 3)}
+    assert {n: b for n, b in three.items() if n not in logs} == one
+    assert logs < set(three)
+
+
+def test_a_fifth_of_the_files_is_damaged(clpipe, renders):
+    renders(10)
+    for i in (3, 7):
+        data = Path(f"in/r00{i}.exr").read_bytes()
+        Path(f"in/r00{i}.exr").write_bytes(data[: len(data) // 2])
+    result = clpipe("run", "in", *RUN, status=1)
+    whole = result.stderr.partition("failed:\n")[2]
+    assert "in/r003.exr: damaged" in whole and "in/r007.exr: damaged" in whole
+    assert "8 of 10 images done, 2 failed" in whole
+    right = {f"r00{i}.{e}" for i in range(10) if i not in (3, 7) for e in ("jpg", "json")}
+    assert set(written(Path("out"))) == right
+    assert list(statuses("out").values()).count("failed") == 2
+
+
+def test_the_log_says_what_was_done_when(clpipe, renders):
+    clpipe("run", renders(2), *RUN)
+    with open("out/run.jsonl", "ab") as file:
+        file.write(b'{"event": "ima')  # as a killed run may leave it
+    clpipe("run", "in", *RUN, "--seed", 1)
+    lines = read_log(Path("out/run.jsonl"))
+    assert [x["event"] for x in lines] == ["start", "image", "image", "end"] * 2
+    image = lines[1]
+    assert image["status"] == "done" and image["error"] is None
+    assert image["outputs"] == [Path(image["input"]).stem + e for e in (".jpg", ".json")]
+    assert all(image[f"{step}_seconds"] > 0 for step in ("decode", "device", "encode"))
+    assert lines[3]["done"] == 2 and lines[3]["images"] == 2 and not lines[3]["interrupted"]
+
+
+def test_quiet_and_stdout(clpipe, renders):
+    renders(3)
+    Path("in/r001.exr").write_bytes(b"no image")
+    result = clpipe("run", "in", *RUN, "--quiet", status=1)
+    assert result.stdout == ""
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("clpipe: in/r001.exr: ")
+    result = clpipe("run", "in", "-o", "b", status=1)
+    assert result.stdout == ""
+    assert "in/r000.exr -> b/r000.jpg" in result.stderr
+
+
+def test_a_trace_for_perfetto(clpipe, renders):
+    clpipe("run", renders(3), *RUN, "--trace", "trace.json")
+    events = json.loads(Path("trace.json").read_text())["traceEvents"]
+    spans = [e for e in events if e["ph"] == "X"]
+    assert {e["cat"] for e in spans} == {"decode", "device", "encode", "launch"}
+    names = {e["tid"]: e["args"]["name"] for e in events if e["ph"] == "M"}
+    for device in (e for e in spans if e["cat"] == "device"):
+        assert names[device["tid"]].startswith("device")
+    inside = [e for e in spans if e["cat"] == "launch"]
+    assert {"upload", "download", "quantize"} & {e["name"] for e in inside}
+    for launch in inside:
+        whole = [e for e in spans if e["cat"] == "device" and e["tid"] == launch["tid"]]
+        slack = 200  # us: two clocks
+        assert any(
+            e["ts"] - slack <= launch["ts"]
+            and launch["ts"] + launch["dur"] <= e["ts"] + e["dur"] + slack
+            for e in whole
+        )
+
+
+def test_two_runs_in_one_folder(tmp_path):
+    holder = (
+        "import sys; from pathlib import Path; from clpipe.output_folder import output_folder\n"
+        "from clpipe.jobs import Shard\n"
+        "with output_folder(Path('out'), Shard(1, 2)): print('held', flush=True); input()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", holder],
+        cwd=tmp_path,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    ) as process:
+        process.stdout.readline()
+        for shard in (Shard(), Shard(1, 2), Shard(1, 3)):
+            with (
+                pytest.raises(RequestError, match="another run is writing there"),
+                output_folder(tmp_path / "out", shard),
+            ):
+                pass
+        with output_folder(tmp_path / "out", Shard(2, 2)):
+            pass
+        assert (tmp_path / "out" / LOCK).exists()
+        process.kill()
+    with output_folder(tmp_path / "out", Shard()):
+        pass
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_halves_of_a_killed_run_are_removed(tmp_path):
+    ours = (".a.0123abcd.part.jpg", "sub/.b.c.normalize.0123abcd.part.exr")
+    others = (".x.0123abcd.part.jpg", ".a.part.jpg", "a.jpg", ".a.0123abc.part.jpg")
+    for name in (*ours, *others):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    remove_unfinished(tmp_path, [Job(Path("a.exr"), "a.exr"), Job(Path("b"), "sub/b.c.exr")])
+    assert written(tmp_path) == sorted(others)
+
+
+def test_the_disk_is_full(clpipe, renders, monkeypatch):
+    renders(5)
+    real, count = image_io._write, []
+
+    def write(path, spec, pixels):
+        count.append(path)
+        if len(count) > 2:
+            monkeypatch.setattr(target, "ROOM", 2**62)  # more than any disk has
+            raise image_io.ImageError(f"{path}: cannot be written: the disk is full")
+        real(path, spec, pixels)
+
+    monkeypatch.setattr(image_io, "_write", write)
+    result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)
+    assert "clpipe: out: cannot write there: " in result.stderr
+    assert "the same command goes on" in result.stderr
+    assert len(written(Path("out"))) == 4
+    monkeypatch.undo()
+
+
+def test_the_folder_has_gone(clpipe, renders, monkeypatch):
+    renders(5)
+    real = image_io._write
+
+    def write(path, spec, pixels):
+        real(path, spec, pixels)
+        if path.name == "r002.jpg":
+            Path("out").rename("elsewhere")
+
+    monkeypatch.setattr(image_io, "_write", write)
+    result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)
+    assert "out: " in result.stderr and "the same command goes on" in result.stderr
+    assert not Path("out").exists()
+    assert {"r000.jpg", "r000.json", "r002.jpg"} <= set(written(Path("elsewhere")))
+
+
+@pytest.mark.parametrize("text", ["0/3", "4/3", "1", "1/", "a/b", "1/0", "-1/3", "1.0/3"])
+def test_a_wrong_shard(text):
+    with pytest.raises(RequestError, match="expected I/N"):
+        parse_shard(text)
+
+
+def start(folder, *arguments):
+    command = [sys.executable, "-m", "clpipe", "run", *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.Popen(command, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def wait_for(folder, count):
+    """Wait until so many pictures are there."""
+    for _ in range(3000):
+        if len(list(folder.glob("*.json"))) >= count:
+            return
+        time.sleep(0.01)
+    raise AssertionError(f"{folder} never held {count} pictures")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_once_what_is_begun_is_finished(clpipe, renders, tmp_path, number):
+    renders(60)
+    process = start(tmp_path, "in", *RUN, "--jobs", 1)
+    wait_for(tmp_path / "out", 3)
+    process.send_signal(number)
+    stderr = process.communicate()[1]
+    assert process.returncode == 130, stderr
+    assert "not begun" in stderr
+    found = written(tmp_path / "out")
+    assert 6 <= len(found) < 120
+    assert all(f"{Path(n).stem}.jpg" in found for n in found if n.endswith(".json"))
+    assert read_log(tmp_path / "out" / "run.jsonl")[-1]["interrupted"]
+    clpipe("run", "in", *RUN)
+    assert len(written(tmp_path / "out")) == 120
+
+
+def test_stopped_twice_it_ends_now(renders, tmp_path):
+    renders(60)
+    process = start(tmp_path, "in", *RUN, "--jobs", 1)
+    wait_for(tmp_path / "out", 2)
+    process.send_signal(signal.SIGINT)
+    process.send_signal(signal.SIGINT)
+    process.communicate()
+    assert process.returncode == 130
+    assert not [p for p in (tmp_path / "out").iterdir() if ".part." in p.name]
+
+
+def test_killed_and_resumed_again_and_again(clpipe, renders, tmp_path):
+    renders(24)
+    clpipe("run", "in", "-o", "whole", *RUN[2:])
+    rng = random.Random(0)
+    finished = {}
+    for _ in range(6):
+        process = start(tmp_path, "in", *RUN)
+        time.sleep(rng.uniform(0.3, 1.6))
+        process.kill()
+        process.communicate()
+        for name in written(tmp_path / "out") if (tmp_path / "out").exists() else ():
+            if name.endswith(".json") and not name.startswith("."):
+                at = (tmp_path / "out" / name).stat().st_mtime_ns
+                assert finished.setdefault(name, at) == at, f"{name} was made again"
+    clpipe("run", "in", *RUN)
+    assert contents("out") == contents("whole")
