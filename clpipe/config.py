@@ -2,10 +2,10 @@
 
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, lru_cache, partial
 from importlib import resources
 from itertools import product
 from pathlib import Path
@@ -81,6 +81,13 @@ class Settings:
         tables = {**self.parameters, OUTPUT: self.output.model_dump(exclude_defaults=True)}
         named = {f"{name}.{key}": v for name, table in tables.items() for key, v in table.items()}
         return {"iso": self.iso, "camera": self.camera, **named}
+
+    def table(self, step: str) -> dict[str, Any]:
+        """The values and draws of a step, or of the output."""
+        output = self.output.model_dump(exclude_defaults=True) if step == OUTPUT else {}
+        names = {key: key.removeprefix(f"{step}.") for key in self.draws}
+        drawn = {names[key]: draw for key, draw in self.draws.items() if names[key] != key}
+        return {**self.parameters.get(step, output), **drawn}
 
     def _record(self, drawn: Mapping[str, Any]) -> dict[str, Any]:
         """The settings as nested values, with others over them by their dotted names."""
@@ -277,6 +284,23 @@ def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Sett
         KeyedError: an unknown key, stage, method or parameter, or a value of the wrong type or out
             of range.
     """
+    return overlay(Settings(), values, folder)
+
+
+def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None = None) -> Settings:
+    """The settings with others over them; what is to be skipped is added to what was.
+
+    Where another method is chosen for a step, the parameters of the one before are dropped. A value
+    takes the place of a draw, and the other way round.
+
+    Args:
+        settings: what holds where nothing else is said.
+        values: as for :func:`settings_from`.
+        folder: as for :func:`settings_from`.
+
+    Raises:
+        KeyedError: as :func:`settings_from`.
+    """
     for path in names_in(values, "stage_files", "files"):
         load_stage_file((folder or Path()) / path)
     if folder is not None:
@@ -291,31 +315,44 @@ def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Sett
         if key not in KEYS:
             raise KeyedError(key, one_of("key", key, (*KEYS, OUTPUT, *all_stages())))
         check_type(key, plain[key])
-    draws = {key: draw_of(key, tables.pop(key)) for key in KEYS if key in tables}
     for key in {"stages", "skip"} & plain.keys():
         names = names_in(plain, key, "stage names")
         for name in names:
             stage_named(key, name if key == "stages" else base_name(name))
-        plain[key] = names
-    for name, table in tables.items():
-        stage = None if name == OUTPUT else stage_named(name, base_name(name))
-        found = {k: draw_of(f"{name}.{k}", v) for k, v in table.items() if isinstance(v, Mapping)}
-        draws |= {f"{name}.{k}": draw for k, draw in found.items()}
-        tables[name] = {k: v for k, v in table.items() if k not in found}
-        if stage and not found:
-            make_method(stage, name, table)
+        plain[key] = (*settings.skip, *names) if key == "skip" else names
     if "iso" in plain:
         plain["iso"] = float(plain["iso"])
     if {"raw_size", "raw_type"} & plain.keys():
+        size = plain.get("raw_size", settings.raw_size)
         try:
-            dump_of(plain.get("raw_size", ""), plain.get("raw_type", ""))
+            dump_of(size, plain.get("raw_type", settings.raw_type))
         except RequestError as error:
             raise KeyedError(str(error).partition(":")[0], str(error)) from None
-    output = make_output(tables.pop(OUTPUT, {}))
-    settings = Settings(parameters=tables, output=output, draws=draws, **plain)
+    draws = {k: draw for k, draw in settings.draws.items() if k.partition(".")[0] not in values}
+    draws |= {key: draw_of(key, tables.pop(key)) for key in KEYS if key in tables}
+    parameters, output = dict(settings.parameters), settings.output
+    for name, table in tables.items():
+        stage = None if name == OUTPUT else stage_named(name, base_name(name))
+        said = {
+            k: draw_of(f"{name}.{k}", v) if isinstance(v, Mapping) else v for k, v in table.items()
+        }
+        merged = settings.table(name)
+        if "method" in said and said["method"] != method_of(name, merged):
+            merged = {}
+        merged |= said
+        drawn = {f"{name}.{k}": v for k, v in merged.items() if isinstance(v, Draw)}
+        draws |= drawn
+        given = {k: v for k, v in merged.items() if not isinstance(v, Draw)}
+        if stage is None:
+            output = make_output(given)
+            continue
+        parameters[name] = given
+        if not drawn:
+            make_method(stage, name, given)
+    made = replace(settings, parameters=parameters, output=output, draws=draws, **plain)
     if draws:
-        check_draws(settings)
-    return settings
+        check_draws(made, values)
+    return made
 
 
 def check_type(key: str, value: Any) -> None:
@@ -373,30 +410,34 @@ def limits_at(settings: Settings, key: str, isos: Limits) -> Limits | None:
     return limits_of(models_at(settings, step)[0], name)
 
 
-def check_draws(settings: Settings) -> None:
+def check_draws(settings: Settings, changed: Container[str]) -> None:
     """See that all that can be drawn is allowed, each with the others at one of their extremes.
+
+    Args:
+        settings: with draws.
+        changed: the keys and steps that are new; others were checked before. What follows something
+            is checked again.
 
     Raises:
         KeyedError: it is not.
     """
     by_step: dict[str, dict[str, Sequence[Any]]] = {}
+    steps = {key.partition(".")[0] for key, draw in settings.draws.items() if draw.of}
     for key in settings.draws:
         step, _, name = key.partition(".")
-        for model in models_at(settings, step) if name not in ("", "method") else ():
-            if name not in model.model_fields:
+        for model in models_at(settings, step) if name and step in changed else ():
+            if name not in ("method", *model.model_fields):
                 raise unknown_parameter(step, model, name)
     limits = partial(limits_at, settings, isos=Limits(low=TINY))
     for key, values in extremes_of(settings.draws, settings.given(), limits).items():
         step, _, name = key.partition(".")
-        if name:
-            by_step.setdefault(step, {})[name] = values
-        else:
+        if not name:
             for value in values:
                 check_type(key, value)
+        elif step in changed or step in steps:
+            by_step.setdefault(step, {})[name] = values
     for step, drawn in by_step.items():
-        given = {"output": settings.output.model_dump()}.get(
-            step, settings.parameters.get(step, {})
-        )
+        given = {k: v for k, v in settings.table(step).items() if not isinstance(v, Draw)}
         first = {name: values[0] for name, values in drawn.items()}
         methods = [{"method": method} for method in drawn.pop("method", ())] or [{}]
         others = [{name: value} for name, values in drawn.items() for value in values] or [{}]
@@ -438,32 +479,6 @@ def check_camera(settings: Settings) -> None:
         camera.gain_stage(iso)
 
 
-def overlay(settings: Settings, values: Mapping[str, Any]) -> Settings:
-    """The settings with others over them; what is to be skipped is added to what was.
-
-    Where another method is chosen for a step, the parameters of the one before are dropped.
-
-    Args:
-        settings: what holds where nothing else is said.
-        values: as for :func:`settings_from`.
-
-    Raises:
-        KeyedError: as :func:`settings_from`.
-    """
-    merged = settings.record()
-    for key, value in values.items():
-        if isinstance(value, Mapping) and key not in KEYS:
-            old = dict(merged.get(key, {}))
-            if "method" in value and value["method"] != method_of(key, old):
-                old.clear()
-            merged[key] = old | dict(value)
-        elif key == "skip" and isinstance(value, Sequence) and not isinstance(value, str):
-            merged[key] = [*merged[key], *value]
-        else:
-            merged[key] = value
-    return settings_from(merged)
-
-
 def names_in(values: Mapping[str, Any], key: str, what: str) -> tuple[str, ...]:
     """The list of texts under a key; empty if it is not there.
 
@@ -489,14 +504,17 @@ def from_folder(folder: Path, values: Mapping[str, Any]) -> dict[str, Any]:
         if key == "camera":
             found[key] = joined(folder, value, only=".toml")
         elif isinstance(value, Mapping) and stage:
-            files = {
-                name
-                for method in stage.methods
-                for name, field_ in method.model_fields.items()
-                if isinstance(extra := field_.json_schema_extra, dict) and extra["file"]
-            }
+            files = file_parameters(stage)
             found[key] = {n: joined(folder, v) if n in files else v for n, v in value.items()}
     return found
+
+
+@cache
+def file_parameters(stage: Stage) -> frozenset[str]:
+    """The parameters of a stage's methods that are names of files."""
+    fields = [field_ for method in stage.methods for field_ in method.model_fields.items()]
+    extras: dict[str, Any] = {name: field_.json_schema_extra for name, field_ in fields}
+    return frozenset(name for name, extra in extras.items() if extra["file"])
 
 
 def joined(folder: Path, value: Any, only: str = "") -> Any:
@@ -524,6 +542,7 @@ def files_of(settings: Settings) -> list[str]:
     return files
 
 
+@lru_cache(maxsize=1024)
 def base_name(step: str) -> str:
     """The stage of a step that may be a repeated one.
 
@@ -717,6 +736,18 @@ def entry(settings: Settings) -> Kind:
     return Kind.DISPLAY if first and first.reads is Kind.DISPLAY else Kind.RGB
 
 
+def step_names(settings: Settings) -> list[str]:
+    """The names of the steps that are not skipped; that of a repeated one has its number.
+
+    >>> step_names(Settings(stages=("exposure", "mosaic", "exposure"), skip=("mosaic",)))
+    ['exposure', 'exposure_2']
+    """
+    before = [settings.stages[:place].count(stage) for place, stage in enumerate(settings.stages)]
+    pairs = zip(settings.stages, before, strict=True)
+    names = [f"{stage}_{count + 1}" if count else stage for stage, count in pairs]
+    return [name for name in names if name not in settings.skip]
+
+
 def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:
     """The steps of the settings, in order, for an image of a kind; None is what the first reads.
 
@@ -727,14 +758,9 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     """
     context = Context(camera=camera, iso=settings.iso)
     steps: list[Step] = []
-    count: dict[str, int] = {}
     before = "the input"
-    for stage_name in settings.stages:
-        stage = all_stages()[stage_name]
-        count[stage_name] = count.get(stage_name, 0) + 1
-        name = stage_name if count[stage_name] == 1 else f"{stage_name}_{count[stage_name]}"
-        if name in settings.skip:
-            continue
+    for name in step_names(settings):
+        stage = all_stages()[base_name(name)]
         method = make_method(stage, name, settings.parameters.get(name, {}))
         if stage.reads is not (kind or stage.reads):
             if isinstance(method, Unchanged) and stage.reads is stage.writes:

@@ -35,9 +35,9 @@ class RawImage(SourceImage):
 class RawEntry:
     """Entering with raws: how to make the chain for one, given the settings that it brings.
 
-    ``settings`` lays a configuration and options over settings, ``chain`` makes the chain that is
-    entered at a step. ``start_at`` is the step to enter at, where one was asked for; ``dump`` the
-    geometry of dumps, where it is given.
+    ``settings`` lays a configuration and options over settings and draws for the image, ``chain``
+    makes the chain that is entered at a step. ``start_at`` is the step to enter at, where one was
+    asked for; ``dump`` the geometry of dumps, where it is given.
     """
 
     settings: Callable[[Settings], Settings]
@@ -83,16 +83,14 @@ class RawEntry:
             settings = self.settings(Settings())
             return self.chain(settings, self.start_at or entrance(settings))
 
-    def enter(self, path: Path, image: RawImage, key: str = "") -> tuple[Chain, RawImage]:
+    def enter(self, path: Path, image: RawImage) -> tuple[Chain, RawImage]:
         """The chain for a raw, and the raw with its warnings and what it carries to the output.
-
-        What its settings draw belongs to its image key.
 
         Raises:
             ImageError: it cannot enter there, or its levels cannot be.
             RequestError: the chain cannot be made.
         """
-        chain, found = self._chain(path, image.said, key)
+        chain, found = self._chain(path, image.said)
         if isinstance(image.said, Dump):
             found += doubts(image, chain)
             return chain, replace(image, warnings=tuple(found))
@@ -103,14 +101,14 @@ class RawEntry:
         attributes = carry(tags_of(image.said, chain), image.said.orientation)
         return chain, replace(image, warnings=tuple(found), attributes=attributes)
 
-    def _chain(self, path: Path, said: RawFacts | Dump, key: str = "") -> tuple[Chain, list[str]]:
+    def _chain(self, path: Path, said: RawFacts | Dump) -> tuple[Chain, list[str]]:
         """The chain for a raw, and what was taken for what it does not say, or says wrongly."""
         brought, found = brought_by(said)
         parameters = dict(brought.parameters)
-        own = self.settings(Settings()).drawn(key)
+        own = self.settings(Settings()).drawn("")  # an example, where there is no image yet
         if "white_balance" in found and own.parameters.get("white_balance"):
             del parameters["white_balance"]  # the user's own, not what stands in for the file's
-        settings = self.settings(replace(brought, parameters=parameters)).drawn(key)
+        settings = self.settings(replace(brought, parameters=parameters)).drawn("")
         camera = load_camera(settings.camera)
         low, high = camera.iso_range
         iso = min(max(settings.iso, low), high)

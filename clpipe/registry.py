@@ -5,7 +5,7 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import module_from_spec, spec_from_file_location
@@ -26,11 +26,12 @@ _from_files: dict[Path, Stage] = {}
 
 def all_stages() -> dict[str, Stage]:
     """Every stage by its name: clpipe's own, the default chain first, then the others."""
-    return {
-        **own_stages(),
-        **installed_stages(),
-        **{stage.name: stage for stage in _from_files.values()},
-    }
+    return _all_stages(tuple(_from_files.values()))
+
+
+@lru_cache(maxsize=1)
+def _all_stages(from_files: tuple[Stage, ...]) -> dict[str, Stage]:
+    return {**own_stages(), **installed_stages(), **{stage.name: stage for stage in from_files}}
 
 
 @cache

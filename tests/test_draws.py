@@ -8,12 +8,10 @@ from scipy import stats
 
 import clpipe
 from clpipe.camera import built_in_cameras
-from clpipe.config import load_settings, make_chain, overlay, read_settings, settings_from
+from clpipe.config import load_settings, make_chain, overlay, settings_from
 from clpipe.describe import toml_text
 from clpipe.draws import Limits, limits_of
 from clpipe.errors import RequestError
-from clpipe.raw_dump import Dump
-from clpipe.raw_entry import RawEntry, RawImage
 from clpipe.registry import all_stages
 
 KEYS = [f"frames/{number:04}.exr" for number in range(2000)]
@@ -122,7 +120,7 @@ def test_settings_with_draws_go_through_json(settings, drawn):
 def test_a_chain_with_draws_is_printed_with_its_draws(settings, tmp_path):
     path = tmp_path / "pipeline.toml"
     path.write_text(toml_text(make_chain(settings)))
-    again = read_settings(path)
+    again = load_settings(str(path))
     assert again.draws == settings.draws
     assert again.drawn("a").iso == settings.drawn("a").iso
     assert make_chain(again.drawn("a")).steps == make_chain(settings.drawn("a")).steps
@@ -184,7 +182,7 @@ def test_files_that_are_drawn_are_relative_to_the_configuration(tmp_path):
         'camera = { choice = ["one.toml", "two.toml", "canon-5d2"] }\n'
         '[tone_curve]\nmethod = { choice = ["file"] }\npath = { choice = ["one.csv", "two.csv"] }\n'
     )
-    settings = read_settings(path)
+    settings = load_settings(str(path))
     values = [settings.drawn(key) for key in KEYS[:40]]
     assert {v.camera for v in values} == {
         *(str(tmp_path / name) for name in ("one.toml", "two.toml")),
@@ -195,7 +193,7 @@ def test_files_that_are_drawn_are_relative_to_the_configuration(tmp_path):
     }
     path.write_text('[tone_curve]\nmethod = "file"\npath = { choice = ["one.csv", "no.csv"] }\n')
     with pytest.raises(RequestError, match=r"line 3: tone_curve.path: .*no.csv.*cannot be read"):
-        read_settings(path)
+        load_settings(str(path))
 
 
 def test_a_pipeline_draws_by_the_key():
@@ -209,26 +207,6 @@ def test_a_pipeline_draws_by_the_key():
     shot = camera.process(image, "a", exposure={"ev": 1.0})
     assert np.array_equal(shot.image, image * 2)
     assert not np.array_equal(camera.process(image, "a", seed=1).image, image * gain)
-
-
-def test_a_raw_draws_by_the_key(tmp_path):
-    values = {
-        "normalize": {"black_level": {"uniform": [90, 110]}, "white_level": 1000.0},
-        "white_balance": {"method": "gains", "red_gain": {"uniform": [1, 2]}},
-    }
-
-    def chain(settings, start_at):
-        return make_chain(settings, start_at=start_at)
-
-    entry = RawEntry(lambda under: overlay(under, values), chain)
-    image = RawImage(np.full((4, 4), 500, np.uint16), "", "", (), {}, said=Dump(4, 4, "uint16le"))
-    levels = {
-        key: entry.enter(tmp_path / "x.raw", image, key)[0].steps[0].method.black_level
-        for key in "ab"
-    }
-    expected = overlay(settings_from({}), values)
-    for key, level in levels.items():
-        assert level == expected.drawn(key).parameters["normalize"]["black_level"]
 
 
 def test_brooks_2019():
@@ -321,7 +299,7 @@ def test_a_draw_that_cannot_be(tmp_path, text, message):
     path = tmp_path / "pipeline.toml"
     path.write_text(text + "\n")
     with pytest.raises(RequestError, match=f"pipeline.toml.*{message}"):
-        read_settings(path)
+        load_settings(str(path))
 
 
 @pytest.mark.parametrize(
