@@ -16,6 +16,7 @@ LEVELS = [
     {"stages"},
     {"registry"},
     {"config"},
+    {"manifest"},
     {"plan"},
     {"codegen"},
     {"device"},
