@@ -21,7 +21,7 @@ from clpipe.config import Chain
 from clpipe.device import Device, Timing
 from clpipe.entrance import Entrance
 from clpipe.errors import ImageError, OutputError, RequestError
-from clpipe.image_io import SourceImage
+from clpipe.image_io import SourceImage, set_codec_threads
 from clpipe.jobs import Job
 from clpipe.run import Result, Runner
 from clpipe.sidecar import is_done, sidecar, stamp_of, wanted, write_sidecar
@@ -172,6 +172,8 @@ class Batch:
             OutputError: nothing can be written any more. What was in flight is reported before.
             DeviceError: a kernel does not compile.
         """
+        processors = len(os.sched_getaffinity(0))
+        set_codec_threads(max(processors // min(self.threads, max(len(jobs), 1)), 1))
         run = _Run(self, jobs)
         try:
             yield from run.outcomes()
