@@ -129,6 +129,12 @@ def read_image(
     return SourceImage(pixels, digest, name, tuple(warnings), attributes, shot)
 
 
+def decode_alone(path: Path) -> Array:
+    """The samples of a file's first part, (height, width, channel), as they are; for measuring."""
+    with _opened(path) as (_, file):
+        return np.asarray(file.read_image(file.spec().format))
+
+
 TRANSFERS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
     "linear": lambda x: x,
     "srgb": inverse_srgb_curve,
