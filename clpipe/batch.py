@@ -10,7 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -21,7 +21,7 @@ from clpipe.config import Chain
 from clpipe.device import Device, Timing
 from clpipe.entrance import Entrance
 from clpipe.errors import ImageError, OutputError, RequestError
-from clpipe.image_io import SourceImage
+from clpipe.image_io import SourceImage, set_codec_threads
 from clpipe.jobs import Job
 from clpipe.run import Result, Runner
 from clpipe.sidecar import is_done, sidecar, stamp_of, wanted, write_sidecar
@@ -70,7 +70,7 @@ class Outcome:
 
 
 @dataclass
-class _Work:
+class Work:
     """A job on its way."""
 
     job: Job
@@ -111,14 +111,8 @@ class _Work:
         )
 
 
-@dataclass
-class _Made:
-    """A picture on its way from a device to its files."""
-
-    work: _Work
-    shot: Shot
-    result: Result
-    device: Device | None
+# A picture on its way from a device to its files.
+Made = tuple[Work, Shot, Result, Device | None]
 
 
 class Batch:
@@ -172,13 +166,35 @@ class Batch:
             OutputError: nothing can be written any more. What was in flight is reported before.
             DeviceError: a kernel does not compile.
         """
+        processors = len(os.sched_getaffinity(0))
+        set_codec_threads(max(processors // min(self.threads, max(len(jobs), 1)), 1))
         run = _Run(self, jobs)
         try:
             yield from run.outcomes()
         finally:
             run.close()
 
-    def _runners(self, device: Device | None) -> Callable[[Chain], Runner]:
+    def one_by_one(
+        self, jobs: Sequence[Job], on: Callable[[str], AbstractContextManager[None]]
+    ) -> Iterator[Outcome]:
+        """The same in this thread alone: what a run is measured against.
+
+        ``on`` is entered around each step of each image.
+        """
+        (device,) = self.devices
+        runners = self.runners(device)
+        for job in jobs:
+            with on("decode"):
+                work = self.decode(job, lambda: None)
+            for shot in work.shots:
+                with on("device"):
+                    result = self.develop(work, shot, runners(shot.chain))
+                if result:
+                    with on("encode"):
+                        self.encode(work, shot, result, device)
+            yield work.outcome()
+
+    def runners(self, device: Device | None) -> Callable[[Chain], Runner]:
         """What makes the runner of a chain on a device; the kernels of the first are compiled."""
         entrance, target = self._entrance, self._target
         first = target.runner(self._chain, device)
@@ -198,12 +214,12 @@ class Batch:
 
         return runner
 
-    def _decode(self, job: Job, begin: Callable[[], None]) -> _Work:
+    def decode(self, job: Job, begin: Callable[[], None]) -> Work:
         """A job's image and what to make of it, without what is there already.
 
         ``begin`` is called where anything is to be made.
         """
-        work = _Work(job, self._entrance)
+        work = Work(job, self._entrance)
         with work.timed("decode"):
             try:
                 work.entrance = self._entrance.of(job)
@@ -230,7 +246,7 @@ class Batch:
     def _wanted(self) -> Mapping[str, Any]:
         return wanted(self._entrance.asked, self._entrance.reading, self._target)
 
-    def _missing(self, work: _Work) -> list[str]:
+    def _missing(self, work: Work) -> list[str]:
         """The names of the pictures that are to be made, which are not there already."""
         job, target = work.job, self._target
         names = target.burst_of(job).names()
@@ -244,7 +260,7 @@ class Batch:
             )
         ]
 
-    def _read(self, work: _Work, names: Sequence[str]) -> None:
+    def _read(self, work: Work, names: Sequence[str]) -> None:
         """Read a job's image, and see what pictures are to be made of it.
 
         Raises:
@@ -263,7 +279,7 @@ class Batch:
         work.shots = [shot for shot in shots if shot.name in names]
         work.unwritten = len(work.shots)
 
-    def _develop(self, work: _Work, shot: Shot, runner: Runner) -> Result | None:
+    def develop(self, work: Work, shot: Shot, runner: Runner) -> Result | None:
         """One picture; None where it cannot be made."""
         assert work.source
         timings: list[Timing] | None = [] if self._trace and runner.device else None
@@ -281,22 +297,20 @@ class Batch:
             work.source = replace(work.source, pixels=np.broadcast_to(np.float16(0), shape))
         return result
 
-    def _encode(self, made: _Made) -> None:
+    def encode(self, work: Work, shot: Shot, result: Result, device: Device | None) -> None:
         """Write one picture and then its sidecar.
 
         Raises:
             OutputError: nothing can be written any more.
         """
-        work, shot, target = made.work, made.shot, self._target
+        target = self._target
         assert work.source
         with work.timed("encode"):
             try:
-                files = target.write(work.job, shot, work.source, made.result)
+                files = target.write(work.job, shot, work.source, result)
                 path = target.path(work.job, SIDECAR, shot.name)
                 names = [file.name for file in files]
-                record = sidecar(
-                    work.job, work.stamp, shot, made.device, work.source, made.result, names
-                )
+                record = sidecar(work.job, work.stamp, shot, device, work.source, result, names)
                 write_sidecar(path, {**record, "asked": work.wanted})
                 work.outputs += [str(f.relative_to(target.folder)) for f in (*files, path)]
             except (ImageError, MemoryError) as error:
@@ -317,8 +331,8 @@ class _Run:
         self._lock = threading.Lock()
         self._places = threading.Semaphore(batch.in_flight)
         self._results = threading.Semaphore(batch.threads + len(batch.devices))
-        self._decoded: queue.SimpleQueue[_Work | None] = queue.SimpleQueue()
-        self._made: queue.SimpleQueue[_Made | None] = queue.SimpleQueue()
+        self._decoded: queue.SimpleQueue[Work | None] = queue.SimpleQueue()
+        self._made: queue.SimpleQueue[Made | None] = queue.SimpleQueue()
         self._news: queue.SimpleQueue[Outcome | None] = queue.SimpleQueue()
         self._decoders = [self._thread(f"decode {i}", self._decoding) for i in range(batch.threads)]
         self._developers = [
@@ -388,7 +402,7 @@ class _Run:
 
     def _decoding(self) -> None:
         while job := self._next():
-            work = self._batch._decode(job, self._begun.set)
+            work = self._batch.decode(job, self._begun.set)
             if work.shots:
                 self._decoded.put(work)
             else:
@@ -401,15 +415,15 @@ class _Run:
         self._begun.wait()  # where nothing is to be made, nothing is compiled
         if self._closing:
             return
-        runners = self._batch._runners(device)
+        runners = self._batch.runners(device)
         while work := self._decoded.get():
             for shot in work.shots:
                 self._results.acquire()
                 result = None
                 if not work.error:
-                    result = self._batch._develop(work, shot, runners(shot.chain))
+                    result = self._batch.develop(work, shot, runners(shot.chain))
                 if result:
-                    self._made.put(_Made(work, shot, result, device))
+                    self._made.put((work, shot, result, device))
                 else:
                     self._written(work)
                 del result
@@ -418,14 +432,14 @@ class _Run:
     def _encoding(self) -> None:
         while made := self._made.get():
             try:
-                self._batch._encode(made)
+                self._batch.encode(*made)
             except OutputError as error:
-                made.work.error = str(error)
+                made[0].error = str(error)
                 self._fail(error)
-            self._written(made.work)
+            self._written(made[0])
             del made
 
-    def _written(self, work: _Work) -> None:
+    def _written(self, work: Work) -> None:
         """One picture less to wait for; with its last one a job is finished."""
         self._results.release()
         with self._lock:

@@ -1,6 +1,7 @@
 """The command line. Thin: it turns options into settings and results into text."""
 
 import json
+import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
@@ -17,6 +18,7 @@ from clpipe.asked import DEFAULTS, asked_for
 from clpipe.batch import Batch
 from clpipe.bench import bench as run_bench
 from clpipe.bench import bench_methods
+from clpipe.bench_batch import bench_batch, loads
 from clpipe.calibration_frames import Given, calibrate_files, check_name, write_profile
 from clpipe.camera import built_in_cameras, load_camera
 from clpipe.check import SIZES, check_all
@@ -481,12 +483,18 @@ def check(
 @click.option(
     "--methods", metavar="STAGE", help="Time each method of this stage instead, on its own."
 )
+@click.option(
+    "--batch",
+    is_flag=True,
+    help="Time whole batches of files instead, half EXR to JPEG, in threads and serially.",
+)
 @json_option
 def bench(
     selector: str | None,
     size: str,
     repeat: int,
     methods: str | None,
+    batch: bool,
     as_json: bool,
     **request: Any,
 ) -> None:
@@ -498,7 +506,8 @@ def bench(
             f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 6000x4000, "
             f"at most {MAX_PIXELS} pixels"
         )
-    chain = asked_for(**request).chain()
+    asked = asked_for(**request)
+    chain = asked.chain()
     device = open_device(selector)
     if device is None:
         raise RequestError("bench: it times the kernels of a device; numpy has none")
@@ -511,6 +520,14 @@ def bench(
         click.echo(f"{device.info.label}: {stage.name}, {width}x{height}, planes to planes")
         rows = [(s.method, f"{s.launches}", f"{s.ms:.1f}", f"{s.mp_per_s:.0f}") for s in speeds]
         show(("method", "launches", "ms", "MP/s"), rows, left=1)
+        return
+    if batch:
+        batches = [bench_batch(device, asked, load) for load in loads()]
+        if as_json:
+            show_json({"device": device.info.label, "batches": [b.record() for b in batches]})
+            return
+        click.echo(f"{device.info.label}: half EXR to JPEG, {len(os.sched_getaffinity(0))} CPUs")
+        show(describe.BATCH_HEADINGS, map(describe.batch_row, batches), left=1)
         return
     report = run_bench(device, chain, int(width), int(height), repeat)
     if as_json:

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import ValidationError
 
+from clpipe.bench_batch import BatchSpeed
 from clpipe.calibration.calibrate import Calibration
 from clpipe.calibration.line_fit import Estimate
 from clpipe.camera import Camera
@@ -524,3 +525,31 @@ def measure_tables(report: Report) -> list[tuple[str, Rows]]:
         ("tails of standardised noise", far),
         ("sigma by intensity", curve),
     ]
+
+
+BATCH_HEADINGS = (
+    "images",
+    "MP/s",
+    "serial s",
+    "batch s",
+    "of limit",
+    "decode",
+    "device",
+    "encode ms CPU",
+    "beyond codec, kernels ms",
+    "peak MiB",
+)
+
+
+def batch_row(speed: BatchSpeed) -> tuple[str, ...]:
+    """One load of ``clpipe bench --batch``."""
+    return (
+        f"{speed.images} of {speed.width}x{speed.height}",
+        f"{speed.megapixels_per_second:.1f}",
+        f"{speed.serial_s:.1f}",
+        f"{speed.batch_s:.1f}",
+        f"{speed.share_of_limit:.2f}",
+        *(f"{ms:.1f}" for ms in speed.cpu_ms.values()),
+        f"{speed.overhead_ms:.1f}",
+        f"{speed.peak_mib:.0f}",
+    )

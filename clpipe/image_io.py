@@ -6,6 +6,7 @@ import json
 import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,12 @@ class SourceImage:
     warnings: tuple[str, ...]
     attributes: Mapping[str, str]
     shot: Mapping[str, float] = field(default_factory=dict)
+
+
+def set_codec_threads(count: int) -> None:
+    """How many threads the reading or writing of one file may take."""
+    oiio.attribute("threads", count)
+    oiio.attribute("exr_threads", count)
 
 
 def read_image(
@@ -120,6 +127,12 @@ def read_image(
         warnings.append(f"{beyond} samples beyond {HALF_MAX:g}, the range of half, were clipped")
     digest = hashlib.sha256(data).hexdigest()
     return SourceImage(pixels, digest, name, tuple(warnings), attributes, shot)
+
+
+def decode_alone(path: Path) -> Array:
+    """The samples of a file's first part, (height, width, channel), as they are; for measuring."""
+    with _opened(path) as (_, file):
+        return np.asarray(file.read_image(file.spec().format))
 
 
 TRANSFERS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
@@ -470,6 +483,7 @@ def without_non_finite(pixels: Array) -> tuple[Array, int]:
     return pixels, count
 
 
+@cache
 def srgb_profile() -> bytes:
     """An ICC profile of sRGB, always the same bytes."""
     profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())

@@ -7,7 +7,7 @@ import platform
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -175,14 +175,20 @@ def sidecar(
         "device": {
             "name": device.info.name if device else "numpy",
             "platform": device.info.platform if device else "numpy",
-            "version": device.info.version if device else version("numpy"),
+            "version": device.info.version if device else all_versions()["numpy"],
             "driver": device.info.driver if device else "",
             "lanes": device.info.lanes if device else 0,
         },
-        "versions": {
-            "python": platform.python_version(),
-            "numpy": version("numpy"),
-            "pyopencl": version("pyopencl"),
-            **versions(),
-        },
+        "versions": all_versions(),
+    }
+
+
+@cache
+def all_versions() -> dict[str, str]:
+    """The versions of what a picture's bytes may depend on."""
+    return {
+        "python": platform.python_version(),
+        "numpy": version("numpy"),
+        "pyopencl": version("pyopencl"),
+        **versions(),
     }

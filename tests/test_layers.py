@@ -25,9 +25,9 @@ LEVELS = [
     {"reentry", "dng", "jobs", "asked", "interrupt"},
     {"raw_entry", "target"},
     {"entrance", "sidecar", "output_folder", "measure"},
-    {"batch", "describe", "measure_plot", "calibration_frames"},
-    {"run_log", "trace"},
-    {"progress"},
+    {"batch", "measure_plot", "calibration_frames"},
+    {"run_log", "trace", "bench_batch"},
+    {"progress", "describe"},
     {"cli"},
 ]
 LEVEL = {name: i for i, names in enumerate(LEVELS) for name in names}

@@ -1,0 +1,177 @@
+"""How near a batch comes to what the machine can do: the same work serially and in threads."""
+
+import os
+import resource
+import shutil
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clpipe.asked import Asked
+from clpipe.batch import DONE, STEPS, Batch
+from clpipe.bench import scene
+from clpipe.device import Device, Timing
+from clpipe.entrance import Entrance
+from clpipe.errors import ImageError
+from clpipe.image_io import Tags, decode_alone, write_display, write_exr
+from clpipe.jobs import find_jobs
+from clpipe.run import Runner
+from clpipe.stage import Kind
+from clpipe.target import Target
+
+TRANSFERS = ("upload", "download")
+DISTINCT = 4  # renders; the other names are links to them
+
+
+@dataclass(frozen=True)
+class Load:
+    """So many images of one size."""
+
+    images: int
+    width: int
+    height: int
+
+
+def loads() -> tuple[Load, ...]:
+    """Patches, frames and photographs."""
+    return Load(1000, 512, 512), Load(200, 1920, 1080), Load(20, 6000, 4000)
+
+
+@dataclass(frozen=True)
+class BatchSpeed:
+    """One load, measured.
+
+    ``cpu_ms`` is each step's CPU time of an image in the serial run; ``limit_s`` their sum over the
+    processors, for all images. ``alone_ms`` is what the file's decoder, the kernels and the encoder
+    take alone; ``overhead_ms`` what an image takes serially beyond them.
+    """
+
+    images: int
+    width: int
+    height: int
+    serial_s: float
+    batch_s: float
+    limit_s: float
+    cpu_ms: dict[str, float]
+    alone_ms: dict[str, float]
+    overhead_ms: float
+    peak_mib: float
+
+    @property
+    def share_of_limit(self) -> float:
+        """How near the batch comes to the limit; 1 is there."""
+        return self.limit_s / self.batch_s
+
+    @property
+    def megapixels_per_second(self) -> float:
+        """Of the batch."""
+        return self.images * self.width * self.height / 1e6 / self.batch_s
+
+    def record(self) -> dict[str, Any]:
+        """The same as JSON values."""
+        ratios = {
+            "share_of_limit": self.share_of_limit,
+            "mp_per_s": self.megapixels_per_second,
+            "batch_over_serial": self.serial_s / self.batch_s,
+        }
+        return asdict(self) | ratios
+
+
+class _Clock:
+    """Time and CPU time of this process, summed by name."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self.cpu: dict[str, float] = {}
+
+    @contextmanager
+    def on(self, name: str) -> Iterator[None]:
+        start, cpu = time.perf_counter(), time.process_time()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+        self.cpu[name] = self.cpu.get(name, 0.0) + time.process_time() - cpu
+
+
+def bench_batch(device: Device, asked: Asked, load: Load) -> BatchSpeed:
+    """Time one load: half EXR in, JPEG out; serially, in threads, and each part alone.
+
+    The files lie in a temporary folder while it lasts.
+    """
+    with tempfile.TemporaryDirectory(prefix="clpipe-bench-") as name:
+        folder = Path(name)
+        write_renders(folder / "in", load)
+        entrance = Entrance(asked)
+        jobs = find_jobs([str(folder / "in")], folder / "out")
+        chain = entrance.first_chain(jobs)
+
+        def batch() -> Batch:
+            shutil.rmtree(folder / "out", ignore_errors=True)
+            (folder / "out").mkdir()
+            return Batch(entrance, Target(folder / "out", ("jpg",)), [device], chain)
+
+        # A few first, so that nothing is compiled and no file is cold in what is timed.
+        list(batch().run(jobs[: 2 * DISTINCT]))
+        clock = _Clock()
+        serial = list(batch().one_by_one(jobs, clock.on))
+        with clock.on("batch"):
+            threaded = list(batch().run(jobs))
+        for outcome in (*serial, *threaded):
+            if outcome.status != DONE:
+                raise ImageError(outcome.error)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        alone = alone_ms(Runner(chain, device), folder / "in", chain.camera.make)
+    n = load.images
+    cpu = {step: clock.cpu[step] / n * 1e3 for step in STEPS}
+    serial_s = sum(clock.seconds[step] for step in STEPS)
+    return BatchSpeed(
+        n,
+        load.width,
+        load.height,
+        serial_s=serial_s,
+        batch_s=clock.seconds["batch"],
+        limit_s=sum(clock.cpu[step] for step in STEPS) / len(os.sched_getaffinity(0)),
+        cpu_ms=cpu,
+        alone_ms=alone,
+        overhead_ms=serial_s / n * 1e3 - sum(alone.values()),
+        peak_mib=peak,
+    )
+
+
+def write_renders(folder: Path, load: Load) -> None:
+    """A folder of renders in half floats; a few, and links to them."""
+    folder.mkdir()
+    picture = scene(load.width, load.height)
+    digits = len(str(load.images - 1))
+    for i in range(load.images):
+        path = folder / f"{i:0{digits}}.exr"
+        if i < DISTINCT:
+            rolled = np.roll(picture, 37 * i, axis=1)
+            write_exr(path, rolled, Kind.RGB.channels, {}, half=True)
+        else:
+            path.symlink_to(f"{i % DISTINCT:0{digits}}.exr")
+
+
+def alone_ms(runner: Runner, folder: Path, make: str) -> dict[str, float]:
+    """The median time of the decoder, the kernels and the encoder alone, for the first render."""
+    path = min(folder.iterdir())
+    times: dict[str, list[float]] = {"decoder": [], "kernels": [], "encoder": []}
+    tags = Tags(make, "", 100)
+    for _ in range(9):
+        start = time.perf_counter()
+        pixels = decode_alone(path)
+        decoded = time.perf_counter()
+        timings: list[Timing] = []
+        result = runner.run(pixels, "bench", timings)
+        written = time.perf_counter()
+        write_display(folder / "alone.jpg", result.image, tags)
+        times["encoder"].append(time.perf_counter() - written)
+        times["decoder"].append(decoded - start)
+        times["kernels"].append(sum(t.seconds for t in timings if t.name not in TRANSFERS))
+    return {name: statistics.median(values) * 1e3 for name, values in times.items()}
