@@ -268,6 +268,7 @@ def run(
     jobs = shard.take(find_jobs(inputs, output, entrance.endings()))
     if not jobs:
         raise RequestError(f"shard {shard.number} of {shard.of} has no image")
+    entrance.check(jobs)
     chain = entrance.first_chain(jobs)
     for option, value in (("--layer", layer), ("--transfer", transfer)):
         if value is not None and chain.source is not Kind.RGB:

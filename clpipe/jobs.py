@@ -9,6 +9,8 @@ from typing import Any
 
 from clpipe.errors import RequestError
 from clpipe.image_io import READABLE
+from clpipe.manifest import ENDINGS as MANIFESTS
+from clpipe.manifest import read_manifest
 from clpipe.raw_io import ENDINGS
 
 
@@ -38,14 +40,17 @@ class Job:
 def find_jobs(
     inputs: Sequence[str], output: Path, endings: Sequence[str] = (*READABLE, *ENDINGS)
 ) -> list[Job]:
-    """The images that inputs name: files, folders (all images in them, at any depth) and globs.
+    """The images that inputs name: files, folders (all images in them, at any depth), globs and
+    manifests.
 
     The image key of a file in a folder is its path relative to that folder, that of a file given
-    by name or found by a glob is its name. A file that does not exist is a job too: it fails later,
-    alone. Where the output folder lies inside an input folder, what is in it is no input.
+    by name or found by a glob is its name; a manifest's rows have their own. A file that does not
+    exist is a job too: it fails later, alone. Where the output folder lies inside an input folder,
+    what is in it is no input.
 
     Raises:
-        RequestError: an empty name, a folder without images, or a glob that no file matches.
+        RequestError: an empty name, a folder without images, a glob that no file matches, or a
+            manifest that is wrong.
     """
     jobs: list[Job] = []
     for text in inputs:
@@ -59,6 +64,11 @@ def find_jobs(
                 raws = " and camera raws" if set(ENDINGS) & set(endings) else ""
                 raise RequestError(f"{path}: a folder without images (looked for {listed}{raws})")
             jobs += [Job(p, p.relative_to(path).as_posix(), listed=False) for p in files]
+        elif path.suffix.lower() in MANIFESTS:
+            jobs += [
+                Job(row.path, row.key, row.name, True, row.values, row.frames, row.place)
+                for row in read_manifest(path)
+            ]
         elif glob.has_magic(text) and not os.path.exists(text):
             matches = sorted(m for m in glob.glob(text, recursive=True) if os.path.isfile(m))
             if not matches:

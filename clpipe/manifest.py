@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Protocol
 
 from clpipe.config import (
     OUTPUT,
@@ -93,15 +93,26 @@ def read_manifest(path: Path) -> list[Row]:
     return rows
 
 
+class Said(Protocol):
+    """An image with what is said of it alone; a row is one."""
+
+    @property
+    def path(self) -> Path: ...
+    @property
+    def values(self) -> Mapping[str, Any]: ...
+    @property
+    def place(self) -> str: ...
+
+
 def check_rows(
-    rows: Iterable[Row],
+    rows: Iterable[Said],
     settings: Settings,
     brings: Callable[[Path], bool] = lambda path: False,
 ) -> list[Settings]:
     """The settings of each row, every value checked, and nothing drawn yet.
 
     Args:
-        rows: of a manifest.
+        rows: of a manifest, or what was made of them.
         settings: what holds where a row says nothing.
         brings: whether an image brings settings of its own, as a raw does, which may have another
             camera and other stages.
