@@ -70,9 +70,11 @@ class Step:
     context: Context
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Chain:
-    """A chain of stages, ready to plan."""
+    """A chain of stages, ready to plan. One is equal to itself alone, so what is made of it can be
+    remembered.
+    """
 
     steps: tuple[Step, ...]
     source: Kind

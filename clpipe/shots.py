@@ -1,6 +1,7 @@
 """Which pictures are made of an image: one or a burst, and the truth beside them."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 from clpipe.config import Chain, Step
 from clpipe.truth import noisy_mosaic, signal_and_noise
@@ -69,21 +70,18 @@ class Burst:
         """
         names = enumerate(self._frames())
         frames = [Shot(name, chain, f"{key}#{i}" if i else key) for i, name in names]
-        return [*frames, *(truth_of(truth, chain, key) for truth in self._truths())]
+        return [*frames, *(replace(truth_of(t, chain), key=key) for t in self._truths())]
 
 
-def truth_of(truth: str, chain: Chain, key: str) -> Shot:
-    """What is to be known of the truth of an image, one of :data:`TRUTHS`.
+@lru_cache(maxsize=16)  # most images of a run have one chain, and what it is planned as is kept too
+def truth_of(truth: str, chain: Chain) -> Shot:
+    """What is to be known of the truth of a chain's images, one of :data:`TRUTHS`; without a key.
 
     Raises:
         RequestError: it cannot be known.
     """
-    noise: tuple[Step, ...] = ()
-    match truth:
-        case "development":
-            chain = chain.clean()
-        case "mosaic":
-            chain = noisy_mosaic(chain).clean()
-        case _:
-            chain, noise = signal_and_noise(chain)
-    return Shot(NAMES[truth], chain, key, noise)
+    if truth == VARIANCE:
+        signal, noise = signal_and_noise(chain)
+        return Shot(NAMES[truth], signal, "", noise)
+    noisy = noisy_mosaic(chain) if truth == MOSAIC else chain
+    return Shot(NAMES[truth], noisy.clean(), "")

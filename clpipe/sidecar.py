@@ -151,6 +151,7 @@ def sidecar(
         "input_modified": modified,
         "sha256": source.sha256,
         "layer": source.layer,
+        "picture": shot.name,
         "image_key": shot.key,
         "seed": chain.seed,
         "width": source.pixels.shape[1],

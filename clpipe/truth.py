@@ -13,9 +13,9 @@ from clpipe.stage import Frame, Kind
 from clpipe.types import Floats
 
 
-def draws(step: Step) -> bool:
-    """Whether a step draws random numbers."""
-    return any(p.random for p in step.method.passes())
+def adds_noise(step: Step) -> bool:
+    """Whether a step is another one where there is no noise."""
+    return step.method.clean() is not step.method
 
 
 def noisy_mosaic(chain: Chain) -> Chain:
@@ -28,7 +28,7 @@ def noisy_mosaic(chain: Chain) -> Chain:
         RequestError: there is no such mosaic.
     """
     chain.clean()  # refuses a chain without noise
-    first = [draws(step) for step in chain.steps].index(True)
+    first = [adds_noise(step) for step in chain.steps].index(True)
     noisy = chain.steps[first:]
     ends = [s for s in noisy if (s.stage.reads, s.stage.writes) == (Kind.RAW, Kind.MOSAIC)][:1]
     if not ends and any(s.stage.writes is Kind.RAW for s in noisy):
@@ -36,7 +36,7 @@ def noisy_mosaic(chain: Chain) -> Chain:
             f"the chain ends in DN, at {noisy[-1].name}, but the truth of a mosaic is in signal; "
             "end it with normalize or a later stage"
         )
-    ends = ends or [s for s in noisy if draws(s) and s.stage.writes is Kind.MOSAIC][-1:]
+    ends = ends or [s for s in noisy if adds_noise(s) and s.stage.writes is Kind.MOSAIC][-1:]
     if not ends:
         raise RequestError(
             f"the first noise of this chain is that of {noisy[0].name}, behind the mosaic; "
@@ -53,7 +53,7 @@ def signal_and_noise(chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
         RequestError: there is no such mosaic, or a step does not say what variance it makes.
     """
     steps = noisy_mosaic(chain).steps
-    first = [draws(step) for step in steps].index(True)
+    first = [adds_noise(step) for step in steps].index(True)
     noise = steps[first:]
     channels = len(noise[0].stage.reads.channels)
     variance_of(noise, np.zeros((2, 2, 3) if channels == 3 else (2, 2), np.float32))
@@ -65,7 +65,8 @@ def variance_of(noise: Sequence[Step], signal: Floats) -> Floats:
 
     It is that of the noisy mosaic about the clean one, over images and over cameras: what is fixed
     to a sensor (PRNU, DSNU, columns) counts as much as what is new in each image, for the clean
-    mosaic has none of it. As each stage says it, in the default chain
+    mosaic has none of it. The rounding of the clean mosaic itself is left out. As each stage says
+    it, in the default chain
 
         a*y + b + (prnu*y)^2 + dsnu^2 + row^2 + column^2 + 1/(12 range^2)
 
@@ -83,9 +84,9 @@ def variance_of(noise: Sequence[Step], signal: Floats) -> Floats:
         RequestError: a step does not say what variance it makes.
     """
     analogue = list(takewhile(lambda step: step.stage.writes is not Kind.RAW, noise))
-    if len(analogue) < len(noise) and all(draws(s) or not s.method.passes() for s in analogue):
+    if len(analogue) < len(noise) and all(adds_noise(s) or not s.method.passes() for s in analogue):
         signal = np.minimum(signal, np.float32(1))
-    last = max(i for i, step in enumerate(noise) if draws(step))
+    last = max(i for i, step in enumerate(noise) if adds_noise(step))
     found: Floats = np.zeros((), np.float32)
     for i, step in enumerate(noise):
         with blamed(f"stage {step.name}", step.stage.folder):
