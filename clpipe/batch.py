@@ -24,9 +24,10 @@ from clpipe.errors import ImageError, OutputError, RequestError
 from clpipe.image_io import SourceImage, set_codec_threads
 from clpipe.jobs import Job
 from clpipe.run import Result, Runner
+from clpipe.shots import Shot
 from clpipe.sidecar import is_done, sidecar, stamp_of, wanted, write_sidecar
 from clpipe.stage import Kind
-from clpipe.target import DNG, SIDECAR, Shot, Target
+from clpipe.target import DNG, SIDECAR, Target
 
 DONE, SKIPPED, LEFT_OUT, FAILED = "done", "skipped", "left out", "failed"
 STEPS = ("decode", "device", "encode")
@@ -188,27 +189,25 @@ class Batch:
                 work = self.decode(job, lambda: None)
             for shot in work.shots:
                 with on("device"):
-                    result = self.develop(work, shot, runners(shot.chain))
+                    result = self.develop(work, shot, runners(shot))
                 if result:
                     with on("encode"):
                         self.encode(work, shot, result, device)
             yield work.outcome()
 
-    def runners(self, device: Device | None) -> Callable[[Chain], Runner]:
-        """What makes the runner of a chain on a device; the kernels of the first are compiled."""
+    def runners(self, device: Device | None) -> Callable[[Shot], Runner]:
+        """What makes the runner of a shot on a device; the kernels of the first are compiled."""
         entrance, target = self._entrance, self._target
-        first = target.runner(self._chain, device)
+        first = target.runner(Shot("", self._chain, ""), device)
         first.warm_up(half=entrance.reentry is None and self._chain.source is Kind.RGB)
         latest = [(self._chain, first)]
 
-        def runner(chain: Chain) -> Runner:
+        def runner(shot: Shot) -> Runner:
             for known, its in latest:
-                if known is chain:
+                if known is shot.chain:
                     return its
-            made = first.of(chain) if chain.names == self._chain.names else None
-            if made is None or target.kept_of(chain) != target.kept_of(self._chain):
-                made = target.runner(chain, device)
-            latest.insert(1, (chain, made))
+            made = target.runner(shot, device)
+            latest.insert(1, (shot.chain, made))
             del latest[4:]
             return made
 
@@ -421,7 +420,7 @@ class _Run:
                 self._results.acquire()
                 result = None
                 if not work.error:
-                    result = self._batch.develop(work, shot, runners(shot.chain))
+                    result = self._batch.develop(work, shot, runners(shot))
                 if result:
                     self._made.put((work, shot, result, device))
                 else:

@@ -37,9 +37,10 @@ from clpipe.raw_dump import TYPES
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.registry import all_stages, load_stage_file
 from clpipe.run_log import RunLog, Summary, log_name
+from clpipe.shots import TRUTHS, Burst, Shot
 from clpipe.stage import Kind, Stage
 from clpipe.suggest import one_of
-from clpipe.target import EVERY_FORMAT, Burst, Target
+from clpipe.target import EVERY_FORMAT, Target
 from clpipe.trace import Trace
 
 
@@ -198,6 +199,14 @@ def main() -> None:
     metavar="N",
     help="Make a burst of N frames of each image, each with noise of its own, and the truth.",
 )
+@click.option(
+    "--truth",
+    "truths",
+    multiple=True,
+    type=click.Choice(TRUTHS),
+    help="Make beside each picture what is known of it: its development or its mosaic without "
+    "noise, or the variance of the noise in the mosaic; may be repeated.",
+)
 @click.option("--raw-size", metavar="WxH", help="Of headerless dumps (.raw): width and height.")
 @click.option(
     "--raw-type", type=click.Choice(list(TYPES)), help="And how their samples are stored."
@@ -245,6 +254,7 @@ def run(
     inputs: tuple[str, ...],
     output: Path,
     frames: int | None,
+    truths: tuple[str, ...],
     transfer: str | None,
     layer: str | None,
     max_pixels: int,
@@ -263,6 +273,11 @@ def run(
 
     Each makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used. With
     --frames: OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise.
+
+    --truth development is that, without a burst. --truth mosaic is OUT/NAME.truth_mosaic.exr, the
+    truth of --keep normalize. --truth variance is OUT/NAME.truth_variance.exr: for each pixel of
+    that mosaic the variance of the noise that the chain adds, in signal squared, with what is fixed
+    to a sensor (PRNU, DSNU, columns) and rounding, without clipping and defect pixels.
     """
     entrance = Entrance(asked_for(**request), Reading(layer, max_pixels, transfer))
     jobs = shard.take(find_jobs(inputs, output, entrance.endings()))
@@ -277,7 +292,7 @@ def run(
             )
     whole = entrance.asked.until is None or chain.result is Kind.DISPLAY
     formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
-    target = Target(output, formats, Burst(frames), chain.kept(keep))
+    target = Target(output, formats, Burst(frames, truths), chain.kept(keep))
     target.check(chain, jobs)
     device = open_device(selector)
     summary = Summary(len(jobs))
@@ -334,7 +349,7 @@ def plan(
         return
     chain = asked.chain()
     target = Target(Path(), formats or ("jpg",), keep=chain.kept(keep))
-    made = target.runner(chain, None).plan()
+    made = target.runner(Shot("", chain, ""), None).plan()
     if as_json:
         show_json(describe.plan_record(made))
         return

@@ -29,7 +29,7 @@ from clpipe.noise_model import NoiseModel
 from clpipe.output import Output
 from clpipe.raw_dump import Dump, dump_of
 from clpipe.registry import all_stages, blamed, check_passes, load_stage_file
-from clpipe.stage import Context, Kind, Method, Stage, Unchanged
+from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
 from clpipe.stages import DEFAULT_CHAIN
 from clpipe.suggest import one_of
 
@@ -124,9 +124,11 @@ class Step:
     context: Context
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Chain:
-    """A chain of stages, ready to plan."""
+    """A chain of stages, ready to plan. One is equal to itself alone, so what is made of it can be
+    remembered.
+    """
 
     steps: tuple[Step, ...]
     source: Kind
@@ -162,14 +164,19 @@ class Chain:
         return any(p.random for s in self.steps for p in s.method.passes())
 
     def clean(self) -> "Chain":
-        """The chain without what its steps draw at random; all else as it is.
+        """The chain without what its steps draw at random; all else as it is, the last step too.
 
         Raises:
             RequestError: no step draws anything.
         """
         left = [(step, step.method.clean()) for step in self.steps]
         if all(method is step.method for step, method in left):
-            raise RequestError("no stage of this chain adds noise; every frame would be the same")
+            raise RequestError(
+                "no stage of this chain adds noise; every frame would be the same, "
+                "and there is no noise to know the truth of"
+            )
+        if left[-1][1] is None:
+            left[-1] = left[-1][0], Noiseless()
         steps = tuple(
             replace(step, method=method, context=replace(step.context, noise=None))
             for step, method in left

@@ -67,7 +67,7 @@ class Reporter:
         first, *others = self._target.burst_of(outcome.job).names()
         made = str(self._target.path(outcome.job, ending_of(self._target.formats[0]), first))
         if others:
-            made += f" and {len(others)} frame{'s' * (len(others) > 1)}"
+            made += f" and {len(others)} more"
         seconds = sum(outcome.seconds(step) for step in self._summary.seconds)
         return f"{made}  {outcome.megapixels:.2g} MP  {seconds:.2f} s"
 
