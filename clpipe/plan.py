@@ -7,7 +7,8 @@ a plane lives in a slot from the launch that writes it to the last one that read
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -115,12 +116,20 @@ class Plan:
     source: Kind
     half: bool
     launches: tuple[AnyLaunch, ...]
-    slots: dict[int, tuple[int, ...]] = field(hash=False)  # image number -> slots of its planes
+    slots: dict[int, tuple[int, ...]]  # image number -> slots of its planes
     slot_count: int = 0
     kept: tuple[tuple[str, Image], ...] = ()  # step -> its image
     final: Image | None = None  # the last image as float planes
     encoded: Kind | None = None  # the kind that is encoded to eight bits
     apron: int = 0
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        # A plan is looked up for each image, and hashing all that is in it takes a while.
+        return hash((self.source, self.half, self.launches, self.kept, self.final, self.encoded))
 
     def bytes_per_pixel(self, lanes: int) -> float:
         """Device memory a pixel takes: source, slots, partial sums and eight-bit result."""

@@ -106,7 +106,7 @@ class Runner:
 
         Args:
             image: (height, width, 3) linear RGB, or (height, width) for a chain that starts on a
-                mosaic; float16 or float32, finite.
+                mosaic; finite, of float16 or any type that fits into float32.
             image_key: what the image's noise is keyed on.
             timings: is given one entry a launch (devices only).
             download: False leaves the results on the device (for measuring).
@@ -125,8 +125,6 @@ class Runner:
             return Result(None, None, {}, {})
         if not self.device:
             return self._run_numpy(np.asarray(image, np.float32), image_key)
-        if image.dtype not in (np.float16, np.float32):
-            image = image.astype(np.float32)
         plan = self.plan(image.dtype == np.float16, fold=min(image.shape[:2]) > 1)
         keys = {s.name: streams(self.chain, s, image_key) for s in self.chain.steps}
 

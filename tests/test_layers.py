@@ -10,7 +10,7 @@ PACKAGE = ROOT / "clpipe"
 # Lower ones first; a module imports only from lower levels.
 LEVELS = [
     {"errors", "types", "suggest", "noise_model", "output", "printable"},
-    {"reference"},
+    {"reference", "memory"},
     {"camera", "statistics", "raw_dump", "exr_colour"},
     {"stage", "calibration", "luminance_chroma"},
     {"stages"},
@@ -18,6 +18,7 @@ LEVELS = [
     {"config"},
     {"plan"},
     {"codegen"},
+    {"tiles"},
     {"device"},
     {"run"},
     {"image_io", "raw_io", "check", "bench", "pipeline"},
