@@ -289,10 +289,16 @@ class Pool:
             if name not in enough:
                 self.held[name] = self._make(size)
 
+    @property
+    def bytes(self) -> int:
+        """What all of them take."""
+        return sum(buffer.size for buffer in self.held.values())
+
     def release(self) -> None:
         """Give all of them back."""
-        while self.held:
-            self.held.popitem()[1].release()
+        held, self.held = self.held, {}
+        for buffer in held.values():
+            buffer.release()
 
 
 class Call:
@@ -360,6 +366,9 @@ class Device:
         chosen: which device.
         memory: bytes that its buffers may take; None is what it reports. A CPU shares its memory
             with everybody, so it is at most half of what is available now.
+
+    Raises:
+        DeviceError: it cannot be opened.
     """
 
     def __init__(self, chosen: Found, memory: int | None = None) -> None:
@@ -368,14 +377,22 @@ class Device:
         self.info = chosen
         self.memory = memory or usable_memory(chosen)
         self._cl = cl
-        self._context = cl.Context([chosen.handle])
-        self._queue = cl.CommandQueue(
-            self._context, properties=cl.command_queue_properties.PROFILING_ENABLE
-        )
+        try:
+            self._context = cl.Context([chosen.handle])
+            self._queue = cl.CommandQueue(
+                self._context, properties=cl.command_queue_properties.PROFILING_ENABLE
+            )
+        except cl.Error as error:
+            raise DeviceError(f"{chosen.label} cannot be opened: {error}") from None
         self._calls: dict[Plan, list[Call]] = {}
         self._programs: dict[str, Any] = {}
         self._pool = Pool(self._new_buffer)
         self._tables: dict[int, tuple[Array, Any]] = {}
+
+    @property
+    def bytes_held(self) -> int:
+        """Device memory of the buffers that are kept from image to image."""
+        return self._pool.bytes
 
     def prepare(self, plan: Plan) -> list[Call]:
         """The compiled kernels of a plan, from the first call on without compiling.
@@ -442,20 +459,29 @@ class Device:
         """
         cl = self._cl
         height, width = source.shape[:2]
-        memory, fresh = self.memory, False
+        memory = self.memory
+        full: Exception | None = None  # what the device said when there was no more
         while True:
-            tiling = tiling_of(
-                plan, width, height, self.info.lanes, memory, min(memory, self.info.max_buffer)
-            )
+            try:
+                tiling = tiling_of(
+                    plan, width, height, self.info.lanes, memory, min(memory, self.info.max_buffer)
+                )
+            except ImageError:
+                if full is None:
+                    raise
+                raise ImageError(
+                    f"{width}x{height} pixels: {self.info.label} is out of memory, in tiles of any "
+                    f"size; others may be using it ({full})"
+                ) from None
             try:
                 return self._run(plan, tiling, source, bind, timings, download)
-            except cl.MemoryError:
+            except cl.MemoryError as error:
                 self._abandon()
-                memory = tiling.bytes // 2 if fresh else memory
-                fresh = True
+                memory = memory if full is None else tiling.bytes // 2
+                full = error
             except cl.Error as error:
                 self._abandon()
-                raise ImageError(f"{self.info.label}: {error}") from None
+                raise ImageError(f"{self.info.label} failed: {error}") from None
 
     def _run(
         self,
@@ -511,6 +537,7 @@ class Device:
         with suppress(self._cl.Error):
             self._queue.finish()
         with suppress(self._cl.Error):
+            self._tables.clear()
             self._pool.release()
 
     def _table(self, table: Array) -> Any:
@@ -584,12 +611,14 @@ class Device:
         return best
 
 
-def open_device(selector: str | None) -> Device | None:
+def open_device(selector: str | None, memory: int | None = None) -> Device | None:
     """The device that a selector names, as :func:`choose` has it; None for "numpy".
+
+    ``memory`` is how many bytes of it may be used.
 
     Raises:
         DeviceError: there is none, none matches, or the one that was asked for cannot be used.
     """
     if selector is not None and selector.lower() == "numpy":
         return None
-    return Device(choose(selector, find_devices()))
+    return Device(choose(selector, find_devices()), memory)

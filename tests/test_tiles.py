@@ -66,7 +66,7 @@ def in_tiles(
     with monkeypatch.context() as patch:
         patch.setattr(device, "memory", memory)
         parts = runner.run(image, "k")
-        assert sum(b.size for b in device._pool.held.values()) <= memory
+        assert device.bytes_held <= memory
     same(whole, parts)
     return whole, len(tiling.tiles)
 
@@ -215,6 +215,77 @@ def test_memory_that_is_too_small_for_any_tile(device, monkeypatch):
         r"with .* KiB in one piece; allowed are 1.0 KiB",
     ):
         runner.run(np.zeros((64, 64, 3), np.float32), "k")
+
+
+class Scarce:
+    """pyopencl on a device that another program has nearly filled."""
+
+    def __init__(self, device: Device, left: int, call: str) -> None:
+        self._real, self._device, self._left, self._call = device._cl, device, left, call
+        self.failures = 0
+
+    def __getattr__(self, name: str):
+        if name == self._call and self._device.bytes_held > self._left:
+            self.failures += 1
+            raise self._real.MemoryError("CL_OUT_OF_RESOURCES")
+        return getattr(self._real, name)
+
+
+@pytest.mark.parametrize("call", ["enqueue_copy", "enqueue_nd_range_kernel"])
+def test_memory_that_is_not_there_all_the_same(device, monkeypatch, call):
+    runner = Runner(make_chain(settings_from({"iso": 3200, **GRAY_WORLD})), device)
+    image = example(Kind.RGB, (150, 203), half=True)
+    whole = runner.run(image, "k")
+    other = example(Kind.RGB, (333, 403), half=True)
+    runner.run(other, "k")
+    # Room for the image alone, but not beside what the larger one has left behind.
+    enough = sum(buffer_sizes(runner.plan(), Extent.whole(203, 150, 8, 2)).values())
+    for left, tries in ((enough, 1), (enough // 3, 3), (enough // 9, 5)):
+        scarce = Scarce(device, left, call)
+        with monkeypatch.context() as patch:
+            patch.setattr(device, "_cl", scarce)
+            same(whole, runner.run(image, "k"))
+        assert 1 <= scarce.failures <= tries
+    with monkeypatch.context() as patch:
+        patch.setattr(device, "_cl", Scarce(device, 100, call))
+        with pytest.raises(ImageError, match=r"203x150 pixels: .* is out of memory, in tiles of a"):
+            runner.run(image, "k")
+    same(whole, runner.run(image, "k"))
+
+
+def test_buffers_that_cannot_be_made(device, monkeypatch):
+    runner = Runner(make_chain(settings_from({"iso": 3200, **GRAY_WORLD})), device)
+    image = example(Kind.RGB, (150, 203), half=True)
+    whole = runner.run(image, "k")
+    make, sizes = device._pool._make, []
+
+    def scarce(size):
+        sizes.append(size)
+        if size > 40_000:
+            raise device._cl.MemoryError("CL_MEM_OBJECT_ALLOCATION_FAILURE")
+        return make(size)
+
+    device._pool.release()
+    with monkeypatch.context() as patch:
+        patch.setattr(device._pool, "_make", scarce)
+        same(whole, runner.run(image, "k"))
+    assert max(sizes) > 100_000
+    assert max(b.size for b in device._pool.held.values()) <= 40_000
+
+
+def test_a_device_that_fails_is_an_error_of_the_image(device, monkeypatch):
+    runner = Runner(make_chain(settings_from({"iso": 3200, **GRAY_WORLD})), device)
+    image = example(Kind.RGB, (150, 203), half=True)
+    whole = runner.run(image, "k")
+
+    def dies(*_, **__):
+        raise device._cl.RuntimeError("the driver died")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(device._cl, "enqueue_nd_range_kernel", dies)
+        with pytest.raises(ImageError, match="failed: the driver died"):
+            runner.run(image, "k")
+    same(whole, runner.run(image, "k"))
 
 
 def test_numbers_of_tiles_to_try():
