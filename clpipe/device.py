@@ -203,17 +203,24 @@ def build_log(text: str) -> str:
     return "\n".join(lines).strip() or text
 
 
-def room_for(plan: Plan, width: int, height: int) -> Output:
-    """Whole images on the host for all that a plan gives."""
+def room_for(plan: Plan, width: int, height: int, into: Array | None) -> Output:
+    """Whole images on the host for all that a plan gives; ``into`` is for the encoded one."""
 
     def shape(kind: Kind) -> tuple[int, ...]:
         channels = len(kind.channels)
         return (height, width) if channels == 1 else (height, width, channels)
 
     images = [image for _, image in plan.kept] + ([plan.final] if plan.final else [])
+    encoded = None
+    if plan.encoded:
+        encoded = np.empty(shape(plan.encoded), np.uint8) if into is None else into
+        if encoded.shape != shape(plan.encoded) or encoded.dtype != np.uint8:
+            raise ValueError(
+                f"into is {encoded.shape} {encoded.dtype}; {shape(plan.encoded)} uint8"
+            )
     return Output(
         images={image.number: np.empty(shape(image.kind), np.float32) for image in images},
-        encoded=np.empty(shape(plan.encoded), np.uint8) if plan.encoded else None,
+        encoded=encoded,
         found={x.op.step: np.empty(4, np.float32) for x in plan.launches if isinstance(x, Find)},
     )
 
@@ -438,6 +445,7 @@ class Device:
         bind: Bind,
         timings: list[Timing] | None = None,
         download: bool = True,
+        into: Array | None = None,
     ) -> Output:
         """Put one image through a plan; in tiles where it does not fit into the memory.
 
@@ -451,6 +459,8 @@ class Device:
             bind: the value of a "value", "key" or "table8" parameter: a NumPy scalar or array.
             timings: is given one entry a launch and transfer, in order.
             download: bring results back; False leaves them on the device (for measuring).
+            into: where the eight-bit pixels are put, (height, width[, channel]) uint8,
+                C-contiguous; memory that is new to the process costs time.
 
         Raises:
             ImageError: the image does not fit into the device's memory, not even in tiles, or the
@@ -474,7 +484,7 @@ class Device:
                     f"size; others may be using it ({full})"
                 ) from None
             try:
-                return self._run(plan, tiling, source, bind, timings, download)
+                return self._run(plan, tiling, source, bind, timings, download, into)
             except cl.MemoryError as error:
                 self._abandon()
                 memory = memory if full is None else tiling.bytes // 2
@@ -491,13 +501,14 @@ class Device:
         bind: Bind,
         timings: list[Timing] | None,
         download: bool,
+        into: Array | None,
     ) -> Output:
         calls = self.prepare(plan)
         if len(self._tables) > 32:
             self._tables.clear()
         upload = download or len(tiling.tiles) > 1 or "src" not in self._pool.held
         self._pool.reserve(tiling.sizes, self.memory)
-        output = room_for(plan, source.shape[1], source.shape[0])
+        output = room_for(plan, source.shape[1], source.shape[0], into)
         events: list[tuple[str, Any]] = []
 
         def value_of(parameter: Parameter) -> Any:

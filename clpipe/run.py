@@ -101,6 +101,7 @@ class Runner:
         image_key: str,
         timings: list[Timing] | None = None,
         download: bool = True,
+        into: Array | None = None,
     ) -> Result:
         """Put one image through.
 
@@ -110,6 +111,8 @@ class Runner:
             image_key: what the image's noise is keyed on.
             timings: is given one entry a launch (devices only).
             download: False leaves the results on the device (for measuring).
+            into: where the eight-bit pixels are put (devices only), of their shape; a batch that
+                uses its arrays again spares the time that new memory takes.
 
         Raises:
             ImageError: an image of the wrong shape, or one that does not fit the device.
@@ -139,7 +142,7 @@ class Runner:
             stream = of[Owner(parameter.item[:-1])]
             return np.uint32(stream.key1 if parameter.item.endswith("1") else stream.key0)
 
-        output = self.device.run(plan, image, bind, timings, download)
+        output = self.device.run(plan, image, bind, timings, download, into)
         names = {s.name: [n for p in s.method.passes() for n in p.found] for s in self.chain.steps}
         return Result(
             final=output.images.get(plan.final.number) if plan.final else None,

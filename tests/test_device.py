@@ -102,6 +102,43 @@ def test_a_second_run_compiles_nothing(device, monkeypatch):
     Runner(changed, fresh).run(image, "k")
 
 
+def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
+    fresh = Device(device.info)
+    runner = Runner(make_chain(settings_from({})), fresh)
+    made = []
+    make = fresh._pool._make
+    monkeypatch.setattr(fresh._pool, "_make", lambda size: made.append(size) or make(size))
+    images = [
+        np.full((h, w, 3), 0.4, np.float16) for h, w in ((60, 50), (20, 90), (7, 8), (60, 50))
+    ]
+    alone = [Runner(runner.chain, device).run(image, "k").encoded for image in images]
+    assert [runner.run(image, "k").encoded.tobytes() for image in images] == [
+        pixels.tobytes() for pixels in alone
+    ]
+    most = max(made)
+    assert len(made) == len(fresh._pool.held) + 1  # a line table, for the width of the second one
+    # What is held for others goes when it would take more than is allowed.
+    fresh.memory = fresh.bytes_held
+    other = Runner(make_chain(settings_from({"stages": ["exposure", "gamma"]})), fresh, final=True)
+    other.run(np.zeros((90, 100, 3), np.float16), "k")
+    assert fresh.bytes_held <= fresh.memory
+    fresh.memory = 8 * most
+    runner.run(images[0], "k")
+    other.run(images[0], "k")
+    assert len(fresh._pool.held) > 4
+
+
+def test_pixels_into_an_array_that_is_there(device):
+    runner = Runner(make_chain(settings_from({})), device)
+    image = np.full((20, 30, 3), 0.5, np.float16)
+    room = np.empty((20, 30, 3), np.uint8)
+    result = runner.run(image, "k", into=room)
+    assert result.encoded is room
+    assert np.array_equal(room, runner.run(image, "k").encoded)
+    with pytest.raises(ValueError, match=r"into is \(20, 30\)"):
+        runner.run(image, "k", into=room[..., 0])
+
+
 @pytest.mark.parametrize("lanes", [1, 8, 16])
 @pytest.mark.parametrize("width", [1, 7, 8, 1000, 1008])
 def test_extents(lanes, width):

@@ -14,7 +14,15 @@ from clpipe.reference.cfa import PATTERNS
 from clpipe.registry import all_stages
 from clpipe.run import Result, Runner
 from clpipe.stage import Kind
-from clpipe.tiles import Extent, buffer_sizes, divisions, halo_of, phases_of, tiling_of
+from clpipe.tiles import (
+    LARGEST_TILE,
+    Extent,
+    buffer_sizes,
+    divisions,
+    halo_of,
+    phases_of,
+    tiling_of,
+)
 
 METHODS = [
     pytest.param(stage, method, id=f"{stage.name}-{method.method}")
@@ -183,9 +191,10 @@ def test_tiles_cover_an_image_once_and_fit(memory, lanes):
 
 def test_full_rows_come_before_narrow_tiles():
     plan = plan_of()
-    for memory, columns in ((2**32, {30000}), (2**26, {2512, 2368})):
-        tiles = tiling_of(plan, 30000, 20000, 8, memory, memory).tiles
-        assert {extent.core.width for extent in tiles} == columns
+    for memory, columns in ((2**34, {30000}), (2**26, {2512, 2368})):
+        tiling = tiling_of(plan, 30000, 20000, 8, memory, memory)
+        assert {extent.core.width for extent in tiling.tiles} == columns
+        assert tiling.bytes < LARGEST_TILE
 
 
 def test_the_halo_is_what_all_stencils_reach_together():
