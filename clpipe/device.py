@@ -276,6 +276,7 @@ class Pool:
     def __init__(self, make: Callable[[int], Any]) -> None:
         self._make = make
         self.held: dict[str, Any] = {}
+        self.generation = 0  # another one when other buffers are held
 
     def reserve(self, sizes: Mapping[str, int], memory: int) -> None:
         """See that there is a buffer of at least these sizes (bytes by name).
@@ -290,6 +291,9 @@ class Pool:
                 dropped = [name for name, b in enough.items() if spare(name, b)]
                 missing += sum(sizes.get(name, 0) for name in dropped)
                 enough = {name: b for name, b in enough.items() if name not in dropped}
+        if enough.keys() == self.held.keys() >= sizes.keys():
+            return
+        self.generation += 1
         for name in self.held.keys() - enough.keys():
             self.held.pop(name).release()
         for name, size in sizes.items():
@@ -303,6 +307,7 @@ class Pool:
 
     def release(self) -> None:
         """Give all of them back."""
+        self.generation += 1
         held, self.held = self.held, {}
         for buffer in held.values():
             buffer.release()
@@ -317,27 +322,27 @@ class Call:
     def __init__(self, kernel: Kernel, compiled: Any) -> None:
         self.kernel = kernel
         self.compiled = compiled
-        self._last: list[Any] = [None] * len(kernel.parameters)
-        self._buffers = [buffer_name(p) for p in kernel.parameters]
+        numbered = list(enumerate(kernel.parameters))
+        names = [(i, buffer_name(p)) for i, p in numbered]
+        self._buffers = [(i, name) for i, name in names if name]
+        self._numbers = [(i, p.item) for i, p in numbered if p.role == "tile"]
+        self._values = [(i, p) for i, p in numbered if p.role in ("value", "key", "table8")]
+        self._last: list[Any] = [None] * len(numbered)
+        self._place: tuple[Any, ...] = ()
 
-    def set_arguments(
-        self,
-        pool: Mapping[str, Any],
-        numbers: Mapping[str, np.uint32],
-        bind: Callable[[Parameter], Any],
-    ) -> None:
+    def set_arguments(self, pool: "Pool", extent: Extent, tile: int, bind: Bind) -> None:
         """Set what is different from the last time: buffers, a tile's numbers, and values."""
-        for i, (parameter, name) in enumerate(
-            zip(self.kernel.parameters, self._buffers, strict=True)
-        ):
-            if name:
-                value = pool[name]
-            elif parameter.role == "tile":
-                value = numbers[parameter.item]
-            else:
-                value = bind(parameter)
-            last = self._last[i]
-            if value is not last and not (name is None and same_bits(value, last)):
+        place = pool.generation, extent, tile
+        if place != self._place:
+            told = {**extent.numbers, "tile": np.uint32(tile)}
+            for i, name in self._buffers:
+                self.compiled.set_arg(i, pool.held[name])
+            for i, name in self._numbers:
+                self.compiled.set_arg(i, told[name])
+            self._place = place
+        for i, parameter in self._values:
+            value, last = bind(parameter), self._last[i]
+            if value is not last and not same_bits(value, last):
                 self.compiled.set_arg(i, value)
                 self._last[i] = value
 
@@ -516,10 +521,9 @@ class Device:
             return self._table(value) if isinstance(value, np.ndarray) else value
 
         def launch(numbers: tuple[int, ...], extent: Extent, tile: int) -> None:
-            told = extent.numbers | {"tile": np.uint32(tile)}
             for number in numbers:
                 call = calls[number]
-                call.set_arguments(self._pool.held, told, value_of)
+                call.set_arguments(self._pool, extent, tile, value_of)
                 sizes = index_space(call.kernel, extent)
                 event = self._cl.enqueue_nd_range_kernel(self._queue, call.compiled, *sizes)
                 events.append((call.kernel.launch.name, event))

@@ -148,3 +148,22 @@ def test_extents(lanes, width):
     assert extent.columns % lanes == 0
     assert extent.pitch >= extent.columns + 6
     assert extent.pitch % 1024
+
+
+def test_another_chain_of_the_same_structure_is_not_planned_again(device, monkeypatch):
+    runner = Runner(make_chain(settings_from({})), device)
+    image = np.full((20, 30, 3), 0.5, np.float16)
+    runner.run(image, "k")
+    values = {"iso": 3200, "exposure": {"ev": 1}, "seed": 4, "gamma": {"exponent": 1.8}}
+    changed = make_chain(settings_from(values))
+    alone = Runner(changed, device).run(image, "k").encoded
+    other = make_chain(settings_from({"mosaic": {"pattern": "BGGR"}}))
+    assert runner.of(other).plan() is not runner.plan()
+    assert runner.of(changed).plan(fold=False) is not runner.plan()
+
+    def plan_again(*_):
+        raise AssertionError("planned again")
+
+    monkeypatch.setattr("clpipe.run.make_plan", plan_again)
+    assert np.array_equal(runner.of(changed).run(image, "k").encoded, alone)
+    assert np.array_equal(runner.of(changed).run(image, "k").encoded, alone)
