@@ -162,6 +162,27 @@ def choose(selector: str | None, devices: list[Found]) -> Found:
     return usable[0]
 
 
+def choose_all(selectors: Sequence[str], devices: list[Found]) -> list[Found]:
+    """The devices that selectors name, each as :func:`choose` has it, each device once.
+
+    Without selectors these are the one that is chosen by default and, if it is a GPU, all others of
+    the same name, which give the same bits.
+
+    Raises:
+        DeviceError: as :func:`choose`.
+    """
+    if not selectors:
+        first = choose(None, devices)
+        return [first] + [
+            d
+            for d in devices
+            if d.type == first.type == "GPU" and d.name == first.name and not d.problem
+            if d.index != first.index
+        ]
+    chosen = [choose(selector, devices) for selector in selectors]
+    return list({d.index: d for d in chosen}.values())
+
+
 def matches(selector: str, device: Found) -> bool:
     """Whether a selector is a part of a device's name, type or platform ('pocl' counts)."""
     alias = " pocl" if "Portable Computing" in device.platform else ""
@@ -637,3 +658,18 @@ def open_device(selector: str | None, memory: int | None = None) -> Device | Non
     if selector is not None and selector.lower() == "numpy":
         return None
     return Device(choose(selector, find_devices()), memory)
+
+
+def open_devices(selectors: Sequence[str] = (), memory: int | None = None) -> list[Device]:
+    """The devices that selectors name, as :func:`choose_all` has them; none for "numpy".
+
+    ``memory`` is how many bytes may be used of each.
+
+    Raises:
+        DeviceError: as :func:`open_device`, or "numpy" stands beside others.
+    """
+    if any(selector.lower() == "numpy" for selector in selectors):
+        if len(selectors) > 1:
+            raise DeviceError(f"found devices {', '.join(selectors)}; numpy is used alone")
+        return []
+    return [Device(found, memory) for found in choose_all(selectors, find_devices())]

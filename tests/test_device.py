@@ -1,13 +1,16 @@
 """The choice of a device, and what one cannot do."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from clpipe.config import make_chain, settings_from
 from clpipe.describe import device_rows
-from clpipe.device import Device, choose, find_devices
+from clpipe.device import Device, choose, choose_all, find_devices, open_devices
 from clpipe.errors import DeviceError, ImageError
 from clpipe.run import Runner
 from clpipe.tiles import Extent
@@ -55,6 +58,64 @@ def test_devices_that_cannot_be_used(devices):
         choose("x", devices)
     with pytest.raises(DeviceError, match="no OpenCL platform"):
         choose(None, [])
+
+
+def test_several_devices_are_chosen(devices):
+    def names(*selectors):
+        return [f"{d.index}{d.name}" for d in choose_all(selectors, devices)]
+
+    assert names() == ["3fast"]
+    assert names("slow", "3", "FAST", "0") == ["0slow", "3fast"]
+    assert [d.index for d in choose_all((), [devices[0], replace(devices[0], index=1)])] == [0]
+    twin = replace(devices[3], index=4)
+    devices += [twin, replace(twin, index=5, name="other"), replace(twin, index=6, problem="no")]
+    assert names() == ["3fast", "4fast"]
+    with pytest.raises(DeviceError, match="unknown device 'x'"):
+        names("slow", "x")
+
+
+def test_devices_are_opened():
+    assert open_devices(["numpy"]) == []
+    with pytest.raises(DeviceError, match="found devices pocl, NumPy; numpy is used alone"):
+        open_devices(["pocl", "NumPy"])
+    (one,) = open_devices(["0", "0"], memory=2**30)
+    assert one.memory == 2**30
+
+
+def test_devices_run_at_the_same_time(device):
+    images = [np.full((40 + 3 * i, 50, 3), 0.1 * i, np.float16) for i in range(8)]
+    alone = Runner(make_chain(settings_from({})), device)
+    expected = [alone.run(image, f"{i}").encoded for i, image in enumerate(images)]
+
+    def work(_):
+        with_all = Runner(alone.chain, Device(device.info))  # which compiles at the same time, too
+        return [with_all.run(image, f"{i}").encoded for i, image in enumerate(images)]
+
+    with ThreadPoolExecutor(3) as threads:
+        for results in threads.map(work, range(3)):
+            assert all(np.array_equal(a, b) for a, b in zip(results, expected, strict=True))
+
+
+def test_timings_are_those_of_a_trace(device):
+    runner = Runner(make_chain(settings_from({"iso": 3200})), device)
+    image = np.full((64, 80, 3), 0.5, np.float16)
+    runner.run(image, "k")
+    timings = []
+    start = time.perf_counter()
+    runner.run(image, "k", timings)
+    end = time.perf_counter()
+    names = [t.name for t in timings]
+    launches = [launch.name for launch in runner.plan().launches]
+    assert [t.name for t in timings if not t.transfer] == launches
+    assert names[0] == "upload"
+    assert names[-1] == "download"
+    assert all(t.transfer for t in timings if t.name in ("upload", "download"))
+    for one, two in pairwise(timings):
+        assert two.start >= one.start + one.seconds - 1e-5
+    # The device's clock is taken to stand at the end of the last one when the queue is empty.
+    assert start - 1e-2 < timings[0].start <= timings[-1].start + timings[-1].seconds <= end
+    runner.run(image, "k", none := [], download=False)
+    assert [t.name for t in none] == launches
 
 
 def test_why_devices_are_passed_over(devices):
