@@ -250,7 +250,7 @@ def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[
     """How many work items a kernel has, and in which groups."""
     match kernel.launch:
         case Launch(rows=rows, columns=columns):
-            across = round_up(extent.columns, extent.lanes * columns)
+            across = round_up(extent.padded_width, extent.lanes * columns)
             blocks = round_up(across // (extent.lanes * columns), LOCAL_SIZE)
             return (blocks, -(-extent.stored.height // rows)), (LOCAL_SIZE, 1)
         case Lines():
@@ -615,7 +615,7 @@ class Device:
         if not output.images:
             return
         plane = np.empty(extent.plane_bytes // 4, np.float32)
-        height = extent.rows + 2 * plan.apron
+        height = extent.padded_height + 2 * plan.apron
         top = plan.apron + core.top - stored.top
         left = apron_left(plan.apron, extent.lanes) + core.left - stored.left
         for number, image in output.images.items():

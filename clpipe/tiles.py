@@ -63,29 +63,29 @@ class Extent:
     @cached_property
     def pitch(self) -> int:
         """Floats from one row of a plane to the next."""
-        pitch = self.columns + 2 * apron_left(self.apron, self.lanes)
+        pitch = self.padded_width + 2 * apron_left(self.apron, self.lanes)
         # Rows a multiple of 4 KiB apart would fall into the same cache sets.
         return pitch + self.lanes * (pitch % 1024 == 0)
 
     @property
-    def columns(self) -> int:
-        """Those of the planes, in whole blocks."""
+    def padded_width(self) -> int:
+        """That of the planes, in whole blocks."""
         return round_up(self.stored.width, self.lanes)
 
     @property
-    def rows(self) -> int:
-        """Those of the planes, in whole blocks of four."""
+    def padded_height(self) -> int:
+        """That of the planes, in whole blocks of four rows."""
         return round_up(self.stored.height, 4)
 
     @property
     def blocks(self) -> int:
         """How many blocks of lanes and four rows there are, each with sums of its own."""
-        return self.columns // self.lanes * (self.rows // 4)
+        return self.padded_width // self.lanes * (self.padded_height // 4)
 
     @property
     def plane_bytes(self) -> int:
         """The size of a plane with its apron; the last block's loads may run over by its width."""
-        return ((self.rows + 2 * self.apron) * self.pitch + 5 * self.lanes) * 4
+        return ((self.padded_height + 2 * self.apron) * self.pitch + 5 * self.lanes) * 4
 
     @cached_property
     def numbers(self) -> dict[str, np.uint32]:
@@ -107,7 +107,7 @@ class Extent:
 
 def buffer_sizes(plan: Plan, extent: Extent) -> dict[str, int]:
     """The device buffers that a plan needs for an image or a tile: bytes by name."""
-    pixels = extent.rows * extent.stored.width
+    pixels = extent.padded_height * extent.stored.width
     source = pixels * len(plan.source.channels) + 3 * extent.lanes
     sizes = {"src": source * (2 if plan.half else 4)}
     sizes |= {f"slot{number}": extent.plane_bytes for number in range(plan.slot_count)}

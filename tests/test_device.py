@@ -204,10 +204,10 @@ def test_pixels_into_an_array_that_is_there(device):
 @pytest.mark.parametrize("width", [1, 7, 8, 1000, 1008])
 def test_extents(lanes, width):
     extent = Extent.whole(width, 5, lanes, 3)
-    assert extent.rows == 8
-    assert extent.columns >= width
-    assert extent.columns % lanes == 0
-    assert extent.pitch >= extent.columns + 6
+    assert extent.padded_height == 8
+    assert extent.padded_width >= width
+    assert extent.padded_width % lanes == 0
+    assert extent.pitch >= extent.padded_width + 6
     assert extent.pitch % 1024
 
 

@@ -11,7 +11,7 @@ from clpipe.device import Device
 from clpipe.errors import ImageError
 from clpipe.plan import Plan
 from clpipe.reference.cfa import PATTERNS
-from clpipe.registry import all_stages
+from clpipe.registry import all_stages, load_stage_file
 from clpipe.run import Result, Runner
 from clpipe.stage import Kind
 from clpipe.tiles import (
@@ -23,13 +23,13 @@ from clpipe.tiles import (
     phases_of,
     tiling_of,
 )
+from tests.test_contributing import block
 
 METHODS = [
     pytest.param(stage, method, id=f"{stage.name}-{method.method}")
     for stage in all_stages().values()
     for method in stage.methods
 ]
-
 
 GRAY_WORLD = {"white_balance": {"method": "gray_world"}}
 
@@ -151,6 +151,18 @@ def test_every_source_of_noise(device, monkeypatch, noise):
     runner = Runner(make_chain(settings, Kind.RGB), device, encode=False, final=True)
     _, count = in_tiles(runner, example(Kind.RGB, (150, 203)), 64, 48, monkeypatch)
     assert count >= 6
+
+
+def test_a_stage_of_somebody_else_reads_places_in_the_image(device, tmp_path, monkeypatch):
+    monkeypatch.setattr("clpipe.registry._from_files", {})
+    (tmp_path / "vignette.cl").write_text(block("c"))
+    (tmp_path / "vignette.py").write_text(block("python"))
+    stage = load_stage_file(tmp_path / "vignette.py")
+    chain = make_chain(Settings(iso=3200, stages=(stage.name,)), Kind.RGB)
+    image = example(Kind.RGB, (150, 203))
+    result, count = in_tiles(Runner(chain, device, final=True), image, 64, 48, monkeypatch)
+    assert count >= 6
+    assert np.abs(result.final - Runner(chain, None, final=True).run(image, "k").final).max() < 1e-6
 
 
 @pytest.mark.parametrize("size", [(1, 900), (900, 1)])
