@@ -455,6 +455,8 @@ class Device:
                 program = cl.Program(self._context, kernel.source).build(
                     options, cache_dir=False if own_cache else None
                 )
+            except cl.MemoryError:
+                raise
             except cl.Error as error:
                 log = build_log(str(error))
                 for file in kernel.files:
@@ -663,7 +665,7 @@ def open_device(selector: str | None, memory: int | None = None) -> Device | Non
 def open_devices(selectors: Sequence[str] = (), memory: int | None = None) -> list[Device]:
     """The devices that selectors name, as :func:`choose_all` has them; none for "numpy".
 
-    ``memory`` is how many bytes may be used of each.
+    ``memory`` is how many bytes may be used of each; without it, CPUs share what there is.
 
     Raises:
         DeviceError: as :func:`open_device`, or "numpy" stands beside others.
@@ -672,4 +674,9 @@ def open_devices(selectors: Sequence[str] = (), memory: int | None = None) -> li
         if len(selectors) > 1:
             raise DeviceError(f"found devices {', '.join(selectors)}; numpy is used alone")
         return []
-    return [Device(found, memory) for found in choose_all(selectors, find_devices())]
+    chosen = choose_all(selectors, find_devices())
+    sharing = sum(found.type != "GPU" for found in chosen)
+    return [
+        Device(found, memory or usable_memory(found) // (1 if found.type == "GPU" else sharing))
+        for found in chosen
+    ]
