@@ -10,6 +10,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from threading import RLock
 from types import ModuleType
 
 import numpy as np
@@ -22,6 +23,7 @@ from clpipe.stages import own_stages
 ARGUMENT_TYPES = (np.float32, np.int32, np.uint32, np.ndarray, Literal)
 ENTRY_POINTS = "clpipe.stages"
 _from_files: dict[Path, Stage] = {}
+_loading = RLock()  # a file is run once, and its name is then taken
 
 
 def all_stages() -> dict[str, Stage]:
@@ -56,7 +58,11 @@ def load_stage_file(path: Path) -> Stage:
     Raises:
         RequestError: the file cannot be read or run, defines no stage, or one whose name is taken.
     """
-    where = path.resolve()
+    with _loading:
+        return _loaded_file(path, path.resolve())
+
+
+def _loaded_file(path: Path, where: Path) -> Stage:
     if where not in _from_files:
         spec = spec_from_file_location(f"clpipe_stage_{path.stem}", where)
         if path.suffix != ".py" or spec is None or spec.loader is None:

@@ -10,7 +10,7 @@ PACKAGE = ROOT / "clpipe"
 # Lower ones first; a module imports only from lower levels.
 LEVELS = [
     {"errors", "types", "suggest", "noise_model", "output", "printable"},
-    {"reference"},
+    {"reference", "memory"},
     {"camera", "draws", "statistics", "raw_dump", "exr_colour"},
     {"stage", "calibration", "luminance_chroma"},
     {"stages"},
@@ -19,6 +19,7 @@ LEVELS = [
     {"manifest"},
     {"plan", "truth"},
     {"codegen", "shots"},
+    {"tiles"},
     {"device"},
     {"run"},
     {"image_io", "raw_io", "check", "bench", "pipeline"},
