@@ -26,7 +26,6 @@ from clpipe.run import Runner
 from clpipe.stage import Kind
 from clpipe.target import Target
 
-TRANSFERS = ("upload", "download")
 DISTINCT = 4  # renders; the other names are links to them
 
 
@@ -189,5 +188,5 @@ def alone_ms(runner: Runner, folder: Path, make: str) -> dict[str, float]:
         write_display(folder / "alone.jpg", result.image, tags)
         times["encoder"].append(time.perf_counter() - written)
         times["decoder"].append(decoded - start)
-        times["kernels"].append(sum(t.seconds for t in timings if t.name not in TRANSFERS))
+        times["kernels"].append(sum(t.seconds for t in timings if not t.transfer))
     return {name: statistics.median(values) * 1e3 for name, values in times.items()}

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import click
+from click.core import ParameterSource
 from rich.console import Console
 from rich.table import Table
 
@@ -23,7 +24,7 @@ from clpipe.calibration_frames import Given, calibrate_files, check_name, write_
 from clpipe.camera import built_in_cameras, load_camera
 from clpipe.check import SIZES, check_all
 from clpipe.config import Settings, built_in_configs, overlay, stage_named
-from clpipe.device import find_devices, open_device
+from clpipe.device import Device, find_devices, open_device, open_devices
 from clpipe.entrance import Entrance
 from clpipe.errors import ClpipeError, RequestError
 from clpipe.image_io import MAX_PIXELS, TRANSFERS, USUAL_MAX_PIXELS, Reading
@@ -31,11 +32,13 @@ from clpipe.interrupt import interruptible
 from clpipe.jobs import Shard, find_jobs, parse_shard
 from clpipe.measure import load
 from clpipe.measure import measure as measure_images
+from clpipe.memory import parse_size
 from clpipe.output_folder import output_folder, remove_unfinished
 from clpipe.progress import Reporter
 from clpipe.raw_dump import TYPES
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.registry import all_stages, load_stage_file
+from clpipe.replay import replay_of
 from clpipe.run_log import RunLog, Summary, log_name
 from clpipe.shots import TRUTHS, Burst, Shot
 from clpipe.stage import Kind, Stage
@@ -183,7 +186,7 @@ def main() -> None:
 
 
 @main.command()
-@click.argument("inputs", nargs=-1, required=True, metavar="INPUT...")
+@click.argument("inputs", nargs=-1, metavar="INPUT...")
 @click.option(
     "-o",
     "--output",
@@ -227,7 +230,19 @@ def main() -> None:
 )
 @keep_option
 @format_option
-@device_option
+@click.option(
+    "--device",
+    "selectors",
+    multiple=True,
+    metavar="SEL",
+    help="An index or a part of a name from 'clpipe devices', or numpy; may be repeated. [default: "
+    "the first GPU and all of its kind, else the first CPU]",
+)
+@click.option(
+    "--memory",
+    metavar="SIZE",
+    help="Of a device, such as 2G; larger images go in tiles. [default: what is free]",
+)
 @click.option(
     "--jobs",
     "threads",
@@ -241,6 +256,12 @@ def main() -> None:
     metavar="I/N",
     callback=lambda _context, _option, text: parse_shard(text),
     help="Do the I-th of N parts of the images, for job arrays.",
+)
+@click.option(
+    "--replay",
+    type=click.Path(path_type=Path),
+    metavar="SIDECAR",
+    help="Make the picture of a sidecar again, the same bytes; an INPUT is where its input is now.",
 )
 @click.option("--overwrite", is_flag=True, help="Make what is there already and up to date, too.")
 @click.option("--quiet", is_flag=True, help="Tell of failures alone.")
@@ -260,9 +281,11 @@ def run(
     max_pixels: int,
     keep: tuple[str, ...],
     formats: tuple[str, ...],
-    selector: str | None,
+    selectors: tuple[str, ...],
+    memory: str | None,
     threads: int | None,
     shard: Shard,
+    replay: Path | None,
     overwrite: bool,
     quiet: bool,
     trace: Path | None,
@@ -279,27 +302,35 @@ def run(
     that mosaic the variance of the noise that the chain adds, in signal squared, with what is fixed
     to a sensor (PRNU, DSNU, columns) and rounding, without clipping and defect pixels.
     """
-    entrance = Entrance(asked_for(**request), Reading(layer, max_pixels, transfer))
-    jobs = shard.take(find_jobs(inputs, output, entrance.endings()))
-    if not jobs:
-        raise RequestError(f"shard {shard.number} of {shard.of} has no image")
-    entrance.check(jobs)
-    chain = entrance.first_chain(jobs)
-    for option, value in (("--layer", layer), ("--transfer", transfer)):
-        if value is not None and chain.source is not Kind.RGB:
-            raise RequestError(
-                f"{option}: it is one of a render, but the chain reads {chain.source.label}"
-            )
-    whole = entrance.asked.until is None or chain.result is Kind.DISPLAY
-    formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
-    target = Target(output, formats, Burst(frames, truths), chain.kept(keep))
+    if replay:
+        refuse_beside_replay()
+        again = replay_of(replay, [Path(path) for path in inputs], max_pixels)
+        entrance, jobs = again.entrance, [again.job]
+        chain = entrance.first_chain(jobs)
+        target = Target(output, again.formats, again.burst, again.keep)
+    else:
+        entrance = Entrance(asked_for(**request), Reading(layer, max_pixels, transfer))
+        jobs = shard.take(find_jobs(inputs, output, entrance.endings()))
+        if not jobs:
+            raise RequestError(f"shard {shard.number} of {shard.of} has no image")
+        entrance.check(jobs)
+        chain = entrance.first_chain(jobs)
+        for option, value in (("--layer", layer), ("--transfer", transfer)):
+            if value is not None and chain.source is not Kind.RGB:
+                raise RequestError(
+                    f"{option}: it is one of a render, but the chain reads {chain.source.label}"
+                )
+        whole = entrance.asked.until is None or chain.result is Kind.DISPLAY
+        formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
+        target = Target(output, formats, Burst(frames, truths), chain.kept(keep))
     target.check(chain, jobs)
-    device = open_device(selector)
+    devices = open_devices(selectors, parse_size(memory) if memory else None)
     summary = Summary(len(jobs))
     with output_folder(output, shard):
         remove_unfinished(output, jobs)
-        batch = Batch(entrance, target, [device], chain, threads, overwrite, trace is not None)
         events = Trace() if trace else None
+        on: list[Device | None] = [*devices] or [None]
+        batch = Batch(entrance, target, on, chain, threads, overwrite, events is not None)
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
         with (
             RunLog(output / log_name(shard), start) as log,
@@ -322,6 +353,26 @@ def run(
     if summary.interrupted:
         sys.exit(130)
     sys.exit(1 if summary.failures else 0)
+
+
+BESIDE_REPLAY = (
+    *("inputs", "output", "replay", "max_pixels", "selectors", "memory"),
+    *("overwrite", "quiet", "trace"),
+)
+
+
+def refuse_beside_replay() -> None:
+    """See that nothing is asked for that a sidecar says.
+
+    Raises:
+        RequestError: something is.
+    """
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        name = str(parameter.name)
+        given = context.get_parameter_source(name) is not ParameterSource.DEFAULT
+        if given and name not in BESIDE_REPLAY:
+            raise RequestError(f"{parameter.opts[0]}: the sidecar says it; --replay repeats that")
 
 
 @main.command()

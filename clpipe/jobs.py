@@ -20,7 +20,8 @@ class Job:
 
     ``key`` is its image key, ``name`` that of its outputs, without an ending. ``values`` are what
     is said of it alone, nested as in a configuration; ``frames`` how many frames are made of it,
-    where that is said; ``place`` where all this is said.
+    where that is said; ``place`` where all this is said. ``pictures`` are those of them to make, by
+    what stands behind the name; None is all.
     """
 
     path: Path
@@ -30,6 +31,7 @@ class Job:
     values: Mapping[str, Any] = field(default_factory=dict)
     frames: int | None = None
     place: str = ""
+    pictures: tuple[str, ...] | None = None
 
     @property
     def stem(self) -> str:
@@ -49,10 +51,12 @@ def find_jobs(
     what is in it is no input.
 
     Raises:
-        RequestError: an empty name, a folder without images, a glob that no file matches, or a
-            manifest that is wrong.
+        RequestError: no input, an empty name, a folder without images, a glob that no file matches,
+            or a manifest that is wrong.
     """
     jobs: list[Job] = []
+    if not inputs:
+        raise RequestError("there is no input; give files, folders, globs or manifests")
     for text in inputs:
         if not text:
             raise RequestError("an input is empty; give files, folders, globs or manifests")

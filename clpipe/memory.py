@@ -20,7 +20,7 @@ def parse_size(text: str) -> int:
     match = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*([kmgt]?)(?:i?b)?", text.strip(), re.IGNORECASE)
     size = int(float(match[1]) * UNITS[match[2].upper()]) if match else 0
     if not 0 < size < 2**63:
-        raise RequestError(f"found '{text}'; expected a size such as 512M or 8G")
+        raise RequestError(f"--memory: found '{text}'; expected a size such as 512M or 8G")
     return size
 
 

@@ -64,7 +64,7 @@ class Reporter:
             self.say(f"{outcome.job.path} -> {self._made(outcome)}")
 
     def _made(self, outcome: Outcome) -> str:
-        first, *others = self._target.burst_of(outcome.job).names()
+        first, *others = self._target.pictures_of(outcome.job)
         made = str(self._target.path(outcome.job, ending_of(self._target.formats[0]), first))
         if others:
             made += f" and {len(others)} more"

@@ -73,6 +73,15 @@ class Burst:
         return [*frames, *(replace(truth_of(t, chain), key=key) for t in self._truths())]
 
 
+def truth_named(name: str) -> str | None:
+    """Which of :data:`TRUTHS` a picture is, by what stands behind the image's name.
+
+    >>> truth_named(".truth_mosaic"), truth_named(".frame3")
+    ('mosaic', None)
+    """
+    return next((truth for truth, its in NAMES.items() if its == name), None)
+
+
 @lru_cache(maxsize=16)  # most images of a run have one chain, and what it is planned as is kept too
 def truth_of(truth: str, chain: Chain) -> Shot:
     """What is to be known of the truth of a chain's images, one of :data:`TRUTHS`; without a key.

@@ -71,6 +71,11 @@ class Target:
         """How many frames are made of a job's image."""
         return self.burst if job.frames is None else replace(self.burst, frames=job.frames)
 
+    def pictures_of(self, job: Job) -> tuple[str, ...]:
+        """What stands behind the name of each picture that is made of a job's image."""
+        names = self.burst_of(job).names()
+        return tuple(name for name in names if job.pictures is None or name in job.pictures)
+
     def runner(self, shot: Shot, device: Device | None) -> Runner:
         """What makes all of a picture that is to be written, and nothing else."""
         formats = self.formats_of(shot.name)
@@ -125,7 +130,7 @@ class Target:
         inside = {path for path in inputs if path.startswith(real_folder + os.sep)}
         makers: dict[str, Job] = {}
         for job in jobs:
-            for name in self.burst_of(job).names():
+            for name in self.pictures_of(job):
                 whole = [ending_of(format_) for format_ in self.formats_of(name)]
                 for ending in (SIDECAR, *whole, *(f"{step}.exr" for step in self.keep_of(name))):
                     path = f"{job.stem}{name}.{ending}"

@@ -424,3 +424,43 @@ def test_killed_and_resumed_again_and_again(clpipe, renders, tmp_path):
                 assert finished.setdefault(name, at) == at, f"{name} was made again"
     clpipe("run", "in", *RUN)
     assert contents("out") == contents("whole")
+
+
+def test_a_sidecar_makes_its_picture_again(clpipe, renders):
+    renders(2)
+    Path("draws.toml").write_text("iso = { log_uniform = [200, 12800] }\n")
+    Path("in/list.csv").write_text("path,name,frames,seed\nr000.exr,a/x.1,3,5\nr001.exr,,,\n")
+    options = ("--truth", "variance", "--keep", "normalize", "--format", "png", "--format", "dng")
+    clpipe("run", "in/list.csv", "-o", "out", "-c", "draws.toml", *options)
+    whole = contents("out")
+    for name in (n for n in whole if n.endswith(".json")):
+        clpipe("run", "--replay", f"out/{name}", "-o", "again")
+    assert contents("again") == whole
+    clpipe("run", "--replay", "out/r001.json", "-o", "again")
+    assert set(statuses("again").values()) == {"skipped"}
+
+
+def test_a_sidecar_whose_picture_cannot_be_the_same(clpipe, renders, monkeypatch):
+    Path("mine.toml").write_text((ROOT / "clpipe/cameras/sony-a7r2.toml").read_text())
+    clpipe("run", renders(2), *RUN, "--camera", "mine.toml")
+
+    def refused(*more):
+        return clpipe("run", "--replay", "out/r000.json", "-o", "b", *more, status=2).stderr
+
+    assert "--iso: the sidecar says it" in refused("--iso", 100)
+    assert "it has one input; found 2" in refused("a.exr", "b.exr")
+    Path("in/r000.exr").rename("moved.exr")
+    assert "in/r000.exr: cannot be read" in refused()
+    assert "in/r001.exr: has changed since" in refused("in/r001.exr")
+    clpipe("run", "--replay", "out/r000.json", "moved.exr", "-o", "b")
+    assert Path("b/r000.jpg").read_bytes() == Path("out/r000.jpg").read_bytes()
+    Path("mine.toml").write_text(Path("mine.toml").read_text() + "\n")
+    assert "mine.toml: has changed since" in refused("moved.exr")
+    monkeypatch.setattr(sidecar.clpipe, "__version__", "9.9.9")
+    assert "it is of clpipe 0" in refused("moved.exr")
+    assert (
+        "clpipe did not write" in clpipe("run", "--replay", "mine.toml", "-o", "b", status=2).stderr
+    )
+    Path("half.json").write_text('{"clpipe": "9.9.9", "asked": {}}')
+    assert "it is damaged" in clpipe("run", "--replay", "half.json", "-o", "b", status=2).stderr
+    assert "no such file" in clpipe("run", "--replay", "no.json", "-o", "b", status=2).stderr

@@ -26,7 +26,7 @@ LEVELS = [
     {"reentry", "dng", "jobs", "asked", "interrupt"},
     {"raw_entry", "target"},
     {"entrance", "sidecar", "output_folder", "measure"},
-    {"batch", "measure_plot", "calibration_frames"},
+    {"batch", "replay", "measure_plot", "calibration_frames"},
     {"run_log", "trace", "bench_batch"},
     {"progress", "describe"},
     {"cli"},
