@@ -78,7 +78,9 @@ class Reporter:
         return f"{speed:.0f} MP/s  {summary.shares()}" + f"  {failed} failed" * bool(failed)
 
     def end(self) -> None:
-        """Tell of the whole."""
+        """Tell of the whole; the bar is over."""
+        if self._bar:
+            self._bar.stop()
         summary, counts = self._summary, self._summary.counts
         if counts[LEFT_OUT] and not self._quiet:
             self.say(f"{counts[LEFT_OUT]} images in folders were kept elsewhere and left out")
