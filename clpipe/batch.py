@@ -474,7 +474,7 @@ class _Run:
             try:
                 self._batch.encode(*made)
             except OutputError as error:
-                made[0].error = str(error)
+                made[0].error = f"{made[0].job.path}: {error}"
                 self._fail(error)
             self._written(made[0])
             del made

@@ -3,7 +3,9 @@
 import contextlib
 import hashlib
 import json
+import os
 import secrets
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
@@ -680,14 +682,31 @@ def _write(path: Path, spec: Any, pixels: Array) -> None:
     """
 
     def write(to: Path) -> None:
-        file = oiio.ImageOutput.create(str(to))
-        data = np.ascontiguousarray(pixels)
-        if file is None or not file.open(str(to), spec) or not file.write_image(data):
-            raise OSError(0, _reason(file.geterror() if file else oiio.geterror()))
-        if not file.close():
-            raise OSError(0, _reason(file.geterror()))
+        if to.suffix != ".jpg":
+            _encode(str(to), str(to), spec, pixels)
+            return
+        # libjpeg ends the process when it cannot write, so it writes to memory.
+        memory = os.memfd_create("jpeg")
+        with open(memory, "rb") as encoded:
+            _encode("jpeg", f"/proc/self/fd/{memory}", spec, pixels)
+            with open(to, "wb") as file:
+                shutil.copyfileobj(encoded, file, 1 << 20)
 
     write_beside(path, write)
+
+
+def _encode(format_: str, to: str, spec: Any, pixels: Array) -> None:
+    """Write pixels in a format, which may be that of a file's name.
+
+    Raises:
+        OSError: they cannot be written.
+    """
+    file = oiio.ImageOutput.create(format_)
+    data = np.ascontiguousarray(pixels)
+    if file is None or not file.open(to, spec) or not file.write_image(data):
+        raise OSError(0, _reason(file.geterror() if file else oiio.geterror()))
+    if not file.close():
+        raise OSError(0, _reason(file.geterror()))
 
 
 def versions() -> dict[str, str]:

@@ -1,5 +1,6 @@
 """Image files: the right picture or the right refusal."""
 
+import errno
 import io
 
 import numpy as np
@@ -7,6 +8,7 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image, ImageCms
 
+from clpipe import image_io
 from clpipe.errors import ImageError
 from clpipe.image_io import (
     Tags,
@@ -172,3 +174,14 @@ def test_jpeg_is_as_a_camera_writes_it(tmp_path):
     assert (exif[0x010F], exif[0x0110]) == ("Sony", "ILCE-7RM2")
     assert exif.get_ifd(0x8769)[0x8827] == 3200
     assert "sRGB" in ImageCms.getProfileDescription(profile)
+
+
+def test_a_jpeg_that_does_not_fit_on_the_disk_does_not_end_the_process(tmp_path, monkeypatch):
+    def copy(source, target, size):
+        target.write(source.read(100))
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(image_io.shutil, "copyfileobj", copy)
+    with pytest.raises(ImageError, match=r"a\.jpg: cannot be written: No space left on device"):
+        write_display(tmp_path / "a.jpg", np.zeros((32, 32, 3), np.uint8), Tags("", "", 100))
+    assert not list(tmp_path.iterdir())
