@@ -41,6 +41,7 @@ from clpipe.stage import Kind, Stage
 from clpipe.suggest import one_of
 from clpipe.target import EVERY_FORMAT, Burst, Target
 from clpipe.trace import Trace
+from clpipe.webdataset import TarBatch, cut, prepare
 
 
 class Group(click.Group):
@@ -232,6 +233,13 @@ def main() -> None:
     callback=lambda _context, _option, text: parse_shard(text),
     help="Do the I-th of N parts of the images, for job arrays.",
 )
+@click.option(
+    "--webdataset",
+    "per_tar",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Pack N images at a time into OUT/000000.tar and so on, as WebDataset reads them.",
+)
 @click.option("--overwrite", is_flag=True, help="Make what is there already and up to date, too.")
 @click.option("--quiet", is_flag=True, help="Tell of failures alone.")
 @click.option(
@@ -252,6 +260,7 @@ def run(
     selector: str | None,
     threads: int | None,
     shard: Shard,
+    per_tar: int | None,
     overwrite: bool,
     quiet: bool,
     trace: Path | None,
@@ -261,10 +270,14 @@ def run(
     camera raws, which are developed as they are: they enter at normalize, where noise is past.
 
     Each makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used. With
-    --frames: OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise.
+    --frames: OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise. With
+    --webdataset these are in tars, and dots in NAME become "_", as a key of WebDataset has none.
     """
     entrance = Entrance(asked_for(**request), Reading(layer, max_pixels, transfer))
-    jobs = shard.take(find_jobs(inputs, output, entrance.endings()))
+    every = find_jobs(inputs, output, entrance.endings())
+    tars = cut(every, per_tar, output) if per_tar else []
+    own = shard.take(tars)
+    jobs = [job for tar in own for job in tar.jobs] if per_tar else shard.take(every)
     if not jobs:
         raise RequestError(f"shard {shard.number} of {shard.of} has no image")
     chain = entrance.first_chain(jobs)
@@ -281,7 +294,10 @@ def run(
     summary = Summary(len(jobs))
     with output_folder(output, shard):
         remove_unfinished(output, jobs)
-        batch = Batch(entrance, target, [device], chain, threads, overwrite, trace is not None)
+        how = (entrance, target, [device], chain, threads, overwrite, trace is not None)
+        if per_tar:
+            prepare(output, own, len(tars), overwrite)
+        batch = TarBatch(own, *how) if per_tar else Batch(*how)
         events = Trace() if trace else None
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
         with (

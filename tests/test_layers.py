@@ -25,7 +25,7 @@ LEVELS = [
     {"raw_entry", "target"},
     {"entrance", "sidecar", "output_folder", "measure"},
     {"batch", "measure_plot", "calibration_frames"},
-    {"run_log", "trace", "bench_batch"},
+    {"run_log", "trace", "bench_batch", "webdataset"},
     {"progress", "describe"},
     {"cli"},
 ]
