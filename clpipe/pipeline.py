@@ -42,7 +42,7 @@ class Pipeline:
         until: str | None = None,
         **settings: Any,
     ) -> None:
-        self._settings = overlay(load_settings(str(config)), _plain(settings))
+        self._settings = overlay(load_settings(str(config)), plain(settings))
         self._ends = start_at, until
         chain = self._chain(self._settings)
         kept = chain.kept([keep] if isinstance(keep, str) else keep)
@@ -80,7 +80,7 @@ class Pipeline:
         """
         runner = self._runner
         if settings:
-            runner = runner.of(self._chain(overlay(self._settings, _plain(settings))))
+            runner = runner.of(self._chain(overlay(self._settings, plain(settings))))
         return runner.run(_checked(image, runner.chain.source), key)
 
     def process_many(
@@ -98,10 +98,10 @@ class Pipeline:
             yield self.process(image, **{"key": str(number), **given})
 
 
-def _plain(values: Any) -> Any:
+def plain(values: Any) -> Any:
     """Settings without NumPy types: what a configuration file could hold."""
     if isinstance(values, Mapping):
-        return {key: _plain(value) for key, value in values.items()}
+        return {key: plain(value) for key, value in values.items()}
     return values.tolist() if isinstance(values, np.ndarray | np.generic) else values
 
 

@@ -24,7 +24,7 @@ LEVELS = [
     {"reentry", "dng", "jobs", "asked", "interrupt"},
     {"raw_entry", "target"},
     {"entrance", "sidecar", "output_folder", "measure"},
-    {"batch", "measure_plot", "calibration_frames"},
+    {"batch", "dataset", "measure_plot", "calibration_frames"},
     {"run_log", "trace", "bench_batch", "webdataset"},
     {"progress", "describe"},
     {"cli"},
