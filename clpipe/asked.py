@@ -26,7 +26,7 @@ class Asked:
     """A configuration's own values, options over them, and what an image says over both.
 
     ``config`` is None where none is named. All are nested values as a configuration file holds
-    them. What is drawn at random is drawn for ``image_key``.
+    them. What is drawn at random is drawn for ``image_key``, where there is one.
     """
 
     config: Mapping[str, Any] | None = None
@@ -58,7 +58,7 @@ class Asked:
             settings = carried or under
         for values in (self.options, self.row):
             settings = overlay(settings, values) if values else settings
-        return settings
+        return settings.drawn(self.image_key) if self.image_key else settings
 
     def chain(self, carried: Settings | None = None) -> Chain:
         """The chain that is asked for; ``carried`` as for :meth:`settings`.

@@ -24,9 +24,11 @@ from clpipe.errors import ImageError, OutputError, RequestError
 from clpipe.image_io import SourceImage, set_codec_threads
 from clpipe.jobs import Job
 from clpipe.run import Result, Runner
+from clpipe.shots import Shot
 from clpipe.sidecar import is_done, sidecar, stamp_of, wanted, write_sidecar
 from clpipe.stage import Kind
-from clpipe.target import DNG, SIDECAR, Shot, Target
+from clpipe.target import DNG, SIDECAR, Target
+from clpipe.types import Array
 
 DONE, SKIPPED, LEFT_OUT, FAILED = "done", "skipped", "left out", "failed"
 STEPS = ("decode", "device", "encode")
@@ -115,6 +117,34 @@ class Work:
 Made = tuple[Work, Shot, Result, Device | None]
 
 
+class _Spare:
+    """Arrays that are not used any more, to be used again: new memory costs time.
+
+    >>> spare = _Spare(2)
+    >>> spare.give(np.zeros((2, 3)))
+    >>> spare.take((3, 2)) is None, spare.take((2, 3)).shape, spare.take((2, 3)) is None
+    (True, (2, 3), True)
+    """
+
+    def __init__(self, count: int) -> None:
+        self._arrays: deque[Array] = deque(maxlen=count)
+        self._lock = threading.Lock()
+
+    def take(self, shape: tuple[int, ...]) -> Array | None:
+        """One of that shape; None where there is none."""
+        with self._lock:
+            for place, array in enumerate(self._arrays):
+                if array.shape == shape:
+                    del self._arrays[place]
+                    return array
+        return None
+
+    def give(self, array: Array) -> None:
+        """One that may be used again; the oldest is dropped where there are too many."""
+        with self._lock:
+            self._arrays.append(array)
+
+
 class Batch:
     """A run over many images.
 
@@ -146,6 +176,7 @@ class Batch:
         self._chain = chain
         self._overwrite = overwrite
         self._trace = trace
+        self._spare = _Spare(self.threads + len(self.devices))
         self._stopping = threading.Event()
 
     @property
@@ -188,27 +219,29 @@ class Batch:
                 work = self.decode(job, lambda: None)
             for shot in work.shots:
                 with on("device"):
-                    result = self.develop(work, shot, runners(shot.chain))
+                    result = self.develop(work, shot, runners(shot))
                 if result:
                     with on("encode"):
                         self.encode(work, shot, result, device)
             yield work.outcome()
 
-    def runners(self, device: Device | None) -> Callable[[Chain], Runner]:
-        """What makes the runner of a chain on a device; the kernels of the first are compiled."""
+    def runners(self, device: Device | None) -> Callable[[Shot], Runner]:
+        """What makes the runner of a shot on a device; the kernels of the first are compiled."""
         entrance, target = self._entrance, self._target
-        first = target.runner(self._chain, device)
+        first = target.runner(Shot("", self._chain, ""), device)
         first.warm_up(half=entrance.reentry is None and self._chain.source is Kind.RGB)
         latest = [(self._chain, first)]
+        alike = {(first.keep, first.encode, first.final): first}
 
-        def runner(chain: Chain) -> Runner:
+        def runner(shot: Shot) -> Runner:
             for known, its in latest:
-                if known is chain:
+                if known is shot.chain:
                     return its
-            made = first.of(chain) if chain.names == self._chain.names else None
-            if made is None or target.kept_of(chain) != target.kept_of(self._chain):
-                made = target.runner(chain, device)
-            latest.insert(1, (chain, made))
+            made = target.runner(shot, device)
+            base = alike.setdefault((made.keep, made.encode, made.final), made)
+            if base is not made:
+                made = base.of(shot.chain)  # with the plans that are there
+            latest.insert(1, (shot.chain, made))
             del latest[4:]
             return made
 
@@ -248,7 +281,7 @@ class Batch:
 
     def _missing(self, work: Work) -> list[str]:
         """The names of the pictures that are to be made, which are not there already."""
-        names = self._target.burst_of(work.job).names()
+        names = self._target.pictures_of(work.job)
         if self._overwrite:
             return list(names)
         return [name for name in names if not self.is_there(work.job, name, work.wanted)]
@@ -288,7 +321,9 @@ class Batch:
         timings: list[Timing] | None = [] if self._trace and runner.device else None
         with work.timed("device"):
             try:
-                result = runner.run(work.source.pixels, shot.key, timings)
+                pixels = work.source.pixels
+                into = self._spare.take(pixels.shape) if runner.encode and runner.device else None
+                result = runner.run(pixels, shot.key, timings, into=into)
             except (ImageError, RequestError, MemoryError) as error:
                 work.error = work.entrance.explain(work.job, error)
                 return None
@@ -313,12 +348,17 @@ class Batch:
                 files = target.write(work.job, shot, work.source, result)
                 path = target.path(work.job, SIDECAR, shot.name)
                 names = [file.name for file in files]
-                record = sidecar(work.job, work.stamp, shot, device, work.source, result, names)
+                frames = target.burst_of(work.job).frames
+                record = sidecar(
+                    work.job, work.stamp, shot, frames, device, work.source, result, names
+                )
                 write_sidecar(path, {**record, "asked": work.wanted})
                 work.outputs += [str(f.relative_to(target.folder)) for f in (*files, path)]
             except (ImageError, MemoryError) as error:
                 target.check_folder()
                 work.error = work.entrance.explain(work.job, error)
+        if result.encoded is not None and device:
+            self._spare.give(result.encoded)
 
 
 class _Run:
@@ -424,7 +464,7 @@ class _Run:
                 self._results.acquire()
                 result = None
                 if not work.error:
-                    result = self._batch.develop(work, shot, runners(shot.chain))
+                    result = self._batch.develop(work, shot, runners(shot))
                 if result:
                     self._made.put((work, shot, result, device))
                 else:

@@ -84,6 +84,7 @@ def bench(
         start = time.perf_counter()
         runner.run(image, "bench", timings, download=False)
         whole = min(whole, time.perf_counter() - start)
+        timings = [t for t in timings if not t.transfer]
         best = [
             min(a, b, key=lambda t: t.seconds)
             for a, b in zip(timings, best or timings, strict=True)
@@ -132,6 +133,7 @@ def bench_methods(
     """
     picture = scene(width, height).astype(np.float32)
     image = picture if len(stage.reads.channels) == 3 else np.ascontiguousarray(picture[..., 1])
+    settings = settings.drawn("")
     given = settings.parameters.get(stage.name, {})
     speeds = []
     methods = [m for m in stage.methods if given.get("method", m.method) == m.method]
@@ -145,7 +147,7 @@ def bench_methods(
         for _ in range(repeat):
             timings: list[Timing] = []
             runner.run(image, "bench", timings, download=False)
-            seconds = [t.seconds for t in timings]
+            seconds = [t.seconds for t in timings if not t.transfer]
             best = [min(pair) for pair in zip(seconds, best or seconds, strict=True)]
         first = runner.plan(half=False).launches[0]
         if len(best) > 1 and isinstance(first, Launch) and not first.reads:

@@ -1,7 +1,7 @@
 """Cameras: what a sensor does at an ISO, from a small TOML file with the source of every number."""
 
 import tomllib
-from functools import cached_property
+from functools import cache, cached_property, lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Annotated
@@ -215,6 +215,7 @@ class Camera(BaseModel):
         return begun[-1] if begun else self.gain_stages[0]
 
 
+@cache
 def built_in_cameras() -> dict[str, Path]:
     """The profiles inside the package, by name."""
     folder = Path(str(resources.files("clpipe") / "cameras"))
@@ -232,13 +233,18 @@ def load_camera(name: str) -> Camera:
     if path.suffix != ".toml":
         raise RequestError(one_of("camera", name, built_in) + ", or a .toml file")
     try:
-        return Camera.model_validate(tomllib.loads(path.read_text()))
+        return _parsed(path.read_text())
     except OSError as error:
         raise RequestError(f"{path}: cannot read this camera profile: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise RequestError(f"{path}: not valid TOML: {error}") from None
     except ValidationError as error:
         raise RequestError(f"{path}: {_reason(error)}") from None
+
+
+@lru_cache(maxsize=64)  # a batch asks again for each image
+def _parsed(text: str) -> Camera:
+    return Camera.model_validate(tomllib.loads(text))
 
 
 def _reason(error: ValidationError) -> str:

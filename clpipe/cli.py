@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import click
+from click.core import ParameterSource
 from rich.console import Console
 from rich.table import Table
 
@@ -23,7 +24,7 @@ from clpipe.calibration_frames import Given, calibrate_files, check_name, write_
 from clpipe.camera import built_in_cameras, load_camera
 from clpipe.check import SIZES, check_all
 from clpipe.config import Settings, built_in_configs, overlay, stage_named
-from clpipe.device import find_devices, open_device
+from clpipe.device import Device, find_devices, open_device, open_devices
 from clpipe.entrance import Entrance
 from clpipe.errors import ClpipeError, RequestError
 from clpipe.image_io import MAX_PIXELS, TRANSFERS, USUAL_MAX_PIXELS, Reading
@@ -31,17 +32,20 @@ from clpipe.interrupt import interruptible
 from clpipe.jobs import Shard, find_jobs, parse_shard
 from clpipe.measure import load
 from clpipe.measure import measure as measure_images
+from clpipe.memory import parse_size
 from clpipe.output_folder import output_folder, remove_unfinished
 from clpipe.progress import Reporter
 from clpipe.raw_dump import TYPES
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.registry import all_stages, load_stage_file
+from clpipe.replay import replay_of
 from clpipe.run_log import RunLog, Summary, log_name
+from clpipe.shots import TRUTHS, Burst, Shot
 from clpipe.stage import Kind, Stage
 from clpipe.suggest import one_of
-from clpipe.target import EVERY_FORMAT, Burst, Target
+from clpipe.target import EVERY_FORMAT, Target
 from clpipe.trace import Trace
-from clpipe.webdataset import TarBatch, cut, prepare
+from clpipe.webdataset import TarBatch, cut
 
 
 class Group(click.Group):
@@ -126,7 +130,8 @@ def chain_options(function: Callable[..., Any]) -> Callable[..., Any]:
             "assignments",
             multiple=True,
             metavar="STAGE.PARAM=VALUE",
-            help="Set a parameter; may be repeated. STAGE.method=NAME chooses a method.",
+            help="Set a parameter; may be repeated. STAGE.method=NAME chooses a method. "
+            "'{uniform=[1, 2]}' draws a value for each image.",
         ),
         click.option(
             "--stages",
@@ -182,7 +187,7 @@ def main() -> None:
 
 
 @main.command()
-@click.argument("inputs", nargs=-1, required=True, metavar="INPUT...")
+@click.argument("inputs", nargs=-1, metavar="INPUT...")
 @click.option(
     "-o",
     "--output",
@@ -197,6 +202,14 @@ def main() -> None:
     type=click.IntRange(1),
     metavar="N",
     help="Make a burst of N frames of each image, each with noise of its own, and the truth.",
+)
+@click.option(
+    "--truth",
+    "truths",
+    multiple=True,
+    type=click.Choice(TRUTHS),
+    help="Make beside each picture what is known of it: its development or its mosaic without "
+    "noise, or the variance of the noise in the mosaic; may be repeated.",
 )
 @click.option("--raw-size", metavar="WxH", help="Of headerless dumps (.raw): width and height.")
 @click.option(
@@ -218,7 +231,19 @@ def main() -> None:
 )
 @keep_option
 @format_option
-@device_option
+@click.option(
+    "--device",
+    "selectors",
+    multiple=True,
+    metavar="SEL",
+    help="An index or a part of a name from 'clpipe devices', or numpy; may be repeated. [default: "
+    "the first GPU and all of its kind, else the first CPU]",
+)
+@click.option(
+    "--memory",
+    metavar="SIZE",
+    help="Of a device, such as 2G; larger images go in tiles. [default: what is free]",
+)
 @click.option(
     "--jobs",
     "threads",
@@ -232,6 +257,12 @@ def main() -> None:
     metavar="I/N",
     callback=lambda _context, _option, text: parse_shard(text),
     help="Do the I-th of N parts of the images, for job arrays.",
+)
+@click.option(
+    "--replay",
+    type=click.Path(path_type=Path),
+    metavar="SIDECAR",
+    help="Make the picture of a sidecar again, the same bytes; an INPUT is where its input is now.",
 )
 @click.option(
     "--webdataset",
@@ -252,14 +283,17 @@ def run(
     inputs: tuple[str, ...],
     output: Path,
     frames: int | None,
+    truths: tuple[str, ...],
     transfer: str | None,
     layer: str | None,
     max_pixels: int,
     keep: tuple[str, ...],
     formats: tuple[str, ...],
-    selector: str | None,
+    selectors: tuple[str, ...],
+    memory: str | None,
     threads: int | None,
     shard: Shard,
+    replay: Path | None,
     per_tar: int | None,
     overwrite: bool,
     quiet: bool,
@@ -270,35 +304,46 @@ def run(
     camera raws, which are developed as they are: they enter at normalize, where noise is past.
 
     Each makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used. With
-    --frames: OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise. With
-    --webdataset these are in tars, and dots in NAME become "_", as a key of WebDataset has none.
+    --frames: OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise.
+    With --webdataset these are in tars, and dots in NAME become "_": a key of WebDataset has none.
+
+    --truth development is that, without a burst. --truth mosaic is OUT/NAME.truth_mosaic.exr, the
+    truth of --keep normalize. --truth variance is OUT/NAME.truth_variance.exr: for each pixel of
+    that mosaic the variance of the noise that the chain adds, in signal squared, with what is fixed
+    to a sensor (PRNU, DSNU, columns) and rounding, without clipping and defect pixels.
     """
-    entrance = Entrance(asked_for(**request), Reading(layer, max_pixels, transfer))
-    every = find_jobs(inputs, output, entrance.endings())
-    tars = cut(every, per_tar, output) if per_tar else []
-    own = shard.take(tars)
-    jobs = [job for tar in own for job in tar.jobs] if per_tar else shard.take(every)
-    if not jobs:
-        raise RequestError(f"shard {shard.number} of {shard.of} has no image")
-    chain = entrance.first_chain(jobs)
-    for option, value in (("--layer", layer), ("--transfer", transfer)):
-        if value is not None and chain.source is not Kind.RGB:
-            raise RequestError(
-                f"{option}: it is one of a render, but the chain reads {chain.source.label}"
-            )
-    whole = entrance.asked.until is None or chain.result is Kind.DISPLAY
-    formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
-    target = Target(output, formats, Burst(frames), chain.kept(keep))
+    if replay:
+        refuse_beside_replay()
+        again = replay_of(replay, [Path(path) for path in inputs], max_pixels)
+        entrance, jobs, tars = again.entrance, [again.job], []
+        chain = entrance.first_chain(jobs)
+        target = Target(output, again.formats, again.burst, again.keep)
+    else:
+        entrance = Entrance(asked_for(**request), Reading(layer, max_pixels, transfer))
+        jobs = find_jobs(inputs, output, entrance.endings())
+        tars = shard.take(cut(jobs, per_tar, output)) if per_tar else []
+        jobs = [job for tar in tars for job in tar.jobs] if per_tar else shard.take(jobs)
+        if not jobs:
+            raise RequestError(f"shard {shard.number} of {shard.of} has no image")
+        entrance.check(jobs)
+        chain = entrance.first_chain(jobs)
+        for option, value in (("--layer", layer), ("--transfer", transfer)):
+            if value is not None and chain.source is not Kind.RGB:
+                raise RequestError(
+                    f"{option}: it is one of a render, but the chain reads {chain.source.label}"
+                )
+        whole = entrance.asked.until is None or chain.result is Kind.DISPLAY
+        formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
+        target = Target(output, formats, Burst(frames, truths), chain.kept(keep))
     target.check(chain, jobs)
-    device = open_device(selector)
+    devices = open_devices(selectors, parse_size(memory) if memory else None)
     summary = Summary(len(jobs))
     with output_folder(output, shard):
         remove_unfinished(output, jobs)
-        how = (entrance, target, [device], chain, threads, overwrite, trace is not None)
-        if per_tar:
-            prepare(output, own, len(tars), overwrite)
-        batch = TarBatch(own, *how) if per_tar else Batch(*how)
         events = Trace() if trace else None
+        on: list[Device | None] = [*devices] or [None]
+        how = (entrance, target, on, chain, threads, overwrite, events is not None)
+        batch = TarBatch(tars, *how) if tars else Batch(*how)
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
         with (
             RunLog(output / log_name(shard), start) as log,
@@ -321,6 +366,26 @@ def run(
     if summary.interrupted:
         sys.exit(130)
     sys.exit(1 if summary.failures else 0)
+
+
+BESIDE_REPLAY = (
+    *("inputs", "output", "replay", "max_pixels", "selectors", "memory"),
+    *("overwrite", "quiet", "trace"),
+)
+
+
+def refuse_beside_replay() -> None:
+    """See that nothing is asked for that a sidecar says.
+
+    Raises:
+        RequestError: something is.
+    """
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        name = str(parameter.name)
+        given = context.get_parameter_source(name) is not ParameterSource.DEFAULT
+        if given and name not in BESIDE_REPLAY:
+            raise RequestError(f"{parameter.opts[0]}: the sidecar says it; --replay repeats that")
 
 
 @main.command()
@@ -348,7 +413,7 @@ def plan(
         return
     chain = asked.chain()
     target = Target(Path(), formats or ("jpg",), keep=chain.kept(keep))
-    made = target.runner(chain, None).plan()
+    made = target.runner(Shot("", chain, ""), None).plan()
     if as_json:
         show_json(describe.plan_record(made))
         return

@@ -28,6 +28,9 @@ LIBRARY = (
     "source",
     "sums",
 )
+# What is known of the origin when compiling: it is in whole blocks, so the rows that share a
+# Philox call and the phase of a Bayer pattern are too.
+EXTENT = "{width, height, pitch, left * LANES, top * 4, columns, rows}"
 LOCAL_SIZE = 64
 SHARES = 256  # work items of a reduction's first half
 
@@ -36,9 +39,9 @@ SHARES = 256  # work items of a reduction's first half
 class Parameter:
     """One kernel parameter: its OpenCL declaration, and what is bound to it.
 
-    ``role`` is one of extent (width, height, pitch), source, slot, encoded, table8 (the composed
-    curve), value, key, lines, found, sums, shares, count, counts, histogram; ``step``, ``item``
-    and ``number`` tell which.
+    ``role`` is one of tile (a number of :class:`clpipe.tiles.Extent`, or the tile's own number),
+    source, slot, encoded, table8 (the composed curve), value, key, lines, found, sums, shares,
+    counts, histogram; ``step``, ``item`` and ``number`` tell which.
     """
 
     declaration: str
@@ -113,6 +116,14 @@ class _Writer:
         self.parameters[name] = Parameter(f"{type_}{space}{name}", role, **which)  # type: ignore[arg-type]
         return name
 
+    def tile(self, number: str) -> str:
+        return self.parameter(number, "uint", "tile", item=number)
+
+    def core(self) -> str:
+        sides = [self.tile(f"core_{side}") for side in ("left", "top", "right", "bottom")]
+        self.setup.append(f"const core c = {{{', '.join(sides)}}};")
+        return "c"
+
     def slot(self, number: int, written: bool) -> str:
         const = "" if written else "const "
         type_ = f"__global {const}float *restrict"
@@ -175,8 +186,8 @@ def write_kernel(plan: Plan, launch: AnyLaunch, index: int, lanes: int) -> Kerne
     """The OpenCL source of one launch of a plan, for a device with that many lanes."""
     writer = _Writer(plan, lanes)
     name = f"launch_{index}_" + re.sub(r"\W+", "_", launch.name)
-    for dimension in ("width", "height", "pitch"):
-        writer.parameter(dimension, "uint", "extent", item=dimension)
+    for number in ("width", "height", "pitch", "left", "top", "columns", "rows"):
+        writer.tile(number)
     seen: set[str] = set()
     left = apron_left(plan.apron, lanes)
     columns = launch.columns if isinstance(launch, Launch) else 1
@@ -209,7 +220,7 @@ def write_kernel(plan: Plan, launch: AnyLaunch, index: int, lanes: int) -> Kerne
         f'#line 1 "{launch.name}"\n'
         f"__kernel __attribute__((vec_type_hint(vf), reqd_work_group_size({size}, 1, 1)))\n"
         f"void {name}(\n    {signature})\n{{\n"
-        f"    const extent e = {{width, height, pitch}};\n{setup}{body}}}\n"
+        f"    const extent e = {EXTENT};\n{setup}{body}}}\n"
     )
     return Kernel(name, text, tuple(writer.parameters.values()), launch, tuple(sorted(seen)))
 
@@ -273,7 +284,7 @@ def _load(writer: _Writer, launch: Launch) -> tuple[list[str], list[str], Kind]:
         return [], [f"const {kind.c_type} v0 = source_{kind.c_name}_{dtype}(src, at, e);"], kind
     block = stencil.pass_.block if stencil else 0
     images = [
-        f"image_at({', '.join(writer.planes(read))}, pitch, first, {'0' if block else 'row'})"
+        f"image_at({', '.join(writer.planes(read))}, e, first, {'0' if block else 'row'})"
         for read in launch.reads
     ]
     if not stencil:
@@ -320,11 +331,11 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
     if launch.sums:
         writer.parameter("sums", "__global int4 *restrict ", "sums")
         sample = call(launch.sums, [value, *writer.arguments(launch.sums, {})])
-        lines.append(f"const vi sample = only_inside({sample}, at, e);")
+        lines.append(f"const vi sample = only_inside({sample}, at, {writer.core()});")
         lines.append("if (row & 1) odd_rows += sample; else even_rows += sample;")
         once.append("vi even_rows = (vi)(0), odd_rows = (vi)(0);")
         after = (
-            "    const size_t block = get_global_id(1) * ((width + LANES - 1) / LANES) + "
+            "    const size_t block = get_global_id(1) * ((columns + LANES - 1) / LANES) + "
             "get_global_id(0);\n"
             "    sums[block] = (int4)(fold_columns(even_rows, first), "
             "fold_columns(odd_rows, first));\n"
@@ -346,9 +357,9 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
     start = "".join(f"    {line}\n" for line in once)
     body = "".join(_over_rows(part, launch.rows, unroll=not block) for part in loops)
     return (
-        f"    const uint x = (uint)get_global_id(0) * {max(block, 1)} * LANES;\n"
-        f"    const uint y = (uint)get_global_id(1) * {launch.rows};\n"
-        "    if (x >= width) return;\n"
+        f"    const uint x = left * LANES + (uint)get_global_id(0) * {max(block, 1)} * LANES;\n"
+        f"    const uint y = top * 4 + (uint)get_global_id(1) * {launch.rows};\n"
+        "    if (x - e.left >= columns) return;\n"
         f"    const site first = site_at(x, y);\n{start}{body}{after}"
     )
 
@@ -356,7 +367,7 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
 def _over_block(lines: Sequence[str], launch: Launch) -> list[list[str]]:
     """Lines for each vector of a row of a stencil's block."""
     head = f"for (uint column = 0; column < {launch.columns}; ++column) {{"
-    beyond = "    if (x + column * LANES >= width) break;"
+    beyond = "    if (x - e.left + column * LANES >= columns) break;"
     place = "    const site at = site_at(x + column * LANES, y + row);"
     return [[head, beyond, place, *(f"    {line}" for line in lines), "}"]]
 
@@ -391,12 +402,13 @@ def _count(writer: _Writer, launch: Count) -> str:
     plane = writer.planes(launch.reads[0])[0]
     counts = writer.parameter("counts", "__global uint *", "counts", number=bins)
     arguments = ["origin", "x", "y", "e", *writer.arguments(op, {})]
+    core = writer.core()
     return (
-        f"    __global const float *origin = {plane} + plane_offset(site_at(0, 0), pitch);\n"
+        f"    __global const float *origin = image_origin({plane}, e);\n"
         f"    __global uint *own = {counts} + (size_t)get_global_id(0) * {bins};\n"
         f"    for (uint k = 0; k < {bins}; ++k) own[k] = 0;\n"
-        f"    for (uint y = get_global_id(0); y < height; y += {SHARES}) {{\n"
-        "        for (uint x = 0; x < width; ++x) {\n"
+        f"    for (uint y = {core}.top + get_global_id(0); y < {core}.bottom; y += {SHARES}) {{\n"
+        f"        for (uint x = {core}.left; x < {core}.right; ++x) {{\n"
         f"            const int bin = {call(op, arguments)};\n"
         "            if (bin >= 0) own[bin] += 1;\n"
         "        }\n    }\n"
@@ -404,14 +416,14 @@ def _count(writer: _Writer, launch: Count) -> str:
 
 
 def _add_up(writer: _Writer, launch: AddUp) -> str:
+    tile = writer.tile("tile")
     if bins := launch.op.pass_.bins:
         writer.parameter("counts", "__global const uint *", "counts", number=bins)
         writer.parameter("histogram", "__global uint *", "histogram", number=bins)
-        return f"    add_up_counts(counts, histogram, {bins}, {SHARES});\n"
+        return f"    add_up_counts(counts, histogram, {bins}, {SHARES}, {tile});\n"
     writer.parameter("sums", "__global const int4 *", "sums")
     writer.parameter("shares", "__global long4 *", "shares")
-    writer.parameter("count", "uint", "count", step=launch.op.step)
-    return "    add_up_blocks(sums, shares, count);\n"
+    return f"    add_up_blocks(sums, shares, {writer.tile('blocks')}, {tile});\n"
 
 
 def _find(writer: _Writer, launch: Find) -> str:

@@ -2,32 +2,49 @@
 
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cache, lru_cache, partial
 from importlib import resources
+from itertools import product
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from clpipe.camera import DEFAULT_CAMERA, Camera, load_camera
-from clpipe.errors import RequestError
+from clpipe.draws import (
+    TINY,
+    Choice,
+    Draw,
+    Limits,
+    extremes_of,
+    limits_of,
+    parse_draw,
+    values_of,
+)
+from clpipe.errors import KeyedError, RequestError
 from clpipe.noise_model import NoiseModel
 from clpipe.output import Output
 from clpipe.raw_dump import Dump, dump_of
 from clpipe.registry import all_stages, blamed, check_passes, load_stage_file
-from clpipe.stage import Context, Kind, Method, Stage, Unchanged
+from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
 from clpipe.stages import DEFAULT_CHAIN
 from clpipe.suggest import one_of
 
 OUTPUT = "output"  # the table that is no stage's
+MOST_ISO = 10**9
+DRAWN = ("iso", "camera")  # what can be, beside parameters
 KEYS = ("camera", "iso", "seed", "raw_size", "raw_type", "stages", "skip", "stage_files")
 
 
 @dataclass(frozen=True)
 class Settings:
-    """A request as it was written, names checked but nothing resolved yet."""
+    """A request as it was written, names checked but nothing resolved yet.
+
+    Where ``draws`` has a law for something ("iso", "sensor_noise.a"), its value is still to come.
+    """
 
     camera: str = DEFAULT_CAMERA
     iso: float = 100.0
@@ -38,16 +55,53 @@ class Settings:
     skip: tuple[str, ...] = ()
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     output: Output = field(default_factory=Output)
+    draws: Mapping[str, Draw] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """The settings as nested values, from which :func:`settings_from` makes them again."""
+        return self._record({key: draw.record() for key, draw in self.draws.items()})
+
+    def drawn(self, image_key: str) -> "Settings":
+        """The settings with a value for each draw; the same object where there are none.
+
+        The values depend on the seed and the image key alone (see :mod:`clpipe.draws`). Frames of a
+        burst share the key, and so the values, of their image.
+
+        Raises:
+            RequestError: the values are not allowed together, or a camera cannot be loaded.
+        """
+        if not self.draws:
+            return self
+        limits = partial(limits_at, self, isos=isos_of(self) if "iso" in self.draws else Limits())
+        owner = f"draw:{self.seed}:{image_key}"
+        return settings_from(self._record(values_of(self.draws, self.given(), limits, owner)))
+
+    def given(self) -> dict[str, Any]:
+        """What has a value already, by its dotted name."""
+        tables = {**self.parameters, OUTPUT: self.output.model_dump(exclude_defaults=True)}
+        named = {f"{name}.{key}": v for name, table in tables.items() for key, v in table.items()}
+        return {"iso": self.iso, "camera": self.camera, **named}
+
+    def table(self, step: str) -> dict[str, Any]:
+        """The values and draws of a step, or of the output."""
+        output = self.output.model_dump(exclude_defaults=True) if step == OUTPUT else {}
+        names = {key: key.removeprefix(f"{step}.") for key in self.draws}
+        drawn = {names[key]: draw for key, draw in self.draws.items() if names[key] != key}
+        return {**self.parameters.get(step, output), **drawn}
+
+    def _record(self, drawn: Mapping[str, Any]) -> dict[str, Any]:
+        """The settings as nested values, with others over them by their dotted names."""
         plain: dict[str, Any] = {"camera": self.camera, "iso": self.iso, "seed": self.seed}
         if self.dump:
             plain |= {"raw_size": self.raw_size, "raw_type": self.raw_type}
         lists = {"stages": list(self.stages), "skip": list(self.skip)}
         output = self.output.model_dump(exclude_defaults=True)
         tables = {**self.parameters, **({OUTPUT: output} if output else {})}
-        return {**plain, **lists, **{name: dict(t) for name, t in tables.items()}}
+        record = {**plain, **lists, **{name: dict(t) for name, t in tables.items()}}
+        for key, value in drawn.items():
+            table, _, name = key.rpartition(".")
+            (record.setdefault(table, {}) if table else record)[name] = value
+        return record
 
     @property
     def dump(self) -> Dump | None:
@@ -70,15 +124,18 @@ class Step:
     context: Context
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Chain:
-    """A chain of stages, ready to plan."""
+    """A chain of stages, ready to plan. One is equal to itself alone, so what is made of it can be
+    remembered.
+    """
 
     steps: tuple[Step, ...]
     source: Kind
     camera: Camera
     settings: Settings  # it was made from
     names: tuple[str, ...]  # of all steps, those before the first and after the last to run too
+    draws: Mapping[str, Draw] = field(default_factory=dict)  # of which the settings are an example
 
     @property
     def iso(self) -> float:
@@ -107,14 +164,19 @@ class Chain:
         return any(p.random for s in self.steps for p in s.method.passes())
 
     def clean(self) -> "Chain":
-        """The chain without what its steps draw at random; all else as it is.
+        """The chain without what its steps draw at random; all else as it is, the last step too.
 
         Raises:
             RequestError: no step draws anything.
         """
         left = [(step, step.method.clean()) for step in self.steps]
         if all(method is step.method for step, method in left):
-            raise RequestError("no stage of this chain adds noise; every frame would be the same")
+            raise RequestError(
+                "no stage of this chain adds noise; every frame would be the same, "
+                "and there is no noise to know the truth of"
+            )
+        if left[-1][1] is None:
+            left[-1] = left[-1][0], Noiseless()
         steps = tuple(
             replace(step, method=method, context=replace(step.context, noise=None))
             for step, method in left
@@ -188,7 +250,7 @@ def own_values(name: str) -> dict[str, Any]:
         raise RequestError(f"{path}: cannot read this configuration: {error.strerror}") from None
     except UnicodeDecodeError:
         raise RequestError(f"{path}: not a text file, so not a TOML configuration") from None
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # tomllib's, of numbers and lists without end too
         raise RequestError(f"{path}: not valid TOML: {error}") from None
     except KeyedError as error:
         line = line_of(text, error.key)
@@ -200,26 +262,22 @@ def own_values(name: str) -> dict[str, Any]:
     return said
 
 
-class KeyedError(RequestError):
-    """A bad setting; ``key`` is its dotted name."""
-
-    def __init__(self, key: str, message: str) -> None:
-        super().__init__(message)
-        self.key = key
-
-
 def line_of(text: str, key: str) -> int | None:
     """The line of a TOML text (from 1) on which a key such as ``stage.parameter`` is set."""
     table = ""
-    header = None
+    within = None
     for number, line in enumerate(text.splitlines(), 1):
         if match := re.match(r"\s*\[\s*([\w.-]+)\s*\]", line):
-            table = match[1] + "."
-            if match[1] == key:
-                header = number
-        elif (match := re.match(r"\s*([\w.-]+)\s*=", line)) and table + match[1] == key:
-            return number
-    return header
+            name, table = match[1], match[1] + "."
+        elif match := re.match(r"\s*([\w.-]+)\s*=", line):
+            name = table + match[1]
+            if name == key:
+                return number
+        else:
+            continue
+        if within is None and f"{name}.".startswith(f"{key}."):
+            within = number
+    return within
 
 
 def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Settings:
@@ -233,13 +291,29 @@ def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Sett
         KeyedError: an unknown key, stage, method or parameter, or a value of the wrong type or out
             of range.
     """
-    folder = folder or Path()
+    return overlay(Settings(), values, folder)
+
+
+def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None = None) -> Settings:
+    """The settings with others over them; what is to be skipped is added to what was.
+
+    Where another method is chosen for a step, the parameters of the one before are dropped. A value
+    takes the place of a draw, and the other way round.
+
+    Args:
+        settings: what holds where nothing else is said.
+        values: as for :func:`settings_from`.
+        folder: as for :func:`settings_from`.
+
+    Raises:
+        KeyedError: as :func:`settings_from`.
+    """
+    for path in names_in(values, "stage_files", "files"):
+        load_stage_file((folder or Path()) / path)
+    if folder is not None:
+        values = from_folder(folder, values)
     tables = {key: value for key, value in values.items() if isinstance(value, Mapping)}
-    output = make_output(tables.pop(OUTPUT, {}))
-    plain = {key: value for key, value in values.items() if not isinstance(value, Mapping)}
-    for path in names_in(plain, "stage_files", "files"):
-        load_stage_file(folder / path)
-    plain.pop("stage_files", None)
+    plain = {k: v for k, v in values.items() if k not in tables and k != "stage_files"}
     for key in plain:
         if key in all_stages():
             raise KeyedError(key, f"{key}: found {plain[key]!r}, but a stage is a table: [{key}]")
@@ -247,58 +321,169 @@ def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Sett
             raise KeyedError(key, f"{key}: found {plain[key]!r}, but it is a table: [{key}]")
         if key not in KEYS:
             raise KeyedError(key, one_of("key", key, (*KEYS, OUTPUT, *all_stages())))
-    texts = dict.fromkeys(("camera", "raw_size", "raw_type"), str)
-    types: dict[str, Any] = {**texts, "iso": (int, float), "seed": int}
-    for key, expected in types.items():
-        value = plain.get(key)
-        if key in plain and (not isinstance(value, expected) or isinstance(value, bool)):
-            kind = {"iso": "a number", "seed": "a whole number"}.get(key, "text")
-            raise KeyedError(key, f"{key}: found {value!r}, but it is {kind}")
+        check_type(key, plain[key])
     for key in {"stages", "skip"} & plain.keys():
         names = names_in(plain, key, "stage names")
         for name in names:
             stage_named(key, name if key == "stages" else base_name(name))
-        plain[key] = names
-    for name, table in tables.items():
-        stage = stage_named(name, base_name(name))
-        tables[name] = from_folder(folder, stage, table)
-        make_method(stage, name, tables[name])
+        plain[key] = (*settings.skip, *names) if key == "skip" else names
     if "iso" in plain:
         plain["iso"] = float(plain["iso"])
-    if str(plain.get("camera", "")).endswith(".toml"):
-        plain["camera"] = str(folder / plain["camera"])
     if {"raw_size", "raw_type"} & plain.keys():
+        size = plain.get("raw_size", settings.raw_size)
         try:
-            dump_of(plain.get("raw_size", ""), plain.get("raw_type", ""))
+            dump_of(size, plain.get("raw_type", settings.raw_type))
         except RequestError as error:
             raise KeyedError(str(error).partition(":")[0], str(error)) from None
-    return Settings(parameters=tables, output=output, **plain)
+    draws = {k: draw for k, draw in settings.draws.items() if k.partition(".")[0] not in values}
+    draws |= {key: draw_of(key, tables.pop(key)) for key in KEYS if key in tables}
+    parameters, output = dict(settings.parameters), settings.output
+    for name, table in tables.items():
+        stage = None if name == OUTPUT else stage_named(name, base_name(name))
+        said = {
+            k: draw_of(f"{name}.{k}", v) if isinstance(v, Mapping) else v for k, v in table.items()
+        }
+        merged = settings.table(name)
+        if "method" in said and said["method"] != method_of(name, merged):
+            merged = {}
+        merged |= said
+        drawn = {f"{name}.{k}": v for k, v in merged.items() if isinstance(v, Draw)}
+        draws |= drawn
+        given = {k: v for k, v in merged.items() if not isinstance(v, Draw)}
+        if stage is None:
+            output = make_output(given)
+            continue
+        parameters[name] = given
+        if not drawn:
+            make_method(stage, name, given)
+    made = replace(settings, parameters=parameters, output=output, draws=draws, **plain)
+    if draws:
+        check_draws(made, values)
+    return made
 
 
-def overlay(settings: Settings, values: Mapping[str, Any]) -> Settings:
-    """The settings with others over them; what is to be skipped is added to what was.
-
-    Where another method is chosen for a step, the parameters of the one before are dropped.
-
-    Args:
-        settings: what holds where nothing else is said.
-        values: as for :func:`settings_from`.
+def check_type(key: str, value: Any) -> None:
+    """See that a key that stands in no table has a value of its type.
 
     Raises:
-        KeyedError: as :func:`settings_from`.
+        KeyedError: it has not.
     """
-    merged = settings.record()
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            old = dict(merged.get(key, {}))
-            if "method" in value and value["method"] != method_of(key, old):
-                old.clear()
-            merged[key] = old | dict(value)
-        elif key == "skip" and isinstance(value, Sequence) and not isinstance(value, str):
-            merged[key] = [*merged[key], *value]
-        else:
-            merged[key] = value
-    return settings_from(merged)
+    types: dict[str, tuple[str, Any]] = {
+        "iso": ("a number", int | float),
+        "seed": ("a whole number", int),
+        **dict.fromkeys(("camera", "raw_size", "raw_type"), ("text", str)),
+    }
+    kind, expected = types.get(key, ("", object))
+    if not isinstance(value, expected) or isinstance(value, bool):
+        raise KeyedError(key, f"{key}: found {value!r}, but it is {kind}")
+    if key == "iso" and value > MOST_ISO:
+        raise KeyedError(key, f"{key}: found {value!r}, but it is at most {MOST_ISO:g}")
+
+
+def draw_of(key: str, table: Mapping[str, Any]) -> Draw:
+    """The draw that stands in the place of a value.
+
+    Raises:
+        KeyedError: it is none, or not for such a value.
+    """
+    if key in KEYS and key not in DRAWN:
+        drawn = f"{', '.join(DRAWN)} and the parameters of stages can"
+        raise KeyedError(key, f"{key}: found {dict(table)!r}, but it cannot be drawn; {drawn}")
+    draw = parse_draw(key, table)
+    if (key == "camera" or key.endswith(".method")) and not isinstance(draw, Choice):
+        raise KeyedError(key, f"{key}: found {dict(table)!r}, but it is drawn by choice")
+    return draw
+
+
+def models_at(settings: Settings, step: str) -> list[type[BaseModel]]:
+    """What declares the parameters of a step: its method, or all that its method is drawn from.
+
+    Raises:
+        KeyedError: there is no such method.
+    """
+    if step == OUTPUT:
+        return [Output]
+    draw = settings.draws.get(f"{step}.method")
+    table = settings.parameters.get(step, {})
+    names = draw.choice if isinstance(draw, Choice) else [method_of(step, table)]
+    return [method_named(stage_named(step, base_name(step)), step, name) for name in names]
+
+
+def limits_at(settings: Settings, key: str, isos: Limits) -> Limits | None:
+    """The limits of what may be drawn, by its dotted name; those of the ISO are given."""
+    step, _, name = key.partition(".")
+    if key in ("iso", "camera") or name == "method":
+        return isos if key == "iso" else None
+    return limits_of(models_at(settings, step)[0], name)
+
+
+def check_draws(settings: Settings, changed: Container[str]) -> None:
+    """See that all that can be drawn is allowed, each with the others at one of their extremes.
+
+    Args:
+        settings: with draws.
+        changed: the keys and steps that are new; others were checked before. What follows something
+            is checked again.
+
+    Raises:
+        KeyedError: it is not.
+    """
+    by_step: dict[str, dict[str, Sequence[Any]]] = {}
+    steps = {key.partition(".")[0] for key, draw in settings.draws.items() if draw.of}
+    for key in settings.draws:
+        step, _, name = key.partition(".")
+        for model in models_at(settings, step) if name and step in changed else ():
+            if name not in ("method", *model.model_fields):
+                raise unknown_parameter(step, model, name)
+    limits = partial(limits_at, settings, isos=Limits(low=TINY))
+    for key, values in extremes_of(settings.draws, settings.given(), limits).items():
+        step, _, name = key.partition(".")
+        if not name:
+            for value in values:
+                check_type(key, value)
+        elif step in changed or step in steps:
+            by_step.setdefault(step, {})[name] = values
+    for step, drawn in by_step.items():
+        given = {k: v for k, v in settings.table(step).items() if not isinstance(v, Draw)}
+        first = {name: values[0] for name, values in drawn.items()}
+        methods = [{"method": method} for method in drawn.pop("method", ())] or [{}]
+        others = [{name: value} for name, values in drawn.items() for value in values] or [{}]
+        for method, other in product(methods, others):
+            table = {**given, **first, **method, **other}
+            if step == OUTPUT:
+                make_output(table)
+            else:
+                make_method(stage_named(step, base_name(step)), step, table)
+
+
+def cameras_of(settings: Settings) -> list[str]:
+    """The cameras that there can be."""
+    draw = settings.draws.get("camera")
+    return list(draw.choice) if isinstance(draw, Choice) else [settings.camera]
+
+
+def isos_of(settings: Settings) -> Limits:
+    """The ISOs that all these cameras have.
+
+    Raises:
+        RequestError: a camera cannot be loaded.
+    """
+    ranges = [load_camera(name).iso_range for name in cameras_of(settings)]
+    return Limits(max(low for low, _ in ranges), min(high for _, high in ranges))
+
+
+def check_camera(settings: Settings) -> None:
+    """See that every camera that there can be is there, and has every ISO that there can be.
+
+    Raises:
+        RequestError: one is not, or has not.
+    """
+    isos: Sequence[float] = [settings.iso]
+    if "iso" in settings.draws:
+        limits = partial(limits_at, settings, isos=isos_of(settings))
+        isos = extremes_of(settings.draws, settings.given(), limits)["iso"]
+    for camera, iso in product(map(load_camera, cameras_of(settings)), isos):
+        camera.gain_stage(iso)
 
 
 def names_in(values: Mapping[str, Any], key: str, what: str) -> tuple[str, ...]:
@@ -316,15 +501,39 @@ def names_in(values: Mapping[str, Any], key: str, what: str) -> tuple[str, ...]:
     return tuple(names)
 
 
-def from_folder(folder: Path, stage: Stage, table: Mapping[str, Any]) -> dict[str, Any]:
-    """A step's settings, in which the names of files are relative to the folder no more."""
-    method = stage.by_name.get(str(table.get("method", stage.methods[0].method)))
-    values = dict(table)
-    for name, field_ in (method.model_fields if method else {}).items():
-        extra: Any = field_.json_schema_extra
-        if extra["file"] and isinstance(values.get(name), str):
-            values[name] = str(folder / values[name]) if values[name] else ""
-    return values
+def from_folder(folder: Path, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as :func:`settings_from` takes them, with names of files relative to the folder no
+    more.
+    """
+    found = dict(values)
+    for key, value in values.items():
+        stage = all_stages().get(base_name(key))
+        if key == "camera":
+            found[key] = joined(folder, value, only=".toml")
+        elif isinstance(value, Mapping) and stage:
+            files = file_parameters(stage)
+            found[key] = {n: joined(folder, v) if n in files else v for n, v in value.items()}
+    return found
+
+
+@cache
+def file_parameters(stage: Stage) -> frozenset[str]:
+    """The parameters of a stage's methods that are names of files."""
+    fields = [field_ for method in stage.methods for field_ in method.model_fields.items()]
+    extras: dict[str, Any] = {name: field_.json_schema_extra for name, field_ in fields}
+    return frozenset(name for name, extra in extras.items() if extra["file"])
+
+
+def joined(folder: Path, value: Any, only: str = "") -> Any:
+    """The name of a file in a folder, or a draw of such; other values as they are.
+
+    >>> joined(Path("a"), {"choice": ["b.toml", "sony-a7r2"]}, only=".toml")
+    {'choice': ['a/b.toml', 'sony-a7r2']}
+    """
+    if isinstance(value, Mapping) and isinstance(value.get("choice"), list):
+        return {**value, "choice": [joined(folder, one, only) for one in value["choice"]]}
+    named = isinstance(value, str) and value and value.endswith(only)
+    return str(folder / value) if named else value
 
 
 def files_of(settings: Settings) -> list[str]:
@@ -340,6 +549,7 @@ def files_of(settings: Settings) -> list[str]:
     return files
 
 
+@lru_cache(maxsize=1024)
 def base_name(step: str) -> str:
     """The stage of a step that may be a repeated one.
 
@@ -375,11 +585,20 @@ def parse_assignment(text: str) -> tuple[str, str, Any]:
     match = re.fullmatch(r"(\w+)\.(\w+)=(.*)", text)
     if not match:
         raise RequestError(f"--set {text}: expected stage.parameter=value")
+    return match[1], match[2], toml_value(match[3])
+
+
+def toml_value(text: str) -> Any:
+    """What a text is as a TOML value; the text itself if it is none.
+
+    >>> toml_value("1e-4"), toml_value("{choice = [100, 400]}"), toml_value("bilinear")
+    (0.0001, {'choice': [100, 400]}, 'bilinear')
+    """
     try:
-        value = tomllib.loads(f"value = {match[3]}")["value"]
-    except tomllib.TOMLDecodeError:
-        value = match[3]
-    return match[1], match[2], value
+        found = tomllib.loads(f"value = {text}")
+    except (ValueError, RecursionError):
+        return text
+    return found["value"] if len(found) == 1 else text
 
 
 def method_of(name: str, table: Mapping[str, Any]) -> Any:
@@ -394,13 +613,21 @@ def make_method(stage: Stage, name: str, table: Mapping[str, Any]) -> Method:
     Raises:
         KeyedError: an unknown method or parameter, or a value that is not allowed.
     """
-    chosen = table.get("method", stage.methods[0].method)
+    method = method_named(stage, name, table.get("method", stage.methods[0].method))
+    with named_errors(name, method):
+        return method.model_validate({k: v for k, v in table.items() if k != "method"})
+
+
+def method_named(stage: Stage, name: str, chosen: Any) -> type[Method]:
+    """The method of a step's stage that has that name.
+
+    Raises:
+        KeyedError: there is none.
+    """
     if not isinstance(chosen, str) or chosen not in stage.by_name:
         message = one_of("method", str(chosen), stage.by_name)
         raise KeyedError(f"{name}.method", f"{name}.method: {message}")
-    method = stage.by_name[chosen]
-    with named_errors(name, method):
-        return method.model_validate({k: v for k, v in table.items() if k != "method"})
+    return stage.by_name[chosen]
 
 
 def make_output(table: Mapping[str, Any]) -> Output:
@@ -416,7 +643,7 @@ def make_output(table: Mapping[str, Any]) -> Output:
         name = str(error["loc"][0])
         key = f"{OUTPUT}.{name}"
         if error["type"] == "extra_forbidden":
-            raise KeyedError(key, one_of("key of output", name, Output.model_fields)) from None
+            raise unknown_parameter(OUTPUT, Output, name) from None
         reason = error["msg"].removeprefix("Input ")
         raise KeyedError(key, f"{key}: found {error['input']!r}: {reason}") from None
 
@@ -434,17 +661,24 @@ def named_errors(name: str, method: type[Method]) -> Iterator[None]:
         error = errors.errors()[0]
         key = ".".join([name, *(str(part) for part in error["loc"])])
         if error["type"] == "extra_forbidden":
-            what = f"parameter of {name} ({method.method})"
-            parameter = str(error["loc"][0])
-            message = one_of(what, parameter, ["method", *method.model_fields])
-            stage = all_stages()[base_name(name)]
-            having = [m for m, other in stage.by_name.items() if parameter in other.model_fields]
-            if having:
-                message += f"; '{parameter}' is a parameter of {' and '.join(having)}"
-            raise KeyedError(key, message) from None
+            raise unknown_parameter(name, method, str(error["loc"][0])) from None
         reason = error["msg"].removeprefix("Value error, ").removeprefix("Input ")
         found = f" found {error['input']!r}:" if error["loc"] else ""
         raise KeyedError(key, f"{key}:{found} {reason}") from None
+
+
+def unknown_parameter(step: str, model: type[BaseModel], parameter: str) -> KeyedError:
+    """What to say of a parameter that a step, or the table of output, has not."""
+    key = f"{step}.{parameter}"
+    if not issubclass(model, Method):
+        return KeyedError(key, one_of(f"key of {step}", parameter, model.model_fields))
+    what = f"parameter of {step} ({model.method})"
+    message = one_of(what, parameter, ["method", *model.model_fields])
+    stage = all_stages()[base_name(step)]
+    having = [m for m, other in stage.by_name.items() if parameter in other.model_fields]
+    if having:
+        message += f"; '{parameter}' is a parameter of {' and '.join(having)}"
+    return KeyedError(key, message)
 
 
 def make_chain(
@@ -455,7 +689,9 @@ def make_chain(
 ) -> Chain:
     """The chain that the settings ask for, every parameter resolved.
 
-    A stage that comes a second time is called ``stage_2``, and so on.
+    A stage that comes a second time is called ``stage_2``, and so on. Settings with draws give an
+    example, that of the image key "", once it is seen that all that can be drawn is right; the
+    chain of an image is made of its :meth:`Settings.drawn`.
 
     Args:
         settings: the request.
@@ -469,8 +705,9 @@ def make_chain(
         RequestError: a chain whose image kinds do not fit, an unknown camera, an ISO it has not,
             a step that is not there.
     """
+    check_camera(settings)
+    draws, settings = settings.draws, settings.drawn("")
     camera = load_camera(settings.camera)
-    camera.noise(settings.iso)  # refuses an ISO that the camera has not
     steps = resolved_steps(settings, camera, source or (None if start_at else entry(settings)))
     names = [step.name for step in steps]
     for name in settings.parameters:
@@ -492,7 +729,7 @@ def make_chain(
         )
     if source is None:
         source = steps[first].stage.reads
-    return Chain(tuple(steps[first:last]), source, camera, settings, tuple(names))
+    return Chain(tuple(steps[first:last]), source, camera, settings, tuple(names), draws)
 
 
 def entry(settings: Settings) -> Kind:
@@ -506,6 +743,18 @@ def entry(settings: Settings) -> Kind:
     return Kind.DISPLAY if first and first.reads is Kind.DISPLAY else Kind.RGB
 
 
+def step_names(settings: Settings) -> list[str]:
+    """The names of the steps that are not skipped; that of a repeated one has its number.
+
+    >>> step_names(Settings(stages=("exposure", "mosaic", "exposure"), skip=("mosaic",)))
+    ['exposure', 'exposure_2']
+    """
+    before = [settings.stages[:place].count(stage) for place, stage in enumerate(settings.stages)]
+    pairs = zip(settings.stages, before, strict=True)
+    names = [f"{stage}_{count + 1}" if count else stage for stage, count in pairs]
+    return [name for name in names if name not in settings.skip]
+
+
 def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:
     """The steps of the settings, in order, for an image of a kind; None is what the first reads.
 
@@ -516,14 +765,9 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     """
     context = Context(camera=camera, iso=settings.iso)
     steps: list[Step] = []
-    count: dict[str, int] = {}
     before = "the input"
-    for stage_name in settings.stages:
-        stage = all_stages()[stage_name]
-        count[stage_name] = count.get(stage_name, 0) + 1
-        name = stage_name if count[stage_name] == 1 else f"{stage_name}_{count[stage_name]}"
-        if name in settings.skip:
-            continue
+    for name in step_names(settings):
+        stage = all_stages()[base_name(name)]
         method = make_method(stage, name, settings.parameters.get(name, {}))
         if stage.reads is not (kind or stage.reads):
             if isinstance(method, Unchanged) and stage.reads is stage.writes:

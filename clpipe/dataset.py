@@ -54,13 +54,14 @@ class Dataset:
     All arrays are in the sensor's orientation. The noise of an image in epoch E is that of frame E
     of ``clpipe run --frames``: its image key is the render's, with "#E" behind it from epoch 1 on.
     So a sample depends on its render, the settings and the epoch alone, and not on order, sharding,
-    workers or restarts. What settings draw at random for each image is drawn anew in each epoch.
+    workers or restarts. What is declared to be drawn at random for each image is drawn anew in each
+    epoch, but for kept images, which keep what was drawn for them.
 
     The device is opened by the process that first makes a sample. OpenCL does not survive a fork:
     workers of a process that has used it must be spawned (``multiprocessing_context="spawn"``).
 
     Args:
-        inputs: files, folders and globs, as ``clpipe run`` takes them.
+        inputs: files, folders, globs and manifests, as ``clpipe run`` takes them.
         config: as for :class:`~clpipe.Pipeline`; None holds what kept images carry, else the
             default.
         device: as for :class:`~clpipe.Pipeline`.
@@ -102,6 +103,7 @@ class Dataset:
         self._entrance = Entrance(asked, Reading(layer=layer, transfer=transfer))
         several = [inputs] if isinstance(inputs, str | Path) else inputs
         self._jobs = find_jobs([str(i) for i in several], NOWHERE, self._entrance.endings())
+        self._entrance.check(self._jobs)
         _check_keys(self._jobs)
         chain = self._entrance.first_chain(self._jobs)
         if truth:

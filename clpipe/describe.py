@@ -143,7 +143,11 @@ def value_text(value: Any) -> str:
 
     >>> value_text((1.0, 2.5)), value_text("bayer"), value_text(False)
     ('[1, 2.5]', '"bayer"', 'false')
+    >>> value_text({"uniform": [1, 2]})
+    '{ uniform = [1, 2] }'
     """
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(f'{key} = {value_text(v)}' for key, v in value.items())} }}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(value_text, value))}]"
     if isinstance(value, float):
@@ -152,11 +156,14 @@ def value_text(value: Any) -> str:
 
 
 def toml_text(chain: Chain) -> str:
-    """A chain as a configuration, complete: what follows camera and ISO is there as a comment."""
+    """A chain as a configuration, complete: what follows camera and ISO is there as a comment, what
+    is drawn as its draw.
+    """
     settings = chain.settings
+    draws = {key: draw.record() for key, draw in chain.draws.items()}
     lines = [
-        f"camera = {value_text(settings.camera)}",
-        f"iso = {value_text(settings.iso)}",
+        f"camera = {value_text(draws.get('camera', settings.camera))}",
+        f"iso = {value_text(draws.get('iso', settings.iso))}",
         f"seed = {value_text(settings.seed)}",
         *(f"{key} = {value_text(v)}" for key, v in settings.record().items() if key[:4] == "raw_"),
         "stages = [",
@@ -164,20 +171,31 @@ def toml_text(chain: Chain) -> str:
         "]",
     ]
     for step in chain.steps:
-        lines += ["", f"[{step.name}]", f"method = {value_text(step.method.method)}"]
+        method = draws.get(f"{step.name}.method", step.method.method)
+        lines += ["", f"[{step.name}]", f"method = {value_text(method)}"]
         given = settings.parameters.get(step.name, {})
         for name, field in type(step.method).model_fields.items():
             extra: Any = field.json_schema_extra
-            if getattr(step.method, name) is None:
-                continue
-            line = f"{name} = {value_text(getattr(step.method, name))}"
+            value = draws.get(f"{step.name}.{name}", getattr(step.method, name))
+            if value is None or (name not in given and isinstance(method, Mapping)):
+                continue  # other methods than the one in the example may not have it
+            line = f"{name} = {value_text(value)}"
             if name not in given and field.default is None:
                 line = f"# {line}  # automatic: {extra['auto']}"
             lines.append(
                 line + (f"  # {extra['unit']}" if extra["unit"] and line[0] != "#" else "")
             )
-    if output := settings.output.model_dump(exclude_defaults=True):
-        lines += ["", f"[{OUTPUT}]", *(f"{k} = {value_text(v)}" for k, v in output.items())]
+    tables = {OUTPUT: settings.output.model_dump(exclude_defaults=True)}
+    if draws:  # which may follow what stands elsewhere
+        ran = {step.name for step in chain.steps}
+        tables |= {k: dict(t) for k, t in settings.parameters.items() if k not in ran}
+    for key, draw in draws.items():
+        table, _, name = key.partition(".")
+        if table in tables:
+            tables[table][name] = draw
+    for name, table_ in tables.items():
+        if table_:
+            lines += ["", f"[{name}]", *(f"{k} = {value_text(v)}" for k, v in table_.items())]
     return "\n".join(lines) + "\n"
 
 

@@ -5,9 +5,9 @@ import re
 import shutil
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,11 @@ from clpipe.codegen import (
     write_kernel,
 )
 from clpipe.errors import DeviceError, ImageError, RequestError
-from clpipe.plan import AddUp, Count, Find, Image, Launch, Lines, Plan
+from clpipe.memory import available_memory
+from clpipe.plan import AddUp, Count, Find, Launch, Lines, Plan
+from clpipe.stage import Kind
 from clpipe.suggest import one_of
+from clpipe.tiles import Extent, Tiling, tiling_of
 from clpipe.types import Array
 
 Bind = Callable[[Parameter], Any]
@@ -168,6 +171,27 @@ def choose(selector: str | None, devices: list[Found]) -> Found:
     return usable[0]
 
 
+def choose_all(selectors: Sequence[str], devices: list[Found]) -> list[Found]:
+    """The devices that selectors name, each as :func:`choose` has it, each device once.
+
+    Without selectors these are the one that is chosen by default and, if it is a GPU, all others of
+    the same name, which give the same bits.
+
+    Raises:
+        DeviceError: as :func:`choose`.
+    """
+    if not selectors:
+        first = choose(None, devices)
+        return [first] + [
+            d
+            for d in devices
+            if d.type == first.type == "GPU" and d.name == first.name and not d.problem
+            if d.index != first.index
+        ]
+    chosen = [choose(selector, devices) for selector in selectors]
+    return list({d.index: d for d in chosen}.values())
+
+
 def matches(selector: str, device: Found) -> bool:
     """Whether a selector is a part of a device's name, type or platform ('pocl' counts)."""
     alias = " pocl" if "Portable Computing" in device.platform else ""
@@ -176,43 +200,17 @@ def matches(selector: str, device: Found) -> bool:
 
 
 @dataclass(frozen=True)
-class Extent:
-    """The size of an image and of its planes on a device."""
-
-    width: int
-    height: int
-    lanes: int
-    apron: int
-
-    @cached_property
-    def pitch(self) -> int:
-        """Floats from one row of a plane to the next."""
-        pitch = self.columns + 2 * apron_left(self.apron, self.lanes)
-        # Rows a multiple of 4 KiB apart would fall into the same cache sets.
-        return pitch + self.lanes * (pitch % 1024 == 0)
-
-    @property
-    def columns(self) -> int:
-        """The width, in whole blocks."""
-        return round_up(self.width, self.lanes)
-
-    @property
-    def rows(self) -> int:
-        """The height, in whole blocks of four."""
-        return round_up(self.height, 4)
-
-    @property
-    def plane_bytes(self) -> int:
-        """The size of a plane with its apron; the last block's loads may run over by its width."""
-        return ((self.rows + 2 * self.apron) * self.pitch + 5 * self.lanes) * 4
-
-
-@dataclass(frozen=True)
 class Timing:
-    """What one launch took, in seconds on the device."""
+    """What one launch or transfer took, in seconds on the device.
+
+    ``start`` is on the clock of :func:`time.perf_counter`. Transfers are called "upload" and
+    "download".
+    """
 
     name: str
     seconds: float
+    start: float
+    transfer: bool
 
 
 @dataclass
@@ -235,34 +233,220 @@ def build_log(text: str) -> str:
     return "\n".join(lines).strip() or text
 
 
-class Device:
-    """A device with its queue, compiled kernels and buffers, kept from image to image."""
+def room_for(plan: Plan, width: int, height: int, into: Array | None) -> Output:
+    """Whole images on the host for all that a plan gives; ``into`` is for the encoded one."""
 
-    def __init__(self, chosen: Found) -> None:
+    def shape(kind: Kind) -> tuple[int, ...]:
+        channels = len(kind.channels)
+        return (height, width) if channels == 1 else (height, width, channels)
+
+    images = [image for _, image in plan.kept] + ([plan.final] if plan.final else [])
+    encoded = None
+    if plan.encoded:
+        encoded = np.empty(shape(plan.encoded), np.uint8) if into is None else into
+        if encoded.shape != shape(plan.encoded) or encoded.dtype != np.uint8:
+            raise ValueError(
+                f"into is {encoded.shape} {encoded.dtype}; {shape(plan.encoded)} uint8"
+            )
+    return Output(
+        images={image.number: np.empty(shape(image.kind), np.float32) for image in images},
+        encoded=encoded,
+        found={x.op.step: np.empty(4, np.float32) for x in plan.launches if isinstance(x, Find)},
+    )
+
+
+def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """How many work items a kernel has, and in which groups."""
+    match kernel.launch:
+        case Launch(rows=rows, columns=columns):
+            across = round_up(extent.padded_width, extent.lanes * columns)
+            blocks = round_up(across // (extent.lanes * columns), LOCAL_SIZE)
+            return (blocks, -(-extent.stored.height // rows)), (LOCAL_SIZE, 1)
+        case Lines():
+            longest = round_up(max(extent.width, extent.height), extent.lanes)
+            return (round_up(longest // extent.lanes, LOCAL_SIZE),), (LOCAL_SIZE,)
+        case Count() | AddUp():
+            return (SHARES,), (LOCAL_SIZE,)
+        case Find():
+            return (1,), (1,)
+
+
+def timed(events: Sequence[tuple[str, Any]]) -> list[Timing]:
+    """How long each took. The queue has just been finished, so the last of them ends now."""
+    if not events:
+        return []
+    offset = time.perf_counter() - events[-1][1].profile.end * 1e-9
+    transfers = ("upload", "download")
+    return [
+        Timing(
+            name,
+            (event.profile.end - event.profile.start) * 1e-9,
+            event.profile.start * 1e-9 + offset,
+            name in transfers,
+        )
+        for name, event in events
+    ]
+
+
+def usable_memory(chosen: Found) -> int:
+    """Bytes that buffers on a device may take by default.
+
+    Of a GPU's, a tenth is left to others. A CPU shares its memory with everybody: half of what is
+    available now.
+    """
+    if chosen.type == "GPU":
+        return chosen.memory * 9 // 10
+    available = available_memory()
+    return min(chosen.memory, available // 2) if available else chosen.memory
+
+
+class Pool:
+    """Device buffers by name, kept from image to image where they are large enough."""
+
+    def __init__(self, make: Callable[[int], Any]) -> None:
+        self._make = make
+        self.held: dict[str, Any] = {}
+        self.generation = 0  # another one when other buffers are held
+
+    def reserve(self, sizes: Mapping[str, int], memory: int) -> None:
+        """See that there is a buffer of at least these sizes (bytes by name).
+
+        Those that an earlier image needed stay, as long as all together take no more than
+        ``memory`` bytes.
+        """
+        enough = {name: b for name, b in self.held.items() if b.size >= sizes.get(name, 0)}
+        missing = sum(size for name, size in sizes.items() if name not in enough)
+        for spare in (lambda name, _: name not in sizes, lambda name, b: b.size > sizes[name]):
+            if sum(b.size for b in enough.values()) + missing > memory:
+                dropped = [name for name, b in enough.items() if spare(name, b)]
+                missing += sum(sizes.get(name, 0) for name in dropped)
+                enough = {name: b for name, b in enough.items() if name not in dropped}
+        if enough.keys() == self.held.keys() >= sizes.keys():
+            return
+        self.generation += 1
+        for name in self.held.keys() - enough.keys():
+            self.held.pop(name).release()
+        for name, size in sizes.items():
+            if name not in enough:
+                self.held[name] = self._make(size)
+
+    @property
+    def bytes(self) -> int:
+        """What all of them take."""
+        return sum(buffer.size for buffer in self.held.values())
+
+    def release(self) -> None:
+        """Give all of them back."""
+        self.generation += 1
+        held, self.held = self.held, {}
+        for buffer in held.values():
+            buffer.release()
+
+
+class Call:
+    """A compiled kernel and the arguments that it was given last.
+
+    Most arguments stay the same from image to image, and to set one takes time.
+    """
+
+    def __init__(self, kernel: Kernel, compiled: Any) -> None:
+        self.kernel = kernel
+        self.compiled = compiled
+        numbered = list(enumerate(kernel.parameters))
+        names = [(i, buffer_name(p)) for i, p in numbered]
+        self._buffers = [(i, name) for i, name in names if name]
+        self._numbers = [(i, p.item) for i, p in numbered if p.role == "tile"]
+        self._values = [(i, p) for i, p in numbered if p.role in ("value", "key", "table8")]
+        self._last: list[Any] = [None] * len(numbered)
+        self._place: tuple[Any, ...] = ()
+
+    def set_arguments(self, pool: "Pool", extent: Extent, tile: int, bind: Bind) -> None:
+        """Set what is different from the last time: buffers, a tile's numbers, and values."""
+        place = pool.generation, extent, tile
+        if place != self._place:
+            told = {**extent.numbers, "tile": np.uint32(tile)}
+            for i, name in self._buffers:
+                self.compiled.set_arg(i, pool.held[name])
+            for i, name in self._numbers:
+                self.compiled.set_arg(i, told[name])
+            self._place = place
+        for i, parameter in self._values:
+            value, last = bind(parameter), self._last[i]
+            if value is not last and not same_bits(value, last):
+                self.compiled.set_arg(i, value)
+                self._last[i] = value
+
+
+def same_bits(one: Any, two: Any) -> bool:
+    """Whether two NumPy scalars are the same; 0 and -0 are not."""
+    scalars = isinstance(one, np.generic) and isinstance(two, np.generic)
+    return scalars and one.tobytes() == two.tobytes()
+
+
+def buffer_name(parameter: Parameter) -> str | None:
+    """The buffer of :func:`clpipe.tiles.buffer_sizes` that a parameter stands for, if it does."""
+    match parameter.role:
+        case "source":
+            return "src"
+        case "encoded":
+            return "dst"
+        case "slot":
+            return f"slot{parameter.number}"
+        case "lines" | "found":
+            return f"{parameter.role}.{parameter.step}"
+        case "sums" | "shares" | "counts" | "histogram":
+            return parameter.role
+    return None
+
+
+class Device:
+    """A device with its queue, compiled kernels and buffers, kept from image to image.
+
+    It is for one thread at a time; several devices can run at once, each in its own.
+
+    Args:
+        chosen: which device.
+        memory: bytes that its buffers may take; None is what it reports. A CPU shares its memory
+            with everybody, so it is at most half of what is available now.
+
+    Raises:
+        DeviceError: it cannot be opened.
+    """
+
+    def __init__(self, chosen: Found, memory: int | None = None) -> None:
         import pyopencl as cl
 
         self.info = chosen
+        self.memory = memory or usable_memory(chosen)
         self._cl = cl
-        self._context = cl.Context([chosen.handle])
-        self._queue = cl.CommandQueue(
-            self._context, properties=cl.command_queue_properties.PROFILING_ENABLE
-        )
-        self._kernels: dict[Plan, list[tuple[Kernel, Any]]] = {}
+        try:
+            self._context = cl.Context([chosen.handle])
+            self._queue = cl.CommandQueue(
+                self._context, properties=cl.command_queue_properties.PROFILING_ENABLE
+            )
+        except cl.Error as error:
+            raise DeviceError(f"{chosen.label} cannot be opened: {error}") from None
+        self._calls: dict[Plan, list[Call]] = {}
         self._programs: dict[str, Any] = {}
-        self._buffers: dict[str, Any] = {}
+        self._pool = Pool(self._new_buffer)
         self._tables: dict[int, tuple[Array, Any]] = {}
 
-    def prepare(self, plan: Plan) -> list[tuple[Kernel, Any]]:
+    @property
+    def bytes_held(self) -> int:
+        """Device memory of the buffers that are kept from image to image."""
+        return self._pool.bytes
+
+    def prepare(self, plan: Plan) -> list[Call]:
         """The compiled kernels of a plan, from the first call on without compiling.
 
         Raises:
             DeviceError: a kernel does not compile; the message is the compiler's.
         """
-        if plan not in self._kernels:
+        if plan not in self._calls:
             lanes = self.info.lanes
             kernels = [write_kernel(plan, x, i, lanes) for i, x in enumerate(plan.launches)]
-            self._kernels[plan] = [(k, self._compile(k)) for k in kernels]
-        return self._kernels[plan]
+            self._calls[plan] = [Call(k, self._compile(k)) for k in kernels]
+        return self._calls[plan]
 
     def _compile(self, kernel: Kernel) -> Any:
         cl = self._cl
@@ -274,12 +458,14 @@ class Device:
                 options.append("-cl-fp32-correctly-rounded-divide-sqrt")
             # PoCL keeps a cache of its own; a second copy only costs time.
             own_cache = "Portable Computing" in self.info.platform
+            # Not within catch_warnings, which is no matter of one thread.
+            warnings.filterwarnings("ignore", category=cl.CompilerWarning)
             try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")
-                    program = cl.Program(self._context, kernel.source).build(
-                        options, cache_dir=False if own_cache else None
-                    )
+                program = cl.Program(self._context, kernel.source).build(
+                    options, cache_dir=False if own_cache else None
+                )
+            except cl.MemoryError:
+                raise
             except cl.Error as error:
                 log = build_log(str(error))
                 for file in kernel.files:
@@ -296,123 +482,110 @@ class Device:
         bind: Bind,
         timings: list[Timing] | None = None,
         download: bool = True,
+        into: Array | None = None,
     ) -> Output:
-        """Put one image through a plan.
+        """Put one image through a plan; in tiles where it does not fit into the memory.
+
+        Where the memory that is allowed is not there, buffers of earlier images are given back,
+        then tiles become smaller.
 
         Args:
             plan: what to do.
-            source: the image, (height, width[, channel]), float16 or float32 as the plan says,
-                C-contiguous.
+            source: the image, (height, width[, channel]), of a type that becomes half floats or
+                floats, as the plan says, without loss.
             bind: the value of a "value", "key" or "table8" parameter: a NumPy scalar or array.
-            timings: is given one entry a launch, in order.
+            timings: is given one entry a launch and transfer, in order.
             download: bring results back; False leaves them on the device (for measuring).
+            into: where the eight-bit pixels are put, (height, width[, channel]) uint8,
+                C-contiguous; memory that is new to the process costs time.
 
         Raises:
-            ImageError: the image does not fit into the device's memory.
+            ImageError: the image does not fit into the device's memory, not even in tiles, or the
+                device fails.
             DeviceError: a kernel does not compile.
         """
         cl = self._cl
-        kernels = self.prepare(plan)
+        height, width = source.shape[:2]
+        memory = self.memory
+        full: Exception | None = None  # what the device said when there was no more
+        while True:
+            try:
+                tiling = tiling_of(
+                    plan, width, height, self.info.lanes, memory, min(memory, self.info.max_buffer)
+                )
+            except ImageError:
+                if full is None:
+                    raise
+                raise ImageError(
+                    f"{width}x{height} pixels: {self.info.label} is out of memory, in tiles of any "
+                    f"size; others may be using it ({full})"
+                ) from None
+            try:
+                return self._run(plan, tiling, source, bind, timings, download, into)
+            except cl.MemoryError as error:
+                self._abandon()
+                memory = memory if full is None else tiling.bytes // 2
+                full = error
+            except cl.Error as error:
+                self._abandon()
+                raise ImageError(f"{self.info.label} failed: {error}") from None
+
+    def _run(
+        self,
+        plan: Plan,
+        tiling: Tiling,
+        source: Array,
+        bind: Bind,
+        timings: list[Timing] | None,
+        download: bool,
+        into: Array | None,
+    ) -> Output:
+        calls = self.prepare(plan)
         if len(self._tables) > 32:
             self._tables.clear()
-        height, width = source.shape[:2]
-        extent = Extent(width, height, self.info.lanes, plan.apron)
-        channels = len(plan.source.channels)
-        room = extent.rows * width * channels + 3 * extent.lanes
-        needed = plan.bytes_per_pixel(extent.lanes) * width * height
-        memory = f"on the device, which has {self.info.memory / 2**20:.0f} MiB"
-        too_large = f"{width}x{height} pixels need {needed / 2**20:.0f} MiB {memory}"
-        if needed > self.info.memory:
-            raise ImageError(too_large)
-        try:
-            if download or "src" not in self._buffers:
-                src = self._buffer("src", room * source.itemsize)
-                self._upload(src, source)
-            events = []
-            for kernel, compiled in kernels:
-                arguments = [
-                    self._argument(p, kernel, plan, extent, bind) for p in kernel.parameters
-                ]
-                compiled.set_args(*arguments)
-                global_size, local_size = self._index_space(kernel, extent)
-                events.append(
-                    cl.enqueue_nd_range_kernel(self._queue, compiled, global_size, local_size)
-                )
-            output = Output({}, None, {})
-            if download:
-                self._download(plan, extent, output)
-            self._queue.finish()
-        except cl.MemoryError as error:
-            raise ImageError(f"{too_large}: {error}") from None
+        upload = download or len(tiling.tiles) > 1 or "src" not in self._pool.held
+        self._pool.reserve(tiling.sizes, self.memory)
+        output = room_for(plan, source.shape[1], source.shape[0], into)
+        events: list[tuple[str, Any]] = []
+
+        def value_of(parameter: Parameter) -> Any:
+            value = bind(parameter)
+            return self._table(value) if isinstance(value, np.ndarray) else value
+
+        def launch(numbers: tuple[int, ...], extent: Extent, tile: int) -> None:
+            for number in numbers:
+                call = calls[number]
+                call.set_arguments(self._pool, extent, tile, value_of)
+                sizes = index_space(call.kernel, extent)
+                event = self._cl.enqueue_nd_range_kernel(self._queue, call.compiled, *sizes)
+                events.append((call.kernel.launch.name, event))
+
+        for phase in tiling.phases:
+            launch(phase.first, tiling.tiles[0], 0)
+            for tile, extent in enumerate(tiling.tiles):
+                if upload:
+                    events.append(("upload", self._upload(plan, extent, source)))
+                launch(phase.each, extent, tile)
+                if download and phase is tiling.phases[-1]:
+                    events += [("download", e) for e in self._download(plan, extent, output)]
+            launch(phase.last, tiling.tiles[0], 0)
+        if download:
+            events += [("download", e) for e in self._find(output)]
+        self._queue.finish()
         if timings is not None:
-            for (kernel, _), event in zip(kernels, events, strict=True):
-                seconds = (event.profile.end - event.profile.start) * 1e-9
-                timings.append(Timing(kernel.launch.name, seconds))
-        return output
+            timings += timed(events)
+        return output if download else Output({}, None, {})
 
-    def _index_space(
-        self, kernel: Kernel, extent: Extent
-    ) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        match kernel.launch:
-            case Launch(rows=rows, columns=columns):
-                across = round_up(extent.columns, extent.lanes * columns)
-                blocks = round_up(across // (extent.lanes * columns), LOCAL_SIZE)
-                return (blocks, round_up(extent.height, rows) // rows), (LOCAL_SIZE, 1)
-            case Lines():
-                longest = round_up(max(extent.width, extent.height), extent.lanes)
-                return (round_up(longest // extent.lanes, LOCAL_SIZE),), (LOCAL_SIZE,)
-            case Count() | AddUp():
-                return (SHARES,), (LOCAL_SIZE,)
-            case Find():
-                return (1,), (1,)
+    def _new_buffer(self, size: int) -> Any:
+        return self._cl.Buffer(self._context, self._cl.mem_flags.READ_WRITE, size)
 
-    def _argument(
-        self, parameter: Parameter, kernel: Kernel, plan: Plan, extent: Extent, bind: Bind
-    ) -> Any:
-        blocks = extent.columns // extent.lanes * (extent.rows // 4)
-        match parameter.role:
-            case "extent":
-                return np.uint32(getattr(extent, parameter.item))
-            case "source":
-                return self._buffers["src"]
-            case "slot":
-                return self._buffer(f"slot{parameter.number}", extent.plane_bytes)
-            case "encoded":
-                assert plan.encoded
-                size = extent.width * extent.height * len(plan.encoded.channels)
-                return self._buffer("dst", size)
-            case "lines":
-                # Room for whole blocks of rows and for the last vector.
-                longest = max(extent.columns, extent.rows) + 2 * extent.lanes
-                return self._buffer(f"lines.{parameter.step}", longest * 4)
-            case "sums":
-                return self._buffer("sums", blocks * 16)
-            case "count":
-                return np.uint32(blocks)
-            case "shares":
-                return self._buffer("shares", SHARES * 32)
-            case "counts":
-                return self._buffer("counts", SHARES * parameter.number * 4)
-            case "histogram":
-                return self._buffer("histogram", parameter.number * 4)
-            case "found":
-                return self._buffer(f"found.{parameter.step}", 16)
-            case _:
-                value = bind(parameter)
-                return self._table(value) if isinstance(value, np.ndarray) else value
-
-    def _buffer(self, name: str, size: int) -> Any:
-        """The buffer of that name, made anew only when its size changes."""
-        cl = self._cl
-        held = self._buffers.pop(name, None)
-        if held is None or held.size != size:
-            if held is not None:
-                held.release()
-            if size > self.info.max_buffer:
-                raise cl.MemoryError(f"one buffer of {size / 2**20:.0f} MiB is too large for it")
-            held = cl.Buffer(self._context, cl.mem_flags.READ_WRITE, size)
-        self._buffers[name] = held
-        return held
+    def _abandon(self) -> None:
+        """Wait for what is still to be done of an image that failed, and give all memory back."""
+        with suppress(self._cl.Error):
+            self._queue.finish()
+        with suppress(self._cl.Error):
+            self._tables.clear()
+            self._pool.release()
 
     def _table(self, table: Array) -> Any:
         """A small constant array on the device, uploaded once."""
@@ -423,41 +596,53 @@ class Device:
             self._tables[id(table)] = table, cl.Buffer(self._context, flags, hostbuf=table)
         return self._tables[id(table)][1]
 
-    def _upload(self, buffer: Any, array: Array) -> None:
-        self._cl.enqueue_copy(self._queue, buffer, np.ascontiguousarray(array), is_blocking=True)
+    def _upload(self, plan: Plan, extent: Extent, image: Array) -> Any:
+        box = extent.stored
+        dtype = np.float16 if plan.half else np.float32
+        part = np.ascontiguousarray(image[box.top : box.bottom, box.left : box.right], dtype)
+        return self._cl.enqueue_copy(self._queue, self._pool.held["src"], part)
 
-    def _download(self, plan: Plan, extent: Extent, output: Output) -> None:
-        cl = self._cl
-        wanted = {image.number: image for _, image in plan.kept}
-        if plan.final:
-            wanted[plan.final.number] = plan.final
-        for number, image in wanted.items():
-            output.images[number] = self._planes(plan, image, extent)
-        if plan.encoded:
-            channels = len(plan.encoded.channels)
-            shape = (extent.height, extent.width, channels)[: 2 if channels == 1 else 3]
-            output.encoded = np.empty(shape, np.uint8)
-            cl.enqueue_copy(self._queue, output.encoded, self._buffers["dst"])
-        for launch in plan.launches:
-            if isinstance(launch, Find):
-                values = np.empty(4, np.float32)
-                cl.enqueue_copy(self._queue, values, self._buffers[f"found.{launch.op.step}"])
-                output.found[launch.op.step] = values
-
-    def _planes(self, plan: Plan, image: Image, extent: Extent) -> Array:
-        """An image from its planes, without the apron: (height, width[, channel]) float32."""
-        slots = plan.slots[image.number]
-        result = np.empty((extent.height, extent.width, len(slots)), np.float32)
-        side = apron_left(plan.apron, extent.lanes)
-        rows = extent.rows + 2 * plan.apron
+    def _download(self, plan: Plan, extent: Extent, output: Output) -> Iterator[Any]:
+        """Bring the core of a tile into the whole images."""
+        core, stored, held = extent.core, extent.stored, self._pool.held
+        if output.encoded is not None:
+            channels = output.encoded.size // (extent.width * extent.height)
+            first = core.left - stored.left, core.top - stored.top
+            if core.width == extent.width:
+                rows = output.encoded[core.top : core.bottom]
+                start = first[1] * core.width * channels
+                yield self._cl.enqueue_copy(self._queue, rows, held["dst"], src_offset=start)
+            else:
+                yield self._cl.enqueue_copy(
+                    self._queue,
+                    output.encoded,
+                    held["dst"],
+                    buffer_origin=(first[0] * channels, first[1], 0),
+                    host_origin=(core.left * channels, core.top, 0),
+                    region=(core.width * channels, core.height, 1),
+                    buffer_pitches=(stored.width * channels,),
+                    host_pitches=(extent.width * channels,),
+                )
+        if not output.images:
+            return
         plane = np.empty(extent.plane_bytes // 4, np.float32)
-        for channel, slot in enumerate(slots):
-            self._cl.enqueue_copy(self._queue, plane, self._buffers[f"slot{slot}"])
-            whole = plane[: rows * extent.pitch].reshape(rows, extent.pitch)
-            result[..., channel] = whole[
-                plan.apron : plan.apron + extent.height, side : side + extent.width
-            ]
-        return result[..., 0] if len(slots) == 1 else result
+        height = extent.padded_height + 2 * plan.apron
+        top = plan.apron + core.top - stored.top
+        left = apron_left(plan.apron, extent.lanes) + core.left - stored.left
+        for number, image in output.images.items():
+            whole = image.reshape(extent.height, extent.width, -1)
+            part = whole[core.top : core.bottom, core.left : core.right]
+            for channel, slot in enumerate(plan.slots[number]):
+                yield self._cl.enqueue_copy(
+                    self._queue, plane, held[f"slot{slot}"], is_blocking=True
+                )
+                rows = plane[: height * extent.pitch].reshape(height, extent.pitch)
+                part[..., channel] = rows[top : top + core.height, left : left + core.width]
+
+    def _find(self, output: Output) -> Iterator[Any]:
+        """Bring what was found in the image."""
+        for step, values in output.found.items():
+            yield self._cl.enqueue_copy(self._queue, values, self._pool.held[f"found.{step}"])
 
     def copy_speed(self, size: int = 96 * 2**20) -> float:
         """Bytes a second, read plus written, of the device's own buffer copy; the best of five."""
@@ -473,12 +658,34 @@ class Device:
         return best
 
 
-def open_device(selector: str | None) -> Device | None:
+def open_device(selector: str | None, memory: int | None = None) -> Device | None:
     """The device that a selector names, as :func:`choose` has it; None for "numpy".
+
+    ``memory`` is how many bytes of it may be used.
 
     Raises:
         DeviceError: there is none, none matches, or the one that was asked for cannot be used.
     """
     if selector is not None and selector.lower() == "numpy":
         return None
-    return Device(choose(selector, find_devices()))
+    return Device(choose(selector, find_devices()), memory)
+
+
+def open_devices(selectors: Sequence[str] = (), memory: int | None = None) -> list[Device]:
+    """The devices that selectors name, as :func:`choose_all` has them; none for "numpy".
+
+    ``memory`` is how many bytes may be used of each; without it, CPUs share what there is.
+
+    Raises:
+        DeviceError: as :func:`open_device`, or "numpy" stands beside others.
+    """
+    if any(selector.lower() == "numpy" for selector in selectors):
+        if len(selectors) > 1:
+            raise DeviceError(f"found devices {', '.join(selectors)}; numpy is used alone")
+        return []
+    chosen = choose_all(selectors, find_devices())
+    sharing = sum(found.type != "GPU" for found in chosen)
+    return [
+        Device(found, memory or usable_memory(found) // (1 if found.type == "GPU" else sharing))
+        for found in chosen
+    ]

@@ -9,6 +9,7 @@ from clpipe.config import Chain, Settings, base_name, entry, stage_named
 from clpipe.errors import KindError
 from clpipe.image_io import FINISHED, READABLE, Reading, SourceImage
 from clpipe.jobs import Job
+from clpipe.manifest import check_rows
 from clpipe.raw_entry import RawEntry, RawImage
 from clpipe.raw_io import ENDINGS
 from clpipe.reentry import Reentry, doubts, misplaced
@@ -45,7 +46,7 @@ class Entrance:
     @cached_property
     def is_drawn(self) -> bool:
         """Whether each image has settings of its own, some of them drawn at random."""
-        return False
+        return bool(self.settings.draws)
 
     @cached_property
     def chain(self) -> Chain:
@@ -89,6 +90,16 @@ class Entrance:
             return own.raws.first_chain(jobs[0].path)
         return own.reentry.first_chain(jobs[0].path) if own.reentry else own.chain
 
+    def check(self, jobs: Sequence[Job]) -> None:
+        """See that what is said of single images is allowed.
+
+        Raises:
+            RequestError: it is not; the message says where it stands.
+        """
+        if said := [job for job in jobs if job.values]:
+            brings = self.raws.takes if self.reentry is None else lambda path: True
+            check_rows(said, self.settings, brings)
+
     def read(self, job: Job) -> SourceImage:
         """The image of a job.
 
@@ -110,6 +121,9 @@ class Entrance:
             return Entered(chain, source, job.key)
         kept, warnings = source.attributes.get("stage"), list(source.warnings)
         if reentry := self.reentry:
+            key = source.attributes.get("image_key", job.key)
+            asked = self.asked.of(key, self.asked.row)  # so that the same is drawn for it
+            reentry = replace(reentry, make=asked.chain)
             chain = reentry.chain_for(job.path, source.attributes)
             if not reentry.is_next(chain, source.attributes):
                 if not job.listed:
@@ -117,7 +131,6 @@ class Entrance:
                 again = f"entering at {reentry.start_at} repeats stages or leaves some out"
                 warnings.append(f"was kept after {kept}; {again}")
             reentry.check_kind(job.path, chain, source.attributes)
-            key = source.attributes.get("image_key", job.key)
             warnings += doubts(source, chain)
             return Entered(chain, replace(source, warnings=tuple(warnings)), key)
         if kept:

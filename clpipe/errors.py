@@ -16,6 +16,14 @@ class RequestError(ClpipeError):
     exit_status = 2
 
 
+class KeyedError(RequestError):
+    """A bad setting; ``key`` is its dotted name."""
+
+    def __init__(self, key: str, message: str) -> None:
+        super().__init__(message)
+        self.key = key
+
+
 class ImageError(ClpipeError):
     """One image cannot be read, processed or written; the others go on."""
 

@@ -9,6 +9,8 @@ from typing import Any, TypeVar
 
 from clpipe.errors import RequestError
 from clpipe.image_io import READABLE
+from clpipe.manifest import ENDINGS as MANIFESTS
+from clpipe.manifest import read_manifest
 from clpipe.raw_io import ENDINGS
 
 T = TypeVar("T")
@@ -20,7 +22,8 @@ class Job:
 
     ``key`` is its image key, ``name`` that of its outputs, without an ending. ``values`` are what
     is said of it alone, nested as in a configuration; ``frames`` how many frames are made of it,
-    where that is said; ``place`` where all this is said.
+    where that is said; ``place`` where all this is said. ``pictures`` are those of them to make, by
+    what stands behind the name; None is all.
     """
 
     path: Path
@@ -30,6 +33,7 @@ class Job:
     values: Mapping[str, Any] = field(default_factory=dict)
     frames: int | None = None
     place: str = ""
+    pictures: tuple[str, ...] | None = None
 
     @property
     def stem(self) -> str:
@@ -40,16 +44,21 @@ class Job:
 def find_jobs(
     inputs: Sequence[str], output: Path, endings: Sequence[str] = (*READABLE, *ENDINGS)
 ) -> list[Job]:
-    """The images that inputs name: files, folders (all images in them, at any depth) and globs.
+    """The images that inputs name: files, folders (all images in them, at any depth), globs and
+    manifests.
 
     The image key of a file in a folder is its path relative to that folder, that of a file given
-    by name or found by a glob is its name. A file that does not exist is a job too: it fails later,
-    alone. Where the output folder lies inside an input folder, what is in it is no input.
+    by name or found by a glob is its name; a manifest's rows have their own. A file that does not
+    exist is a job too: it fails later, alone. Where the output folder lies inside an input folder,
+    what is in it is no input.
 
     Raises:
-        RequestError: an empty name, a folder without images, or a glob that no file matches.
+        RequestError: no input, an empty name, a folder without images, a glob that no file matches,
+            or a manifest that is wrong.
     """
     jobs: list[Job] = []
+    if not inputs:
+        raise RequestError("there is no input; give files, folders, globs or manifests")
     for text in inputs:
         if not text:
             raise RequestError("an input is empty; give files, folders, globs or manifests")
@@ -61,6 +70,11 @@ def find_jobs(
                 raws = " and camera raws" if set(ENDINGS) & set(endings) else ""
                 raise RequestError(f"{path}: a folder without images (looked for {listed}{raws})")
             jobs += [Job(p, p.relative_to(path).as_posix(), listed=False) for p in files]
+        elif path.suffix.lower() in MANIFESTS:
+            jobs += [
+                Job(row.path, row.key, row.name, True, row.values, row.frames, row.place)
+                for row in read_manifest(path)
+            ]
         elif glob.has_magic(text) and not os.path.exists(text):
             matches = sorted(m for m in glob.glob(text, recursive=True) if os.path.isfile(m))
             if not matches:

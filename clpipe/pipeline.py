@@ -25,7 +25,7 @@ class Pipeline:
         start_at: the first step to run; images are then of the kind that it reads.
         until: the last step to run.
         **settings: what a configuration file may hold, over ``config``: ``iso=3200``,
-            ``denoise={"method": "mean"}``.
+            ``denoise={"method": "mean"}``, ``iso={"choice": [100, 800]}`` (drawn by image key).
 
     Raises:
         RequestError: a name or value that is not allowed.
@@ -66,7 +66,7 @@ class Pipeline:
             image: (height, width, 3) linear RGB, 1 = full scale of the sensor, of float16, float32
                 or float64; or (height, width) where the chain starts on a mosaic, also of uint16;
                 or a finished picture, also of uint8, where it starts on one.
-            key: what the image's noise belongs to: the same key gives the same noise.
+            key: what the image's noise and draws belong to: the same key gives the same.
             **settings: other values for this image alone, as for the class. Values such as ISO,
                 gains and noise parameters cost nothing; another method or size is compiled.
 
@@ -79,8 +79,9 @@ class Pipeline:
             RequestError: a setting that is not allowed.
         """
         runner = self._runner
-        if settings:
-            runner = runner.of(self._chain(overlay(self._settings, plain(settings))))
+        own = overlay(self._settings, plain(settings)) if settings else self._settings
+        if settings or own.draws:
+            runner = runner.of(self._chain(own.drawn(key)))
         return runner.run(_checked(image, runner.chain.source), key)
 
     def process_many(
@@ -102,6 +103,8 @@ def plain(values: Any) -> Any:
     """Settings without NumPy types: what a configuration file could hold."""
     if isinstance(values, Mapping):
         return {key: plain(value) for key, value in values.items()}
+    if isinstance(values, list | tuple):
+        return list(map(plain, values))
     return values.tolist() if isinstance(values, np.ndarray | np.generic) else values
 
 

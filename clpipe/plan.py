@@ -6,13 +6,14 @@ intermediate close it. What crosses from one launch to the next is an image of o
 a plane lives in a slot from the launch that writes it to the last one that reads it.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from clpipe.config import Chain, Step
-from clpipe.stage import Access, Kind, Literal, Pass
+from clpipe.stage import Access, Argument, Kind, Literal, Pass
 
 
 @dataclass(frozen=True)
@@ -115,12 +116,20 @@ class Plan:
     source: Kind
     half: bool
     launches: tuple[AnyLaunch, ...]
-    slots: dict[int, tuple[int, ...]] = field(hash=False)  # image number -> slots of its planes
+    slots: dict[int, tuple[int, ...]]  # image number -> slots of its planes
     slot_count: int = 0
     kept: tuple[tuple[str, Image], ...] = ()  # step -> its image
     final: Image | None = None  # the last image as float planes
     encoded: Kind | None = None  # the kind that is encoded to eight bits
     apron: int = 0
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        # A plan is looked up for each image, and hashing all that is in it takes a while.
+        return hash((self.source, self.half, self.launches, self.kept, self.final, self.encoded))
 
     def bytes_per_pixel(self, lanes: int) -> float:
         """Device memory a pixel takes: source, slots, partial sums and eight-bit result."""
@@ -181,28 +190,27 @@ class _Planner:
             return Read(group.reads[0].image, group.ops)
         return Read(self.close())
 
-    def add_step(self, step: Step) -> None:
-        passes = step.method.passes()
+    def add_step(self, ops: Sequence[Op]) -> None:
         local: dict[str, Read] = {}
-        if any(p.access is Access.STENCIL and "src" in p.reads for p in passes):
+        if any(op.pass_.access is Access.STENCIL and "src" in op.pass_.reads for op in ops):
             local["src"] = self.input_of_stencil()
         written = "src"
-        for pass_ in passes:
-            op = make_op(step, pass_)
+        for op in ops:
+            pass_ = op.pass_
             match pass_.access:
                 case Access.LINES:
                     self.lines.append(op)
                     continue
                 case Access.SUMS:
                     self.close(sums=op)
-                    self.launches.append(AddUp(op, f"{step.name}.add_up"))
-                    self.launches.append(Find(op, f"{step.name}.{pass_.finish}"))
+                    self.launches.append(AddUp(op, f"{op.step}.add_up"))
+                    self.launches.append(Find(op, f"{op.step}.{pass_.finish}"))
                     continue
                 case Access.HISTOGRAM:
                     stored = Read(self.close())
-                    self.launches.append(Count(op, (stored,), f"{step.name}.count"))
-                    self.launches.append(AddUp(op, f"{step.name}.add_up"))
-                    self.launches.append(Find(op, f"{step.name}.{pass_.finish}"))
+                    self.launches.append(Count(op, (stored,), f"{op.step}.count"))
+                    self.launches.append(AddUp(op, f"{op.step}.add_up"))
+                    self.launches.append(Find(op, f"{op.step}.{pass_.finish}"))
                     continue
                 case Access.STENCIL:
                     if written not in local:
@@ -216,21 +224,27 @@ class _Planner:
             self.kind, written = op.kind, pass_.writes
 
 
-def make_op(step: Step, pass_: Pass) -> Op:
-    """A pass of a step with the types of its arguments, which decide the kernel's signature."""
+def ops_of(step: Step, arguments: Mapping[str, Argument]) -> tuple[Op, ...]:
+    """The passes of a step with the types of its arguments, which decide the kernels' signatures.
+
+    Two chains whose steps have the same names and the same of these have the same plan.
+    """
+    passes = step.method.passes()
+    if not passes:
+        return ()
     types, literals = [], []
-    for name, value in step.method.arguments(step.context).items():
+    for name, value in arguments.items():
         if isinstance(value, Literal):
             literals.append((name, value.text))
         elif isinstance(value, np.ndarray):
             types.append((name, "__global const float *"))
         else:
             types.append((name, {"f": "float", "u": "uint", "i": "int"}[value.dtype.kind]))
-    kind = pass_.kind or step.stage.writes
     kernel = f"{step.method.kernel}.cl"
     if step.stage.folder:
         kernel = str(step.stage.folder / kernel)
-    return Op(step.name, kernel, pass_, kind, tuple(types), tuple(literals))
+    given = tuple(types), tuple(literals)
+    return tuple(Op(step.name, kernel, p, p.kind or step.stage.writes, *given) for p in passes)
 
 
 def make_plan(
@@ -264,7 +278,7 @@ def make_plan(
     planner = _Planner(chain.source, fold)
     kept: dict[str, Image] = {}
     for step in chain.steps:
-        planner.add_step(step)
+        planner.add_step(ops_of(step, step.method.arguments(step.context)))
         if step.name in keep and step.name != last:
             kept[step.name] = planner.close()
     group = planner.group or Launch("encode", (), (Read(planner.close()),))

@@ -64,10 +64,10 @@ class Reporter:
             self.say(f"{outcome.job.path} -> {self._made(outcome)}")
 
     def _made(self, outcome: Outcome) -> str:
-        first, *others = self._target.burst_of(outcome.job).names()
+        first, *others = self._target.pictures_of(outcome.job)
         made = str(self._target.path(outcome.job, ending_of(self._target.formats[0]), first))
         if others:
-            made += f" and {len(others)} frame{'s' * (len(others) > 1)}"
+            made += f" and {len(others)} more"
         seconds = sum(outcome.seconds(step) for step in self._summary.seconds)
         return f"{made}  {outcome.megapixels:.2g} MP  {seconds:.2f} s"
 
@@ -78,7 +78,9 @@ class Reporter:
         return f"{speed:.0f} MP/s  {summary.shares()}" + f"  {failed} failed" * bool(failed)
 
     def end(self) -> None:
-        """Tell of the whole."""
+        """Tell of the whole; the bar is over."""
+        if self._bar:
+            self._bar.stop()
         summary, counts = self._summary, self._summary.counts
         if counts[LEFT_OUT] and not self._quiet:
             self.say(f"{counts[LEFT_OUT]} images in folders were kept elsewhere and left out")

@@ -35,9 +35,9 @@ class RawImage(SourceImage):
 class RawEntry:
     """Entering with raws: how to make the chain for one, given the settings that it brings.
 
-    ``settings`` lays a configuration and options over settings, ``chain`` makes the chain that is
-    entered at a step. ``start_at`` is the step to enter at, where one was asked for; ``dump`` the
-    geometry of dumps, where it is given.
+    ``settings`` lays a configuration and options over settings and draws for the image, ``chain``
+    makes the chain that is entered at a step. ``start_at`` is the step to enter at, where one was
+    asked for; ``dump`` the geometry of dumps, where it is given.
     """
 
     settings: Callable[[Settings], Settings]
@@ -105,9 +105,10 @@ class RawEntry:
         """The chain for a raw, and what was taken for what it does not say, or says wrongly."""
         brought, found = brought_by(said)
         parameters = dict(brought.parameters)
-        if "white_balance" in found and self.settings(Settings()).parameters.get("white_balance"):
+        own = self.settings(Settings()).drawn("")  # an example, where there is no image yet
+        if "white_balance" in found and own.parameters.get("white_balance"):
             del parameters["white_balance"]  # the user's own, not what stands in for the file's
-        settings = self.settings(replace(brought, parameters=parameters))
+        settings = self.settings(replace(brought, parameters=parameters)).drawn("")
         camera = load_camera(settings.camera)
         low, high = camera.iso_range
         iso = min(max(settings.iso, low), high)

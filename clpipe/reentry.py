@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from clpipe.config import Chain, Settings, Step, base_name, settings_from
@@ -11,15 +11,29 @@ from clpipe.image_io import SourceImage, read_attributes
 from clpipe.registry import all_stages
 from clpipe.stage import Kind
 
+NOISE = "sensor_noise"  # the attribute of an image that says "none", where others have some
+
 
 def attributes_of(step: Step, chain: Chain, image_key: str) -> dict[str, str]:
     """What a kept image says of itself, so that a chain can go on with it."""
+    noisy = step.method.after(step.context).noise is not None
     return {
         "stage": step.name,
         "kind": step.stage.writes.label,
         "image_key": image_key,
         "settings": json.dumps(chain.settings.record()),
+        **({} if noisy else {NOISE: "none"}),
     }
+
+
+def without_noise(chain: Chain) -> Chain:
+    """The chain for an image without sensor noise: it has what the chain's own steps add."""
+    steps: list[Step] = []
+    noise = None
+    for step in chain.steps:
+        steps.append(replace(step, context=replace(step.context, noise=noise)))
+        noise = step.method.after(steps[-1].context).noise
+    return replace(chain, steps=tuple(steps))
 
 
 def carried_settings(attributes: Mapping[str, str]) -> Settings | None:
@@ -71,7 +85,7 @@ class Reentry:
             chain = self.make(carried_settings(attributes))
         except RequestError as error:
             raise ImageError(f"{path}: what it was made with cannot be used: {error}") from None
-        return chain
+        return without_noise(chain) if attributes.get(NOISE) == "none" else chain
 
     def check_kind(self, path: Path, chain: Chain, attributes: Mapping[str, str]) -> None:
         """See that an image is of the kind that the first step reads.

@@ -5,11 +5,12 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from threading import RLock
 from types import ModuleType
 
 import numpy as np
@@ -22,15 +23,17 @@ from clpipe.stages import own_stages
 ARGUMENT_TYPES = (np.float32, np.int32, np.uint32, np.ndarray, Literal)
 ENTRY_POINTS = "clpipe.stages"
 _from_files: dict[Path, Stage] = {}
+_loading = RLock()  # a file is run once, and its name is then taken
 
 
 def all_stages() -> dict[str, Stage]:
     """Every stage by its name: clpipe's own, the default chain first, then the others."""
-    return {
-        **own_stages(),
-        **installed_stages(),
-        **{stage.name: stage for stage in _from_files.values()},
-    }
+    return _all_stages(tuple(_from_files.values()))
+
+
+@lru_cache(maxsize=1)
+def _all_stages(from_files: tuple[Stage, ...]) -> dict[str, Stage]:
+    return {**own_stages(), **installed_stages(), **{stage.name: stage for stage in from_files}}
 
 
 @cache
@@ -55,7 +58,11 @@ def load_stage_file(path: Path) -> Stage:
     Raises:
         RequestError: the file cannot be read or run, defines no stage, or one whose name is taken.
     """
-    where = path.resolve()
+    with _loading:
+        return _loaded_file(path, path.resolve())
+
+
+def _loaded_file(path: Path, where: Path) -> Stage:
     if where not in _from_files:
         spec = spec_from_file_location(f"clpipe_stage_{path.stem}", where)
         if path.suffix != ".py" or spec is None or spec.loader is None:

@@ -10,7 +10,7 @@ from clpipe.codegen import Parameter
 from clpipe.config import Chain, Step
 from clpipe.device import Device, Timing
 from clpipe.errors import ImageError
-from clpipe.plan import Plan, make_plan
+from clpipe.plan import Find, Plan, make_plan, ops_of
 from clpipe.reference.curve import compose, to_8_bit
 from clpipe.reference.random import Stream, stream_of
 from clpipe.registry import blamed
@@ -74,20 +74,33 @@ class Runner:
         self.keep = tuple(keep)
         self.encode = encode
         self.final = final
-        self._plans: dict[tuple[bool, bool], Plan] = {}
         self._arguments = {s.name: s.method.arguments(s.context) for s in chain.steps}
-        self._table8: dict[str, Array] = {}
+        self._own_plans: dict[tuple[bool, bool], Plan] = {}
+        # Those that runners of other chains have made too, by the structure of a chain.
+        self._plans: dict[Any, Plan] = {}
+        self._tables: dict[Any, tuple[Sequence[Array], Array]] = {}
 
     def of(self, chain: Chain) -> "Runner":
-        """The same for another chain, which compiles nothing if only values are different."""
-        return Runner(chain, self.device, self.keep, self.encode, self.final)
+        """The same for another chain.
+
+        Where only values are different, nothing is planned or compiled again.
+        """
+        other = Runner(chain, self.device, self.keep, self.encode, self.final)
+        other._plans, other._tables = self._plans, self._tables
+        return other
 
     def plan(self, half: bool = True, fold: bool = True) -> Plan:
         """The plan for a source of half floats or floats."""
-        key = (half, fold)
-        if key not in self._plans:
-            self._plans[key] = make_plan(self.chain, half, self.keep, self.encode, self.final, fold)
-        return self._plans[key]
+        chain, key = self.chain, (half, fold)
+        if key not in self._own_plans:
+            ops = tuple((s.name, ops_of(s, self._arguments[s.name])) for s in chain.steps)
+            structure = (half, fold, chain.source, chain.result, ops)
+            plan = self._plans.get(structure)
+            if plan is None:
+                plan = make_plan(chain, half, self.keep, self.encode, self.final, fold)
+                self._plans[structure] = plan
+            self._own_plans[key] = plan
+        return self._own_plans[key]
 
     def warm_up(self, half: bool = True) -> None:
         """Compile everything, so that the first image does not wait for it."""
@@ -101,15 +114,18 @@ class Runner:
         image_key: str,
         timings: list[Timing] | None = None,
         download: bool = True,
+        into: Array | None = None,
     ) -> Result:
         """Put one image through.
 
         Args:
             image: (height, width, 3) linear RGB, or (height, width) for a chain that starts on a
-                mosaic; float16 or float32, finite.
+                mosaic; finite, of float16 or any type that fits into float32.
             image_key: what the image's noise is keyed on.
             timings: is given one entry a launch (devices only).
             download: False leaves the results on the device (for measuring).
+            into: where the eight-bit pixels are put (devices only), of their shape; a batch that
+                uses its arrays again spares the time that new memory takes.
 
         Raises:
             ImageError: an image of the wrong shape, or one that does not fit the device.
@@ -125,24 +141,25 @@ class Runner:
             return Result(None, None, {}, {})
         if not self.device:
             return self._run_numpy(np.asarray(image, np.float32), image_key)
-        if image.dtype not in (np.float16, np.float32):
-            image = image.astype(np.float32)
         plan = self.plan(image.dtype == np.float16, fold=min(image.shape[:2]) > 1)
-        keys = {s.name: streams(self.chain, s, image_key) for s in self.chain.steps}
+        keys: dict[str, dict[Owner, Stream]] = {}
 
         def bind(parameter: Parameter) -> Any:
             if parameter.role == "table8":
                 return self._composed(parameter.item)
             if parameter.role == "value":
                 return self._arguments[parameter.step][parameter.item]
+            if parameter.step not in keys:
+                step = self.chain.step_named(parameter.step)
+                keys[parameter.step] = streams(self.chain, step, image_key)
             of = keys[parameter.step]
             if parameter.item == "stage":
                 return np.uint32(of[Owner.IMAGE].stage)
             stream = of[Owner(parameter.item[:-1])]
             return np.uint32(stream.key1 if parameter.item.endswith("1") else stream.key0)
 
-        output = self.device.run(plan, image, bind, timings, download)
-        names = {s.name: [n for p in s.method.passes() for n in p.found] for s in self.chain.steps}
+        output = self.device.run(plan, image, bind, timings, download, into)
+        names = {x.op.step: x.op.pass_.found for x in plan.launches if isinstance(x, Find)}
         return Result(
             final=output.images.get(plan.final.number) if plan.final else None,
             encoded=output.encoded,
@@ -155,15 +172,22 @@ class Runner:
 
     def _composed(self, steps: str) -> Array:
         """The table of these curves and the conversion to eight bits, all in one."""
-        if steps not in self._table8:
-            *first, last = (self._arguments[name]["table"] for name in steps.split(","))
-            assert isinstance(last, np.ndarray)
-            table: Array = to_8_bit(last)
+        curves: list[Array] = []
+        for name in steps.split(","):
+            table = self._arguments[name]["table"]
+            assert isinstance(table, np.ndarray)
+            curves.append(table)
+        # A curve's table is one object for the same parameters; held, its id stays its own.
+        key = tuple(map(id, curves))
+        if key not in self._tables:
+            *first, last = curves
+            composed: Array = to_8_bit(last)
             for curve in reversed(first):
-                assert isinstance(curve, np.ndarray)
-                table = compose(curve, table)
-            self._table8[steps] = table
-        return self._table8[steps]
+                composed = compose(curve, composed)
+            if len(self._tables) >= 32:
+                self._tables.clear()
+            self._tables[key] = curves, composed
+        return self._tables[key][1]
 
     def _run_numpy(self, image: Floats, image_key: str) -> Result:
         kept: dict[str, Floats] = {}

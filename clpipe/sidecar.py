@@ -21,7 +21,8 @@ from clpipe.image_io import Reading, SourceImage, versions, write_beside
 from clpipe.jobs import Job
 from clpipe.raw_entry import RawImage
 from clpipe.run import Result
-from clpipe.target import Shot, Target
+from clpipe.shots import Shot
+from clpipe.target import Target
 
 OWN = "clpipe"  # the key that every sidecar has
 
@@ -139,13 +140,14 @@ def sidecar(
     job: Job,
     stamp: tuple[int, int],
     shot: Shot,
+    frames: int | None,
     device: Device | None,
     source: SourceImage,
     result: Result,
     outputs: Sequence[str],
 ) -> dict[str, Any]:
     """Everything that is needed to make the same files again."""
-    chain = shot.chain
+    chain = shot.whole
     raw = source.said if isinstance(source, RawImage) else None
     noise = chain.noise if not raw or chain.is_noisy else None
     size, modified = stamp
@@ -156,6 +158,9 @@ def sidecar(
         "input_modified": modified,
         "sha256": source.sha256,
         "layer": source.layer,
+        "name": job.stem,
+        "picture": shot.name,
+        "frames": frames,
         "image_key": shot.key,
         "seed": chain.seed,
         "width": source.pixels.shape[1],

@@ -181,6 +181,22 @@ class Method(BaseModel):
         """What is left of this (resolved) method without noise; None where that is nothing."""
         return None if any(each.random for each in self.passes()) else self
 
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
+        """The variance of the noise behind this (resolved) method, from that of the noise before.
+
+        A method that draws random numbers of mean 0 adds theirs; one that scales scales it.
+
+        Args:
+            before: the variance in the image that enters, in its unit squared; float32 of the
+                image's shape, or of shape () where it is the same everywhere. It is not changed.
+            signal: the image that enters, without noise, (height, width[, channel]).
+            context: what is known there.
+
+        Returns:
+            The same of the image that comes out; None where that cannot be said.
+        """
+        return None if self.passes() else before
+
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         """Kernel arguments by name, from the resolved parameters."""
         return {}
@@ -207,6 +223,13 @@ class Unchanged(Method):
         return image
 
 
+class Noiseless(Unchanged):
+    """What is left of a stage that does nothing but add noise, without it."""
+
+    method: ClassVar = "none"
+    summary: ClassVar = "no noise"
+
+
 class Curve(Method):
     """A curve on each channel. Subclasses give its table, see :mod:`clpipe.reference.curve`."""
 
@@ -229,7 +252,8 @@ class Curve(Method):
 class GaussianNoise(Method):
     """Gaussian noise of one sigma; where that is 0, the image stays as it is, at no cost.
 
-    Subclasses say where the sigma comes from, how it is drawn, and what it is in NumPy.
+    Subclasses say where the sigma comes from, how it is drawn, and what it is in NumPy; and where
+    it is not that of an offset, its variance.
     """
 
     method: ClassVar = "gaussian"
@@ -250,6 +274,9 @@ class GaussianNoise(Method):
 
     def passes(self) -> tuple[Pass, ...]:
         return self.draw() if self.sigma else ()
+
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        return before + np.float32(self.sigma) ** 2
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"sigma": np.float32(self.sigma)}

@@ -1,9 +1,9 @@
-"""Where the pictures of a run go: names, formats, bursts."""
+"""Where the pictures of a run go: names and formats."""
 
 import contextlib
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from clpipe.config import Chain
@@ -24,7 +24,9 @@ from clpipe.jobs import Job
 from clpipe.reentry import attributes_of
 from clpipe.reference.curve import to_16_bit
 from clpipe.run import Result, Runner
+from clpipe.shots import MAPS, Burst, Shot
 from clpipe.stage import Kind
+from clpipe.truth import variance_of
 
 
 @dataclass(frozen=True)
@@ -57,71 +59,47 @@ def ending_of(format_: str) -> str:
 
 
 @dataclass(frozen=True)
-class Shot:
-    """One picture of an image: what stands behind the image's name, how it is made, its key."""
-
-    name: str
-    chain: Chain
-    key: str
-
-
-@dataclass(frozen=True)
-class Burst:
-    """How many frames are made of each image; None is one, without anything beside it."""
-
-    frames: int | None = None
-
-    def names(self) -> tuple[str, ...]:
-        """What stands behind the image's name for each picture that is made of it.
-
-        >>> Burst(2).names(), Burst().names()
-        (('.truth', '.frame0', '.frame1'), ('',))
-        """
-        if self.frames is None:
-            return ("",)
-        digits = len(str(self.frames - 1))
-        return (".truth", *(f".frame{i:0{digits}}" for i in range(self.frames)))
-
-    def shots(self, chain: Chain, key: str) -> list[Shot]:
-        """The pictures of an image.
-
-        The first frame is the picture that there is without a burst; the truth has no noise.
-        """
-        first, *others = self.names()
-        if not others:
-            return [Shot(first, chain, key)]
-        frames = [Shot(n, chain, f"{key}#{i}" if i else key) for i, n in enumerate(others)]
-        return [Shot(first, chain.clean(), key), *frames]
-
-
-@dataclass(frozen=True)
 class Target:
     """Where results go, in which formats, how many of each image, and which stages' images too."""
 
     folder: Path
     formats: tuple[str, ...]
-    burst: Burst = Burst()
+    burst: Burst = field(default_factory=Burst)
     keep: tuple[str, ...] = ()
 
     def burst_of(self, job: Job) -> Burst:
         """How many frames are made of a job's image."""
-        return self.burst if job.frames is None else Burst(job.frames)
+        return self.burst if job.frames is None else replace(self.burst, frames=job.frames)
 
-    def runner(self, chain: Chain, device: Device | None) -> Runner:
-        """What makes all that is to be written, and nothing else."""
-        made = [FORMATS[f] for f in self.formats if f != DNG]
-        raw = negative_of(chain).step if DNG in self.formats else None
+    def pictures_of(self, job: Job) -> tuple[str, ...]:
+        """What stands behind the name of each picture that is made of a job's image."""
+        names = self.burst_of(job).names()
+        return tuple(name for name in names if job.pictures is None or name in job.pictures)
+
+    def runner(self, shot: Shot, device: Device | None) -> Runner:
+        """What makes all of a picture that is to be written, and nothing else."""
+        formats = self.formats_of(shot.name)
+        made = [FORMATS[f] for f in formats if f != DNG]
+        raw = negative_of(shot.chain).step if DNG in formats else None
         return Runner(
-            chain,
+            shot.chain,
             device,
-            tuple(dict.fromkeys([*self.kept_of(chain), *([raw] if raw else [])])),
+            tuple(dict.fromkeys([*self.kept_of(shot), *([raw] if raw else [])])),
             encode=any(f.bits == 8 for f in made),
             final=any(f.bits > 8 for f in made),
         )
 
-    def kept_of(self, chain: Chain) -> list[str]:
-        """The steps of a chain whose image is written too."""
-        return [step.name for step in chain.steps if step.name in self.keep]
+    def formats_of(self, name: str) -> tuple[str, ...]:
+        """The formats of the picture of that name, see :meth:`Burst.names`."""
+        return ("exr",) if name in MAPS else self.formats
+
+    def keep_of(self, name: str) -> tuple[str, ...]:
+        """The steps whose image is written beside the picture of that name, if it has them."""
+        return () if name in MAPS else self.keep
+
+    def kept_of(self, shot: Shot) -> list[str]:
+        """The steps of a picture's chain whose image is written too."""
+        return [s.name for s in shot.chain.steps if s.name in self.keep_of(shot.name)]
 
     def check(self, chain: Chain, jobs: Sequence[Job]) -> None:
         """See that the results can be written in these formats, over no input and no other result.
@@ -137,8 +115,8 @@ class Target:
             )
         if DNG in self.formats:
             negative_of(chain)  # refuses a chain without a raw
-        if any(self.burst_of(job).frames for job in jobs):
-            chain.clean()  # refuses a chain in which frames would be the same
+        for burst in {self.burst_of(job) for job in jobs}:
+            burst.shots(chain, "")  # refuses a chain of which there is no truth
         endings: dict[str, str] = {}
         for format_ in self.formats:
             other = endings.setdefault(ending_of(format_), format_)
@@ -151,10 +129,10 @@ class Target:
         inputs = {os.path.realpath(job.path) for job in jobs}
         inside = {path for path in inputs if path.startswith(real_folder + os.sep)}
         makers: dict[str, Job] = {}
-        every = (SIDECAR, *endings, *(f"{step}.exr" for step in self.keep))
         for job in jobs:
-            for name in self.burst_of(job).names():
-                for ending in every:
+            for name in self.pictures_of(job):
+                whole = [ending_of(format_) for format_ in self.formats_of(name)]
+                for ending in (SIDECAR, *whole, *(f"{step}.exr" for step in self.keep_of(name))):
                     path = f"{job.stem}{name}.{ending}"
                     if inside and os.path.realpath(self.folder / path) in inside:
                         raise RequestError(
@@ -200,7 +178,7 @@ class Target:
         """The images of one picture that are there in any case; an image that enters behind a kept
         step has not that one.
         """
-        return [self.path(job, ending_of(format_), name) for format_ in self.formats]
+        return [self.path(job, ending_of(format_), name) for format_ in self.formats_of(name)]
 
     def check_folder(self) -> None:
         """See that the output folder can still be written to.
@@ -228,14 +206,17 @@ class Target:
         mosaic = chain.result in (Kind.RAW, Kind.MOSAIC)
         turn = 1 if mosaic else orientation  # to turn a mosaic would be to change its pattern
         outputs: list[Path] = []
-        for step in (chain.step_named(name) for name in self.kept_of(chain)):
+        for step in (chain.step_named(name) for name in self.kept_of(shot)):
             path = self.path(job, f"{step.name}.exr", shot.name)
             attributes = attributes_of(step, chain, shot.key) | brought
             write_exr(path, result.kept[step.name], step.stage.writes.channels, attributes)
             outputs.append(path)
-        for format_ in self.formats:
+        for format_ in self.formats_of(shot.name):
             path = self.path(job, ending_of(format_), shot.name)
-            if format_ == DNG:
+            if shot.noise:
+                assert result.final is not None
+                write_exr(path, variance_of(shot.noise, result.final), ("Y",), says_variance(shot))
+            elif format_ == DNG:
                 negative = negative_of(chain)
                 raw = result.kept[negative.step] if negative.step else source.pixels
                 write_dng(path, raw, negative, tags, orientation)
@@ -247,6 +228,14 @@ class Target:
 
 
 RESUMABLE = "what is finished is there, and the same command goes on"
+
+
+def says_variance(shot: Shot) -> dict[str, str]:
+    """What a variance map says of itself: what it is, so that it enters nowhere, and how made."""
+    own = attributes_of(shot.noise[-1], shot.whole, shot.key)
+    return {**own, "stage": "variance", "kind": "variance"}
+
+
 ROOM = 8 * 2**20  # bytes; a disk with less is full
 
 

@@ -11,12 +11,15 @@ import tarfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.batch import DONE, FAILED, SKIPPED, Batch, Outcome
+from clpipe.config import Chain
+from clpipe.device import Device
+from clpipe.entrance import Entrance
 from clpipe.errors import ImageError, OutputError, RequestError
 from clpipe.image_io import write_beside
 from clpipe.jobs import Job
@@ -41,11 +44,12 @@ def sample_name(job: Job) -> str:
 
 @dataclass(frozen=True)
 class Tar:
-    """One shard of a run; its jobs are named so that their pictures go into its own folder."""
+    """One shard of a run, which has ``of`` of them; its jobs are named as samples."""
 
     folder: Path
     name: str
     jobs: tuple[Job, ...]
+    of: int
 
     @property
     def path(self) -> Path:
@@ -78,29 +82,19 @@ def cut(jobs: Sequence[Job], count: int, folder: Path) -> list[Tar]:
                 "__NAME__ for its own and skips it; give it another name"
             )
         owners[name] = job
-    samples = list(owners.items())
-    tars = []
-    for number, first in enumerate(range(0, len(samples), count)):
-        file = f"{number:06}.tar"
-        some = samples[first : first + count]
-        own = tuple(replace(job, name=f"{STAGING}{file}/{name}") for name, job in some)
-        tars.append(Tar(folder, file, own))
-    return tars
+    samples = [replace(job, name=name) for name, job in owners.items()]
+    parts = [tuple(samples[first : first + count]) for first in range(0, len(samples), count)]
+    return [Tar(folder, f"{i:06}.tar", part, len(parts)) for i, part in enumerate(parts)]
 
 
-def prepare(folder: Path, tars: Sequence[Tar], total: int, overwrite: bool) -> None:
-    """Clear an output folder of what a killed run left of these tars, and see that they may be
-    written.
-
-    Args:
-        folder: the output folder.
-        tars: those of this run, or of this shard of it.
-        total: how many the whole run has.
-        overwrite: whether tars of others are written over.
+def prepare(tars: Sequence[Tar], overwrite: bool) -> None:
+    """Clear the output folder of what a killed run left of these tars, and see that they may be
+    written; with ``overwrite`` also over tars of others.
 
     Raises:
         RequestError: a tar is somebody else's, or one of a run with more tars.
     """
+    folder, total = tars[0].folder, tars[0].of
     remove_unfinished(folder, [Job(tar.path, tar.name) for tar in tars])
     for path in sorted(folder.iterdir()):
         match = NUMBERED.fullmatch(path.name)
@@ -131,6 +125,17 @@ def is_own(path: Path) -> bool:
     except (OSError, tarfile.TarError, ValueError, TypeError):
         pass
     return False
+
+
+@dataclass(frozen=True)
+class Staged(Target):
+    """The same target, but for each picture in the folder of its tar."""
+
+    folders: Mapping[str, str] = field(default_factory=dict)  # by the stem of a job
+
+    def path(self, job: Job, ending: str, name: str = "") -> Path:
+        """The output of a job with that ending, until it is packed."""
+        return self.folder / self.folders[job.stem] / f"{job.stem}{name}.{ending}"
 
 
 class Members:
@@ -195,9 +200,8 @@ class _Shard:
 
     def shown(self, outcome: Outcome) -> Outcome:
         """An outcome as it is told: with the tar in place of the folder."""
-        before, after = self._tar.staging.name + "/", self._tar.name + "/"
-        job = replace(outcome.job, name=outcome.job.stem.replace(before, after, 1))
-        outputs = tuple(file.replace(before, after, 1) for file in outcome.outputs)
+        job = replace(outcome.job, name=f"{self._tar.name}/{outcome.job.stem}")
+        outputs = tuple(file.removeprefix(STAGING) for file in outcome.outputs)
         return replace(outcome, job=job, outputs=outputs)
 
     def add(self, outcome: Outcome) -> bool:
@@ -232,7 +236,7 @@ class _Shard:
         for job in self._tar.jobs:
             if self._statuses[job.stem] not in (DONE, SKIPPED):
                 continue
-            for name in self._target.burst_of(job).names():
+            for name in self._target.pictures_of(job):
                 member = self._member(job, name)
                 if files := self._from_before.get(member):
                     for file in (*files, member):
@@ -266,16 +270,33 @@ class TarBatch(Batch):
     """A run over many images whose pictures are packed into tars.
 
     Args:
-        tars: which.
-        given: as for :class:`~clpipe.batch.Batch`.
+        tars: which; what a killed run left of them is cleared away.
+        entrance, target, devices, chain, threads, overwrite, trace: as for the base.
+
+    Raises:
+        RequestError: as :func:`prepare`.
     """
 
-    def __init__(self, tars: Sequence[Tar], *given: Any) -> None:
-        super().__init__(*given)
-        self._shards = {tar.staging.name: _Shard(tar, self._target) for tar in tars}
+    def __init__(
+        self,
+        tars: Sequence[Tar],
+        entrance: Entrance,
+        target: Target,
+        devices: Sequence[Device | None],
+        chain: Chain,
+        threads: int | None = None,
+        overwrite: bool = False,
+        trace: bool = False,
+    ) -> None:
+        folders = {job.stem: tar.staging.name for tar in tars for job in tar.jobs}
+        staged = Staged(**vars(target), folders=folders)
+        super().__init__(entrance, staged, devices, chain, threads, overwrite, trace)
+        prepare(tars, overwrite)
+        self._folders = folders
+        self._shards = {tar.staging.name: _Shard(tar, staged) for tar in tars}
 
     def _shard_of(self, job: Job) -> _Shard:
-        return self._shards[job.stem.partition("/")[0]]
+        return self._shards[self._folders[job.stem]]
 
     def is_there(self, job: Job, name: str, wanted: Mapping[str, Any]) -> bool:
         """Whether a picture is there already, in its tar or in the folder that will be one."""
@@ -298,6 +319,6 @@ class TarBatch(Batch):
                     if packing:
                         packing.result()
                     packing = packer.submit(shard.pack)
-                    self._shards.pop(outcome.job.stem.partition("/")[0])
+                    del self._shards[self._folders[outcome.job.stem]]
             if packing:
                 packing.result()

@@ -293,6 +293,72 @@ def test_the_folder_has_gone(clpipe, renders, monkeypatch):
     assert {"r000.jpg", "r000.json", "r002.jpg"} <= set(written(Path("elsewhere")))
 
 
+def test_a_manifest_and_draws(clpipe, renders):
+    renders(2)
+    Path("in/list.csv").write_text(
+        "path,name,iso,seed,frames,sensor_noise.a\n"
+        "r000.exr,a/low.0001,400,,,\n"
+        "r000.exr,a/high,12800,3,,\n"
+        'r001.exr,,,,2,"{uniform = [1e-4, 1e-3]}"\n'
+    )
+    clpipe("run", "in/list.csv", *RUN)
+    burst = [f"r001.{n}" for n in ("truth", "frame0", "frame1")]
+    names = [f"{n}.{e}" for n in ("a/low.0001", "a/high", *burst) for e in ("jpg", "json")]
+    assert written(Path("out")) == sorted(names)
+    low, high, one, two = (
+        json.loads(Path(f"out/{n}.json").read_text())
+        for n in ("a/low.0001", "a/high", "r001.frame0", "r001.frame1")
+    )
+    assert (low["iso"], low["image_key"], high["iso"], high["seed"]) == (
+        400,
+        "a/low.0001",
+        12800,
+        3,
+    )
+    assert one["iso"] == 3200 and one["image_key"] == "r001.exr"
+    assert 1e-4 < one["noise"]["signal"]["a"] == two["noise"]["signal"]["a"] < 1e-3
+    whole = contents("out")
+    lines = Path("in/list.csv").read_text().splitlines()
+    Path("in/list.csv").write_text("\n".join([lines[0], *reversed(lines[1:])]))
+    clpipe("run", "in/list.csv", *RUN)
+    assert set(statuses("out").values()) == {"skipped"}
+    clpipe("run", "in/list.csv", *RUN, "--overwrite", "--jobs", 1)
+    assert contents("out") == whole
+    Path("in/list.csv").write_text("\n".join(lines).replace("12800", "6400"))
+    clpipe("run", "in/list.csv", *RUN)
+    assert statuses("out") == {"a/low.0001": "skipped", "a/high": "done", "r001.exr": "skipped"}
+
+
+def test_what_is_drawn_for_an_image_is_drawn_again_where_it_re_enters(clpipe, renders):
+    renders(3)
+    Path("draws.toml").write_text("iso = { log_uniform = [200, 12800] }\n")
+    draws = ("-c", "draws.toml", "--format", "png")
+    clpipe("run", "in", "-o", "out", *draws, "--keep", "demosaic")
+    isos = [json.loads(Path(f"out/r00{i}.json").read_text())["iso"] for i in range(3)]
+    assert len(set(isos)) == 3
+    clpipe("run", "out", "-o", "again", *draws, "--start-at", "denoise")
+    for i in range(3):
+        one, two = Path(f"out/r00{i}.png"), Path(f"again/r00{i}.demosaic.png")
+        assert one.read_bytes() == two.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("file,iso\nr000.exr,100\n", "there is no column 'path'"),
+        ("path,iso\nr000.exr,fast\n", "row 2: iso: found 'fast'"),
+        ("path,denoise.a\nr000.exr,1\n", "unknown parameter of denoise 'a'"),
+        ("path,name\nr000.exr,../up\n", "row 2: name: found '../up'"),
+        ("path\nr000.exr\nr000.exr\n", "row 3: it would make the same outputs as row 2"),
+    ],
+)
+def test_a_wrong_manifest_writes_nothing(clpipe, renders, text, message):
+    renders(1)
+    Path("in/list.csv").write_text(text)
+    assert message in clpipe("run", "in/list.csv", *RUN, status=2).stderr
+    assert not Path("out").exists()
+
+
 @pytest.mark.parametrize("text", ["0/3", "4/3", "1", "1/", "a/b", "1/0", "-1/3", "1.0/3"])
 def test_a_wrong_shard(text):
     with pytest.raises(RequestError, match="expected I/N"):
@@ -358,3 +424,43 @@ def test_killed_and_resumed_again_and_again(clpipe, renders, tmp_path):
                 assert finished.setdefault(name, at) == at, f"{name} was made again"
     clpipe("run", "in", *RUN)
     assert contents("out") == contents("whole")
+
+
+def test_a_sidecar_makes_its_picture_again(clpipe, renders):
+    renders(2)
+    Path("draws.toml").write_text("iso = { log_uniform = [200, 12800] }\n")
+    Path("in/list.csv").write_text("path,name,frames,seed\nr000.exr,a/x.1,3,5\nr001.exr,,,\n")
+    options = ("--truth", "variance", "--keep", "normalize", "--format", "png", "--format", "dng")
+    clpipe("run", "in/list.csv", "-o", "out", "-c", "draws.toml", *options)
+    whole = contents("out")
+    for name in (n for n in whole if n.endswith(".json")):
+        clpipe("run", "--replay", f"out/{name}", "-o", "again")
+    assert contents("again") == whole
+    clpipe("run", "--replay", "out/r001.json", "-o", "again")
+    assert set(statuses("again").values()) == {"skipped"}
+
+
+def test_a_sidecar_whose_picture_cannot_be_the_same(clpipe, renders, monkeypatch):
+    Path("mine.toml").write_text((ROOT / "clpipe/cameras/sony-a7r2.toml").read_text())
+    clpipe("run", renders(2), *RUN, "--camera", "mine.toml")
+
+    def refused(*more):
+        return clpipe("run", "--replay", "out/r000.json", "-o", "b", *more, status=2).stderr
+
+    assert "--iso: the sidecar says it" in refused("--iso", 100)
+    assert "it has one input; found 2" in refused("a.exr", "b.exr")
+    Path("in/r000.exr").rename("moved.exr")
+    assert "in/r000.exr: cannot be read" in refused()
+    assert "in/r001.exr: has changed since" in refused("in/r001.exr")
+    clpipe("run", "--replay", "out/r000.json", "moved.exr", "-o", "b")
+    assert Path("b/r000.jpg").read_bytes() == Path("out/r000.jpg").read_bytes()
+    Path("mine.toml").write_text(Path("mine.toml").read_text() + "\n")
+    assert "mine.toml: has changed since" in refused("moved.exr")
+    monkeypatch.setattr(sidecar.clpipe, "__version__", "9.9.9")
+    assert "it is of clpipe 0" in refused("moved.exr")
+    assert (
+        "clpipe did not write" in clpipe("run", "--replay", "mine.toml", "-o", "b", status=2).stderr
+    )
+    Path("half.json").write_text('{"clpipe": "9.9.9", "asked": {}}')
+    assert "it is damaged" in clpipe("run", "--replay", "half.json", "-o", "b", status=2).stderr
+    assert "no such file" in clpipe("run", "--replay", "no.json", "-o", "b", status=2).stderr

@@ -14,7 +14,7 @@ from clpipe.cli import main
 from clpipe.config import load_settings, make_chain
 from clpipe.device import Device
 from clpipe.registry import load_stage_file
-from tests.conftest import ROOT, STILL_LIFE
+from tests.conftest import ROOT, STILL_LIFE, written
 
 TEXT = (ROOT / "CONTRIBUTING.md").read_text()
 
@@ -82,7 +82,7 @@ def test_every_file_it_names_is_there():
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md"])
 def test_every_link_leads_somewhere(name):
     for target in re.findall(r"\]\(([^)#]+)\)", (ROOT / name).read_text()):
-        assert (ROOT / target).exists(), target
+        assert target.startswith("https://") or (ROOT / target).exists(), target
 
 
 def test_the_configurations_in_the_readme_are_valid(tmp_path):
@@ -92,7 +92,18 @@ def test_the_configurations_in_the_readme_are_valid(tmp_path):
         if "[[gain_stages]]" not in text:
             path.write_text(text)
             chains.append(make_chain(load_settings(str(path))))
-    output, whole = chains
+    output, whole, drawn = chains
     assert output.settings.output.focal_length == 35
     assert whole.iso == 1600
     assert "row_noise" not in [step.name for step in whole.steps]
+    assert {"iso", "sensor_noise.b"} < set(drawn.draws)
+
+
+def test_the_manifest_in_the_readme(clpipe, tmp_path):
+    (table,) = re.findall(r"```csv\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    (tmp_path / "frames.csv").write_text(table)
+    (tmp_path / "render.exr").symlink_to(STILL_LIFE)
+    clpipe("run", "frames.csv", "-o", "out")
+    burst = [f"high.{name}.jpg" for name in ("frame0", "frame1", "truth")]
+    made = ["drawn.jpg", *burst, "low/frame.0001.jpg"]
+    assert [name for name in written(tmp_path / "out") if name.endswith(".jpg")] == made

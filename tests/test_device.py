@@ -1,15 +1,19 @@
 """The choice of a device, and what one cannot do."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from clpipe.config import make_chain, settings_from
 from clpipe.describe import device_rows
-from clpipe.device import Device, Extent, choose, find_devices
+from clpipe.device import Device, choose, choose_all, find_devices, open_devices
 from clpipe.errors import DeviceError, ImageError
 from clpipe.run import Runner
+from clpipe.tiles import Extent
 
 
 @pytest.fixture
@@ -56,6 +60,64 @@ def test_devices_that_cannot_be_used(devices):
         choose(None, [])
 
 
+def test_several_devices_are_chosen(devices):
+    def names(*selectors):
+        return [f"{d.index}{d.name}" for d in choose_all(selectors, devices)]
+
+    assert names() == ["3fast"]
+    assert names("slow", "3", "FAST", "0") == ["0slow", "3fast"]
+    assert [d.index for d in choose_all((), [devices[0], replace(devices[0], index=1)])] == [0]
+    twin = replace(devices[3], index=4)
+    devices += [twin, replace(twin, index=5, name="other"), replace(twin, index=6, problem="no")]
+    assert names() == ["3fast", "4fast"]
+    with pytest.raises(DeviceError, match="unknown device 'x'"):
+        names("slow", "x")
+
+
+def test_devices_are_opened():
+    assert open_devices(["numpy"]) == []
+    with pytest.raises(DeviceError, match="found devices pocl, NumPy; numpy is used alone"):
+        open_devices(["pocl", "NumPy"])
+    (one,) = open_devices(["0", "0"], memory=2**30)
+    assert one.memory == 2**30
+
+
+def test_devices_run_at_the_same_time(device):
+    images = [np.full((40 + 3 * i, 50, 3), 0.1 * i, np.float16) for i in range(8)]
+    alone = Runner(make_chain(settings_from({})), device)
+    expected = [alone.run(image, f"{i}").encoded for i, image in enumerate(images)]
+
+    def work(_):
+        with_all = Runner(alone.chain, Device(device.info))  # which compiles at the same time, too
+        return [with_all.run(image, f"{i}").encoded for i, image in enumerate(images)]
+
+    with ThreadPoolExecutor(3) as threads:
+        for results in threads.map(work, range(3)):
+            assert all(np.array_equal(a, b) for a, b in zip(results, expected, strict=True))
+
+
+def test_timings_are_those_of_a_trace(device):
+    runner = Runner(make_chain(settings_from({"iso": 3200})), device)
+    image = np.full((64, 80, 3), 0.5, np.float16)
+    runner.run(image, "k")
+    timings = []
+    start = time.perf_counter()
+    runner.run(image, "k", timings)
+    end = time.perf_counter()
+    names = [t.name for t in timings]
+    launches = [launch.name for launch in runner.plan().launches]
+    assert [t.name for t in timings if not t.transfer] == launches
+    assert names[0] == "upload"
+    assert names[-1] == "download"
+    assert all(t.transfer for t in timings if t.name in ("upload", "download"))
+    for one, two in pairwise(timings):
+        assert two.start >= one.start + one.seconds - 1e-5
+    # The device's clock is taken to stand at the end of the last one when the queue is empty.
+    assert start - 1e-2 < timings[0].start <= timings[-1].start + timings[-1].seconds <= end
+    runner.run(image, "k", none := [], download=False)
+    assert [t.name for t in none] == launches
+
+
 def test_why_devices_are_passed_over(devices):
     status = [row["status"] for row in device_rows(devices)]
     assert status == [
@@ -74,23 +136,14 @@ def test_a_missing_linker_is_a_problem_of_pocl(monkeypatch):
             assert "no 'ld' on the PATH" in found.problem
 
 
-def test_an_image_too_large_for_the_device_fails_alone(device):
-    tiny = Device(replace(device.info, memory=1000))
-    runner = Runner(make_chain(settings_from({})), tiny)
-    with pytest.raises(
-        ImageError, match=r"64x64 pixels need .* MiB on the device, which has 0 MiB"
-    ):
-        runner.run(np.zeros((64, 64, 3), np.float32), "k")
-
-
 def test_after_an_image_that_is_too_large_the_next_one_works(device):
-    small = Device(replace(device.info, max_buffer=200_000))
+    small = Device(device.info, memory=100_000)
     runner = Runner(make_chain(settings_from({})), small)
     image = np.full((20, 30, 3), 0.5, np.float16)
     expected = runner.run(image, "k").encoded
     for _ in range(2):
-        with pytest.raises(ImageError, match="is too large for it"):
-            runner.run(np.zeros((300, 300, 3), np.float16), "k")
+        with pytest.raises(ImageError, match="allowed are 97"):
+            runner.run(np.zeros((1, 30000, 3), np.float16), "k")
     assert np.array_equal(runner.run(image, "k").encoded, expected)
 
 
@@ -110,12 +163,68 @@ def test_a_second_run_compiles_nothing(device, monkeypatch):
     Runner(changed, fresh).run(image, "k")
 
 
+def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
+    fresh = Device(device.info)
+    runner = Runner(make_chain(settings_from({})), fresh)
+    made = []
+    make = fresh._pool._make
+    monkeypatch.setattr(fresh._pool, "_make", lambda size: made.append(size) or make(size))
+    images = [
+        np.full((h, w, 3), 0.4, np.float16) for h, w in ((60, 50), (20, 90), (7, 8), (60, 50))
+    ]
+    alone = [Runner(runner.chain, device).run(image, "k").encoded for image in images]
+    assert [runner.run(image, "k").encoded.tobytes() for image in images] == [
+        pixels.tobytes() for pixels in alone
+    ]
+    most = max(made)
+    assert len(made) == len(fresh._pool.held) + 1  # a line table, for the width of the second one
+    # What is held for others goes when it would take more than is allowed.
+    fresh.memory = fresh.bytes_held
+    other = Runner(make_chain(settings_from({"stages": ["exposure", "gamma"]})), fresh, final=True)
+    other.run(np.zeros((90, 100, 3), np.float16), "k")
+    assert fresh.bytes_held <= fresh.memory
+    fresh.memory = 8 * most
+    runner.run(images[0], "k")
+    other.run(images[0], "k")
+    assert len(fresh._pool.held) > 4
+
+
+def test_pixels_into_an_array_that_is_there(device):
+    runner = Runner(make_chain(settings_from({})), device)
+    image = np.full((20, 30, 3), 0.5, np.float16)
+    room = np.empty((20, 30, 3), np.uint8)
+    result = runner.run(image, "k", into=room)
+    assert result.encoded is room
+    assert np.array_equal(room, runner.run(image, "k").encoded)
+    with pytest.raises(ValueError, match=r"into is \(20, 30\)"):
+        runner.run(image, "k", into=room[..., 0])
+
+
 @pytest.mark.parametrize("lanes", [1, 8, 16])
 @pytest.mark.parametrize("width", [1, 7, 8, 1000, 1008])
 def test_extents(lanes, width):
-    extent = Extent(width, 5, lanes, 3)
-    assert extent.rows == 8
-    assert extent.columns >= width
-    assert extent.columns % lanes == 0
-    assert extent.pitch >= extent.columns + 6
+    extent = Extent.whole(width, 5, lanes, 3)
+    assert extent.padded_height == 8
+    assert extent.padded_width >= width
+    assert extent.padded_width % lanes == 0
+    assert extent.pitch >= extent.padded_width + 6
     assert extent.pitch % 1024
+
+
+def test_another_chain_of_the_same_structure_is_not_planned_again(device, monkeypatch):
+    runner = Runner(make_chain(settings_from({})), device)
+    image = np.full((20, 30, 3), 0.5, np.float16)
+    runner.run(image, "k")
+    values = {"iso": 3200, "exposure": {"ev": 1}, "seed": 4, "gamma": {"exponent": 1.8}}
+    changed = make_chain(settings_from(values))
+    alone = Runner(changed, device).run(image, "k").encoded
+    other = make_chain(settings_from({"mosaic": {"pattern": "BGGR"}}))
+    assert runner.of(other).plan() is not runner.plan()
+    assert runner.of(changed).plan(fold=False) is not runner.plan()
+
+    def plan_again(*_):
+        raise AssertionError("planned again")
+
+    monkeypatch.setattr("clpipe.run.make_plan", plan_again)
+    assert np.array_equal(runner.of(changed).run(image, "k").encoded, alone)
+    assert np.array_equal(runner.of(changed).run(image, "k").encoded, alone)

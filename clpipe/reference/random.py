@@ -2,6 +2,7 @@
 
 import zlib
 from dataclasses import dataclass
+from functools import lru_cache
 from hashlib import blake2b
 
 import numpy as np
@@ -46,11 +47,13 @@ def stream_of(owner: str, stage: str) -> Stream:
     ``owner`` names what the noise belongs to (seed and image key, or the camera id); the key is
     its 64-bit BLAKE2b hash. ``stage`` is the stage's name in the chain.
     """
+    return Stream(*_key_of(owner), zlib.crc32(stage.encode()))
+
+
+@lru_cache(maxsize=64)
+def _key_of(owner: str) -> tuple[int, int]:
     digest = blake2b(owner.encode(), digest_size=8).digest()
-    low, high = digest[:4], digest[4:]
-    return Stream(
-        int.from_bytes(low, "little"), int.from_bytes(high, "little"), zlib.crc32(stage.encode())
-    )
+    return int.from_bytes(digest[:4], "little"), int.from_bytes(digest[4:], "little")
 
 
 def philox(c0: Words, c1: Words, c2: Words, c3: Words, stream: Stream) -> tuple[Words, ...]:

@@ -83,6 +83,10 @@ class Random(Method):
             "hot_level": np.float32(self.hot_level),
         }
 
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        """A few pixels that are wrong are no noise of all the others: they are left out."""
+        return before
+
     def reference(self, image: Floats, frame: Frame) -> Floats:
         hot_limit, dead_limit = self._limits()
         words = word_at(image.shape, 0, frame.stream[Owner.CAMERA])

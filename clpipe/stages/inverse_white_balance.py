@@ -46,6 +46,11 @@ class Gains(Method):
         red, blue = np.float32(1 / self.red_gain), np.float32(1 / self.blue_gain)
         return {"pattern": context.cfa, "red": red, "blue": blue}
 
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        assert self.red_gain is not None and self.blue_gain is not None
+        red, blue = np.float32(self.red_gain**-2), np.float32(self.blue_gain**-2)
+        return before * by_site(signal.shape[:2], context.pattern, red, np.float32(1), blue)
+
     def reference(self, image: Floats, frame: Frame) -> Floats:
         assert self.red_gain is not None and self.blue_gain is not None
         red, blue = np.float32(1 / self.red_gain), np.float32(1 / self.blue_gain)

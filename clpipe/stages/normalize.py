@@ -64,6 +64,10 @@ class Linear(Method):
         scale = np.float32(1 / (self.white_level - self.black_level))
         return {"black_level": np.float32(self.black_level), "scale": scale}
 
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        assert self.black_level is not None and self.white_level is not None
+        return before * np.float32((self.white_level - self.black_level) ** -2)
+
     def reference(self, image: Floats, frame: Frame) -> Floats:
         assert self.black_level is not None and self.white_level is not None
         scale = np.float32(1 / (self.white_level - self.black_level))

@@ -36,6 +36,9 @@ class Gaussian(GaussianNoise):
     def draw(self) -> tuple[Pass, ...]:
         return (Pass("prnu", arguments=("sigma",), random=Owner.CAMERA),)
 
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        return (signal * signal + before) * np.float32(self.sigma) ** 2 + before
+
     def reference(self, image: Floats, frame: Frame) -> Floats:
         normals = normal_at(image.shape, 0, frame.stream[Owner.CAMERA])
         return image * (normals * np.float32(self.sigma) + np.float32(1))

@@ -77,6 +77,10 @@ class Linear(Method):
             "white_level": np.float32(self.white_level),
         }
 
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        """Rounding adds 1/12 DN^2; clipping, which takes some away, is not modelled."""
+        return before * np.float32(self._range**2) + np.float32(1 / 12)
+
     def reference(self, image: Floats, frame: Frame) -> Floats:
         dn = np.rint(image * np.float32(self._range) + np.float32(self.black_level))
         return np.minimum(np.maximum(dn, np.float32(0)), np.float32(self.white_level))

@@ -159,6 +159,15 @@ class SensorNoise(Method):
         """
         return self.full_well * self.a if self.full_well and self.a else None
 
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        """a*y + b, y from 0 to the full well (of which it is not modelled that it cuts noise)."""
+        return self.added(np.maximum(signal, np.float32(0))) + before
+
+    def added(self, signal: Floats) -> Floats:
+        """The variance of this noise, a*y + b, y at most the full well."""
+        y = np.minimum(signal, np.float32(_or(self.full_signal, NEVER_FULL)))
+        return y * np.float32(self.a) + np.float32(self.b)
+
     def values(self) -> dict[str, np.float32]:
         """The kernel's arguments, by name."""
         raise NotImplementedError(type(self).__name__)
@@ -203,6 +212,11 @@ class Gaussian(SensorNoise):
             return (Pass("sensor_noise", arguments=("a", "b", "full_well"), random=Owner.IMAGE),)
         names = ("a", "full_well", "read_noise", "shape", "scale")
         return (Pass("sensor_noise_tukey", arguments=names, random=Owner.IMAGE),)
+
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        if self.tukey_lambda is None:  # below 0 it goes on to fall
+            return np.maximum(self.added(signal), np.float32(0)) + before
+        return super().variance(before, signal, context)
 
     def values(self) -> dict[str, np.float32]:
         full = np.float32(_or(self.full_signal, NEVER_FULL))
@@ -308,6 +322,9 @@ class NoNoise(Method):
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"full_signal": np.float32(_or(self.full_signal, NEVER_FULL))}
+
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        return before
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
         return np.minimum(image, np.float32(_or(self.full_signal, NEVER_FULL)))

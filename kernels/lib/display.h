@@ -19,10 +19,11 @@ INLINE uint level(const levels *v, const int *channel, int k) {
 }
 
 INLINE void store_levels(const levels *v, __global uchar *dst, site at, extent e) {
-    if (at.y >= e.height) return;
-    __global uchar *p = dst + 3 * ((size_t)at.y * e.width + at.x);
+    const uint x = at.x - e.left;
+    if (at.y - e.top >= e.rows) return;
+    __global uchar *p = dst + 3 * pixel_number(at, e);
 #if LANES > 1
-    if (at.x + LANES <= e.width) {
+    if (x + LANES <= e.columns) {
         // Whole words: a store for each byte is what takes the time.
         typedef uint unaligned_uint __attribute__((aligned(1)));
         __global unaligned_uint *word = (__global unaligned_uint *)p;
@@ -38,7 +39,7 @@ INLINE void store_levels(const levels *v, __global uchar *dst, site at, extent e
         return;
     }
 #endif
-    for (int k = 0; k < LANES && at.x + k < e.width; ++k) {
+    for (int k = 0; k < LANES && x + k < e.columns; ++k) {
         p[3 * k] = (uchar)level(v, v->r, k);
         p[3 * k + 1] = (uchar)level(v, v->g, k);
         p[3 * k + 2] = (uchar)level(v, v->b, k);
@@ -68,9 +69,9 @@ INLINE void encode_rgb_by_table(rgb c, __global const uchar *table, __global uch
 INLINE void encode_mosaic(vf v, __global uchar *dst, site at, extent e) {
     int value[LANES];
     spill_int(to_8_bit(v), value);
-    if (at.y >= e.height) return;
-    __global uchar *p = dst + (size_t)at.y * e.width + at.x;
-    for (uint k = 0; k < LANES && at.x + k < e.width; ++k) p[k] = (uchar)value[k];
+    if (at.y - e.top >= e.rows) return;
+    __global uchar *p = dst + pixel_number(at, e);
+    for (uint k = 0; k < LANES && at.x - e.left + k < e.columns; ++k) p[k] = (uchar)value[k];
 }
 
 #endif

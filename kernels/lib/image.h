@@ -12,9 +12,18 @@ typedef struct {
     vi odd;     // -1 in the lanes whose column is odd, else 0
 } site;
 
+// What is stored is the whole image or a tile of it with its halo: a site is a place in the image, and
+// `left`, `top` is where the planes begin in it. A tile has an apron too; at edges that are none of
+// the image it mirrors what nobody uses, because the halo is wide enough.
 typedef struct {
-    uint width, height, pitch;
+    uint width, height;  // of the image
+    uint pitch;
+    uint left, top;      // of the planes, in the image; in whole blocks
+    uint columns, rows;  // of the planes
 } extent;
+
+// The pixels that a tile is there for, without its halo.
+typedef struct { uint left, top, right, bottom; } core;
 
 typedef struct { vf r, g, b; } rgb;
 typedef struct { vf y, cb, cr; } ycbcr;
@@ -41,15 +50,25 @@ INLINE site shifted(site at, int dx, int dy) {
     return to;
 }
 
-INLINE size_t plane_offset(site at, uint pitch) {
-    return (size_t)(at.y + APRON) * pitch + APRON_LEFT + at.x;
+// In what has no apron and no padding: source and result.
+INLINE size_t pixel_number(site at, extent e) {
+    return (size_t)(at.y - e.top) * e.columns + (at.x - e.left);
+}
+
+INLINE size_t plane_offset(site at, extent e) {
+    return (size_t)(at.y - e.top + APRON) * e.pitch + APRON_LEFT + (at.x - e.left);
+}
+
+// Where the image's first pixel would be, so that its pixels can be found by their places in it.
+INLINE __global const float *image_origin(__global const float *plane, extent e) {
+    return plane + ((long)APRON - (long)e.top) * (long)e.pitch + APRON_LEFT - (long)e.left;
 }
 
 INLINE image image_at(__global const float *p0, __global const float *p1, __global const float *p2,
-                      uint pitch, site first, uint row) {
-    const size_t offset = plane_offset(first, pitch);
+                      extent e, site first, uint row) {
+    const size_t offset = plane_offset(first, e);
     const site at = {first.x, first.y + row, first.odd};
-    const image i = {p0 + offset, p1 + offset, p2 + offset, pitch, (int)row, at};
+    const image i = {p0 + offset, p1 + offset, p2 + offset, e.pitch, (int)row, at};
     return i;
 }
 
@@ -100,27 +119,28 @@ static void store_row(vf v, __global float *row, int x, int width) {
     for (int k = 0; k < LANES && x + k < width; ++k) store_lane(lanes[k], row, x + k, width);
 }
 
+// `x` and `y` are counted from where the planes begin.
 static void store_at_edge(vf v, __global float *dst, int x, int y, extent e) {
-    const int height = (int)e.height;
+    const int columns = (int)e.columns, rows = (int)e.rows;
     __global float *origin = dst + (size_t)APRON * e.pitch + APRON_LEFT;
-    store_row(v, origin + (long)y * e.pitch, x, (int)e.width);
+    store_row(v, origin + (long)y * e.pitch, x, columns);
     for (int a = 1; a <= APRON; ++a) {
-        if (mirror(-a, height) == y) store_row(v, origin - (long)a * e.pitch, x, (int)e.width);
-        if (mirror(height - 1 + a, height) == y)
-            store_row(v, origin + (long)(height - 1 + a) * e.pitch, x, (int)e.width);
+        if (mirror(-a, rows) == y) store_row(v, origin - (long)a * e.pitch, x, columns);
+        if (mirror(rows - 1 + a, rows) == y)
+            store_row(v, origin + (long)(rows - 1 + a) * e.pitch, x, columns);
     }
 }
 
-INLINE bool near_edge(site at, extent e) {
-    return at.x <= APRON || at.x + LANES + APRON >= e.width || at.y <= APRON ||
-           at.y + 1 + APRON >= e.height;
+INLINE bool near_edge(uint x, uint y, extent e) {
+    return x <= APRON || x + LANES + APRON >= e.columns || y <= APRON || y + 1 + APRON >= e.rows;
 }
 
 INLINE void store_plane(vf v, __global float *dst, site at, extent e) {
-    if (near_edge(at, e)) {
-        if (at.y < e.height) store_at_edge(v, dst, (int)at.x, (int)at.y, e);
+    const uint x = at.x - e.left, y = at.y - e.top;
+    if (near_edge(x, y, e)) {
+        if (y < e.rows) store_at_edge(v, dst, (int)x, (int)y, e);
     } else {
-        store(v, dst + plane_offset(at, e.pitch));
+        store(v, dst + plane_offset(at, e));
     }
 }
 

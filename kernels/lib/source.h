@@ -1,5 +1,5 @@
-// Lanes out of an image as a file holds it: interleaved channels, half or float, no padding
-// between rows. The buffer has room for whole blocks beyond its last pixel, so a block at the
+// Lanes out of an image, or a tile of it, as a file holds it: interleaved channels, half or float, no
+// padding between rows. The buffer has room for whole blocks beyond its last pixel, so a block at the
 // right or lower edge may read on; what it reads there is never stored.
 #ifndef CLPIPE_SOURCE_H
 #define CLPIPE_SOURCE_H
@@ -22,25 +22,25 @@
 #endif
 
 INLINE rgb source_rgb_half(__global const half *src, site at, extent e) {
-    __global const half *p = src + 3 * ((size_t)at.y * e.width + at.x);
+    __global const half *p = src + 3 * pixel_number(at, e);
     const vf a = load_half(p), b = load_half(p + LANES), c = load_half(p + 2 * LANES);
     const rgb v = DEINTERLEAVE(a, b, c);
     return v;
 }
 
 INLINE rgb source_rgb_float(__global const float *src, site at, extent e) {
-    __global const float *p = src + 3 * ((size_t)at.y * e.width + at.x);
+    __global const float *p = src + 3 * pixel_number(at, e);
     const vf a = load(p), b = load(p + LANES), c = load(p + 2 * LANES);
     const rgb v = DEINTERLEAVE(a, b, c);
     return v;
 }
 
 INLINE vf source_mosaic_half(__global const half *src, site at, extent e) {
-    return load_half(src + (size_t)at.y * e.width + at.x);
+    return load_half(src + pixel_number(at, e));
 }
 
 INLINE vf source_mosaic_float(__global const float *src, site at, extent e) {
-    return load(src + (size_t)at.y * e.width + at.x);
+    return load(src + pixel_number(at, e));
 }
 
 #endif

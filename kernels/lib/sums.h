@@ -4,9 +4,10 @@
 #ifndef CLPIPE_SUMS_H
 #define CLPIPE_SUMS_H
 
-INLINE vi only_inside(vi v, site at, extent e) {
-    if (at.y >= e.height) return (vi)(0);
-    return (iota() + (vi)((int)at.x)) < (vi)((int)e.width) ? v : (vi)(0);
+// A tile's core begins with a whole block.
+INLINE vi only_inside(vi v, site at, core c) {
+    if (at.y < c.top || at.y >= c.bottom || at.x < c.left) return (vi)(0);
+    return (iota() + (vi)((int)at.x)) < (vi)((int)c.right) ? v : (vi)(0);
 }
 
 INLINE int2 fold_columns(vi v, site at) {
@@ -22,10 +23,11 @@ INLINE int2 fold_columns(vi v, site at) {
 #endif
 }
 
-// Work item i of n adds up its share of the blocks.
-INLINE void add_up_blocks(__global const int4 *blocks, __global long4 *shares, uint count) {
+// Work item i of n adds up its share of the blocks, on top of those of the tiles before.
+INLINE void add_up_blocks(__global const int4 *blocks, __global long4 *shares, uint count,
+                          uint tile) {
     const uint n = get_global_size(0), i = get_global_id(0);
-    long4 sum = (long4)(0);
+    long4 sum = tile ? shares[i] : (long4)(0);
     for (uint k = i; k < count; k += n) sum += convert_long4(blocks[k]);
     shares[i] = sum;
 }
@@ -36,11 +38,11 @@ INLINE long4 add_up_shares(__global const long4 *shares, uint count) {
     return sum;
 }
 
-// Each work item adds up some of the bins, over all shares.
+// Each work item adds up some of the bins, over all shares, on top of those of the tiles before.
 INLINE void add_up_counts(__global const uint *counts, __global uint *histogram, uint bins,
-                          uint shares) {
+                          uint shares, uint tile) {
     for (uint bin = get_global_id(0); bin < bins; bin += get_global_size(0)) {
-        uint sum = 0;
+        uint sum = tile ? histogram[bin] : 0;
         for (uint share = 0; share < shares; ++share) sum += counts[(size_t)share * bins + bin];
         histogram[bin] = sum;
     }

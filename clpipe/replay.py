@@ -1,0 +1,90 @@
+"""Making a picture again from its sidecar: the same bytes, or a reason why not."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import clpipe
+from clpipe.asked import asked_again
+from clpipe.entrance import Entrance
+from clpipe.errors import ImageError, RequestError
+from clpipe.image_io import Reading
+from clpipe.jobs import Job
+from clpipe.shots import Burst, truth_named
+from clpipe.sidecar import digests, read_sidecar
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What a sidecar says: what was asked for, of which image, and which picture of it."""
+
+    entrance: Entrance
+    job: Job
+    formats: tuple[str, ...]
+    keep: tuple[str, ...]
+    burst: Burst
+
+
+def replay_of(path: Path, inputs: Sequence[Path], max_pixels: int) -> Replay:
+    """What a sidecar says, where it can be done again.
+
+    Args:
+        path: of the sidecar.
+        inputs: where its input is now, or none, where it was.
+        max_pixels: as for :class:`clpipe.image_io.Reading`.
+
+    Raises:
+        RequestError: it is no sidecar, or one of another version, or the input or a file that was
+            used (a camera profile, a curve, a stage) is not there or has changed.
+    """
+    if len(inputs) > 1:
+        raise RequestError(f"{path}: it has one input; found {len(inputs)}")
+    try:
+        found = read_sidecar(path)
+    except FileNotFoundError:
+        raise RequestError(f"{path}: no such file") from None
+    except ImageError:
+        raise RequestError(f"{path}: clpipe did not write this file; a sidecar is wanted") from None
+    if found["clpipe"] != clpipe.__version__:
+        raise RequestError(
+            f"{path}: it is of clpipe {found['clpipe']}, and this is {clpipe.__version__}, which "
+            "may make other bytes; install that version, or run it anew"
+        )
+    try:
+        replay = _replay(found, inputs, max_pixels)
+        files = dict(found["asked"]["files"])
+        digest = str(found["sha256"])
+    except (KeyError, TypeError, ValueError, AttributeError, RequestError) as error:
+        raise RequestError(f"{path}: it is damaged: {error}") from None
+    for name, was in {**files, str(replay.job.path): digest}.items():
+        now = digests([name]).get(name)
+        if now is None:
+            raise RequestError(f"{path}: {name}: cannot be read, and was used")
+        if now != was:
+            raise RequestError(
+                f"{path}: {name}: has changed since (SHA-256 {now[:12]}..., was {was[:12]}...), so "
+                "the picture would be another one"
+            )
+    return replay
+
+
+def _replay(found: dict[str, Any], inputs: Sequence[Path], max_pixels: int) -> Replay:
+    asked, picture = found["asked"], str(found["picture"])
+    own = asked_again(asked)
+    reading = Reading(asked["layer"], max_pixels, asked["transfer"])
+    job = Job(
+        inputs[0] if inputs else Path(found["input"]),
+        own.image_key,
+        str(found["name"]),
+        values=own.row,
+        pictures=(picture,),
+    )
+    truth = truth_named(picture)
+    return Replay(
+        Entrance(own, reading),
+        job,
+        tuple(asked["formats"]),
+        tuple(asked["keep"]),
+        Burst(found["frames"], (truth,) if truth else ()),
+    )

@@ -1,0 +1,375 @@
+"""Manifests: what their rows say, and what is said of a row that is wrong."""
+
+import csv
+import io
+import json
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clpipe.camera import built_in_cameras
+from clpipe.config import load_settings, make_chain, settings_from
+from clpipe.errors import RequestError
+from clpipe.manifest import Row, check_rows, read_manifest
+
+DEFAULT = settings_from({})
+
+
+@pytest.fixture
+def manifest(tmp_path):
+    """Read a manifest with this text."""
+
+    def read(text, name="frames.csv"):
+        path = tmp_path / name
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return read_manifest(path)
+
+    return read
+
+
+@pytest.mark.parametrize("bom", ["", "\ufeff"])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_a_csv(manifest, tmp_path, bom, end):
+    lines = [
+        "path, name,frames,iso,camera,seed,sensor_noise.a,demosaic.method,output.focal_length",
+        "a.exr,,,,,,,,",
+        "",
+        "b/c.0001.exr,view1/c.0001,3, 800 ,canon-5d2,7,1e-4,bilinear,35",
+        '"d, e.exr",,,"{choice = [100, 400]}",,,"{uniform = [1e-4, 2e-4]}",,',
+    ]
+    rows = manifest(bom + end.join(lines))
+    assert rows == [
+        Row(tmp_path / "a.exr", "a.exr", "", {}, None, f"{tmp_path}/frames.csv, row 2"),
+        Row(
+            tmp_path / "b/c.0001.exr",
+            "view1/c.0001",
+            "view1/c.0001",
+            {
+                "iso": 800,
+                "camera": "canon-5d2",
+                "seed": 7,
+                "sensor_noise": {"a": 1e-4},
+                "demosaic": {"method": "bilinear"},
+                "output": {"focal_length": 35},
+            },
+            3,
+            f"{tmp_path}/frames.csv, row 4",
+        ),
+        Row(
+            tmp_path / "d, e.exr",
+            "d, e.exr",
+            "",
+            {"iso": {"choice": [100, 400]}, "sensor_noise": {"a": {"uniform": [1e-4, 2e-4]}}},
+            None,
+            f"{tmp_path}/frames.csv, row 5",
+        ),
+    ]
+    assert [row.stem for row in rows] == ["a", "view1/c.0001", "d, e"]
+
+
+def test_a_jsonl(manifest, tmp_path):
+    lines = [
+        '{"path": "a.exr", "iso": 800, "sensor_noise": {"a": 1e-4, "b": null}, "name": null}',
+        "",
+        '{"path": "b.exr", "name": "b.\u2028x", "sensor_noise.a": 2e-4, "frames": 2}',
+        '{"path": "c.exr", "camera": {"choice": ["sony-a7r2", "canon-5d2"]}}',
+    ]
+    rows = manifest("\r\n".join(lines), "frames.JSONL")
+    assert [row.values for row in rows] == [
+        {"iso": 800, "sensor_noise": {"a": 1e-4}},
+        {"sensor_noise": {"a": 2e-4}},
+        {"camera": {"choice": ["sony-a7r2", "canon-5d2"]}},
+    ]
+    assert [(row.name, row.frames) for row in rows] == [("", None), ("b.\u2028x", 2), ("", None)]
+    assert [row.place[-5:] for row in rows] == ["row 1", "row 3", "row 4"]
+
+
+@pytest.mark.parametrize(
+    ("path", "key"),
+    [
+        ("a.exr", "a.exr"),
+        ("./b/../c/a.exr", "c/a.exr"),
+        ("{folder}/b/a.exr", "b/a.exr"),
+        ("../b/a.exr", "a.exr"),
+        ("/elsewhere/b/a.exr", "a.exr"),
+        ("..a/b.exr", "..a/b.exr"),
+    ],
+)
+def test_the_image_key(manifest, tmp_path, monkeypatch, path, key):
+    (row,) = manifest("path\n" + path.format(folder=tmp_path))
+    assert row.key == key
+    monkeypatch.chdir(tmp_path)
+    (row,) = read_manifest(Path("frames.csv"))
+    assert row.key == key
+    (row,) = manifest("path,name\n" + path.format(folder=tmp_path) + ",x/y")
+    assert row.key == row.stem == "x/y"
+
+
+def test_one_path_with_two_names(manifest):
+    rows = manifest("path,name,iso\na.exr,low,100\na.exr,high,6400")
+    assert rows[0].path == rows[1].path
+    assert [row.key for row in rows] == ["low", "high"]
+
+
+def test_files_are_relative_to_the_manifest(manifest, tmp_path):
+    (tmp_path / "mine.toml").write_text(built_in_cameras()["sony-a7r2"].read_text())
+    (tmp_path / "curve.csv").write_text("0,0\n1,1\n")
+    rows = manifest(
+        "path,camera,tone_curve.path\n"
+        "a.exr,mine.toml,curve.csv\n"
+        'b.exr,"{choice=[""mine.toml"", ""sony-a7r2""]}","{choice=[""curve.csv""]}"\n'
+    )
+    mine, curve = str(tmp_path / "mine.toml"), str(tmp_path / "curve.csv")
+    assert rows[0].values == {"camera": mine, "tone_curve": {"path": curve}}
+    assert rows[1].values == {
+        "camera": {"choice": [mine, "sony-a7r2"]},
+        "tone_curve": {"path": {"choice": [curve]}},
+    }
+    base = settings_from({"tone_curve": {"method": "file"}})
+    one, two = check_rows(rows, base)
+    assert make_chain(one).step_named("tone_curve").method.path == curve
+    assert two.drawn("b").parameters["tone_curve"]["path"] == curve
+
+
+def test_rows_lie_over_settings(manifest):
+    base = load_settings("brooks2019")
+    rows = manifest("path,iso,sensor_noise.a,denoise.method\na.exr,400,1e-3,\nb.exr,,,mean\n")
+    one, two = check_rows(rows, base)
+    assert one.iso == 400
+    assert one.drawn("a").parameters["sensor_noise"]["a"] == 1e-3
+    assert two.parameters["denoise"] == {"method": "mean"}
+    assert two.draws == base.draws
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "frames.csv: it is empty; its first row names columns, such as path"),
+        ("\n\n", "frames.csv: it is empty"),
+        ("path,iso\n", "frames.csv: it has no rows"),
+        (
+            "paht,iso\na.exr,1",
+            r"row 1: there is no column 'path' .did you mean 'paht'..; found: pa",
+        ),
+        ("path;iso\na.exr;1", "no column 'path'.*; columns are separated by commas"),
+        ("path,iso,iso\n", "row 1: there are two columns 'iso'"),
+        ("path,,iso\n", "row 1: column 2 has no name"),
+        ("path,isoo\n", "row 1: unknown column 'isoo' .*mean 'iso'.*, or stage.parameter"),
+        ("path,skip\n", "row 1: unknown column 'skip'"),
+        ("path,mosaic\n", "row 1: mosaic: its parameters have columns of their own: mosaic.NAME"),
+        (
+            "path,sensr_noise.a\n",
+            "row 1: sensr_noise.a: unknown stage 'sensr_noise' .*sensor_noise",
+        ),
+        ("path,sensor_noise.aa\n", "row 1: unknown parameter of sensor_noise 'aa'"),
+        ("path,output.quality\n", "row 1: unknown key of output 'quality' .*jpeg_quality"),
+        ("path,iso\n\na.exr\n", r"row 3: found 1 cells, but there are 2 columns .path, iso."),
+        ("path,iso\na.exr,1,2\n", "row 2: found 3 cells, but there are 2 columns"),
+        ('path,iso\n"a\nb.exr",1\n"c.exr,2', "row 4: not valid CSV: unexpected end of data"),
+        ('path,iso\n"a\nb.exr",1\nc.exr', "row 4: found 1 cells"),
+        ('path\n"a"b\n', "row 2: not valid CSV"),
+        ("path,iso\n,100\n", "row 2: path: found '', which names no image"),
+        ("path\na/\n", "row 2: path: found 'a/', which names no image"),
+        ("path\n..\n", "row 2: path: found '..', which names no image"),
+        ("path\na\0b\n", "row 2: path: found .*no NUL"),
+        (b"path\na.exr\n\xff.exr\n", "frames.csv, line 3: not a text in UTF-8"),
+        ("path,frames\na.exr,0\n", "row 2: frames: found 0, but it is a whole number from 1 on"),
+        ("path,frames\na.exr,2.5\n", "row 2: frames: found 2.5"),
+        ("path,frames\na.exr,true\n", "row 2: frames: found True"),
+        ("path\nx/a.exr\nb.exr\nx/a.exr\n", "row 4: .*same outputs as row 2, x/a; .*called name"),
+        ("path\na.exr\na.hdr\n", "row 3: it would make the same outputs as row 2, a"),
+        (
+            "path,frames\na,0\nb,1\nc,x\nd,-1\n",
+            "row 2: frames: found 0.*; and 2 more rows are wrong",
+        ),
+        ("path,frames\na,0\nb,0\n", "row 2: frames: found 0.*; and 1 more row is wrong"),
+        *(
+            (f"path,name\na.exr,{name}\n", "row 2: name: found .*a path in the output folder")
+            for name in ("/x", "../x", "a/../../x", "a/..", "..", ".", "a//b", "x/", "./x", "a/./b")
+        ),
+    ],
+)
+def test_a_csv_that_is_wrong(manifest, text, message):
+    with pytest.raises(RequestError, match=message):
+        manifest(text)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("{", "row 2: not valid JSON: .* at character 2"),
+        ("[1]", r"row 2: found \[1\], but a row is an object"),
+        ('{"path": "b.exr", "iso": NaN}', "row 2: not valid JSON: found NaN"),
+        ('{"path": "b.exr", "iso": -Infinity}', "row 2: not valid JSON: found -Infinity"),
+        ('{"path": "b.exr", "iso": 1, "iso": 2}', "row 2: 'iso' is there twice"),
+        (
+            '{"path": "b.exr", "exposure": {"ev": 1}, "exposure.ev": 2}',
+            "row 2: 'exposure.ev' is there twice",
+        ),
+        ('{"iso": 100}', "row 2: path: found '', which names no image"),
+        ('{"path": 3}', "row 2: path: found 3, but it is text"),
+        ('{"path": "b.exr", "name": 3}', "row 2: name: found 3, but it is text"),
+        ('{"path": "b.exr", "name": "\\ud800"}', "row 2: name: .*no text in UTF-8"),
+        ('{"path": "b.exr", "name": "a\\u0000"}', "row 2: name: .*no NUL"),
+        ('{"path": "b.exr", "frames": "3"}', "row 2: frames: found '3'"),
+        ('{"path": "b.exr", "isoo": 3}', "row 2: unknown column 'isoo'"),
+        ('{"path": "b.exr", "exposure": 3}', "row 2: exposure: its parameters have columns"),
+        ('{"path": "b.exr", "exposure": {"e": 3}}', "row 2: unknown parameter of exposure 'e'"),
+        ('{"path": "b.exr", "skip": ["denoise"]}', "row 2: unknown column 'skip'"),
+        ('{"path": "b.exr", "iso": ' + "[" * 100_000, "row 2: not valid JSON"),
+        ('{"path": "b.exr", "iso": ' + "1" * 5000 + "}", "row 2: not valid JSON"),
+    ],
+)
+def test_a_jsonl_that_is_wrong(manifest, line, message):
+    with pytest.raises(RequestError, match=message):
+        manifest('{"path": "a.exr"}\n' + line, "frames.jsonl")
+
+
+def test_a_manifest_that_is_not_there(tmp_path):
+    with pytest.raises(RequestError, match=r"no.csv: cannot read this manifest: No such file"):
+        read_manifest(tmp_path / "no.csv")
+    with pytest.raises(RequestError, match="cannot read this manifest: Is a directory"):
+        read_manifest(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("cells", "message"),
+    [
+        ("iso\nhigh", "row 2: iso: found 'high', but it is a number"),
+        ("iso\nNaN", "row 2: iso: found 'NaN', but it is a number"),
+        ("iso\nnan", "row 2: iso: found nan, but camera sony-a7r2"),
+        ("iso\n50", "row 2: iso: found 50, but camera sony-a7r2 goes from 100 to 25600"),
+        ("iso\n1" + "0" * 400, "row 2: iso: found 10+, but it is at most"),
+        ("iso\n" + "1" * 5000, "row 2: iso: found '1+', but it is a number"),
+        ("iso\n" + "[" * 5000, "row 2: iso: found .*but it is a number"),
+        ("seed\n1.5", "row 2: seed: found 1.5, but it is a whole number"),
+        ('seed\n"{choice=[1, 2]}"', "row 2: seed: found .*cannot be drawn"),
+        ("camera\nsony-a7r3", "row 2: unknown camera 'sony-a7r3' .*mean 'sony-a7r2'"),
+        ("camera\n7", "row 2: camera: found 7, but it is text"),
+        ("camera\nno.toml", "row 2: .*/no.toml: cannot read this camera profile"),
+        ("sensor_noise.a\nmuch", "row 2: sensor_noise.a: found 'much': .*number"),
+        ("sensor_noise.a\nnan", "row 2: sensor_noise.a: found nan: .*finite"),
+        ("sensor_noise.a\n2", "row 2: sensor_noise.a: found 2.*less than or equal to 1"),
+        ("sensor_noise.a\n1" + "0" * 400, "row 2: sensor_noise.a: found 10+.*"),
+        ('sensor_noise.a\n"{uniform=[0,2]}"', "row 2: sensor_noise.a: found 2.*less than"),
+        ("demosaic.method\nbiliner", "row 2: demosaic.method: unknown method .*'bilinear'"),
+        ("picture_noise.sigma\n0.1", "row 2: unknown parameter of picture_noise .none. 'sigma'"),
+        ("mosaic_denoise.size\n5", "row 2: unknown stage in this chain 'mosaic_denoise'"),
+        ("denoise_2.luma_size\n5", "row 2: unknown stage in this chain 'denoise_2'"),
+    ],
+)
+def test_a_row_whose_values_are_wrong(manifest, cells, message):
+    header, cell = cells.split("\n")
+    rows = manifest(f"path,{header}\na.exr,{cell}\n")
+    with pytest.raises(RequestError, match=message):
+        check_rows(rows, DEFAULT)
+
+
+def test_what_is_wrong_in_several_rows(manifest):
+    rows = manifest("path,iso\na,100\nb,50\nc,x\nd,800\n")
+    with pytest.raises(RequestError, match=r"row 3: iso: found 50.*; and 1 more row is wrong$"):
+        check_rows(rows, DEFAULT)
+
+
+def test_an_image_that_brings_its_own_camera_may_have_its_isos(manifest):
+    rows = manifest("path,iso,denoise_2.luma_size\na.ARW,50,5\n")
+    assert check_rows(rows, DEFAULT, lambda path: path.suffix == ".ARW")[0].iso == 50
+
+
+# Whatever a manifest holds, what is said of it is a RequestError; what is written is read again.
+
+few = settings(max_examples=200, deadline=None, database=None, derandomize=True)
+texts = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12)
+columns = st.sampled_from(
+    ["path", "name", "frames", "iso", "camera", "seed", "sensor_noise.a", "denoise.method", "x", ""]
+)
+cells = st.one_of(
+    texts,
+    st.sampled_from(["a.exr", "100", "1e-4", "nan", "-inf", "[[", "{uniform=[0,1]}", "{a=1}"]),
+    st.integers().map(str),
+)
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(columns | texts, inner, max_size=3),
+    max_leaves=6,
+)
+names = st.text(st.characters(codec="utf-8", exclude_characters="\0/"), min_size=1, max_size=8)
+
+
+def is_read_or_refused(path):
+    try:
+        rows = read_manifest(path)
+        check_rows(rows, DEFAULT)
+    except RequestError as error:
+        assert re.match(re.escape(str(path)), str(error))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("manifests")
+
+
+@few
+@given(data=st.binary(max_size=60) | texts.map(str.encode))
+def test_any_bytes(folder, data):
+    for name in ("a.csv", "a.jsonl"):
+        (folder / name).write_bytes(data)
+        is_read_or_refused(folder / name)
+
+
+@few
+@given(
+    table=st.lists(st.lists(cells, min_size=1, max_size=4), max_size=4), header=st.lists(columns)
+)
+def test_any_csv(folder, table, header):
+    text = io.StringIO()
+    csv.writer(text).writerows([["path", *header], *table])
+    (folder / "b.csv").write_text(text.getvalue(), newline="")
+    is_read_or_refused(folder / "b.csv")
+
+
+@few
+@given(rows=st.lists(st.dictionaries(columns | texts, values, max_size=4), max_size=3))
+def test_any_jsonl(folder, rows):
+    lines = [json.dumps({"path": f"{number}.exr", **row}) for number, row in enumerate(rows)]
+    (folder / "b.jsonl").write_text("\n".join(lines))
+    is_read_or_refused(folder / "b.jsonl")
+
+
+@few
+@given(
+    rows=st.lists(
+        st.fixed_dictionaries(
+            {"name": names.filter(lambda name: name not in (".", "..") and name.strip())},
+            optional={
+                "frames": st.integers(1, 100),
+                "iso": st.floats(100, 25600),
+                "seed": st.integers(0, 2**63),
+                "sensor_noise.a": st.floats(0, 1),
+            },
+        ),
+        min_size=1,
+        max_size=4,
+        unique_by=lambda row: row["name"],
+    )
+)
+def test_what_is_written_is_read_again(folder, rows):
+    header = ["path", "name", "frames", "iso", "seed", "sensor_noise.a"]
+    with open(folder / "c.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, header, quoting=csv.QUOTE_ALL)
+        writer.writeheader()
+        writer.writerows([{"path": "a.exr", **row} for row in rows])
+    lines = [json.dumps({"path": "a.exr", **row}) for row in rows]
+    (folder / "c.jsonl").write_text("\n".join(lines))
+    one, two = (read_manifest(folder / name) for name in ("c.csv", "c.jsonl"))
+    for row, from_csv, from_json in zip(rows, one, two, strict=True):
+        assert from_csv.name == from_json.name == row["name"]
+        assert from_csv.frames == from_json.frames == row.get("frames")
+        nested = {key: row[key] for key in ("iso", "seed") if key in row}
+        if "sensor_noise.a" in row:
+            nested["sensor_noise"] = {"a": row["sensor_noise.a"]}
+        assert from_csv.values == from_json.values == nested
+    assert check_rows(one, DEFAULT) == check_rows(two, DEFAULT)

@@ -1,0 +1,316 @@
+"""Images in tiles: the same bits as whole, in whatever memory there is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clpipe.check import NOISE, example
+from clpipe.config import Settings, make_chain, settings_from
+from clpipe.device import Device
+from clpipe.errors import ImageError
+from clpipe.plan import Plan
+from clpipe.reference.cfa import PATTERNS
+from clpipe.registry import all_stages, load_stage_file
+from clpipe.run import Result, Runner
+from clpipe.stage import Kind
+from clpipe.tiles import (
+    LARGEST_TILE,
+    Extent,
+    buffer_sizes,
+    divisions,
+    halo_of,
+    phases_of,
+    tiling_of,
+)
+from tests.test_contributing import block
+
+METHODS = [
+    pytest.param(stage, method, id=f"{stage.name}-{method.method}")
+    for stage in all_stages().values()
+    for method in stage.methods
+]
+
+GRAY_WORLD = {"white_balance": {"method": "gray_world"}}
+
+
+def plan_of(**settings) -> Plan:
+    return Runner(make_chain(settings_from(settings)), None).plan()
+
+
+def memory_for(plan: Plan, columns: int, rows: int, lanes: int) -> int:
+    """What a tile takes that has so many pixels beside its halo."""
+    halo = 2 * halo_of(plan) + lanes
+    whole = Extent.whole(columns + halo, rows + halo, lanes, plan.apron)
+    return sum(buffer_sizes(plan, whole).values()) + 4 * 1024
+
+
+def same(one: Result, two: Result) -> None:
+    """Fail unless two results are the same, bit for bit."""
+    for a, b in ((one.final, two.final), (one.encoded, two.encoded)):
+        assert (a is None) == (b is None)
+        assert a is None or a.tobytes() == b.tobytes()
+    assert one.kept.keys() == two.kept.keys()
+    for name, image in one.kept.items():
+        assert image.tobytes() == two.kept[name].tobytes(), name
+    assert one.found == two.found
+
+
+@pytest.fixture(scope="module")
+def scalar_device(device: Device) -> Device:
+    """The same device as if it were a GPU."""
+    return Device(replace(device.info, lanes=1))
+
+
+def in_tiles(
+    runner: Runner, image: np.ndarray, columns: int, rows: int, monkeypatch: pytest.MonkeyPatch
+) -> tuple[Result, int]:
+    """The result of an image, which is the same in tiles of about that size, and their number."""
+    device = runner.device
+    plan = runner.plan(image.dtype == np.float16, fold=min(image.shape[:2]) > 1)
+    memory = memory_for(plan, columns, rows, device.info.lanes)
+    tiling = tiling_of(plan, *image.shape[1::-1], device.info.lanes, memory, memory)
+    whole = runner.run(image, "k")
+    with monkeypatch.context() as patch:
+        patch.setattr(device, "memory", memory)
+        parts = runner.run(image, "k")
+        assert device.bytes_held <= memory
+    same(whole, parts)
+    return whole, len(tiling.tiles)
+
+
+@pytest.mark.parametrize(("stage", "method"), METHODS)
+@pytest.mark.parametrize("lanes", [8, 1])
+def test_every_stage(device, scalar_device, monkeypatch, stage, method, lanes):
+    chain, source = (stage.name,), stage.reads
+    if source is Kind.MOSAIC and stage.name != "mosaic":
+        chain, source = ("mosaic", stage.name), Kind.RGB
+    # The chains of clpipe check, so that nothing new is compiled.
+    own = {**method.example, "method": method.method}
+    parameters = {"mosaic": {"pattern": "GRBG"}, stage.name: own}
+    made = make_chain(Settings(iso=3200, stages=chain, parameters=parameters), source)
+    on = device if lanes == 8 else scalar_device
+    runner = Runner(made, on, encode=made.result is not Kind.RAW, final=True)
+    result, count = in_tiles(runner, example(source, (150, 203)), 70, 56, monkeypatch)
+    assert count >= 6
+    if method.method in ("gray_world", "white_patch"):
+        assert result.found["white_balance"]["red_gain"] != 1
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("balance", ["gray_world", "white_patch"])
+def test_the_default_chain(device, monkeypatch, pattern, balance):
+    settings = {"mosaic": {"pattern": pattern}, "white_balance": {"method": balance}}
+    chain = make_chain(settings_from({"iso": 3200, **settings}))
+    runner = Runner(chain, device)
+    for size in ((150, 203), (901, 9)) if pattern == "RGGB" else ((149, 202),):
+        image = example(Kind.RGB, size, half=True)
+        _, count = in_tiles(runner, image, 64, 48, monkeypatch)
+        assert count >= 4
+
+
+def test_sizes_at_which_tiles_are_narrow_or_end_with_the_image(device, monkeypatch):
+    runner = Runner(make_chain(settings_from({"iso": 3200, **GRAY_WORLD})), device)
+    random = np.random.default_rng(0)
+    counts = set()
+    for _ in range(25):
+        height, width, rows, columns = (
+            int(n) for n in random.integers((40, 40, 4, 8), (200, 200, 60, 60))
+        )
+        image = example(Kind.RGB, (height, width), half=True)
+        counts.add(in_tiles(runner, image, columns, rows, monkeypatch)[1])
+    assert len(counts) > 6
+
+
+def test_numbers_found_twice_and_kept_images(device, monkeypatch):
+    settings = {
+        "stages": ["mosaic", "white_balance", "demosaic", "mosaic", "white_balance"],
+        "demosaic": {"method": "bilinear"},
+        **GRAY_WORLD,
+        "white_balance_2": {"method": "white_patch"},
+    }
+    chain = make_chain(settings_from(settings))
+    image = example(Kind.RGB, (157, 211))
+    keep = [step.name for step in chain.steps]
+    kept, count = in_tiles(Runner(chain, device, keep), image, 64, 48, monkeypatch)
+    assert count >= 9
+    assert list(kept.kept) == keep
+    assert set(kept.found) == {"white_balance", "white_balance_2"}
+    fused, _ = in_tiles(Runner(chain, device, final=True), image, 64, 48, monkeypatch)
+    assert fused.found == kept.found
+    assert fused.final.tobytes() == kept.final.tobytes()
+
+
+@pytest.mark.parametrize("noise", ["gaussian", "poisson"])
+def test_every_source_of_noise(device, monkeypatch, noise):
+    names = list(all_stages())
+    chain = tuple(names[: names.index("quantize") + 1])
+    settings = Settings(
+        iso=3200, stages=chain, parameters={**NOISE, "sensor_noise": {"method": noise}}
+    )
+    runner = Runner(make_chain(settings, Kind.RGB), device, encode=False, final=True)
+    _, count = in_tiles(runner, example(Kind.RGB, (150, 203)), 64, 48, monkeypatch)
+    assert count >= 6
+
+
+def test_a_stage_of_somebody_else_reads_places_in_the_image(device, tmp_path, monkeypatch):
+    monkeypatch.setattr("clpipe.registry._from_files", {})
+    (tmp_path / "vignette.cl").write_text(block("c"))
+    (tmp_path / "vignette.py").write_text(block("python"))
+    stage = load_stage_file(tmp_path / "vignette.py")
+    chain = make_chain(Settings(iso=3200, stages=(stage.name,)), Kind.RGB)
+    image = example(Kind.RGB, (150, 203))
+    result, count = in_tiles(Runner(chain, device, final=True), image, 64, 48, monkeypatch)
+    assert count >= 6
+    assert np.abs(result.final - Runner(chain, None, final=True).run(image, "k").final).max() < 1e-6
+
+
+@pytest.mark.parametrize("size", [(1, 900), (900, 1)])
+def test_one_pixel_wide_or_high(device, monkeypatch, size):
+    settings = Settings(iso=3200, stages=("mosaic", "demosaic"))
+    runner = Runner(make_chain(settings, Kind.RGB), device, encode=True, final=True)
+    assert in_tiles(runner, example(Kind.RGB, size), 24, 4, monkeypatch)[1] >= 4
+
+
+def test_whole_numbers_become_floats_tile_by_tile(device, monkeypatch):
+    chain = make_chain(Settings(iso=3200, stages=("normalize",)), Kind.RAW)
+    runner = Runner(chain, device, final=True)
+    image = np.random.default_rng(0).integers(0, 16384, (150, 203)).astype(np.uint16)
+    in_tiles(runner, image, 64, 48, monkeypatch)
+
+
+@pytest.mark.parametrize("memory", [2**17, 2**18, 2**20, 2**22, 2**26])
+@pytest.mark.parametrize("lanes", [1, 8, 16])
+def test_tiles_cover_an_image_once_and_fit(memory, lanes):
+    plan = plan_of(**GRAY_WORLD)
+    width, height, halo = 403, 333, halo_of(plan)
+    tiling = tiling_of(plan, width, height, lanes, memory, memory // 4)
+    covered = np.zeros((height, width), int)
+    assert tiling.bytes <= memory
+    for extent in tiling.tiles:
+        core, stored = extent.core, extent.stored
+        covered[core.top : core.bottom, core.left : core.right] += 1
+        assert stored.left % lanes == stored.top % 4 == core.left % 2 == core.left % lanes == 0
+        assert stored.left <= max(core.left - halo, 0) and stored.top <= max(core.top - halo, 0)
+        assert stored.right == min(core.right + halo, width)
+        assert stored.bottom == min(core.bottom + halo, height)
+        sizes = buffer_sizes(plan, extent)
+        assert all(size <= tiling.sizes[name] for name, size in sizes.items())
+        assert max(sizes.values()) <= memory // 4
+    assert (covered == 1).all()
+    assert (len(tiling.tiles) == 1) == (memory == 2**26)
+
+
+def test_full_rows_come_before_narrow_tiles():
+    plan = plan_of()
+    for memory, columns in ((2**34, {30000}), (2**26, {2512, 2368})):
+        tiling = tiling_of(plan, 30000, 20000, 8, memory, memory)
+        assert {extent.core.width for extent in tiling.tiles} == columns
+        assert tiling.bytes < LARGEST_TILE
+
+
+def test_the_halo_is_what_all_stencils_reach_together():
+    assert halo_of(plan_of()) == 2 + 1 + 1 + 2
+    assert halo_of(plan_of(stages=["exposure", "gamma"])) == 0
+    bilinear = {"stages": ["mosaic", "demosaic"], "demosaic": {"method": "bilinear"}}
+    assert halo_of(plan_of(**bilinear)) == 1
+
+
+def test_phases_end_with_what_is_found():
+    plan = plan_of(**GRAY_WORLD)
+    first, second = phases_of(plan)
+    names = [launch.name for launch in plan.launches]
+    assert [names[i] for i in first.first] == ["lines"]
+    assert [names[i] for i in first.each] == ["exposure..normalize", "white_balance.add_up"]
+    assert [names[i] for i in first.last] == ["white_balance.gray_world"]
+    assert second.first == second.last == ()
+    assert len(second.each) == 5
+
+
+def test_memory_that_is_too_small_for_any_tile(device, monkeypatch):
+    runner = Runner(make_chain(settings_from({})), device)
+    monkeypatch.setattr(device, "memory", 1000)
+    with pytest.raises(
+        ImageError,
+        match=r"64x64 pixels need .* KiB of device memory, or in the smallest tiles .* KiB, "
+        r"with .* KiB in one piece; allowed are 1.0 KiB",
+    ):
+        runner.run(np.zeros((64, 64, 3), np.float32), "k")
+
+
+class Scarce:
+    """pyopencl on a device that another program has nearly filled."""
+
+    def __init__(self, device: Device, left: int, call: str) -> None:
+        self._real, self._device, self._left, self._call = device._cl, device, left, call
+        self.failures = 0
+
+    def __getattr__(self, name: str):
+        if name == self._call and self._device.bytes_held > self._left:
+            self.failures += 1
+            raise self._real.MemoryError("CL_OUT_OF_RESOURCES")
+        return getattr(self._real, name)
+
+
+@pytest.mark.parametrize("call", ["enqueue_copy", "enqueue_nd_range_kernel"])
+def test_memory_that_is_not_there_all_the_same(device, monkeypatch, call):
+    runner = Runner(make_chain(settings_from({"iso": 3200, **GRAY_WORLD})), device)
+    image = example(Kind.RGB, (150, 203), half=True)
+    whole = runner.run(image, "k")
+    other = example(Kind.RGB, (333, 403), half=True)
+    runner.run(other, "k")
+    # Room for the image alone, but not beside what the larger one has left behind.
+    enough = sum(buffer_sizes(runner.plan(), Extent.whole(203, 150, 8, 2)).values())
+    for left, tries in ((enough, 1), (enough // 3, 3), (enough // 9, 5)):
+        scarce = Scarce(device, left, call)
+        with monkeypatch.context() as patch:
+            patch.setattr(device, "_cl", scarce)
+            same(whole, runner.run(image, "k"))
+        assert 1 <= scarce.failures <= tries
+    with monkeypatch.context() as patch:
+        patch.setattr(device, "_cl", Scarce(device, 100, call))
+        with pytest.raises(ImageError, match=r"203x150 pixels: .* is out of memory, in tiles of a"):
+            runner.run(image, "k")
+    same(whole, runner.run(image, "k"))
+
+
+def test_buffers_that_cannot_be_made(device, monkeypatch):
+    runner = Runner(make_chain(settings_from({"iso": 3200, **GRAY_WORLD})), device)
+    image = example(Kind.RGB, (150, 203), half=True)
+    whole = runner.run(image, "k")
+    make, sizes = device._pool._make, []
+
+    def scarce(size):
+        sizes.append(size)
+        if size > 40_000:
+            raise device._cl.MemoryError("CL_MEM_OBJECT_ALLOCATION_FAILURE")
+        return make(size)
+
+    device._pool.release()
+    with monkeypatch.context() as patch:
+        patch.setattr(device._pool, "_make", scarce)
+        same(whole, runner.run(image, "k"))
+    assert max(sizes) > 100_000
+    assert max(b.size for b in device._pool.held.values()) <= 40_000
+
+
+def test_a_device_that_fails_is_an_error_of_the_image(device, monkeypatch):
+    runner = Runner(make_chain(settings_from({"iso": 3200, **GRAY_WORLD})), device)
+    image = example(Kind.RGB, (150, 203), half=True)
+    whole = runner.run(image, "k")
+
+    def dies(*_, **__):
+        raise device._cl.RuntimeError("the driver died")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(device._cl, "enqueue_nd_range_kernel", dies)
+        with pytest.raises(ImageError, match="failed: the driver died"):
+            runner.run(image, "k")
+    same(whole, runner.run(image, "k"))
+
+
+def test_numbers_of_tiles_to_try():
+    tried = list(divisions(10_000))
+    assert tried[:20] == list(range(1, 21))
+    assert tried[-1] == 10_000
+    assert len(tried) < 100
