@@ -278,11 +278,15 @@ class _Developer:
         if chain is self._chain:
             return
         chains = {"image": chain, **({"truth": chain.clean()} if self._truth else {})}
-        for name, each in chains.items():
-            kept = [step.name for step in each.steps if step.name in self._keep]
-            encode = self._encode
-            self._runners[name] = Runner(each, self._device, kept, encode, final=not encode)
+        self._runners = {name: self._runner(name, each) for name, each in chains.items()}
         self._chain = chain
+
+    def _runner(self, name: str, chain: Chain) -> Runner:
+        kept = tuple(step.name for step in chain.steps if step.name in self._keep)
+        latest = self._runners.get(name)
+        if latest and latest.keep == kept:
+            return latest.of(chain)  # with the plans that are there
+        return Runner(chain, self._device, kept, self._encode, final=not self._encode)
 
 
 def _check_keys(jobs: Sequence[Job]) -> None:

@@ -163,6 +163,18 @@ def test_kept_images_enter(clpipe, renders, dataset):
         assert np.array_equal(one["image"], two["image"])
 
 
+def test_a_manifest_and_draws(renders):
+    Path("m.csv").write_text("path,iso\nin/r2.exr,100\nin/r0.exr,\n")
+    Path("drawn.toml").write_text("[iso]\nlog_uniform = [200, 6400]\n")
+    drawn = api.Dataset("m.csv", "drawn.toml", epochs=3)
+    isos = [sample["iso"] for sample in drawn]
+    assert isos[0::2] == [100, 100, 100] and len(set(isos[1::2])) == 3
+    assert isos == [drawn[i]["iso"] for i in range(6)]
+    Path("m.csv").write_text("path,isos\nin/r2.exr,100\n")
+    with pytest.raises(RequestError, match=r"m\.csv"):
+        api.Dataset("m.csv")
+
+
 class Loader:
     """What torch's DataLoader does with a map-style dataset: numbers to workers, in order."""
 

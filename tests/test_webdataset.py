@@ -103,6 +103,33 @@ def test_a_burst_is_one_sample(clpipe, renders):
         assert set(sample) - {"__key__"} == {f"{n}.{e}" for n in names for e in ("jpg", "json")}
 
 
+def test_truths_are_of_the_sample(clpipe, renders):
+    clpipe("run", renders(1), *RUN, "--truth", "mosaic", "--truth", "development")
+    (sample,) = samples("out/000000.tar")
+    pictures = {"jpg", "truth.jpg", "truth_mosaic.exr"}
+    sidecars = {"json", "truth.json", "truth_mosaic.json"}
+    assert set(sample) - {"__key__"} == pictures | sidecars
+
+
+def test_a_sidecar_makes_its_picture_again(clpipe, renders):
+    clpipe("run", renders(5), *RUN)
+    sample = samples("out/000001.tar")[0]
+    Path("one.json").write_bytes(sample["json"])
+    clpipe("run", "--replay", "one.json", "-o", "again")
+    assert Path("again/r_004.jpg").read_bytes() == sample["jpg"]
+    result = clpipe("run", "--replay", "one.json", *RUN[:2], *RUN[4:], status=2)
+    assert "--webdataset: the sidecar says it" in result.stderr
+
+
+def test_a_manifest(clpipe, renders):
+    renders(3)
+    Path("m.csv").write_text("path,name,iso\nin/r.002.exr,b/two.2,100\nin/r.000.exr,zero,800\n")
+    clpipe("run", "m.csv", *RUN)
+    found = samples("out/000000.tar")
+    assert [s["__key__"] for s in found] == ["b/two_2", "zero"]
+    assert [json.loads(s["json"])["iso"] for s in found] == [100, 800]
+
+
 def test_threads_and_shards_do_not_change_a_byte(clpipe, renders):
     clpipe("run", renders(), *RUN)
     clpipe("run", "in", "-o", "b", *RUN[2:], "--jobs", 1)
