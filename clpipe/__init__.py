@@ -2,8 +2,17 @@
 
 __version__ = "0.1.0"
 
+from clpipe.dataset import Dataset
 from clpipe.errors import ClpipeError, DeviceError, ImageError, RequestError
 from clpipe.pipeline import Pipeline
 from clpipe.run import Result
 
-__all__ = ["ClpipeError", "DeviceError", "ImageError", "Pipeline", "RequestError", "Result"]
+__all__ = [
+    "ClpipeError",
+    "Dataset",
+    "DeviceError",
+    "ImageError",
+    "Pipeline",
+    "RequestError",
+    "Result",
+]

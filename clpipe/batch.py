@@ -281,17 +281,20 @@ class Batch:
 
     def _missing(self, work: Work) -> list[str]:
         """The names of the pictures that are to be made, which are not there already."""
-        job, target = work.job, self._target
-        names = target.pictures_of(job)
+        names = self._target.pictures_of(work.job)
         if self._overwrite:
             return list(names)
-        return [
-            name
-            for name in names
-            if not is_done(
-                target.path(job, SIDECAR, name), job, work.wanted, target.outputs(job, name)
-            )
-        ]
+        return [name for name in names if not self.is_there(work.job, name, work.wanted)]
+
+    def is_there(self, job: Job, name: str, wanted: Mapping[str, Any]) -> bool:
+        """Whether a picture is there already, as it is wanted.
+
+        Raises:
+            ImageError: its sidecar is somebody else's file.
+        """
+        target = self._target
+        path, outputs = target.path(job, SIDECAR, name), target.outputs(job, name)
+        return is_done(path, job, wanted, outputs)
 
     def _read(self, work: Work, names: Sequence[str]) -> None:
         """Read a job's image, and see what pictures are to be made of it.

@@ -45,6 +45,7 @@ from clpipe.stage import Kind, Stage
 from clpipe.suggest import one_of
 from clpipe.target import EVERY_FORMAT, Target
 from clpipe.trace import Trace
+from clpipe.webdataset import TarBatch, cut
 
 
 class Group(click.Group):
@@ -263,6 +264,13 @@ def main() -> None:
     metavar="SIDECAR",
     help="Make the picture of a sidecar again, the same bytes; an INPUT is where its input is now.",
 )
+@click.option(
+    "--webdataset",
+    "per_tar",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Pack N images at a time into OUT/000000.tar and so on, as WebDataset reads them.",
+)
 @click.option("--overwrite", is_flag=True, help="Make what is there already and up to date, too.")
 @click.option("--quiet", is_flag=True, help="Tell of failures alone.")
 @click.option(
@@ -286,6 +294,7 @@ def run(
     threads: int | None,
     shard: Shard,
     replay: Path | None,
+    per_tar: int | None,
     overwrite: bool,
     quiet: bool,
     trace: Path | None,
@@ -296,6 +305,7 @@ def run(
 
     Each makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used. With
     --frames: OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise.
+    With --webdataset these are in tars, and dots in NAME become "_": a key of WebDataset has none.
 
     --truth development is that, without a burst. --truth mosaic is OUT/NAME.truth_mosaic.exr, the
     truth of --keep normalize. --truth variance is OUT/NAME.truth_variance.exr: for each pixel of
@@ -305,12 +315,14 @@ def run(
     if replay:
         refuse_beside_replay()
         again = replay_of(replay, [Path(path) for path in inputs], max_pixels)
-        entrance, jobs = again.entrance, [again.job]
+        entrance, jobs, tars = again.entrance, [again.job], []
         chain = entrance.first_chain(jobs)
         target = Target(output, again.formats, again.burst, again.keep)
     else:
         entrance = Entrance(asked_for(**request), Reading(layer, max_pixels, transfer))
-        jobs = shard.take(find_jobs(inputs, output, entrance.endings()))
+        jobs = find_jobs(inputs, output, entrance.endings())
+        tars = shard.take(cut(jobs, per_tar, output)) if per_tar else []
+        jobs = [job for tar in tars for job in tar.jobs] if per_tar else shard.take(jobs)
         if not jobs:
             raise RequestError(f"shard {shard.number} of {shard.of} has no image")
         entrance.check(jobs)
@@ -330,7 +342,8 @@ def run(
         remove_unfinished(output, jobs)
         events = Trace() if trace else None
         on: list[Device | None] = [*devices] or [None]
-        batch = Batch(entrance, target, on, chain, threads, overwrite, events is not None)
+        how = (entrance, target, on, chain, threads, overwrite, events is not None)
+        batch = TarBatch(tars, *how) if tars else Batch(*how)
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
         with (
             RunLog(output / log_name(shard), start) as log,

@@ -1,5 +1,6 @@
 """OpenCL devices: which there are, and running a plan on one. The only importer of pyopencl."""
 
+import os
 import re
 import shutil
 import time
@@ -30,6 +31,7 @@ from clpipe.tiles import Extent, Tiling, tiling_of
 from clpipe.types import Array
 
 Bind = Callable[[Parameter], Any]
+_process: int | None = None  # the one that has used OpenCL, of this and those before it
 
 
 @dataclass(frozen=True)
@@ -59,8 +61,15 @@ def find_devices() -> list[Found]:
     """Every device of every OpenCL platform, in the platforms' order.
 
     Raises:
-        DeviceError: pyopencl cannot be loaded.
+        DeviceError: pyopencl cannot be loaded, or this process cannot use it.
     """
+    global _process
+    if _process not in (None, os.getpid()):
+        raise DeviceError(
+            "this process was forked from one that had used OpenCL, which would hang here; let it "
+            'be spawned (multiprocessing\'s "spawn" or "forkserver"), or fork before'
+        )
+    _process = os.getpid()
     try:
         import pyopencl as cl
     except (ImportError, OSError) as error:

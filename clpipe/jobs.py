@@ -5,13 +5,15 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from clpipe.errors import RequestError
 from clpipe.image_io import READABLE
 from clpipe.manifest import ENDINGS as MANIFESTS
 from clpipe.manifest import read_manifest
 from clpipe.raw_io import ENDINGS
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -106,13 +108,13 @@ def images_in(folder: Path, output: Path, endings: Sequence[str]) -> list[Path]:
 
 @dataclass(frozen=True)
 class Shard:
-    """One part of several of a run: every ``of``-th job, from the ``number``-th (from 1) on."""
+    """One part of several of a run: every ``of``-th job or tar, from the ``number``-th (from 1)."""
 
     number: int = 1
     of: int = 1
 
-    def take(self, jobs: Sequence[Job]) -> list[Job]:
-        """Its jobs.
+    def take(self, jobs: Sequence[T]) -> list[T]:
+        """Those that are its own.
 
         >>> [job.key for job in Shard(2, 3).take([Job(Path(k), k) for k in "abcde"])]
         ['b', 'e']

@@ -42,7 +42,7 @@ class Pipeline:
         until: str | None = None,
         **settings: Any,
     ) -> None:
-        self._settings = overlay(load_settings(str(config)), _plain(settings))
+        self._settings = overlay(load_settings(str(config)), plain(settings))
         self._ends = start_at, until
         chain = self._chain(self._settings)
         kept = chain.kept([keep] if isinstance(keep, str) else keep)
@@ -79,7 +79,7 @@ class Pipeline:
             RequestError: a setting that is not allowed.
         """
         runner = self._runner
-        own = overlay(self._settings, _plain(settings)) if settings else self._settings
+        own = overlay(self._settings, plain(settings)) if settings else self._settings
         if settings or own.draws:
             runner = runner.of(self._chain(own.drawn(key)))
         return runner.run(_checked(image, runner.chain.source), key)
@@ -99,12 +99,12 @@ class Pipeline:
             yield self.process(image, **{"key": str(number), **given})
 
 
-def _plain(values: Any) -> Any:
+def plain(values: Any) -> Any:
     """Settings without NumPy types: what a configuration file could hold."""
     if isinstance(values, Mapping):
-        return {key: _plain(value) for key, value in values.items()}
+        return {key: plain(value) for key, value in values.items()}
     if isinstance(values, list | tuple):
-        return list(map(_plain, values))
+        return list(map(plain, values))
     return values.tolist() if isinstance(values, np.ndarray | np.generic) else values
 
 

@@ -71,8 +71,6 @@ def _digest(file: str, size: int, modified: int) -> str:
 def is_done(path: Path, job: Job, wanted: Mapping[str, Any], outputs: Sequence[Path]) -> bool:
     """Whether a picture is there already, made of the same input, in the same way, by this version.
 
-    An input of the same size and time of change is taken for the same; else its SHA-256 decides.
-
     Args:
         path: of the sidecar.
         job: the image.
@@ -86,8 +84,16 @@ def is_done(path: Path, job: Job, wanted: Mapping[str, Any], outputs: Sequence[P
         found = read_sidecar(path)
     except FileNotFoundError:
         return False
-    same = found[OWN] == clpipe.__version__ and found.get("asked") == wanted
-    if not same or not all(map(os.path.exists, outputs)):
+    return all(map(os.path.exists, outputs)) and is_as_wanted(found, job, wanted)
+
+
+def is_as_wanted(found: Mapping[str, Any], job: Job, wanted: Mapping[str, Any]) -> bool:
+    """Whether a sidecar's values are of the same input, the same wishes and this version.
+
+    An input of the same size and time of change is taken for the same; else its SHA-256 decides.
+    ``wanted`` as for :func:`is_done`.
+    """
+    if found.get(OWN) != clpipe.__version__ or found.get("asked") != wanted:
         return False
     size, modified = stamp_of(job.path)
     if found.get("input_size") != size:

@@ -26,8 +26,8 @@ LEVELS = [
     {"reentry", "dng", "jobs", "asked", "interrupt"},
     {"raw_entry", "target"},
     {"entrance", "sidecar", "output_folder", "measure"},
-    {"batch", "replay", "measure_plot", "calibration_frames"},
-    {"run_log", "trace", "bench_batch"},
+    {"batch", "dataset", "replay", "measure_plot", "calibration_frames"},
+    {"run_log", "trace", "bench_batch", "webdataset"},
     {"progress", "describe"},
     {"cli"},
 ]

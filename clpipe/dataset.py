@@ -1,0 +1,305 @@
+"""Training straight from renders: samples as NumPy arrays, developed on the way."""
+
+import copy
+import itertools
+import os
+import threading
+import warnings
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
+from clpipe.asked import Asked
+from clpipe.config import Chain, own_values
+from clpipe.device import Device, open_device
+from clpipe.entrance import Entered, Entrance
+from clpipe.errors import ImageError, RequestError
+from clpipe.image_io import Reading, set_codec_threads
+from clpipe.jobs import Job, find_jobs
+from clpipe.pipeline import plain
+from clpipe.raw_entry import RawImage
+from clpipe.run import Runner
+from clpipe.stage import Kind
+from clpipe.target import named
+
+Sample = dict[str, Any]
+NOWHERE = Path(os.devnull)  # nothing is written
+
+
+def key_in(epoch: int, key: str) -> str:
+    """The image key of an epoch: as frames of a burst have them, the first is the image's own.
+
+    >>> key_in(0, "a.exr"), key_in(2, "a.exr")
+    ('a.exr', 'a.exr#2')
+    """
+    return f"{key}#{epoch}" if epoch else key
+
+
+class Dataset:
+    """Renders as a camera sees them, sample by sample, with new noise in each epoch.
+
+    Iterate over it, or index it: ``torch.utils.data.DataLoader`` takes it as it is. A sample is a
+    dict of
+
+    - "image": (height, width, 3) uint8 where the chain ends in display values, else float32,
+    - "truth", if asked for: the same without noise; images of ``keep`` by the names of their
+      steps, and "truth.NAME" for each that is kept without noise; float32,
+    - "key": the image key of the render, and "epoch",
+    - "iso", "a" and "b": the sensor noise that was added, Var[y] = a*y + b in signal units (1 is
+      the white level), zeros where none was.
+
+    All arrays are in the sensor's orientation. The noise of an image in epoch E is that of frame E
+    of ``clpipe run --frames``: its image key is the render's, with "#E" behind it from epoch 1 on.
+    So a sample depends on its render, the settings and the epoch alone, and not on order, sharding,
+    workers or restarts. What is declared to be drawn at random for each image is drawn anew in each
+    epoch, but for kept images, which keep what was drawn for them.
+
+    The device is opened by the process that first makes a sample. OpenCL does not survive a fork:
+    workers of a process that has used it must be spawned (``multiprocessing_context="spawn"``).
+
+    Args:
+        inputs: files, folders, globs and manifests, as ``clpipe run`` takes them.
+        config: as for :class:`~clpipe.Pipeline`; None holds what kept images carry, else the
+            default.
+        device: as for :class:`~clpipe.Pipeline`.
+        keep: steps whose image is wanted too, or "all".
+        start_at: the first step to run; inputs are then images that were kept before it.
+        until: the last step to run.
+        truth: whether each sample is wanted without noise too.
+        layer: of an EXR, which is the picture.
+        transfer: of renders in whole numbers: "srgb", "linear".
+        epoch: the first.
+        epochs: how many there are, one after the other; None is no end.
+        threads: how many images are decoded at a time; None is one for each processor.
+        **settings: what a configuration file may hold, over ``config``.
+
+    Raises:
+        RequestError: a name or value that is not allowed, a folder without images, two images with
+            the same key, a truth of a chain without noise.
+    """
+
+    def __init__(
+        self,
+        inputs: str | Path | Sequence[str | Path],
+        config: str | Path | None = None,
+        *,
+        device: str | int | None = None,
+        keep: str | Sequence[str] = (),
+        start_at: str | None = None,
+        until: str | None = None,
+        truth: bool = False,
+        layer: str | None = None,
+        transfer: str | None = None,
+        epoch: int = 0,
+        epochs: int | None = 1,
+        threads: int | None = None,
+        **settings: Any,
+    ) -> None:
+        own = None if config is None else own_values(str(config))
+        asked = Asked(own, plain(settings), start_at=start_at, until=until)
+        self._entrance = Entrance(asked, Reading(layer=layer, transfer=transfer))
+        several = [inputs] if isinstance(inputs, str | Path) else inputs
+        self._jobs = find_jobs([str(i) for i in several], NOWHERE, self._entrance.endings())
+        self._entrance.check(self._jobs)
+        _check_keys(self._jobs)
+        chain = self._entrance.first_chain(self._jobs)
+        if truth:
+            chain.clean()  # refuses a chain that adds no noise
+        self._keep = chain.kept([keep] if isinstance(keep, str) else keep)
+        self._encode = chain.result is Kind.DISPLAY
+        self._truth = truth
+        self._selector = None if device is None else str(device)
+        self._epochs = epochs
+        self._threads = threads or len(os.sched_getaffinity(0))
+        self._opened: _Developer | None = None
+        self.set_epoch(epoch)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Begin with this epoch, from the next sample on; for a run that goes on, for example.
+
+        Raises:
+            RequestError: it is negative.
+        """
+        if epoch < 0:
+            raise RequestError(f"found epoch {epoch}; expected 0 or more")
+        self._epoch = epoch
+
+    def shard(self, index: int, of: int) -> Self:
+        """One part of several, for a worker: every ``of``-th image, from the ``index``-th (from 0).
+
+        Raises:
+            RequestError: there is no such part.
+        """
+        if not 0 <= index < of:
+            raise RequestError(f"found shard {index} of {of}; expected 0 to {of - 1}")
+        part = copy.copy(self)
+        part._jobs = self._jobs[index::of]
+        return part
+
+    def __getstate__(self) -> Mapping[str, Any]:
+        # What was found out and opened stays with the process.
+        return {**self.__dict__, "_entrance": replace(self._entrance), "_opened": None}
+
+    def __len__(self) -> int:
+        """How many samples there are, over all epochs.
+
+        Raises:
+            TypeError: there is no end of them.
+        """
+        if self._epochs is None:
+            raise TypeError("a dataset of endless epochs has no length; say epochs=N")
+        return len(self._jobs) * self._epochs
+
+    def __getitem__(self, index: int) -> Sample:
+        """A sample; those of the second epoch follow those of the first, and so on.
+
+        Raises:
+            IndexError: there is none of that number.
+            ImageError: its image cannot be read or processed.
+            DeviceError: there is no usable device.
+        """
+        number = index + len(self) if index < 0 else index
+        if number < 0 or not self._jobs or (self._epochs is not None and number >= len(self)):
+            raise IndexError(f"found sample {index}; there are {len(self)}")
+        return self._develop(*self._place(number), self._read(*self._place(number)))
+
+    def __iter__(self) -> Iterator[Sample]:
+        """Every sample in order; images are decoded and developed ahead, a few at a time.
+
+        Raises:
+            ImageError: an image cannot be read or processed.
+            DeviceError: there is no usable device.
+        """
+        set_codec_threads(max(len(os.sched_getaffinity(0)) // self._threads, 1))
+        ahead: deque[Future[Sample]] = deque()
+        decoders = ThreadPoolExecutor(self._threads, "decode")
+        developer = ThreadPoolExecutor(1, "device")
+        try:
+            endless = self._epochs is None and self._jobs
+            for number in itertools.count() if endless else range(len(self)):
+                place = self._place(number)
+                read = decoders.submit(self._read, *place)
+                ahead.append(developer.submit(self._develop_read, *place, read))
+                if len(ahead) > self._threads + 1:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
+        finally:
+            decoders.shutdown(cancel_futures=True)
+            developer.shutdown(cancel_futures=True)
+
+    def _place(self, number: int) -> tuple[Job, int]:
+        """The image and the epoch of a sample."""
+        epoch, image = divmod(number, len(self._jobs))
+        return self._jobs[image], self._epoch + epoch
+
+    def _read(self, job: Job, epoch: int) -> Entered:
+        entrance = self._entrance
+        try:
+            entrance = entrance.of(replace(job, key=key_in(epoch, job.key)))
+            entered = entrance.enter(job, entrance.read(job))
+        except (ImageError, RequestError, MemoryError) as error:
+            raise ImageError(entrance.explain(job, error)) from None
+        if entered is None:
+            raise ImageError(
+                f"{job.path}: was kept after another step than the one before "
+                f"{entrance.asked.start_at}; name those to go on from by a glob"
+            )
+        for warning in entered.source.warnings:
+            warnings.warn(f"{job.path}: {warning}", stacklevel=2)
+        return entered
+
+    def _develop_read(self, job: Job, epoch: int, read: Future[Entered]) -> Sample:
+        return self._develop(job, epoch, read.result())
+
+    def _develop(self, job: Job, epoch: int, entered: Entered) -> Sample:
+        chain = entered.chain
+        try:
+            made = self._developer().develop(entered, key_in(epoch, entered.key))
+        except (ImageError, RequestError, MemoryError) as error:
+            raise ImageError(self._entrance.explain(job, error)) from None
+        is_known = chain.is_noisy or not isinstance(entered.source, RawImage)
+        noise = chain.noise if is_known else None
+        a, b = (noise.a, noise.b) if noise else (0.0, 0.0)
+        return {**made, "key": job.key, "epoch": epoch, "iso": chain.iso, "a": a, "b": b}
+
+    def _developer(self) -> "_Developer":
+        """What develops in this process.
+
+        Raises:
+            DeviceError: there is no usable device, or another process had opened it.
+        """
+        with _opening:
+            if self._opened is None or self._opened.process != os.getpid():
+                device = open_device(self._selector)
+                self._opened = _Developer(device, self._keep, self._encode, self._truth)
+            return self._opened
+
+
+_opening = threading.Lock()
+
+
+class _Developer:
+    """What develops images on a device, one at a time."""
+
+    def __init__(
+        self, device: Device | None, keep: Sequence[str], encode: bool, truth: bool
+    ) -> None:
+        self.process = os.getpid()
+        self._device = device
+        self._keep = keep
+        self._encode = encode
+        self._truth = truth
+        self._lock = threading.Lock()
+        self._chain: Chain | None = None
+        self._runners: dict[str, Runner] = {}
+
+    def develop(self, entered: Entered, key: str) -> Sample:
+        """The pictures of an image, and what is kept on the way.
+
+        Raises:
+            ImageError, RequestError, MemoryError: it cannot be developed.
+        """
+        made: Sample = {}
+        with self._lock:
+            self._prepare(entered.chain)
+            for name, runner in self._runners.items():
+                result = runner.run(entered.source.pixels, key)
+                inside = "" if name == "image" else f"{name}."
+                made |= {inside + step: image for step, image in result.kept.items()}
+                made[name] = result.image
+        return made
+
+    def _prepare(self, chain: Chain) -> None:
+        """Have runners for a chain, which is mostly the one before."""
+        if chain is self._chain:
+            return
+        chains = {"image": chain, **({"truth": chain.clean()} if self._truth else {})}
+        self._runners = {name: self._runner(name, each) for name, each in chains.items()}
+        self._chain = chain
+
+    def _runner(self, name: str, chain: Chain) -> Runner:
+        kept = tuple(step.name for step in chain.steps if step.name in self._keep)
+        latest = self._runners.get(name)
+        if latest and latest.keep == kept:
+            return latest.of(chain)  # with the plans that are there
+        return Runner(chain, self._device, kept, self._encode, final=not self._encode)
+
+
+def _check_keys(jobs: Sequence[Job]) -> None:
+    """See that no two images have the same key, and with it the same noise.
+
+    Raises:
+        RequestError: two have.
+    """
+    owners: dict[str, Job] = {}
+    for job in jobs:
+        other = owners.setdefault(job.key, job)
+        if other is not job:
+            raise RequestError(
+                f"{named(other)} and {named(job)} have the same image key, {job.key}, and would "
+                "have the same noise; give the folder that both are in"
+            )

@@ -1,0 +1,209 @@
+"""Samples for training, developed on the way: the same as a run's, whoever asks for them when."""
+
+import itertools
+import multiprocessing
+import os
+import pickle
+import threading
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import clpipe as api
+from clpipe.errors import DeviceError, ImageError, RequestError
+
+ISO = 3200  # a chain that other tests compile too
+
+
+@pytest.fixture
+def renders(write_exr, tmp_path, monkeypatch):
+    """Five small renders of two sizes."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    for i in range(5):
+        size = (24, 32) if i % 2 else (17, 40)
+        write_exr(f"in/r{i}.exr", rng.random((*size, 3)).astype(np.float32) * 0.6)
+    return Path("in")
+
+
+@pytest.fixture
+def dataset(renders):
+    return api.Dataset(renders, iso=ISO)
+
+
+def same(one, two):
+    assert one.keys() == two.keys()
+    assert all(np.array_equal(one[name], two[name]) for name in one)
+
+
+def test_a_sample_is_what_a_run_makes(clpipe, renders):
+    clpipe("run", renders, "-o", "out", "--iso", ISO, "--frames", 3, "--format", "png")
+    many = api.Dataset(renders, iso=ISO, truth=True, keep="quantize", epochs=3)
+    assert len(many) == 15
+    for number, sample in enumerate(many):
+        key, epoch = sample["key"], sample["epoch"]
+        assert (key, epoch) == (f"r{number % 5}.exr", number // 5)
+        stem = Path("out", key).with_suffix("")
+        for name, file in (("image", f"frame{epoch}"), ("truth", "truth")):
+            picture = np.asarray(Image.open(f"{stem}.{file}.png"))
+            assert sample[name].dtype == np.uint8 and np.array_equal(sample[name], picture)
+        raw = sample["quantize"]
+        assert raw.dtype == np.float32 and np.array_equal(raw, np.rint(raw))
+        assert sample["truth.quantize"].shape == raw.shape
+        assert sample["iso"] == ISO
+
+
+def test_the_noise_is_as_the_sample_says(write_exr, tmp_path):
+    write_exr("flat.exr", np.full((256, 256, 3), 0.2, np.float32))
+    (sample,) = api.Dataset(
+        tmp_path / "flat.exr", iso=ISO, truth=True, until="normalize", skip=["row_noise"]
+    )
+    assert sample["image"].dtype == np.float32
+    green = (slice(None, None, 2), slice(1, None, 2))
+    signal = sample["truth"][green].mean()
+    found = (sample["image"] - sample["truth"])[green].var()
+    assert found == pytest.approx(sample["a"] * signal + sample["b"], rel=0.05)
+
+
+def test_by_number_and_one_after_the_other(dataset):
+    whole = list(dataset)
+    assert [s["key"] for s in whole] == [f"r{i}.exr" for i in range(5)]
+    for i in (3, 0, -1):
+        same(dataset[i], whole[i])
+    for i in (5, -6):
+        with pytest.raises(IndexError, match=f"found sample {i}; there are 5"):
+            dataset[i]
+
+
+def test_epochs_repeat_and_differ(dataset, renders):
+    three = list(api.Dataset(renders, iso=ISO, epochs=3, threads=1))
+    dataset.set_epoch(2)
+    for one, two in zip(dataset, three[10:], strict=True):
+        same(one, two)
+    assert not np.array_equal(three[0]["image"], three[5]["image"])
+    endless = api.Dataset(renders, iso=ISO, epochs=None)
+    for one, two in zip(itertools.islice(endless, 12), three, strict=False):
+        same(one, two)
+    with pytest.raises(TypeError, match="endless"):
+        len(endless)
+    same(endless[11], three[11])
+    with pytest.raises(RequestError, match="found epoch -1"):
+        dataset.set_epoch(-1)
+
+
+def test_parts_for_workers(dataset):
+    whole = list(dataset)
+    parts = [list(dataset.shard(i, 2)) for i in range(2)]
+    for one, two in zip(
+        whole, itertools.chain(*zip(*parts, strict=False), parts[0][2:]), strict=True
+    ):
+        same(one, two)
+    assert list(dataset.shard(6, 7)) == []
+    with pytest.raises(RequestError, match="found shard 2 of 2; expected 0 to 1"):
+        dataset.shard(2, 2)
+
+
+def test_only_a_few_are_ahead(dataset, monkeypatch):
+    read, real = [], api.Dataset._read
+
+    def reading(self, job, epoch):
+        read.append(job.key)
+        return real(self, job, epoch)
+
+    monkeypatch.setattr(api.Dataset, "_read", reading)
+    endless = api.Dataset("in", iso=ISO, epochs=None, threads=2)
+    before = threading.active_count()
+    samples = iter(endless)
+    for _ in range(3):
+        next(samples)
+    assert len(read) <= 3 + 2 + 2
+    samples.close()
+    assert threading.active_count() == before
+
+
+def test_samples_do_not_share_memory(dataset):
+    one, two = dataset[0], dataset[0]
+    one["image"][:] = 0
+    assert two["image"].any() and two["image"].flags.writeable
+
+
+def test_a_damaged_image_is_named(dataset):
+    Path("in/r2.exr").write_bytes(b"no image")
+    with pytest.raises(ImageError, match=r"in/r2\.exr"):
+        dataset[2]
+    samples = iter(dataset)
+    assert [next(samples)["key"], next(samples)["key"]] == ["r0.exr", "r1.exr"]
+    with pytest.raises(ImageError, match=r"in/r2\.exr"):
+        next(samples)
+    assert dataset[3]["key"] == "r3.exr"
+
+
+def test_what_is_refused(renders):
+    for wrong, message in (
+        ({"isos": 3}, "isos"),
+        ({"keep": "demosiac"}, "demosaic"),
+        ({"truth": True, "skip": ["sensor_noise", "row_noise", "column_noise"]}, "adds noise"),
+        ({"epoch": -1}, "found epoch -1"),
+    ):
+        with pytest.raises(RequestError, match=message):
+            api.Dataset(renders, **wrong)
+    with pytest.raises(RequestError, match="no file matches"):
+        api.Dataset("in/*.png")
+    with pytest.raises(RequestError, match=r"have the same image key, r0\.exr"):
+        api.Dataset(["in/r0.exr", Path("in")])
+
+
+def test_kept_images_enter(clpipe, renders, dataset):
+    clpipe("run", renders, "-o", "kept", "--iso", ISO, "--keep", "normalize")
+    again = api.Dataset("kept/*.normalize.exr", start_at="white_balance")
+    for one, two in zip(dataset, again, strict=True):
+        assert np.array_equal(one["image"], two["image"])
+
+
+def test_a_manifest_and_draws(renders):
+    Path("m.csv").write_text("path,iso\nin/r2.exr,100\nin/r0.exr,\n")
+    Path("drawn.toml").write_text("[iso]\nlog_uniform = [200, 6400]\n")
+    drawn = api.Dataset("m.csv", "drawn.toml", epochs=3)
+    isos = [sample["iso"] for sample in drawn]
+    assert isos[0::2] == [100, 100, 100] and len(set(isos[1::2])) == 3
+    assert isos == [drawn[i]["iso"] for i in range(6)]
+    Path("m.csv").write_text("path,isos\nin/r2.exr,100\n")
+    with pytest.raises(RequestError, match=r"m\.csv"):
+        api.Dataset("m.csv")
+
+
+class Loader:
+    """What torch's DataLoader does with a map-style dataset: numbers to workers, in order."""
+
+    def __init__(self, dataset, workers, context):
+        self.dataset, self.workers = dataset, workers
+        self.context = multiprocessing.get_context(context)
+
+    def __iter__(self):
+        with ProcessPoolExecutor(self.workers, mp_context=self.context) as pool:
+            yield from pool.map(self.dataset.__getitem__, range(len(self.dataset)))
+
+
+def test_workers_that_are_spawned_make_the_same(dataset):
+    whole = list(dataset)
+    for one, two in zip(Loader(dataset, 1, "spawn"), whole, strict=True):
+        same(one, two)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_worker_that_is_forked_says_so_and_does_not_hang(dataset):
+    dataset[0]
+    pool = multiprocessing.get_context("fork").Pool(1)
+    with pool, pytest.raises(DeviceError, match="forked from one that had used OpenCL"):
+        pool.apply_async(dataset.__getitem__, (1,)).get(timeout=60)
+
+
+def test_it_pickles_before_and_after_it_was_used(dataset):
+    before = pickle.dumps(dataset)
+    one = dataset[1]
+    assert dataset._opened and dataset._opened.process == os.getpid()
+    for data in (before, pickle.dumps(dataset)):
+        same(pickle.loads(data)[1], one)

@@ -1,0 +1,357 @@
+"""WebDataset shards: what readers see in them, and that they resume as folders do."""
+
+import io
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import tarfile
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clpipe import target, webdataset
+from clpipe.errors import ImageError, RequestError
+from clpipe.jobs import Job
+from clpipe.run_log import read_log
+from clpipe.webdataset import cut
+from tests.conftest import ROOT, written
+
+# A chain that other tests compile too.
+RUN = ("-o", "out", "--iso", 3200, "--webdataset", 4)
+OUT = Path("out")
+
+
+@pytest.fixture
+def renders(write_exr):
+    """A folder of small renders of two sizes, with dots in their names, some in a folder."""
+
+    def write(count=10, folder="in"):
+        rng = np.random.default_rng(0)
+        for i in range(count):
+            size = (24, 32) if i % 2 else (17, 40)
+            name = f"sub.x/r{i:03}.exr" if i >= 8 else f"r.{i:03}.exr"
+            write_exr(f"{folder}/{name}", rng.random((*size, 3)).astype(np.float32))
+        return folder
+
+    return write
+
+
+def samples(path):
+    """The samples of a tar as WebDataset's readers group them: neighbours with the same key."""
+    found = []
+    with tarfile.open(path) as tar:
+        for member in tar:
+            key, ending = re.match(r"^((?:.*/|)[^.]+)[.]([^/]*)$", member.name).groups()
+            if not found or found[-1]["__key__"] != key:
+                found.append({"__key__": key})
+            assert ending not in found[-1]
+            found[-1][ending] = tar.extractfile(member).read()
+    return found
+
+
+def contents(folder):
+    """Each file's bytes, by name, without the logs."""
+    names = [n for n in written(Path(folder)) if not n.endswith(".jsonl")]
+    return {name: (Path(folder) / name).read_bytes() for name in names}
+
+
+def stamps(folder):
+    return {name: (Path(folder) / name).stat().st_mtime_ns for name in contents(folder)}
+
+
+def statuses(folder):
+    lines = read_log(Path(folder) / "run.jsonl")
+    last = max(i for i, line in enumerate(lines) if line["event"] == "start")
+    return {x["image_key"]: x["status"] for x in lines[last:] if x["event"] == "image"}
+
+
+def test_what_readers_see(clpipe, renders):
+    clpipe("run", renders(), *RUN, "--keep", "quantize")
+    assert written(OUT) == ["000000.tar", "000001.tar", "000002.tar"]
+    tars = [samples(OUT / name) for name in written(OUT)]
+    keys = [[s["__key__"] for s in tar] for tar in tars]
+    assert keys[1:] == [[f"r_00{i}" for i in range(4, 8)], ["sub.x/r008", "sub.x/r009"]]
+    clpipe("run", "in", "-o", "plain", "--iso", 3200, "--keep", "quantize")
+    for sample in (sample for tar in tars for sample in tar):
+        assert set(sample) == {"__key__", "jpg", "json", "quantize.exr"}
+        said = json.loads(sample["json"])
+        image = Image.open(io.BytesIO(sample["jpg"]))
+        assert image.size == (said["width"], said["height"])
+        stem = Path("plain", said["image_key"])
+        for ending in ("jpg", "quantize.exr"):
+            assert sample[ending] == stem.with_suffix(f".{ending}").read_bytes()
+
+
+def test_members_say_nothing_of_who_made_them_when(clpipe, renders):
+    clpipe("run", renders(1), *RUN)
+    with tarfile.open("out/000000.tar") as tar:
+        for m in tar:
+            assert (m.mtime, m.uid, m.gid, m.uname, m.gname, m.mode) == (0, 0, 0, "", "", 0o644)
+
+
+def test_a_burst_is_one_sample(clpipe, renders):
+    clpipe("run", renders(2), *RUN, "--frames", 2)
+    for sample in samples("out/000000.tar"):
+        names = {"truth", "frame0", "frame1"}
+        assert set(sample) - {"__key__"} == {f"{n}.{e}" for n in names for e in ("jpg", "json")}
+
+
+def test_truths_are_of_the_sample(clpipe, renders):
+    clpipe("run", renders(1), *RUN, "--truth", "mosaic", "--truth", "development")
+    (sample,) = samples("out/000000.tar")
+    pictures = {"jpg", "truth.jpg", "truth_mosaic.exr"}
+    sidecars = {"json", "truth.json", "truth_mosaic.json"}
+    assert set(sample) - {"__key__"} == pictures | sidecars
+
+
+def test_a_sidecar_makes_its_picture_again(clpipe, renders):
+    clpipe("run", renders(5), *RUN)
+    sample = samples("out/000001.tar")[0]
+    Path("one.json").write_bytes(sample["json"])
+    clpipe("run", "--replay", "one.json", "-o", "again")
+    assert Path("again/r_004.jpg").read_bytes() == sample["jpg"]
+    result = clpipe("run", "--replay", "one.json", *RUN[:2], *RUN[4:], status=2)
+    assert "--webdataset: the sidecar says it" in result.stderr
+
+
+def test_a_manifest(clpipe, renders):
+    renders(3)
+    Path("m.csv").write_text("path,name,iso\nin/r.002.exr,b/two.2,100\nin/r.000.exr,zero,800\n")
+    clpipe("run", "m.csv", *RUN)
+    found = samples("out/000000.tar")
+    assert [s["__key__"] for s in found] == ["b/two_2", "zero"]
+    assert [json.loads(s["json"])["iso"] for s in found] == [100, 800]
+
+
+def test_threads_and_shards_do_not_change_a_byte(clpipe, renders):
+    clpipe("run", renders(), *RUN)
+    clpipe("run", "in", "-o", "b", *RUN[2:], "--jobs", 1)
+    for i in (3, 1, 2):
+        clpipe("run", "in", "-o", "c", *RUN[2:], "--jobs", 5, "--shard", f"{i}/3")
+    assert contents("out") == contents("b") == contents("c")
+    assert len(contents("out")) == 3
+    result = clpipe("run", "in", "-o", "c", *RUN[2:], "--shard", "4/4", status=2)
+    assert "shard 4 of 4 has no image" in result.stderr
+
+
+def test_a_second_run_makes_nothing(clpipe, renders):
+    clpipe("run", renders(), *RUN)
+    before = stamps("out")
+    clpipe("run", "in", *RUN)
+    assert stamps("out") == before
+    assert set(statuses("out").values()) == {"skipped"}
+    clpipe("run", "in", *RUN, "--overwrite")
+    assert all(before[name] != at for name, at in stamps("out").items())
+
+
+def test_what_is_missing_or_changed_is_made_again(clpipe, renders, write_exr):
+    clpipe("run", renders(), *RUN)
+    whole, before = contents("out"), stamps("out")
+    write_exr("in/r.005.exr", np.full((24, 32, 3), 0.3, np.float32))
+    clpipe("run", "in", *RUN)
+    assert [k for k, status in statuses("out").items() if status == "done"] == ["r.005.exr"]
+    assert {n for n, at in stamps("out").items() if before[n] != at} == {"000001.tar"}
+    old = [s["jpg"] for s in samples(io_of(whole["000001.tar"]))]
+    new = [s["jpg"] for s in samples("out/000001.tar")]
+    assert [a == b for a, b in zip(old, new, strict=True)] == [True, False, True, True]
+    clpipe("run", "in", *RUN, "--seed", 1)
+    assert set(statuses("out").values()) == {"done"}
+
+
+def io_of(data):
+    Path("old.tar").write_bytes(data)
+    return "old.tar"
+
+
+def test_an_image_that_is_gone_goes_from_its_tar_and_a_new_one_comes(clpipe, renders, write_exr):
+    clpipe("run", renders(), *RUN)
+    Path("in/sub.x/r009.exr").unlink()
+    clpipe("run", "in", *RUN)
+    assert [s["__key__"] for s in samples("out/000002.tar")] == ["sub.x/r008"]
+    write_exr("in/sub.x/r010.exr", np.full((24, 32, 3), 0.3, np.float32))
+    clpipe("run", "in", *RUN)
+    assert [s["__key__"] for s in samples("out/000002.tar")] == ["sub.x/r008", "sub.x/r010"]
+    assert list(statuses("out").values()).count("done") == 1
+
+
+def test_an_image_that_failed_is_left_out_and_tried_again(clpipe, renders):
+    clpipe("run", renders(), "-o", "whole", *RUN[2:])
+    whole = Path("in/r.002.exr").read_bytes()
+    stamp = Path("in/r.002.exr").stat().st_mtime_ns
+    Path("in/r.002.exr").write_bytes(whole[:200])
+    result = clpipe("run", "in", *RUN, status=1)
+    assert "clpipe: in/r.002.exr: " in result.stderr and "9 of 10 images done" in result.stderr
+    assert [s["__key__"] for s in samples("out/000000.tar")] == ["r_000", "r_001", "r_003"]
+    before = stamps("out")
+    clpipe("run", "in", *RUN, status=1)
+    assert stamps("out") == before
+    Path("in/r.002.exr").write_bytes(whole)
+    os.utime("in/r.002.exr", ns=(stamp, stamp))
+    clpipe("run", "in", *RUN)
+    assert list(statuses("out").values()).count("done") == 1
+    assert contents("out") == contents("whole")
+
+
+def test_tars_stay_where_every_image_fails(clpipe, renders):
+    clpipe("run", renders(4), *RUN)
+    before = stamps("out")
+    for path in Path("in").iterdir():
+        path.write_bytes(b"no image")
+    clpipe("run", "in", *RUN, status=1)
+    assert stamps("out") == before
+    clpipe("run", "in", "-o", "none", *RUN[2:], status=1)
+    assert contents("none") == {}
+
+
+def test_two_names_of_one_key():
+    jobs = [Job(Path("in/a.b.exr"), "a.b.exr"), Job(Path("in/a_b.exr"), "a_b.exr")]
+    with pytest.raises(
+        RequestError, match=r"in/a\.b\.exr and in/a_b\.exr would both be the sample"
+    ):
+        cut(jobs, 1, OUT)
+    with pytest.raises(RequestError, match="skips it"):
+        cut([Job(Path("in/__x__/a.exr"), "__x__/a.exr")], 1, OUT)
+
+
+def test_a_name_longer_than_ustar_holds(clpipe, write_exr):
+    name = f"in/{'f' * 80}/{'g' * 120}.exr"
+    write_exr(name, np.full((24, 32, 3), 0.3, np.float32))
+    clpipe("run", "in", *RUN)
+    (sample,) = samples("out/000000.tar")
+    assert sample["__key__"] == name[3:-4]
+
+
+@pytest.mark.parametrize("text", ["no tar", "tar"])
+def test_a_tar_of_another_hand_is_not_written_over(clpipe, renders, text):
+    renders(2)
+    OUT.mkdir()
+    path = OUT / "000000.tar"
+    if text == "tar":
+        Path("data.json").write_text('{"annotations": []}')
+        with tarfile.open(path, "w") as tar:
+            tar.add("data.json")
+    else:
+        path.write_text(text)
+    before = path.read_bytes()
+    result = clpipe("run", "in", *RUN, status=2)
+    assert "out/000000.tar: clpipe did not write this tar" in result.stderr
+    assert path.read_bytes() == before
+    clpipe("run", "in", *RUN, "--overwrite")
+    assert len(samples(path)) == 2
+
+
+def test_tars_of_a_run_with_more_of_them_are_not_mixed_with(clpipe, renders):
+    clpipe("run", renders(), *RUN)
+    result = clpipe("run", "in", *RUN, "--webdataset", 5, status=2)
+    assert "out/000002.tar: is of another run, as this one makes 2 tars" in result.stderr
+    Path("out/000002.tar").unlink()
+    clpipe("run", "in", *RUN, "--webdataset", 5)
+    assert [len(samples(OUT / name)) for name in contents("out")] == [5, 5]
+
+
+def test_none_in_a_tar(clpipe, renders):
+    result = clpipe("run", renders(1), *RUN, "--webdataset", 0, status=2)
+    assert "--webdataset" in result.stderr
+
+
+def test_a_tar_that_is_cut_off_is_made_again(clpipe, renders):
+    clpipe("run", renders(), *RUN)
+    whole = contents("out")
+    path = OUT / "000000.tar"
+    path.write_bytes(whole[path.name][: len(whole[path.name]) // 2])
+    clpipe("run", "in", *RUN)
+    assert contents("out") == whole
+    assert 0 < list(statuses("out").values()).count("done") < 4
+
+
+@pytest.mark.parametrize("when", ["picture", "tar"])
+def test_the_disk_is_full(clpipe, renders, when):
+    clpipe("run", renders(), "-o", "whole", *RUN[2:])
+    real, count = target.write_display, []
+
+    with pytest.MonkeyPatch.context() as patch:
+
+        def full(path, _write):
+            raise ImageError(f"{path}: cannot be written: No space left on device")
+
+        def write(path, pixels, tags):
+            count.append(path)
+            if len(count) > 5:
+                patch.setattr(target, "ROOM", 2**62)  # more than any disk has
+                full(path, None)
+            real(path, pixels, tags)
+
+        if when == "tar":
+            patch.setattr(webdataset, "write_beside", full)
+        else:
+            patch.setattr(target, "write_display", write)
+        result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)
+    assert "the same command goes on" in result.stderr
+    clpipe("run", "in", *RUN)
+    assert list(statuses("out").values()).count("skipped") >= 4
+    assert contents("out") == contents("whole")
+
+
+def start(folder, *arguments):
+    command = [sys.executable, "-m", "clpipe", "run", *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.Popen(command, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def test_killed_and_resumed_again_and_again(clpipe, renders, tmp_path):
+    renders(24)
+    clpipe("run", "in", "-o", "whole", *RUN[2:])
+    rng = random.Random(0)
+    done = []
+    for _ in range(5):
+        process = start(tmp_path, "in", *RUN)
+        time.sleep(rng.uniform(0.4, 1.2))
+        process.kill()
+        process.communicate()
+    clpipe("run", "in", *RUN)
+    assert contents("out") == contents("whole")
+    assert not [n for n in os.listdir("out") if n.startswith(".")]
+    for line in read_log(OUT / "run.jsonl"):
+        if line.get("status") == "done":
+            done.append(line["image_key"])
+    assert len(done) == len(set(done)), "an image was made twice"
+
+
+def test_stopped_and_gone_on_with(clpipe, renders, tmp_path):
+    renders(60)
+    process = start(tmp_path, "in", *RUN, "--jobs", 1)
+    for _ in range(3000):
+        if (tmp_path / "out" / "000000.tar").exists():
+            break
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    assert "not begun" in process.communicate()[1]
+    assert process.returncode == 130
+    before = stamps("out")
+    clpipe("run", "in", *RUN)
+    assert len(contents("out")) == 15
+    assert all(stamps("out")[n] == at for n, at in before.items() if not n.startswith("."))
+    assert not [n for n in os.listdir("out") if n.startswith(".")]
+
+
+def test_what_is_left_of_a_kill_while_packing_goes(clpipe, renders):
+    clpipe("run", renders(4), *RUN)
+    whole = contents("out")
+    for name in (".000000.0123abcd.part.tar", ".clpipe.000007.tar/r_000.jpg"):
+        (OUT / name).parent.mkdir(exist_ok=True)
+        (OUT / name).write_bytes(b"half")
+    folder = OUT / ".clpipe.000000.tar"  # packed, but not removed any more
+    folder.mkdir()
+    with tarfile.open(OUT / "000000.tar") as tar:
+        tar.extractall(folder, filter="data")
+    before = stamps("out")["000000.tar"]
+    clpipe("run", "in", *RUN)
+    assert contents("out") == whole and sorted(os.listdir("out")) == ["000000.tar", "run.jsonl"]
+    assert stamps("out")["000000.tar"] == before
