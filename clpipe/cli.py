@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
@@ -20,6 +21,7 @@ from clpipe.bench import bench_methods
 from clpipe.calibration_frames import Given, calibrate_files, check_name, write_profile
 from clpipe.camera import built_in_cameras, load_camera
 from clpipe.check import SIZES, check_all
+from clpipe.cluster import Order, connected
 from clpipe.config import Settings, built_in_configs, overlay, stage_named
 from clpipe.device import find_devices, open_device
 from clpipe.entrance import Entrance
@@ -230,6 +232,11 @@ def main() -> None:
     callback=lambda _context, _option, text: parse_shard(text),
     help="Do the I-th of N parts of the images, for job arrays.",
 )
+@click.option(
+    "--dask",
+    metavar="ADDRESS",
+    help="Of a Dask scheduler (tcp://HOST:8786), whose workers see the same files: use them.",
+)
 @click.option("--overwrite", is_flag=True, help="Make what is there already and up to date, too.")
 @click.option("--quiet", is_flag=True, help="Tell of failures alone.")
 @click.option(
@@ -250,6 +257,7 @@ def run(
     selector: str | None,
     threads: int | None,
     shard: Shard,
+    dask: str | None,
     overwrite: bool,
     quiet: bool,
     trace: Path | None,
@@ -275,11 +283,16 @@ def run(
     formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
     target = Target(output, formats, Burst(frames), chain.kept(keep))
     target.check(chain, jobs)
-    device = open_device(selector)
+    how = (threads, overwrite, trace is not None)
+    engine = (
+        connected(dask, Order(entrance, target, selector, *how))
+        if dask is not None
+        else nullcontext(Batch(entrance, target, [open_device(selector)], chain, *how))
+    )
     summary = Summary(len(jobs))
-    with output_folder(output, shard):
+    with engine as batch, output_folder(output, shard):
         remove_unfinished(output, jobs)
-        batch = Batch(entrance, target, [device], chain, threads, overwrite, trace is not None)
+        outcomes = batch.run(jobs)
         events = Trace() if trace else None
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
         with (
@@ -288,7 +301,7 @@ def run(
             Reporter(summary, target, Console(stderr=True), quiet) as reporter,
         ):
             try:
-                for outcome in batch.run(jobs):
+                for outcome in outcomes:
                     summary.add(outcome)
                     log.add(outcome)
                     reporter.tell(outcome)

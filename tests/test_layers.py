@@ -25,7 +25,7 @@ LEVELS = [
     {"raw_entry", "target"},
     {"entrance", "sidecar", "output_folder", "measure"},
     {"batch", "describe", "measure_plot", "calibration_frames"},
-    {"run_log", "trace"},
+    {"run_log", "trace", "cluster"},
     {"progress"},
     {"cli"},
 ]
@@ -41,6 +41,7 @@ DOORS = {
     "exifread": {"raw_io"},
     "matplotlib": {"calibration", "measure_plot"},
     "scipy": {"calibration"},
+    "distributed": {"cluster"},
 }
 
 
