@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
@@ -292,10 +292,10 @@ def run(
     summary = Summary(len(jobs))
     with engine as batch, output_folder(output, shard):
         remove_unfinished(output, jobs)
-        outcomes = batch.run(jobs)
         events = Trace() if trace else None
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
         with (
+            closing(batch.run(jobs)) as outcomes,
             RunLog(output / log_name(shard), start) as log,
             interruptible(batch.stop),
             Reporter(summary, target, Console(stderr=True), quiet) as reporter,

@@ -6,6 +6,7 @@ its chunk. Where a worker dies, Dask gives its chunk to another one, to which th
 is done already: such images are reported as skipped.
 """
 
+import asyncio
 import contextlib
 import os
 import queue
@@ -13,7 +14,7 @@ import secrets
 import threading
 import time
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -209,11 +210,12 @@ def connected(address: str, order: Order) -> Iterator["Cluster"]:
     except ImportError:
         raise RequestError("--dask: needs distributed; pip install 'clpipe[dask]'") from None
     try:
+        asyncio.run(_reach(address))
         client = Client(address, timeout=TIMEOUT, name="clpipe", set_as_default=False)
-    except (OSError, ValueError, TypeError, RuntimeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    except (OSError, ValueError) as error:
         raise RequestError(
-            f"--dask: no Dask scheduler answers at {address} within {TIMEOUT:g} s ({reason})"
+            f"--dask: no Dask scheduler answers at {address!r} within {TIMEOUT:g} s"
+            f"{f' ({error})' * bool(str(error))}; expected its tcp://HOST:PORT"
         ) from None
     try:
         with contextlib.suppress(TimeoutError):
@@ -235,6 +237,20 @@ def connected(address: str, order: Order) -> Iterator["Cluster"]:
         client.close()
 
 
+async def _reach(address: str) -> None:
+    """Speak to a scheduler; a Client waits without end for who listens and does not answer.
+
+    Raises:
+        OSError, ValueError: nobody answers there, or it is no address.
+    """
+    from distributed import Security
+    from distributed.comm import connect
+
+    security = Security().get_connection_args("client")
+    comm = await asyncio.wait_for(connect(address, timeout=TIMEOUT, **security), TIMEOUT)
+    await comm.close()
+
+
 class Cluster:
     """A cluster's workers, as something that puts jobs through, like a Batch."""
 
@@ -251,14 +267,14 @@ class Cluster:
         self._stopping = True
         self._news.put(None)
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
+    def run(self, jobs: Sequence[Job]) -> Generator[Outcome, None, None]:
         """Put every job through; one that fails is reported and the others go on.
 
         Outcomes come as chunks are finished, in any order.
 
         Raises:
-            RequestError: workers are of different make, or do not see the files.
-            DeviceError: a worker has no usable device.
+            RequestError: workers are of different make, lack the device, or do not see the files.
+            DeviceError: a kernel does not compile.
             OutputError: nothing can be written any more.
             ClusterError: the scheduler or all workers have gone.
         """
@@ -287,8 +303,8 @@ class Cluster:
         _same(found)
         self._order = replace(order, make=next(iter(found.values())))
 
-    def _outcomes(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
-        from distributed import KilledWorker
+    def _outcomes(self, jobs: Sequence[Job]) -> Generator[Outcome, None, None]:
+        from distributed import KilledWorker, wait
 
         chunks = _Chunks(deque(jobs))
         running: dict[Any, list[Job]] = {}
@@ -317,8 +333,8 @@ class Cluster:
                     if len(chunk) > 1:
                         chunks.alone += chunk  # one of them may be what they died of
                         continue
-                    deaths = f"{error.allowed_failures + 1} workers died of it"
-                    report = _failed(chunk, f"{deaths}, the last one {_name(error)}")
+                    deaths = f"{error.allowed_failures + 1} in all, the last one {_name(error)}"
+                    report = _failed(chunk, f"killed the worker that took it, {deaths}")
                 except Exception as error:
                     if future.status in ("cancelled", "lost"):
                         raise self._gone() from None
@@ -331,8 +347,13 @@ class Cluster:
                 if report.error:
                     failure = failure or report.error
                     self._halt()
-        finally:
-            self._client.cancel(list(running))
+        except (
+            GeneratorExit
+        ):  # nobody wants more: leave the folder in peace before its lock is gone
+            self._halt()
+            with self._client.as_current(), contextlib.suppress(TimeoutError):
+                wait(list(running), timeout=LONG)
+            raise
         remove_unfinished(self._order.target.folder, jobs)  # by workers that died
         if failure:
             raise failure
@@ -395,7 +416,7 @@ class _Chunks:
         """The next chunk."""
         if self.alone:
             return [self.alone.popleft()]
-        size = max(1, min(self.size, len(self.jobs) // (4 * workers)))
+        size = max(1, min(self.size, len(self.jobs) // (2 * workers)))
         return [self.jobs.popleft() for _ in range(size)]
 
     def took(self, seconds: float) -> None:
