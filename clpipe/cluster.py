@@ -259,7 +259,10 @@ class Cluster:
         self._address = address
         self._order = order
         self._stopping = False
-        self._news: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._news: queue.SimpleQueue[Any] = (
+            queue.SimpleQueue()
+        )  # chunks that are through; None: stop
+        self._running: dict[Any, tuple[list[Job], bool]] = {}
         self._seen = time.monotonic()
 
     def stop(self) -> None:
@@ -297,6 +300,8 @@ class Cluster:
         finally:
             with contextlib.suppress(OSError):
                 probe.unlink()
+        if not found:
+            raise self._gone()
         for worker, made in found.items():
             if not isinstance(made, Make):
                 raise RequestError(f"--dask: worker {worker}: {made}")
@@ -304,21 +309,11 @@ class Cluster:
         self._order = replace(order, make=next(iter(found.values())))
 
     def _outcomes(self, jobs: Sequence[Job]) -> Generator[Outcome, None, None]:
-        from distributed import KilledWorker, wait
-
         chunks = _Chunks(deque(jobs))
-        running: dict[Any, list[Job]] = {}
         failure: ClpipeError | None = None
         try:
-            while running or (chunks and not self._stopping):
-                workers = self._workers()
-                while chunks and not self._stopping and len(running) < workers:
-                    chunk = chunks.cut(workers)
-                    future = self._client.submit(
-                        work_off, self._order, chunk, pure=False, retries=RETRIES
-                    )
-                    running[future] = chunk
-                    future.add_done_callback(self._news.put)
+            while self._running or (chunks and not self._stopping):
+                self._hand_out(chunks)
                 try:
                     future = self._news.get(timeout=1)
                 except queue.Empty:
@@ -326,20 +321,7 @@ class Cluster:
                 if future is None:
                     self._halt()
                     continue
-                chunk = running.pop(future)
-                try:
-                    report = future.result()
-                except KilledWorker as error:
-                    if len(chunk) > 1:
-                        chunks.alone += chunk  # one of them may be what they died of
-                        continue
-                    deaths = f"{error.allowed_failures + 1} in all, the last one {_name(error)}"
-                    report = _failed(chunk, f"killed the worker that took it, {deaths}")
-                except Exception as error:
-                    if future.status in ("cancelled", "lost"):
-                        raise self._gone() from None
-                    report = _failed(chunk, f"on a worker: {type(error).__name__}: {error}")
-                future.release()
+                report = self._report(future, chunks)
                 chunks.took(report.seconds)
                 here = time.perf_counter() - time.time()
                 for outcome in report.outcomes:
@@ -347,31 +329,24 @@ class Cluster:
                 if report.error:
                     failure = failure or report.error
                     self._halt()
-        except (
-            GeneratorExit
-        ):  # nobody wants more: leave the folder in peace before its lock is gone
-            self._halt()
-            with self._client.as_current(), contextlib.suppress(TimeoutError):
-                wait(list(running), timeout=LONG)
+        except GeneratorExit:
+            self._finish()
             raise
         remove_unfinished(self._order.target.folder, jobs)  # by workers that died
         if failure:
             raise failure
 
-    def _halt(self) -> None:
-        """Let the workers finish what is in flight."""
-        self._stopping = True
-        self._client.run(halt, self._order.run, on_error="ignore")
+    def _hand_out(self, chunks: "_Chunks") -> None:
+        """See that there are as many chunks at work as there are workers.
 
-    def _workers(self) -> int:
-        """How many workers there are now.
+        Dask chooses the worker; a chunk that is tied to one would wait for it for ever.
 
         Raises:
-            ClusterError: there have been none for long, or the scheduler has gone.
+            ClusterError: there have been no workers for long, or the scheduler has gone.
         """
         try:
             workers = len(self._client.nthreads())
-        except (OSError, ValueError, RuntimeError, TimeoutError):
+        except (OSError, ValueError, RuntimeError):
             raise self._gone() from None
         if workers:
             self._seen = time.monotonic()
@@ -380,11 +355,56 @@ class Cluster:
                 f"--dask: the scheduler at {self._address} has had no workers for {PATIENCE:g} s; "
                 "what is finished is there, and the same command goes on"
             )
-        return workers
+        while chunks.jobs and len(self._running) < workers and not self._stopping:
+            self._submit(chunks.cut(workers))
+        if chunks.suspects and not self._running and not self._stopping:
+            self._submit([chunks.suspects.popleft()], alone=True)
+
+    def _submit(self, chunk: list[Job], alone: bool = False) -> None:
+        future = self._client.submit(work_off, self._order, chunk, pure=False, retries=RETRIES)
+        self._running[future] = (chunk, alone)
+        future.add_done_callback(self._news.put)
+
+    def _report(self, future: Any, chunks: "_Chunks") -> Report:
+        """What became of a chunk that is through.
+
+        Raises:
+            ClusterError: the scheduler has gone.
+        """
+        from distributed import KilledWorker
+
+        chunk, alone = self._running.pop(future)
+        try:
+            return future.result()
+        except KilledWorker as error:
+            if not alone:
+                chunks.suspects += chunk  # or another chunk on these workers is to blame
+                return Report((), LONG)
+            deaths = f"{error.allowed_failures + 1} in all, the last one {_name(error)}"
+            return _failed(chunk, f"killed the worker that took it, {deaths}")
+        except Exception as error:
+            if future.status in ("cancelled", "lost"):
+                raise self._gone() from None
+            return _failed(chunk, f"on a worker: {type(error).__name__}: {error}")
+        finally:
+            future.release()  # or its worker's death would have it done again
+
+    def _halt(self) -> None:
+        """Let the workers finish what is in flight."""
+        self._stopping = True
+        self._client.run(halt, self._order.run, on_error="ignore")
+
+    def _finish(self) -> None:
+        """Wait until no worker is at it any more."""
+        from distributed import wait
+
+        self._halt()
+        with self._client.as_current(), contextlib.suppress(TimeoutError):
+            wait(list(self._running), timeout=LONG)
 
     def _gone(self) -> ClusterError:
         return ClusterError(
-            f"--dask: the scheduler at {self._address} has gone; "
+            f"--dask: the scheduler at {self._address} or its workers have gone; "
             "what is finished is there, and the same command goes on"
         )
 
@@ -393,8 +413,8 @@ class Cluster:
 class _Chunks:
     """What is left of the jobs, to be cut into chunks.
 
-    They grow as long as they take little time, and get smaller again towards the end. ``alone``
-    are jobs that get a chunk of their own.
+    They grow as long as they take little time, and get smaller again towards the end.
+    ``suspects`` are jobs whose workers died: in the end each is tried with nothing beside it.
 
     >>> chunks = _Chunks(deque(Job(Path(str(i)), "") for i in range(100)))
     >>> chunks.took(1.0)
@@ -406,16 +426,14 @@ class _Chunks:
     """
 
     jobs: deque[Job]
-    alone: deque[Job] = field(default_factory=deque)
+    suspects: deque[Job] = field(default_factory=deque)
     size: int = FIRST
 
     def __bool__(self) -> bool:
-        return bool(self.jobs or self.alone)
+        return bool(self.jobs or self.suspects)
 
     def cut(self, workers: int) -> list[Job]:
         """The next chunk."""
-        if self.alone:
-            return [self.alone.popleft()]
         size = max(1, min(self.size, len(self.jobs) // (2 * workers)))
         return [self.jobs.popleft() for _ in range(size)]
 
