@@ -4,6 +4,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
@@ -23,7 +24,8 @@ from clpipe.bench_batch import bench_batch, loads
 from clpipe.calibration_frames import Given, calibrate_files, check_name, write_profile
 from clpipe.camera import built_in_cameras, load_camera
 from clpipe.check import SIZES, check_all
-from clpipe.config import Settings, built_in_configs, overlay, stage_named
+from clpipe.cluster import Cluster, Order, connected
+from clpipe.config import Chain, Settings, built_in_configs, overlay, stage_named
 from clpipe.device import Device, find_devices, open_device, open_devices
 from clpipe.entrance import Entrance
 from clpipe.errors import ClpipeError, RequestError
@@ -45,7 +47,7 @@ from clpipe.stage import Kind, Stage
 from clpipe.suggest import one_of
 from clpipe.target import EVERY_FORMAT, Target
 from clpipe.trace import Trace
-from clpipe.webdataset import TarBatch, cut
+from clpipe.webdataset import Tar, TarBatch, cut
 
 
 class Group(click.Group):
@@ -271,6 +273,11 @@ def main() -> None:
     metavar="N",
     help="Pack N images at a time into OUT/000000.tar and so on, as WebDataset reads them.",
 )
+@click.option(
+    "--dask",
+    metavar="ADDRESS",
+    help="Of a Dask scheduler (tcp://HOST:8786), whose workers see the same files: use them.",
+)
 @click.option("--overwrite", is_flag=True, help="Make what is there already and up to date, too.")
 @click.option("--quiet", is_flag=True, help="Tell of failures alone.")
 @click.option(
@@ -295,6 +302,7 @@ def run(
     shard: Shard,
     replay: Path | None,
     per_tar: int | None,
+    dask: str | None,
     overwrite: bool,
     quiet: bool,
     trace: Path | None,
@@ -336,22 +344,26 @@ def run(
         formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
         target = Target(output, formats, Burst(frames, truths), chain.kept(keep))
     target.check(chain, jobs)
-    devices = open_devices(selectors, parse_size(memory) if memory else None)
+    budget = parse_size(memory) if memory else None
+    engine = engine_for(
+        Order(entrance, target, selectors, budget, threads, overwrite, trace is not None),
+        chain,
+        tars,
+        dask,
+    )
     summary = Summary(len(jobs))
-    with output_folder(output, shard):
+    with engine as batch, output_folder(output, shard):
         remove_unfinished(output, jobs)
         events = Trace() if trace else None
-        on: list[Device | None] = [*devices] or [None]
-        how = (entrance, target, on, chain, threads, overwrite, events is not None)
-        batch = TarBatch(tars, *how) if tars else Batch(*how)
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
         with (
+            closing(batch.run(jobs)) as outcomes,
             RunLog(output / log_name(shard), start) as log,
             interruptible(batch.stop),
             Reporter(summary, target, Console(stderr=True), quiet) as reporter,
         ):
             try:
-                for outcome in batch.run(jobs):
+                for outcome in outcomes:
                     summary.add(outcome)
                     log.add(outcome)
                     reporter.tell(outcome)
@@ -366,6 +378,27 @@ def run(
     if summary.interrupted:
         sys.exit(130)
     sys.exit(1 if summary.failures else 0)
+
+
+def engine_for(
+    order: Order, chain: Chain, tars: Sequence[Tar], dask: str | None
+) -> AbstractContextManager[Batch | TarBatch | Cluster]:
+    """What puts the images through: this machine, with or without tars, or a cluster.
+
+    Raises:
+        RequestError: both are asked for.
+    """
+    if dask is not None:
+        if tars:
+            raise RequestError("--dask: it makes no tars; use --webdataset with --shard")
+        return connected(dask, order)
+    devices: list[Device | None] = [*open_devices(order.selectors, order.memory)]
+    how = (order.threads, order.overwrite, order.trace)
+    if tars:
+        return nullcontext(
+            TarBatch(tars, order.entrance, order.target, devices or [None], chain, *how)
+        )
+    return nullcontext(Batch(order.entrance, order.target, devices or [None], chain, *how))
 
 
 BESIDE_REPLAY = (

@@ -49,3 +49,9 @@ class OutputError(ClpipeError):
     """Nothing can be written any more: the disk is full, or the folder has gone."""
 
     exit_status = 1
+
+
+class ClusterError(ClpipeError):
+    """The cluster has gone in the midst of a run; what is finished is there."""
+
+    exit_status = 1

@@ -9,7 +9,7 @@ import re
 import shutil
 import tarfile
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -270,11 +270,8 @@ class TarBatch(Batch):
     """A run over many images whose pictures are packed into tars.
 
     Args:
-        tars: which; what a killed run left of them is cleared away.
+        tars: which.
         entrance, target, devices, chain, threads, overwrite, trace: as for the base.
-
-    Raises:
-        RequestError: as :func:`prepare`.
     """
 
     def __init__(
@@ -291,7 +288,7 @@ class TarBatch(Batch):
         folders = {job.stem: tar.staging.name for tar in tars for job in tar.jobs}
         staged = Staged(**vars(target), folders=folders)
         super().__init__(entrance, staged, devices, chain, threads, overwrite, trace)
-        prepare(tars, overwrite)
+        self._tars = tars
         self._folders = folders
         self._shards = {tar.staging.name: _Shard(tar, staged) for tar in tars}
 
@@ -302,13 +299,17 @@ class TarBatch(Batch):
         """Whether a picture is there already, in its tar or in the folder that will be one."""
         return self._shard_of(job).has(job, name, wanted) or super().is_there(job, name, wanted)
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
+    def run(self, jobs: Sequence[Job]) -> Generator[Outcome, None, None]:
         """The same; a tar is packed while the next one is made.
 
+        What a killed run left is cleared away first.
+
         Raises:
+            RequestError: as :func:`prepare`.
             OutputError: nothing can be written any more.
             DeviceError: a kernel does not compile.
         """
+        prepare(self._tars, self._overwrite)
         packing: Future[None] | None = None
         with ThreadPoolExecutor(1, "pack") as packer:
             for outcome in super().run(jobs):

@@ -99,6 +99,16 @@ def test_the_configurations_in_the_readme_are_valid(tmp_path):
     assert {"iso", "sensor_noise.b"} < set(drawn.draws)
 
 
+def test_the_samples_of_the_readme(tmp_path, monkeypatch, capsys):
+    text = (ROOT / "README.md").read_text()
+    (code,) = (b for b in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "Dataset" in b)
+    (tmp_path / "renders").mkdir()
+    (tmp_path / "renders" / "a.exr").symlink_to(STILL_LIFE)
+    monkeypatch.chdir(tmp_path)
+    exec(f"import clpipe\n{code}", {})
+    assert capsys.readouterr().out.startswith("a.exr 0 0.00063")
+
+
 def test_the_manifest_in_the_readme(clpipe, tmp_path):
     (table,) = re.findall(r"```csv\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     (tmp_path / "frames.csv").write_text(table)

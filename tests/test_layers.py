@@ -27,7 +27,7 @@ LEVELS = [
     {"raw_entry", "target"},
     {"entrance", "sidecar", "output_folder", "measure"},
     {"batch", "dataset", "replay", "measure_plot", "calibration_frames"},
-    {"run_log", "trace", "bench_batch", "webdataset"},
+    {"run_log", "trace", "bench_batch", "webdataset", "cluster"},
     {"progress", "describe"},
     {"cli"},
 ]
@@ -43,6 +43,7 @@ DOORS = {
     "exifread": {"raw_io"},
     "matplotlib": {"calibration", "measure_plot"},
     "scipy": {"calibration"},
+    "distributed": {"cluster"},
 }
 
 

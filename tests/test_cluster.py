@@ -1,0 +1,279 @@
+"""A run through a Dask cluster: two worker processes on this machine."""
+
+import itertools
+import json
+import os
+import signal
+import socket
+import sys
+import time
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from distributed import Client, LocalCluster, WorkerPlugin
+
+import clpipe as package
+from clpipe import batch, cluster
+from clpipe.asked import Asked
+from clpipe.cluster import Make, Order, look, make_of
+from clpipe.entrance import Entrance
+from clpipe.errors import OutputError
+from clpipe.jobs import Job
+from clpipe.progress import Reporter
+from clpipe.run_log import RunLog
+from clpipe.target import Target
+
+IMAGES = 40
+
+
+@pytest.fixture(scope="module")
+def workers():
+    """A client of two workers, processes of their own, which are started again where they die."""
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as local,
+        Client(local, set_as_default=False) as client,
+    ):
+        yield client
+
+
+@pytest.fixture
+def address(workers):
+    workers.wait_for_workers(2, timeout=30)
+    return workers.scheduler.address
+
+
+@pytest.fixture
+def renders(write_exr):
+    for i in range(IMAGES):
+        pixels = np.random.default_rng(i).random((64, 64, 3)).astype(np.float32)
+        write_exr(f"in/f{i:02}.exr", pixels)
+
+
+def contents(folder):
+    """All files but the logs, with their bytes."""
+    found = {p.relative_to(folder): p.read_bytes() for p in Path(folder).rglob("*") if p.is_file()}
+    return {path: data for path, data in found.items() if path.suffix != ".jsonl"}
+
+
+def log(folder):
+    return [json.loads(line) for line in (Path(folder) / "run.jsonl").read_text().splitlines()]
+
+
+def die_at_sidecar(number):
+    """On a worker: be killed in the midst of writing the sidecar of that number."""
+    write, numbers = batch.write_sidecar, itertools.count(1)
+
+    def planted(path, record):
+        if next(numbers) == number:
+            path.with_name(f".{path.stem}.00000000.part{path.suffix}").write_text("{")
+            os.kill(os.getpid(), signal.SIGKILL)
+        write(path, record)
+
+    batch.write_sidecar = planted
+
+
+class DieOf(WorkerPlugin):
+    """Workers, those that are started again too, are killed by an image of this name."""
+
+    def __init__(self, name):
+        self.name = name
+
+    def setup(self, worker):
+        decode = batch.Batch.decode
+
+        def planted(this, job, begin):
+            if job.path.name == self.name:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return decode(this, job, begin)
+
+        batch.Batch.decode = planted
+
+
+def test_one_machine_three_shards_and_a_cluster_that_loses_a_worker(
+    clpipe, renders, workers, address
+):
+    clpipe("run", "in", "-o", "whole", "--jobs", 1)
+    whole = contents("whole")
+    assert len(whole) == 2 * IMAGES
+
+    backwards = sorted(Path("in").iterdir(), reverse=True)
+    for number in (3, 1, 2):
+        clpipe("run", *backwards, "-o", "sharded", "--shard", f"{number}/3", "--jobs", 3)
+    assert contents("sharded") == whole
+
+    before = set(workers.nthreads())
+    workers.run(die_at_sidecar, 5)  # at least one of the two comes so far
+    clpipe("run", "in", "-o", "dask", "--dask", address)
+    assert contents("dask") == whole
+    assert before - set(workers.nthreads())
+    start, *images, end = log("dask")
+    assert (start["event"], end["event"]) == ("start", "end")
+    assert sorted(i["image_key"] for i in images) == sorted(p.name for p in backwards)
+    assert {i["status"] for i in images} <= {"done", "skipped"}
+    assert end["done"] + end["skipped"] == IMAGES and end["skipped"] <= 2 * 4
+
+    told = clpipe("run", "in", "-o", "dask", "--dask", address)
+    assert f"({IMAGES} of them were there already)" in told.stderr
+    assert contents("dask") == whole
+
+
+def test_an_image_that_kills_workers_fails_alone(clpipe, renders, workers, address):
+    Path("in/damaged.exr").write_bytes(b"no EXR")
+    Path("in/f05.exr").rename("in/deadly.exr")
+
+    def allow(deaths):
+        workers.run_on_scheduler(
+            lambda dask_scheduler: setattr(dask_scheduler, "allowed_failures", deaths)
+        )
+
+    allow(0)
+    workers.register_plugin(DieOf("deadly.exr"), name="die")
+    try:
+        told = clpipe("run", "in", "-o", "out", "--dask", address, status=1)
+    finally:
+        workers.unregister_worker_plugin("die")
+        allow(3)
+    failed = {i["image_key"]: i["error"] for i in log("out")[1:-1] if i["status"] == "failed"}
+    assert sorted(failed) == ["damaged.exr", "deadly.exr"]
+    assert "killed the worker that took it, 1 in all, the last one tcp" in failed["deadly.exr"]
+    assert f"{IMAGES - 1} of {IMAGES + 1} images done" in told.stderr
+    assert len(contents("out")) == 2 * (IMAGES - 1)
+
+
+def test_interrupted_it_finishes_what_is_in_flight(clpipe, renders, address, monkeypatch, tmp_path):
+    stops = []
+
+    def interruptible(stop):
+        stops.append(stop)
+        return nullcontext()
+
+    tell = Reporter.tell
+
+    def interrupting(self, outcome):
+        tell(self, outcome)
+        stops[0]()  # as Ctrl-C does
+
+    monkeypatch.setattr("clpipe.cli.interruptible", interruptible)
+    monkeypatch.setattr(Reporter, "tell", interrupting)
+    told = clpipe("run", "in", "-o", "out", "--dask", address, status=130)
+    assert "not begun" in told.stderr
+    images = log("out")[1:-1]
+    assert 0 < len(images) < IMAGES
+    made = contents("out")
+    assert len(made) == 2 * len(images)
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    clpipe("run", "in", "-o", "out", "--dask", address)
+    assert len(contents("out")) == 2 * IMAGES
+    assert made.items() <= contents("out").items()
+
+
+def test_a_wrong_request(clpipe, renders, address):
+    wrong = ("run", "in", "-o", "out", "--dask", address)
+    clpipe(*wrong, "--set", "no=1", status=2)
+    assert not Path("out").exists()
+    told = clpipe(*wrong, "--device", "no such device", status=2).stderr
+    assert "worker tcp://" in told and "'no such device'" in told
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("version", "0.0.9", "workers differ in their version"),
+        ("device", "Fast GPU (A Platform), 1 lanes", "Fast GPU (A Platform), 1 lanes on tcp://"),
+        ("libraries", "Pillow 1.0", "workers differ in their libraries"),
+    ],
+)
+def test_workers_of_another_make(clpipe, renders, workers, address, name, value, message):
+    def pretend(**to):
+        real = cluster.real = getattr(cluster, "real", make_of)
+        cluster.make_of = lambda selector: replace(real(selector), **to)
+        package.__version__ = to.get("version", "0.1.0")
+
+    worker = next(iter(workers.nthreads()))
+    workers.run(pretend, **{name: value}, workers=[worker])
+    try:
+        told = clpipe("run", "in", "-o", "out", "--dask", address, status=2).stderr
+        assert message in told and worker in told
+        assert not contents("out")
+    finally:
+        workers.run(pretend, workers=[worker])
+
+
+def test_a_log_that_cannot_be_written_ends_the_run(clpipe, renders, address, monkeypatch):
+    def full(self, outcome):
+        raise OutputError("the disk is full")
+
+    monkeypatch.setattr(RunLog, "add", full)
+    told = clpipe("run", "in", "-o", "out", "--dask", address, status=1)
+    assert "the disk is full" in told.stderr
+    made = contents("out")
+    assert 0 < len(made) < 2 * IMAGES
+    time.sleep(0.3)
+    assert contents("out") == made  # no worker is at it any more
+
+
+def test_a_worker_of_another_make_that_comes_later(clpipe, renders, address, monkeypatch):
+    look = cluster.Cluster._look
+
+    def earlier(self, jobs):
+        look(self, jobs)
+        self._order = replace(self._order, make=Make("0.1.0", "a device that was there", ""))
+
+    monkeypatch.setattr(cluster.Cluster, "_look", earlier)
+    told = clpipe("run", "in", "-o", "out", "--dask", address, status=2)
+    assert "workers differ in their device" in told.stderr
+    assert not contents("out")
+
+
+def test_a_trace_is_told_by_one_clock(clpipe, renders, address):
+    began = time.perf_counter()
+    options = ("--device", "numpy", "--until", "quantize", "--trace", "t.json")
+    clpipe("run", "in/f00.exr", "in/f01.exr", "-o", "out", "--dask", address, *options)
+    events = json.loads(Path("t.json").read_text())["traceEvents"]
+    threads = [e["args"]["name"] for e in events if e["ph"] == "M"]
+    assert threads and all(name.startswith("tcp://") for name in threads)
+    ends = [e["ts"] + e["dur"] for e in events if e["ph"] == "X"]
+    assert len(ends) == 6 and 0 < max(ends) < 1e6 * (time.perf_counter() - began)
+
+
+def test_a_worker_sees_the_same_files(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "probe").touch()
+    entrance, target = Entrance(Asked()), Target(Path("out"), ("jpg",))
+    first = Job(Path("a.exr"), "a.exr")
+    order = Order(
+        entrance, target, ("numpy",), None, None, False, False, "run", str(tmp_path), first=first
+    )
+    elsewhere = replace(order, folder=str(tmp_path / "elsewhere"))
+    assert "elsewhere, where the run was started" in look(elsewhere, "probe", None)
+    assert look(order, "probe", None).startswith("does not see the output folder")
+    (tmp_path / "probe").rename(tmp_path / "out" / "probe")
+    assert look(order, "probe", 3) == f"does not see the input {tmp_path / 'a.exr'}"
+    (tmp_path / "a.exr").write_text("abcd")
+    assert look(order, "probe", 3) == f"does not see the input {tmp_path / 'a.exr'}"
+    assert look(order, "probe", 4) == make_of(("numpy",))
+    assert isinstance(look(order, "probe", None), Make)
+
+
+def test_a_scheduler_that_cannot_be_reached(clpipe, renders, monkeypatch):
+    monkeypatch.setattr(cluster, "TIMEOUT", 0.4)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        for address in (f"tcp://127.0.0.1:{port}", "tcp://127.0.0.1:1", "nonsense", ""):
+            told = clpipe("run", "in", "-o", "out", "--dask", address, status=2).stderr
+            assert f"no Dask scheduler answers at '{address}'" in told
+    with LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0", processes=False) as empty:
+        address = empty.scheduler_address
+        told = clpipe("run", "in", "-o", "out", "--dask", address, status=2).stderr
+        assert f"the scheduler at {address} has no workers" in told
+    assert not Path("out").exists()
+
+
+def test_distributed_is_an_extra(clpipe, renders, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    told = clpipe("run", "in", "-o", "out", "--dask", "tcp://127.0.0.1:1", status=2).stderr
+    assert "pip install 'clpipe[dask]'" in told

@@ -1,0 +1,65 @@
+"""tools/examples, as they are, on a few small renders."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from tests.conftest import ROOT
+
+EXAMPLES = ROOT / "tools" / "examples"
+
+
+@pytest.fixture
+def start(write_exr, tmp_path):
+    """Start an example in a folder with renders, the command clpipe on the PATH; what it told."""
+    for i in range(5):
+        pixels = np.random.default_rng(i).random((64, 64, 3)).astype(np.float32)
+        write_exr(f"in/f{i}.exr", pixels)
+    command = tmp_path / "bin" / "clpipe"
+    command.parent.mkdir()
+    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m clpipe "$@"\n')
+    command.chmod(0o755)
+    path = f"{command.parent}:{os.environ['PATH']}"
+    environment = {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT)}
+
+    def run(*arguments, **variables):
+        done = subprocess.run(
+            arguments,
+            cwd=tmp_path,
+            env=environment | variables,
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+        return done.stderr
+
+    return run
+
+
+def pictures(folder):
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.suffix != ".jsonl"}
+
+
+def test_slurm_and_dask_make_what_one_machine_makes(start, tmp_path):
+    start("clpipe", "run", "in", "-o", "whole")
+    whole = pictures(tmp_path / "whole")
+    assert len(whole) == 10
+    for task in "123":
+        told = start(
+            "sh",
+            EXAMPLES / "slurm_array.sh",
+            *("in", "-o", "slurm"),
+            CLPIPE_PARTS="3",
+            SLURM_ARRAY_TASK_ID=task,
+            SLURM_CPUS_PER_TASK="2",
+        )
+    assert "f2.exr" in told  # the third of three has one image
+    assert pictures(tmp_path / "slurm") == whole
+    logs = {p.name for p in (tmp_path / "slurm").glob("*.jsonl")}
+    assert logs == {f"run.{i}-of-3.jsonl" for i in "123"}
+    told = start(sys.executable, EXAMPLES / "dask_local.py", "in", "-o", "dask")
+    assert "5 of 5 images done" in told
+    assert pictures(tmp_path / "dask") == whole

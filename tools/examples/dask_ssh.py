@@ -1,0 +1,26 @@
+"""A Dask cluster of machines that are reached by SSH, and a run of clpipe on it.
+
+    pip install 'clpipe[dask]' asyncssh
+    HOSTS="node1 node2 node3" python tools/examples/dask_ssh.py /data/frames -o /data/out --iso 3200
+
+All arguments go to clpipe run. Each host starts a worker, the first one the scheduler too. They
+need a login by key (and to be in known_hosts), the same clpipe[dask] in a Python at the same path
+as here, inputs, output and the current folder at the same paths, and OpenCL devices of one kind.
+"""
+
+import os
+import sys
+
+from distributed import SSHCluster
+
+from clpipe.cli import main
+
+if __name__ == "__main__":
+    first, *others = os.environ["HOSTS"].split()
+    with SSHCluster(
+        [first, first, *others],  # the first of these is the scheduler's
+        remote_python=sys.executable,
+        worker_options={"nthreads": 4},  # for decoding and encoding
+        scheduler_options={"port": 8786, "dashboard_address": ":0"},
+    ) as cluster:
+        main(["run", *sys.argv[1:], "--dask", cluster.scheduler_address])
