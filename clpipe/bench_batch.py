@@ -3,7 +3,6 @@
 import os
 import re
 import shutil
-import statistics
 import tempfile
 import time
 from collections.abc import Iterator
@@ -17,7 +16,7 @@ import numpy as np
 from clpipe.asked import Asked
 from clpipe.batch import DONE, STEPS, Batch
 from clpipe.bench import scene
-from clpipe.device import Device, Timing
+from clpipe.device import Device
 from clpipe.entrance import Entrance
 from clpipe.errors import ImageError
 from clpipe.image_io import Tags, decode_alone, write_display, write_exr
@@ -26,6 +25,8 @@ from clpipe.run import Runner
 from clpipe.stage import Kind
 from clpipe.target import Target
 
+CODED = 100  # images by which the codecs are timed alone
+TRANSFERS = ("upload", "download")
 DISTINCT = 4  # renders; the other names are links to them
 
 
@@ -48,8 +49,8 @@ class BatchSpeed:
     """One load, measured.
 
     ``cpu_ms`` is each step's CPU time of an image in the serial run; ``limit_s`` their sum over the
-    processors, for all images. ``alone_ms`` is what the file's decoder, the kernels and the encoder
-    take alone; ``overhead_ms`` what an image takes serially beyond them.
+    processors, for all images. ``alone_ms`` is what the file's decoder and encoder take alone, and
+    the kernels there; ``overhead_ms`` what an image takes serially beyond them.
     """
 
     images: int
@@ -110,15 +111,26 @@ def bench_batch(device: Device, asked: Asked, load: Load) -> BatchSpeed:
         jobs = find_jobs([str(folder / "in")], folder / "out")
         chain = entrance.first_chain(jobs)
 
-        def batch() -> Batch:
+        def batch(trace: bool = False) -> Batch:
             shutil.rmtree(folder / "out", ignore_errors=True)
             (folder / "out").mkdir()
-            return Batch(entrance, Target(folder / "out", ("jpg",)), [device], chain)
+            target = Target(folder / "out", ("jpg",))
+            return Batch(entrance, target, [device], chain, trace=trace)
 
         # A few first, so that nothing is compiled and no file is cold in what is timed.
         list(batch().run(jobs[: 2 * DISTINCT]))
         clock = _Clock()
-        serial = list(batch().one_by_one(jobs, clock.on))
+        encoded = Runner(chain, device).run(decode_alone(jobs[0].path), "").image
+        tags = Tags(chain.camera.make, chain.camera.model, chain.iso)
+        serial = []
+        for outcome in batch(trace=True).one_by_one(jobs, clock.on):
+            serial.append(outcome)
+            if len(serial) % max(load.images // CODED, 1) == 0:
+                # In between, for machines are not always as fast.
+                with clock.on("decoder"):
+                    decode_alone(outcome.job.path)
+                with clock.on("encoder"):
+                    write_display(folder / "alone.jpg", encoded, tags)
         forget_peak_memory()
         with clock.on("batch"):
             threaded = list(batch().run(jobs))
@@ -126,8 +138,12 @@ def bench_batch(device: Device, asked: Asked, load: Load) -> BatchSpeed:
             if outcome.status != DONE:
                 raise ImageError(outcome.error)
         peak = peak_memory()
-        alone = alone_ms(Runner(chain, device), folder / "in", chain.camera.make)
+        spans = [span for outcome in serial for span in outcome.spans]
+        kernels = sum(s.seconds for s in spans if s.step not in (*STEPS, *TRANSFERS))
     n = load.images
+    coded = n // max(n // CODED, 1)
+    alone = {name: clock.seconds[name] / coded * 1e3 for name in ("decoder", "encoder")}
+    alone["kernels"] = kernels / n * 1e3
     cpu = {step: clock.cpu[step] / n * 1e3 for step in STEPS}
     serial_s = sum(clock.seconds[step] for step in STEPS)
     return BatchSpeed(
@@ -171,22 +187,3 @@ def write_renders(folder: Path, load: Load) -> None:
             write_exr(path, rolled, Kind.RGB.channels, {}, half=True)
         else:
             path.symlink_to(f"{i % DISTINCT:0{digits}}.exr")
-
-
-def alone_ms(runner: Runner, folder: Path, make: str) -> dict[str, float]:
-    """The median time of the decoder, the kernels and the encoder alone, for the first render."""
-    path = min(folder.iterdir())
-    times: dict[str, list[float]] = {"decoder": [], "kernels": [], "encoder": []}
-    tags = Tags(make, "", 100)
-    for _ in range(9):
-        start = time.perf_counter()
-        pixels = decode_alone(path)
-        decoded = time.perf_counter()
-        timings: list[Timing] = []
-        result = runner.run(pixels, "bench", timings)
-        written = time.perf_counter()
-        write_display(folder / "alone.jpg", result.image, tags)
-        times["encoder"].append(time.perf_counter() - written)
-        times["decoder"].append(decoded - start)
-        times["kernels"].append(sum(t.seconds for t in timings if not t.transfer))
-    return {name: statistics.median(values) * 1e3 for name, values in times.items()}

@@ -600,7 +600,9 @@ class Device:
         box = extent.stored
         dtype = np.float16 if plan.half else np.float32
         part = np.ascontiguousarray(image[box.top : box.bottom, box.left : box.right], dtype)
-        return self._cl.enqueue_copy(self._queue, self._pool.held["src"], part)
+        # A part that had to be copied is not held until the image is done.
+        copied = part.flags.owndata
+        return self._cl.enqueue_copy(self._queue, self._pool.held["src"], part, is_blocking=copied)
 
     def _download(self, plan: Plan, extent: Extent, output: Output) -> Iterator[Any]:
         """Bring the core of a tile into the whole images."""
@@ -611,7 +613,9 @@ class Device:
             if core.width == extent.width:
                 rows = output.encoded[core.top : core.bottom]
                 start = first[1] * core.width * channels
-                yield self._cl.enqueue_copy(self._queue, rows, held["dst"], src_offset=start)
+                yield self._cl.enqueue_copy(
+                    self._queue, rows, held["dst"], src_offset=start, is_blocking=False
+                )
             else:
                 yield self._cl.enqueue_copy(
                     self._queue,

@@ -90,7 +90,7 @@ def read_image(
             file and the reason.
     """
     try:
-        with _opened(path) as (data, file):
+        with _opened(path) as (digest, file):
             picture = _find_picture(path, file, mosaic, layer)
             spec, pixels = file.spec(), _read_part(path, file, picture, mosaic, max_pixels)
         chromaticities = CIE_XYZ if picture.xyz else spec.getattribute("chromaticities")
@@ -101,7 +101,7 @@ def read_image(
             raise
         window = read_luminance_chroma(path, max_pixels)
         pixels = display_window(window.pixels, window.x, window.y, window.width, window.height)
-        data, attributes, name, shot = path.read_bytes(), {}, "", {}
+        (digest, _), attributes, name, shot = sha256_of(path), {}, "", {}
         chromaticities = window.attributes.get("chromaticities")
         neutral = window.attributes.get("adoptedNeutral")
     warnings = []
@@ -112,8 +112,10 @@ def read_image(
         pixels = np.stack([pixels] * 3, axis=-1)
         warnings.append("it holds luminance alone; the picture is grey")
     elif not mosaic:
+        matrix = None
         try:
-            matrix = to_linear_srgb(SRGB if chromaticities is None else chromaticities, neutral)
+            if chromaticities is not None or neutral is not None:
+                matrix = to_linear_srgb(SRGB if chromaticities is None else chromaticities, neutral)
         except ImageError as error:
             raise ImageError(f"{path}: {error}") from None
         if matrix is not None:
@@ -127,13 +129,14 @@ def read_image(
     ):
         pixels = np.clip(pixels, -HALF_MAX, HALF_MAX)
         warnings.append(f"{beyond} samples beyond {HALF_MAX:g}, the range of half, were clipped")
-    digest = hashlib.sha256(data).hexdigest()
     return SourceImage(pixels, digest, name, tuple(warnings), attributes, shot)
 
 
 def decode_alone(path: Path) -> Array:
     """The samples of a file's first part, (height, width, channel), as they are; for measuring."""
-    with _opened(path) as (_, file):
+    file = oiio.ImageInput.open(str(path))
+    assert file
+    with contextlib.closing(file):
         return np.asarray(file.read_image(file.spec().format))
 
 
@@ -187,7 +190,7 @@ def read_finished(path: Path) -> SourceImage | None:
     Raises:
         ImageError: the file is missing, empty, damaged or no image.
     """
-    with _opened(path) as (data, file):
+    with _opened(path) as (digest, file):
         spec = file.spec()
         picture = picture_channels(list(spec.channelnames))
         if picture is None or spec.format.basetype not in (oiio.UINT8, oiio.UINT16):
@@ -197,7 +200,7 @@ def read_finished(path: Path) -> SourceImage | None:
         if pixels is None or problem:
             raise ImageError(f"{path}: damaged: {_reason(problem)}")
         rgb = np.ascontiguousarray(np.asarray(pixels)[..., list(picture[1])])
-        return SourceImage(rgb, hashlib.sha256(data).hexdigest(), "", (), {})
+        return SourceImage(rgb, digest, "", (), {})
 
 
 def holds_mosaic(path: Path) -> bool:
@@ -213,9 +216,22 @@ def holds_mosaic(path: Path) -> bool:
     return not any(map(picture_channels, parts)) and any(map(mosaic_channel, parts))
 
 
+def sha256_of(path: Path) -> tuple[str, int]:
+    """The SHA-256 of a file, and its size in bytes.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    digest = hashlib.sha256()
+    with open(path, "rb", buffering=0) as file:
+        while part := file.read(4 << 20):
+            digest.update(part)
+        return digest.hexdigest(), file.tell()
+
+
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[tuple[bytes, Any]]:
-    """A file's bytes, and the same file open in OpenImageIO.
+def _opened(path: Path) -> Iterator[tuple[str, Any]]:
+    """A file's SHA-256, and the file open in OpenImageIO.
 
     Raises:
         ImageError: the file is missing, empty, or of no known format.
@@ -225,12 +241,12 @@ def _opened(path: Path) -> Iterator[tuple[bytes, Any]]:
     except UnicodeEncodeError:
         raise ImageError(f"{str(path)!a}: its name is not UTF-8; rename it") from None
     try:
-        data = path.read_bytes()
+        digest, size = sha256_of(path)
     except FileNotFoundError:
         raise ImageError(f"{path}: no such file") from None
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
-    if not data:
+    if not size:
         raise ImageError(f"{path}: the file is empty")
     try:
         hints = oiio.ImageSpec()
@@ -241,7 +257,7 @@ def _opened(path: Path) -> Iterator[tuple[bytes, Any]]:
             failure = SubsampledError if reason.startswith("Subsampled channels") else ImageError
             raise failure(f"{path}: cannot be read as an image: {reason}")
         with contextlib.closing(file):
-            yield data, file
+            yield digest, file
     except UnicodeDecodeError:  # out of any call that gives text from the file
         raise ImageError(f"{path}: damaged: a name or attribute in it is not UTF-8") from None
 
@@ -476,7 +492,10 @@ def display_window(data: Array, x: int, y: int, width: int, height: int) -> Arra
 def without_non_finite(pixels: Array) -> tuple[Array, int]:
     """The image with 0 for each NaN or infinity, and how many there were."""
     if pixels.dtype == np.float16:
-        bad = (pixels.view(np.uint16) & 0x7C00) == 0x7C00
+        bits = pixels.view(np.uint16)
+        if bits.max() < 0x7C00:  # all are finite, and none is negative
+            return pixels, 0
+        bad = (bits & 0x7C00) == 0x7C00
     else:
         bad = ~np.isfinite(pixels)
     count = int(np.count_nonzero(bad))
@@ -687,10 +706,10 @@ def _write(path: Path, spec: Any, pixels: Array) -> None:
             return
         # libjpeg ends the process when it cannot write, so it writes to memory.
         memory = os.memfd_create("jpeg")
-        with open(memory, "rb") as encoded:
+        with open(memory, "rb", buffering=0) as encoded:
             _encode("jpeg", f"/proc/self/fd/{memory}", spec, pixels)
-            with open(to, "wb") as file:
-                shutil.copyfileobj(encoded, file, 1 << 20)
+            with open(to, "wb", buffering=0) as file:
+                shutil.copyfileobj(encoded, file, 8 << 20)
 
     write_beside(path, write)
 

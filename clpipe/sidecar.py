@@ -1,6 +1,5 @@
 """The sidecar: everything that is needed to make a picture again, and whether it must be."""
 
-import hashlib
 import json
 import os
 import platform
@@ -17,7 +16,7 @@ from clpipe.asked import Asked
 from clpipe.config import files_of
 from clpipe.device import Device
 from clpipe.errors import ImageError
-from clpipe.image_io import Reading, SourceImage, versions, write_beside
+from clpipe.image_io import Reading, SourceImage, sha256_of, versions, write_beside
 from clpipe.jobs import Job
 from clpipe.raw_entry import RawImage
 from clpipe.run import Result
@@ -64,8 +63,7 @@ def digests(files: Iterable[str]) -> dict[str, str]:
 
 @lru_cache(maxsize=1024)
 def _digest(file: str, size: int, modified: int) -> str:
-    with open(file, "rb") as data:
-        return hashlib.file_digest(data, "sha256").hexdigest()
+    return sha256_of(Path(file))[0]
 
 
 def is_done(path: Path, job: Job, wanted: Mapping[str, Any], outputs: Sequence[Path]) -> bool:
@@ -132,8 +130,30 @@ def write_sidecar(path: Path, record: Mapping[str, Any]) -> None:
     Raises:
         ImageError: it cannot be written.
     """
-    text = json.dumps(record, indent=2) + "\n"
-    write_beside(path, lambda to: to.write_text(text))
+    data = json_text(record).encode()
+    write_beside(path, lambda to: to.write_bytes(data))
+
+
+def json_text(record: Mapping[str, Any]) -> str:
+    """JSON with a line for each key, and for each object of a list.
+
+    >>> print(json_text({"a": 1, "b": [{"c": 2}, {"d": [3, 4]}]}), end="")
+    {
+      "a": 1,
+      "b": [
+        {"c": 2},
+        {"d": [3, 4]}
+      ]
+    }
+    """
+    lines = []
+    for key, value in record.items():
+        text = json.dumps(value)
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            each = ",\n".join(f"    {json.dumps(one)}" for one in value)
+            text = f"[\n{each}\n  ]"
+        lines.append(f"  {json.dumps(key)}: {text}")
+    return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 def sidecar(

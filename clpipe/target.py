@@ -2,7 +2,7 @@
 
 import contextlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from clpipe.run import Result, Runner
 from clpipe.shots import MAPS, Burst, Shot
 from clpipe.stage import Kind
 from clpipe.truth import variance_of
+from clpipe.types import Array
 
 
 @dataclass(frozen=True)
@@ -220,9 +221,16 @@ class Target:
                 negative = negative_of(chain)
                 raw = result.kept[negative.step] if negative.step else source.pixels
                 write_dng(path, raw, negative, tags, orientation)
-            else:
+            elif FORMATS[format_].ending == "exr":
+                assert result.final is not None
                 attributes = attributes_of(chain.steps[-1], chain, shot.key) | brought
-                write_last(path, FORMATS[format_], result, chain, attributes, tags, turn)
+                if turn != 1:
+                    attributes |= {"orientation": "1"}
+                half = FORMATS[format_].bits == 16
+                image = upright(result.final, turn)
+                write_exr(path, image, chain.result.channels, attributes, half)
+            else:
+                write_display(path, upright(samples(result, FORMATS[format_]), turn), tags)
             outputs.append(path)
         return outputs
 
@@ -258,32 +266,10 @@ def named(job: Job) -> str:
     return f"{job.path} ({job.place})" if job.place else str(job.path)
 
 
-def write_last(
-    path: Path,
-    format_: Format,
-    result: Result,
-    chain: Chain,
-    attributes: Mapping[str, str],
-    tags: Tags,
-    orientation: int,
-) -> None:
-    """Write the last image of a chain, turned as EXIF's ``orientation`` says.
-
-    Raises:
-        ImageError: the file cannot be written.
-    """
-    pixels = result.encoded
-    if format_.bits > 8:
-        assert result.final is not None
-        pixels = result.final if format_.floats else to_16_bit(result.final)
-    if format_.ending == "exr":
-        pixels = result.final
-    assert pixels is not None
-    pixels = upright(pixels, orientation)
-    if format_.ending == "exr":
-        if orientation != 1:
-            attributes = {**attributes, "orientation": "1"}
-        channels = chain.result.channels
-        write_exr(path, pixels, channels, attributes, half=format_.bits == 16)
-    else:
-        write_display(path, pixels, tags)
+def samples(result: Result, format_: Format) -> Array:
+    """The last image as a format for display holds it."""
+    if format_.bits == 8:
+        assert result.encoded is not None
+        return result.encoded
+    assert result.final is not None
+    return result.final if format_.floats else to_16_bit(result.final)
