@@ -308,10 +308,12 @@ def run(
     trace: Path | None,
     **request: Any,
 ) -> None:
-    """Run images through the chain: files, folders or globs of linear float images (EXR), and of
-    camera raws, which are developed as they are: they enter at normalize, where noise is past.
+    """Run images through the chain: files, folders, globs or manifests (.csv, .jsonl) of linear
+    float images (EXR), and of camera raws, which are developed as they are: they enter at
+    normalize, where noise is past.
 
-    Each makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used. With
+    Each makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used. A second
+    run makes only what is missing or has changed. OUT/run.jsonl is the log. With
     --frames: OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise.
     With --webdataset these are in tars, and dots in NAME become "_": a key of WebDataset has none.
 
@@ -332,7 +334,8 @@ def run(
         tars = shard.take(cut(jobs, per_tar, output)) if per_tar else []
         jobs = [job for tar in tars for job in tar.jobs] if per_tar else shard.take(jobs)
         if not jobs:
-            raise RequestError(f"shard {shard.number} of {shard.of} has no image")
+            click.echo(f"shard {shard.number} of {shard.of} has no images", err=True)
+            return
         entrance.check(jobs)
         chain = entrance.first_chain(jobs)
         for option, value in (("--layer", layer), ("--transfer", transfer)):

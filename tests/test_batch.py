@@ -159,6 +159,49 @@ def test_order_threads_and_shards_do_not_change_a_byte(clpipe, renders):
     assert logs < set(three)
 
 
+def test_a_shard_without_images_is_no_mistake(clpipe, renders):
+    result = clpipe("run", renders(2), *RUN, "--shard", "3/3")
+    assert "shard 3 of 3 has no images" in result.stderr
+    assert not Path("out").exists()
+
+
+def test_several_devices_share_a_run(clpipe, renders, tmp_path):
+    clpipe("run", renders(24), "-o", "whole", *RUN[2:])
+    both = ("--device", "0", "--device", "1", "--trace", "trace.json")
+    environment = {"POCL_DEVICES": "pthread pthread"}
+    process = start(tmp_path, "in", *RUN, *both, environment=environment)
+    stderr = process.communicate()[1]
+    if "unknown device '1'" in stderr:
+        pytest.skip("needs PoCL, which makes two devices of one CPU")
+    assert process.returncode == 0, stderr
+    assert contents("out") == contents("whole")
+    events = json.loads(Path("trace.json").read_text())["traceEvents"]
+    assert {"device 0", "device 1"} <= {e["args"].get("name") for e in events}
+
+
+def test_memory_does_not_grow_with_the_number_of_images(renders, tmp_path):
+    renders(1)
+    code = (
+        "import sys; from clpipe.bench_batch import peak_memory; from clpipe.cli import main\n"
+        "try: main(sys.argv[1:])\n"
+        "except SystemExit as end: assert not end.code, end.code\n"
+        "print(peak_memory())"
+    )
+    peaks = []
+    for count in (20, 200):
+        for i in range(count):
+            link = tmp_path / f"many{count}" / f"{i}.exr"
+            link.parent.mkdir(exist_ok=True)
+            link.symlink_to(tmp_path / "in" / "r000.exr")
+        command = [sys.executable, "-c", code, "run", f"many{count}", "-o", f"o{count}", "--quiet"]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        done = subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+        )
+        peaks.append(int(done.stdout))
+    assert peaks[1] < peaks[0] + 16 * 2**20, peaks
+
+
 def test_a_fifth_of_the_files_is_damaged(clpipe, renders):
     renders(10)
     for i in (3, 7):
@@ -365,9 +408,9 @@ def test_a_wrong_shard(text):
         parse_shard(text)
 
 
-def start(folder, *arguments):
+def start(folder, *arguments, environment=None):
     command = [sys.executable, "-m", "clpipe", "run", *map(str, arguments)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **(environment or {})}
     return subprocess.Popen(command, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True)
 
 
