@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -14,10 +15,14 @@ import numpy as np
 import pytest
 
 from clpipe import image_io, sidecar, target
+from clpipe.asked import asked_for
+from clpipe.batch import Batch
+from clpipe.entrance import Entrance
 from clpipe.errors import RequestError
-from clpipe.jobs import Job, Shard, parse_shard
+from clpipe.jobs import Job, Shard, find_jobs, parse_shard
 from clpipe.output_folder import LOCK, output_folder, remove_unfinished
 from clpipe.run_log import read_log
+from clpipe.target import Target
 from tests.conftest import ROOT, written
 
 # A chain that other tests compile too.
@@ -167,7 +172,7 @@ def test_a_shard_without_images_is_no_mistake(clpipe, renders):
 
 def test_several_devices_share_a_run(clpipe, renders, tmp_path):
     clpipe("run", renders(24), "-o", "whole", *RUN[2:])
-    both = ("--device", "0", "--device", "1", "--trace", "trace.json")
+    both = ("--device", "0", "--device", "1")
     environment = {"POCL_DEVICES": "pthread pthread"}
     process = start(tmp_path, "in", *RUN, *both, environment=environment)
     stderr = process.communicate()[1]
@@ -175,8 +180,48 @@ def test_several_devices_share_a_run(clpipe, renders, tmp_path):
         pytest.skip("needs PoCL, which makes two devices of one CPU")
     assert process.returncode == 0, stderr
     assert contents("out") == contents("whole")
-    events = json.loads(Path("trace.json").read_text())["traceEvents"]
-    assert {"device 0", "device 1"} <= {e["args"].get("name") for e in events}
+
+
+def test_devices_develop_at_the_same_time(renders, tmp_path, monkeypatch):
+    renders(8)
+    (tmp_path / "out").mkdir()
+    develop, both = Batch.develop, threading.Barrier(2)
+
+    def together(self, work, shot, runner):
+        both.wait(timeout=20)  # for the other device's image
+        return develop(self, work, shot, runner)
+
+    monkeypatch.setattr(Batch, "develop", together)
+    entrance = Entrance(asked_for())
+    jobs = find_jobs([str(tmp_path / "in")], tmp_path / "out")
+    batch = Batch(
+        entrance, Target(tmp_path / "out", ("png",)), [None, None], entrance.first_chain(jobs)
+    )
+    outcomes = list(batch.run(jobs))
+    assert [o.status for o in outcomes] == ["done"] * 8
+    workers = [s.worker for o in outcomes for s in o.spans if s.step == "device"]
+    assert sorted(workers) == ["device 0"] * 4 + ["device 1"] * 4
+
+
+def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, monkeypatch):
+    renders(30)
+    (tmp_path / "out").mkdir()
+    entrance = Entrance(asked_for())
+    jobs = find_jobs([str(tmp_path / "in")], tmp_path / "out")
+    target = Target(tmp_path / "out", ("png",))
+    batch = Batch(entrance, target, [None], entrance.first_chain(jobs), threads=2)
+    decode, decoded, seen = Batch.decode, [], []
+
+    def counted(self, job, begin):
+        decoded.append(job)
+        return decode(self, job, begin)
+
+    monkeypatch.setattr(Batch, "decode", counted)
+    for done, _ in enumerate(batch.run(jobs)):
+        time.sleep(0.01)  # whoever waits for outcomes is slow
+        seen.append(len(decoded) - done)
+    assert batch.in_flight == 4
+    assert max(seen) <= batch.in_flight + 1
 
 
 def test_memory_does_not_grow_with_the_number_of_images(renders, tmp_path):
