@@ -133,8 +133,11 @@ def test_a_strength_of_0_is_off(device, method):
     assert np.abs(runner.run(image, "k").final - image).max() < 2e-6
 
 
-@pytest.mark.parametrize("pattern", PATTERNS)
-@pytest.mark.parametrize("size", [1, 7, 15])
+# One pattern in every way, the others for what depends on the pattern: each is compiled anew.
+MOSAIC_WINDOWS = [("GRBG", 7), *((pattern, size) for pattern in PATTERNS for size in (1, 15))]
+
+
+@pytest.mark.parametrize(("pattern", "size"), MOSAIC_WINDOWS)
 def test_mosaic_windows_of_all_sizes_on_small_images(device, scalar_device, pattern, size):
     parameters = {
         "mosaic": {"pattern": pattern},
@@ -142,11 +145,13 @@ def test_mosaic_windows_of_all_sizes_on_small_images(device, scalar_device, patt
         "mosaic_denoise": {"size": size, "a": 0.02, "b": 0.01},
     }
     before = ("mosaic", "inverse_white_balance")
-    for balance in ((), ("white_balance",)):
+    whole = pattern == "GRBG"
+    for balance in ((), ("white_balance",)) if whole else ((),):
         stages = (*before, *balance, "mosaic_denoise")
         settings = Settings(stages=stages, parameters=parameters)
         assert compare(device, settings, Kind.RGB, SMALL)[2] < 2e-4
-    assert compare(scalar_device, settings, Kind.RGB, SMALL[:4])[2] < 2e-4
+    if whole:
+        assert compare(scalar_device, settings, Kind.RGB, SMALL[:4])[2] < 2e-4
 
 
 def test_sums_over_the_blocks_of_a_wide_stencil(device, scalar_device):
