@@ -600,9 +600,10 @@ class Device:
         box = extent.stored
         dtype = np.float16 if plan.half else np.float32
         part = np.ascontiguousarray(image[box.top : box.bottom, box.left : box.right], dtype)
-        # A part that had to be copied is not held until the image is done.
-        copied = part.flags.owndata
-        return self._cl.enqueue_copy(self._queue, self._pool.held["src"], part, is_blocking=copied)
+        event = self._cl.enqueue_copy(self._queue, self._pool.held["src"], part, is_blocking=False)
+        if part.flags.owndata:
+            event.wait()  # or the event would hold the copy until the image is done
+        return event
 
     def _download(self, plan: Plan, extent: Extent, output: Output) -> Iterator[Any]:
         """Bring the core of a tile into the whole images."""
