@@ -133,7 +133,7 @@ def test_numbers_found_twice_and_kept_images(device, monkeypatch):
     image = example(Kind.RGB, (157, 211))
     keep = [step.name for step in chain.steps]
     kept, count = in_tiles(Runner(chain, device, keep), image, 64, 48, monkeypatch)
-    assert count >= 9
+    assert count >= 6
     assert list(kept.kept) == keep
     assert set(kept.found) == {"white_balance", "white_balance_2"}
     fused, _ = in_tiles(Runner(chain, device, final=True), image, 64, 48, monkeypatch)
