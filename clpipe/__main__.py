@@ -1,5 +1,16 @@
-"""``python -m clpipe``."""
+"""The program: ``clpipe``, or ``python -m clpipe``."""
 
-from clpipe.cli import main
+import signal
 
-main()
+
+def main() -> None:
+    """Run the command line; Ctrl-C while it is still being loaded just ends it."""
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from clpipe.cli import main as command
+
+    signal.signal(signal.SIGINT, before)
+    command()
+
+
+if __name__ == "__main__":
+    main()

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.config import (
+    KEYS,
     OUTPUT,
     Chain,
     Settings,
@@ -76,7 +77,8 @@ class Asked:
         """
         chain = make_chain(settings, start_at=start_at, until=self.until)
         for step, value in self.options.items():
-            if isinstance(value, Mapping) and step not in (*chain.names, OUTPUT):
+            named = isinstance(value, Mapping) and step not in KEYS  # or it is a draw
+            if named and step not in (*chain.names, OUTPUT):
                 raise RequestError(one_of("stage in this chain", step, chain.names))
         return chain
 

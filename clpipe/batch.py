@@ -25,7 +25,7 @@ from clpipe.image_io import SourceImage, set_codec_threads
 from clpipe.jobs import Job
 from clpipe.run import Result, Runner
 from clpipe.shots import Shot
-from clpipe.sidecar import is_done, sidecar, stamp_of, wanted, write_sidecar
+from clpipe.sidecar import check_own, is_done, sidecar, stamp_of, wanted, write_sidecar
 from clpipe.stage import Kind
 from clpipe.target import DNG, SIDECAR, Target
 from clpipe.types import Array
@@ -229,7 +229,10 @@ class Batch:
         """What makes the runner of a shot on a device; the kernels of the first are compiled."""
         entrance, target = self._entrance, self._target
         first = target.runner(Shot("", self._chain, ""), device)
-        first.warm_up(half=entrance.reentry is None and self._chain.source is Kind.RGB)
+        try:
+            first.warm_up(half=entrance.reentry is None and self._chain.source is Kind.RGB)
+        except ImageError as error:  # not even one of 8x8 pixels
+            raise RequestError(f"--memory: too little for any image: {error}") from None
         latest = [(self._chain, first)]
         alike = {(first.keep, first.encode, first.final): first}
 
@@ -290,11 +293,16 @@ class Batch:
         """Whether a picture is there already, as it is wanted.
 
         Raises:
-            ImageError: its sidecar is somebody else's file.
+            ImageError: a file of its name is somebody else's.
         """
         target = self._target
         path, outputs = target.path(job, SIDECAR, name), target.outputs(job, name)
-        return is_done(path, job, wanted, outputs)
+        if is_done(path, job, wanted, outputs):
+            return True
+        if not path.exists():
+            for output in outputs:
+                check_own(output)
+        return False
 
     def _read(self, work: Work, names: Sequence[str]) -> None:
         """Read a job's image, and see what pictures are to be made of it.

@@ -46,7 +46,7 @@ from clpipe.shots import TRUTHS, Burst, Shot
 from clpipe.stage import Kind, Stage
 from clpipe.suggest import one_of
 from clpipe.target import EVERY_FORMAT, Target
-from clpipe.trace import Trace
+from clpipe.trace import Trace, check_trace
 from clpipe.webdataset import Tar, TarBatch, cut
 
 
@@ -194,7 +194,7 @@ def main() -> None:
     "-o",
     "--output",
     required=True,
-    type=click.Path(path_type=Path),
+    callback=lambda _context, _option, text: folder_named(text),
     metavar="OUT",
     help="The folder for what comes out; made if need be.",
 )
@@ -347,6 +347,8 @@ def run(
         formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
         target = Target(output, formats, Burst(frames, truths), chain.kept(keep))
     target.check(chain, jobs)
+    if trace:
+        check_trace(trace)
     budget = parse_size(memory) if memory else None
     engine = engine_for(
         Order(entrance, target, selectors, budget, threads, overwrite, trace is not None),
@@ -402,6 +404,17 @@ def engine_for(
             TarBatch(tars, order.entrance, order.target, devices or [None], chain, *how)
         )
     return nullcontext(Batch(order.entrance, order.target, devices or [None], chain, *how))
+
+
+def folder_named(text: str) -> Path:
+    """The folder for what comes out.
+
+    Raises:
+        RequestError: the name is empty.
+    """
+    if not text:
+        raise RequestError("--output: it is empty; name a folder")
+    return Path(text)
 
 
 BESIDE_REPLAY = (

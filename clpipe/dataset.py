@@ -112,6 +112,10 @@ class Dataset:
         self._encode = chain.result is Kind.DISPLAY
         self._truth = truth
         self._selector = None if device is None else str(device)
+        if epochs is not None and (type(epochs) is not int or epochs < 1):
+            raise RequestError(
+                f"found epochs {epochs!r}; expected a whole number from 1 on, or None"
+            )
         self._epochs = epochs
         self._threads = threads or len(os.sched_getaffinity(0))
         self._opened: _Developer | None = None

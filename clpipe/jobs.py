@@ -87,7 +87,7 @@ def find_jobs(
 
 def images_in(folder: Path, output: Path, endings: Sequence[str]) -> list[Path]:
     """The files in a folder at any depth that end so, sorted; hidden ones and a folder in it that
-    is the output aside, links followed.
+    is the output aside, links followed. A link that leads nowhere is one too: it fails later.
     """
     found: list[Path] = []
     seen: set[str] = set()
@@ -103,7 +103,7 @@ def images_in(folder: Path, output: Path, endings: Sequence[str]) -> list[Path]:
             for n in names
             if not n.startswith(".") and os.path.splitext(n)[1].lower() in endings
         ]
-    return sorted(path for path in found if path.is_file())
+    return sorted(p for p in found if p.is_file() or p.is_symlink())
 
 
 @dataclass(frozen=True)

@@ -245,7 +245,7 @@ def _from_json(line: str) -> dict[str, Any]:
         raise RequestError(f"found {line.strip()[:40]}, but a row is an object: {{...}}")
     pairs: list[tuple[str, Any]] = []
     for key, value in found.items():
-        if isinstance(value, dict) and key not in (*OWN, *PLAIN):
+        if isinstance(value, dict) and "." not in key and key not in (*OWN, *PLAIN):
             pairs += [(f"{key}.{name}", one) for name, one in value.items()]
         else:
             pairs.append((key, value))
@@ -304,10 +304,7 @@ def _row(folder: Path, place: str, found: Mapping[str, Any]) -> Row:
     path, name, frames = found.get("path", ""), found.get("name", ""), found.get("frames")
     if os.path.basename(path) in ("", ".", ".."):
         raise RequestError(f"path: found {path!r}, which names no image")
-    if name and not all(part not in ("", ".", "..") for part in name.split("/")):
-        raise RequestError(
-            f"name: found {name!r}, but it is a path in the output folder, such as a/frame_0001"
-        )
+    check_name(name)
     if frames is not None and (type(frames) is not int or frames < 1):
         raise RequestError(f"frames: found {frames!r}, but it is a whole number from 1 on")
     values: dict[str, Any] = {}
@@ -319,6 +316,18 @@ def _row(folder: Path, place: str, found: Mapping[str, Any]) -> Row:
             values[column] = value
     key = name or _relative(folder, path)
     return Row(folder / path, key, name, from_folder(folder, values), frames, place)
+
+
+def check_name(name: str) -> None:
+    """See that the name of outputs, where there is one, stays in the output folder.
+
+    Raises:
+        RequestError: it does not.
+    """
+    if name and ("\0" in name or not {"", ".", ".."}.isdisjoint(name.split("/"))):
+        raise RequestError(
+            f"name: found {name!r}, but it is a path in the output folder, such as a/frame_0001"
+        )
 
 
 def _check_text(column: str, value: Any) -> None:

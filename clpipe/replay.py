@@ -11,8 +11,10 @@ from clpipe.entrance import Entrance
 from clpipe.errors import ImageError, RequestError
 from clpipe.image_io import Reading
 from clpipe.jobs import Job
+from clpipe.manifest import check_name
 from clpipe.shots import Burst, truth_named
 from clpipe.sidecar import digests, read_sidecar
+from clpipe.target import EVERY_FORMAT
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,14 @@ def _replay(found: dict[str, Any], inputs: Sequence[Path], max_pixels: int) -> R
     asked, picture = found["asked"], str(found["picture"])
     own = asked_again(asked)
     reading = Reading(asked["layer"], max_pixels, asked["transfer"])
+    check_name(str(found["name"]))
+    frames = found["frames"]
+    burst = Burst(frames, tuple(filter(None, [truth_named(picture)])))
+    formats = tuple(asked["formats"])
+    if not set(formats) <= set(EVERY_FORMAT) or not (frames is None or frames > 0):
+        raise RequestError(f"found formats {', '.join(map(str, formats))} and frames {frames}")
+    if picture not in burst.names():
+        raise RequestError(f"found picture {picture!r}")
     job = Job(
         inputs[0] if inputs else Path(found["input"]),
         own.image_key,
@@ -80,11 +90,4 @@ def _replay(found: dict[str, Any], inputs: Sequence[Path], max_pixels: int) -> R
         values=own.row,
         pictures=(picture,),
     )
-    truth = truth_named(picture)
-    return Replay(
-        Entrance(own, reading),
-        job,
-        tuple(asked["formats"]),
-        tuple(asked["keep"]),
-        Burst(found["frames"], (truth,) if truth else ()),
-    )
+    return Replay(Entrance(own, reading), job, formats, tuple(asked["keep"]), burst)

@@ -23,7 +23,9 @@ from clpipe.run import Result
 from clpipe.shots import Shot
 from clpipe.target import Target
 
-OWN = "clpipe"  # the key that every sidecar has
+OWN = "clpipe"  # the key that every sidecar has, its first one
+NEAR = 1 << 16  # bytes in which a file says who wrote it
+BEGINNING = f'{{\n  "{OWN}": '.encode()
 
 
 def wanted(asked: Asked, reading: Reading, target: Target) -> dict[str, Any]:
@@ -91,7 +93,7 @@ def is_as_wanted(found: Mapping[str, Any], job: Job, wanted: Mapping[str, Any]) 
     An input of the same size and time of change is taken for the same; else its SHA-256 decides.
     ``wanted`` as for :func:`is_done`.
     """
-    if found.get(OWN) != clpipe.__version__ or found.get("asked") != wanted:
+    if found.get(OWN) != clpipe.__version__ or not _same(found.get("asked"), wanted):
         return False
     size, modified = stamp_of(job.path)
     if found.get("input_size") != size:
@@ -101,27 +103,69 @@ def is_as_wanted(found: Mapping[str, Any], job: Job, wanted: Mapping[str, Any]) 
     return found.get("sha256") in digests([str(job.path)]).values()
 
 
+def _same(asked: Any, wanted: Mapping[str, Any]) -> bool:
+    """Whether the same was asked for; files that are named by their contents, wherever they lie."""
+    if asked == wanted:
+        return True
+    if not isinstance(asked, dict) or not (wanted["files"] and asked.get("files")):
+        return False
+    texts = []
+    for values in (asked, wanted):
+        text = json.dumps({k: v for k, v in values.items() if k != "files"}, sort_keys=True)
+        for file, digest in values["files"].items():
+            text = text.replace(json.dumps(file), json.dumps(digest))
+        texts.append(text)
+    return texts[0] == texts[1]
+
+
 def read_sidecar(path: Path) -> dict[str, Any]:
     """A sidecar's values.
 
     Raises:
-        FileNotFoundError: it is not there.
+        FileNotFoundError: it is not there, or is empty or cut off, as a loss of power may leave it.
         ImageError: it cannot be read, or clpipe did not write it.
     """
     try:
-        found = json.loads(path.read_bytes())
+        data = path.read_bytes()
     except FileNotFoundError:
         raise
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError:
+    try:
+        found = json.loads(data)
+    except (ValueError, RecursionError):
         found = None
+        if not data.strip(b"\0") or data.startswith(BEGINNING):
+            raise FileNotFoundError(path) from None
     if not isinstance(found, dict) or OWN not in found:
         raise ImageError(
             f"{path}: clpipe did not write this file, and would overwrite it with its sidecar; "
             "move it, choose another output folder, or say --overwrite"
         )
     return found
+
+
+def check_own(path: Path) -> None:
+    """See that a picture that would be written over, and has no sidecar, is one of clpipe's.
+
+    All its formats say so, before their pixels or behind them; a run that was killed may have left
+    one without a sidecar.
+
+    Raises:
+        ImageError: it is somebody else's.
+    """
+    try:
+        with open(path, "rb") as file:
+            ends = file.read(NEAR)
+            file.seek(max(os.fstat(file.fileno()).st_size - NEAR, 0))
+            ends += file.read(NEAR)
+    except OSError:
+        return  # it is not there, or the writing of it says why
+    if ends and OWN.encode() not in ends:
+        raise ImageError(
+            f"{path}: clpipe did not write this picture, and would overwrite it; "
+            "move it, choose another output folder, or say --overwrite"
+        )
 
 
 def write_sidecar(path: Path, record: Mapping[str, Any]) -> None:

@@ -1,6 +1,7 @@
 """Where the pictures of a run go: names and formats."""
 
 import contextlib
+import errno
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -21,6 +22,7 @@ from clpipe.image_io import (
     write_exr,
 )
 from clpipe.jobs import Job
+from clpipe.memory import in_words
 from clpipe.reentry import attributes_of
 from clpipe.reference.curve import to_16_bit
 from clpipe.run import Result, Runner
@@ -254,7 +256,8 @@ def trouble_with(folder: Path) -> str:
         with open(probe, "wb") as file:
             os.posix_fallocate(file.fileno(), 0, ROOM)
     except OSError as error:
-        return f"cannot write there: {error.strerror}"
+        wanted = f" ({in_words(ROOM)} are wanted)" if error.errno == errno.ENOSPC else ""
+        return f"cannot write there: {error.strerror}{wanted}"
     finally:
         with contextlib.suppress(OSError):
             probe.unlink()

@@ -6,7 +6,29 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.batch import STEPS, Outcome
+from clpipe.errors import RequestError
 from clpipe.image_io import write_new
+
+BEGINNING = b'{"traceEvents"'
+
+
+def check_trace(path: Path) -> None:
+    """See that a trace may be written under a name.
+
+    Raises:
+        RequestError: there is something else of that name, or it does not end in .json.
+    """
+    if path.suffix != ".json":
+        raise RequestError(f"--trace: found {path}; expected a name that ends in .json")
+    try:
+        with open(path, "rb") as file:
+            own = file.read(len(BEGINNING)) == BEGINNING
+    except FileNotFoundError:
+        return
+    except OSError:
+        own = False
+    if not own:
+        raise RequestError(f"--trace: {path} is there and is no trace; choose another name")
 
 
 class Trace:

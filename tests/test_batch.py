@@ -22,7 +22,7 @@ from clpipe.errors import RequestError
 from clpipe.jobs import Job, Shard, find_jobs, parse_shard
 from clpipe.output_folder import LOCK, output_folder, remove_unfinished
 from clpipe.run_log import read_log
-from clpipe.target import Target
+from clpipe.target import EVERY_FORMAT, Target, ending_of
 from tests.conftest import ROOT, written
 
 # A chain that other tests compile too.
@@ -137,7 +137,9 @@ def test_frames_that_are_missing_are_made_alone(clpipe, renders):
     assert contents("out") == whole
 
 
-@pytest.mark.parametrize("text", ['{"annotations": []}', "[1, 2]", "no JSON", ""])
+@pytest.mark.parametrize(
+    "text", ['{"annotations": []}', "[1, 2]", "no JSON", pytest.param("[" * 100_000, id="deep")]
+)
 def test_a_file_of_another_hand_is_not_written_over(clpipe, renders, text):
     renders(2)
     Path("out").mkdir()
@@ -552,3 +554,73 @@ def test_a_sidecar_whose_picture_cannot_be_the_same(clpipe, renders, monkeypatch
     Path("half.json").write_text('{"clpipe": "9.9.9", "asked": {}}')
     assert "it is damaged" in clpipe("run", "--replay", "half.json", "-o", "b", status=2).stderr
     assert "no such file" in clpipe("run", "--replay", "no.json", "-o", "b", status=2).stderr
+
+
+@pytest.mark.parametrize("kept", [0, 20, 300])
+def test_a_sidecar_that_was_cut_off_is_none(clpipe, renders, kept):
+    clpipe("run", renders(1), *RUN)
+    whole, sidecar_ = contents("out"), Path("out/r000.json")
+    sidecar_.write_bytes(sidecar_.read_bytes()[:kept])
+    clpipe("run", "in", *RUN)
+    assert contents("out") == whole
+
+
+@pytest.mark.parametrize("format_", EVERY_FORMAT)
+def test_a_picture_of_another_hand_is_not_written_over(clpipe, renders, format_):
+    run = ("run", renders(1), *RUN, "--format", format_)
+    clpipe(*run)
+    Path("out/r000.json").unlink()
+    clpipe(*run)  # as a killed run may have left it
+    Path("out/r000.json").unlink()
+    picture = Path(f"out/r000.{ending_of(format_)}")
+    picture.write_bytes(b"somebody else's" * 20_000)
+    assert f"{picture}: clpipe did not write this picture" in clpipe(*run, status=1).stderr
+    assert picture.read_bytes().startswith(b"somebody")
+    clpipe(*run, "--overwrite")
+
+
+def test_a_link_that_leads_nowhere_is_a_failed_image(clpipe, renders):
+    Path(renders(1), "gone.exr").symlink_to("/nowhere/gone.exr")
+    assert "in/gone.exr: no such file" in clpipe("run", "in", *RUN, status=1).stderr
+    assert statuses("out") == {"r000.exr": "done", "gone.exr": "failed"}
+
+
+def test_a_file_is_the_same_however_it_is_spelled(clpipe, renders, tmp_path, monkeypatch):
+    Path("mine.toml").write_text((ROOT / "clpipe/cameras/sony-a7r2.toml").read_text())
+    clpipe("run", renders(2), *RUN, "--camera", "mine.toml")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    clpipe("run", "../in", "-o", "../out", *RUN[2:], "--camera", "../mine.toml")
+    assert set(statuses("../out").values()) == {"skipped"}
+    Path("../mine.toml").write_text(Path("../mine.toml").read_text() + "\n")
+    clpipe("run", "../in", "-o", "../out", *RUN[2:], "--camera", "../mine.toml")
+    assert set(statuses("../out").values()) == {"done"}
+
+
+def test_what_a_trace_must_not_write_over(clpipe, renders):
+    renders(1)
+    Path("notes.json").write_text("{}")
+    for name in ("in/r000.exr", "notes.json", ".", "in"):
+        assert "--trace: " in clpipe("run", "in", *RUN, "--trace", name, status=2).stderr
+    assert not Path("out").exists()
+    for _ in range(2):
+        clpipe("run", "in", *RUN, "--trace", "trace.json")
+
+
+def test_an_output_or_memory_that_cannot_be(clpipe, renders):
+    renders(1)
+    assert "--output: it is empty" in clpipe("run", "in", "-o", "", status=2).stderr
+    assert "--memory: too little" in clpipe("run", "in", *RUN, "--memory", "1K", status=2).stderr
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("name", "../../evil"), ("name", "/tmp/evil"), ("frames", -3), ("picture", ".frame9")],
+)
+def test_a_sidecar_that_somebody_edited(clpipe, renders, key, value):
+    clpipe("run", renders(1), *RUN)
+    record = json.loads(Path("out/r000.json").read_text())
+    Path("edited.json").write_text(json.dumps({**record, key: value}))
+    stderr = clpipe("run", "--replay", "edited.json", "-o", "b", status=2).stderr
+    assert "edited.json: it is damaged" in stderr
+    assert not Path("b").exists()

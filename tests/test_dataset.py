@@ -207,3 +207,14 @@ def test_it_pickles_before_and_after_it_was_used(dataset):
     assert dataset._opened and dataset._opened.process == os.getpid()
     for data in (before, pickle.dumps(dataset)):
         same(pickle.loads(data)[1], one)
+
+
+def test_an_iso_that_is_drawn(renders):
+    samples = api.Dataset(renders, device="numpy", iso={"choice": [100, 400]}, epochs=4)
+    assert {sample["iso"] for sample in samples} == {100, 400}
+
+
+@pytest.mark.parametrize("epochs", [0, -1, 1.5])
+def test_epochs_that_cannot_be(renders, epochs):
+    with pytest.raises(RequestError, match="found epochs"):
+        api.Dataset(renders, epochs=epochs)

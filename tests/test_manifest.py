@@ -373,3 +373,16 @@ def test_what_is_written_is_read_again(folder, rows):
             nested["sensor_noise"] = {"a": row["sensor_noise.a"]}
         assert from_csv.values == from_json.values == nested
     assert check_rows(one, DEFAULT) == check_rows(two, DEFAULT)
+
+
+def test_draws_under_dotted_keys_of_jsonl(tmp_path):
+    (tmp_path / "list.jsonl").write_text(
+        '{"path": "a.exr", "sensor_noise.a": {"uniform": [1e-4, 1e-3]}, '
+        '"demosaic.method": {"choice": ["bilinear", "median"]}}\n'
+    )
+    (row,) = read_manifest(tmp_path / "list.jsonl")
+    assert row.values == {
+        "sensor_noise": {"a": {"uniform": [1e-4, 1e-3]}},
+        "demosaic": {"method": {"choice": ["bilinear", "median"]}},
+    }
+    check_rows([row], settings_from({}))
