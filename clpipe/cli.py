@@ -325,6 +325,8 @@ def run(
     if replay:
         refuse_beside_replay()
         again = replay_of(replay, [Path(path) for path in inputs], max_pixels)
+        if again.doubt:
+            click.echo(f"clpipe: {replay}: warning: {again.doubt}", err=True)
         entrance, jobs, tars = again.entrance, [again.job], []
         chain = entrance.first_chain(jobs)
         target = Target(output, again.formats, again.burst, again.keep)

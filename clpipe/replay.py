@@ -13,7 +13,7 @@ from clpipe.image_io import Reading
 from clpipe.jobs import Job
 from clpipe.manifest import check_name
 from clpipe.shots import Burst, truth_named
-from clpipe.sidecar import digests, read_sidecar
+from clpipe.sidecar import all_versions, digests, read_sidecar
 from clpipe.target import EVERY_FORMAT
 
 
@@ -26,6 +26,7 @@ class Replay:
     formats: tuple[str, ...]
     keep: tuple[str, ...]
     burst: Burst
+    doubt: str  # why the bytes may be others after all; "" where nothing speaks for it
 
 
 def replay_of(path: Path, inputs: Sequence[Path], max_pixels: int) -> Replay:
@@ -90,4 +91,9 @@ def _replay(found: dict[str, Any], inputs: Sequence[Path], max_pixels: int) -> R
         values=own.row,
         pictures=(picture,),
     )
-    return Replay(Entrance(own, reading), job, formats, tuple(asked["keep"]), burst)
+    were = found["versions"]
+    other = [
+        f"{name} {were.get(name)}" for name, now in all_versions().items() if were[name] != now
+    ]
+    doubt = f"was made with {', '.join(other)}; the bytes may be others" if other else ""
+    return Replay(Entrance(own, reading), job, formats, tuple(asked["keep"]), burst, doubt)

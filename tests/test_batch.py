@@ -624,3 +624,14 @@ def test_a_sidecar_that_somebody_edited(clpipe, renders, key, value):
     stderr = clpipe("run", "--replay", "edited.json", "-o", "b", status=2).stderr
     assert "edited.json: it is damaged" in stderr
     assert not Path("b").exists()
+
+
+def test_a_sidecar_made_with_other_libraries(clpipe, renders):
+    clpipe("run", renders(1), *RUN)
+    sidecar_ = Path("out/r000.json")
+    record = json.loads(sidecar_.read_text())
+    assert "warning" not in clpipe("run", "--replay", sidecar_, "-o", "b").stderr
+    record["versions"]["OpenImageIO"] = "1.2.3"
+    sidecar_.write_text(json.dumps(record))
+    stderr = clpipe("run", "--replay", sidecar_, "-o", "c").stderr
+    assert "warning: was made with OpenImageIO 1.2.3; the bytes may be others" in stderr
