@@ -209,7 +209,7 @@ def connected(address: str, order: Order) -> Iterator["Cluster"]:
     try:
         from distributed import Client
     except ImportError:
-        raise RequestError("--dask: needs distributed; pip install 'clpipe[dask]'") from None
+        raise RequestError("--dask: needs distributed; pip install distributed") from None
     try:
         asyncio.run(_reach(address))
         client = Client(address, timeout=TIMEOUT, name="clpipe", set_as_default=False)

@@ -276,4 +276,4 @@ def test_a_scheduler_that_cannot_be_reached(clpipe, renders, monkeypatch):
 def test_distributed_is_an_extra(clpipe, renders, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     told = clpipe("run", "in", "-o", "out", "--dask", "tcp://127.0.0.1:1", status=2).stderr
-    assert "pip install 'clpipe[dask]'" in told
+    assert "pip install distributed" in told

@@ -1,6 +1,6 @@
 """A Dask cluster of this machine's processors, and a run of clpipe on it.
 
-    pip install 'clpipe[dask]'
+    pip install distributed
     python tools/examples/dask_local.py frames/ -o out --iso 3200
 
 All arguments go to clpipe run. On one machine clpipe alone does the same with less ado: this shows

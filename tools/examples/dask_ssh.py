@@ -1,6 +1,6 @@
 """A Dask cluster of machines that are reached by SSH, and a run of clpipe on it.
 
-    pip install 'clpipe[dask]' asyncssh
+    pip install distributed asyncssh
     HOSTS="node1 node2 node3" python tools/examples/dask_ssh.py /data/frames -o /data/out --iso 3200
 
 All arguments go to clpipe run. Each host starts a worker, the first one the scheduler too. They
