@@ -435,6 +435,8 @@ class _Run:
             self._places.release()
         for _ in self._developers:
             self._decoded.put(None)
+            if self._broken:
+                self._results.release()  # perhaps nobody is left to do so
         for thread in [*self._decoders, *self._developers]:
             thread.join()
         for _ in self._encoders:
@@ -470,6 +472,8 @@ class _Run:
         while work := self._decoded.get():
             for shot in work.shots:
                 self._results.acquire()
+                if self._broken:
+                    return
                 result = None
                 if not work.error:
                     result = self._batch.develop(work, shot, runners(shot))

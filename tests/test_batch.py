@@ -635,3 +635,31 @@ def test_a_sidecar_made_with_other_libraries(clpipe, renders):
     sidecar_.write_text(json.dumps(record))
     stderr = clpipe("run", "--replay", sidecar_, "-o", "c").stderr
     assert "warning: was made with OpenImageIO 1.2.3; the bytes may be others" in stderr
+
+
+def test_what_nobody_expected_ends_the_run_and_does_not_hang(renders, tmp_path, monkeypatch):
+    renders(30)
+    (tmp_path / "out").mkdir()
+    entrance = Entrance(asked_for())
+    jobs = find_jobs([str(tmp_path / "in")], tmp_path / "out")
+    target, chain = Target(tmp_path / "out", ("png",)), entrance.first_chain(jobs)
+    for step in ("decode", "develop", "encode"):
+        caught = []
+
+        def fail(*_):
+            raise ValueError("a mistake of ours")
+
+        def run(batch, caught=caught):
+            try:
+                list(batch.run(jobs))
+            except ValueError as error:
+                caught.append(str(error))
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Batch, step, fail)
+            batch = Batch(entrance, target, [None], chain, threads=1)
+            thread = threading.Thread(target=run, args=(batch,), daemon=True)
+            thread.start()
+            thread.join(20)
+            assert not thread.is_alive(), step
+        assert caught == ["a mistake of ours"]
