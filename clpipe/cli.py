@@ -365,10 +365,10 @@ def run(
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
         with (
             closing(batch.run(jobs)) as outcomes,
-            RunLog(output / log_name(shard), start) as log,
+            closing(RunLog(output / log_name(shard), start)) as log,
             interruptible(batch.stop),
-            Reporter(summary, target, Console(stderr=True), quiet) as reporter,
         ):
+            reporter = Reporter(summary, target, Console(stderr=True), quiet)
             try:
                 for outcome in outcomes:
                     summary.add(outcome)

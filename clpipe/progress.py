@@ -1,8 +1,5 @@
 """What a run says while it goes on: a bar on a terminal, lines in a log. All of it on stderr."""
 
-from types import TracebackType
-from typing import Self
-
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -14,7 +11,7 @@ NAMED = 20  # failures that are named again at the end
 
 
 class Reporter:
-    """Tells of outcomes as they come, and of all of them at the end.
+    """Tells of outcomes as they come, and of all of them when it is told to end.
 
     Args:
         summary: what became of the images so far; kept up by who calls.
@@ -42,6 +39,7 @@ class Reporter:
                 transient=True,
             )
             self._task = self._bar.add_task("", total=summary.total)
+            self._bar.start()
 
     def say(self, text: str) -> None:
         """A line of its own."""
@@ -102,17 +100,3 @@ class Reporter:
             speed = summary.megapixels / summary.elapsed
             text += f"; {summary.elapsed:.1f} s, {speed:.3g} MP/s; {summary.shares()}"
         self.say(text)
-
-    def __enter__(self) -> Self:
-        if self._bar:
-            self._bar.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._bar:
-            self._bar.stop()

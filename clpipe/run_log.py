@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO
 
 import clpipe
 from clpipe.batch import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS, Outcome
@@ -140,15 +139,8 @@ class RunLog:
         if self._file:
             self._write(_line("end", time.time(), summary.record()))
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Close the file."""
         if self._file:
             self._file.close()
 
