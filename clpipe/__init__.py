@@ -1,11 +1,29 @@
-"""clpipe puts a clean, linear render through a camera: mosaic, sensor noise, development."""
+"""clpipe puts a clean, linear render through a camera: mosaic, sensor noise, development.
 
-__version__ = "0.1.0"
+What is exported here is the Python API. Names are imported on first use, so that ``import clpipe``
+takes as long as an empty module.
+"""
 
-from clpipe.dataset import Dataset
-from clpipe.errors import ClpipeError, DeviceError, ImageError, RequestError
-from clpipe.pipeline import Pipeline
-from clpipe.run import Result
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from clpipe.base.about import __version__
+
+if TYPE_CHECKING:
+    from clpipe.base.errors import ClpipeError, DeviceError, ImageError, RequestError
+    from clpipe.dataset import Dataset
+    from clpipe.engine.runner import Result
+    from clpipe.pipeline import Pipeline
+
+_MODULES = {
+    "ClpipeError": "clpipe.base.errors",
+    "Dataset": "clpipe.dataset",
+    "DeviceError": "clpipe.base.errors",
+    "ImageError": "clpipe.base.errors",
+    "Pipeline": "clpipe.pipeline",
+    "RequestError": "clpipe.base.errors",
+    "Result": "clpipe.engine.runner",
+}
 
 __all__ = [
     "ClpipeError",
@@ -15,4 +33,15 @@ __all__ = [
     "Pipeline",
     "RequestError",
     "Result",
+    "__version__",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -6,7 +6,7 @@ import signal
 def main() -> None:
     """Run the command line; Ctrl-C while it is still being loaded just ends it."""
     before = signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from clpipe.cli import main as command
+    from clpipe.commands.main import main as command
 
     signal.signal(signal.SIGINT, before)
     command()

@@ -12,18 +12,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
-from clpipe.asked import Asked
-from clpipe.config import Chain, own_values
-from clpipe.device import Device, open_device
-from clpipe.entrance import Entered, Entrance
-from clpipe.errors import ImageError, RequestError
-from clpipe.image_io import Reading, set_codec_threads
-from clpipe.jobs import Job, find_jobs
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.chain.chain import Chain
+from clpipe.chain.files import own_values
+from clpipe.chain.request import Request
+from clpipe.engine.device import Device, open_device
+from clpipe.engine.runner import Runner
+from clpipe.images.read import ReadOptions, set_codec_threads
+from clpipe.inputs.find import Job, find_jobs
+from clpipe.inputs.loader import ImageLoader, LoadedImage
+from clpipe.inputs.raw import RawImage
+from clpipe.outputs.writer import named
 from clpipe.pipeline import plain
-from clpipe.raw_entry import RawImage
-from clpipe.run import Runner
 from clpipe.stage import Kind
-from clpipe.target import named
 
 Sample = dict[str, Any]
 NOWHERE = Path(os.devnull)  # nothing is written
@@ -99,15 +100,15 @@ class Dataset:
         **settings: Any,
     ) -> None:
         own = None if config is None else own_values(str(config))
-        asked = Asked(own, plain(settings), start_at=start_at, until=until)
-        self._entrance = Entrance(asked, Reading(layer=layer, transfer=transfer))
+        asked = Request(own, plain(settings), start_at=start_at, until=until)
+        self._entrance = ImageLoader(asked, ReadOptions(layer=layer, transfer=transfer))
         several = [inputs] if isinstance(inputs, str | Path) else inputs
         self._jobs = find_jobs([str(i) for i in several], NOWHERE, self._entrance.endings())
         self._entrance.check(self._jobs)
         _check_keys(self._jobs)
         chain = self._entrance.first_chain(self._jobs)
         if truth:
-            chain.clean()  # refuses a chain that adds no noise
+            chain.without_noise()  # refuses a chain that adds no noise
         self._keep = chain.kept([keep] if isinstance(keep, str) else keep)
         self._encode = chain.result is Kind.DISPLAY
         self._truth = truth
@@ -200,7 +201,7 @@ class Dataset:
         epoch, image = divmod(number, len(self._jobs))
         return self._jobs[image], self._epoch + epoch
 
-    def _read(self, job: Job, epoch: int) -> Entered:
+    def _read(self, job: Job, epoch: int) -> LoadedImage:
         entrance = self._entrance
         try:
             entrance = entrance.of(replace(job, key=key_in(epoch, job.key)))
@@ -216,10 +217,10 @@ class Dataset:
             warnings.warn(f"{job.path}: {warning}", stacklevel=2)
         return entered
 
-    def _develop_read(self, job: Job, epoch: int, read: Future[Entered]) -> Sample:
+    def _develop_read(self, job: Job, epoch: int, read: Future[LoadedImage]) -> Sample:
         return self._develop(job, epoch, read.result())
 
-    def _develop(self, job: Job, epoch: int, entered: Entered) -> Sample:
+    def _develop(self, job: Job, epoch: int, entered: LoadedImage) -> Sample:
         chain = entered.chain
         try:
             made = self._developer().develop(entered, key_in(epoch, entered.key))
@@ -261,7 +262,7 @@ class _Developer:
         self._chain: Chain | None = None
         self._runners: dict[str, Runner] = {}
 
-    def develop(self, entered: Entered, key: str) -> Sample:
+    def develop(self, entered: LoadedImage, key: str) -> Sample:
         """The pictures of an image, and what is kept on the way.
 
         Raises:
@@ -281,7 +282,7 @@ class _Developer:
         """Have runners for a chain, which is mostly the one before."""
         if chain is self._chain:
             return
-        chains = {"image": chain, **({"truth": chain.clean()} if self._truth else {})}
+        chains = {"image": chain, **({"truth": chain.without_noise()} if self._truth else {})}
         self._runners = {name: self._runner(name, each) for name, each in chains.items()}
         self._chain = chain
 

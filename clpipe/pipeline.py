@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.config import Chain, Settings, load_settings, make_chain, overlay
-from clpipe.device import open_device
-from clpipe.errors import ImageError
-from clpipe.run import Result, Runner
+from clpipe.base.errors import ImageError
+from clpipe.base.types import Array
+from clpipe.chain.chain import Chain, make_chain
+from clpipe.chain.files import load_settings
+from clpipe.chain.settings import Settings, overlay
+from clpipe.engine.device import open_device
+from clpipe.engine.runner import Result, Runner
 from clpipe.stage import Kind
-from clpipe.types import Array
 
 
 class Pipeline:

@@ -16,12 +16,37 @@ from typing import Any, ClassVar, Self, get_args, get_origin
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
-from clpipe.camera import DEFAULT_CAMERA, IDENTITY, Camera, Matrix, load_camera
-from clpipe.noise_model import NoiseModel
+from clpipe.base.types import Array, Floats
+from clpipe.camera.noise import NoiseModel
+from clpipe.camera.profile import DEFAULT_CAMERA, IDENTITY, Camera, Matrix, load_camera
 from clpipe.reference.cfa import PATTERNS, Pattern, red_site
 from clpipe.reference.curve import curve_index
 from clpipe.reference.random import Stream, stream_of
-from clpipe.types import Array, Floats
+
+# What a stage file may import from here.
+__all__ = [
+    "Access",
+    "Argument",
+    "Array",
+    "Context",
+    "Curve",
+    "Floats",
+    "Frame",
+    "GaussianNoise",
+    "Kind",
+    "Literal",
+    "Method",
+    "NoiseScope",
+    "Noiseless",
+    "Pass",
+    "Stage",
+    "Unchanged",
+    "odd_size",
+    "parameter",
+    "run_reference",
+    "variant_label",
+    "variants",
+]
 
 
 class Kind(Enum):
@@ -56,7 +81,7 @@ class Access(Enum):
     HISTOGRAM = "histogram"  # counts over the whole image, then a few numbers found from them
 
 
-class Owner(Enum):
+class NoiseScope(Enum):
     """What noise belongs to, and so what its random key is made of."""
 
     IMAGE = "image"  # new in each image
@@ -81,7 +106,7 @@ class Pass:
     writes: str = "dst"
     kind: Kind | None = None  # of what it writes; None: what the stage writes
     radius: int = 0
-    random: Owner | None = None  # gets a random stream as its first argument
+    random: NoiseScope | None = None  # gets a random stream as its first argument
     block: int = 0  # STENCIL: one call gives 4 rows of that many vectors, which share work
     cheap: bool = False  # so cheap that a stencil after it may redo it at each tap
     lines: str = ""  # LINES: "rows" or "columns"
@@ -177,7 +202,7 @@ class Method(BaseModel):
         """The kernel functions, in order; none where the image stays as it is."""
         raise NotImplementedError(type(self).__name__)
 
-    def clean(self) -> "Method | None":
+    def without_noise(self) -> "Method | None":
         """What is left of this (resolved) method without noise; None where that is nothing."""
         return None if any(each.random for each in self.passes()) else self
 
@@ -325,18 +350,20 @@ class Frame:
     """
 
     context: Context
-    stream: Mapping[Owner, Stream]
+    stream: Mapping[NoiseScope, Stream]
     found: dict[str, float]
 
 
-def alone(method: Method, image: Floats, iso: float = 100, pattern: Pattern = "RGGB") -> Floats:
+def run_reference(
+    method: Method, image: Floats, iso: float = 100, pattern: Pattern = "RGGB"
+) -> Floats:
     """A method's reference on an image, as the first stage after a mosaic of the default camera.
 
     For examples and for trying things out; noise is that of the image key "".
     """
     context = Context(load_camera(DEFAULT_CAMERA), iso, pattern)
     resolved = method.resolve(context)
-    stream = {owner: stream_of(owner.value, resolved.method) for owner in Owner}
+    stream = {owner: stream_of(owner.value, resolved.method) for owner in NoiseScope}
     return resolved.reference(image, Frame(context, stream, {}))
 
 

@@ -61,7 +61,7 @@ INLINE void non_local_means(site at, image planes, int luma_reach, int chroma_re
                 for (int dx = -1; dx <= 1; ++dx)
                     level += tap_ycbcr(planes, column * LANES + dx, y + dy).y;
             }
-            per_variance[i] = 1.0f / (most(level, (vf)(0.0f)) * noise_slope + noise_offset);
+            per_variance[i] = 1.0f / (vmax(level, (vf)(0.0f)) * noise_slope + noise_offset);
             sum[i].y = sum[i].cb = sum[i].cr = luma_weight[i] = chroma_weight[i] = (vf)(0.0f);
         }
     }
@@ -81,13 +81,13 @@ INLINE void non_local_means(site at, image planes, int luma_reach, int chroma_re
                     const ycbcr other = tap_ycbcr(planes, column * LANES + dx, y + dy);
                     if (luma) {
                         const vf beyond = luma_start + distance * luma_scale;
-                        const vf weight = exp2_of_negative(least(beyond, (vf)(0.0f)));
+                        const vf weight = exp2_of_negative(vmin(beyond, (vf)(0.0f)));
                         sum[i].y += weight * other.y;
                         luma_weight[i] += weight;
                     }
                     if (chroma) {
                         const vf beyond = chroma_start + distance * chroma_scale;
-                        const vf weight = exp2_of_negative(least(beyond, (vf)(0.0f)));
+                        const vf weight = exp2_of_negative(vmin(beyond, (vf)(0.0f)));
                         sum[i].cb += weight * other.cb;
                         sum[i].cr += weight * other.cr;
                         chroma_weight[i] += weight;

@@ -2,7 +2,7 @@
 // Gray world (Buchsbaum 1980): gains that make the means of the three colours equal.
 // Samples are summed as integers in steps of 2^-20, clipped to -1..1.
 INLINE vi gray_world_sample(vf y) {
-    return to_int(nearest(least(most(y, (vf)(-1.0f)), (vf)(1.0f)) * 1048576.0f));
+    return to_int(nearest(vmin(vmax(y, (vf)(-1.0f)), (vf)(1.0f)) * 1048576.0f));
 }
 
 INLINE void gray_world(long4 sums, cfa pattern, extent e, __global float *found) {

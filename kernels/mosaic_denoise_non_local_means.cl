@@ -8,7 +8,7 @@
 INLINE pair stabilize(vf y, site at, cfa pattern, float red_inverse, float blue_inverse,
                             float a, float offset, float root_of_offset) {
     const vf signal = y * by_site(at, pattern, (vf)(red_inverse), (vf)(1.0f), (vf)(blue_inverse));
-    const vf root = square_root(most(a * signal + offset, (vf)(0.0f)));
+    const vf root = square_root(vmax(a * signal + offset, (vf)(0.0f)));
     // Of the factor 2, a third: nine squares of it then add up to their mean.
     const pair v = {signal, signal * 0.6666667f / (root + root_of_offset)};
     return v;
@@ -56,7 +56,7 @@ INLINE void mosaic_non_local_means(site at, image samples, int reach, float bias
                 const int x = i % COLUMNS * LANES, y = i / COLUMNS;
                 const vf distance = across(down[y] + x);
                 const vf beyond = start + distance * scale;
-                const vf weight = exp2_of_negative(least(beyond, (vf)(0.0f)));
+                const vf weight = exp2_of_negative(vmin(beyond, (vf)(0.0f)));
                 sum[i] += weight * tap_pair(samples, x + dx, y + dy).first;
                 weights[i] += weight;
             }

@@ -3,13 +3,13 @@
 #include "lib/tukey_lambda.h"
 
 INLINE vf sensor_noise(vf y, site at, stream s, float a, float b, float full_well) {
-    const vf noise = normal_at(at, 0, s) * square_root(most(a * y + b, (vf)(0.0f)));
-    return least(y + noise, (vf)(full_well));
+    const vf noise = normal_at(at, 0, s) * square_root(vmax(a * y + b, (vf)(0.0f)));
+    return vmin(y + noise, (vf)(full_well));
 }
 
 // The same with read noise of its own law.
 INLINE vf sensor_noise_tukey(vf y, site at, stream s, float a, float full_well, float read_noise, float shape, float scale) {
-    const vf shot = normal_at(at, 0, s) * square_root(most(a * y, (vf)(0.0f)));
+    const vf shot = normal_at(at, 0, s) * square_root(vmax(a * y, (vf)(0.0f)));
     const vf read = tukey_lambda_of(word_at(at, 1, s), shape, scale);
-    return least(y + shot, (vf)(full_well)) + read * read_noise;
+    return vmin(y + shot, (vf)(full_well)) + read * read_noise;
 }

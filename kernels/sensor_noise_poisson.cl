@@ -3,8 +3,8 @@
 #include "lib/tukey_lambda.h"
 
 INLINE vf photo_electrons(vf y, site at, stream s, float chi, float full_well) {
-    const vf mean = most(y, (vf)(0.0f)) * chi;
-    return least(poisson_of(mean, word_at(at, 0, s)), (vf)(full_well));
+    const vf mean = vmax(y, (vf)(0.0f)) * chi;
+    return vmin(poisson_of(mean, word_at(at, 0, s)), (vf)(full_well));
 }
 
 INLINE vf sensor_noise_poisson(vf y, site at, stream s, float chi, float full_well, float a, float read_noise) {

@@ -6,5 +6,5 @@ INLINE vf inverse_white_balance(vf y, site at, cfa pattern, float red, float blu
 // What a gain lifts above white is clipped there: all three colours of a burnt-out highlight end at
 // the same value, so it is white and not tinted.
 INLINE vf white_balance(vf y, site at, cfa pattern, float red, float blue) {
-    return least(y * by_site(at, pattern, (vf)(red), (vf)(1.0f), (vf)(blue)), (vf)(1.0f));
+    return vmin(y * by_site(at, pattern, (vf)(red), (vf)(1.0f), (vf)(blue)), (vf)(1.0f));
 }

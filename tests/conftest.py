@@ -8,10 +8,12 @@ import pytest
 from click.testing import CliRunner
 from click.testing import Result as ClickResult
 
-from clpipe.cli import main
-from clpipe.config import make_chain, settings_from
-from clpipe.device import Device, choose, find_devices
-from clpipe.run import Result, Runner
+from clpipe.chain.chain import make_chain
+from clpipe.chain.settings import settings_from
+from clpipe.commands.main import main
+from clpipe.engine.device import Device
+from clpipe.engine.discovery import choose, find_devices
+from clpipe.engine.runner import Result, Runner
 from clpipe.stage import Kind
 
 ROOT = Path(__file__).resolve().parent.parent

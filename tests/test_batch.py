@@ -14,15 +14,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clpipe import image_io, sidecar, target
-from clpipe.asked import asked_for
-from clpipe.batch import Batch
-from clpipe.entrance import Entrance
-from clpipe.errors import RequestError
-from clpipe.jobs import Job, Shard, find_jobs, parse_shard
-from clpipe.output_folder import LOCK, output_folder, remove_unfinished
-from clpipe.run_log import read_log
-from clpipe.target import EVERY_FORMAT, Target, ending_of
+from clpipe.base.errors import RequestError
+from clpipe.batch.run_log import read_log
+from clpipe.batch.threads import Batch
+from clpipe.chain.request import request_from_options
+from clpipe.images import read as image_io
+from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
+from clpipe.inputs.loader import ImageLoader
+from clpipe.outputs import sidecar
+from clpipe.outputs import writer as target
+from clpipe.outputs.folder import LOCK, output_folder, remove_unfinished
+from clpipe.outputs.formats import EVERY_FORMAT, ending_of
+from clpipe.outputs.writer import OutputWriter
 from tests.conftest import ROOT, written
 
 # A chain that other tests compile too.
@@ -194,10 +197,10 @@ def test_devices_develop_at_the_same_time(renders, tmp_path, monkeypatch):
         return develop(self, work, shot, runner)
 
     monkeypatch.setattr(Batch, "develop", together)
-    entrance = Entrance(asked_for())
+    entrance = ImageLoader(request_from_options())
     jobs = find_jobs([str(tmp_path / "in")], tmp_path / "out")
     batch = Batch(
-        entrance, Target(tmp_path / "out", ("png",)), [None, None], entrance.first_chain(jobs)
+        entrance, OutputWriter(tmp_path / "out", ("png",)), [None, None], entrance.first_chain(jobs)
     )
     outcomes = list(batch.run(jobs))
     assert [o.status for o in outcomes] == ["done"] * 8
@@ -208,9 +211,9 @@ def test_devices_develop_at_the_same_time(renders, tmp_path, monkeypatch):
 def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, monkeypatch):
     renders(30)
     (tmp_path / "out").mkdir()
-    entrance = Entrance(asked_for())
+    entrance = ImageLoader(request_from_options())
     jobs = find_jobs([str(tmp_path / "in")], tmp_path / "out")
-    target = Target(tmp_path / "out", ("png",))
+    target = OutputWriter(tmp_path / "out", ("png",))
     batch = Batch(entrance, target, [None], entrance.first_chain(jobs), threads=2)
     decode, decoded, seen = Batch.decode, [], []
 
@@ -229,7 +232,8 @@ def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, m
 def test_memory_does_not_grow_with_the_number_of_images(renders, tmp_path):
     renders(1)
     code = (
-        "import sys; from clpipe.bench_batch import peak_memory; from clpipe.cli import main\n"
+        "import sys; from clpipe.batch.bench import peak_memory\n"
+        "from clpipe.commands.main import main\n"
         "try: main(sys.argv[1:])\n"
         "except SystemExit as end: assert not end.code, end.code\n"
         "print(peak_memory())"
@@ -311,8 +315,8 @@ def test_a_trace_for_perfetto(clpipe, renders):
 
 def test_two_runs_in_one_folder(tmp_path):
     holder = (
-        "import sys; from pathlib import Path; from clpipe.output_folder import output_folder\n"
-        "from clpipe.jobs import Shard\n"
+        "import sys; from pathlib import Path; from clpipe.outputs.folder import output_folder\n"
+        "from clpipe.inputs.find import Shard\n"
         "with output_folder(Path('out'), Shard(1, 2)): print('held', flush=True); input()"
     )
     with subprocess.Popen(
@@ -640,9 +644,9 @@ def test_a_sidecar_made_with_other_libraries(clpipe, renders):
 def test_what_nobody_expected_ends_the_run_and_does_not_hang(renders, tmp_path, monkeypatch):
     renders(30)
     (tmp_path / "out").mkdir()
-    entrance = Entrance(asked_for())
+    entrance = ImageLoader(request_from_options())
     jobs = find_jobs([str(tmp_path / "in")], tmp_path / "out")
-    target, chain = Target(tmp_path / "out", ("png",)), entrance.first_chain(jobs)
+    target, chain = OutputWriter(tmp_path / "out", ("png",)), entrance.first_chain(jobs)
     for step in ("decode", "develop", "encode"):
         caught = []
 

@@ -4,8 +4,9 @@ import json
 
 import pytest
 
-from clpipe import bench_batch, cli
-from clpipe.bench_batch import Load
+from clpipe.batch import bench as bench_batch
+from clpipe.batch.bench import Load
+from clpipe.commands import measure as cli
 
 
 @pytest.fixture
@@ -32,5 +33,5 @@ def test_the_table(clpipe, short):
 
 def test_it_leaves_no_files(device, tmp_path, monkeypatch):
     monkeypatch.setattr(bench_batch.tempfile, "tempdir", str(tmp_path))
-    bench_batch.bench_batch(device, cli.asked_for(), Load(5, 24, 16))
+    bench_batch.bench_batch(device, cli.request_from_options(), Load(5, 24, 16))
     assert not list(tmp_path.iterdir())

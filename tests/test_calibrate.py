@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from clpipe import Pipeline
-from clpipe.calibration.calibrate import ROUNDING, Calibration, calibrate, gain_stages
-from clpipe.calibration.line_fit import Estimate, Line, Table, fit_line
-from clpipe.calibration.repeats import CHANNELS, Sensor, neighbours
-from clpipe.camera import load_camera
-from clpipe.errors import ImageError
+from clpipe.analysis.calibration.calibrate import ROUNDING, Calibration, calibrate, gain_stages
+from clpipe.analysis.calibration.line_fit import Estimate, Line, Table, fit_line
+from clpipe.analysis.calibration.repeats import CHANNELS, Sensor, neighbours
+from clpipe.base.errors import ImageError
+from clpipe.camera.profile import load_camera
 from clpipe.reference.cfa import PATTERNS
 
 SENSOR = Sensor("RGGB", 512, 16383)

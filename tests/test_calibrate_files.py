@@ -9,11 +9,11 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from clpipe.calibration_frames import Given, describe, find_frames
-from clpipe.camera import load_camera
-from clpipe.cli import main
-from clpipe.errors import ImageError
-from clpipe.raw_io import read_facts, read_raw
+from clpipe.analysis.calibration.frames import Given, find_frames, read_frame
+from clpipe.base.errors import ImageError
+from clpipe.camera.profile import load_camera
+from clpipe.commands.main import main
+from clpipe.images.raw import read_facts, read_raw
 from tests.test_calibrate import frames, scene
 
 LEVELS = ("--black-level", 512, "--white-level", 16383, "--pattern", "RGGB", "--iso", 400)
@@ -127,8 +127,8 @@ def test_dark_frames_among_the_frames_are_dark_frames(shots, tmp_path):
 def test_signal_and_dn_say_the_same(shots, tmp_path):
     call("run", f"{shots}/scene/640_0.exr", "-o", tmp_path, "--start-at", "normalize", "--until",
          "normalize", "--device", "numpy")  # fmt: skip
-    dn = describe(shots / "scene" / "640_0.exr", Given())
-    signal = describe(tmp_path / "640_0.exr", Given())
+    dn = read_frame(shots / "scene" / "640_0.exr", Given())
+    signal = read_frame(tmp_path / "640_0.exr", Given())
     assert signal.signal and not dn.signal
     assert np.array_equal(dn.read(), signal.read())
 
@@ -210,7 +210,7 @@ def test_signal_that_is_taken_for_dn_is_told(tmp_path):
 
 
 def test_options_win_over_what_the_file_says(shots):
-    frame = describe(shots / "scene" / "500_0.exr", Given(500, 16000, "BGGR", 1234))
+    frame = read_frame(shots / "scene" / "500_0.exr", Given(500, 16000, "BGGR", 1234))
     assert (frame.iso, frame.sensor.black_level, frame.sensor.pattern) == (1234, 500, "BGGR")
 
 

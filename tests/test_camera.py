@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from clpipe.camera import built_in_cameras, load_camera
-from clpipe.errors import RequestError
+from clpipe.base.errors import RequestError
+from clpipe.camera.profile import built_in_cameras, load_camera
 
 NAMES = tuple(built_in_cameras())
 PROFILE = """name = "mine"

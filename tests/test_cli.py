@@ -444,8 +444,8 @@ def test_no_platform_at_all(tmp_path):
     )
     if "no OpenCL platform was found" not in done.stderr:
         # The pip loader may bring its own PoCL whatever OCL_ICD_VENDORS says.
-        from clpipe.device import choose
-        from clpipe.errors import DeviceError
+        from clpipe.base.errors import DeviceError
+        from clpipe.engine.discovery import choose
 
         with pytest.raises(DeviceError, match="no OpenCL platform was found"):
             choose(None, [])
@@ -454,6 +454,8 @@ def test_no_platform_at_all(tmp_path):
 
 
 def test_a_missing_linker_is_said_before_it_aborts_the_process(tmp_path):
-    done = python("from clpipe.cli import main; main(['check', '--small'])", PATH=str(tmp_path))
+    done = python(
+        "from clpipe.commands.main import main; main(['check', '--small'])", PATH=str(tmp_path)
+    )
     assert done.returncode == 3
     assert "PoCL needs a linker" in done.stderr

@@ -16,15 +16,17 @@ import pytest
 from distributed import Client, LocalCluster, WorkerPlugin
 
 import clpipe as package
-from clpipe import batch, cluster
-from clpipe.asked import Asked
-from clpipe.cluster import Make, Order, look, make_of
-from clpipe.entrance import Entrance
-from clpipe.errors import OutputError
-from clpipe.jobs import Job
-from clpipe.progress import Reporter
-from clpipe.run_log import RunLog
-from clpipe.target import Target
+from clpipe.base.errors import OutputError
+from clpipe.batch import dask_client as cluster
+from clpipe.batch import dask_worker
+from clpipe.batch import threads as batch
+from clpipe.batch.dask_worker import RunSpec, WorkerEnvironment, probe_worker, worker_environment
+from clpipe.batch.run_log import RunLog
+from clpipe.chain.request import Request
+from clpipe.commands.progress import Reporter
+from clpipe.inputs.find import Job
+from clpipe.inputs.loader import ImageLoader
+from clpipe.outputs.writer import OutputWriter
 
 IMAGES = 40
 
@@ -156,7 +158,7 @@ def test_interrupted_it_finishes_what_is_in_flight(clpipe, renders, address, mon
         tell(self, outcome)
         stops[0]()  # as Ctrl-C does
 
-    monkeypatch.setattr("clpipe.cli.interruptible", interruptible)
+    monkeypatch.setattr("clpipe.commands.measure.interruptible", interruptible)
     monkeypatch.setattr(Reporter, "tell", interrupting)
     told = clpipe("run", "in", "-o", "out", "--dask", address, status=130)
     assert "not begun" in told.stderr
@@ -189,8 +191,8 @@ def test_a_wrong_request(clpipe, renders, address):
 )
 def test_workers_of_another_make(clpipe, renders, workers, address, name, value, message):
     def pretend(**to):
-        real = cluster.real = getattr(cluster, "real", make_of)
-        cluster.make_of = lambda selector: replace(real(selector), **to)
+        real = dask_worker.real = getattr(dask_worker, "real", worker_environment)
+        dask_worker.worker_environment = lambda selector: replace(real(selector), **to)
         package.__version__ = to.get("version", "0.1.0")
 
     worker = next(iter(workers.nthreads()))
@@ -221,7 +223,9 @@ def test_a_worker_of_another_make_that_comes_later(clpipe, renders, address, mon
 
     def earlier(self, jobs):
         look(self, jobs)
-        self._order = replace(self._order, make=Make("0.1.0", "a device that was there", ""))
+        self._spec = replace(
+            self._spec, make=WorkerEnvironment("0.1.0", "a device that was there", "")
+        )
 
     monkeypatch.setattr(cluster.Cluster, "_look", earlier)
     told = clpipe("run", "in", "-o", "out", "--dask", address, status=2)
@@ -243,20 +247,20 @@ def test_a_trace_is_told_by_one_clock(clpipe, renders, address):
 def test_a_worker_sees_the_same_files(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "probe").touch()
-    entrance, target = Entrance(Asked()), Target(Path("out"), ("jpg",))
+    entrance, target = ImageLoader(Request()), OutputWriter(Path("out"), ("jpg",))
     first = Job(Path("a.exr"), "a.exr")
-    order = Order(
+    spec = RunSpec(
         entrance, target, ("numpy",), None, None, False, False, "run", str(tmp_path), first=first
     )
-    elsewhere = replace(order, folder=str(tmp_path / "elsewhere"))
-    assert "elsewhere, where the run was started" in look(elsewhere, "probe", None)
-    assert look(order, "probe", None).startswith("does not see the output folder")
+    elsewhere = replace(spec, folder=str(tmp_path / "elsewhere"))
+    assert "elsewhere, where the run was started" in probe_worker(elsewhere, "probe", None)
+    assert probe_worker(spec, "probe", None).startswith("does not see the output folder")
     (tmp_path / "probe").rename(tmp_path / "out" / "probe")
-    assert look(order, "probe", 3) == f"does not see the input {tmp_path / 'a.exr'}"
+    assert probe_worker(spec, "probe", 3) == f"does not see the input {tmp_path / 'a.exr'}"
     (tmp_path / "a.exr").write_text("abcd")
-    assert look(order, "probe", 3) == f"does not see the input {tmp_path / 'a.exr'}"
-    assert look(order, "probe", 4) == make_of(("numpy",))
-    assert isinstance(look(order, "probe", None), Make)
+    assert probe_worker(spec, "probe", 3) == f"does not see the input {tmp_path / 'a.exr'}"
+    assert probe_worker(spec, "probe", 4) == worker_environment(("numpy",))
+    assert isinstance(probe_worker(spec, "probe", None), WorkerEnvironment)
 
 
 def test_a_scheduler_that_cannot_be_reached(clpipe, renders, monkeypatch):

@@ -4,17 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from clpipe.camera import load_camera
-from clpipe.config import (
-    built_in_configs,
-    load_settings,
-    make_chain,
-    overlay,
-    parse_assignment,
-    settings_from,
-)
-from clpipe.describe import toml_text
-from clpipe.errors import RequestError
+from clpipe.base.errors import RequestError
+from clpipe.camera.profile import load_camera
+from clpipe.chain.chain import make_chain
+from clpipe.chain.files import built_in_configs, load_settings, parse_assignment, toml_text
+from clpipe.chain.settings import overlay, settings_from
 from clpipe.stage import Kind
 from clpipe.stages import DEFAULT_CHAIN
 
@@ -139,8 +133,8 @@ def test_a_repeated_stage_has_settings_of_its_own():
 
 
 def test_every_parameter_says_what_it_is():
-    from clpipe.describe import parameter_rows
-    from clpipe.registry import all_stages
+    from clpipe.chain.registry import all_stages
+    from clpipe.commands.stages import parameter_rows
 
     for stage in all_stages().values():
         for method in stage.methods:
@@ -171,7 +165,7 @@ def test_what_is_laid_over_settings():
 
 
 def test_files_that_a_configuration_names_are_relative_to_it(tmp_path, monkeypatch):
-    from clpipe.camera import built_in_cameras
+    from clpipe.camera.profile import built_in_cameras
 
     folder = tmp_path / "settings"
     folder.mkdir()
@@ -222,7 +216,7 @@ def test_a_chain_as_toml_is_the_chain_again(tmp_path):
 
 
 def test_a_camera_of_ones_own(tmp_path):
-    from clpipe.camera import built_in_cameras
+    from clpipe.camera.profile import built_in_cameras
 
     text = built_in_cameras()["sony-a7r2"].read_text()
     own = tmp_path / "own.toml"

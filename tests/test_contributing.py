@@ -8,12 +8,13 @@ from dataclasses import replace
 import pytest
 from click.testing import CliRunner
 
-from clpipe.camera import load_camera
-from clpipe.check import check_method
-from clpipe.cli import main
-from clpipe.config import load_settings, make_chain
-from clpipe.device import Device
-from clpipe.registry import load_stage_file
+from clpipe.camera.profile import load_camera
+from clpipe.chain.chain import make_chain
+from clpipe.chain.files import load_settings
+from clpipe.chain.registry import load_stage_file
+from clpipe.commands.main import main
+from clpipe.engine.check import check_method
+from clpipe.engine.device import Device
 from tests.conftest import ROOT, STILL_LIFE, written
 
 TEXT = (ROOT / "CONTRIBUTING.md").read_text()
@@ -24,7 +25,7 @@ def block(language: str) -> str:
 
 
 def test_the_example_stage_works(device, tmp_path, monkeypatch):
-    monkeypatch.setattr("clpipe.registry._from_files", {})
+    monkeypatch.setattr("clpipe.chain.registry._from_files", {})
     (tmp_path / "vignette.cl").write_text(block("c"))
     (tmp_path / "vignette.py").write_text(block("python"))
     stage = load_stage_file(tmp_path / "vignette.py")
@@ -35,7 +36,7 @@ def test_the_example_stage_works(device, tmp_path, monkeypatch):
 
 
 def test_the_commands_it_shows_work(tmp_path, monkeypatch):
-    monkeypatch.setattr("clpipe.registry._from_files", {})
+    monkeypatch.setattr("clpipe.chain.registry._from_files", {})
     monkeypatch.chdir(tmp_path)
     (tmp_path / "vignette.cl").write_text(block("c"))
     (tmp_path / "vignette.py").write_text(block("python"))

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 import clpipe as api
-from clpipe.errors import DeviceError, ImageError, RequestError
+from clpipe.base.errors import DeviceError, ImageError, RequestError
 
 ISO = 3200  # a chain that other tests compile too
 

@@ -8,12 +8,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from clpipe.config import make_chain, settings_from
-from clpipe.describe import device_rows
-from clpipe.device import Device, choose, choose_all, find_devices, open_devices
-from clpipe.errors import DeviceError, ImageError
-from clpipe.run import Runner
-from clpipe.tiles import Extent
+from clpipe.base.errors import DeviceError, ImageError
+from clpipe.chain.chain import make_chain
+from clpipe.chain.settings import settings_from
+from clpipe.commands.devices import device_rows
+from clpipe.engine.device import Device, open_devices
+from clpipe.engine.discovery import choose, choose_all, find_devices
+from clpipe.engine.runner import Runner
+from clpipe.engine.tiles import Extent
 
 
 @pytest.fixture
@@ -225,6 +227,6 @@ def test_another_chain_of_the_same_structure_is_not_planned_again(device, monkey
     def plan_again(*_):
         raise AssertionError("planned again")
 
-    monkeypatch.setattr("clpipe.run.make_plan", plan_again)
+    monkeypatch.setattr("clpipe.engine.runner.make_plan", plan_again)
     assert np.array_equal(runner.of(changed).run(image, "k").encoded, alone)
     assert np.array_equal(runner.of(changed).run(image, "k").encoded, alone)

@@ -12,13 +12,16 @@ from click.testing import CliRunner
 from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
-from clpipe.camera import SRGB_TO_XYZ, load_camera
-from clpipe.cli import main
-from clpipe.config import make_chain, settings_from
-from clpipe.dng import negative_of, write_dng
-from clpipe.errors import ImageError
-from clpipe.image_io import Tags, read_image
-from clpipe.raw_io import read_facts, read_raw
+from clpipe.base.errors import ImageError
+from clpipe.camera.profile import SRGB_TO_XYZ, load_camera
+from clpipe.chain.chain import make_chain
+from clpipe.chain.settings import settings_from
+from clpipe.commands.main import main
+from clpipe.images.dng import write_dng
+from clpipe.images.raw import read_facts, read_raw
+from clpipe.images.read import read_image
+from clpipe.images.tags import Tags
+from clpipe.outputs.negative import negative_of
 from clpipe.reference.cfa import PATTERNS
 from tests.conftest import STILL_LIFE, written
 from tests.dng import write_dng as write_raw

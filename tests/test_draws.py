@@ -7,12 +7,13 @@ import pytest
 from scipy import stats
 
 import clpipe
-from clpipe.camera import built_in_cameras
-from clpipe.config import load_settings, make_chain, overlay, settings_from
-from clpipe.describe import toml_text
-from clpipe.draws import Limits, limits_of
-from clpipe.errors import RequestError
-from clpipe.registry import all_stages
+from clpipe.base.errors import RequestError
+from clpipe.camera.profile import built_in_cameras
+from clpipe.chain.chain import make_chain
+from clpipe.chain.draws import Limits, limits_of
+from clpipe.chain.files import load_settings, toml_text
+from clpipe.chain.registry import all_stages
+from clpipe.chain.settings import overlay, settings_from
 
 KEYS = [f"frames/{number:04}.exr" for number in range(2000)]
 LEAST_P = 0.001  # the seed is fixed, and so is the outcome

@@ -8,17 +8,12 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image, ImageCms
 
-from clpipe import image_io
-from clpipe.errors import ImageError
-from clpipe.image_io import (
-    Tags,
-    display_window,
-    holds_mosaic,
-    picture_channels,
-    read_finished,
-    read_image,
-    write_display,
-)
+from clpipe.base.errors import ImageError
+from clpipe.images import read as image_io
+from clpipe.images.layers import picture_channels
+from clpipe.images.read import display_window, holds_mosaic, read_finished, read_image
+from clpipe.images.tags import Tags
+from clpipe.images.write import write_display
 from tests.conftest import STILL_LIFE
 
 

@@ -16,9 +16,10 @@ def test_the_installed_package_works_from_anywhere(tmp_path):
         cwd=tmp_path,
     )
     assert (target / "clpipe" / "kernels" / "lib" / "lanes.h").is_file()
-    assert (target / "clpipe" / "cameras" / "sony-a7r2.toml").is_file()
+    assert (target / "clpipe" / "camera" / "profiles" / "sony-a7r2.toml").is_file()
     code = (
-        "import clpipe.codegen as c; print(c.kernel_folder()); from clpipe.cli import main; main()"
+        "import clpipe.engine.sources as c; print(c.kernel_folder()); "
+        "from clpipe.commands.main import main; main()"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, "run", STILL_LIFE, "-o", "out"],

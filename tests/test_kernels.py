@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clpipe.check import SIZES, check_method, check_raw, compare, example
-from clpipe.config import Settings, make_chain
-from clpipe.device import Device
+from clpipe.chain.chain import make_chain
+from clpipe.chain.registry import all_stages
+from clpipe.chain.settings import Settings
+from clpipe.engine.check import SIZES, check_method, check_raw, compare, example
+from clpipe.engine.device import Device
+from clpipe.engine.runner import Runner
 from clpipe.reference.cfa import PATTERNS
-from clpipe.registry import all_stages
-from clpipe.run import Runner
 from clpipe.stage import Kind, variant_label, variants
 
 METHODS = [(stage, method) for stage in all_stages().values() for method in stage.methods]

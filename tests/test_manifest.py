@@ -10,10 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clpipe.camera import built_in_cameras
-from clpipe.config import load_settings, make_chain, settings_from
-from clpipe.errors import RequestError
-from clpipe.manifest import Row, check_rows, read_manifest
+from clpipe.base.errors import RequestError
+from clpipe.camera.profile import built_in_cameras
+from clpipe.chain.chain import make_chain
+from clpipe.chain.files import load_settings
+from clpipe.chain.settings import settings_from
+from clpipe.inputs.manifest import Row, check_rows, read_manifest
 
 DEFAULT = settings_from({})
 

@@ -9,9 +9,10 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
-from clpipe.camera import load_camera
-from clpipe.describe import measure_tables
-from clpipe.measure import Picture, load, measure
+from clpipe.analysis.measure import measure
+from clpipe.analysis.pictures import Picture, load_picture
+from clpipe.camera.profile import load_camera
+from clpipe.commands.measure import measure_tables
 from tests.conftest import STILL_LIFE
 
 NOISELESS = ("--skip", "sensor_noise", "--skip", "row_noise", "--skip", "column_noise")
@@ -259,11 +260,11 @@ def test_load_says_what_it_read(clpipe, tmp_path):
         "picture_noise": "display",
     }
     for stage, kind in kinds.items():
-        picture = load(tmp_path / f"a/still_life.{stage}.exr")
+        picture = load_picture(tmp_path / f"a/still_life.{stage}.exr")
         assert picture.kind == kind
         assert picture.pattern == ("GBRG" if kind == "mosaic" else "RGGB")
         assert picture.black == {"mosaic": None}.get(stage, picture.black)
-    raw = load(tmp_path / "a/still_life.quantize.exr")
+    raw = load_picture(tmp_path / "a/still_life.quantize.exr")
     assert raw.black == pytest.approx(-512 / 15871)
     assert raw.pixels.max() <= 1
 

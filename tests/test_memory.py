@@ -2,8 +2,8 @@
 
 import pytest
 
-from clpipe.errors import RequestError
-from clpipe.memory import available_memory, parse_size
+from clpipe.base.errors import RequestError
+from clpipe.base.memory import available_memory, parse_size
 
 
 @pytest.mark.parametrize(

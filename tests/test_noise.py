@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 
 from clpipe.reference.math import negative_log, square_root
-from clpipe.reference.random import (
-    Stream,
-    normal_at,
-    normal_of,
-    philox,
-    stream_of,
-)
+from clpipe.reference.random import Stream, normal_at, normal_of, philox, stream_of
 from clpipe.stage import Kind
 
 A, B = 2e-4, 3e-6
@@ -166,7 +160,7 @@ def test_repeated_stages_draw_different_noise(develop):
 
 @pytest.mark.parametrize("iso", [100, 500, 640, 3200])
 def test_camera_noise_is_the_measured_one(iso):
-    from clpipe.camera import load_camera
+    from clpipe.camera.profile import load_camera
 
     # gain and read noise in DN: W. Claff, photonstophotos.net, Sony A7RM2, 2015-08-29
     gain, read = {
@@ -182,7 +176,7 @@ def test_camera_noise_is_the_measured_one(iso):
 
 
 def test_read_noise_is_never_interpolated_across_gain_stages():
-    from clpipe.camera import load_camera
+    from clpipe.camera.profile import load_camera
 
     noise = load_camera("sony-a7r2").noise
     assert noise(639).b > noise(500).b > 4 * noise(640).b

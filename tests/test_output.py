@@ -9,9 +9,10 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from clpipe.cli import main
-from clpipe.config import load_settings, overlay, settings_from
-from clpipe.image_io import read_image
+from clpipe.chain.files import load_settings
+from clpipe.chain.settings import overlay, settings_from
+from clpipe.commands.main import main
+from clpipe.images.read import read_image
 from tests.conftest import STILL_LIFE
 
 FORMATS = ("jpg", "png", "png16", "tif", "tif16", "tif32", "exr", "exr16")

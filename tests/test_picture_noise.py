@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from clpipe.cli import main
-from clpipe.config import make_chain, settings_from
-from clpipe.errors import RequestError
-from clpipe.plan import make_plan
+from clpipe.base.errors import RequestError
+from clpipe.chain.chain import make_chain
+from clpipe.chain.settings import settings_from
+from clpipe.commands.main import main
+from clpipe.engine.plan import make_plan
 from clpipe.stage import Kind
 from clpipe.stages.picture_noise import measured_noise
 from tests.conftest import STILL_LIFE

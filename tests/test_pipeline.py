@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from clpipe.config import make_chain, settings_from
-from clpipe.image_io import read_image
+from clpipe.chain.chain import make_chain
+from clpipe.chain.registry import all_stages
+from clpipe.chain.settings import settings_from
+from clpipe.engine.runner import Runner
+from clpipe.images.read import read_image
 from clpipe.reference.cfa import PATTERNS, red_site
-from clpipe.registry import all_stages
-from clpipe.run import Runner
 from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import STILL_LIFE
 

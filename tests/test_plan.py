@@ -2,10 +2,11 @@
 
 import pytest
 
-from clpipe.codegen import write_kernel
-from clpipe.config import make_chain, settings_from
-from clpipe.errors import RequestError
-from clpipe.plan import AddUp, Find, Launch, Lines, make_plan
+from clpipe.base.errors import RequestError
+from clpipe.chain.chain import make_chain
+from clpipe.chain.settings import settings_from
+from clpipe.engine.codegen import write_kernel
+from clpipe.engine.plan import Finalize, Launch, Lines, Reduce, make_plan
 from clpipe.stage import Kind
 
 GRAY_WORLD = {"white_balance": {"method": "gray_world"}}
@@ -34,7 +35,9 @@ def test_default_chain():
 
 def test_default_chain_with_gray_world_is_eight_launches_and_at_most_48_bytes():
     plan = plan_of(**GRAY_WORLD)
-    assert [type(launch) for launch in plan.launches] == [Lines, Launch, AddUp, Find] + [Launch] * 4
+    assert [type(launch) for launch in plan.launches] == [Lines, Launch, Reduce, Finalize] + [
+        Launch
+    ] * 4
     assert plan.bytes_per_pixel(8) <= 48
 
 
@@ -108,9 +111,9 @@ def test_a_plan_depends_on_structure_alone():
 
 
 def test_the_apron_is_as_wide_as_the_widest_stencil():
-    assert plan_of().apron == 2
-    assert plan_of(denoise={"chroma_size": 11}).apron == 5
-    assert plan_of(stages=["exposure", "gamma"]).apron == 0
+    assert plan_of().border == 2
+    assert plan_of(denoise={"chroma_size": 11}).border == 5
+    assert plan_of(stages=["exposure", "gamma"]).border == 0
 
 
 def test_curves_before_eight_bits_become_one_table():

@@ -6,7 +6,7 @@ from importlib.util import module_from_spec, spec_from_loader
 import numpy as np
 import pytest
 
-from clpipe.image_io import read_image
+from clpipe.images.read import read_image
 from tests.conftest import ROOT, STILL_LIFE
 
 LOADER = SourceFileLoader("quality", str(ROOT / "tools" / "quality"))

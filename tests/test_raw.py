@@ -8,11 +8,13 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from clpipe.cli import main
-from clpipe.errors import ImageError, RequestError
-from clpipe.image_io import read_image, upright, write_exr
-from clpipe.raw_dump import dump_of
-from clpipe.raw_io import read_facts, read_raw
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.commands.main import main
+from clpipe.images.dump import dump_of
+from clpipe.images.raw import read_facts, read_raw
+from clpipe.images.read import read_image
+from clpipe.images.tags import upright
+from clpipe.images.write import write_exr
 from clpipe.reference.cfa import PATTERNS, by_site
 from tests.conftest import STILL_LIFE, written
 from tests.dng import field, write_dng
@@ -334,7 +336,7 @@ def test_a_chain_without_mosaic_cannot_know_the_pattern(tmp_path):
 
 
 def test_exif_is_found_in_files_that_are_no_tiff(tmp_path):
-    from clpipe.raw_io import _exif
+    from clpipe.images.raw import _exif
 
     tiff = write_dng(tmp_path / "a.dng", mosaic()).read_bytes()
     for start in (b"\0\0\0\x18ftypcrx " + bytes(60) + b"CMT1", b"FUJIFILM" * 9 + b"Exif\0\0"):

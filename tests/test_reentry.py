@@ -10,8 +10,9 @@ import OpenImageIO as oiio
 import pytest
 from click.testing import CliRunner
 
-from clpipe.cli import main
-from clpipe.image_io import read_image, write_exr
+from clpipe.commands.main import main
+from clpipe.images.read import read_image
+from clpipe.images.write import write_exr
 from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import STILL_LIFE, written
 

@@ -7,8 +7,8 @@ import sys
 import pytest
 from click.testing import CliRunner
 
-from clpipe import registry
-from clpipe.cli import main
+from clpipe.chain import registry
+from clpipe.commands.main import main
 from tests.conftest import ROOT, STILL_LIFE
 from tests.test_contributing import block
 
@@ -154,7 +154,7 @@ def install(folder, python=PYTHON):
 
 def run_with_package(folder, *arguments):
     program = f"import sys; sys.path[:0] = [{str(folder)!r}, {str(ROOT)!r}]\n"
-    program += "from clpipe.cli import main; main()"
+    program += "from clpipe.commands.main import main; main()"
     command = [sys.executable, "-c", program, *arguments]
     return subprocess.run(command, capture_output=True, text=True)
 

@@ -10,10 +10,10 @@ import OpenImageIO as oiio
 import pytest
 from click.testing import CliRunner
 
-from clpipe.cli import main
-from clpipe.errors import ImageError
-from clpipe.exr_colour import CIE_XYZ, SRGB, rgb_to_xyz, to_linear_srgb
-from clpipe.image_io import Reading, read_image, read_source
+from clpipe.base.errors import ImageError
+from clpipe.commands.main import main
+from clpipe.images.colour import CIE_XYZ, SRGB, rgb_to_xyz, to_linear_srgb
+from clpipe.images.read import ReadOptions, read_image, read_source
 from clpipe.stage import Kind
 from tests.conftest import ROOT, STILL_LIFE
 
@@ -69,7 +69,7 @@ REFUSED_IN_PEACE = r"""
 import re, sys, time
 from pathlib import Path
 from clpipe.errors import ImageError
-from clpipe.image_io import Reading, read_image, read_source
+from clpipe.image_io import ReadOptions, read_image, read_source
 from clpipe.stage import Kind
 for path in map(Path, sys.argv[1:]):
     start = time.perf_counter()
@@ -151,7 +151,7 @@ def test_too_many_pixels_are_refused_before_memory_is_taken(tmp_path):
     }
     for name, data in files.items():
         (tmp_path / f"{name}.exr").write_bytes(data)
-        if "display" in name or "chroma" in name:  # OpenImageIO doubts the others by itself
+        if "display" in name or "chroma" in name:  # OpenImageIO input_warnings the others by itself
             with pytest.raises(ImageError, match="40000x25000 pixels; at most 200000000 are read"):
                 read_image(tmp_path / f"{name}.exr")
     refused(*(tmp_path / f"{name}.exr" for name in files))
@@ -367,7 +367,7 @@ def test_renders_in_whole_numbers_with_a_stated_transfer(tmp_path, ending, trans
     file = oiio.ImageOutput.create(str(path))
     assert file.open(str(path), oiio.ImageSpec(12, 8, 3, oiio.UINT16))
     assert file.write_image(pixels) and file.close()
-    found = read_source(path, Kind.RGB, Reading(transfer=transfer)).pixels
+    found = read_source(path, Kind.RGB, ReadOptions(transfer=transfer)).pixels
     assert found.shape == (8, 12, 3) and found == pytest.approx(light, abs=1e-4)
     command = ["run", str(tmp_path), "-o", str(tmp_path / "out"), "--transfer", transfer]
     result = CliRunner().invoke(main, command, catch_exceptions=False)

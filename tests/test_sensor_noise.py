@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kurtosis, norm, poisson, tukeylambda
 
-from clpipe.camera import built_in_cameras, load_camera
-from clpipe.config import make_chain, settings_from
-from clpipe.errors import RequestError
-from clpipe.plan import make_plan
+from clpipe.base.errors import RequestError
+from clpipe.camera.profile import built_in_cameras, load_camera
+from clpipe.chain.chain import make_chain
+from clpipe.chain.settings import settings_from
+from clpipe.engine.plan import make_plan
+from clpipe.engine.runner import Runner
 from clpipe.reference.poisson import poisson_of
 from clpipe.reference.tukey_lambda import shape_and_scale, tukey_lambda_of
-from clpipe.run import Runner
 from clpipe.stage import Kind
 
 MEANS = (0.1, 1, 5, 9.9, 10.1, 50, 1000, 1e5)
@@ -170,9 +171,9 @@ def test_a_full_well_stays_in_the_truth(develop):
     }
     chain = make_chain(settings_from(given), Kind.MOSAIC)
     bright = np.full((8, 8), 0.9, np.float32)
-    truth = Runner(chain.clean(), None, encode=False, final=True).run(bright, "k").final
+    truth = Runner(chain.without_noise(), None, encode=False, final=True).run(bright, "k").final
     assert np.all(truth == np.rint(np.float32(0.5) * 15871 + 512))
-    assert chain.clean().noise is None
+    assert chain.without_noise().noise is None
     # Without a gain an electron is worth nothing, and a full well says nothing.
     dim = draw(develop, 0.1, 10_000, a=0.0, b=0.0, full_well=4e4)
     assert np.all(dim == np.float32(0.1))

@@ -5,7 +5,8 @@ from math import erfc, sqrt
 import numpy as np
 import pytest
 
-from clpipe.statistics import (
+from clpipe.analysis.selection import flat, unclipped
+from clpipe.analysis.statistics import (
     LAGS,
     SIGMAS,
     autocorrelation,
@@ -15,12 +16,10 @@ from clpipe.statistics import (
     correlation,
     energy_left,
     fit_law,
-    flat,
     line_noise,
     pairs_of,
     pooled,
     tails,
-    unclipped,
 )
 
 RANDOM = np.random.default_rng(5)

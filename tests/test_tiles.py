@@ -5,16 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clpipe.check import NOISE, example
-from clpipe.config import Settings, make_chain, settings_from
-from clpipe.device import Device
-from clpipe.errors import ImageError
-from clpipe.plan import Plan
-from clpipe.reference.cfa import PATTERNS
-from clpipe.registry import all_stages, load_stage_file
-from clpipe.run import Result, Runner
-from clpipe.stage import Kind
-from clpipe.tiles import (
+from clpipe.base.errors import ImageError
+from clpipe.chain.chain import make_chain
+from clpipe.chain.registry import all_stages, load_stage_file
+from clpipe.chain.settings import Settings, settings_from
+from clpipe.engine.check import NOISE, example
+from clpipe.engine.device import Device
+from clpipe.engine.plan import Plan
+from clpipe.engine.runner import Result, Runner
+from clpipe.engine.tiles import (
     LARGEST_TILE,
     Extent,
     buffer_sizes,
@@ -23,6 +22,8 @@ from clpipe.tiles import (
     phases_of,
     tiling_of,
 )
+from clpipe.reference.cfa import PATTERNS
+from clpipe.stage import Kind
 from tests.test_contributing import block
 
 METHODS = [
@@ -41,7 +42,7 @@ def plan_of(**settings) -> Plan:
 def memory_for(plan: Plan, columns: int, rows: int, lanes: int) -> int:
     """What a tile takes that has so many pixels beside its halo."""
     halo = 2 * halo_of(plan) + lanes
-    whole = Extent.whole(columns + halo, rows + halo, lanes, plan.apron)
+    whole = Extent.whole(columns + halo, rows + halo, lanes, plan.border)
     return sum(buffer_sizes(plan, whole).values()) + 4 * 1024
 
 
@@ -154,7 +155,7 @@ def test_every_source_of_noise(device, monkeypatch, noise):
 
 
 def test_a_stage_of_somebody_else_reads_places_in_the_image(device, tmp_path, monkeypatch):
-    monkeypatch.setattr("clpipe.registry._from_files", {})
+    monkeypatch.setattr("clpipe.chain.registry._from_files", {})
     (tmp_path / "vignette.cl").write_text(block("c"))
     (tmp_path / "vignette.py").write_text(block("python"))
     stage = load_stage_file(tmp_path / "vignette.py")

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from clpipe.config import make_chain, settings_from
-from clpipe.errors import RequestError
+from clpipe.base.errors import RequestError
+from clpipe.chain.chain import make_chain
+from clpipe.chain.settings import settings_from
 from clpipe.stages.tone_curve import DEFAULT
 from clpipe.stages.tone_curve.table import table_of
 

@@ -7,18 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clpipe.camera import DEFAULT_CAMERA, load_camera
-from clpipe.config import make_chain, settings_from
-from clpipe.errors import RequestError
-from clpipe.image_io import read_image
+from clpipe.base.errors import RequestError
+from clpipe.camera.profile import DEFAULT_CAMERA, load_camera
+from clpipe.chain.chain import make_chain
+from clpipe.chain.registry import all_stages
+from clpipe.chain.settings import settings_from
+from clpipe.chain.truth import noisy_mosaic, variance_of
+from clpipe.engine.runner import Runner
+from clpipe.images.read import read_image
+from clpipe.outputs.renditions import MOSAIC, VARIANCE, truth_of
 from clpipe.reference.cfa import PATTERNS
-from clpipe.registry import all_stages
-from clpipe.run import Runner
-from clpipe.shots import MOSAIC, VARIANCE, truth_of
 from clpipe.stage import Context, Kind, Method
 from clpipe.stages import DEFAULT_CHAIN
 from clpipe.stages.row_noise import Gaussian as RowNoise
-from clpipe.truth import noisy_mosaic, variance_of
 from tests.conftest import STILL_LIFE, written
 from tests.dng import write_dng
 

@@ -6,8 +6,8 @@ from click.testing import CliRunner
 from PIL import Image
 
 from clpipe import Pipeline
-from clpipe.cli import main
-from clpipe.errors import RequestError
+from clpipe.base.errors import RequestError
+from clpipe.commands.main import main
 from clpipe.reference.curve import curve_index
 from clpipe.stages.gamma import Power, Srgb
 from clpipe.stages.inverse_gamma import Power as InversePower

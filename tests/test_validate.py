@@ -6,7 +6,7 @@ from importlib.util import module_from_spec, spec_from_loader
 
 import pytest
 
-from clpipe.camera import load_camera
+from clpipe.camera.profile import load_camera
 from tests.conftest import ROOT
 
 LOADER = SourceFileLoader("validate", str(ROOT / "tools" / "validate"))

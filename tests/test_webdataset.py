@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clpipe import target, webdataset
-from clpipe.errors import ImageError, RequestError
-from clpipe.jobs import Job
-from clpipe.run_log import read_log
-from clpipe.webdataset import cut
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.batch import tars as webdataset
+from clpipe.batch.run_log import read_log
+from clpipe.batch.tars import cut
+from clpipe.inputs.find import Job
+from clpipe.outputs import writer as target
 from tests.conftest import ROOT, written
 
 # A chain that other tests compile too.

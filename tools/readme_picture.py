@@ -9,8 +9,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 import clpipe
-from clpipe.image_io import read_image
-from clpipe.types import Array
+from clpipe.base.types import Array
+from clpipe.images.read import read_image
 
 ROOT = Path(__file__).resolve().parent.parent
 RENDER = ROOT / "tests" / "data" / "still_life.exr"

@@ -4,7 +4,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from clpipe.types import Floats
+from clpipe.base.types import Floats
 
 Pattern = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 PATTERNS: tuple[Pattern, ...] = get_args(Pattern)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from clpipe.types import Floats
+from clpipe.base.types import Floats
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from clpipe.types import Array, Floats
+from clpipe.base.types import Array, Floats
 
 OCTAVES, STEPS = 20, 4096
 SIZE = OCTAVES * STEPS + 1

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from clpipe.types import Floats
+from clpipe.base.types import Floats
 
 
 def mirror(index: np.ndarray, size: int) -> np.ndarray:

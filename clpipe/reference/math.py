@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from clpipe.types import Floats
+from clpipe.base.types import Floats
 
 # Lowest power first.
 LOG_COEFFICIENTS = np.array(

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.image import tap
-from clpipe.types import Floats
 
 
 def median_filter(image: Floats, size: int) -> Floats:

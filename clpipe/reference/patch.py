@@ -5,8 +5,8 @@ from math import e, log2
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.image import mirrored, tap
-from clpipe.types import Floats
 
 
 def patch_distances(planes: Floats, reach: int, step: int = 1) -> Iterator[tuple[int, int, Floats]]:

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.math import estrin, exponential, inverse_root
 from clpipe.reference.random import Words, in_upper_half, normal_of, tail_probability
-from clpipe.types import Floats
 
 LARGE = np.float32(10)
 TERMS = 36

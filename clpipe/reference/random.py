@@ -8,8 +8,8 @@ from hashlib import blake2b
 import numpy as np
 from numpy.typing import NDArray
 
+from clpipe.base.types import Floats
 from clpipe.reference.math import estrin, negative_log, square_root
-from clpipe.types import Floats
 
 Words = NDArray[np.uint32]
 

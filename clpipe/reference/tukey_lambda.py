@@ -4,9 +4,9 @@ from math import gamma
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.math import exponential_minus_1, negative_log
 from clpipe.reference.random import Words, in_upper_half, tail_probability
-from clpipe.types import Floats
 
 NEARLY_ZERO = 1e-4  # there, what stands in for 0, the logistic distribution
 

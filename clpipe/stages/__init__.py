@@ -1,4 +1,9 @@
-"""The stages, one a file or folder, found by looking; and the default chain."""
+"""The stages, one a file or folder, found by looking; and the default chain.
+
+A file declares one stage: its methods, their parameters, kernels and NumPy references. Every module
+here must define ``STAGE``; code that several stages share belongs in ``reference`` or ``stage``.
+It imports ``stage``, ``reference``, ``camera`` and ``base``.
+"""
 
 from functools import cache
 from importlib import import_module

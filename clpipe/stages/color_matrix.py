@@ -7,9 +7,9 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from pydantic import BeforeValidator, field_validator
 
-from clpipe.camera import IDENTITY, Matrix
+from clpipe.base.types import Floats
+from clpipe.camera.profile import IDENTITY, Matrix
 from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, Unchanged, parameter
-from clpipe.types import Floats
 
 NAMES = tuple(f"{row}_{column}" for row in "rgb" for column in "rgb")
 

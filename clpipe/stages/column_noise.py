@@ -4,16 +4,16 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.random import normal_of_line
-from clpipe.stage import Access, Context, Frame, GaussianNoise, Kind, Owner, Pass, Stage
-from clpipe.types import Floats
+from clpipe.stage import Access, Context, Frame, GaussianNoise, Kind, NoiseScope, Pass, Stage
 
 
 class Gaussian(GaussianNoise):
     """One Gaussian offset a column, the same in every image of a camera.
 
-    >>> from clpipe.stage import alone
-    >>> noisy = alone(Gaussian(sigma=0.01), np.zeros((2, 1000), np.float32))
+    >>> from clpipe.stage import run_reference
+    >>> noisy = run_reference(Gaussian(sigma=0.01), np.zeros((2, 1000), np.float32))
     >>> round(float(noisy.std()), 3), bool((noisy[0] == noisy[1]).all())
     (0.01, True)
     """
@@ -31,14 +31,14 @@ class Gaussian(GaussianNoise):
                 Access.LINES,
                 arguments=("sigma",),
                 writes="lines",
-                random=Owner.CAMERA,
+                random=NoiseScope.CAMERA,
                 lines="columns",
             ),
             Pass("column_noise", arguments=("lines",)),
         )
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        normals = normal_of_line(image.shape[1], frame.stream[Owner.CAMERA])
+        normals = normal_of_line(image.shape[1], frame.stream[NoiseScope.CAMERA])
         return image + (normals * np.float32(self.sigma))[None, :]
 
 

@@ -5,20 +5,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.math import negative_log
 from clpipe.reference.random import word_at
-from clpipe.stage import (
-    Argument,
-    Context,
-    Frame,
-    Kind,
-    Method,
-    Owner,
-    Pass,
-    Stage,
-    parameter,
-)
-from clpipe.types import Floats
+from clpipe.stage import Argument, Context, Frame, Kind, Method, NoiseScope, Pass, Stage, parameter
 
 WORDS = 1 << 31  # as many random words tell pixels apart
 VISIBLE = 0.1  # signal of a hot pixel where the camera does not say its charge
@@ -30,9 +20,9 @@ class Random(Method):
     A hot one has an extra charge of hot_level * (1 + e), e exponential of mean 1, at every ISO the
     same number of electrons; a dead one gives no signal.
 
-    >>> from clpipe.stage import alone
+    >>> from clpipe.stage import run_reference
     >>> image = np.full((300, 300), 0.1, np.float32)
-    >>> image = alone(Random(hot_share=0.01, hot_level=0.5, dead_share=0.02), image)
+    >>> image = run_reference(Random(hot_share=0.01, hot_level=0.5, dead_share=0.02), image)
     >>> round(float((image >= 0.6).mean()), 2), round(float((image == 0).mean()), 2)
     (0.01, 0.02)
     """
@@ -68,7 +58,7 @@ class Random(Method):
         if not self.hot_share and not self.dead_share:
             return ()
         names = ("hot_limit", "dead_limit", "hot_scale", "hot_level")
-        return (Pass("defect_pixels", arguments=names, random=Owner.CAMERA),)
+        return (Pass("defect_pixels", arguments=names, random=NoiseScope.CAMERA),)
 
     def _limits(self) -> tuple[int, int]:
         assert self.hot_share is not None and self.dead_share is not None
@@ -89,7 +79,7 @@ class Random(Method):
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
         hot_limit, dead_limit = self._limits()
-        words = word_at(image.shape, 0, frame.stream[Owner.CAMERA])
+        words = word_at(image.shape, 0, frame.stream[NoiseScope.CAMERA])
         bits = (words >> np.uint32(1)).view(np.int32)
         u = (bits.astype(np.float32) + np.float32(0.5)) * np.float32(1 / max(hot_limit, 1))
         excess = np.maximum(negative_log(u), np.float32(0))

@@ -4,9 +4,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.random import normal_at
-from clpipe.stage import Context, Frame, GaussianNoise, Kind, Owner, Pass, Stage
-from clpipe.types import Floats
+from clpipe.stage import Context, Frame, GaussianNoise, Kind, NoiseScope, Pass, Stage
 
 
 class Gaussian(GaussianNoise):
@@ -14,8 +14,8 @@ class Gaussian(GaussianNoise):
 
     In electrons it is the same at every ISO.
 
-    >>> from clpipe.stage import alone
-    >>> uneven = alone(Gaussian(sigma=0.01), np.zeros((300, 300), np.float32))
+    >>> from clpipe.stage import run_reference
+    >>> uneven = run_reference(Gaussian(sigma=0.01), np.zeros((300, 300), np.float32))
     >>> round(float(uneven.std()), 3)
     0.01
     """
@@ -28,10 +28,10 @@ class Gaussian(GaussianNoise):
         return self.filled(sigma=camera.signal_of(camera.dsnu, context.iso))
 
     def draw(self) -> tuple[Pass, ...]:
-        return (Pass("dsnu", arguments=("sigma",), random=Owner.CAMERA),)
+        return (Pass("dsnu", arguments=("sigma",), random=NoiseScope.CAMERA),)
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        normals = normal_at(image.shape, 0, frame.stream[Owner.CAMERA])
+        normals = normal_at(image.shape, 0, frame.stream[NoiseScope.CAMERA])
         return image + normals * np.float32(self.sigma)
 
 

@@ -5,15 +5,15 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
-from clpipe.types import Floats
 
 
 class Gain(Method):
     """Linear light times 2^EV.
 
-    >>> from clpipe.stage import alone
-    >>> alone(Gain(ev=-1.0), np.float32([[[0.5, 1, 4]]])).tolist()
+    >>> from clpipe.stage import run_reference
+    >>> run_reference(Gain(ev=-1.0), np.float32([[[0.5, 1, 4]]])).tolist()
     [[[0.25, 0.5, 2.0]]]
     """
 

@@ -3,12 +3,10 @@
 from functools import lru_cache
 from typing import ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from clpipe.base.types import Floats
 from clpipe.reference.curve import tabulate
+from clpipe.reference.transfer import srgb_curve
 from clpipe.stage import Curve, Kind, Stage, parameter
-from clpipe.types import Floats
 
 
 @lru_cache(maxsize=16)
@@ -27,15 +25,6 @@ class Power(Curve):
 
     def table(self) -> Floats:
         return power_table(self.exponent)
-
-
-def srgb_curve(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The transfer function of sRGB (IEC 61966-2-1, 1999): linear below 0.0031308.
-
-    >>> srgb_curve(np.array([0.001, 0.5])).round(5).tolist()
-    [0.01292, 0.73536]
-    """
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
 SRGB_TABLE = tabulate(srgb_curve)

@@ -3,22 +3,10 @@
 from functools import lru_cache
 from typing import ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from clpipe.base.types import Floats
 from clpipe.reference.curve import tabulate
+from clpipe.reference.transfer import inverse_srgb_curve
 from clpipe.stage import Curve, Kind, Stage, parameter
-from clpipe.types import Floats
-
-
-def inverse_srgb_curve(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """From sRGB back to linear light (IEC 61966-2-1, 1999).
-
-    >>> inverse_srgb_curve(np.array([0.01292, 0.73536])).round(4).tolist()
-    [0.001, 0.5]
-    """
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
-
 
 SRGB_TABLE = tabulate(inverse_srgb_curve)
 

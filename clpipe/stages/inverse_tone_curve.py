@@ -6,11 +6,11 @@ from typing import ClassVar
 import numpy as np
 from pydantic import field_validator
 
+from clpipe.base.types import Floats
 from clpipe.reference.curve import tabulate
 from clpipe.stage import Curve, Kind, Stage, Unchanged, parameter
 from clpipe.stages.tone_curve import DEFAULT
 from clpipe.stages.tone_curve.table import table_of
-from clpipe.types import Floats
 
 
 @lru_cache(maxsize=16)

@@ -6,16 +6,16 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.cfa import by_site
 from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
-from clpipe.types import Floats
 
 
 class Gains(Method):
     """Each colour divided by the gain that white balance would give it (green = 1).
 
-    >>> from clpipe.stage import alone
-    >>> alone(Gains(red_gain=2.0, blue_gain=4.0), np.ones((2, 2), np.float32)).tolist()
+    >>> from clpipe.stage import run_reference
+    >>> run_reference(Gains(red_gain=2.0, blue_gain=4.0), np.ones((2, 2), np.float32)).tolist()
     [[0.5, 1.0], [1.0, 0.25]]
     """
 

@@ -6,17 +6,17 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
-from clpipe.types import Floats
 
 
 class Bayer(Method):
     """A Bayer pattern (US patent 3,971,065, 1976): a pixel keeps one of its three colours.
 
-    >>> from clpipe.stage import alone
+    >>> from clpipe.stage import run_reference
     >>> image = np.float32([1, 2, 3]) * np.ones((2, 2, 1), np.float32)
-    >>> alone(Bayer(pattern="GRBG"), image).tolist()
+    >>> run_reference(Bayer(pattern="GRBG"), image).tolist()
     [[2.0, 1.0], [3.0, 2.0]]
     """
 

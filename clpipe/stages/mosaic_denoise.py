@@ -7,6 +7,7 @@ from typing import ClassVar
 import numpy as np
 from pydantic import field_validator
 
+from clpipe.base.types import Floats
 from clpipe.reference.cfa import by_site
 from clpipe.reference.image import tap
 from clpipe.reference.math import square_root
@@ -24,7 +25,6 @@ from clpipe.stage import (
     odd_size,
     parameter,
 )
-from clpipe.types import Floats
 
 FACTOR = 1.3  # of h; the best in PSNR on our picture, ISO 1600 to 12800
 LARGEST = 15

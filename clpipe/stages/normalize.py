@@ -6,15 +6,16 @@ from typing import ClassVar
 import numpy as np
 from pydantic import model_validator
 
+from clpipe.base.types import Floats
 from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
-from clpipe.types import Floats
 
 
 class Linear(Method):
     """(DN - black) / (white - black); what lies below black stays negative.
 
-    >>> from clpipe.stage import alone
-    >>> alone(Linear(black_level=100, white_level=1124), np.float32([[36, 100, 612]])).tolist()
+    >>> from clpipe.stage import run_reference
+    >>> linear = Linear(black_level=100, white_level=1124)
+    >>> run_reference(linear, np.float32([[36, 100, 612]])).tolist()
     [[-0.0625, 0.0, 0.5]]
     """
 

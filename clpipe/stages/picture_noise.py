@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
+from clpipe.base.types import Floats
 from clpipe.reference.curve import to_8_bit
 from clpipe.reference.random import normal_at
 from clpipe.stage import (
@@ -21,13 +22,12 @@ from clpipe.stage import (
     Frame,
     Kind,
     Method,
-    Owner,
+    NoiseScope,
     Pass,
     Stage,
     Unchanged,
     parameter,
 )
-from clpipe.types import Floats
 
 ENTRIES = 256
 RESOLVED = 65  # entries of a measured curve, as the sidecar has it
@@ -85,8 +85,8 @@ class Matched(Method):
 class IidGaussian(Matched):
     """Independent Gaussian noise of one sigma: the usual baseline.
 
-    >>> from clpipe.stage import alone
-    >>> noisy = alone(IidGaussian(sigma=0.02), np.full((300, 300, 3), 0.5, np.float32))
+    >>> from clpipe.stage import run_reference
+    >>> noisy = run_reference(IidGaussian(sigma=0.02), np.full((300, 300, 3), 0.5, np.float32))
     >>> noisy.std((0, 1)).round(3).tolist()
     [0.019999999552965164, 0.019999999552965164, 0.019999999552965164]
     """
@@ -109,7 +109,7 @@ class IidGaussian(Matched):
         return self.filled(sigma=tuple(noise.sigma for noise in measured_noise(self.measured)))
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("picture_noise", arguments=("red", "green", "blue"), random=Owner.IMAGE),)
+        return (Pass("picture_noise", arguments=("red", "green", "blue"), random=NoiseScope.IMAGE),)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         assert self.sigma is not None
@@ -126,9 +126,9 @@ class IntensityDependent(Matched):
     benchmark for 3D reconstruction from images", ECCV 2016): sigma by intensity, as a table. Beyond
     the intensities that were measured the last sigma holds.
 
-    >>> from clpipe.stage import alone
+    >>> from clpipe.stage import run_reference
     >>> grey = np.full((300, 300, 3), 0.5, np.float32)
-    >>> noisy = alone(IntensityDependent(sigma=(0.01, 0.03)), grey)
+    >>> noisy = run_reference(IntensityDependent(sigma=(0.01, 0.03)), grey)
     >>> bool(abs(noisy.std() - 0.02) < 1e-3)
     True
     """
@@ -161,7 +161,7 @@ class IntensityDependent(Matched):
         return _table(self.sigma)
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("picture_noise", arguments=("sigmas",), random=Owner.IMAGE),)
+        return (Pass("picture_noise", arguments=("sigmas",), random=NoiseScope.IMAGE),)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"sigmas": self.table()}
@@ -173,7 +173,7 @@ class IntensityDependent(Matched):
 
 def _normals(image: Floats, frame: Frame) -> Floats:
     """A standard normal a sample, of the image's own stream."""
-    stream = frame.stream[Owner.IMAGE]
+    stream = frame.stream[NoiseScope.IMAGE]
     return np.stack([normal_at(image.shape, draw, stream) for draw in range(3)], axis=-1)
 
 

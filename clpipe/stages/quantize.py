@@ -7,16 +7,16 @@ from typing import ClassVar
 import numpy as np
 from pydantic import model_validator
 
+from clpipe.base.types import Floats
 from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
-from clpipe.types import Floats
 
 
 class Linear(Method):
     """Signal to whole DN, rounded to nearest, clipped to 0..white level.
 
-    >>> from clpipe.stage import alone
+    >>> from clpipe.stage import run_reference
     >>> signal = np.float32([[-1, 0, 0.1, 0.5, 7]])
-    >>> alone(Linear(black_level=100, white_level=1124), signal).tolist()
+    >>> run_reference(Linear(black_level=100, white_level=1124), signal).tolist()
     [[0.0, 100.0, 202.0, 612.0, 1124.0]]
     """
 

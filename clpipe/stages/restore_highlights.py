@@ -5,8 +5,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
-from clpipe.types import Floats
 
 
 class Brooks2019(Method):
@@ -17,9 +17,9 @@ class Brooks2019(Method):
     m = (max(grey - 0.9, 0) / 0.1)^2; inverse_white_balance divides later (Brooks et al.,
     "Unprocessing images for learned raw denoising", CVPR 2019, sec. 3.3).
 
-    >>> from clpipe.stage import alone
+    >>> from clpipe.stage import run_reference
     >>> image = np.float32([[[1, 1, 1], [0.5, 0.5, 0.5]]])
-    >>> alone(Brooks2019(red_gain=2.0, blue_gain=1.5), image).tolist()
+    >>> run_reference(Brooks2019(red_gain=2.0, blue_gain=1.5), image).tolist()
     [[[2.0, 1.0, 1.5], [0.5, 0.5, 0.5]]]
     """
 

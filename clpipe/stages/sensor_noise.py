@@ -8,24 +8,14 @@ from typing import ClassVar, Self
 import numpy as np
 from pydantic import model_validator
 
-from clpipe.errors import RequestError
-from clpipe.noise_model import Emva, NoiseModel, Paper
+from clpipe.base.errors import RequestError
+from clpipe.base.types import Floats
+from clpipe.camera.noise import Emva, NoiseModel, Paper
 from clpipe.reference.math import square_root
 from clpipe.reference.poisson import poisson_of
 from clpipe.reference.random import normal_at, word_at
 from clpipe.reference.tukey_lambda import shape_and_scale, tukey_lambda_of
-from clpipe.stage import (
-    Argument,
-    Context,
-    Frame,
-    Kind,
-    Method,
-    Owner,
-    Pass,
-    Stage,
-    parameter,
-)
-from clpipe.types import Floats
+from clpipe.stage import Argument, Context, Frame, Kind, Method, NoiseScope, Pass, Stage, parameter
 
 EMVA = ("system_gain", "read_noise", "adc_noise")
 PAPER = ("chi", "theta", "b_before", "b_after", "p0")
@@ -148,7 +138,7 @@ class SensorNoise(Method):
     def after(self, context: Context) -> Context:
         return replace(context, noise=self.model(context))
 
-    def clean(self) -> Method | None:
+    def without_noise(self) -> Method | None:
         full = self.full_signal
         return None if full is None else NoNoise(full_signal=full)
 
@@ -186,7 +176,7 @@ class SensorNoise(Method):
 
     def read_reference(self, image: Floats, frame: Frame) -> Floats:
         """Read noise of variance 1, in NumPy."""
-        stream = frame.stream[Owner.IMAGE]
+        stream = frame.stream[NoiseScope.IMAGE]
         if self.tukey_lambda is None:
             return normal_at(image.shape, 1, stream)
         words = word_at(image.shape, 1, stream)
@@ -196,8 +186,8 @@ class SensorNoise(Method):
 class Gaussian(SensorNoise):
     """Heteroscedastic Gaussian, Var[y] = a*y + b (Foi et al., IEEE TIP 2008, eq. 2).
 
-    >>> from clpipe.stage import alone
-    >>> noisy = alone(Gaussian(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
+    >>> from clpipe.stage import run_reference
+    >>> noisy = run_reference(Gaussian(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
     >>> round(float(noisy.mean()), 2), round(float(noisy.var()), 4)
     (0.5, 0.0006)
     """
@@ -209,9 +199,11 @@ class Gaussian(SensorNoise):
 
     def passes(self) -> tuple[Pass, ...]:
         if self.tukey_lambda is None:
-            return (Pass("sensor_noise", arguments=("a", "b", "full_well"), random=Owner.IMAGE),)
+            return (
+                Pass("sensor_noise", arguments=("a", "b", "full_well"), random=NoiseScope.IMAGE),
+            )
         names = ("a", "full_well", "read_noise", "shape", "scale")
-        return (Pass("sensor_noise_tukey", arguments=names, random=Owner.IMAGE),)
+        return (Pass("sensor_noise_tukey", arguments=names, random=NoiseScope.IMAGE),)
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
         if self.tukey_lambda is None:  # below 0 it goes on to fall
@@ -227,7 +219,7 @@ class Gaussian(SensorNoise):
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
         given = self.values()
-        normals = normal_at(image.shape, 0, frame.stream[Owner.IMAGE])
+        normals = normal_at(image.shape, 0, frame.stream[NoiseScope.IMAGE])
         variance = given["a"] * image + given.get("b", np.float32(0))
         noise = normals * square_root(np.maximum(variance, np.float32(0)))
         noisy = np.minimum(image + noise, given["full_well"])
@@ -241,8 +233,8 @@ class Poisson(SensorNoise):
 
     Light below 0 gives no electrons. Drawn by inverse CDF (Giles, ACM TOMS 42(1), 2016).
 
-    >>> from clpipe.stage import alone
-    >>> noisy = alone(Poisson(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
+    >>> from clpipe.stage import run_reference
+    >>> noisy = run_reference(Poisson(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
     >>> round(float(noisy.mean()), 2), round(float(noisy.var()), 4)
     (0.5, 0.0006)
     """
@@ -270,7 +262,7 @@ class Poisson(SensorNoise):
             Pass(
                 "sensor_noise_poisson" if gaussian else "sensor_noise_poisson_tukey",
                 arguments=names if gaussian else (*names, "shape", "scale"),
-                random=Owner.IMAGE,
+                random=NoiseScope.IMAGE,
             ),
         )
 
@@ -285,7 +277,7 @@ class Poisson(SensorNoise):
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
         given = self.values()
-        words = word_at(image.shape, 0, frame.stream[Owner.IMAGE])
+        words = word_at(image.shape, 0, frame.stream[NoiseScope.IMAGE])
         mean = np.maximum(image, np.float32(0)) * given["chi"]
         electrons = np.minimum(poisson_of(mean, words), given["full_well"])
         return electrons * given["a"] + self.read_reference(image, frame) * given["read_noise"]
@@ -294,8 +286,8 @@ class Poisson(SensorNoise):
 class NoNoise(Method):
     """No noise; but a full well is no noise, and stays.
 
-    >>> from clpipe.stage import alone
-    >>> alone(NoNoise(full_signal=0.5), np.float32([[0.25, 0.75]])).tolist()
+    >>> from clpipe.stage import run_reference
+    >>> run_reference(NoNoise(full_signal=0.5), np.float32([[0.25, 0.75]])).tolist()
     [[0.25, 0.5]]
     """
 

@@ -6,7 +6,7 @@
 #define CLPIPE_CURVE_H
 
 INLINE vi curve_index(vf v) {
-    const vf inside = least(most(v, (vf)(9.5367431640625e-07f)), (vf)(1.0f));
+    const vf inside = vmin(vmax(v, (vf)(9.5367431640625e-07f)), (vf)(1.0f));
     return ((float_bits(inside) + 0x400) >> 11) - (0x35800000 >> 11);
 }
 

@@ -4,7 +4,7 @@
 
 // 0..1 to 0..255, rounded to nearest.
 INLINE vi to_8_bit(vf v) {
-    const vf inside = least(most(v, (vf)(0.0f)), (vf)(1.0f));
+    const vf inside = vmin(vmax(v, (vf)(0.0f)), (vf)(1.0f));
     return to_int(nearest(inside * 255.0f));
 }
 

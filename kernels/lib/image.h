@@ -1,9 +1,9 @@
 // Where a block of lanes stands, and how lanes are read from and written to images.
 //
 // A stored image is one to three planes of float32. Its rows are `pitch` apart and it is
-// surrounded by an apron of APRON pixels that mirrors the image (reflect-101: the edge pixel is
+// surrounded by an border of BORDER pixels that mirrors the image (reflect-101: the edge pixel is
 // not repeated, so the phase of a Bayer pattern goes on). Whoever writes a pixel writes its mirror
-// images in the apron too, so a stencil never has to look where it is.
+// images in the border too, so a stencil never has to look where it is.
 #ifndef CLPIPE_IMAGE_H
 #define CLPIPE_IMAGE_H
 
@@ -13,7 +13,7 @@ typedef struct {
 } site;
 
 // What is stored is the whole image or a tile of it with its halo: a site is a place in the image, and
-// `left`, `top` is where the planes begin in it. A tile has an apron too; at edges that are none of
+// `left`, `top` is where the planes begin in it. A tile has an border too; at edges that are none of
 // the image it mirrors what nobody uses, because the halo is wide enough.
 typedef struct {
     uint width, height;  // of the image
@@ -50,18 +50,18 @@ INLINE site shifted(site at, int dx, int dy) {
     return to;
 }
 
-// In what has no apron and no padding: source and result.
+// In what has no border and no padding: source and result.
 INLINE size_t pixel_number(site at, extent e) {
     return (size_t)(at.y - e.top) * e.columns + (at.x - e.left);
 }
 
 INLINE size_t plane_offset(site at, extent e) {
-    return (size_t)(at.y - e.top + APRON) * e.pitch + APRON_LEFT + (at.x - e.left);
+    return (size_t)(at.y - e.top + BORDER) * e.pitch + BORDER_LEFT + (at.x - e.left);
 }
 
 // Where the image's first pixel would be, so that its pixels can be found by their places in it.
 INLINE __global const float *image_origin(__global const float *plane, extent e) {
-    return plane + ((long)APRON - (long)e.top) * (long)e.pitch + APRON_LEFT - (long)e.left;
+    return plane + ((long)BORDER - (long)e.top) * (long)e.pitch + BORDER_LEFT - (long)e.left;
 }
 
 INLINE image image_at(__global const float *p0, __global const float *p1, __global const float *p2,
@@ -103,14 +103,14 @@ INLINE int mirror(int i, int n) {
 // One lane's value to its column and to that column's mirror images, all in one row.
 INLINE void store_lane(float v, __global float *row, int x, int width) {
     row[x] = v;
-    for (int a = 1; a <= APRON; ++a) {
+    for (int a = 1; a <= BORDER; ++a) {
         if (mirror(-a, width) == x) row[-a] = v;
         if (mirror(width - 1 + a, width) == x) row[width - 1 + a] = v;
     }
 }
 
 static void store_row(vf v, __global float *row, int x, int width) {
-    if (x > APRON && x + LANES + APRON < width) {
+    if (x > BORDER && x + LANES + BORDER < width) {
         store(v, row + x);
         return;
     }
@@ -122,9 +122,9 @@ static void store_row(vf v, __global float *row, int x, int width) {
 // `x` and `y` are counted from where the planes begin.
 static void store_at_edge(vf v, __global float *dst, int x, int y, extent e) {
     const int columns = (int)e.columns, rows = (int)e.rows;
-    __global float *origin = dst + (size_t)APRON * e.pitch + APRON_LEFT;
+    __global float *origin = dst + (size_t)BORDER * e.pitch + BORDER_LEFT;
     store_row(v, origin + (long)y * e.pitch, x, columns);
-    for (int a = 1; a <= APRON; ++a) {
+    for (int a = 1; a <= BORDER; ++a) {
         if (mirror(-a, rows) == y) store_row(v, origin - (long)a * e.pitch, x, columns);
         if (mirror(rows - 1 + a, rows) == y)
             store_row(v, origin + (long)(rows - 1 + a) * e.pitch, x, columns);
@@ -132,7 +132,7 @@ static void store_at_edge(vf v, __global float *dst, int x, int y, extent e) {
 }
 
 INLINE bool near_edge(uint x, uint y, extent e) {
-    return x <= APRON || x + LANES + APRON >= e.columns || y <= APRON || y + 1 + APRON >= e.rows;
+    return x <= BORDER || x + LANES + BORDER >= e.columns || y <= BORDER || y + 1 + BORDER >= e.rows;
 }
 
 INLINE void store_plane(vf v, __global float *dst, site at, extent e) {

@@ -62,8 +62,8 @@ INLINE vi to_int(vf v) { return __builtin_convertvector(v, vi); }
 INLINE vf load_half(__global const half *p) { return LANES_OF(vload_half)(0, p); }
 #endif
 
-INLINE vf least(vf a, vf b) { return a < b ? a : b; }
-INLINE vf most(vf a, vf b) { return a > b ? a : b; }
+INLINE vf vmin(vf a, vf b) { return a < b ? a : b; }
+INLINE vf vmax(vf a, vf b) { return a > b ? a : b; }
 INLINE vi least_int(vi a, vi b) { return a < b ? a : b; }
 INLINE vi most_int(vi a, vi b) { return a > b ? a : b; }
 

@@ -55,7 +55,7 @@ INLINE vf exponential_minus_1(vf x) {
 INLINE vf exp2_of_negative(vf x) {
 #pragma OPENCL FP_CONTRACT ON
     const vf round_magic = (vf)(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer
-    x = most(x, (vf)(-30.0f));
+    x = vmax(x, (vf)(-30.0f));
     const vf shifted = x + round_magic;
     const vf f = x - (shifted - round_magic);
     vf p = f * 0.055171624f + 0.24261113f;

@@ -7,7 +7,7 @@
 #ifndef CLPIPE_MEDIAN_H
 #define CLPIPE_MEDIAN_H
 
-#define ORDER(a, b) { const vf smaller = least(a, b); b = most(a, b); a = smaller; }
+#define ORDER(a, b) { const vf smaller = vmin(a, b); b = vmax(a, b); a = smaller; }
 
 // In ascending order.
 typedef struct { vf a, b, c; } sorted3;
@@ -35,18 +35,18 @@ INLINE sorted5 sort4_and_insert(vf a, vf b, vf c, vf d, vf x) {
     ORDER(a, b) ORDER(c, d)
     ORDER(a, c) ORDER(b, d)
     ORDER(b, c)
-    const sorted5 s = {least(a, x), most(a, least(b, x)), most(b, least(c, x)),
-                       most(c, least(d, x)), most(d, x)};
+    const sorted5 s = {vmin(a, x), vmax(a, vmin(b, x)), vmax(b, vmin(c, x)),
+                       vmax(c, vmin(d, x)), vmax(d, x)};
     return s;
 }
 
-INLINE vf median3(vf a, vf b, vf c) { return most(least(a, b), least(most(a, b), c)); }
+INLINE vf median3(vf a, vf b, vf c) { return vmax(vmin(a, b), vmin(vmax(a, b), c)); }
 
 // Of three sorted rows, in any order: the median is that of the largest of the small ones, the
 // median of the middle ones and the smallest of the large ones (Smith 1996).
 INLINE vf median9(sorted3 p, sorted3 q, sorted3 r) {
-    return median3(most(most(p.a, q.a), r.a), median3(p.b, q.b, r.b),
-                   least(least(p.c, q.c), r.c));
+    return median3(vmax(vmax(p.a, q.a), r.a), median3(p.b, q.b, r.b),
+                   vmin(vmin(p.c, q.c), r.c));
 }
 
 // Of five sorted rows, in any order. Sorted by columns too, 12 of the 25 cannot be the median: a
@@ -60,19 +60,19 @@ INLINE vf median25(sorted5 p, sorted5 q, sorted5 r, sorted5 s, sorted5 t) {
     const sorted5 column3 = sort4_and_insert(p.c, q.c, r.c, s.c, t.c);
     const sorted5 column4 = sort4_and_insert(p.d, q.d, r.d, s.d, t.d);
     const sorted5 column5 = sort4_and_insert(p.e, q.e, r.e, s.e, t.e);
-    const vf m = least(most(column3.b, column2.d), column4.c);
-    vf a = least(most(column4.b, column1.d), column2.e);
-    vf b = least(column5.b, m);
-    b = most(b, column4.a);
-    vf c = least(most(column5.a, column2.c), column3.d);
+    const vf m = vmin(vmax(column3.b, column2.d), column4.c);
+    vf a = vmin(vmax(column4.b, column1.d), column2.e);
+    vf b = vmin(column5.b, m);
+    b = vmax(b, column4.a);
+    vf c = vmin(vmax(column5.a, column2.c), column3.d);
     vf d = column1.e;
     ORDER(c, d)
     ORDER(b, a)
-    a = least(a, d);
-    c = most(b, c);
+    a = vmin(a, d);
+    c = vmax(b, c);
     vf e = column3.c;
     ORDER(c, e)
-    return least(e, most(c, a));
+    return vmin(e, vmax(c, a));
 }
 #undef ORDER
 

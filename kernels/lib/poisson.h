@@ -47,7 +47,7 @@ INLINE vf poisson_small(vf mean, vu word) {
 INLINE vf poisson_large(vf mean, vu word) {
     const vf w = normal_of(word);
     const vf r = inverse_root(mean);
-    const vf s = most(w * r, (vf)(-1.3f));  // below, it is 0 anyway
+    const vf s = vmax(w * r, (vf)(-1.3f));  // below, it is 0 anyway
     const vf s2 = s * s, s4 = s2 * s2;
     const vf a0 = (s * -0.01394692063331604f + 0.16666667f) +
                   (s * -0.001212189788930118f + 0.003954051993787289f) * s2;
@@ -61,14 +61,14 @@ INLINE vf poisson_large(vf mean, vu word) {
     const vf offset = (mean * r) * w + ((w * w) * (a0 + a4 * s4) + (b + c * (r * r)));
     const vf v = offset + (mean - whole);
     const vf rounded = nearest(v);
-    return most(whole + (rounded > v ? rounded - 1.0f : rounded), (vf)(0.0f));
+    return vmax(whole + (rounded > v ? rounded - 1.0f : rounded), (vf)(0.0f));
 }
 
 // The Poisson number of a mean >= 0 for a random word.
 INLINE vf poisson_of(vf mean, vu word) {
-    const vf large = poisson_large(most(mean, (vf)(POISSON_LARGE)), word);
+    const vf large = poisson_large(vmax(mean, (vf)(POISSON_LARGE)), word);
     if (!any_lane(mean < POISSON_LARGE)) return large;
-    const vf small = poisson_small(least(mean, (vf)(POISSON_LARGE)), word);
+    const vf small = poisson_small(vmin(mean, (vf)(POISSON_LARGE)), word);
     return mean < POISSON_LARGE ? small : large;
 }
 

@@ -53,7 +53,7 @@ INLINE vi in_upper_half(vu word) { return signed_bits(word) >= 0; }
 // relative error 4e-5 out to 6.2 sigma. Only * + and bit operations, so NumPy gives the same bits.
 INLINE vf normal_of(vu word) {
     const vf p = tail_probability(word);
-    const vf s = square_root(most(negative_log(4.0f * p * (1.0f - p)), (vf)(0.0f))) - 2.25f;
+    const vf s = square_root(vmax(negative_log(4.0f * p * (1.0f - p)), (vf)(0.0f))) - 2.25f;
     const vf s2 = s * s, s4 = s2 * s2, s8 = s4 * s4;
     const vf z0 = (s * 1.3548409f + 2.9601128f) + (s * -0.076602094f + 0.09441337f) * s2;
     const vf z4 = (s * 0.0062090177f + 0.028542647f) + (s * -0.00031167656f + -0.0069498117f) * s2;

@@ -12,7 +12,7 @@ import sys
 
 from distributed import LocalCluster
 
-from clpipe.cli import main
+from clpipe.commands.main import main
 
 if __name__ == "__main__":  # the workers import this file
     processors = len(os.sched_getaffinity(0))

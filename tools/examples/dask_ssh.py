@@ -13,7 +13,7 @@ import sys
 
 from distributed import SSHCluster
 
-from clpipe.cli import main
+from clpipe.commands.main import main
 
 if __name__ == "__main__":
     first, *others = os.environ["HOSTS"].split()

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.stage import Access, Argument, Context, Frame, Method, Pass
 from clpipe.stages.demosaic.common import (
@@ -15,7 +16,6 @@ from clpipe.stages.demosaic.common import (
     red_and_blue,
     sum_of_corners,
 )
-from clpipe.types import Floats
 
 
 def bilinear(image: Floats, pattern: Pattern) -> Floats:

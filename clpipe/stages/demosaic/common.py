@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site, red_site
 from clpipe.reference.image import tap
-from clpipe.types import Floats
 
 HALF, QUARTER, EIGHTH = np.float32(0.5), np.float32(0.25), np.float32(0.125)
 

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
 from clpipe.stage import Access, Argument, Context, Frame, Kind, Literal, Method, Pass, parameter
@@ -17,7 +18,6 @@ from clpipe.stages.demosaic.common import (
     mean_beside,
     spread_differences,
 )
-from clpipe.types import Floats
 
 Classifier = typing.Literal["hamilton_adams", "laroche_prescott", "hibbard"]
 

@@ -3,12 +3,12 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
+from clpipe.base.types import Floats
 from clpipe.reference.median import median_filter
 from clpipe.stage import Access, Argument, Context, Frame, Kind, Pass
 from clpipe.stages.demosaic.common import from_differences, spread_differences
 from clpipe.stages.demosaic.edge_directed import EdgeDirected, green_or_difference
 from clpipe.stages.demosaic.median import Median
-from clpipe.types import Floats
 
 
 class EdgeDirectedMedian(Median, EdgeDirected):

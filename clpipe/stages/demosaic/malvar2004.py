@@ -5,11 +5,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
 from clpipe.stage import Access, Argument, Context, Frame, Method, Pass
 from clpipe.stages.demosaic.common import EIGHTH, HALF, red_and_blue, sum_of_corners
-from clpipe.types import Floats
 
 TWO, FOUR, FIVE, SIX = np.float32(2), np.float32(4), np.float32(5), np.float32(6)
 

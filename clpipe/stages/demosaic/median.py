@@ -6,11 +6,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.median import median_filter
 from clpipe.stage import Access, Argument, Context, Frame, Kind, Literal, Method, Pass, parameter
 from clpipe.stages.demosaic.bilinear import bilinear
 from clpipe.stages.demosaic.common import from_differences
-from clpipe.types import Floats
 
 
 class Median(Method):

@@ -10,17 +10,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Array, Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
 from clpipe.stage import Access, Argument, Context, Frame, Kind, Method, Pass
-from clpipe.stages.demosaic.common import (
-    HALF,
-    QUARTER,
-    mean_above_below,
-    mean_beside,
-    red_and_blue,
-)
-from clpipe.types import Array, Floats
+from clpipe.stages.demosaic.common import HALF, QUARTER, mean_above_below, mean_beside, red_and_blue
 
 THIRD = np.float32(1 / 3)
 

@@ -1,7 +1,7 @@
 """Denoising in luma and chroma, chroma stronger, as strong as the ISO asks for."""
 
 from clpipe.stage import Context, Kind, Stage
-from clpipe.stages.denoise import law
+from clpipe.stages.denoise import strength as law
 from clpipe.stages.denoise.bilateral import Bilateral
 from clpipe.stages.denoise.mean import Mean
 from clpipe.stages.denoise.median import Median

@@ -6,11 +6,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.reference.image import tap
 from clpipe.stage import Context, Frame, parameter
-from clpipe.stages.denoise.law import Denoiser
-from clpipe.types import Floats
+from clpipe.stages.denoise.strength import Denoiser
 
 RANGE = 3.0  # sigma of the range weight, in multiples of strength times noise
 

@@ -4,13 +4,13 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.image import tap
-from clpipe.stages.denoise.law import size_of
-from clpipe.stages.denoise.share import Shared
-from clpipe.types import Floats
+from clpipe.stages.denoise.blended import BlendedFilter
+from clpipe.stages.denoise.strength import size_of
 
 
-class Mean(Shared):
+class Mean(BlendedFilter):
     """Mean of a square window. It does not know an edge from noise; it is here to compare with."""
 
     method: ClassVar = "mean"

@@ -2,13 +2,13 @@
 
 from typing import ClassVar
 
+from clpipe.base.types import Floats
 from clpipe.reference.median import median_filter
-from clpipe.stages.denoise.law import size_of
-from clpipe.stages.denoise.share import Shared
-from clpipe.types import Floats
+from clpipe.stages.denoise.blended import BlendedFilter
+from clpipe.stages.denoise.strength import size_of
 
 
-class Median(Shared):
+class Median(BlendedFilter):
     """Median of a square window (Tukey, Exploratory Data Analysis, 1977), each plane by itself."""
 
     method: ClassVar = "median"

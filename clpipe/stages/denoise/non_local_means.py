@@ -6,12 +6,12 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.reference.image import tap
 from clpipe.reference.patch import bias_of, decay_of, patch_distances, patch_sum
 from clpipe.stage import Context, Frame, Kind, Pass
-from clpipe.stages.denoise.law import MID_GREY, Denoiser, noise_of_luma_and_chroma, size_of
-from clpipe.types import Floats
+from clpipe.stages.denoise.strength import MID_GREY, Denoiser, noise_of_luma_and_chroma, size_of
 
 FACTOR = 1.1  # of h; the best in PSNR for both planes on our picture, ISO 1600 to 12800
 PATCH = 9  # pixels

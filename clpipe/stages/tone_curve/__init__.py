@@ -5,11 +5,11 @@ from typing import ClassVar
 
 from pydantic import field_validator
 
+from clpipe.base.types import Floats
 from clpipe.stage import Curve, Kind, Stage, Unchanged, parameter
 from clpipe.stages.tone_curve.table import table_of
-from clpipe.types import Floats
 
-DEFAULT = str(resources.files("clpipe") / "curves" / "default.csv")
+DEFAULT = str(resources.files("clpipe.stages.tone_curve") / "default.csv")
 
 
 class Default(Curve):

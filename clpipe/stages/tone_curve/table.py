@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from clpipe.base.types import Floats
 from clpipe.reference.curve import tabulate
-from clpipe.types import Floats
 
 Knots = NDArray[np.float64]
 

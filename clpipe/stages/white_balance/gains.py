@@ -6,9 +6,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.stage import Argument, Context, Frame, Method, Pass, Unchanged, parameter
-from clpipe.types import Floats
 
 
 def balanced(image: Floats, context: Context, red: np.float32, blue: np.float32) -> Floats:
@@ -17,7 +17,7 @@ def balanced(image: Floats, context: Context, red: np.float32, blue: np.float32)
     return np.minimum(image * gains, np.float32(1))
 
 
-class FoundGains(Method):
+class EstimatedGains(Method):
     """Gains that are found in the image itself. Subclasses say how."""
 
     tolerance: ClassVar = 1e-6  # of the gains: division is not exact on every device
@@ -48,8 +48,9 @@ class FoundGains(Method):
 class AsShot(Method):
     """The gains that inverse_white_balance took out (none, if it did not run).
 
-    >>> from clpipe.stage import alone
-    >>> alone(AsShot(red_gain=2.0, blue_gain=4.0), np.full((2, 2), 0.375, np.float32)).tolist()
+    >>> from clpipe.stage import run_reference
+    >>> as_shot = AsShot(red_gain=2.0, blue_gain=4.0)
+    >>> run_reference(as_shot, np.full((2, 2), 0.375, np.float32)).tolist()
     [[0.75, 0.375], [0.375, 1.0]]
     """
 

@@ -5,13 +5,13 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.stage import Access, Argument, Context, Pass
-from clpipe.stages.white_balance.gains import FoundGains
-from clpipe.types import Floats
+from clpipe.stages.white_balance.gains import EstimatedGains
 
 
-class GrayWorld(FoundGains):
+class GrayWorld(EstimatedGains):
     """k_c = mean(G) / mean(c) (Buchsbaum, J. Franklin Institute 1980).
 
     Samples are clipped to -1..1 and summed as integers in steps of 2^-20, so the sums are exact.

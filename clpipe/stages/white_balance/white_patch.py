@@ -5,10 +5,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.stage import Access, Argument, Context, Pass, parameter
-from clpipe.stages.white_balance.gains import FoundGains
-from clpipe.types import Floats
+from clpipe.stages.white_balance.gains import EstimatedGains
 
 STEPS = 6144  # bins a colour: 12 octaves below 1, 512 each
 _FIRST = int(np.float32(2.0**-12).view(np.int32))
@@ -41,7 +41,7 @@ def percentile_level(samples: Floats, millionths: int) -> np.float32:
     return np.int32(_FIRST + (bin_ << 14) + (1 << 13)).view(np.float32)
 
 
-class WhitePatch(FoundGains):
+class WhitePatch(EstimatedGains):
     """k_c = max(G) / max(c), the maximum as a percentile (Land and McCann, J. Opt. Soc. Am. 1971).
 
     Cells of 2x2 samples that clip are left out: of a burnt-out light nothing is known but that it

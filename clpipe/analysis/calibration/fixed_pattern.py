@@ -1,0 +1,205 @@
+"""What stays put from frame to frame: column offsets, DSNU, PRNU, hot and dead pixels."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from clpipe.analysis.calibration.line_fit import Estimate, Line
+from clpipe.analysis.calibration.repeats import Sensor, Stack
+from clpipe.base.types import Array, Floats
+
+SURE = 7.0  # standard deviations that none of 1e8 pixels lies out by chance
+
+
+BLOCK = 16  # pixels of one colour, a side
+
+
+LEAST_BLOCKS = 30
+
+
+DARKEST = 0.05  # signal of a block that tells PRNU
+
+
+UNEVEN = 0.03  # relative standard deviation of the scene in a block
+
+
+LEAST_DEVIATION = 0.05  # DN, in a mean dark frame
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Bad pixels: rows and columns, how far each lies above its neighbours in DN, and the share of
+    the sensor on which one would have been seen.
+    """
+
+    rows: Array
+    columns: Array
+    excess: Array
+    seen_on: float
+
+    def record(self) -> dict[str, object]:
+        """Positions as [column, row], and the share of the pixels that could be judged."""
+        at = np.stack([self.columns, self.rows], axis=1).tolist()
+        return {"positions": at, "excess_dn": np.round(self.excess, 2).tolist()}
+
+
+def _found(mask: Array, excess: Array, seen_on: float) -> Pixels:
+    rows, columns = np.nonzero(mask)
+    return Pixels(rows, columns, excess[mask].astype(np.float64), seen_on)
+
+
+def hot_in_dark(dark: Floats, sensor: Sensor) -> Pixels:
+    """Hot pixels of a mean dark frame: 7 standard deviations above the median of the 3x3 pixels of
+    the same colour; the deviation is a quarter of what the middle 95 % of all pixels span.
+    """
+    from scipy.ndimage import median_filter
+    from scipy.stats import norm
+
+    excess = np.empty(dark.shape, np.float32)
+    hot = np.empty(dark.shape, bool)
+    for site in sensor.sites().values():
+        excess[site] = dark[site] - median_filter(dark[site], 3, mode="mirror")
+        low, high = np.quantile(excess[site], norm.cdf([-2, 2]))
+        hot[site] = excess[site] > SURE * max((high - low) / 4, LEAST_DEVIATION)
+    return _found(hot, excess, 1.0)
+
+
+def hot_in_scene(stack: Stack, line: Line) -> Pixels:
+    """Hot pixels of a scene, brighter than the brightest of the 8 neighbours of the same colour.
+
+    They are so by 7 standard deviations of the mean, by all that these neighbours differ among
+    themselves, and by three times what any adjacent pixel differs from its own.
+    """
+    from scipy.ndimage import maximum_filter
+
+    low, high = _extremes(stack)
+    deviation = np.sqrt(line.at(np.maximum(high, 0)) / len(stack.rest))
+    excess = stack.light - high
+    out = np.maximum(np.abs(excess), np.abs(stack.light - low))
+    nearby = np.ones((3, 3), bool)
+    nearby[1, 1] = False
+    hot = excess > np.maximum(SURE * deviation + (high - low), 0)
+    hot &= excess > 3 * maximum_filter(out, footprint=nearby, mode="mirror")
+    return _found(stack.used & hot, excess, 1.0)
+
+
+def dead_in_scene(stack: Stack, line: Line) -> Pixels:
+    """Dead pixels: without light, where all 8 neighbours of the same colour have much, and more
+    than they differ among themselves.
+    """
+    low, high = _extremes(stack)
+    nothing = SURE * float(np.sqrt(line.at(np.zeros(1))[0] / len(stack.rest)))
+    lit = low > np.maximum(4 * nothing, high - low)
+    return _found(lit & (stack.light < nothing), stack.light - low, float(lit.mean()))
+
+
+def _extremes(stack: Stack) -> tuple[Floats, Floats]:
+    """The least and the largest of each pixel's 8 neighbours of the same colour."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    around = np.ones((3, 3), bool)
+    around[1, 1] = False
+    low, high = np.empty_like(stack.light), np.empty_like(stack.light)
+    for site in stack.sensor.sites().values():
+        low[site] = minimum_filter(stack.light[site], footprint=around, mode="mirror")
+        high[site] = maximum_filter(stack.light[site], footprint=around, mode="mirror")
+    return low, high
+
+
+def dark_pattern(
+    dark: Floats, temporal: Estimate, bad: Pixels, sensor: Sensor
+) -> tuple[Estimate, Estimate]:
+    """The variances of column offsets and of pixels (DSNU) in a mean dark frame, in DN^2.
+
+    Args:
+        dark: the mean of the dark frames, DN.
+        temporal: the variance that a pixel of it has from its frames' noise, row noise apart, DN^2.
+        bad: hot pixels, which are left out.
+        sensor: its pattern; each channel's mean is taken out, as channels may differ in black.
+
+    Returns:
+        Columns, corrected for what all pixel scatter leaves in a column's mean; DSNU, after
+        columns and rows are taken out, corrected for the temporal noise that is left.
+    """
+    values = dark.astype(np.float64)
+    good = np.ones(dark.shape, bool)
+    good[bad.rows, bad.columns] = False
+    for site in sensor.sites().values():
+        values[site] -= values[site][good[site]].mean()
+    values[~good] = 0
+    height, width = dark.shape
+    values -= (values.sum(axis=1) / good.sum(axis=1).clip(1))[:, None] * good
+    in_column = good.sum(axis=0).clip(1)
+    columns = values.sum(axis=0) / in_column
+    values -= columns * good
+    # Rows and columns took degrees of freedom along.
+    freedom = good.sum() * (1 - 1 / height) * (1 - 1 / width)
+    scatter = (values**2).sum() / freedom
+    scatter_error = np.sqrt(max((values**4).sum() / freedom - scatter**2, 0) / freedom)
+    columns2 = (columns**2).sum() / max(width - 2, 1)  # even and odd columns have their own mean
+    left = float((scatter / in_column).mean())
+    return (
+        Estimate(float(columns2 - left), float(columns2 * np.sqrt(2 / max(width - 2, 1)))),
+        Estimate(float(scatter - temporal.value), float(np.hypot(scatter_error, temporal.error))),
+    )
+
+
+def response_pattern(stack: Stack, line: Line, dsnu: float) -> Estimate | None:
+    """PRNU squared, from places where the scene is flat; None where it has too few.
+
+    In blocks of 16x16 pixels of one colour, a smooth surface and the means of rows and columns are
+    taken out. What then scatters, less temporal noise and DSNU, is (PRNU * light)^2. A block is
+    flat where that surface is nearly level and diagonal neighbours do not scatter together; and all
+    flat blocks must tell the same PRNU, else it is the scene's texture.
+
+    Args:
+        stack: the frames of a scene.
+        line: their noise, DN^2, rounding included.
+        dsnu: variance of DSNU in DN^2, 0 where it is not known.
+    """
+    surface = _surface()
+    freedom = BLOCK**2 - surface.shape[1]
+    squares, lights = [], []
+    for site in stack.sensor.sites().values():
+        used = _blocks(stack.used[site]).all(axis=(1, 2))
+        pixels = _blocks(stack.light[site])[used].reshape(-1, BLOCK**2).astype(np.float64)
+        mean = pixels.mean(axis=1)
+        shape = pixels @ surface
+        uneven = (shape**2).sum(axis=1) - mean**2 * BLOCK**2
+        rest = pixels - shape @ surface.T
+        square = (rest**2).sum(axis=1) / freedom
+        rest = rest.reshape(-1, BLOCK, BLOCK)
+        together = np.abs((rest[:, 1:, 1:] * rest[:, :-1, :-1]).mean(axis=(1, 2)))
+        flat = (together < 3 / BLOCK * square) & (mean > DARKEST * stack.sensor.unit)
+        flat &= uneven < (UNEVEN * mean) ** 2 * BLOCK**2 + square * surface.shape[1]
+        squares.append(square[flat])
+        lights.append(mean[flat])
+    square, light = np.concatenate(squares), np.concatenate(lights)
+    if len(light) < LEAST_BLOCKS:
+        return None
+    noise = line.at(light) / len(stack.rest) + dsnu
+    value = 0.0
+    for _ in range(5):
+        expected = 2 * ((noise + value * light**2) / light**2) ** 2 / freedom
+        weight = 1 / expected / (1 / expected).sum()
+        value = max(float(weight @ ((square - noise) / light**2)), 0.0)
+    apart = (((square - noise) / light**2 - value) ** 2 / expected).mean()
+    return Estimate(value, float(np.sqrt(weight**2 @ expected))) if apart < 2 else None
+
+
+def _surface() -> Array:
+    """What is taken out of a block, as orthonormal columns: each row's and each column's mean, and
+    a surface of the fourth degree.
+    """
+    one = np.linspace(-1, 1, BLOCK)
+    row, column = np.repeat(np.eye(BLOCK), BLOCK, axis=0), np.tile(np.eye(BLOCK), (BLOCK, 1))
+    mixed = [np.outer(one**i, one**j).ravel() for i in range(1, 4) for j in range(1, 5 - i)]
+    basis, sizes, _ = np.linalg.svd(np.column_stack([row, column, *mixed]), full_matrices=False)
+    return basis[:, sizes > 1e-9 * sizes[0]]
+
+
+def _blocks(plane: Array) -> Array:
+    """A plane cut into whole blocks, (blocks, BLOCK, BLOCK)."""
+    rows, columns = (n // BLOCK for n in plane.shape)
+    cut = plane[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK)
+    return cut.swapaxes(1, 2).reshape(-1, BLOCK, BLOCK)

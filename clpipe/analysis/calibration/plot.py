@@ -1,0 +1,100 @@
+"""The picture of a calibration."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from clpipe.analysis.calibration.calibrate import Calibration
+
+COLOURS = {"R": "#c8312b", "G1": "#2f9e44", "G2": "#8fb339", "B": "#2b62c8", "all": "#6b6b6b"}
+
+
+WIDTH = 1600  # px
+
+
+COLUMNS = 3
+
+
+def plot_calibration(path: Path, found: Sequence[Calibration], title: str) -> None:
+    """Write a PNG of 1600 px width: for each ISO variance over mean with the fitted line, and the
+    photon-transfer curves of all (log noise over log light), in DN.
+
+    Args:
+        path: of the PNG.
+        found: one calibration an ISO.
+        title: what was calibrated.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    columns = min(COLUMNS, len(found))
+    rows = math.ceil(len(found) / columns)
+    figure = Figure(figsize=(16, 7.5 + 4.2 * rows), dpi=WIDTH / 16, layout="constrained")
+    figure.suptitle(title, fontsize=17)
+    upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[4.2 * rows, 7]).ravel()
+    panels = np.ravel(upper.subplots(rows, columns, squeeze=False))
+    for panel, one in zip(panels, found, strict=False):
+        _variance_over_mean(panel, one)
+    for panel in panels[len(found) :]:
+        panel.axis("off")
+    _photon_transfer(lower.subplots(), found)
+    canvas = FigureCanvasAgg(figure)
+    canvas.print_png(str(path))
+
+
+def _variance_over_mean(panel: object, one: Calibration) -> None:
+    """One ISO: the channels' bins and the line through all."""
+    from matplotlib.axes import Axes
+
+    assert isinstance(panel, Axes)
+    rounding = one.rounding
+    most = 0.0
+    for name, bins in one.bins.items():
+        light = np.array([b.light for b in bins])
+        variance = np.array([b.variance for b in bins]) - rounding
+        errors = np.array([b.error for b in bins])
+        most = max(most, *light) if len(light) else most
+        panel.errorbar(
+            light, variance, errors, fmt="o", ms=4, lw=1, color=COLOURS[name], label=name
+        )
+    ends = np.array([0.0, most * 1.05])
+    gain, floor = one.pooled.gain, one.pooled.floor
+    for name, line in one.lines.items():
+        own = line.gain.value * ends + line.floor.value
+        label = None if name in one.bins else f"fit, {name}"
+        panel.plot(ends, own, color=COLOURS[name], lw=0.8, alpha=0.7, label=label)
+    panel.plot(ends, gain.value * ends + floor.value, color="black", lw=1.3, label="fit, all")
+    panel.set_title(f"ISO {one.iso:g}: variance = {gain.value:.4g} · mean + {floor.value:.3g}")
+    panel.set_xlabel("mean above black, DN")
+    panel.set_ylabel("variance, DN²")
+    panel.set_ylim(0)
+    panel.set_xlim(0)
+    panel.grid(alpha=0.25)
+    panel.legend(fontsize=9, loc="upper left")
+
+
+def _photon_transfer(panel: object, found: Sequence[Calibration]) -> None:
+    """All ISOs: noise over light, both logarithmic."""
+    from matplotlib import colormaps
+    from matplotlib.axes import Axes
+
+    assert isinstance(panel, Axes)
+    unit = found[0].sensor.unit
+    shades = colormaps["viridis"](np.linspace(0, 0.85, len(found)))
+    light = np.geomspace(unit * 1e-4, unit, 200)
+    for shade, one in zip(shades, found, strict=True):
+        gain, floor = one.pooled.gain.value, one.pooled.floor.value
+        label = f"ISO {one.iso:g}: K {gain:.3g} DN/e⁻, read {one.read_noise.value:.3g} DN"
+        panel.plot(light, np.sqrt(np.maximum(gain * light + floor, 1e-9)), color=shade, label=label)
+        every = [b for bins in one.bins.values() for b in bins if b.light > light[0]]
+        noise = np.sqrt([max(b.variance - one.rounding, 1e-9) for b in every])
+        panel.plot([b.light for b in every], noise, "o", ms=3.5, color=shade)
+    panel.set_xscale("log")
+    panel.set_yscale("log")
+    panel.set_title("Photon transfer: lines as fitted, points as measured")
+    panel.set_xlabel("mean above black, DN")
+    panel.set_ylabel("noise (standard deviation), DN")
+    panel.grid(alpha=0.25, which="both")
+    panel.legend(fontsize=10, loc="upper left")

@@ -1,0 +1,281 @@
+"""Noise of a single raw image: Foi, Trimeche, Katkovnik, Egiazarian, "Practical
+Poissonian-Gaussian noise modeling and fitting for single-image raw-data", IEEE TIP 17(10), 2008.
+
+Wavelet details of smooth places hold noise alone. Places of equal smoothed value make a level set;
+each gives a mean and a standard deviation, and the line variance = a*y + b is the most likely one
+behind all these pairs. Clipped samples are modelled, not left out (sec. III).
+
+What departs from the paper. A level set's deviation comes from those of its places whose local
+variance a line found before explains, not from the median of all details: where half of a picture
+is textured, the median is far too large. The integral of the likelihood over the unknown y of a
+level set is taken to first order, since a set's mean is known far better than its deviation. The
+optimum is searched for over the variance at both ends of the light, so b may come out below zero.
+"""
+
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clpipe.analysis.calibration.line_fit import Estimate, Line
+from clpipe.analysis.calibration.repeats import Sensor
+from clpipe.base.types import Floats
+
+# Daubechies' scaling and wavelet functions with three vanishing moments (sec. II-A): the wavelet of
+# norm 1, the scaling function of sum 1.
+WAVELET = np.array([0.035226, 0.085441, -0.135011, -0.459878, 0.806892, -0.332671])
+
+
+SCALING = np.array([0.332671, 0.806892, 0.459878, -0.135011, -0.085441, 0.035226]) / np.sqrt(2)
+
+
+LEVELS = 150  # level sets of a colour, at most
+
+
+LEAST = 400  # places in a level set
+
+
+LEAST_EXPLAINED = 40  # of them
+
+
+WINDOW = 7  # of the smoothing, and of local variances
+
+
+EDGE = 1.0  # tau, in standard deviations of the details (sec. II-B1)
+
+
+EXPLAINED = 1.4  # times the line's variance, two standard deviations of a local variance
+
+
+ROUNDS = 8  # of choosing places by the line before
+
+
+GRID = 2000
+
+
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Places:
+    """Smooth places of one colour: the smoothed signal, the signal, the local variance."""
+
+    smooth: Values
+    signal: Values
+    variance: Values
+
+    def sets(self) -> list[NDArray[np.intp]]:
+        """The level sets, as indices: places in order of their smoothed signal, cut evenly."""
+        order = np.argsort(self.smooth, kind="stable")
+        return np.array_split(order, min(LEVELS, len(order) // LEAST) or 1)
+
+
+@dataclass(frozen=True)
+class LevelSets:
+    """Level sets: mean of the clipped signal, its standard deviation, how many places."""
+
+    mean: Values
+    deviation: Values
+    count: Values
+
+
+def joined(parts: Sequence[LevelSets]) -> LevelSets:
+    """All sets of several collections."""
+    columns = ([getattr(p, name) for p in parts] for name in ("mean", "deviation", "count"))
+    return LevelSets(*(np.concatenate(column) for column in columns))
+
+
+def smooth_places(plane: Floats) -> Places:
+    """The smooth places of one colour's plane of signal (sec. II-A and II-B).
+
+    A place is smooth where the Laplacian of the smoothed image, and the Laplacian's gradient, are
+    less than the local deviation of the details.
+    """
+    from scipy.ndimage import convolve1d, laplace, sobel, uniform_filter
+
+    def decimated(kernel: Values) -> Values:
+        rows = convolve1d(plane.astype(np.float64), kernel, axis=0, mode="mirror")[::2]
+        return convolve1d(rows, kernel, axis=1, mode="mirror")[:, ::2]
+
+    detail, approximation = decimated(WAVELET), decimated(SCALING)
+    smooth = uniform_filter(approximation, WINDOW, mode="mirror")
+    local = np.sqrt(np.pi / 2) * uniform_filter(np.abs(detail), WINDOW, mode="mirror")
+    bend = laplace(smooth, mode="mirror")
+    slope = np.hypot(sobel(bend, 0, mode="mirror"), sobel(bend, 1, mode="mirror")) / 8
+    flat = slope + np.abs(bend) < EDGE * local
+    # A running sum may leave less than nothing.
+    variance = np.maximum(uniform_filter(detail * detail, WINDOW, mode="mirror"), 0)
+    return Places(smooth[flat], approximation[flat], variance[flat])
+
+
+def explained_line(
+    parts: Sequence[Places], low: float, dark: Sequence[LevelSets] = ()
+) -> tuple[float, float, LevelSets, Values]:
+    """The line behind the places that it explains, and their level sets.
+
+    The first line goes through each set's lowest twentieth of local variances. Then those below
+    1.4 times the line count, whose mean is brought up by what a chi-square distribution loses when
+    it is cut there, and so on. ``dark`` are level sets that are known otherwise.
+
+    Returns:
+        a and b, signal units; the level sets; the standard errors of a and b.
+
+    Raises:
+        ValueError: there are too few sets, or they are all alike in light.
+    """
+    from scipy.stats import chi2
+
+    freedom = WINDOW**2
+    cut = chi2.cdf(EXPLAINED * freedom, freedom + 2) / chi2.cdf(EXPLAINED * freedom, freedom)
+    lowest = chi2.ppf(0.05, freedom) / freedom
+    places = [(part, chosen) for part in parts for chosen in part.sets()]
+    found = [
+        (part.signal[i].mean(), np.quantile(part.variance[i], 0.05) / lowest, len(i))
+        for part, i in places
+    ]
+    for _ in range(ROUNDS):
+        mean, variance, count = np.array(found, np.float64).reshape(-1, 3).T
+        sets = joined([LevelSets(mean, np.sqrt(variance), count), *dark])
+        a, b, errors = most_likely_line(sets, low)
+        found = []
+        for part, i in places:
+            i = i[part.variance[i] < EXPLAINED * np.maximum(a * part.smooth[i] + b, 1e-12)]
+            # Not more: sets that lose places by chance would go, those that keep them stay.
+            if len(i) >= LEAST_EXPLAINED:
+                found.append((part.signal[i].mean(), part.variance[i].mean() / cut, len(i)))
+    return a, b, sets, errors
+
+
+def clipped_moments(y: Values, deviation: Values, low: float) -> tuple[Values, Values]:
+    """Mean and deviation of y plus Gaussian noise after clipping to low..1 (sec. III-B).
+
+    E_m(u) = Phi(u) u + phi(u) and S_m(u)^2 = Phi(u) + phi(u) u - phi(u)^2
+    + Phi(u) u (u - Phi(u) u - 2 phi(u)) are those of a normal of mean u and deviation 1, clipped at
+    0 from below; the two ends are put together as if apart.
+
+    >>> mean, deviation = clipped_moments(np.array([0.0, 0.5]), np.array([0.1, 0.1]), 0.0)
+    >>> mean.round(4).tolist(), deviation.round(4).tolist()
+    ([0.0399, 0.5], [0.0584, 0.1])
+    """
+    from scipy.stats import norm
+
+    def one_end(u: Values) -> tuple[Values, Values]:
+        below, density = norm.cdf(u), norm.pdf(u)
+        mean = below * u + density
+        square = below + density * u - density**2 + below * u * (u - below * u - 2 * density)
+        return mean, np.sqrt(np.maximum(square, 1e-12))
+
+    from_low, low_deviation = one_end((y - low) / deviation)
+    from_high, high_deviation = one_end((1 - y) / deviation)
+    mean = low + deviation * from_low + 1 - deviation * from_high - y
+    return mean, deviation * low_deviation * high_deviation
+
+
+def most_likely_line(sets: LevelSets, low: float) -> tuple[float, float, Values]:
+    """The most likely line behind level sets (sec. II-C and III-C), signal units.
+
+    Each set's deviation is compared with that of the clipped model at the set's mean; its square
+    scatters as 1.35/(n + 1.5) of itself, half as a Gaussian and half as a Cauchy distribution,
+    which forgives the sets that hold texture.
+
+    Args:
+        sets: of signal, 1 = white level.
+        low: the signal at 0 DN, where it clips.
+
+    Returns:
+        a, b, and their standard errors (from the curvature of the likelihood).
+
+    Raises:
+        ValueError: there are too few sets, or they are all alike in light.
+    """
+    from scipy.optimize import minimize
+
+    mean, deviation, count = sets.mean, sets.deviation, sets.count
+    # Where nearly all is clipped, nothing is left to measure.
+    used = (mean < 0.995) & (mean > low + 0.005 * (1 - low)) & (deviation > 0)
+    mean, deviation, count = mean[used], deviation[used], count[used]
+    if len(mean) < 8 or np.ptp(mean) < 0.02:
+        raise ValueError("too few smooth places of different light")
+    dark, bright = float(mean.min()), float(mean.max())
+    grid = np.linspace(min(dark, 0) - 0.05, 1.3, GRID)
+    scatter = 1.35 / (count + 1.5)
+
+    def line(ends: Values) -> Values:
+        first, last = np.exp(ends)
+        a = (last - first) / (bright - dark)
+        return np.array([a, first - a * dark])
+
+    def cost(ends: Values) -> float:
+        a, b = line(ends)
+        sigma = np.sqrt(np.maximum(a * grid + b, 1e-12))
+        seen, seen_sigma = clipped_moments(grid, sigma, low)
+        rising = np.maximum.accumulate(seen)
+        model = np.interp(mean, rising, seen_sigma)
+        steep = np.interp(mean, rising, np.gradient(seen_sigma) / (np.gradient(seen) + 1e-12))
+        width = model * np.sqrt(scatter + np.clip(steep, -9, 9) ** 2 / (4 * count))
+        t = (deviation - model) / width
+        gauss = np.exp(-0.5 * np.minimum(np.abs(t), 38) ** 2) / np.sqrt(2 * np.pi)
+        cauchy = 1 / (np.pi * (1 + t * t))
+        return float(-np.log((0.5 * gauss + 0.5 * cauchy) / width).sum())
+
+    order = np.argsort(mean)
+    ends = [np.median(deviation[order[part]] ** 2) for part in (slice(0, 5), slice(-5, None))]
+    start = np.log(np.maximum(ends, 1e-12))
+    options = {"xatol": 1e-4, "fatol": 1e-4, "maxiter": 2000}
+    best = minimize(cost, start, method="Nelder-Mead", options=options).x
+    a, b = line(best)
+    return float(a), float(b), _errors(cost, best, line)
+
+
+def _errors(
+    cost: Callable[[Values], float], at: Values, line: Callable[[Values], Values]
+) -> Values:
+    """Standard errors of a and b from the curvature of the likelihood at its optimum."""
+    step = 0.01
+    unit = np.eye(2) * step
+    curvature = np.empty((2, 2))
+    for i in range(2):
+        for j in range(2):
+            corners = cost(at + unit[i] + unit[j]) - cost(at + unit[i] - unit[j])
+            corners += cost(at - unit[i] - unit[j]) - cost(at - unit[i] + unit[j])
+            curvature[i, j] = corners / (4 * step**2)
+    slopes = np.array([line(at + unit[i]) - line(at - unit[i]) for i in range(2)]).T / (2 * step)
+    covariance = slopes @ np.linalg.pinv(curvature) @ slopes.T
+    return np.sqrt(np.maximum(np.diag(covariance), 0))
+
+
+def single_image(
+    light: Floats, sensor: Sensor, dark: LevelSets | None = None
+) -> tuple[dict[str, Line], Line, LevelSets]:
+    """The lines of one mosaic's channels, the line of all, and the level sets behind it.
+
+    The details are those across both directions: what a row or a column shares is not in them. A
+    channel with too few smooth places has no line.
+
+    Args:
+        light: (height, width) above black, DN.
+        sensor: its pattern and levels.
+        dark: what dark frames say of noise without light, signal units.
+
+    Raises:
+        ValueError: there are too few smooth places, or they are all alike in light.
+    """
+    unit = sensor.unit
+    low = -sensor.black_level / unit
+    known = [dark] if dark else []
+    places = {name: smooth_places(light[site] / unit) for name, site in sensor.sites().items()}
+
+    def line(parts: Sequence[Places]) -> tuple[Line, LevelSets]:
+        a, b, sets, errors = explained_line(parts, low, known)
+        gain, floor = Estimate(a, float(errors[0])), Estimate(b, float(errors[1]))
+        pixels = int(sets.count.sum()) * 4  # a place is a detail, one of every 2x2 pixels
+        return Line(gain.scaled(unit), floor.scaled(unit**2), pixels), sets
+
+    whole, sets = line(list(places.values()))
+    lines = {}
+    for name, part in places.items():
+        with contextlib.suppress(ValueError):
+            lines[name] = line([part])[0]
+    return lines, whole, sets

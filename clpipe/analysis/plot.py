@@ -1,0 +1,143 @@
+"""A report of measured noise as a picture."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+
+from clpipe.analysis.measure import UNITS, NoiseReport
+from clpipe.analysis.statistics import HISTOGRAM, LAGS, Channel, gaussian_beyond
+from clpipe.base.files import write_new
+
+INK = {
+    "R": "#c8102e",
+    "G": "#2e8b3d",
+    "G1": "#2e8b3d",
+    "G2": "#8ab800",
+    "B": "#1f5fbf",
+    "Y": "#222222",
+    "Cb": "#18a0b0",
+    "Cr": "#b0389a",
+    "mosaic": "#222222",
+}
+
+
+MAPS = {"display": ("Y", "Cb", "Cr"), "rgb": ("Y", "Cb", "Cr")}
+
+
+SITE_MAPS = ("mosaic", "R", "G1", "B")
+
+
+def draw(report: NoiseReport, path: Path) -> None:
+    """Draw noise by intensity, tails and autocorrelation as a PNG, 1600 pixels wide.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    figure = Figure(figsize=(16, 11), dpi=100, layout="constrained")
+    grid = figure.add_gridspec(2, 1, height_ratios=(1.15, 1))
+    above, below = figure.add_subfigure(grid[0]), figure.add_subfigure(grid[1])
+    intensity, tails = above.subplots(1, 2)
+    draw_intensity(intensity, report)
+    draw_tails(tails, report)
+    by_name = {one.name: one for one in report.channels}
+    names = MAPS.get(report.kind, SITE_MAPS)
+    shown = [by_name[name] for name in names]
+    largest = max((peak(one) for one in shown), default=0.0)
+    limit = float(np.clip(largest, 0.05, 1.0))
+    axes = below.subplots(1, len(names))
+    for axis, one in zip(axes, shown, strict=True):
+        picture = draw_autocorrelation(axis, one, limit, report)
+    below.colorbar(picture, ax=axes, shrink=0.85, label="correlation (lag 0 is 1)")
+    first, *more = report.images
+    of = short_name(first) + (f" and {len(more)} more" if more else "")
+    against = short_name(report.truth) if report.truth else "their mean"
+    title = f"Noise of {of} against {against} ({report.kind}, {report.share:.0%} of it counts)"
+    figure.suptitle(title, fontsize=15)
+    FigureCanvasAgg(figure)
+    write_new(path, figure.savefig)
+
+
+def short_name(path: str) -> str:
+    """The end of a path: the file and its folder, which tell truth and noisy image apart.
+
+    >>> short_name("a/b/c.exr")
+    'b/c.exr'
+    """
+    return "/".join(Path(path).parts[-2:])
+
+
+def peak(one: Channel) -> float:
+    """The largest correlation of a channel apart from lag 0."""
+    table = np.nan_to_num(one.autocorrelation.copy())
+    table[LAGS, LAGS] = 0
+    return float(np.abs(table).max())
+
+
+def draw_intensity(axes: Axes, report: NoiseReport) -> None:
+    """Sigma over intensity, with the fitted sqrt(a*y + b) where there is one."""
+    for one in report.channels:
+        ink, curve = INK[one.name], one.curve
+        dashed = one.name in ("Y", "Cb", "Cr")
+        axes.plot(
+            curve.mean,
+            curve.sigma,
+            marker="o",
+            markersize=5,
+            linestyle=("--" if dashed else "-") if one.law is None else "",
+            color=ink,
+            label=one.name,
+        )
+        if one.law:
+            y = np.linspace(report.edges[0], report.edges[-1], 200)
+            variance = np.maximum(one.law.a * y + one.law.b, 0)
+            axes.plot(y, np.sqrt(variance), color=ink, linewidth=1)
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel(f"intensity of the truth ({UNITS[report.kind]})", fontsize=12)
+    axes.set_ylabel("sigma of the noise", fontsize=12)
+    lawful = any(one.law for one in report.channels)
+    axes.set_title("Noise by intensity" + ("; lines: sqrt(a·y + b)" if lawful else ""), fontsize=13)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=12)
+
+
+def draw_tails(axes: Axes, report: NoiseReport) -> None:
+    """The share of standardised noise beyond each value, on its side of 0, over a Gaussian's."""
+    beyond = [gaussian_beyond(abs(z)) / 2 for z in HISTOGRAM]
+    axes.fill_between(HISTOGRAM, beyond, 1e-12, color="0.85", label="Gaussian")
+    for one in report.channels:
+        below = np.concatenate([[0], np.cumsum(one.tails.histogram)]) / one.count
+        share = np.minimum(below, 1 - below)
+        axes.plot(
+            HISTOGRAM,
+            np.where(share * one.count > 0.5, share, np.nan),
+            color=INK[one.name],
+            linewidth=1.5,
+            label=one.name,
+        )
+    axes.set_yscale("log")
+    axes.set_ylim(0.3 / max(one.count for one in report.channels), 0.7)
+    axes.set_xlim(-6, 6)
+    axes.set_xlabel("noise / its sigma at that intensity", fontsize=12)
+    axes.set_ylabel("share of samples further out", fontsize=12)
+    axes.set_title("Tails", fontsize=13)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=12)
+
+
+def draw_autocorrelation(axes: Axes, one: Channel, limit: float, report: NoiseReport) -> AxesImage:
+    """The autocorrelation of one channel as a map, lag 0 left white."""
+    table = one.autocorrelation.copy()
+    table[LAGS, LAGS] = np.nan
+    extent = (-LAGS - 0.5, LAGS + 0.5, LAGS + 0.5, -LAGS - 0.5)
+    picture = axes.imshow(table, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=extent)
+    axes.set_title(f"{one.name}: left after 2x2: {one.energy_left:.3f}", fontsize=13)
+    per_site = report.kind not in MAPS and one.name != "mosaic"
+    axes.set_xlabel("lag right, pixels" + (" of this site" if per_site else ""), fontsize=12)
+    axes.set_ylabel("lag down", fontsize=12)
+    axes.set_xticks(range(-LAGS, LAGS + 1, 4))
+    axes.set_yticks(range(-LAGS, LAGS + 1, 4))
+    return picture

@@ -1,0 +1,64 @@
+"""TODO."""
+
+import contextlib
+import hashlib
+import secrets
+from collections.abc import Callable
+from pathlib import Path
+
+from clpipe.base.errors import ImageError
+
+
+def sha256_of(path: Path) -> tuple[str, int]:
+    """The SHA-256 of a file, and its size in bytes.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    digest = hashlib.sha256()
+    with open(path, "rb", buffering=0) as file:
+        while part := file.read(4 << 20):
+            digest.update(part)
+        return digest.hexdigest(), file.tell()
+
+
+_unfinished: set[Path] = set()
+
+
+def write_beside(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file under a temporary name beside ``path``, then rename it: never half a file.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    beside = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
+    _unfinished.add(beside)
+    try:
+        write(beside)
+        beside.replace(path)
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be written: {error.strerror or error}") from None
+    finally:
+        with contextlib.suppress(OSError):
+            beside.unlink(missing_ok=True)
+        _unfinished.discard(beside)
+
+
+def write_new(path: Path, write: Callable[[Path], object]) -> None:
+    """The same, where the folders above it may have to be made.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be written: {error.strerror}") from None
+    write_beside(path, write)
+
+
+def drop_unfinished() -> None:
+    """Remove the halves of files that are being written now, before the process is ended."""
+    for path in list(_unfinished):
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)

@@ -1,0 +1,91 @@
+"""Amounts of memory: as people write them, and how much of it is free on this machine."""
+
+import re
+from pathlib import Path
+
+from clpipe.base.errors import RequestError
+
+UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
+
+
+def parse_size(text: str) -> int:
+    """Bytes, from a number with a unit: K, M, G or T, in powers of 1024.
+
+    >>> parse_size("512M"), parse_size("1.5 GiB"), parse_size("4096")
+    (536870912, 1610612736, 4096)
+
+    Raises:
+        RequestError: it is no such size, or none at all.
+    """
+    match = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*([kmgt]?)(?:i?b)?", text.strip(), re.IGNORECASE)
+    size = int(float(match[1]) * UNITS[match[2].upper()]) if match else 0
+    if not 0 < size < 2**63:
+        raise RequestError(f"--memory: found '{text}'; expected a size such as 512M or 8G")
+    return size
+
+
+def in_words(size: float) -> str:
+    """Bytes as people read them, rounded.
+
+    >>> in_words(8.2 * 2**30), in_words(5_000_000), in_words(1000)
+    ('8.2 GiB', '4.8 MiB', '1.0 KiB')
+    """
+    for unit in ("GiB", "MiB"):
+        scale = UNITS[unit[0]]
+        if size >= scale:
+            return f"{size / scale:.1f} {unit}"
+    return f"{size / 1024:.1f} KiB"
+
+
+def available_memory(root: Path = Path("/")) -> int | None:
+    """Bytes that this process could still take, by the kernel's account and its control groups.
+
+    None where neither is told (not Linux).
+    """
+    known = [_available(root / "proc/meminfo"), *_left_in_groups(root)]
+    return min((size for size in known if size is not None), default=None)
+
+
+def _available(meminfo: Path) -> int | None:
+    try:
+        match = re.search(r"^MemAvailable:\s+(\d+) kB", meminfo.read_text(), re.MULTILINE)
+    except OSError:
+        return None
+    return int(match[1]) * 1024 if match else None
+
+
+def _left_in_groups(root: Path) -> list[int | None]:
+    """What the control groups of this process leave it, version 1 or 2, each with its parents'."""
+    try:
+        lines = (root / "proc/self/cgroup").read_text().splitlines()
+    except OSError:
+        return []
+    left = []
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if controllers not in ("", "memory"):
+            continue
+        mount = root / "sys/fs/cgroup" / controllers
+        names = (
+            ("memory.limit_in_bytes", "memory.usage_in_bytes")
+            if controllers
+            else ("memory.max", "memory.current")
+        )
+        own = mount / path.lstrip("/")
+        for folder in (own, *own.parents):
+            left.append(_left_in_group(folder, *names))
+            if folder == mount:
+                break
+    return left
+
+
+def _left_in_group(folder: Path, limit: str, used: str) -> int | None:
+    """The rest up to a limit; cached files that can be dropped are not counted as used."""
+    try:
+        rest = int((folder / limit).read_text()) - int((folder / used).read_text())
+        files = re.search(
+            r"^inactive_file (\d+)", (folder / "memory.stat").read_text(), re.MULTILINE
+        )
+    except (OSError, ValueError):  # not there, or "max": no limit
+        return None
+    return max(rest + (int(files[1]) if files else 0), 0)

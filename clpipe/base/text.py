@@ -1,0 +1,26 @@
+"""Telling a user what a wrong name should have been."""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+def one_of(what: str, found: str, allowed: Iterable[str]) -> str:
+    """A message for an unknown name, with the nearest right one first.
+
+    >>> one_of("stage", "demosiac", ["mosaic", "demosaic"])
+    "unknown stage 'demosiac' (did you mean 'demosaic'?); allowed: mosaic, demosaic"
+    """
+    names = list(allowed)
+    near = get_close_matches(found, names, n=1, cutoff=0.5)
+    hint = f" (did you mean '{near[0]}'?)" if near else ""
+    return f"unknown {what} '{found}'{hint}; allowed: {', '.join(names) or 'none'}"
+
+
+def printable(text: str) -> str:
+    """Text in one line, with ? for what cannot be printed.
+
+    >>> printable("R" + chr(1) + chr(10) + "G")
+    'R? G'
+    """
+    line = " ".join(text.split())
+    return "".join(letter if letter.isprintable() else "?" for letter in line)

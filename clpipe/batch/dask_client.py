@@ -1,0 +1,304 @@
+"""Many images through the workers of a Dask cluster. The only importer of distributed.
+
+The one who started the run holds the output folder, cuts the images into chunks, gives every worker
+one at a time, and reports what became of each image; a worker runs a
+:class:`clpipe.batch.threads.Batch` on its chunk. Where a worker dies, Dask gives its chunk to
+another one, which sees by the sidecars what is done already: such images are reported as skipped.
+"""
+
+import asyncio
+import contextlib
+import queue
+import time
+from collections import deque
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from clpipe.base.about import __version__
+from clpipe.base.errors import ClpipeError, ClusterError, RequestError
+from clpipe.batch.dask_worker import (
+    ChunkReport,
+    RunSpec,
+    WorkerEnvironment,
+    _moved,
+    _same,
+    _same_in,
+    close_devices,
+    halt,
+    probe_worker,
+    run_chunk,
+)
+from clpipe.batch.outcome import FAILED, Outcome
+from clpipe.inputs.find import Job
+from clpipe.outputs.folder import remove_unfinished
+
+TIMEOUT = 10.0  # s, for the scheduler to answer and for its first worker
+
+
+PATIENCE = 60.0  # s without any worker, as nannies and job queues start new ones
+
+
+RETRIES = 2  # of a chunk that raised what nobody expected
+
+
+FIRST, LARGEST = 4, 64  # images in a chunk
+
+
+SHORT, LONG = 15.0, 60.0  # s; chunks that took less grow, those that took more shrink
+
+
+@contextlib.contextmanager
+def connected(address: str, spec: RunSpec) -> Iterator["Cluster"]:
+    """The cluster of a scheduler.
+
+    Raises:
+        RequestError: distributed is not installed, the scheduler does not answer, it has no
+            workers, or they are of different make.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise RequestError("--dask: needs distributed; pip install distributed") from None
+    try:
+        asyncio.run(_reach(address))
+        client = Client(address, timeout=TIMEOUT, name="clpipe", set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise RequestError(
+            f"--dask: no Dask scheduler answers at {address!r} within {TIMEOUT:g} s"
+            f"{f' ({error})' * bool(str(error))}; expected its tcp://HOST:PORT"
+        ) from None
+    try:
+        with contextlib.suppress(TimeoutError):
+            client.wait_for_workers(1, timeout=TIMEOUT)
+        if not client.nthreads():
+            raise RequestError(
+                f"--dask: the scheduler at {address} has no workers; start some: "
+                f"dask worker {address}"
+            )
+        found = client.run(lambda: __import__("clpipe").__version__, on_error="return")
+        for worker, version in found.items():
+            if isinstance(version, BaseException):
+                raise RequestError(f"--dask: worker {worker} cannot load clpipe: {version}")
+        _same_in("version of clpipe", {"this machine": __version__, **found})
+        yield Cluster(client, address, spec)
+    finally:
+        with contextlib.suppress(OSError, TimeoutError):
+            client.run(close_devices, on_error="ignore")
+        client.close()
+
+
+async def _reach(address: str) -> None:
+    """Speak to a scheduler; a Client waits without end for who listens and does not answer.
+
+    Raises:
+        OSError, ValueError: nobody answers there, or it is no address.
+    """
+    from distributed import Security
+    from distributed.comm import connect
+
+    security = Security().get_connection_args("client")
+    comm = await asyncio.wait_for(connect(address, timeout=TIMEOUT, **security), TIMEOUT)
+    await comm.close()
+
+
+class Cluster:
+    """A cluster's workers, as something that puts jobs through, like a Batch."""
+
+    def __init__(self, client: Any, address: str, spec: RunSpec) -> None:
+        self._client = client
+        self._address = address
+        self._spec = spec
+        self._stopping = False
+        self._news: queue.SimpleQueue[Any] = (
+            queue.SimpleQueue()
+        )  # chunks that are through; None: stop
+        self._running: dict[Any, tuple[list[Job], bool]] = {}
+        self._seen = time.monotonic()
+
+    def stop(self) -> None:
+        """Let no more images in; those in flight are finished. May be called by a signal."""
+        self._stopping = True
+        self._news.put(None)
+
+    def run(self, jobs: Sequence[Job]) -> Generator[Outcome, None, None]:
+        """Put every job through; one that fails is reported and the others go on.
+
+        Outcomes come as chunks are finished, in any spec.
+
+        Raises:
+            RequestError: workers are of different make, lack the device, or do not see the files.
+            DeviceError: a kernel does not compile.
+            OutputError: nothing can be written any more.
+            ClusterError: the scheduler or all workers have gone.
+        """
+        self._look(jobs)
+        return self._outcomes(jobs)
+
+    def _look(self, jobs: Sequence[Job]) -> None:
+        """See that all workers are of one make, and see the same files as this machine."""
+        spec = self._spec
+        entrance = spec.entrance
+        others = (job for job in jobs if not entrance.raws.takes(job.path))
+        first = next(others, jobs[0])  # as ImageLoader.first_chain has it
+        # Without what is found out when it is asked for, which is long and may be of stage files.
+        spec = replace(spec, entrance=replace(entrance), first=first)
+        size = first.path.stat().st_size if first.path.is_file() else None
+        probe = spec.target.folder / f".clpipe.{spec.run}"
+        try:
+            probe.touch()
+            found = self._client.run(probe_worker, spec, probe.name, size, on_error="return")
+        finally:
+            with contextlib.suppress(OSError):
+                probe.unlink()
+        if not found:
+            raise self._gone()
+        for worker, made in found.items():
+            if not isinstance(made, WorkerEnvironment):
+                raise RequestError(f"--dask: worker {worker}: {made}")
+        _same(found)
+        self._spec = replace(spec, make=next(iter(found.values())))
+
+    def _outcomes(self, jobs: Sequence[Job]) -> Generator[Outcome, None, None]:
+        chunks = _Chunks(deque(jobs))
+        failure: ClpipeError | None = None
+        try:
+            while self._running or (chunks and not self._stopping):
+                self._hand_out(chunks)
+                try:
+                    future = self._news.get(timeout=1)
+                except queue.Empty:
+                    continue
+                if future is None:
+                    self._halt()
+                    continue
+                report = self._report(future, chunks)
+                chunks.took(report.seconds)
+                here = time.perf_counter() - time.time()
+                for outcome in report.outcomes:
+                    yield _moved(outcome, here)
+                if report.error:
+                    failure = failure or report.error
+                    self._halt()
+        except GeneratorExit:
+            self._finish()
+            raise
+        remove_unfinished(self._spec.target.folder, jobs)  # by workers that died
+        if failure:
+            raise failure
+
+    def _hand_out(self, chunks: "_Chunks") -> None:
+        """See that there are as many chunks at work as there are workers.
+
+        Dask chooses the worker; a chunk that is tied to one would wait for it for ever.
+
+        Raises:
+            ClusterError: there have been no workers for long, or the scheduler has gone.
+        """
+        try:
+            workers = len(self._client.nthreads())
+        except (OSError, ValueError, RuntimeError):
+            raise self._gone() from None
+        if workers:
+            self._seen = time.monotonic()
+        elif time.monotonic() - self._seen > PATIENCE:
+            raise ClusterError(
+                f"--dask: the scheduler at {self._address} has had no workers for {PATIENCE:g} s; "
+                "what is finished is there, and the same command goes on"
+            )
+        while chunks.jobs and len(self._running) < workers and not self._stopping:
+            self._submit(chunks.cut(workers))
+        if chunks.suspects and not self._running and not self._stopping:
+            self._submit([chunks.suspects.popleft()], alone=True)
+
+    def _submit(self, chunk: list[Job], alone: bool = False) -> None:
+        future = self._client.submit(run_chunk, self._spec, chunk, pure=False, retries=RETRIES)
+        self._running[future] = (chunk, alone)
+        future.add_done_callback(self._news.put)
+
+    def _report(self, future: Any, chunks: "_Chunks") -> ChunkReport:
+        """What became of a chunk that is through.
+
+        Raises:
+            ClusterError: the scheduler has gone.
+        """
+        from distributed import KilledWorker
+
+        chunk, alone = self._running.pop(future)
+        try:
+            return future.result()
+        except KilledWorker as error:
+            if not alone:
+                chunks.suspects += chunk  # or another chunk on these workers is to blame
+                return ChunkReport((), LONG)
+            deaths = f"{error.allowed_failures + 1} in all, the last one {_name(error)}"
+            return _failed(chunk, f"killed the worker that took it, {deaths}")
+        except Exception as error:
+            if future.status in ("cancelled", "lost"):
+                raise self._gone() from None
+            return _failed(chunk, f"on a worker: {type(error).__name__}: {error}")
+        finally:
+            future.release()  # or its worker's death would have it done again
+
+    def _halt(self) -> None:
+        """Let the workers finish what is in flight."""
+        self._stopping = True
+        self._client.run(halt, self._spec.run, on_error="ignore")
+
+    def _finish(self) -> None:
+        """Wait until no worker is at it any more."""
+        from distributed import wait
+
+        self._halt()
+        with self._client.as_current(), contextlib.suppress(TimeoutError):
+            wait(list(self._running), timeout=LONG)
+
+    def _gone(self) -> ClusterError:
+        return ClusterError(
+            f"--dask: the scheduler at {self._address} or its workers have gone; "
+            "what is finished is there, and the same command goes on"
+        )
+
+
+@dataclass
+class _Chunks:
+    """What is left of the jobs, to be cut into chunks.
+
+    They grow as long as they take little time, and get smaller again towards the end.
+    ``suspects`` are jobs whose workers died: in the end each is tried with nothing beside it.
+
+    >>> chunks = _Chunks(deque(Job(Path(str(i)), "") for i in range(100)))
+    >>> chunks.took(1.0)
+    >>> [len(chunks.cut(2)) for _ in range(4)], len(chunks.jobs)
+    ([8, 8, 8, 8], 68)
+    >>> chunks.took(100.0)
+    >>> len(chunks.cut(2)), len(chunks.cut(20))
+    (4, 1)
+    """
+
+    jobs: deque[Job]
+    suspects: deque[Job] = field(default_factory=deque)
+    size: int = FIRST
+
+    def __bool__(self) -> bool:
+        return bool(self.jobs or self.suspects)
+
+    def cut(self, workers: int) -> list[Job]:
+        """The next chunk."""
+        size = max(1, min(self.size, len(self.jobs) // (2 * workers)))
+        return [self.jobs.popleft() for _ in range(size)]
+
+    def took(self, seconds: float) -> None:
+        """Learn from how long a chunk took."""
+        if seconds < SHORT:
+            self.size = min(2 * self.size, LARGEST)
+        elif seconds > LONG:
+            self.size = max(self.size // 2, 1)
+
+
+def _failed(chunk: Sequence[Job], reason: str) -> ChunkReport:
+    return ChunkReport([Outcome(job, FAILED, error=f"{job.path}: {reason}") for job in chunk], LONG)
+
+
+def _name(error: Any) -> str:
+    return str(getattr(error.last_worker, "address", error.last_worker))

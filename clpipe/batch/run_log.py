@@ -1,0 +1,160 @@
+"""The log of a run: a line of JSON for its start, each image and its end."""
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from clpipe.base.about import __version__
+from clpipe.base.errors import OutputError
+from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS, Outcome
+from clpipe.inputs.find import Shard
+
+
+def log_name(shard: Shard) -> str:
+    """The name of the log of a run, or of a shard of one.
+
+    >>> log_name(Shard()), log_name(Shard(2, 12))
+    ('run.jsonl', 'run.02-of-12.jsonl')
+    """
+    if shard.of == 1:
+        return "run.jsonl"
+    return f"run.{shard.number:0{len(str(shard.of))}}-of-{shard.of}.jsonl"
+
+
+@dataclass
+class Summary:
+    """What became of the images of a run so far."""
+
+    total: int
+    counts: dict[str, int] = field(
+        default_factory=lambda: dict.fromkeys((DONE, SKIPPED, LEFT_OUT, FAILED), 0)
+    )
+    failures: list[str] = field(default_factory=list)
+    megapixels: float = 0.0
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STEPS, 0.0))
+    began: float = field(default_factory=time.perf_counter)
+    interrupted: bool = False
+
+    def add(self, outcome: Outcome) -> None:
+        """Count one more."""
+        self.counts[outcome.status] += 1
+        if outcome.status == DONE:
+            self.megapixels += outcome.megapixels
+        if outcome.error:
+            self.failures.append(outcome.error)
+        for step in STEPS:
+            self.seconds[step] += outcome.seconds(step)
+
+    @property
+    def finished(self) -> int:
+        """How many images are through, whatever became of them."""
+        return sum(self.counts.values())
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the start."""
+        return time.perf_counter() - self.began
+
+    def shares(self) -> str:
+        """How the time of the threads is shared out.
+
+        >>> Summary(1, seconds={"decode": 1.0, "device": 2.0, "encode": 1.0}).shares()
+        'decode 25 %, device 50 %, encode 25 %'
+        """
+        whole = sum(self.seconds.values()) or 1.0
+        return ", ".join(f"{s} {100 * t / whole:.0f} %" for s, t in self.seconds.items())
+
+    def record(self) -> dict[str, Any]:
+        """The same as JSON values."""
+        return {
+            "images": self.total,
+            **{status.replace(" ", "_"): n for status, n in self.counts.items()},
+            "interrupted": self.interrupted,
+            "megapixels": round(self.megapixels, 3),
+            "seconds": round(self.elapsed, 3),
+            **{f"{step}_seconds": round(t, 3) for step, t in self.seconds.items()},
+        }
+
+
+def _line(event: str, at: float, values: Mapping[str, Any]) -> bytes:
+    moment = datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds")
+    return (json.dumps({"event": event, "at": moment, **values}) + "\n").encode()
+
+
+class RunLog:
+    """The log of a run; lines are appended to those of runs before, from the first image on."""
+
+    def __init__(self, path: Path, start: Mapping[str, Any]) -> None:
+        self._path = path
+        self._file: BinaryIO | None = None
+        self._start = _line("start", time.time(), {"clpipe": __version__, **start})
+
+    def _write(self, line: bytes) -> None:
+        try:
+            if self._file is None:
+                self._file = open(self._path, "a+b")  # noqa: SIM115  closed at exit
+                if self._file.seek(0, 2):
+                    self._file.seek(-1, 2)
+                    if self._file.read(1) != b"\n":
+                        self._file.write(b"\n")  # after a line that was cut off
+                self._file.write(self._start)
+            self._file.write(line)
+            self._file.flush()
+        except OSError as error:
+            raise OutputError(f"{self._path}: cannot be written: {error.strerror}") from None
+
+    def add(self, outcome: Outcome) -> None:
+        """A line for one image.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        job = outcome.job
+        line = _line(
+            "image",
+            outcome.began,
+            {
+                "input": str(job.path),
+                "image_key": job.key,
+                "status": outcome.status,
+                "megapixels": round(outcome.megapixels, 3),
+                **{f"{step}_seconds": round(outcome.seconds(step), 6) for step in STEPS},
+                "outputs": list(outcome.outputs),
+                "warnings": list(outcome.warnings),
+                "error": outcome.error or None,
+            },
+        )
+        self._write(line)
+
+    def end(self, summary: Summary) -> None:
+        """The last line, where there is a first one.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        if self._file:
+            self._write(_line("end", time.time(), summary.record()))
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file:
+            self._file.close()
+
+
+def read_log(path: Path) -> Sequence[dict[str, Any]]:
+    """The lines of a log; one that was cut off is left out.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    lines = []
+    for line in path.read_text("utf-8").splitlines():
+        try:
+            lines.append(json.loads(line))
+        except ValueError:
+            continue
+    return lines

@@ -1,1 +1,0 @@
-"""Noise parameters of a sensor from its frames: statistics on arrays, a profile, a picture."""

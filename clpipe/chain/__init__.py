@@ -1,0 +1,7 @@
+"""What the user asks for, until it is a resolved chain of stages.
+
+TOML, ``--set``, manifest rows and sidecars become a :class:`~clpipe.chain.request.Request`, then
+:class:`~clpipe.chain.settings.Settings`, then a :class:`~clpipe.chain.chain.Chain`; random draws,
+truths and the registry of stages belong here too. No pixels and no devices; it imports ``images``
+(for the tables that describe files) and below.
+"""

@@ -1,0 +1,224 @@
+"""TODO."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from clpipe.base.errors import KeyedError, RequestError
+from clpipe.base.text import one_of
+from clpipe.camera.noise import NoiseModel
+from clpipe.camera.profile import Camera, load_camera
+from clpipe.chain.drawing import check_camera
+from clpipe.chain.draws import Draw
+from clpipe.chain.methods import base_name, make_method, named_errors
+from clpipe.chain.registry import all_stages, check_passes, user_code_errors
+from clpipe.chain.settings import Settings
+from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
+
+
+@dataclass(frozen=True)
+class Step:
+    """A stage in its place in a chain: its method with resolved parameters, and what is known."""
+
+    name: str
+    stage: Stage
+    method: Method
+    context: Context
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """A chain of stages, ready to plan. One is equal to itself alone, so what is made of it can be
+    remembered.
+    """
+
+    steps: tuple[Step, ...]
+    source: Kind
+    camera: Camera
+    settings: Settings  # it was made from
+    names: tuple[str, ...]  # of all steps, those before the first and after the last to run too
+    draws: Mapping[str, Draw] = field(default_factory=dict)  # of which the settings are an example
+
+    @property
+    def iso(self) -> float:
+        """The ISO."""
+        return self.settings.iso
+
+    @property
+    def seed(self) -> int:
+        """The seed of the noise."""
+        return self.settings.seed
+
+    @property
+    def result(self) -> Kind:
+        """The kind of image that comes out."""
+        return self.steps[-1].stage.writes if self.steps else self.source
+
+    @property
+    def noise(self) -> NoiseModel | None:
+        """The sensor noise in the image that comes out; None where none was added."""
+        last = self.steps[-1]
+        return last.method.after(last.context).noise
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether a step draws random numbers."""
+        return any(p.random for s in self.steps for p in s.method.passes())
+
+    def without_noise(self) -> "Chain":
+        """The chain without what its steps draw at random; all else as it is, the last step too.
+
+        Raises:
+            RequestError: no step draws anything.
+        """
+        left = [(step, step.method.without_noise()) for step in self.steps]
+        if all(method is step.method for step, method in left):
+            raise RequestError(
+                "no stage of this chain adds noise; every frame would be the same, "
+                "and there is no noise to know the truth of"
+            )
+        if left[-1][1] is None:
+            left[-1] = left[-1][0], Noiseless()
+        steps = tuple(
+            replace(step, method=method, context=replace(step.context, noise=None))
+            for step, method in left
+            if method
+        )
+        return replace(self, steps=steps)
+
+    def kept(self, names: Sequence[str]) -> tuple[str, ...]:
+        """The names of steps to keep, each once; ``all`` is every one.
+
+        Raises:
+            RequestError: the chain has no such step.
+        """
+        if "all" in names:
+            return tuple(step.name for step in self.steps)
+        return tuple(self.step_named(name).name for name in dict.fromkeys(names))
+
+    def through(self, names: Sequence[str]) -> "Chain":
+        """The chain up to the last of these steps; all of it where none is named."""
+        places = [place for place, step in enumerate(self.steps) if step.name in names]
+        return replace(self, steps=self.steps[: places[-1] + 1]) if places else self
+
+    def step_named(self, name: str) -> Step:
+        """The step of that name.
+
+        Raises:
+            RequestError: the chain has no such step.
+        """
+        for step in self.steps:
+            if step.name == name:
+                return step
+        raise RequestError(one_of("stage in this chain", name, [s.name for s in self.steps]))
+
+
+def make_chain(
+    settings: Settings,
+    source: Kind | None = None,
+    start_at: str | None = None,
+    until: str | None = None,
+) -> Chain:
+    """The chain that the settings ask for, every parameter resolved.
+
+    A stage that comes a second time is called ``stage_2``, and so on. Settings with draws give an
+    example, that of the image key "", once it is seen that all that can be drawn is right; the
+    chain of an image is made of its :meth:`Settings.drawn`.
+
+    Args:
+        settings: the request.
+        source: the kind of image that enters; None is what :func:`entry` says, or, with
+            ``start_at``, what that step reads.
+        start_at: the first step to run. The steps before it are resolved all the same: what they
+            say of the image (pattern, gains, noise, levels) holds.
+        until: the last step to run.
+
+    Raises:
+        RequestError: a chain whose image kinds do not fit, an unknown camera, an ISO it has not,
+            a step that is not there.
+    """
+    check_camera(settings)
+    draws, settings = settings.draws, settings.drawn("")
+    camera = load_camera(settings.camera)
+    steps = resolved_steps(settings, camera, source or (None if start_at else entry(settings)))
+    names = [step.name for step in steps]
+    for name in settings.parameters:
+        if name not in names and name not in all_stages():
+            raise KeyedError(name, one_of("stage in this chain", name, names))
+    first, last = 0, len(steps)
+    for name in (n for n in (start_at, until) if n is not None):
+        if name not in names:
+            raise RequestError(one_of("stage in this chain", name, names))
+    if start_at is not None:
+        first = names.index(start_at)
+    if until is not None:
+        last = names.index(until) + 1
+    if first >= last:
+        raise RequestError(
+            f"nothing is left to do; {start_at} comes after {until}"
+            if steps
+            else "stages: nothing is left to do; no stage is listed, or every one was skipped"
+        )
+    if source is None:
+        source = steps[first].stage.reads
+    return Chain(tuple(steps[first:last]), source, camera, settings, tuple(names), draws)
+
+
+def entry(settings: Settings) -> Kind:
+    """What enters a whole chain: linear RGB, or a finished picture where the first stage reads it.
+
+    >>> entry(Settings(stages=("inverse_gamma", "mosaic"))).label, entry(Settings()).label
+    ('display', 'rgb')
+    """
+    stages = (all_stages().get(base_name(name)) for name in settings.stages)
+    first = next((s for s in stages if s and s.name not in settings.skip), None)
+    return Kind.DISPLAY if first and first.reads is Kind.DISPLAY else Kind.RGB
+
+
+def step_names(settings: Settings) -> list[str]:
+    """The names of the steps that are not skipped; that of a repeated one has its number.
+
+    >>> step_names(Settings(stages=("exposure", "mosaic", "exposure"), skip=("mosaic",)))
+    ['exposure', 'exposure_2']
+    """
+    before = [settings.stages[:place].count(stage) for place, stage in enumerate(settings.stages)]
+    pairs = zip(settings.stages, before, strict=True)
+    names = [f"{stage}_{count + 1}" if count else stage for stage, count in pairs]
+    return [name for name in names if name not in settings.skip]
+
+
+def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:
+    """The steps of the settings, in order, for an image of a kind; None is what the first reads.
+
+    A step that does nothing is left out where it does not fit.
+
+    Raises:
+        RequestError: image kinds do not fit.
+    """
+    context = Context(camera=camera, iso=settings.iso)
+    steps: list[Step] = []
+    before = "the input"
+    for name in step_names(settings):
+        stage = all_stages()[base_name(name)]
+        method = make_method(stage, name, settings.parameters.get(name, {}))
+        if stage.reads is not (kind or stage.reads):
+            if isinstance(method, Unchanged) and stage.reads is stage.writes:
+                continue  # so that gamma can be skipped without picture_noise, which does nothing
+            raise RequestError(misfit(name, stage, before, kind or stage.reads))
+        with named_errors(name, type(method)), user_code_errors(f"stage {name}", stage.folder):
+            method = method.resolve(context)
+            after = method.after(context)
+        if stage.folder:
+            check_passes(name, stage, method, context)
+        steps.append(Step(name, stage, method, context))
+        context = after
+        kind, before = stage.writes, name
+    return steps
+
+
+def misfit(name: str, stage: Stage, before: str, kind: Kind) -> str:
+    """Why a stage cannot follow, and which stages could stand between."""
+    bridges = [s.name for s in all_stages().values() if (s.reads, s.writes) == (kind, stage.reads)]
+    help_ = f"put {' or '.join(bridges)} between them" if bridges else f"leave out {name} as well"
+    if before == "the input":
+        help_ += f", or enter there with an image of that kind: --start-at {name}"
+    return f"stage {name} reads {stage.reads.label}, but {before} gives {kind.label}; {help_}"

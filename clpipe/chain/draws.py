@@ -1,0 +1,334 @@
+"""Random draws, declared in a configuration in the place of a value.
+
+A drawn value depends on the seed, the image key and the name of what is drawn, and on nothing else.
+It has nine digits, which is what a kernel's float can tell apart, so that the last bit of a
+platform's ``log`` changes nothing.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from statistics import NormalDist
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from clpipe.base.errors import KeyedError
+from clpipe.base.text import one_of
+
+TINY = math.ulp(0.0)
+
+
+FAR = 9.0  # standard deviations; a uniform number of 52 bits gives no normal beyond 8.3
+
+
+MOST_TRIED = 64  # whole numbers of a range
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a number may be: from ``low`` to ``high``, both allowed; whole or not."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    whole: bool = False
+
+    def nearest(self, value: float) -> float:
+        """The allowed number next to a value, with nine digits unless it is a limit.
+
+        >>> Limits(0, 1).nearest(-0.5), Limits().nearest(1 / 3), Limits(whole=True).nearest(2.7)
+        (0.0, 0.333333333, 3)
+        """
+        inside = min(max(value, self.low), self.high)
+        rounded = round(inside) if self.whole else float(f"{inside:.9g}")
+        return min(max(rounded, self.low), self.high)
+
+    def between(self, low: float, high: float) -> list[float]:
+        """What to try of a range, so that all of it is known to be allowed or not.
+
+        >>> Limits().between(1, 3), Limits(whole=True).between(1, 3)
+        ([1, 3], [1, 2, 3, 3])
+        """
+        if not (self.whole and float(low).is_integer() and float(high).is_integer()):
+            return [low, high]
+        return [*range(int(low), int(high) + 1)[:MOST_TRIED], int(high)]
+
+
+@cache
+def limits_of(model: type[BaseModel], name: str) -> Limits | None:
+    """The limits of a field of a model; None where it holds no number.
+
+    >>> from clpipe.images.encoding import Output
+    >>> limits_of(Output, "jpeg_quality"), limits_of(Output, "jpeg_subsampling")
+    (Limits(low=1, high=100, whole=True), None)
+    """
+    schema = model.model_json_schema()["properties"][name]
+    for part in schema.get("anyOf", [schema]):
+        if part.get("type") in ("number", "integer"):
+            above, below = part.get("exclusiveMinimum"), part.get("exclusiveMaximum")
+            low = part.get(
+                "minimum", -math.inf if above is None else math.nextafter(above, math.inf)
+            )
+            high = part.get(
+                "maximum", math.inf if below is None else math.nextafter(below, -math.inf)
+            )
+            return Limits(low, high, part["type"] == "integer")
+    return None
+
+
+class Draw(BaseModel):
+    """A law that values are drawn from. The fields of a subclass are what a configuration holds."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    @property
+    def follows(self) -> str:
+        """The name of the value that the drawn one follows; empty where it follows none."""
+        return ""
+
+    def record(self) -> dict[str, Any]:
+        """The draw as a configuration holds it."""
+        values = self.model_dump()
+        return {key: list(v) if isinstance(v, tuple) else v for key, v in values.items()}
+
+    def extremes(self, limits: Limits | None, followed: Sequence[Any]) -> Sequence[Any]:
+        """Values that are all allowed only if every one is that can be drawn.
+
+        Args:
+            limits: of what is drawn; None for what is no number.
+            followed: the extremes of the value that it follows.
+
+        Raises:
+            ValueError: the law cannot draw such a thing, or follow such values.
+        """
+        raise NotImplementedError(type(self).__name__)
+
+    def value(self, uniform: float, limits: Limits | None, followed: Any) -> Any:
+        """The value that a uniform number, above 0 and below 1, comes to; arguments as above."""
+        raise NotImplementedError(type(self).__name__)
+
+
+Ends = Annotated[tuple[float, float], Field(strict=False)]
+
+
+class Choice(Draw):
+    """One of several values, all equally likely."""
+
+    choice: Annotated[list[Any], Field(strict=False, min_length=1)]
+
+    @model_validator(mode="after")
+    def _plain(self) -> "Choice":
+        for item in self.choice:
+            if item is None or isinstance(item, Mapping):
+                raise ValueError(f"found {item!r} in the list; a choice is among plain values")
+        return self
+
+    def extremes(self, limits: Limits | None, followed: Sequence[Any]) -> Sequence[Any]:
+        return self.choice
+
+    def value(self, uniform: float, limits: Limits | None, followed: Any) -> Any:
+        return self.choice[int(uniform * len(self.choice))]
+
+
+class NumberDraw(Draw):
+    """A law of numbers. Subclasses say from where to where, and what a uniform number comes to."""
+
+    def extremes(self, limits: Limits | None, followed: Sequence[Any]) -> Sequence[Any]:
+        if limits is None:
+            raise ValueError("it is no single number, so it is drawn by choice or same_as")
+        return limits.between(*self.reach(limits, followed))
+
+    def value(self, uniform: float, limits: Limits | None, followed: Any) -> Any:
+        assert limits
+        return limits.nearest(self.number(uniform, limits, followed))
+
+    def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
+        """The least and the greatest value; errors as ``extremes``."""
+        raise NotImplementedError(type(self).__name__)
+
+    def number(self, uniform: float, limits: Limits, followed: Any) -> float:
+        """The value before it is rounded."""
+        raise NotImplementedError(type(self).__name__)
+
+
+class Uniform(NumberDraw):
+    """Any number of a range, both ends included; whole numbers where such are wanted.
+
+    >>> Uniform(uniform=(3, 5)).value(0.99, Limits(whole=True), None)
+    5
+    """
+
+    uniform: Ends
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "Uniform":
+        _check_ascending(*self.uniform)
+        return self
+
+    def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
+        return self.uniform
+
+    def number(self, uniform: float, limits: Limits, followed: Any) -> float:
+        low, high = self.uniform
+        if limits.whole:
+            return min(math.floor(low + uniform * (high - low + 1)), high)
+        return min(max(low * (1 - uniform) + high * uniform, low), high)
+
+
+class LogUniform(NumberDraw):
+    """A number whose logarithm is uniform: each octave of the range is as likely as the others.
+
+    >>> round(LogUniform(log_uniform=(100, 6400)).value(0.5, Limits(), None))
+    800
+    """
+
+    log_uniform: Ends
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "LogUniform":
+        if self.log_uniform[0] <= 0:
+            raise ValueError(f"found {list(self.log_uniform)}; both ends must be above 0")
+        _check_ascending(*self.log_uniform)
+        return self
+
+    def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
+        return self.log_uniform
+
+    def number(self, uniform: float, limits: Limits, followed: Any) -> float:
+        low, high = self.log_uniform
+        log = math.log(low) * (1 - uniform) + math.log(high) * uniform
+        return min(max(_exp(log), low), high)
+
+
+class Normal(NumberDraw):
+    """A Gaussian of a mean and a standard deviation; what is beyond the limits is put on them.
+
+    >>> Normal(normal=(0.8, 0.1)).value(0.5, Limits(), None)
+    0.8
+    """
+
+    normal: Ends
+
+    @model_validator(mode="after")
+    def _spread(self) -> "Normal":
+        if self.normal[1] < 0:
+            raise ValueError(f"found {list(self.normal)}; the standard deviation is 0 or above")
+        return self
+
+    def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
+        mean, sigma = self.normal
+        if not limits.low <= mean <= limits.high:
+            return mean, mean  # which the parameter refuses
+        return limits.nearest(mean - FAR * sigma), limits.nearest(mean + FAR * sigma)
+
+    def number(self, uniform: float, limits: Limits, followed: Any) -> float:
+        mean, sigma = self.normal
+        return mean + sigma * _normal(uniform)
+
+
+class SameAs(Draw):
+    """What another one is."""
+
+    same_as: str
+
+    @property
+    def follows(self) -> str:
+        return self.same_as
+
+    def extremes(self, limits: Limits | None, followed: Sequence[Any]) -> Sequence[Any]:
+        return followed
+
+    def value(self, uniform: float, limits: Limits | None, followed: Any) -> Any:
+        return followed
+
+
+class LogNormalOf(NumberDraw):
+    """A number whose logarithm is Gaussian, around a line over the logarithm of another one.
+
+    As read noise follows shot noise, log b ~ N(2.18 log a + 1.2, 0.26) (Brooks et al.,
+    "Unprocessing images for learned raw denoising", CVPR 2019, sec. 3.1). What is beyond the limits
+    is put on them.
+
+    >>> read = LogNormalOf(log_normal_of="sensor_noise.a", slope=2.18, intercept=1.2, sigma=0.26)
+    >>> read.value(0.5, Limits(), 1e-3)
+    9.5753218e-07
+    """
+
+    log_normal_of: str
+    slope: float
+    intercept: float
+    sigma: Annotated[float, Field(ge=0)]
+
+    @property
+    def follows(self) -> str:
+        return self.log_normal_of
+
+    def _at(self, normal: float, followed: float) -> float:
+        log = self.slope * math.log(followed) + self.intercept + self.sigma * normal
+        return max(_exp(log), TINY)
+
+    def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
+        for one in followed:
+            if isinstance(one, bool) or not isinstance(one, int | float) or not one > 0:
+                raise ValueError(f"{self.follows} must be a number above 0, but can be {one!r}")
+        all_ = [limits.nearest(self._at(z, one)) for z in (-FAR, FAR) for one in followed]
+        return min(all_), max(all_)
+
+    def number(self, uniform: float, limits: Limits, followed: Any) -> float:
+        return self._at(_normal(uniform), followed)
+
+
+LAWS: dict[str, type[Draw]] = {
+    "choice": Choice,
+    "uniform": Uniform,
+    "log_uniform": LogUniform,
+    "normal": Normal,
+    "same_as": SameAs,
+    "log_normal_of": LogNormalOf,
+}
+
+
+def parse_draw(key: str, table: Mapping[str, Any]) -> Draw:
+    """A draw as a configuration holds it, such as ``{"uniform": [1, 2]}``.
+
+    >>> parse_draw("iso", {"choice": [100, 400]})
+    Choice(choice=[100, 400])
+
+    Raises:
+        KeyedError: it is none; the message begins with ``key``, the name of what is drawn.
+    """
+    named = [law for law in LAWS if law in table]
+    if len(named) != 1:
+        wrong = one_of("draw", next((str(k) for k in table), ""), LAWS)
+        if named:
+            wrong = f"a draw has one law; found {' and '.join(named)}"
+        raise KeyedError(key, f"{key}: found {dict(table)!r}: {wrong}")
+    law = LAWS[named[0]]
+    try:
+        return law.model_validate(dict(table))
+    except ValidationError as errors:
+        error = errors.errors()[0]
+        field = str(error["loc"][0]) if error["loc"] else named[0]
+        reason = error["msg"].removeprefix("Value error, ").removeprefix("Input ")
+        if error["type"] == "extra_forbidden":
+            reason = one_of(f"key of {named[0]}", field, law.model_fields)
+        elif error["type"] == "missing":
+            reason = f"it needs {field}"
+        elif error["loc"]:
+            reason = f"found {error['input']!r}: {reason}"
+        raise KeyedError(key, f"{key}: {field}: {reason}") from None
+
+
+def _check_ascending(low: float, high: float) -> None:
+    if low > high:
+        raise ValueError(f"found [{low:g}, {high:g}]; the lower end comes first")
+
+
+def _exp(log: float) -> float:
+    return math.exp(min(log, 709.0))
+
+
+def _normal(uniform: float) -> float:
+    """The standard normal of a uniform number, by inverse CDF (Wichura 1988, AS241)."""
+    return NormalDist().inv_cdf(uniform)

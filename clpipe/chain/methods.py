@@ -1,0 +1,120 @@
+"""TODO."""
+
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import lru_cache
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from clpipe.base.errors import KeyedError
+from clpipe.base.text import one_of
+from clpipe.chain.keys import OUTPUT
+from clpipe.chain.registry import all_stages
+from clpipe.images.encoding import Output
+from clpipe.stage import Method, Stage
+
+
+@lru_cache(maxsize=1024)
+def base_name(step: str) -> str:
+    """The stage of a step that may be a repeated one.
+
+    >>> base_name("denoise_2")
+    'denoise'
+    """
+    return re.sub(r"_\d+$", "", step)
+
+
+def stage_named(key: str, name: str) -> Stage:
+    """The stage of that name.
+
+    Raises:
+        KeyedError: there is no such stage.
+    """
+    if name not in all_stages():
+        if base_name(name) in all_stages():
+            again = f"{name}: a stage that is to come again is listed again, as {base_name(name)}"
+            raise KeyedError(key, f"{again}; the second is then called {base_name(name)}_2")
+        raise KeyedError(key, one_of("stage", name, all_stages()))
+    return all_stages()[name]
+
+
+def method_of(name: str, table: Mapping[str, Any]) -> Any:
+    """The method that a step's settings choose: the one they name, or the stage's default."""
+    stage = all_stages().get(base_name(name))
+    return table.get("method", stage.methods[0].method if stage else None)
+
+
+def make_method(stage: Stage, name: str, table: Mapping[str, Any]) -> Method:
+    """A stage's method from its settings, parameters validated.
+
+    Raises:
+        KeyedError: an unknown method or parameter, or a value that is not allowed.
+    """
+    method = method_named(stage, name, table.get("method", stage.methods[0].method))
+    with named_errors(name, method):
+        return method.model_validate({k: v for k, v in table.items() if k != "method"})
+
+
+def method_named(stage: Stage, name: str, chosen: Any) -> type[Method]:
+    """The method of a step's stage that has that name.
+
+    Raises:
+        KeyedError: there is none.
+    """
+    if not isinstance(chosen, str) or chosen not in stage.by_name:
+        message = one_of("method", str(chosen), stage.by_name)
+        raise KeyedError(f"{name}.method", f"{name}.method: {message}")
+    return stage.by_name[chosen]
+
+
+def make_output(table: Mapping[str, Any]) -> Output:
+    """How results are written, from the table of that name.
+
+    Raises:
+        KeyedError: an unknown key, or a value that is not allowed.
+    """
+    try:
+        return Output.model_validate(dict(table))
+    except ValidationError as errors:
+        error = errors.errors()[0]
+        name = str(error["loc"][0])
+        key = f"{OUTPUT}.{name}"
+        if error["type"] == "extra_forbidden":
+            raise unknown_parameter(OUTPUT, Output, name) from None
+        reason = error["msg"].removeprefix("Input ")
+        raise KeyedError(key, f"{key}: found {error['input']!r}: {reason}") from None
+
+
+@contextmanager
+def named_errors(name: str, method: type[Method]) -> Iterator[None]:
+    """Turn what pydantic says of a step's parameters into a message that names the step.
+
+    Raises:
+        KeyedError: a parameter is unknown, or its value is not allowed.
+    """
+    try:
+        yield
+    except ValidationError as errors:
+        error = errors.errors()[0]
+        key = ".".join([name, *(str(part) for part in error["loc"])])
+        if error["type"] == "extra_forbidden":
+            raise unknown_parameter(name, method, str(error["loc"][0])) from None
+        reason = error["msg"].removeprefix("Value error, ").removeprefix("Input ")
+        found = f" found {error['input']!r}:" if error["loc"] else ""
+        raise KeyedError(key, f"{key}:{found} {reason}") from None
+
+
+def unknown_parameter(step: str, model: type[BaseModel], parameter: str) -> KeyedError:
+    """What to say of a parameter that a step, or the table of output, has not."""
+    key = f"{step}.{parameter}"
+    if not issubclass(model, Method):
+        return KeyedError(key, one_of(f"key of {step}", parameter, model.model_fields))
+    what = f"parameter of {step} ({model.method})"
+    message = one_of(what, parameter, ["method", *model.model_fields])
+    stage = all_stages()[base_name(step)]
+    having = [m for m, other in stage.by_name.items() if parameter in other.model_fields]
+    if having:
+        message += f"; '{parameter}' is a parameter of {' and '.join(having)}"
+    return KeyedError(key, message)

@@ -1,0 +1,178 @@
+"""Every stage there is: clpipe's own, those of installed packages, those of files a user named."""
+
+import re
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache, lru_cache
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from threading import RLock
+from types import ModuleType
+
+import numpy as np
+from pydantic import ValidationError
+
+from clpipe.base.errors import ClpipeError, RequestError
+from clpipe.stage import Context, Literal, Method, Stage
+from clpipe.stages import own_stages
+
+ARGUMENT_TYPES = (np.float32, np.int32, np.uint32, np.ndarray, Literal)
+
+
+ENTRY_POINTS = "clpipe.stages"
+
+
+_from_files: dict[Path, Stage] = {}
+
+
+_loading = RLock()  # a file is run once, and its name is then taken
+
+
+def all_stages() -> dict[str, Stage]:
+    """Every stage by its name: clpipe's own, the default chain first, then the others."""
+    return _all_stages(tuple(_from_files.values()))
+
+
+@lru_cache(maxsize=1)
+def _all_stages(from_files: tuple[Stage, ...]) -> dict[str, Stage]:
+    return {**own_stages(), **installed_stages(), **{stage.name: stage for stage in from_files}}
+
+
+@cache
+def installed_stages() -> dict[str, Stage]:
+    """The stages that installed packages offer as entry points of the group ``clpipe.stages``.
+
+    Raises:
+        RequestError: one cannot be loaded, is no stage, or has a name that is taken.
+    """
+    found: dict[str, Stage] = {}
+    for entry in entry_points(group=ENTRY_POINTS):
+        package = f"package {entry.dist.name}" if entry.dist else f"entry point {entry.name}"
+        stage, file = _loaded(package, entry)
+        _check_stage_name(package, stage.name, own_stages() | found)
+        found[stage.name] = replace(stage, folder=file.parent)
+    return found
+
+
+def load_stage_file(path: Path) -> Stage:
+    """Load a stage from a Python file that defines ``STAGE``; its kernels lie in the same folder.
+
+    Raises:
+        RequestError: the file cannot be read or run, defines no stage, or one whose name is taken.
+    """
+    with _loading:
+        return _loaded_file(path, path.resolve())
+
+
+def _loaded_file(path: Path, where: Path) -> Stage:
+    if where not in _from_files:
+        spec = spec_from_file_location(f"clpipe_stage_{path.stem}", where)
+        if path.suffix != ".py" or spec is None or spec.loader is None:
+            raise RequestError(f"{path}: a stage file is a Python file, ending in .py")
+        if not where.is_file():
+            raise RequestError(f"{path}: no such file")
+        module = module_from_spec(spec)
+        stage, _ = _loaded(str(path), module)
+        _check_stage_name(str(path), stage.name, all_stages())
+        _from_files[where] = replace(stage, folder=where.parent)
+    return _from_files[where]
+
+
+def _loaded(place: str, source: EntryPoint | ModuleType) -> tuple[Stage, Path]:
+    """The stage of an entry point or of a module still to be run, and the file it stands in."""
+    folder = Path(place).parent.resolve() if isinstance(source, ModuleType) else None
+    with user_code_errors(place, folder):
+        if isinstance(source, EntryPoint):
+            stage = source.load()
+            module = import_module(source.module)
+        else:
+            module = source
+            assert module.__spec__ and module.__spec__.loader
+            module.__spec__.loader.exec_module(module)
+            stage = getattr(module, "STAGE", None)
+    if not isinstance(stage, Stage):
+        raise RequestError(f"{place}: STAGE is not there, or is no clpipe.stage.Stage")
+    file = Path(str(module.__file__))
+    if not isinstance(stage.methods, tuple) or not stage.methods:
+        raise RequestError(f"{place}: the methods of {stage.name} must be a tuple: (Method,)")
+    for method in stage.methods:
+        if not (isinstance(method, type) and issubclass(method, Method)):
+            raise RequestError(f"{place}: {method!r} is no class derived from Method")
+        missing = [n for n in ("method", "kernel", "summary") if not hasattr(method, n)]
+        if missing:
+            raise RequestError(f"{place}: {method.__name__} lacks {', '.join(missing)}")
+        kernel = file.parent / f"{method.kernel}.cl"
+        if method.kernel and not kernel.is_file():
+            raise RequestError(f"{place}: its kernel {kernel} is not there")
+    return stage, file
+
+
+@contextmanager
+def user_code_errors(place: str, folder: Path | None) -> Iterator[None]:
+    """Turn whatever the code of somebody else's stage raises into a message that names its line.
+
+    Raises:
+        RequestError: it raised something.
+    """
+    try:
+        yield
+    except (ClpipeError, ValidationError):
+        raise
+    except SyntaxError as error:
+        raise RequestError(f"{error.filename}, line {error.lineno}: {error.msg}") from None
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        own = [f for f in frames if folder and Path(f.filename).resolve().parent == folder]
+        at = (own or frames)[-1]
+        where = f"{at.filename}, line {at.lineno}: {type(error).__name__}: {error}"
+        named = Path(place).resolve() == Path(at.filename).resolve()
+        raise RequestError(where if named else f"{place}: {where}") from None
+
+
+def check_passes(name: str, stage: Stage, method: Method, context: Context) -> None:
+    """See that the passes of somebody else's method fit its arguments and its kernel file.
+
+    Raises:
+        RequestError: they do not.
+    """
+    assert stage.folder
+    kernel = stage.folder / f"{method.kernel}.cl"
+    with user_code_errors(f"stage {name}", stage.folder):
+        passes, arguments = method.passes(), method.arguments(context)
+        for pass_ in passes:
+            known = [*arguments, *(n for p in passes for n in (*p.found, p.writes))]
+            for argument in (*pass_.arguments, *pass_.finish_arguments):
+                if argument not in known:
+                    raise RequestError(
+                        f"stage {name}: pass {pass_.function} wants the argument '{argument}'; "
+                        f"arguments() gives {', '.join(arguments) or 'none'}"
+                    )
+            for function in filter(None, (pass_.function, pass_.finish)):
+                if not re.search(rf"\b{re.escape(function)}\s*\(", kernel.read_text()):
+                    raise RequestError(
+                        f"stage {name}: {kernel} has no function {function}, which a pass names"
+                    )
+        for argument, value in arguments.items():
+            if not isinstance(value, ARGUMENT_TYPES):
+                allowed = ", ".join(t.__name__ for t in ARGUMENT_TYPES)
+                raise RequestError(
+                    f"stage {name}: arguments() gives {value!r} as '{argument}'; allowed: {allowed}"
+                )
+
+
+def _check_stage_name(place: str, name: str, taken: dict[str, Stage]) -> None:
+    if not name.isidentifier() or name[-1].isdecimal():
+        raise RequestError(
+            f"{place}: its stage is called '{name}'; "
+            "a name has letters, digits and _, and no digit last"
+        )
+    if name in taken:
+        owner = taken[name].folder or "clpipe itself"
+        raise RequestError(
+            f"{place}: its stage is called '{name}', but that name is taken ({owner}); "
+            "choose another"
+        )

@@ -1,0 +1,127 @@
+"""Plans, stages and devices in words, for people and for programs."""
+
+import os
+from dataclasses import asdict
+from typing import Any
+
+import click
+
+from clpipe.base.errors import RequestError
+from clpipe.batch.bench import BatchSpeed, bench_batch, loads
+from clpipe.chain.methods import stage_named
+from clpipe.chain.request import request_from_options
+from clpipe.commands.options import chain_options, device_option, json_option
+from clpipe.commands.printing import show, show_json
+from clpipe.engine.bench import bench as run_bench
+from clpipe.engine.bench import bench_methods
+from clpipe.engine.device import open_device
+from clpipe.images.read import MAX_PIXELS
+
+BATCH_HEADINGS = (
+    "images",
+    "MP/s",
+    "serial s",
+    "batch s",
+    "of limit",
+    "decode",
+    "device",
+    "encode ms CPU",
+    "beyond codec, kernels ms",
+    "peak MiB",
+)
+
+
+def batch_row(speed: BatchSpeed) -> tuple[str, ...]:
+    """One load of ``clpipe bench --batch``."""
+    return (
+        f"{speed.images} of {speed.width}x{speed.height}",
+        f"{speed.megapixels_per_second:.1f}",
+        f"{speed.serial_s:.1f}",
+        f"{speed.batch_s:.1f}",
+        f"{speed.share_of_limit:.2f}",
+        *(f"{ms:.1f}" for ms in speed.cpu_ms.values()),
+        f"{speed.overhead_ms:.1f}",
+        f"{speed.peak_mib:.0f}",
+    )
+
+
+@click.command("bench")
+@chain_options
+@device_option
+@click.option(
+    "--size", default="6000x4000", show_default=True, metavar="WxH", help="The picture's size."
+)
+@click.option(
+    "--repeat", default=7, show_default=True, type=click.IntRange(1), help="Runs; the best counts."
+)
+@click.option(
+    "--methods", metavar="STAGE", help="Time each method of this stage instead, on its own."
+)
+@click.option(
+    "--batch",
+    is_flag=True,
+    help="Time whole batches of files instead, half EXR to JPEG, in threads and serially.",
+)
+@json_option
+def bench(
+    selector: str | None,
+    size: str,
+    repeat: int,
+    methods: str | None,
+    batch: bool,
+    as_json: bool,
+    **request: Any,
+) -> None:
+    """Time the chain and each launch, from half RGB to eight-bit RGB on the device."""
+    width, _, height = size.partition("x")
+    numbers = width.isdecimal() and height.isdecimal()
+    if not numbers or not 0 < int(width) * int(height) <= MAX_PIXELS:
+        raise RequestError(
+            f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 6000x4000, "
+            f"at most {MAX_PIXELS} pixels"
+        )
+    asked = request_from_options(**request)
+    chain = asked.chain()
+    device = open_device(selector)
+    if device is None:
+        raise RequestError("bench: it times the kernels of a device; numpy has none")
+    if methods is not None:
+        stage = stage_named("--methods", methods)
+        speeds = bench_methods(device, stage, chain.settings, int(width), int(height), repeat)
+        if as_json:
+            show_json([asdict(speed) for speed in speeds])
+            return
+        click.echo(f"{device.info.label}: {stage.name}, {width}x{height}, planes to planes")
+        rows = [(s.method, f"{s.launches}", f"{s.ms:.1f}", f"{s.mp_per_s:.0f}") for s in speeds]
+        show(("method", "launches", "ms", "MP/s"), rows, left=1)
+        return
+    if batch:
+        batches = [bench_batch(device, asked, load) for load in loads()]
+        if as_json:
+            show_json({"device": device.info.label, "batches": [b.record() for b in batches]})
+            return
+        click.echo(f"{device.info.label}: half EXR to JPEG, {len(os.sched_getaffinity(0))} CPUs")
+        show(BATCH_HEADINGS, map(batch_row, batches), left=1)
+        return
+    report = run_bench(device, chain, int(width), int(height), repeat)
+    if as_json:
+        show_json(report.record())
+        return
+    click.echo(
+        f"{report.device}: {report.width}x{report.height}, copy {report.copy_gb_per_s:.1f} GB/s, "
+        f"{report.bytes_per_pixel:.1f} bytes a pixel, first run {report.first_run_s:.2f} s"
+    )
+    show(
+        ("launch", "ms", "MP/s", "GB/s", "of copy"),
+        (
+            (
+                speed.name,
+                f"{speed.ms:.1f}",
+                f"{speed.mp_per_s:.0f}",
+                f"{speed.gb_per_s:.1f}",
+                f"{speed.share_of_copy:.0%}",
+            )
+            for speed in (*report.launches, report.chain)
+        ),
+        left=1,
+    )

@@ -1,0 +1,152 @@
+"""TODO."""
+
+from typing import Any
+
+import click
+
+from clpipe.base.errors import RequestError
+from clpipe.camera.profile import Camera, built_in_cameras, load_camera
+from clpipe.commands.options import json_option
+from clpipe.commands.printing import Rows, short_text, show, show_json
+
+# What a camera has at every ISO, with units.
+FIXED = {
+    "black_level": "DN",
+    "white_level": "DN",
+    "bits": "",
+    "white_balance_gains": "red, blue",
+    "full_well": "e-",
+    "tukey_lambda": "",
+    "prnu": "",
+    "dsnu": "e-",
+    "hot_pixel_share": "",
+    "hot_pixel_level": "e-",
+    "dead_pixel_share": "",
+}
+
+
+def make_and_model(camera: Camera) -> str:
+    """What is written on a camera; some makers begin the model with their name."""
+    model, make = camera.model, camera.make
+    return model if model.startswith(make) else f"{make} {model}"
+
+
+def camera_row(camera: Camera) -> tuple[str, ...]:
+    """A camera in a line: name, make and model, ISOs, where its gain stages begin."""
+    stages = ", ".join(f"{stage.iso[0]:g}" for stage in camera.gain_stages)
+    low, high = camera.iso_range
+    return camera.name, make_and_model(camera), f"{low:g} to {high:g}", stages
+
+
+def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[str, ...], Rows]]:
+    """A camera's noise at an ISO, or at all that were measured, as titles, headings and rows.
+
+    Raises:
+        RequestError: the camera has not that ISO.
+    """
+    isos = [iso] if iso is not None else [i for stage in camera.gain_stages for i in stage.iso]
+    signal: Rows = []
+    paper: Rows = []
+    for i in isos:
+        record = noise_at(camera, i)
+        lines = record["dark_noise"], record["row_noise"], record["column_noise"]
+        signal.append(figures(i, *record["signal"].values(), *record["emva1288"].values(), *lines))
+        paper.append(figures(i, *record["paper"].values()))
+    return [
+        (
+            f"{make_and_model(camera)}: Var[y] = a*y + b, y = 1 at the white level; EMVA 1288",
+            (
+                "ISO",
+                "a",
+                "b",
+                "system_gain",
+                "read_noise",
+                "adc_noise",
+                "both",
+                "row",
+                "column",
+            ),
+            [("", "", "", "DN/e-", "e-", "DN", "DN", "DN", "DN"), *signal],
+        ),
+        (
+            "The paper's: a = theta/chi, b = theta^2 b' + b'' - theta^2 p0/chi",
+            ("ISO", "chi", "theta", "b'", "b''", "p0"),
+            paper,
+        ),
+        (
+            "At every ISO",
+            ("", "found", "unit"),
+            [
+                (key, short_text(value) if value is not None else "none known", unit)
+                for key, unit in FIXED.items()
+                for value in (getattr(camera, key),)
+            ],
+        ),
+    ]
+
+
+def figures(iso: float, *values: float) -> tuple[str, ...]:
+    """An ISO, and numbers with four digits."""
+    return (f"{iso:g}", *(f"{value:.4g}" for value in values))
+
+
+def noise_at(camera: Camera, iso: float) -> dict[str, Any]:
+    """Noise at an ISO in all three ways; in the dark, of rows and of columns in DN; JSON values.
+
+    Raises:
+        RequestError: the camera has not that ISO.
+    """
+    unit, model = camera.signal_range, camera.noise(iso)
+    return {
+        "iso": iso,
+        **model.record(),
+        "dark_noise": model.b**0.5 * unit,
+        "row_noise": camera.row_noise(iso) * unit,
+        "column_noise": camera.column_noise(iso) * unit,
+    }
+
+
+def camera_record(camera: Camera, iso: float | None = None) -> dict[str, Any]:
+    """A camera as JSON values, with its noise at an ISO or at all that were measured.
+
+    Raises:
+        RequestError: the camera has not that ISO.
+    """
+    isos = [iso] if iso is not None else [i for stage in camera.gain_stages for i in stage.iso]
+    return {
+        "name": camera.name,
+        "make": camera.make,
+        "model": camera.model,
+        "iso_range": camera.iso_range,
+        **{key: getattr(camera, key) for key in FIXED},
+        "noise": [noise_at(camera, i) for i in isos],
+        "sources": camera.sources,
+    }
+
+
+@click.command("cameras")
+@click.argument("name", required=False, metavar="[NAME|FILE]")
+@click.option("--iso", type=float, help="The ISO. [default: those that were measured]")
+@json_option
+def cameras(name: str | None, iso: float | None, as_json: bool) -> None:
+    """List the cameras, or show one: its noise in all three ways, and its sources."""
+    if name is None:
+        if iso is not None:
+            raise RequestError("--iso: name the camera that it is of")
+        records = [camera_record(load_camera(n)) for n in built_in_cameras()]
+        if as_json:
+            show_json(records)
+            return
+        every = map(load_camera, built_in_cameras())
+        show(("camera", "make and model", "ISO", "gain stages from"), map(camera_row, every))
+        return
+    camera = load_camera(name)
+    if as_json:
+        show_json(camera_record(camera, iso))
+        return
+    for title, headings, rows in camera_tables(camera, iso):
+        click.echo(title)
+        show(headings, rows, left=1)
+        click.echo("")
+    for key, source in camera.sources.items():
+        click.echo(f"{key}: {source}")

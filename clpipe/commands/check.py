@@ -1,0 +1,63 @@
+"""TODO."""
+
+import sys
+from pathlib import Path
+
+import click
+
+from clpipe.base.errors import RequestError
+from clpipe.chain.methods import stage_named
+from clpipe.chain.registry import load_stage_file
+from clpipe.commands.options import device_option, json_option, stage_file_option
+from clpipe.commands.printing import show, show_json
+from clpipe.engine.check import SIZES, Check, check_all
+from clpipe.engine.device import open_device
+
+
+def check_row(check: Check) -> tuple[str, ...]:
+    """A comparison of a kernel with its reference, in a line."""
+    return (
+        check.stage,
+        check.method,
+        str(check.cases),
+        str(check.samples),
+        str(check.differing),
+        f"{check.largest:.2g}",
+        f"{check.tolerance:.2g}",
+        "ok" if check.passed else "FAILED",
+    )
+
+
+@click.command("check")
+@click.argument("names", nargs=-1, metavar="[STAGE]...")
+@device_option
+@click.option("--small", is_flag=True, help="Only tiny images, for slow devices.")
+@stage_file_option
+@json_option
+def check(
+    names: tuple[str, ...],
+    selector: str | None,
+    small: bool,
+    stage_files: tuple[Path, ...],
+    as_json: bool,
+) -> None:
+    """Compare kernels with their NumPy references on a device: of these stages, or of all, and then
+    the raw bit for bit.
+    """
+    for file in stage_files:
+        load_stage_file(file)
+    chosen = [stage_named("check", name) for name in names]
+    device = open_device(selector)
+    if device is None:
+        raise RequestError("check: numpy is the reference; choose a device to compare with it")
+    checks = list(check_all(device, chosen, SIZES[:5] if small else SIZES))
+    failed = sum(not c.passed for c in checks)
+    if as_json:
+        records = [c.record() for c in checks]
+        show_json({"device": device.info.label, "failed": failed, "checks": records})
+    else:
+        click.echo(f"{device.info.label}, driver {device.info.driver}, {device.info.lanes} lanes")
+        headings = ("stage", "method", "cases", "samples", "differing", "largest", "allowed", "")
+        show(headings, map(check_row, checks))
+        click.echo(f"{len(checks) - failed} passed, {failed} failed")
+    sys.exit(1 if failed else 0)

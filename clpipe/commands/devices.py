@@ -1,0 +1,63 @@
+"""TODO."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import click
+
+from clpipe.base.errors import DeviceError
+from clpipe.commands.options import json_option
+from clpipe.commands.printing import show, show_json
+from clpipe.engine.discovery import DeviceInfo, choose, find_devices
+
+
+def device_rows(devices: Sequence[DeviceInfo]) -> list[dict[str, Any]]:
+    """A row a device with its status: used, usable, or why it is passed over; NumPy comes last."""
+    try:
+        used: DeviceInfo | None = choose(None, list(devices))
+    except DeviceError:
+        used = None
+    rows: list[dict[str, Any]] = []
+    for device in devices:
+        if device is used:
+            status = "used by default"
+        elif device.problem:
+            status = f"passed over: {device.problem}"
+        elif device.type == "emulator":
+            status = f"passed over: an emulator, slow; --device {device.index}"
+        elif used and used.type == "GPU" and device.type != "GPU":
+            status = f"passed over: there is a GPU; --device {device.index}"
+        else:
+            status = f"passed over: an earlier one serves; --device {device.index}"
+        rows.append(
+            {
+                "index": device.index,
+                "name": device.name,
+                "platform": device.platform,
+                "driver": device.driver,
+                "type": device.type,
+                "compute_units": device.compute_units,
+                "memory": f"{device.memory / 2**30:.1f} GiB",
+                "lanes": device.lanes,
+                "status": status,
+            }
+        )
+    numpy = "slow; --device numpy"
+    blank = dict.fromkeys(("driver", "compute_units", "memory", "lanes"), "")
+    rows.append(
+        {"index": "numpy", "name": "NumPy", "platform": "the references", "type": "CPU"}
+        | blank
+        | {"status": numpy}
+    )
+    return rows
+
+
+@click.command("devices")
+@json_option
+def devices(as_json: bool) -> None:
+    """List the OpenCL devices, which one is used, and why others are passed over."""
+    rows = device_rows(find_devices())
+    if as_json:
+        show_json(rows)
+        return
+    show([key.replace("_", " ") for key in rows[0]], [[*map(str, r.values())] for r in rows])

@@ -1,0 +1,92 @@
+"""The program's command group: finds a command's module when the command is asked for."""
+
+import ast
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NoReturn
+
+import click
+
+from clpipe.base.about import __version__
+from clpipe.base.errors import ClpipeError, RequestError
+
+# In the order of the help. Each is a module of this folder that defines a function of its name.
+COMMANDS = (
+    "run",
+    "plan",
+    "stages",
+    "cameras",
+    "devices",
+    "measure",
+    "calibrate",
+    "check",
+    "bench",
+)
+
+
+class LazyGroup(click.Group):
+    """Commands that are imported on use, and whose errors are one message and an exit status."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        command = getattr(import_module(f"clpipe.commands.{cmd_name}"), cmd_name)
+        assert isinstance(command, click.Command)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, summary(name)) for name in COMMANDS])
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except ClpipeError as error:
+            fail(error)
+        except KeyboardInterrupt:
+            click.echo("interrupted", err=True)
+            sys.exit(130)
+        except BrokenPipeError:
+            sys.exit(0)
+        except OSError as error:
+            fail(RequestError(f"cannot print: {error.strerror}"))
+
+
+def summary(name: str) -> str:
+    """The first sentence of a command's help, read from its source.
+
+    Importing all commands to list them would take ten times as long as listing them.
+    """
+    module = ast.parse(Path(__file__).with_name(f"{name}.py").read_text("utf-8"))
+    functions = (node for node in module.body if isinstance(node, ast.FunctionDef))
+    text = next(ast.get_docstring(f) or "" for f in functions if f.name == name)
+    return (
+        " ".join(text.partition("\n\n")[0].split())
+        .partition(". ")[0]
+        .partition(": ")[0]
+        .rstrip(".")
+    )
+
+
+def fail(error: ClpipeError) -> NoReturn:
+    """Print what was wrong and exit with the error's status."""
+    click.echo(f"clpipe: {error}", err=True)
+    sys.exit(error.exit_status)
+
+
+@click.group(
+    cls=LazyGroup,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+@click.version_option(__version__, prog_name="clpipe")
+def main() -> None:
+    """Put clean, linear renders through a camera: mosaic, sensor noise, development.
+
+    \b
+    clpipe run render.exr -o out --iso 3200
+    clpipe stages sensor_noise
+    """

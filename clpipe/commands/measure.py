@@ -1,0 +1,129 @@
+"""The command line. Thin: it turns options into settings and results into text."""
+
+import math
+from pathlib import Path
+
+import click
+
+from clpipe.analysis.measure import UNITS, NoiseReport
+from clpipe.analysis.measure import measure as measure_images
+from clpipe.analysis.pictures import load_picture
+from clpipe.analysis.statistics import LAGS, SIGMAS, LineNoise, gaussian_beyond
+from clpipe.base.errors import RequestError
+from clpipe.commands.options import json_option
+from clpipe.commands.printing import Rows, number, show, show_json
+from clpipe.reference.cfa import PATTERNS, Pattern
+
+
+def line_text(lines: LineNoise) -> str:
+    """What rows or columns share, or what it is below where chance alone could be all of it."""
+    if lines.sigma > lines.limit:
+        return number(lines.sigma)
+    return "-" if math.isnan(lines.limit) else f"< {number(lines.limit)}"
+
+
+def measure_heading(report: NoiseReport) -> str:
+    """What was measured, of what, over which pixels, in a line or two."""
+    against = report.truth or "their mean"
+    what = "samples" if report.kind in ("mosaic", "values") else "pixels (flat, not clipped)"
+    lines = [
+        f"{len(report.images)} x {report.kind}, {report.width}x{report.height}, against {against}; "
+        f"unit: {UNITS[report.kind]}",
+        f"{report.share:.1%} of the {what} count",
+        *(f"note: {note}" for note in report.notes),
+    ]
+    return "\n".join(lines)
+
+
+def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
+    """The tables of a report: a title and rows of text, the first row being the headings."""
+    names = [one.name for one in report.channels]
+    laws = ["a", "b"] if any(one.law for one in report.channels) else []
+    size: Rows = [("", "samples", "sigma", *laws, "row sigma", "column sigma")]
+    shape: Rows = [("", *(f"{k}" for k in range(1, LAGS + 1)), "diagonal 1", "left after 2x2")]
+    far: Rows = [("", "skewness", "excess kurtosis", *(f"> {k} sigma" for k in SIGMAS))]
+    for one in report.channels:
+        found = [""] * len(laws)
+        if law := one.law:
+            found = [f"{law.a:.4g} ± {law.a_error:.1g}", f"{law.b:.4g} ± {law.b_error:.1g}"]
+        lines = line_text(one.rows), line_text(one.columns)
+        size.append((one.name, str(one.count), number(one.sigma, ".4g"), *found, *lines))
+        table, middle = one.autocorrelation, slice(LAGS + 1, None)
+        right = [number(r, ".3f") for r in table[LAGS, middle]]
+        down = [number(r, ".3f") for r in table[middle, LAGS]]
+        diagonal = number(table[LAGS + 1, LAGS + 1], ".3f")
+        shape.append((f"{one.name} right", *right, diagonal, number(one.energy_left, ".3f")))
+        shape.append((f"{one.name} down", *down, "", ""))
+        tails = one.tails
+        moments = number(tails.skewness, ".3f"), number(tails.excess_kurtosis, ".3f")
+        far.append((one.name, *moments, *(number(p, ".2g") for p in tails.beyond)))
+    far.append(("Gaussian", "0", "0", *(f"{gaussian_beyond(k):.2g}" for k in SIGMAS)))
+    sigmas = [dict(zip(one.curve.bins, one.curve.sigma, strict=True)) for one in report.channels]
+    curve: Rows = [("intensity", *names)]
+    for i in sorted(set().union(*sigmas)):
+        middle_of_bin = (report.edges[i] + report.edges[i + 1]) / 2
+        values = (f"{s[i]:.4g}" if i in s else "" for s in sigmas)
+        curve.append((f"{middle_of_bin:.3f}", *values))
+    pairs = [f"{a}-{b}" for a, b in report.correlations]
+    across: Rows = [tuple(pairs), tuple(number(r, ".3f") for r in report.correlations.values())]
+    return [
+        ("noise" + ("; variance = a * intensity + b" if laws else ""), size),
+        ("autocorrelation (independent noise: 0; left after 2x2: 0.25)", shape),
+        ("correlation between channels", across),
+        ("tails of standardised noise", far),
+        ("sigma by intensity", curve),
+    ]
+
+
+@click.command("measure")
+@click.argument(
+    "images", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE..."
+)
+@click.option(
+    "--truth", type=click.Path(path_type=Path), metavar="FILE", help="The same image without noise."
+)
+@click.option(
+    "--pattern",
+    default="RGGB",
+    show_default=True,
+    type=click.Choice(PATTERNS),
+    help="Of mosaics that do not say their own.",
+)
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    metavar="FILE.png",
+    help="Draw noise by intensity, autocorrelation and tails.",
+)
+@json_option
+def measure(
+    images: tuple[Path, ...], truth: Path | None, pattern: Pattern, plot: Path | None, as_json: bool
+) -> None:
+    """Measure the noise of images: how large, how correlated, how Gaussian.
+
+    IMAGE is a kept EXR of any stage, a mosaic, or a finished picture (JPEG, PNG, TIFF). Noise is
+    the difference from --truth, or, of two or more frames of one scene, from their mean.
+
+    \b
+    clpipe run render.exr -o noisy --iso 3200 --until quantize
+    clpipe run render.exr -o clean --iso 3200 --until quantize \\
+        --skip sensor_noise --skip row_noise --skip column_noise
+    clpipe measure noisy/render.exr --truth clean/render.exr
+    """
+    if plot is not None and plot.suffix != ".png":
+        raise RequestError(f"--plot: found {plot}; expected a name that ends in .png")
+    report = measure_images(
+        [load_picture(path, pattern) for path in images],
+        load_picture(truth, pattern) if truth else None,
+    )
+    if plot is not None:
+        from clpipe.analysis.plot import draw
+
+        draw(report, plot)
+    if as_json:
+        show_json(report.record())
+        return
+    click.echo(measure_heading(report))
+    for title, (headings, *rows) in measure_tables(report):
+        click.echo(f"\n{title}")
+        show(headings, rows, left=0 if headings[0] else 1)

@@ -1,0 +1,136 @@
+"""TODO."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+from clpipe.base.errors import RequestError
+from clpipe.chain.files import toml_text
+from clpipe.chain.request import request_from_options
+from clpipe.commands.options import chain_options, format_option, json_option, keep_option
+from clpipe.commands.printing import show, show_json
+from clpipe.engine.plan import AnyLaunch, Launch, Lines, Plan, launch_bytes, reads_of
+from clpipe.outputs.renditions import Rendition
+from clpipe.outputs.writer import OutputWriter
+
+
+def plan_rows(plan: Plan) -> list[tuple[str, ...]]:
+    """A row a launch: name, what opened it, stages, images read and written, bytes a pixel."""
+    kept = {image.number: name for name, image in plan.kept}
+    return [
+        (
+            launch.name,
+            opener(launch, kept),
+            ", ".join(stages_of(launch)),
+            reads_text(plan, launch),
+            writes_text(plan, launch),
+            f"{launch_bytes(plan, launch, 8):.1f}",
+        )
+        for launch in plan.launches
+    ]
+
+
+def opener(launch: AnyLaunch, kept: Mapping[int, str]) -> str:
+    """Why a launch is one of its own, and which stage is the cause."""
+    if isinstance(launch, Lines):
+        return "tables of rows and columns"
+    if not isinstance(launch, Launch):
+        return f"{launch.op.step}: {launch.op.pass_.access.value}"
+    if launch.stencil:
+        return f"{launch.stencil.step}: stencil, radius {launch.stencil.pass_.radius}"
+    if not launch.reads:
+        return "source"
+    if name := kept.get(launch.reads[0].image.number):
+        return f"{name} is kept"
+    return f"{launch.ops[0].step if launch.ops else 'end'}: stored image"
+
+
+def stages_of(launch: AnyLaunch) -> list[str]:
+    """The steps in a launch, in order, each once; those redone at each tap are in brackets."""
+    if isinstance(launch, Lines):
+        return [op.step for op in launch.ops]
+    if not isinstance(launch, Launch):
+        return [launch.op.step]
+    names = [f"({op.step})" for read in launch.reads for op in read.prologue]
+    names += [op.step for op in launch.ops]
+    if launch.sums:
+        names.append(f"{launch.sums.step}: sums")
+    return list(dict.fromkeys(names))
+
+
+def slots_text(plan: Plan, number: int) -> str:
+    """The slots of an image."""
+    return ",".join(str(slot) for slot in plan.slots[number])
+
+
+def reads_text(plan: Plan, launch: AnyLaunch) -> str:
+    """What a launch reads."""
+    if isinstance(launch, Launch) and not launch.reads:
+        return f"source {plan.source.label}, {'half' if plan.half else 'float'}"
+    return "; ".join(
+        f"{r.image.kind.label} in {slots_text(plan, r.image.number)}" for r in reads_of(launch)
+    )
+
+
+def writes_text(plan: Plan, launch: AnyLaunch) -> str:
+    """What a launch writes."""
+    if not isinstance(launch, Launch):
+        return ""
+    kept = {image.number: name for name, image in plan.kept}
+    parts = []
+    if launch.writes:
+        text = f"{launch.writes.kind.label} in {slots_text(plan, launch.writes.number)}"
+        parts.append(text + (" (kept)" if launch.writes.number in kept else ""))
+    if launch.encodes:
+        parts.append("8 bit")
+    return "; ".join(parts)
+
+
+def plan_record(plan: Plan) -> dict[str, Any]:
+    """A plan as JSON values."""
+    keys = ("launch", "opened_by", "stages", "reads", "writes", "bytes_per_pixel")
+    return {
+        "launches": [dict(zip(keys, row, strict=True)) for row in plan_rows(plan)],
+        "slots": plan.slot_count,
+        "bytes_per_pixel": plan.bytes_per_pixel(8),
+        "kept": [name for name, _ in plan.kept],
+    }
+
+
+@click.command("plan")
+@chain_options
+@keep_option
+@format_option
+@json_option
+@click.option("--toml", "as_toml", is_flag=True, help="Print the chain as a configuration.")
+def plan(
+    keep: tuple[str, ...], formats: tuple[str, ...], as_json: bool, as_toml: bool, **request: Any
+) -> None:
+    """Show the launches and buffer slots of a chain, without running it.
+
+    A launch is one kernel call over the image. Stages that look at a pixel alone join the launch
+    before them; a stencil, a reduction and a kept image open one. A slot is a buffer of one plane.
+    """
+    asked = request_from_options(**request)
+    if as_toml:
+        if asked.start_at or asked.until or as_json:
+            raise RequestError(
+                "plan: --toml prints a whole chain, which neither --start-at nor --until is part "
+                "of, and --json prints the plan"
+            )
+        click.echo(toml_text(asked.chain()), nl=False)
+        return
+    chain = asked.chain()
+    target = OutputWriter(Path(), formats or ("jpg",), keep=chain.kept(keep))
+    made = target.runner(Rendition("", chain, ""), None).plan()
+    if as_json:
+        show_json(plan_record(made))
+        return
+    headings = ("launch", "opened by", "stages", "reads", "writes", "bytes/px")
+    show(headings, plan_rows(made))
+    click.echo(
+        f"\n{len(made.launches)} launches, {made.slot_count} slots, "
+        f"{made.bytes_per_pixel(8):.1f} bytes a pixel on the device"
+    )

@@ -1,0 +1,58 @@
+"""TODO."""
+
+import json
+import math
+import sys
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from clpipe.chain.files import value_text
+
+Rows = list[tuple[str, ...]]
+
+
+def short_text(value: Any) -> str:
+    """A number, or numbers, with four digits.
+
+    >>> short_text(((1.0, 0.123456), (0.0, 2.0)))
+    '[[1, 0.1235], [0, 2]]'
+    """
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(short_text, value))}]"
+    if value is None:
+        return "none"
+    plain = not isinstance(value, float) or value.is_integer()
+    return value_text(value) if plain else f"{value:.4g}"
+
+
+def number(value: float, form: str = ".3g") -> str:
+    """A measured number; a dash where it could not be told.
+
+    >>> number(0.01234), number(math.nan)
+    ('0.0123', '-')
+    """
+    return "-" if math.isnan(value) else f"{value:{form}}"
+
+
+def console() -> Console:
+    """Where tables go. A pipe gets room for whole lines."""
+    return Console(width=None if sys.stdout.isatty() else 140, highlight=False)
+
+
+def show(headings: Sequence[str], rows: Iterable[Sequence[str]], left: int | None = None) -> None:
+    """Print a table whose first ``left`` columns stand left and the others right; None is all."""
+    table = Table(box=None, pad_edge=False)
+    for number, heading in enumerate(headings):
+        table.add_column(heading, justify="left" if left is None or number < left else "right")
+    for row in rows:
+        table.add_row(*row)
+    console().print(table)
+
+
+def show_json(values: Any) -> None:
+    """Print values as JSON."""
+    click.echo(json.dumps(values, indent=2))

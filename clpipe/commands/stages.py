@@ -1,0 +1,149 @@
+"""TODO."""
+
+import types
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import click
+from pydantic import ValidationError
+
+from clpipe.base.errors import ClpipeError, RequestError
+from clpipe.base.text import one_of
+from clpipe.chain.chain import make_chain
+from clpipe.chain.files import value_text
+from clpipe.chain.registry import all_stages, load_stage_file
+from clpipe.chain.request import DEFAULTS
+from clpipe.chain.settings import Settings, overlay
+from clpipe.commands.options import camera_option, iso_option, json_option, stage_file_option
+from clpipe.commands.printing import short_text, show, show_json
+from clpipe.stage import Context, Method, Stage
+
+LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+
+
+def type_text(annotation: Any) -> str:
+    """A parameter's type, in a word."""
+    if get_origin(annotation) is Literal:
+        return " | ".join(map(str, get_args(annotation)))
+    if get_origin(annotation) is Annotated:
+        return type_text(get_args(annotation)[0])
+    if get_origin(annotation) is tuple:
+        first, *more = get_args(annotation)
+        if Ellipsis in more:
+            return f"list of {type_text(first)}s"
+        return f"{1 + len(more)} x {type_text(first)}"
+    if get_origin(annotation) in (Union, types.UnionType):
+        return " | ".join(type_text(a) for a in get_args(annotation) if a is not type(None))
+    return {"float": "number", "int": "whole number"}.get(annotation.__name__, annotation.__name__)
+
+
+def resolved(method: type[Method], context: Context) -> dict[str, str]:
+    """The values that automatic parameters of a method take in a context, as text."""
+    automatic = [name for name, field in method.model_fields.items() if field.default is None]
+    try:
+        values = method().resolve(context)
+    except ValidationError:  # it must be given something
+        values = method.model_validate(method.example).resolve(context)
+        automatic = [name for name in automatic if name not in method.example]
+    except ClpipeError as error:
+        return dict.fromkeys(automatic, str(error))
+    return {name: short_text(getattr(values, name)) for name in automatic}
+
+
+def context_for(stage: Stage, settings: Settings) -> Context:
+    """What is known where a stage stands in the default chain, or could stand."""
+    steps = make_chain(settings).steps
+    own = [step.context for step in steps if step.stage is stage]
+    alike = [step.context for step in steps if step.stage.reads is stage.reads]
+    return [steps[0].context, *alike, *own][-1]
+
+
+def parameter_rows(method: type[Method]) -> list[tuple[str, ...]]:
+    """A row a parameter: name, default, unit, what is allowed, one sentence."""
+    rows: list[tuple[str, ...]] = []
+    for name, field in method.model_fields.items():
+        extra: Any = field.json_schema_extra
+        allowed = [type_text(field.annotation)]
+        for limit in field.metadata:
+            for key, sign in LIMITS.items():
+                if (value := getattr(limit, key, None)) is not None:
+                    allowed.append(f"{sign} {value:g}")
+        default = extra["auto"] or value_text(field.default)
+        rows.append((name, default, extra["unit"], ", ".join(allowed), field.description or ""))
+    return rows
+
+
+def stage_record(stage: Stage, context: Context) -> dict[str, Any]:
+    """A stage as JSON values, with what automatic parameters come to in a context."""
+    keys = ("name", "default", "unit", "allowed", "text")
+    return {
+        "name": stage.name,
+        "summary": stage.summary,
+        "reads": stage.reads.label,
+        "writes": stage.writes.label,
+        "methods": [
+            {
+                "name": method.method,
+                "summary": method.summary,
+                "parameters": [dict(zip(keys, row, strict=True)) for row in parameter_rows(method)],
+                "automatic": resolved(method, context),
+            }
+            for method in stage.methods
+        ],
+    }
+
+
+def stage_row(stage: Stage) -> tuple[str, ...]:
+    """A stage in a line: name, what it reads and writes, what it does, its methods."""
+    methods = ", ".join(stage.by_name)
+    return stage.name, stage.reads.label, stage.writes.label, stage.summary, methods
+
+
+@click.command("stages")
+@click.argument("name", required=False)
+@camera_option
+@iso_option
+@stage_file_option
+@json_option
+def stages(
+    name: str | None,
+    camera: str | None,
+    iso: float | None,
+    stage_files: tuple[Path, ...],
+    as_json: bool,
+) -> None:
+    """List the stages, or explain one: its methods and parameters, for a camera and an ISO."""
+    for file in stage_files:
+        load_stage_file(file)
+    if name is not None and name not in all_stages():
+        raise RequestError(one_of("stage", name, all_stages()))
+    values = {"camera": camera, "iso": iso}
+    settings = overlay(DEFAULTS, {k: v for k, v in values.items() if v is not None})
+    chosen = [all_stages()[name]] if name else list(all_stages().values())
+    if as_json:
+        records = [stage_record(s, context_for(s, settings)) for s in chosen]
+        show_json(records)
+    elif name is None:
+        headings = ("stage", "reads", "writes", "what it does", "methods (first is default)")
+        show(headings, map(stage_row, chosen))
+    else:
+        explain_stage(chosen[0], settings)
+
+
+def explain_stage(stage: Stage, settings: Settings) -> None:
+    """One stage: its methods and parameters, and what a camera and an ISO make of them."""
+    context = context_for(stage, settings)
+    reads, writes = stage.reads.label, stage.writes.label
+    click.echo(f"{stage.name}: {stage.summary} Reads {reads}, writes {writes}.")
+    place = f"{context.camera.name}, ISO {context.iso:g}"
+    for method in stage.methods:
+        click.echo(f"\nmethod {method.method}: {method.summary}")
+        rows = parameter_rows(method)
+        automatic = resolved(method, context)
+        headings = ["parameter", "default", *([place] if automatic else []), "unit", "allowed", ""]
+        if automatic:
+            rows = [(row[0], row[1], automatic.get(row[0], ""), *row[2:]) for row in rows]
+        if rows:
+            show(headings, rows)
+    if stage.explain:
+        click.echo(f"\n{stage.explain(context)}")

@@ -1,0 +1,159 @@
+"""How fast a chain is on a device, launch by launch, against the device's own copy speed."""
+
+import time
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from clpipe.base.types import Array
+from clpipe.chain.chain import Chain, make_chain
+from clpipe.chain.settings import Settings
+from clpipe.engine.device import Device, Timing
+from clpipe.engine.plan import Launch, launch_bytes
+from clpipe.engine.runner import Runner
+from clpipe.stage import Stage, variant_label, variants
+
+
+@dataclass(frozen=True)
+class Speed:
+    """One launch, or the chain: milliseconds, megapixels a second, GB/s and its share of a copy."""
+
+    name: str
+    ms: float
+    mp_per_s: float
+    gb_per_s: float
+    share_of_copy: float
+
+
+@dataclass(frozen=True)
+class BenchReport:
+    """A benchmark: the chain, its launches, and what they were measured on."""
+
+    device: str
+    width: int
+    height: int
+    copy_gb_per_s: float
+    bytes_per_pixel: float
+    first_run_s: float
+    chain: Speed
+    launches: tuple[Speed, ...]
+
+    def record(self) -> dict[str, Any]:
+        """The report as JSON values, with the chain's ``mp_per_s`` at the top."""
+        return {"mp_per_s": self.chain.mp_per_s} | asdict(self)
+
+
+@dataclass(frozen=True)
+class MethodSpeed:
+    """One method of a stage: how many launches it takes, milliseconds, megapixels a second."""
+
+    method: str
+    launches: int
+    ms: float
+    mp_per_s: float
+
+
+def scene(width: int, height: int) -> Array:
+    """A picture to measure on, (height, width, 3) half: gradients, texture and edges."""
+    x, y = np.linspace(0, 60, width, dtype=np.float32), np.linspace(0, 40, height, dtype=np.float32)
+    shade = (np.sin(x)[None, :] * np.cos(y)[:, None] + 1) * 0.4
+    shade[:, :: max(width // 50, 1)] *= 0.3
+    texture = np.random.default_rng(0).random((height, width), np.float32) * 0.05
+    colour = np.array([1.0, 0.8, 0.6], np.float32)
+    return ((shade + texture)[..., None] * colour).astype(np.float16)
+
+
+def bench(
+    device: Device, chain: Chain, width: int = 6000, height: int = 4000, repeat: int = 7
+) -> BenchReport:
+    """Time a chain from half RGB on the device to eight-bit RGB on the device.
+
+    The chain is timed whole, with one wait at its end; its launches by the device's own events.
+    Each figure is the best of ``repeat`` runs after a first one that compiles.
+    """
+    runner = Runner(chain, device)
+    image = scene(width, height)
+    pixels = width * height
+    start = time.perf_counter()
+    runner.run(image, "bench")
+    first = time.perf_counter() - start
+    whole = float("inf")
+    best: list[Timing] = []
+    for _ in range(repeat):
+        timings: list[Timing] = []
+        start = time.perf_counter()
+        runner.run(image, "bench", timings, download=False)
+        whole = min(whole, time.perf_counter() - start)
+        timings = [t for t in timings if not t.transfer]
+        best = [
+            min(a, b, key=lambda t: t.seconds)
+            for a, b in zip(timings, best or timings, strict=True)
+        ]
+    copy = device.copy_speed()
+    plan = runner.plan()
+
+    def speed(name: str, seconds: float, touched: float) -> Speed:
+        seconds = max(seconds, 1e-9)
+        return Speed(
+            name,
+            seconds * 1e3,
+            pixels / seconds / 1e6,
+            touched / seconds / 1e9,
+            touched / seconds / copy,
+        )
+
+    lanes = device.info.lanes
+    touched = [launch_bytes(plan, launch, lanes) * pixels for launch in plan.launches]
+    return BenchReport(
+        device=device.info.label,
+        width=width,
+        height=height,
+        copy_gb_per_s=copy / 1e9,
+        bytes_per_pixel=plan.bytes_per_pixel(lanes),
+        first_run_s=first,
+        chain=speed("chain", whole, sum(touched)),
+        launches=tuple(speed(t.name, t.seconds, b) for t, b in zip(best, touched, strict=True)),
+    )
+
+
+def bench_methods(
+    device: Device,
+    stage: Stage,
+    settings: Settings,
+    width: int = 6000,
+    height: int = 4000,
+    repeat: int = 7,
+) -> list[MethodSpeed]:
+    """Time every method of a stage alone, from float planes to float planes on the device.
+
+    A figure is the sum of the best times of a method's launches. A first launch that brings the
+    image into planes, with what is pointwise in it, is not counted: in a chain the stage before
+    does that. The settings' parameters of the stage hold for every method that has them; where
+    they name a method, it alone is timed.
+    """
+    picture = scene(width, height).astype(np.float32)
+    image = picture if len(stage.reads.channels) == 3 else np.ascontiguousarray(picture[..., 1])
+    settings = settings.drawn("")
+    given = settings.parameters.get(stage.name, {})
+    speeds = []
+    methods = [m for m in stage.methods if given.get("method", m.method) == m.method]
+    for method, choice in ((m, choice) for m in methods for choice in variants(m)):
+        own = {name: value for name, value in given.items() if name in method.model_fields}
+        table = {"method": method.method, **method.example, **own, **choice}
+        alone = replace(settings, stages=(stage.name,), skip=(), parameters={stage.name: table})
+        runner = Runner(make_chain(alone, stage.reads), device, encode=False, final=True)
+        runner.run(image, "bench")
+        best: list[float] = []
+        for _ in range(repeat):
+            timings: list[Timing] = []
+            runner.run(image, "bench", timings, download=False)
+            seconds = [t.seconds for t in timings if not t.transfer]
+            best = [min(pair) for pair in zip(seconds, best or seconds, strict=True)]
+        first = runner.plan(half=False).launches[0]
+        if len(best) > 1 and isinstance(first, Launch) and not first.reads:
+            del best[0]
+        ms = max(sum(best), 1e-9) * 1e3
+        label = variant_label(method, own | choice)
+        speeds.append(MethodSpeed(label, len(best), ms, width * height / ms / 1e3))
+    return speeds

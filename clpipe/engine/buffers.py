@@ -1,0 +1,104 @@
+"""TODO."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from clpipe.base.types import Array
+from clpipe.engine.codegen import Parameter
+from clpipe.engine.plan import Finalize, Plan
+from clpipe.stage import Kind
+
+
+@dataclass
+class Output:
+    """What a run brings back: planes by image number, eight-bit pixels, and numbers found."""
+
+    images: dict[int, Array]
+    encoded: Array | None
+    found: dict[str, Array]
+
+
+def room_for(plan: Plan, width: int, height: int, into: Array | None) -> Output:
+    """Whole images on the host for all that a plan gives; ``into`` is for the encoded one."""
+
+    def shape(kind: Kind) -> tuple[int, ...]:
+        channels = len(kind.channels)
+        return (height, width) if channels == 1 else (height, width, channels)
+
+    images = [image for _, image in plan.kept] + ([plan.final] if plan.final else [])
+    encoded = None
+    if plan.encoded:
+        encoded = np.empty(shape(plan.encoded), np.uint8) if into is None else into
+        if encoded.shape != shape(plan.encoded) or encoded.dtype != np.uint8:
+            raise ValueError(
+                f"into is {encoded.shape} {encoded.dtype}; {shape(plan.encoded)} uint8"
+            )
+    return Output(
+        images={image.number: np.empty(shape(image.kind), np.float32) for image in images},
+        encoded=encoded,
+        found={
+            x.op.step: np.empty(4, np.float32) for x in plan.launches if isinstance(x, Finalize)
+        },
+    )
+
+
+class Pool:
+    """Device buffers by name, kept from image to image where they are large enough."""
+
+    def __init__(self, make: Callable[[int], Any]) -> None:
+        self._make = make
+        self.held: dict[str, Any] = {}
+        self.generation = 0  # another one when other buffers are held
+
+    def reserve(self, sizes: Mapping[str, int], memory: int) -> None:
+        """See that there is a buffer of at least these sizes (bytes by name).
+
+        Those that an earlier image needed stay, as long as all together take no more than
+        ``memory`` bytes.
+        """
+        enough = {name: b for name, b in self.held.items() if b.size >= sizes.get(name, 0)}
+        missing = sum(size for name, size in sizes.items() if name not in enough)
+        for spare in (lambda name, _: name not in sizes, lambda name, b: b.size > sizes[name]):
+            if sum(b.size for b in enough.values()) + missing > memory:
+                dropped = [name for name, b in enough.items() if spare(name, b)]
+                missing += sum(sizes.get(name, 0) for name in dropped)
+                enough = {name: b for name, b in enough.items() if name not in dropped}
+        if enough.keys() == self.held.keys() >= sizes.keys():
+            return
+        self.generation += 1
+        for name in self.held.keys() - enough.keys():
+            self.held.pop(name).release()
+        for name, size in sizes.items():
+            if name not in enough:
+                self.held[name] = self._make(size)
+
+    @property
+    def bytes(self) -> int:
+        """What all of them take."""
+        return sum(buffer.size for buffer in self.held.values())
+
+    def release(self) -> None:
+        """Give all of them back."""
+        self.generation += 1
+        held, self.held = self.held, {}
+        for buffer in held.values():
+            buffer.release()
+
+
+def buffer_name(parameter: Parameter) -> str | None:
+    """The name, in :func:`~clpipe.engine.tiles.buffer_sizes`, of the buffer of a parameter."""
+    match parameter.role:
+        case "source":
+            return "src"
+        case "encoded":
+            return "dst"
+        case "slot":
+            return f"slot{parameter.number}"
+        case "lines" | "found":
+            return f"{parameter.role}.{parameter.step}"
+        case "sums" | "shares" | "counts" | "histogram":
+            return parameter.role
+    return None

@@ -1,0 +1,69 @@
+"""TODO."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from clpipe.engine.buffers import Pool, buffer_name
+from clpipe.engine.codegen import LOCAL_SIZE, SHARES, Kernel, Parameter, round_up
+from clpipe.engine.plan import Finalize, Histogram, Launch, Lines, Reduce
+from clpipe.engine.tiles import Extent
+
+Bind = Callable[[Parameter], Any]
+
+
+def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """How many work items a kernel has, and in which groups."""
+    match kernel.launch:
+        case Launch(rows=rows, columns=columns):
+            across = round_up(extent.padded_width, extent.lanes * columns)
+            blocks = round_up(across // (extent.lanes * columns), LOCAL_SIZE)
+            return (blocks, -(-extent.stored.height // rows)), (LOCAL_SIZE, 1)
+        case Lines():
+            longest = round_up(max(extent.width, extent.height), extent.lanes)
+            return (round_up(longest // extent.lanes, LOCAL_SIZE),), (LOCAL_SIZE,)
+        case Histogram() | Reduce():
+            return (SHARES,), (LOCAL_SIZE,)
+        case Finalize():
+            return (1,), (1,)
+
+
+class Call:
+    """A compiled kernel and the arguments that it was given last.
+
+    Most arguments stay the same from image to image, and to set one takes time.
+    """
+
+    def __init__(self, kernel: Kernel, compiled: Any) -> None:
+        self.kernel = kernel
+        self.compiled = compiled
+        numbered = list(enumerate(kernel.parameters))
+        names = [(i, buffer_name(p)) for i, p in numbered]
+        self._buffers = [(i, name) for i, name in names if name]
+        self._numbers = [(i, p.item) for i, p in numbered if p.role == "tile"]
+        self._values = [(i, p) for i, p in numbered if p.role in ("value", "key", "table8")]
+        self._last: list[Any] = [None] * len(numbered)
+        self._place: tuple[Any, ...] = ()
+
+    def set_arguments(self, pool: "Pool", extent: Extent, tile: int, bind: Bind) -> None:
+        """Set what is different from the last time: buffers, a tile's numbers, and values."""
+        place = pool.generation, extent, tile
+        if place != self._place:
+            told = {**extent.numbers, "tile": np.uint32(tile)}
+            for i, name in self._buffers:
+                self.compiled.set_arg(i, pool.held[name])
+            for i, name in self._numbers:
+                self.compiled.set_arg(i, told[name])
+            self._place = place
+        for i, parameter in self._values:
+            value, last = bind(parameter), self._last[i]
+            if value is not last and not same_bits(value, last):
+                self.compiled.set_arg(i, value)
+                self._last[i] = value
+
+
+def same_bits(one: Any, two: Any) -> bool:
+    """Whether two NumPy scalars are the same; 0 and -0 are not."""
+    scalars = isinstance(one, np.generic) and isinstance(two, np.generic)
+    return scalars and one.tobytes() == two.tobytes()

@@ -1,0 +1,396 @@
+"""From a launch to OpenCL source. Pure text: what runs is what this prints.
+
+A kernel is the library, the stage files it needs (with ``#line``, so that the compiler's messages
+name the right file and line) and one short function that loads, calls the stages and stores.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from clpipe.engine.plan import AnyLaunch, Finalize, Histogram, Launch, Lines, Op, Plan, Read, Reduce
+from clpipe.engine.sources import LIBRARY, files_text
+from clpipe.stage import Access, Kind
+
+# What is known of the origin when compiling: it is in whole blocks, so the rows that share a
+# Philox call and the phase of a Bayer pattern are too.
+EXTENT = "{width, height, pitch, left * LANES, top * 4, columns, rows}"
+
+
+LOCAL_SIZE = 64
+
+
+SHARES = 256  # work items of a reduction's first half
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One kernel parameter: its OpenCL declaration, and what is bound to it.
+
+    ``role`` is one of tile (a number of :class:`clpipe.engine.tiles.Extent`, or the tile's own
+    number), source, slot, encoded, table8 (the composed curve), value, key, lines, found, sums,
+    shares, counts, histogram; ``step``, ``item`` and ``number`` tell which.
+    """
+
+    declaration: str
+    role: str
+    step: str = ""
+    item: str = ""
+    number: int = 0
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A launch as OpenCL: its name, whole source, parameters in order and kind of index space."""
+
+    name: str
+    source: str
+    parameters: tuple[Parameter, ...]
+    launch: AnyLaunch
+    files: tuple[str, ...]
+
+
+def round_up(value: int, step: int) -> int:
+    """The smallest multiple of ``step`` that is not below ``value``."""
+    return -(-value // step) * step
+
+
+def border_left(border: int, lanes: int) -> int:
+    """Columns before the first pixel of a plane's row: the border, in whole blocks."""
+    return round_up(border, lanes)
+
+
+class _Writer:
+    """Collects the parameters and the body of one kernel."""
+
+    def __init__(self, plan: Plan, lanes: int) -> None:
+        self.plan = plan
+        self.lanes = lanes
+        self.parameters: dict[str, Parameter] = {}
+        self.setup: list[str] = []
+
+    def parameter(self, name: str, type_: str, role: str, **which: str | int) -> str:
+        space = "" if type_.endswith("*") else " "
+        self.parameters[name] = Parameter(f"{type_}{space}{name}", role, **which)  # type: ignore[arg-type]
+        return name
+
+    def tile(self, number: str) -> str:
+        return self.parameter(number, "uint", "tile", item=number)
+
+    def core(self) -> str:
+        sides = [self.tile(f"core_{side}") for side in ("left", "top", "right", "bottom")]
+        self.setup.append(f"const core c = {{{', '.join(sides)}}};")
+        return "c"
+
+    def slot(self, number: int, written: bool) -> str:
+        const = "" if written else "const "
+        type_ = f"__global {const}float *restrict"
+        return self.parameter(f"slot{number}", type_, "slot", number=number)
+
+    def planes(self, read: Read) -> list[str]:
+        """Three plane parameters of an image that is read, the last repeated where it has less."""
+        slots = [self.slot(n, False) for n in self.plan.slots[read.image.number]]
+        return (slots + [slots[-1]] * 2)[:3]
+
+    def arguments(
+        self, op: Op, found: dict[str, tuple[str, int]], names: Sequence[str] | None = None
+    ) -> list[str]:
+        """The actual arguments of a pass, or those ``names``, after the pixel and its site."""
+        pass_, types, literals = op.pass_, dict(op.types), dict(op.literals)
+        texts = []
+        if pass_.random:
+            key = f"{op.step}_{pass_.random.value}_key"
+            for half in "01":
+                self.parameter(
+                    key + half, "uint", "key", step=op.step, item=pass_.random.value + half
+                )
+            stage = self.parameter(f"{op.step}_stage", "uint", "key", step=op.step, item="stage")
+            texts.append(f"(stream){{{key}0, {key}1, {stage}}}")
+        for name in pass_.arguments if names is None else names:
+            full = f"{op.step}_{name}"
+            if name in literals:
+                texts.append(literals[name])
+            elif name in types:
+                texts.append(self.parameter(full, types[name], "value", step=op.step, item=name))
+            elif name in found:
+                step, index = found[name]
+                buffer = self.parameter(
+                    f"{step}_found", "__global const float *", "found", step=step
+                )
+                line = f"const float {full} = {buffer}[{index}];"
+                if line not in self.setup:
+                    self.setup.append(line)
+                texts.append(full)
+            else:
+                self.parameter(full, "__global const float *", "lines", step=op.step, item=name)
+                texts.append(full)
+        return texts
+
+
+def found_by(plan: Plan, step: str) -> dict[str, tuple[str, int]]:
+    """Names of the numbers that a step finds, with the step and the place in its buffer."""
+    for launch in plan.launches:
+        if isinstance(launch, Finalize) and launch.op.step == step:
+            return {name: (step, i) for i, name in enumerate(launch.op.pass_.found)}
+    return {}
+
+
+def call(op: Op, arguments: Sequence[str]) -> str:
+    """The call of a pass's function."""
+    return f"{op.pass_.function}({', '.join(arguments)})"
+
+
+def write_kernel(plan: Plan, launch: AnyLaunch, index: int, lanes: int) -> Kernel:
+    """The OpenCL source of one launch of a plan, for a device with that many lanes."""
+    writer = _Writer(plan, lanes)
+    name = f"launch_{index}_" + re.sub(r"\W+", "_", launch.name)
+    for number in ("width", "height", "pitch", "left", "top", "columns", "rows"):
+        writer.tile(number)
+    seen: set[str] = set()
+    left = border_left(plan.border, lanes)
+    columns = launch.columns if isinstance(launch, Launch) else 1
+    text = f"#define LANES {lanes}\n#define BORDER {plan.border}\n#define BORDER_LEFT {left}\n"
+    text += f"#define COLUMNS {columns}\n"
+    text += files_text([f"lib/{part}.h" for part in LIBRARY], seen)
+    match launch:
+        case Launch():
+            body = _pixels(writer, launch)
+            # The tap function calls the stages of its prologue, and the stencil calls it.
+            text += files_text(kernels_of([op for r in launch.reads for op in r.prologue]), seen)
+            text += _source_image(writer, launch)
+            text += files_text(kernels_of([*launch.ops, launch.sums]), seen)
+        case Lines():
+            body = _lines(writer, launch)
+            text += files_text(kernels_of(launch.ops), seen)
+        case Histogram():
+            body = _count(writer, launch)
+            text += files_text(kernels_of([launch.op]), seen)
+        case Reduce():
+            body = _add_up(writer, launch)
+        case Finalize():
+            body = _find(writer, launch)
+            text += files_text(kernels_of([launch.op]), seen)
+    signature = ",\n    ".join(p.declaration for p in writer.parameters.values())
+    size = 1 if isinstance(launch, Finalize) else LOCAL_SIZE
+    setup = "".join(f"    {line}\n" for line in writer.setup)
+    # The hint keeps Intel's compiler from making vectors of our vectors, up to nine times slower.
+    text += (
+        f'#line 1 "{launch.name}"\n'
+        f"__kernel __attribute__((vec_type_hint(vf), reqd_work_group_size({size}, 1, 1)))\n"
+        f"void {name}(\n    {signature})\n{{\n"
+        f"    const extent e = {EXTENT};\n{setup}{body}}}\n"
+    )
+    return Kernel(name, text, tuple(writer.parameters.values()), launch, tuple(sorted(seen)))
+
+
+def kernels_of(ops: Sequence[Op | None]) -> list[str]:
+    """The kernel files of these passes."""
+    return [op.kernel for op in ops if op]
+
+
+def _prologue(writer: _Writer, read: Read) -> list[tuple[Op, list[str], list[str]]]:
+    """Each pass redone at a tap, its arguments, and which of them are run-time values."""
+    calls = []
+    for op in read.prologue:
+        arguments = writer.arguments(op, found_by(writer.plan, op.step))
+        literals = dict(op.literals).values()
+        calls.append((op, arguments, [a for a in arguments if a not in literals]))
+    return calls
+
+
+def _source_image(writer: _Writer, launch: Launch) -> str:
+    """The type and the tap function of a stencil's ``src``, with the passes redone at each tap."""
+    if not launch.stencil:
+        return ""
+    reads = dict(zip(launch.stencil.pass_.reads, launch.reads, strict=True))
+    read = reads.get("src")
+    if not read or not read.prologue:
+        kind = read.image.kind if read else Kind.MOSAIC
+        return (
+            "typedef image src_image;\n"
+            f"INLINE {kind.c_type} src_tap(src_image src, int dx, int dy) "
+            f"{{ return tap_{kind.c_name}(src, dx, dy); }}\n"
+        )
+    fields = ""
+    value = f"tap_{read.image.kind.c_name}(src.stored, dx, dy)"
+    for op, arguments, values in _prologue(writer, read):
+        fields += "".join(f"float {v}; " for v in values)
+        value = call(op, [value, "at", *(f"src.{a}" if a in values else a for a in arguments)])
+    return (
+        f"typedef struct {{ image stored; {fields}}} src_image;\n"
+        f"INLINE {read.prologue[-1].kind.c_type} src_tap(src_image src, int dx, int dy) {{\n"
+        f"    const site at = shifted(src.stored.at, dx, dy);\n    return {value};\n}}\n"
+    )
+
+
+def _load(writer: _Writer, launch: Launch) -> tuple[list[str], list[str], Kind]:
+    """What makes ``v0``, from the source, a stored image or the stencil; and its kind.
+
+    The first lines come once a work item (for a stencil that gives its whole block), the others
+    once a row.
+    """
+    plan = writer.plan
+    stencil = launch.stencil
+    if not launch.reads:
+        kind, dtype = plan.source, "half" if plan.half else "float"
+        writer.parameter("src", f"__global const {dtype} *restrict ", "source")
+        return [], [f"const {kind.c_type} v0 = source_{kind.c_name}_{dtype}(src, at, e);"], kind
+    block = stencil.pass_.block if stencil else 0
+    images = [
+        f"image_at({', '.join(writer.planes(read))}, e, first, {'0' if block else 'row'})"
+        for read in launch.reads
+    ]
+    if not stencil:
+        kind = launch.reads[0].image.kind
+        return [], [f"const {kind.c_type} v0 = tap_{kind.c_name}({images[0]}, 0, 0);"], kind
+    lines = []
+    for name, read, stored in zip(stencil.pass_.reads, launch.reads, images, strict=True):
+        values = [v for _, _, own in _prologue(writer, read) for v in own]
+        type_ = "src_image" if name == "src" else "image"
+        made = f"{{{', '.join([stored, *values])}}}" if values else stored
+        lines.append(f"const {type_} {name} = {made};")
+    arguments = writer.arguments(stencil, found_by(plan, stencil.step))
+    kind, given = stencil.kind, [*stencil.pass_.reads, *arguments]
+    if not block:
+        return [], [*lines, f"const {kind.c_type} v0 = {call(stencil, ['at', *given])};"], kind
+    lines.append(f"{call(stencil, ['first', *given, 'block'])};")
+    once = [f"{kind.c_type} block[{launch.rows * block}];", "{", *(f"    {x}" for x in lines), "}"]
+    return once, [f"const {kind.c_type} v0 = block[row * {block} + column];"], kind
+
+
+def _encode(writer: _Writer, value: str, kind: Kind, curves: Sequence[Op]) -> str:
+    """The line that writes eight-bit pixels, through one table where curves come last."""
+    writer.parameter("dst", "__global uchar *restrict ", "encoded")
+    if not curves:
+        return f"encode_{'mosaic' if kind.c_type == 'vf' else 'rgb'}({value}, dst, at, e);"
+    steps = ",".join(op.step for op in curves)
+    writer.parameter("table8", "__global const uchar *restrict ", "table8", item=steps)
+    return f"encode_rgb_by_table({value}, table8, dst, at, e);"
+
+
+def _pixels(writer: _Writer, launch: Launch) -> str:
+    """The body of a kernel over the image: load, the stages, store."""
+    plan = writer.plan
+    once, lines, kind = _load(writer, launch)
+    ops = list(launch.ops[1:] if launch.stencil else launch.ops)
+    curves: list[Op] = []
+    while launch.encodes and not launch.writes and ops and ops[-1].pass_.access is Access.CURVE:
+        curves.insert(0, ops.pop())
+    for i, op in enumerate(ops):
+        kind = op.kind
+        made = call(op, [f"v{i}", "at", *writer.arguments(op, found_by(plan, op.step))])
+        lines.append(f"const {kind.c_type} v{i + 1} = {made};")
+    value, after = f"v{len(ops)}", ""
+    if launch.sums:
+        writer.parameter("sums", "__global int4 *restrict ", "sums")
+        sample = call(launch.sums, [value, *writer.arguments(launch.sums, {})])
+        lines.append(f"const vi sample = only_inside({sample}, at, {writer.core()});")
+        lines.append("if (row & 1) odd_rows += sample; else even_rows += sample;")
+        once.append("vi even_rows = (vi)(0), odd_rows = (vi)(0);")
+        after = (
+            "    const size_t block = get_global_id(1) * ((columns + LANES - 1) / LANES) + "
+            "get_global_id(0);\n"
+            "    sums[block] = (int4)(fold_columns(even_rows, first), "
+            "fold_columns(odd_rows, first));\n"
+        )
+    block = launch.stencil.pass_.block if launch.stencil else 0
+    if not block:
+        # All rows before the first store: what they have in common is then done once, because no
+        # store can have changed what they read.
+        once.append(f"{kind.c_type} values[{launch.rows}];")
+        lines.append(f"values[row] = {value};")
+        value = "values[row]"
+    stores = []
+    if launch.writes:
+        slots = [writer.slot(n, True) for n in plan.slots[launch.writes.number]]
+        stores.append(f"store_{kind.c_name}({', '.join([value, *slots])}, at, e);")
+    if launch.encodes:
+        stores.append(_encode(writer, value, kind, curves))
+    loops = _over_block([*lines, *stores], launch) if block else [lines, stores]
+    start = "".join(f"    {line}\n" for line in once)
+    body = "".join(_over_rows(part, launch.rows, unroll=not block) for part in loops)
+    return (
+        f"    const uint x = left * LANES + (uint)get_global_id(0) * {max(block, 1)} * LANES;\n"
+        f"    const uint y = top * 4 + (uint)get_global_id(1) * {launch.rows};\n"
+        "    if (x - e.left >= columns) return;\n"
+        f"    const site first = site_at(x, y);\n{start}{body}{after}"
+    )
+
+
+def _over_block(lines: Sequence[str], launch: Launch) -> list[list[str]]:
+    """Lines for each vector of a row of a stencil's block."""
+    head = f"for (uint column = 0; column < {launch.columns}; ++column) {{"
+    beyond = "    if (x - e.left + column * LANES >= columns) break;"
+    place = "    const site at = site_at(x + column * LANES, y + row);"
+    return [[head, beyond, place, *(f"    {line}" for line in lines), "}"]]
+
+
+def _over_rows(lines: Sequence[str], rows: int, unroll: bool) -> str:
+    """A loop over the rows of a work item. What is in an array already need not be unrolled."""
+    place = ["const site at = site_at(x, y + row);"] if unroll else []
+    body = "".join(f"        {line}\n" for line in [*place, *lines])
+    pragma = "#pragma unroll" if unroll else "#pragma unroll 1"
+    return f"{pragma}\n    for (uint row = 0; row < {rows}; ++row) {{\n{body}    }}\n"
+
+
+def _lines(writer: _Writer, launch: Lines) -> str:
+    body = "    const uint i = (uint)get_global_id(0) * LANES;\n"
+    body += "    const vu line = lane_indices(i);\n"
+    for op in launch.ops:
+        table = writer.parameter(
+            f"{op.step}_{op.pass_.writes}",
+            "__global float *",
+            "lines",
+            step=op.step,
+            item=op.pass_.writes,
+        )
+        count = "height" if op.pass_.lines == "rows" else "width"
+        value = call(op, ["line", *writer.arguments(op, {})])
+        body += f"    if (i < {count}) store({value}, {table} + i);\n"
+    return body
+
+
+def _count(writer: _Writer, launch: Histogram) -> str:
+    op, bins = launch.op, launch.op.pass_.bins
+    plane = writer.planes(launch.reads[0])[0]
+    counts = writer.parameter("counts", "__global uint *", "counts", number=bins)
+    arguments = ["origin", "x", "y", "e", *writer.arguments(op, {})]
+    core = writer.core()
+    return (
+        f"    __global const float *origin = image_origin({plane}, e);\n"
+        f"    __global uint *own = {counts} + (size_t)get_global_id(0) * {bins};\n"
+        f"    for (uint k = 0; k < {bins}; ++k) own[k] = 0;\n"
+        f"    for (uint y = {core}.top + get_global_id(0); y < {core}.bottom; y += {SHARES}) {{\n"
+        f"        for (uint x = {core}.left; x < {core}.right; ++x) {{\n"
+        f"            const int bin = {call(op, arguments)};\n"
+        "            if (bin >= 0) own[bin] += 1;\n"
+        "        }\n    }\n"
+    )
+
+
+def _add_up(writer: _Writer, launch: Reduce) -> str:
+    tile = writer.tile("tile")
+    if bins := launch.op.pass_.bins:
+        writer.parameter("counts", "__global const uint *", "counts", number=bins)
+        writer.parameter("histogram", "__global uint *", "histogram", number=bins)
+        return f"    add_up_counts(counts, histogram, {bins}, {SHARES}, {tile});\n"
+    writer.parameter("sums", "__global const int4 *", "sums")
+    writer.parameter("shares", "__global long4 *", "shares")
+    return f"    add_up_blocks(sums, shares, {writer.tile('blocks')}, {tile});\n"
+
+
+def _find(writer: _Writer, launch: Finalize) -> str:
+    pass_ = launch.op.pass_
+    if pass_.bins:
+        whole = writer.parameter(
+            "histogram", "__global const uint *", "histogram", number=pass_.bins
+        )
+    else:
+        writer.parameter("shares", "__global const long4 *", "shares")
+        whole = f"add_up_shares(shares, {SHARES})"
+    found = writer.parameter(
+        f"{launch.op.step}_found", "__global float *", "found", step=launch.op.step
+    )
+    arguments = writer.arguments(launch.op, {}, pass_.finish_arguments)
+    texts = [whole, *arguments, "e", found]
+    return f"    {pass_.finish}({', '.join(texts)});\n"

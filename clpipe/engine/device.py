@@ -1,0 +1,360 @@
+"""OpenCL devices: which there are, and running a plan on one. The only importer of pyopencl."""
+
+import re
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clpipe.base.errors import DeviceError, ImageError, RequestError
+from clpipe.base.types import Array
+from clpipe.engine.buffers import Output, Pool, room_for
+from clpipe.engine.calls import Bind, Call, index_space
+from clpipe.engine.codegen import Kernel, Parameter, border_left, write_kernel
+from clpipe.engine.discovery import DeviceInfo, choose, choose_all, find_devices, usable_memory
+from clpipe.engine.plan import Plan
+from clpipe.engine.tiles import Extent, Tiling, tiling_of
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What one launch or transfer took, in seconds on the device.
+
+    ``start`` is on the clock of :func:`time.perf_counter`. Transfers are called "upload" and
+    "download".
+    """
+
+    name: str
+    seconds: float
+    start: float
+    transfer: bool
+
+
+def build_log(text: str) -> str:
+    """What the compiler said, out of pyopencl's error message.
+
+    >>> build_log("failed\\n\\nBuild on <x>:\\n\\nerror: a.cl:2:7: no\\n\\n(options: -a)")
+    'error: a.cl:2:7: no'
+    """
+    log = re.sub(r"\n*\(options: .*", "", text.partition(">:\n")[2], flags=re.DOTALL)
+    lines = [line for line in log.splitlines() if "failed to build the program" not in line]
+    return "\n".join(lines).strip() or text
+
+
+def timed(events: Sequence[tuple[str, Any]]) -> list[Timing]:
+    """How long each took. The queue has just been finished, so the last of them ends now."""
+    if not events:
+        return []
+    offset = time.perf_counter() - events[-1][1].profile.end * 1e-9
+    transfers = ("upload", "download")
+    return [
+        Timing(
+            name,
+            (event.profile.end - event.profile.start) * 1e-9,
+            event.profile.start * 1e-9 + offset,
+            name in transfers,
+        )
+        for name, event in events
+    ]
+
+
+class Device:
+    """A device with its queue, compiled kernels and buffers, kept from image to image.
+
+    It is for one thread at a time; several devices can run at once, each in its own.
+
+    Args:
+        chosen: which device.
+        memory: bytes that its buffers may take; None is what it reports. A CPU shares its memory
+            with everybody, so it is at most half of what is available now.
+
+    Raises:
+        DeviceError: it cannot be opened.
+    """
+
+    def __init__(self, chosen: DeviceInfo, memory: int | None = None) -> None:
+        import pyopencl as cl
+
+        self.info = chosen
+        self.memory = memory or usable_memory(chosen)
+        self._cl = cl
+        try:
+            self._context = cl.Context([chosen.handle])
+            self._queue = cl.CommandQueue(
+                self._context, properties=cl.command_queue_properties.PROFILING_ENABLE
+            )
+        except cl.Error as error:
+            raise DeviceError(f"{chosen.label} cannot be opened: {error}") from None
+        self._calls: dict[Plan, list[Call]] = {}
+        self._programs: dict[str, Any] = {}
+        self._pool = Pool(self._new_buffer)
+        self._tables: dict[int, tuple[Array, Any]] = {}
+
+    @property
+    def bytes_held(self) -> int:
+        """Device memory of the buffers that are kept from image to image."""
+        return self._pool.bytes
+
+    def prepare(self, plan: Plan) -> list[Call]:
+        """The compiled kernels of a plan, from the first call on without compiling.
+
+        Raises:
+            DeviceError: a kernel does not compile; the message is the compiler's.
+        """
+        if plan not in self._calls:
+            lanes = self.info.lanes
+            kernels = [write_kernel(plan, x, i, lanes) for i, x in enumerate(plan.launches)]
+            self._calls[plan] = [Call(k, self._compile(k)) for k in kernels]
+        return self._calls[plan]
+
+    def _compile(self, kernel: Kernel) -> Any:
+        cl = self._cl
+        program = self._programs.get(kernel.source)
+        if program is None:
+            options = ["-cl-std=CL1.2"]
+            exact = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
+            if self.info.handle.single_fp_config & exact:
+                options.append("-cl-fp32-correctly-rounded-divide-sqrt")
+            # PoCL keeps a cache of its own; a second copy only costs time.
+            own_cache = "Portable Computing" in self.info.platform
+            # Not within catch_warnings, which is no matter of one thread.
+            warnings.filterwarnings("ignore", category=cl.CompilerWarning)
+            try:
+                program = cl.Program(self._context, kernel.source).build(
+                    options, cache_dir=False if own_cache else None
+                )
+            except cl.MemoryError:
+                raise
+            except cl.Error as error:
+                log = build_log(str(error))
+                for file in kernel.files:
+                    if Path(file).is_absolute():
+                        raise RequestError(f"{file}: does not compile:\n{log}") from None
+                raise DeviceError(f"{kernel.launch.name}: does not compile:\n{log}") from None
+            self._programs[kernel.source] = program
+        return cl.Kernel(program, kernel.name)
+
+    def run(
+        self,
+        plan: Plan,
+        source: Array,
+        bind: Bind,
+        timings: list[Timing] | None = None,
+        download: bool = True,
+        into: Array | None = None,
+    ) -> Output:
+        """Put one image through a plan; in tiles where it does not fit into the memory.
+
+        Where the memory that is allowed is not there, buffers of earlier images are given back,
+        then tiles become smaller.
+
+        Args:
+            plan: what to do.
+            source: the image, (height, width[, channel]), of a type that becomes half floats or
+                floats, as the plan says, without loss.
+            bind: the value of a "value", "key" or "table8" parameter: a NumPy scalar or array.
+            timings: is given one entry a launch and transfer, in order.
+            download: bring results back; False leaves them on the device (for measuring).
+            into: where the eight-bit pixels are put, (height, width[, channel]) uint8,
+                C-contiguous; memory that is new to the process costs time.
+
+        Raises:
+            ImageError: the image does not fit into the device's memory, not even in tiles, or the
+                device fails.
+            DeviceError: a kernel does not compile.
+        """
+        cl = self._cl
+        height, width = source.shape[:2]
+        memory = self.memory
+        full: Exception | None = None  # what the device said when there was no more
+        while True:
+            try:
+                tiling = tiling_of(
+                    plan, width, height, self.info.lanes, memory, min(memory, self.info.max_buffer)
+                )
+            except ImageError:
+                if full is None:
+                    raise
+                raise ImageError(
+                    f"{width}x{height} pixels: {self.info.label} is out of memory, in tiles of any "
+                    f"size; others may be using it ({full})"
+                ) from None
+            try:
+                return self._run(plan, tiling, source, bind, timings, download, into)
+            except cl.MemoryError as error:
+                self._abandon()
+                memory = memory if full is None else tiling.bytes // 2
+                full = error
+            except cl.Error as error:
+                self._abandon()
+                raise ImageError(f"{self.info.label} failed: {error}") from None
+
+    def _run(
+        self,
+        plan: Plan,
+        tiling: Tiling,
+        source: Array,
+        bind: Bind,
+        timings: list[Timing] | None,
+        download: bool,
+        into: Array | None,
+    ) -> Output:
+        calls = self.prepare(plan)
+        if len(self._tables) > 32:
+            self._tables.clear()
+        upload = download or len(tiling.tiles) > 1 or "src" not in self._pool.held
+        self._pool.reserve(tiling.sizes, self.memory)
+        output = room_for(plan, source.shape[1], source.shape[0], into)
+        events: list[tuple[str, Any]] = []
+
+        def value_of(parameter: Parameter) -> Any:
+            value = bind(parameter)
+            return self._table(value) if isinstance(value, np.ndarray) else value
+
+        def launch(numbers: tuple[int, ...], extent: Extent, tile: int) -> None:
+            for number in numbers:
+                call = calls[number]
+                call.set_arguments(self._pool, extent, tile, value_of)
+                sizes = index_space(call.kernel, extent)
+                event = self._cl.enqueue_nd_range_kernel(self._queue, call.compiled, *sizes)
+                events.append((call.kernel.launch.name, event))
+
+        for phase in tiling.phases:
+            launch(phase.first, tiling.tiles[0], 0)
+            for tile, extent in enumerate(tiling.tiles):
+                if upload:
+                    events.append(("upload", self._upload(plan, extent, source)))
+                launch(phase.each, extent, tile)
+                if download and phase is tiling.phases[-1]:
+                    events += [("download", e) for e in self._download(plan, extent, output)]
+            launch(phase.last, tiling.tiles[0], 0)
+        if download:
+            events += [("download", e) for e in self._find(output)]
+        self._queue.finish()
+        if timings is not None:
+            timings += timed(events)
+        return output if download else Output({}, None, {})
+
+    def _new_buffer(self, size: int) -> Any:
+        return self._cl.Buffer(self._context, self._cl.mem_flags.READ_WRITE, size)
+
+    def _abandon(self) -> None:
+        """Wait for what is still to be done of an image that failed, and give all memory back."""
+        with suppress(self._cl.Error):
+            self._queue.finish()
+        with suppress(self._cl.Error):
+            self._tables.clear()
+            self._pool.release()
+
+    def _table(self, table: Array) -> Any:
+        """A small constant array on the device, uploaded once."""
+        cl = self._cl
+        if id(table) not in self._tables:
+            flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
+            # The array is held so that its id stays its own.
+            self._tables[id(table)] = table, cl.Buffer(self._context, flags, hostbuf=table)
+        return self._tables[id(table)][1]
+
+    def _upload(self, plan: Plan, extent: Extent, image: Array) -> Any:
+        box = extent.stored
+        dtype = np.float16 if plan.half else np.float32
+        part = np.ascontiguousarray(image[box.top : box.bottom, box.left : box.right], dtype)
+        event = self._cl.enqueue_copy(self._queue, self._pool.held["src"], part, is_blocking=False)
+        if part.flags.owndata:
+            event.wait()  # or the event would hold the copy until the image is done
+        return event
+
+    def _download(self, plan: Plan, extent: Extent, output: Output) -> Iterator[Any]:
+        """Bring the core of a tile into the whole images."""
+        core, stored, held = extent.core, extent.stored, self._pool.held
+        if output.encoded is not None:
+            channels = output.encoded.size // (extent.width * extent.height)
+            first = core.left - stored.left, core.top - stored.top
+            if core.width == extent.width:
+                rows = output.encoded[core.top : core.bottom]
+                start = first[1] * core.width * channels
+                yield self._cl.enqueue_copy(
+                    self._queue, rows, held["dst"], src_offset=start, is_blocking=False
+                )
+            else:
+                yield self._cl.enqueue_copy(
+                    self._queue,
+                    output.encoded,
+                    held["dst"],
+                    buffer_origin=(first[0] * channels, first[1], 0),
+                    host_origin=(core.left * channels, core.top, 0),
+                    region=(core.width * channels, core.height, 1),
+                    buffer_pitches=(stored.width * channels,),
+                    host_pitches=(extent.width * channels,),
+                )
+        if not output.images:
+            return
+        plane = np.empty(extent.plane_bytes // 4, np.float32)
+        height = extent.padded_height + 2 * plan.border
+        top = plan.border + core.top - stored.top
+        left = border_left(plan.border, extent.lanes) + core.left - stored.left
+        for number, image in output.images.items():
+            whole = image.reshape(extent.height, extent.width, -1)
+            part = whole[core.top : core.bottom, core.left : core.right]
+            for channel, slot in enumerate(plan.slots[number]):
+                yield self._cl.enqueue_copy(
+                    self._queue, plane, held[f"slot{slot}"], is_blocking=True
+                )
+                rows = plane[: height * extent.pitch].reshape(height, extent.pitch)
+                part[..., channel] = rows[top : top + core.height, left : left + core.width]
+
+    def _find(self, output: Output) -> Iterator[Any]:
+        """Bring what was found in the image."""
+        for step, values in output.found.items():
+            yield self._cl.enqueue_copy(self._queue, values, self._pool.held[f"found.{step}"])
+
+    def copy_speed(self, size: int = 96 * 2**20) -> float:
+        """Bytes a second, read plus written, of the device's own buffer copy; the best of five."""
+        cl = self._cl
+        one, two = (cl.Buffer(self._context, cl.mem_flags.READ_WRITE, size) for _ in range(2))
+        best = 0.0
+        for _ in range(6):
+            start = time.perf_counter()
+            cl.enqueue_copy(self._queue, two, one, byte_count=size).wait()
+            best = max(best, 2 * size / (time.perf_counter() - start))
+        one.release()
+        two.release()
+        return best
+
+
+def open_device(selector: str | None, memory: int | None = None) -> Device | None:
+    """The device that a selector names, as :func:`choose` has it; None for "numpy".
+
+    ``memory`` is how many bytes of it may be used.
+
+    Raises:
+        DeviceError: there is none, none matches, or the one that was asked for cannot be used.
+    """
+    if selector is not None and selector.lower() == "numpy":
+        return None
+    return Device(choose(selector, find_devices()), memory)
+
+
+def open_devices(selectors: Sequence[str] = (), memory: int | None = None) -> list[Device]:
+    """The devices that selectors name, as :func:`choose_all` has them; none for "numpy".
+
+    ``memory`` is how many bytes may be used of each; without it, CPUs share what there is.
+
+    Raises:
+        DeviceError: as :func:`open_device`, or "numpy" stands beside others.
+    """
+    if any(selector.lower() == "numpy" for selector in selectors):
+        if len(selectors) > 1:
+            raise DeviceError(f"found devices {', '.join(selectors)}; numpy is used alone")
+        return []
+    chosen = choose_all(selectors, find_devices())
+    sharing = sum(found.type != "GPU" for found in chosen)
+    return [
+        Device(found, memory or usable_memory(found) // (1 if found.type == "GPU" else sharing))
+        for found in chosen
+    ]

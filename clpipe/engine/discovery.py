@@ -1,0 +1,190 @@
+"""TODO."""
+
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from clpipe.base.errors import DeviceError
+from clpipe.base.memory import available_memory
+from clpipe.base.text import one_of
+
+_process: int | None = None  # the one that has used OpenCL, of this and those before it
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """A device that an OpenCL platform offers. ``problem`` says why it cannot be used, if so."""
+
+    index: int
+    platform: str
+    name: str
+    type: str  # "GPU", "CPU", "emulator" or "accelerator"
+    version: str  # of OpenCL, as the device tells it
+    driver: str
+    compute_units: int
+    memory: int  # bytes
+    max_buffer: int  # bytes
+    lanes: int
+    problem: str
+    handle: Any
+
+    @property
+    def label(self) -> str:
+        """Name and platform, as people tell devices apart."""
+        return f"{self.name.strip()} ({self.platform})"
+
+
+def find_devices() -> list[DeviceInfo]:
+    """Every device of every OpenCL platform, in the platforms' order.
+
+    Raises:
+        DeviceError: pyopencl cannot be loaded, or this process cannot use it.
+    """
+    global _process
+    if _process not in (None, os.getpid()):
+        raise DeviceError(
+            "this process was forked from one that had used OpenCL, which would hang here; let it "
+            'be spawned (multiprocessing\'s "spawn" or "forkserver"), or fork before'
+        )
+    _process = os.getpid()
+    try:
+        import pyopencl as cl
+    except (ImportError, OSError) as error:
+        raise DeviceError(f"pyopencl cannot be loaded: {error}") from None
+    try:
+        platforms = cl.get_platforms()
+    except cl.Error:
+        return []
+    found: list[DeviceInfo] = []
+    for platform in platforms:
+        try:
+            devices = platform.get_devices()
+        except cl.Error:
+            continue
+        for device in devices:
+            kind = device.type
+            type_ = "GPU" if kind & cl.device_type.GPU else "CPU"
+            if not kind & (cl.device_type.GPU | cl.device_type.CPU):
+                type_ = "accelerator"
+            if "oclgrind" in platform.name.lower():
+                type_ = "emulator"  # it finds errors in kernels, slowly, and says it is all types
+            found.append(
+                DeviceInfo(
+                    index=len(found),
+                    platform=platform.name.strip(),
+                    name=device.name.strip(),
+                    type=type_,
+                    version=device.version.strip(),
+                    driver=device.driver_version.strip(),
+                    compute_units=device.max_compute_units,
+                    memory=device.global_mem_size,
+                    max_buffer=device.max_mem_alloc_size,
+                    lanes=lanes_for(type_, platform.name, device),
+                    problem=problem_with(type_, platform.name, device),
+                    handle=device,
+                )
+            )
+    return found
+
+
+def lanes_for(type_: str, platform: str, device: Any) -> int:
+    """How many lanes the kernels are compiled for: one vector register on a CPU, 1 on a GPU.
+
+    PoCL's compiler takes 8 everywhere: PoCL 3.0 (LLVM 14) crashes on 16 on CPUs that have AVX-512
+    but are newer than it (seen on AMD Zen 4), and gains nothing from 16 on the others.
+    """
+    if type_ != "CPU":
+        return 1
+    if "Portable Computing" in platform or device.native_vector_width_float < 16:
+        return 8
+    return 16
+
+
+def problem_with(type_: str, platform: str, device: Any) -> str:
+    """Why a device cannot be used, or nothing."""
+    if type_ == "accelerator":
+        return "neither a GPU nor a CPU (an emulator or an FPGA)"
+    if not device.available or not device.compiler_available:
+        return "it is not available or has no compiler"
+    if "Portable Computing" in platform and not shutil.which("ld"):
+        return (
+            "PoCL needs a linker and there is no 'ld' on the PATH "
+            "(Debian, Ubuntu: apt-get install binutils; conda: binutils)"
+        )
+    return ""
+
+
+def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
+    """The device to use: the first usable GPU, else the first usable CPU, or what was asked for.
+
+    Args:
+        selector: an index from ``clpipe devices``, or a part of a device's or platform's name.
+
+    Raises:
+        DeviceError: there is none, none matches, or the one that was asked for cannot be used.
+    """
+    if not devices:
+        raise DeviceError(
+            "no OpenCL platform was found; install one (pip install 'pyopencl[pocl]', or your "
+            "GPU's driver), or use --device numpy, which is slow but needs none"
+        )
+    if selector is not None:
+        wanted = [
+            d
+            for d in devices
+            if (selector == str(d.index) if selector.isdecimal() else matches(selector, d))
+        ]
+        if not wanted:
+            names = [f"{d.index}: {d.label}" for d in devices]
+            raise DeviceError(one_of("device", selector, [*names, "numpy"]))
+        usable = [d for d in wanted if not d.problem]
+        if not usable:
+            raise DeviceError(f"device {wanted[0].label}: {wanted[0].problem}")
+        return usable[0]
+    usable = [d for kind in ("GPU", "CPU") for d in devices if d.type == kind and not d.problem]
+    if not usable:
+        reasons = "; ".join(f"{d.label}: {d.problem or 'an emulator'}" for d in devices)
+        raise DeviceError(f"no usable OpenCL device ({reasons}); or use --device numpy")
+    return usable[0]
+
+
+def choose_all(selectors: Sequence[str], devices: list[DeviceInfo]) -> list[DeviceInfo]:
+    """The devices that selectors name, each as :func:`choose` has it, each device once.
+
+    Without selectors these are the one that is chosen by default and, if it is a GPU, all others of
+    the same name, which give the same bits.
+
+    Raises:
+        DeviceError: as :func:`choose`.
+    """
+    if not selectors:
+        first = choose(None, devices)
+        return [first] + [
+            d
+            for d in devices
+            if d.type == first.type == "GPU" and d.name == first.name and not d.problem
+            if d.index != first.index
+        ]
+    chosen = [choose(selector, devices) for selector in selectors]
+    return list({d.index: d for d in chosen}.values())
+
+
+def matches(selector: str, device: DeviceInfo) -> bool:
+    """Whether a selector is a part of a device's name, type or platform ('pocl' counts)."""
+    alias = " pocl" if "Portable Computing" in device.platform else ""
+    names = f"{device.name} {device.platform} {device.type}{alias}"
+    return bool(selector) and selector.lower() in names.lower()
+
+
+def usable_memory(chosen: DeviceInfo) -> int:
+    """Bytes that buffers on a device may take by default.
+
+    Of a GPU's, a tenth is left to others. A CPU shares its memory with everybody: half of what is
+    available now.
+    """
+    if chosen.type == "GPU":
+        return chosen.memory * 9 // 10
+    available = available_memory()
+    return min(chosen.memory, available // 2) if available else chosen.memory

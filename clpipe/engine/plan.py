@@ -1,0 +1,355 @@
+"""From a chain of stages to launches and buffer slots. Pure: it needs no device.
+
+Passes go into groups, and a group becomes one launch. A stencil opens a group, because its
+neighbours must be there first; pointwise passes join the group before them; sums and a kept
+intermediate close it. What crosses from one launch to the next is an image of one to three planes;
+a plane lives in a slot from the launch that writes it to the last one that reads it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from clpipe.chain.chain import Chain, Step
+from clpipe.stage import Access, Argument, Kind, Literal, Pass
+
+
+@dataclass(frozen=True)
+class Op:
+    """One pass of one step, with the types of its run-time arguments and its literals."""
+
+    step: str
+    kernel: str  # file, in clpipe's own folder of kernels unless it is a whole path
+    pass_: Pass
+    kind: Kind  # of what it gives
+    types: tuple[tuple[str, str], ...]  # argument -> OpenCL type
+    literals: tuple[tuple[str, str], ...]  # argument -> OpenCL text
+
+
+@dataclass(frozen=True)
+class Image:
+    """An image between launches."""
+
+    number: int
+    kind: Kind
+
+
+@dataclass(frozen=True)
+class Read:
+    """An image as a launch reads it: passes in ``prologue`` are redone at each tap."""
+
+    image: Image
+    prologue: tuple[Op, ...] = ()
+
+
+@dataclass(frozen=True)
+class Launch:
+    """One kernel call over the image.
+
+    ``reads`` is empty where the launch reads the source; if the first op is a stencil they are
+    its images in order, else the one image that is loaded. ``writes`` is stored as planes,
+    ``encodes`` says that eight-bit pixels are written, ``sums`` is a SUMS pass fed on the way.
+    """
+
+    name: str
+    ops: tuple[Op, ...]
+    reads: tuple[Read, ...] = ()
+    writes: Image | None = None
+    encodes: bool = False
+    sums: Op | None = None
+    rows: int = 2  # of a work item's block
+    columns: int = 1  # of it, in vectors
+
+    @property
+    def stencil(self) -> Op | None:
+        """The stencil that opens the group, if one does."""
+        return self.ops[0] if self.ops and self.ops[0].pass_.access is Access.STENCIL else None
+
+
+@dataclass(frozen=True)
+class Lines:
+    """One launch that fills the line tables of all steps that have one."""
+
+    ops: tuple[Op, ...]
+    name: str = "lines"
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """A histogram's start: each work item counts its share of a stored image's rows."""
+
+    op: Op
+    reads: tuple[Read]
+    name: str
+
+
+@dataclass(frozen=True)
+class Reduce:
+    """A reduction goes on: sums of blocks to sums of work items, or counts to one histogram."""
+
+    op: Op
+    name: str
+
+
+@dataclass(frozen=True)
+class Finalize:
+    """The end of a reduction: one work item makes the numbers out of the sums or the histogram."""
+
+    op: Op
+    name: str
+
+
+AnyLaunch = Launch | Lines | Histogram | Reduce | Finalize
+
+
+def reads_of(launch: AnyLaunch) -> tuple[Read, ...]:
+    """The stored images that a launch reads."""
+    return launch.reads if isinstance(launch, Launch | Histogram) else ()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that is to be done to one image, in order."""
+
+    source: Kind
+    half: bool
+    launches: tuple[AnyLaunch, ...]
+    slots: dict[int, tuple[int, ...]]  # image number -> slots of its planes
+    slot_count: int = 0
+    kept: tuple[tuple[str, Image], ...] = ()  # step -> its image
+    final: Image | None = None  # the last image as float planes
+    encoded: Kind | None = None  # the kind that is encoded to eight bits
+    border: int = 0
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        # A plan is looked up for each image, and hashing all that is in it takes a while.
+        return hash((self.source, self.half, self.launches, self.kept, self.final, self.encoded))
+
+    def bytes_per_pixel(self, lanes: int) -> float:
+        """Device memory a pixel takes: source, slots, partial sums and eight-bit result."""
+        source = len(self.source.channels) * (2 if self.half else 4)
+        sums = [x for x in self.launches if isinstance(x, Launch) and x.sums]
+        encoded = len(self.encoded.channels) if self.encoded else 0
+        return source + 4 * self.slot_count + sum(16 / (lanes * x.rows) for x in sums) + encoded
+
+
+class _Planner:
+    def __init__(self, source: Kind, fold: bool) -> None:
+        self.kind = source
+        self.fold = fold
+        self.launches: list[AnyLaunch] = []
+        self.lines: list[Op] = []
+        self.images: list[Image] = []
+        self.group: Launch | None = Launch("load", ())  # open, still to be stored
+        self.stored: Image | None = None  # the current image, when no group is open
+
+    def close(self, sums: Op | None = None) -> Image:
+        """End the open group and store its result; the stored current image if none is open."""
+        if self.group is None:
+            assert self.stored is not None
+            if not sums:
+                return self.stored
+            self.group = Launch("sums", (), (Read(self.stored),))
+        elif sums and self.group.stencil and self.group.stencil.pass_.block:
+            # Sums go over narrower blocks.
+            self.group = Launch("sums", (), (Read(self.close()),))
+        if sums and not self.group.ops and self.group.reads:
+            image = self.group.reads[0].image  # nothing new to store
+            self.emit(replace(self.group, sums=sums))
+        else:
+            image = Image(len(self.images), self.kind)
+            self.images.append(image)
+            self.emit(replace(self.group, writes=image, sums=sums))
+        self.group, self.stored = None, image
+        return image
+
+    def emit(self, group: Launch) -> None:
+        names = list(dict.fromkeys(op.step for op in group.ops))
+        block = group.stencil.pass_.block if group.stencil else 0
+        shared = block or group.sums or any(op.pass_.random for op in group.ops)
+        name = names[0] if len(names) == 1 else f"{names[0]}..{names[-1]}" if names else group.name
+        if group.stencil and group.stencil.pass_.function != group.stencil.step:
+            name = name.replace(
+                group.stencil.step, f"{group.stencil.step}.{group.stencil.pass_.function}", 1
+            )
+        rows = 4 if shared else 2
+        self.launches.append(replace(group, name=name, rows=rows, columns=max(block, 1)))
+
+    def input_of_stencil(self) -> Read:
+        """The current image for a stencil: cheap pointwise passes on a stored one are redone."""
+        group = self.group
+        loaded = group and group.reads and not group.stencil
+        if group and loaded and self.fold and all(op.pass_.cheap for op in group.ops):
+            self.group, self.stored = None, group.reads[0].image
+            return Read(group.reads[0].image, group.ops)
+        return Read(self.close())
+
+    def add_step(self, ops: Sequence[Op]) -> None:
+        local: dict[str, Read] = {}
+        if any(op.pass_.access is Access.STENCIL and "src" in op.pass_.reads for op in ops):
+            local["src"] = self.input_of_stencil()
+        written = "src"
+        for op in ops:
+            pass_ = op.pass_
+            match pass_.access:
+                case Access.LINES:
+                    self.lines.append(op)
+                    continue
+                case Access.SUMS:
+                    self.close(sums=op)
+                    self.launches.append(Reduce(op, f"{op.step}.add_up"))
+                    self.launches.append(Finalize(op, f"{op.step}.{pass_.finish}"))
+                    continue
+                case Access.HISTOGRAM:
+                    stored = Read(self.close())
+                    self.launches.append(Histogram(op, (stored,), f"{op.step}.count"))
+                    self.launches.append(Reduce(op, f"{op.step}.add_up"))
+                    self.launches.append(Finalize(op, f"{op.step}.{pass_.finish}"))
+                    continue
+                case Access.STENCIL:
+                    if written not in local:
+                        local[written] = Read(self.close())
+                    self.group = Launch("", (op,), tuple(local[name] for name in pass_.reads))
+                case Access.POINTWISE | Access.CURVE:
+                    if self.group is None:
+                        assert self.stored is not None
+                        self.group = Launch("", (), (Read(self.stored),))
+                    self.group = replace(self.group, ops=(*self.group.ops, op))
+            self.kind, written = op.kind, pass_.writes
+
+
+def ops_of(step: Step, arguments: Mapping[str, Argument]) -> tuple[Op, ...]:
+    """The passes of a step with the types of its arguments, which decide the kernels' signatures.
+
+    Two chains whose steps have the same names and the same of these have the same plan.
+    """
+    passes = step.method.passes()
+    if not passes:
+        return ()
+    types, literals = [], []
+    for name, value in arguments.items():
+        if isinstance(value, Literal):
+            literals.append((name, value.text))
+        elif isinstance(value, np.ndarray):
+            types.append((name, "__global const float *"))
+        else:
+            types.append((name, {"f": "float", "u": "uint", "i": "int"}[value.dtype.kind]))
+    kernel = f"{step.method.kernel}.cl"
+    if step.stage.folder:
+        kernel = str(step.stage.folder / kernel)
+    given = tuple(types), tuple(literals)
+    return tuple(Op(step.name, kernel, p, p.kind or step.stage.writes, *given) for p in passes)
+
+
+def make_plan(
+    chain: Chain,
+    half: bool = True,
+    keep: Sequence[str] = (),
+    encode: bool = True,
+    final: bool = False,
+    fold: bool = True,
+) -> Plan:
+    """The plan of a chain.
+
+    Args:
+        half: the source holds half floats, not floats.
+        keep: steps whose image is wanted.
+        encode: the last image is wanted in eight bits.
+        final: the last image is wanted in float. If it is not wanted at all, the plan ends with
+            the last step to keep.
+        fold: let a stencil redo cheap passes at its taps. It must be off for images one pixel
+            wide or high: mirroring cannot keep the Bayer phase there.
+
+    Raises:
+        RequestError: a step to keep that the chain has not.
+    """
+    for name in keep:
+        chain.step_named(name)
+    if not (encode or final):
+        chain = chain.through(keep)
+    last = chain.steps[-1].name
+    final = final or last in keep
+    planner = _Planner(chain.source, fold)
+    kept: dict[str, Image] = {}
+    for step in chain.steps:
+        planner.add_step(ops_of(step, step.method.arguments(step.context)))
+        if step.name in keep and step.name != last:
+            kept[step.name] = planner.close()
+    group = planner.group or Launch("encode", (), (Read(planner.close()),))
+    final_image = None
+    if final:
+        final_image = Image(len(planner.images), planner.kind)
+        planner.images.append(final_image)
+        if last in keep:
+            kept[last] = final_image
+    planner.emit(replace(group, writes=final_image, encodes=encode))
+    launches = list(planner.launches)
+    if planner.lines:
+        launches.insert(0, Lines(tuple(planner.lines)))
+    pinned = {image.number for image in kept.values()}
+    if final_image:
+        pinned.add(final_image.number)
+    slots, count = assign_slots(launches, planner.images, pinned)
+    radii = [x.stencil.pass_.radius for x in launches if isinstance(x, Launch) and x.stencil]
+    return Plan(
+        source=chain.source,
+        half=half,
+        launches=tuple(launches),
+        slots=slots,
+        slot_count=count,
+        kept=tuple(kept.items()),
+        final=final_image,
+        encoded=chain.result if encode else None,
+        border=max(radii, default=0),
+    )
+
+
+def assign_slots(
+    launches: Sequence[AnyLaunch], images: Sequence[Image], pinned: set[int]
+) -> tuple[dict[int, tuple[int, ...]], int]:
+    """Slots for the planes of every image, by last use; those of ``pinned`` are never reused.
+
+    Returns the slots of each image number, and how many slots there are.
+    """
+    last_use = {
+        read.image.number: i for i, launch in enumerate(launches) for read in reads_of(launch)
+    }
+    slots: dict[int, tuple[int, ...]] = {}
+    free: list[int] = []
+    count = 0
+    for i, launch in enumerate(launches):
+        if isinstance(launch, Launch) and launch.writes:
+            planes = len(launch.writes.kind.channels)
+            while len(free) < planes:
+                free.append(count)
+                count += 1
+            slots[launch.writes.number] = tuple(free[:planes])
+            del free[:planes]
+        for read in {read.image.number for read in reads_of(launch)}:
+            if last_use[read] == i and read not in pinned:
+                free.extend(slots[read])
+    return slots, count
+
+
+def launch_bytes(plan: Plan, launch: AnyLaunch, lanes: int) -> float:
+    """Bytes a pixel that a launch reads and writes in device memory, each sample once."""
+    if isinstance(launch, Reduce) and launch.op.pass_.access is Access.SUMS:
+        return 16 / (lanes * 4)
+    total = float(sum(4 * len(read.image.kind.channels) for read in reads_of(launch)))
+    if not isinstance(launch, Launch):
+        return total
+    if not launch.reads:
+        total += len(plan.source.channels) * (2 if plan.half else 4)
+    if launch.writes:
+        total += 4 * len(launch.writes.kind.channels)
+    if launch.encodes and plan.encoded:
+        total += len(plan.encoded.channels)
+    if launch.sums:
+        total += 16 / (lanes * launch.rows)
+    return total

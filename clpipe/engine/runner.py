@@ -1,0 +1,210 @@
+"""One image through a chain, on a device or in NumPy."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from clpipe.base.errors import ImageError
+from clpipe.base.types import Array, Floats
+from clpipe.chain.chain import Chain, Step
+from clpipe.chain.registry import user_code_errors
+from clpipe.engine.codegen import Parameter
+from clpipe.engine.device import Device, Timing
+from clpipe.engine.plan import Finalize, Plan, make_plan, ops_of
+from clpipe.reference.curve import compose, to_8_bit
+from clpipe.reference.random import Stream, stream_of
+from clpipe.stage import Frame, NoiseScope
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came out of a chain.
+
+    ``final`` is the last image in float32, ``encoded`` the same in eight bits, ``kept`` the images
+    of the steps that were asked for, ``found`` what stages found in the image.
+    """
+
+    final: Floats | None
+    encoded: Array | None
+    kept: dict[str, Floats]
+    found: dict[str, dict[str, float]]
+
+    @property
+    def image(self) -> Array:
+        """The last image: in eight bits where these were asked for, else in float."""
+        image = self.final if self.encoded is None else self.encoded
+        assert image is not None
+        return image
+
+
+def streams(chain: Chain, step: Step, image_key: str) -> dict[NoiseScope, Stream]:
+    """The random streams of a step for one image.
+
+    Image noise is keyed on the seed and the image key, fixed pattern noise on the camera.
+    """
+    return {
+        NoiseScope.IMAGE: stream_of(f"image:{chain.seed}:{image_key}", step.name),
+        NoiseScope.CAMERA: stream_of(f"camera:{chain.camera.name}", step.name),
+    }
+
+
+class Runner:
+    """Runs one chain over images, on a device, or in NumPy where there is none.
+
+    Args:
+        chain: the chain.
+        device: where to run; None is NumPy.
+        keep: steps whose image is wanted.
+        encode: whether the last image is wanted in eight bits.
+        final: whether the last image is wanted in float.
+    """
+
+    def __init__(
+        self,
+        chain: Chain,
+        device: Device | None,
+        keep: Sequence[str] = (),
+        encode: bool = True,
+        final: bool = False,
+    ) -> None:
+        self.chain = chain
+        self.device = device
+        self.keep = tuple(keep)
+        self.encode = encode
+        self.final = final
+        self._arguments = {s.name: s.method.arguments(s.context) for s in chain.steps}
+        self._own_plans: dict[tuple[bool, bool], Plan] = {}
+        # Those that runners of other chains have made too, by the structure of a chain.
+        self._plans: dict[Any, Plan] = {}
+        self._tables: dict[Any, tuple[Sequence[Array], Array]] = {}
+
+    def of(self, chain: Chain) -> "Runner":
+        """The same for another chain.
+
+        Where only values are different, nothing is planned or compiled again.
+        """
+        other = Runner(chain, self.device, self.keep, self.encode, self.final)
+        other._plans, other._tables = self._plans, self._tables
+        return other
+
+    def plan(self, half: bool = True, fold: bool = True) -> Plan:
+        """The plan for a source of half floats or floats."""
+        chain, key = self.chain, (half, fold)
+        if key not in self._own_plans:
+            ops = tuple((s.name, ops_of(s, self._arguments[s.name])) for s in chain.steps)
+            structure = (half, fold, chain.source, chain.result, ops)
+            plan = self._plans.get(structure)
+            if plan is None:
+                plan = make_plan(chain, half, self.keep, self.encode, self.final, fold)
+                self._plans[structure] = plan
+            self._own_plans[key] = plan
+        return self._own_plans[key]
+
+    def warm_up(self, half: bool = True) -> None:
+        """Compile everything, so that the first image does not wait for it."""
+        if self.device:
+            shape = (8, 8, 3)[: 2 if len(self.chain.source.channels) == 1 else 3]
+            self.run(np.zeros(shape, np.float16 if half else np.float32), "")
+
+    def run(
+        self,
+        image: Array,
+        image_key: str,
+        timings: list[Timing] | None = None,
+        download: bool = True,
+        into: Array | None = None,
+    ) -> Result:
+        """Put one image through.
+
+        Args:
+            image: (height, width, 3) linear RGB, or (height, width) for a chain that starts on a
+                mosaic; finite, of float16 or any type that fits into float32.
+            image_key: what the image's noise is keyed on.
+            timings: is given one entry a launch (devices only).
+            download: False leaves the results on the device (for measuring).
+            into: where the eight-bit pixels are put (devices only), of their shape; a batch that
+                uses its arrays again spares the time that new memory takes.
+
+        Raises:
+            ImageError: an image of the wrong shape, or one that does not fit the device.
+        """
+        channels = len(self.chain.source.channels)
+        shape = image.shape[2] if image.ndim == 3 else 1
+        if image.ndim not in (2, 3) or shape != channels or 0 in image.shape:
+            raise ImageError(
+                f"found an image of shape {image.shape}, but the chain starts on "
+                f"{self.chain.source.label} with {channels} channel(s)"
+            )
+        if not (self.encode or self.final or self.keep):
+            return Result(None, None, {}, {})
+        if not self.device:
+            return self._run_numpy(np.asarray(image, np.float32), image_key)
+        plan = self.plan(image.dtype == np.float16, fold=min(image.shape[:2]) > 1)
+        keys: dict[str, dict[NoiseScope, Stream]] = {}
+
+        def bind(parameter: Parameter) -> Any:
+            if parameter.role == "table8":
+                return self._composed(parameter.item)
+            if parameter.role == "value":
+                return self._arguments[parameter.step][parameter.item]
+            if parameter.step not in keys:
+                step = self.chain.step_named(parameter.step)
+                keys[parameter.step] = streams(self.chain, step, image_key)
+            of = keys[parameter.step]
+            if parameter.item == "stage":
+                return np.uint32(of[NoiseScope.IMAGE].stage)
+            stream = of[NoiseScope(parameter.item[:-1])]
+            return np.uint32(stream.key1 if parameter.item.endswith("1") else stream.key0)
+
+        output = self.device.run(plan, image, bind, timings, download, into)
+        names = {x.op.step: x.op.pass_.found for x in plan.launches if isinstance(x, Finalize)}
+        return Result(
+            final=output.images.get(plan.final.number) if plan.final else None,
+            encoded=output.encoded,
+            kept={name: output.images[i.number] for name, i in plan.kept if output.images},
+            found={
+                step: dict(zip(names[step], map(float, values), strict=False))
+                for step, values in output.found.items()
+            },
+        )
+
+    def _composed(self, steps: str) -> Array:
+        """The table of these curves and the conversion to eight bits, all in one."""
+        curves: list[Array] = []
+        for name in steps.split(","):
+            table = self._arguments[name]["table"]
+            assert isinstance(table, np.ndarray)
+            curves.append(table)
+        # A curve's table is one object for the same parameters; held, its id stays its own.
+        key = tuple(map(id, curves))
+        if key not in self._tables:
+            *first, last = curves
+            composed: Array = to_8_bit(last)
+            for curve in reversed(first):
+                composed = compose(curve, composed)
+            if len(self._tables) >= 32:
+                self._tables.clear()
+            self._tables[key] = curves, composed
+        return self._tables[key][1]
+
+    def _run_numpy(self, image: Floats, image_key: str) -> Result:
+        kept: dict[str, Floats] = {}
+        found: dict[str, dict[str, float]] = {}
+        whole = self.encode or self.final
+        steps = (self.chain if whole else self.chain.through(self.keep)).steps
+        for step in steps:
+            frame = Frame(step.context, streams(self.chain, step, image_key), {})
+            with user_code_errors(f"stage {step.name}", step.stage.folder):
+                image = step.method.reference(image, frame)
+            if step.name in self.keep:
+                kept[step.name] = image
+            if frame.found:
+                found[step.name] = frame.found
+        return Result(
+            final=image if self.final or steps[-1].name in self.keep else None,
+            encoded=to_8_bit(image) if self.encode else None,
+            kept=kept,
+            found=found,
+        )

@@ -1,0 +1,76 @@
+"""How results are written: the [output] table of a configuration."""
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+SIMULATED = "clpipe "  # what the model of a camera begins with in a DNG of clpipe
+
+
+FULL_FRAME = 36.0  # mm, the longer side of 35 mm film
+
+
+Length = Annotated[float, Field(gt=0, le=10000, allow_inf_nan=False)]
+
+
+class Output(BaseModel):
+    """How JPEGs are encoded, and what files say of the shot; None is not said."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 97
+    jpeg_subsampling: Literal["4:4:4", "4:2:2", "4:2:0"] = "4:2:2"
+    jpeg_progressive: bool = False
+    exposure_time: Annotated[float, Field(gt=0, le=86400, allow_inf_nan=False)] | None = None  # s
+    focal_length: Length | None = None  # mm
+    sensor_width: Length | None = None  # mm, along the longer side of the image
+
+    def filled(self, shot: Mapping[str, float]) -> "Output":
+        """The same, with what a source says of its shot where nothing else is said.
+
+        >>> Output(focal_length=24.0).filled({"focal_length": 50.0, "exposure_time": 0.5}).shot
+        {'exposure_time': 0.5, 'focal_length': 24.0}
+        """
+        return self.model_copy(update={**shot, **self.shot})
+
+    @property
+    def shot(self) -> dict[str, float]:
+        """What is known of the shot, by the names of the fields."""
+        return self.model_dump(include=SHOT, exclude_none=True)
+
+
+SHOT = {"exposure_time", "focal_length", "sensor_width"}
+
+
+def exif(iso: float, shot: Output, longer_side: int) -> dict[str, float]:
+    """The EXIF (2.3, 2010) of a shot, by the names of its tags.
+
+    Args:
+        iso: the ISO; EXIF holds at most 65535.
+        shot: what is said of it.
+        longer_side: of the image, in pixels.
+
+    >>> shot = Output(focal_length=24.0, sensor_width=24.0)
+    >>> for name, value in exif(800, shot, 6000).items():
+    ...     print(name, value)
+    PhotographicSensitivity 800
+    FocalLength 24.0
+    FocalLengthIn35mmFilm 36
+    FocalPlaneXResolution 2500.0
+    FocalPlaneYResolution 2500.0
+    FocalPlaneResolutionUnit 3
+    """
+    tags: dict[str, float] = {"PhotographicSensitivity": min(round(iso), 65535)}
+    if shot.exposure_time:
+        tags["ExposureTime"] = shot.exposure_time
+    if shot.focal_length:
+        tags["FocalLength"] = shot.focal_length
+    if shot.focal_length and shot.sensor_width:
+        equivalent = round(shot.focal_length * FULL_FRAME / shot.sensor_width)
+        tags["FocalLengthIn35mmFilm"] = min(max(equivalent, 1), 65535)
+    if shot.sensor_width:
+        per_cm = longer_side / shot.sensor_width * 10
+        tags |= {"FocalPlaneXResolution": per_cm, "FocalPlaneYResolution": per_cm}
+        tags["FocalPlaneResolutionUnit"] = 3  # cm
+    return tags

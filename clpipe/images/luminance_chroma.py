@@ -1,0 +1,105 @@
+"""OpenEXR files of luminance and chroma. The only importer of OpenEXR."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clpipe.base.errors import ImageError
+from clpipe.base.text import printable
+from clpipe.base.types import Array, Floats
+from clpipe.images.colour import SRGB, rgb_to_xyz
+
+CHANNELS = ("Y", "RY", "BY")
+
+
+@dataclass(frozen=True)
+class DataWindow:
+    """RGB of a data window, (height, width, 3) float32, and where it and the picture lie.
+
+    ``x`` and ``y`` are its place in the display window, which is ``width`` x ``height``.
+    """
+
+    pixels: Floats
+    x: int
+    y: int
+    width: int
+    height: int
+    attributes: Mapping[str, Any]
+
+
+def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
+    """Read an EXR whose chroma is subsampled, which OpenImageIO cannot.
+
+    Raises:
+        ImageError: it is damaged, too large, deep, or has other subsampled channels.
+    """
+    import OpenEXR
+
+    def found(what: str) -> Any:
+        try:
+            file = OpenEXR.File(
+                str(path), separate_channels=True, header_only=what == "header", num_threads=1
+            )
+            return getattr(file, what)()
+        except Exception as error:  # the package raises what its C++ library did, of many types
+            raise ImageError(f"{path}: damaged: {printable(str(error))}") from None
+
+    header = found("header")
+    names = sorted(channel.name for channel in header["channels"])
+    if not set(CHANNELS) <= set(names) or header["type"] != OpenEXR.scanlineimage:
+        raise ImageError(
+            f"{path}: subsampled channels can be read as {', '.join(CHANNELS)} only; "
+            f"found {printable(', '.join(names))}"
+        )
+    (left, top), (right, bottom) = (corner.tolist() for corner in header["dataWindow"])
+    (x, y), (x_end, y_end) = (corner.tolist() for corner in header["displayWindow"])
+    size, picture = (right - left + 1, bottom - top + 1), (x_end - x + 1, y_end - y + 1)
+    for width, height in (size, picture):
+        if width < 1 or height < 1 or width * height > max_pixels:
+            raise ImageError(f"{path}: {width}x{height} pixels; at most {max_pixels} are read")
+    channels = found("channels")
+    luminance, red, blue = (channels[name] for name in CHANNELS)
+    planes = luminance.pixels, red.pixels, blue.pixels
+    sampling = [(c.xSampling, c.ySampling) for c in (luminance, red, blue)]
+    half = tuple((n + 1) // 2 for n in size[::-1])
+    shapes = [plane.shape for plane in planes]
+    if sampling != [(1, 1), (2, 2), (2, 2)] or shapes != [size[::-1], half, half]:
+        raise ImageError(f"{path}: its chroma is not subsampled by 2")
+    weights = rgb_to_xyz(header.get("chromaticities", SRGB))[1]
+    return DataWindow(to_rgb(*planes, weights), left - x, top - y, *picture, header)
+
+
+def to_rgb(luminance: Array, red: Array, blue: Array, weights: Array) -> Floats:
+    """RGB, (height, width, 3) float32, from luminance and subsampled chroma.
+
+    RY = (R - Y) / Y and BY = (B - Y) / Y (OpenEXR, ImfRgbaYca.h), at even rows and columns; linear
+    between them, which makes no new extremes of colour.
+
+    Args:
+        luminance: (height, width).
+        red: RY, one for each second row and column.
+        blue: BY, likewise.
+        weights: the luminance of red, green and blue.
+    """
+    y = luminance.astype(np.float32)
+    wr, wg, wb = (np.float32(weight) for weight in weights)
+    with np.errstate(all="ignore"):  # the file may hold infinity
+        r, b = ((upsampled(plane, y.shape) + 1) * y for plane in (red, blue))
+        return np.stack([r, (y - wr * r - wb * b) / wg, b], axis=-1)
+
+
+def upsampled(plane: Array, shape: tuple[int, ...]) -> Floats:
+    """A plane of twice the rows and columns, linear between the given ones.
+
+    >>> upsampled(np.array([[0, 1]]), (1, 4)).tolist()
+    [[0.0, 0.5, 1.0, 1.0]]
+    """
+    for axis, size in enumerate(shape):
+        given = np.moveaxis(plane.astype(np.float32), axis, 0)
+        wide = np.repeat(given, 2, axis=0)
+        wide[1:-1:2] = (given[:-1] + given[1:]) / 2
+        plane = np.moveaxis(wide[:size], 0, axis)
+    return plane

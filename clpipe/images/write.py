@@ -1,0 +1,141 @@
+"""TODO."""
+
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+from PIL import Image, ImageCms
+
+from clpipe.base.about import __version__
+from clpipe.base.files import write_beside
+from clpipe.base.types import Array, Floats
+from clpipe.images.encoding import exif
+from clpipe.images.read import HALF_MAX, _reason
+from clpipe.images.tags import ATTRIBUTES, Tags
+
+JPEG_MAX_SIDE = 65500
+
+
+# Else the time of writing is put in, and no two runs make the same bytes.
+NO_TIME = "1970:01:01 00:00:00"
+
+
+@cache
+def srgb_profile() -> bytes:
+    """An ICC profile of sRGB, always the same bytes."""
+    profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    profile[24:36] = bytes(12)  # the date of creation
+    return bytes(profile)
+
+
+def write_display(path: Path, pixels: Array, tags: Tags) -> None:
+    """Write a picture, (height, width[, 3]), as JPEG, PNG or TIFF, with EXIF.
+
+    Whole numbers of 8 or 16 bits get an sRGB profile; float samples (TIFF) do not. JPEG is encoded
+    as ``tags.output`` says. A TIFF's EXIF is without the ISO, for which OpenImageIO has no way.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    height, width = pixels.shape[:2]
+    channels = pixels.shape[2] if pixels.ndim == 3 else 1
+    samples = "float" if pixels.dtype.kind == "f" else pixels.dtype.name
+    spec = oiio.ImageSpec(width, height, channels, samples)
+    output = tags.output
+    jpeg = path.suffix == ".jpg"
+    spec.attribute("compression", f"jpeg:{output.jpeg_quality}" if jpeg else "zip")
+    if jpeg:
+        spec.attribute("jpeg:subsampling", output.jpeg_subsampling)
+        spec.attribute("jpeg:progressive", int(output.jpeg_progressive))
+    if channels == 3 and pixels.dtype.kind == "u":
+        icc = np.frombuffer(srgb_profile(), np.uint8)
+        spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(icc)}]"), icc)
+        spec.attribute("Exif:ColorSpace", 1)  # sRGB
+    spec.attribute("Make", tags.make)
+    spec.attribute("Model", tags.model)
+    spec.attribute("Software", f"clpipe {__version__}")
+    for name, value in exif(tags.iso, output, max(height, width)).items():
+        if name == "ExposureTime":
+            # OpenImageIO cuts off after the sixth digit, and 0.01 is 0.0099999998 in float.
+            above = float(np.nextafter(np.float32(value), np.float32(np.inf)))
+            spec.attribute(name, above)
+        else:
+            spec.attribute(f"Exif:{name}", value)
+    if tags.aperture:
+        spec.attribute("FNumber", tags.aperture)
+    if tags.taken:
+        spec.attribute("Exif:DateTimeOriginal", tags.taken)
+    if tags.taken or path.suffix == ".tif":
+        spec.attribute("DateTime", tags.taken or NO_TIME)
+    _write(path, spec, pixels.reshape(height, width, channels))
+
+
+def write_exr(
+    path: Path,
+    pixels: Floats,
+    channels: Sequence[str],
+    attributes: Mapping[str, str],
+    half: bool = False,
+) -> None:
+    """Write a float image, (height, width[, channel]), as OpenEXR (ZIP), channels named.
+
+    The names of ``attributes`` get clpipe's prefix in the file. Half holds 11 bits and at most
+    65504; what is beyond is clipped.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    height, width = pixels.shape[:2]
+    spec = oiio.ImageSpec(width, height, len(channels), oiio.HALF if half else oiio.FLOAT)
+    spec.channelnames = tuple(channels)
+    spec.attribute("compression", "zip")
+    spec.attribute("DateTime", NO_TIME)
+    for name, value in attributes.items():
+        spec.attribute(ATTRIBUTES + name, value)
+    data = np.clip(pixels, -HALF_MAX, HALF_MAX) if half else pixels
+    _write(path, spec, data.reshape(height, width, len(channels)))
+
+
+def _write(path: Path, spec: Any, pixels: Array) -> None:
+    """Write (height, width, channel) as OpenImageIO does, which does not hold the GIL.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+
+    def write(to: Path) -> None:
+        if to.suffix != ".jpg":
+            _encode(str(to), str(to), spec, pixels)
+            return
+        # libjpeg ends the process when it cannot write, so it writes to memory.
+        memory = os.memfd_create("jpeg")
+        with open(memory, "rb", buffering=0) as encoded:
+            _encode("jpeg", f"/proc/self/fd/{memory}", spec, pixels)
+            with open(to, "wb", buffering=0) as file:
+                shutil.copyfileobj(encoded, file, 8 << 20)
+
+    write_beside(path, write)
+
+
+def _encode(format_: str, to: str, spec: Any, pixels: Array) -> None:
+    """Write pixels in a format, which may be that of a file's name.
+
+    Raises:
+        OSError: they cannot be written.
+    """
+    file = oiio.ImageOutput.create(format_)
+    data = np.ascontiguousarray(pixels)
+    if file is None or not file.open(to, spec) or not file.write_image(data):
+        raise OSError(0, _reason(file.geterror() if file else oiio.geterror()))
+    if not file.close():
+        raise OSError(0, _reason(file.geterror()))
+
+
+def versions() -> dict[str, str]:
+    """The versions of what reads and writes files."""
+    return {"OpenImageIO": oiio.__version__, "Pillow": Image.__version__}  # type: ignore[attr-defined]

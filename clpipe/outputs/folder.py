@@ -1,0 +1,107 @@
+"""The folder that a run writes to: made, locked against other runs, and cleared of halves."""
+
+import contextlib
+import errno
+import fcntl
+import os
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from clpipe.base.errors import RequestError
+from clpipe.base.memory import in_words
+from clpipe.inputs.find import Job, Shard
+
+RESUMABLE = "what is finished is there, and the same command goes on"
+
+
+ROOM = 8 * 2**20  # bytes; a disk with less is full
+
+
+def trouble_with(folder: Path) -> str:
+    """Why nothing can be written to a folder, "" where it can."""
+    probe = folder / f".clpipe.{os.getpid()}"
+    try:
+        with open(probe, "wb") as file:
+            os.posix_fallocate(file.fileno(), 0, ROOM)
+    except OSError as error:
+        wanted = f" ({in_words(ROOM)} are wanted)" if error.errno == errno.ENOSPC else ""
+        return f"cannot write there: {error.strerror}{wanted}"
+    finally:
+        with contextlib.suppress(OSError):
+            probe.unlink()
+    return ""
+
+
+LOCK = ".clpipe.lock"
+
+
+PARTS = 2**40  # bytes of the lock, of which a shard takes its share; none is ever written
+
+
+UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # as image_io.write_beside names them
+
+
+@contextlib.contextmanager
+def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
+    """Make the folder, see that it can be written, and hold it against other runs.
+
+    Shards of one run hold it together. The lock is the system's: it ends with the process.
+
+    Raises:
+        RequestError: it cannot be written to, or another run is at work in it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RequestError(f"{folder}: cannot write there: {error.strerror}") from None
+    if reason := trouble_with(folder):
+        raise RequestError(f"{folder}: {reason}")
+    first = PARTS * (shard.number - 1) // shard.of
+    share = PARTS * shard.number // shard.of - first
+    lock = _locked(folder / LOCK, share, first)
+    try:
+        yield
+    finally:
+        # Alone in the end: the file has no more use.
+        with contextlib.suppress(OSError):
+            fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB, PARTS)
+            (folder / LOCK).unlink()
+        os.close(lock)
+
+
+def _locked(path: Path, length: int, first: int) -> int:
+    """The lock file, open, a part of it held.
+
+    Raises:
+        RequestError: another process holds it.
+    """
+    while True:
+        lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB, length, first)
+        except OSError as error:
+            if error.errno in (errno.EACCES, errno.EAGAIN):
+                os.close(lock)
+                raise RequestError(
+                    f"{path.parent}: another run is writing there; wait for it, or choose another "
+                    "output folder"
+                ) from None
+            return lock  # a file system without locks
+        with contextlib.suppress(OSError):
+            if os.fstat(lock).st_ino == path.stat().st_ino:
+                return lock
+        os.close(lock)  # who held it has taken it away in between
+
+
+def remove_unfinished(folder: Path, jobs: Iterable[Job]) -> None:
+    """Remove what a run that was killed left half written of these jobs."""
+    stems = {job.stem for job in jobs}
+    for place, _, names in os.walk(folder):
+        for match in filter(None, map(UNFINISHED.fullmatch, names)):
+            stem = os.path.relpath(os.path.join(place, match[1]), folder)
+            while stem not in stems and "." in os.path.basename(stem):
+                stem = stem.rpartition(".")[0]
+            if stem in stems:
+                with contextlib.suppress(OSError):
+                    os.unlink(os.path.join(place, match[0]))

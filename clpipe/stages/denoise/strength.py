@@ -1,0 +1,184 @@
+"""The law by which the ISO steers denoising, and the parameters that every method has.
+
+A sensor's noise has the variance a*y + b (Foi et al., IEEE TIP 2008, eq. 2), with a and b from the
+camera at that ISO, or as ``sensor_noise`` used them. White balance gains amplify it; luma and
+chroma are sums of the three colours, whose noise is independent. So grey of level v has luma noise
+of a variance that is linear in v, and at mid grey it is one number: what every method takes its
+strength from.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import sqrt
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from pydantic import field_validator
+
+from clpipe.reference.colour import LUMA
+from clpipe.stage import Access, Argument, Context, Kind, Literal, Method, Pass, odd_size, parameter
+
+MID_GREY = 0.18
+
+
+PREDICTED = "the {} noise at mid grey that a, b and the gains predict"
+
+
+@dataclass(frozen=True)
+class Variance:
+    """A variance that is linear in the level of grey: ``slope`` * level + ``offset``."""
+
+    slope: float
+    offset: float
+
+    def at(self, level: float) -> float:
+        """The variance at a level of grey.
+
+        >>> Variance(2.0, 1.0).at(0.5)
+        2.0
+        """
+        return self.slope * level + self.offset
+
+
+def noise_of_colours(context: Context) -> tuple[Variance, Variance, Variance]:
+    """The noise of red, green and blue of a grey, after white balance, in signal units squared.
+
+    Grey of level v is v/k at a colour with gain k; its variance there, a*v/k + b, comes out k^2
+    times as large. Noise that demosaicing takes away is not counted.
+    """
+    a, b = context.known_noise()
+    red, blue = context.applied_gains
+    one, two, three = (Variance(a * k, b * k * k) for k in (red, 1.0, blue))
+    return one, two, three
+
+
+def noise_of_luma_and_chroma(context: Context) -> tuple[Variance, Variance]:
+    """The noise of luma, and of both chroma planes together, of a grey, in signal units squared."""
+    luma = np.asarray(LUMA, float)
+    cb, cr = 0.564 * (np.eye(3)[2] - luma), 0.713 * (np.eye(3)[0] - luma)
+    colours = noise_of_colours(context)
+
+    def mixed(squares: np.ndarray) -> Variance:
+        slope = sum(w * c.slope for w, c in zip(squares, colours, strict=True))
+        offset = sum(w * c.offset for w, c in zip(squares, colours, strict=True))
+        return Variance(float(slope), float(offset))
+
+    return mixed(luma**2), mixed(cb**2 + cr**2)
+
+
+def predicted_noise(context: Context) -> tuple[float, float]:
+    """Standard deviations of luma and chroma noise at mid grey (0.18), in signal units."""
+    luma, chroma = noise_of_luma_and_chroma(context)
+    return sqrt(luma.at(MID_GREY)), sqrt(chroma.at(MID_GREY))
+
+
+def explain(context: Context) -> str:
+    """The law in a few lines, with the numbers of a context."""
+    a, b = context.known_noise()
+    red, blue = context.applied_gains
+    sigmas = [sqrt(colour.at(MID_GREY)) for colour in noise_of_colours(context)]
+    luma, chroma = predicted_noise(context)
+    source = "as sensor_noise used them" if context.noise else "from the camera"
+    return (
+        f"Strength follows the noise that is predicted at mid grey (v = {MID_GREY:g}):\n"
+        f"  {context.camera.name}, ISO {context.iso:g}: a = {a:.4g}, b = {b:.4g} ({source})\n"
+        f"  white balance gains k: red {red:.4g}, green 1, blue {blue:.4g}\n"
+        "  sigma of a colour after its gain = sqrt(k*a*v + k^2*b):"
+        f" R {sigmas[0]:.3g}, G {sigmas[1]:.3g}, B {sigmas[2]:.3g}\n"
+        "  luma_noise = sqrt(sum of (.299, .587, .114)^2 * sigma^2)"
+        f" = {luma:.3g}\n"
+        "  chroma_noise = the same for Cb and Cr together"
+        f" = {chroma:.3g}\n"
+        "  Methods filter as luma_strength * luma_noise, chroma_strength * chroma_noise ask for."
+    )
+
+
+def size_of(plane: str, default: int, largest: int) -> Any:
+    """Declare the width of a plane's window; each method has its own default and limit."""
+    text = f"Width of the {plane} window: odd, 1 to {largest}; 1 leaves {plane} alone."
+    return parameter(default, text, "px", structural=True)
+
+
+class Denoiser(Method):
+    """What all methods have in common: luma and chroma, each with a size, a strength, its noise."""
+
+    largest_size: ClassVar[int] = 15
+    function: ClassVar[str]  # the stencil in the kernel file
+    names: ClassVar[tuple[str, ...]]  # its run-time arguments, after the two reaches
+    enter: ClassVar[Pass] = Pass("to_luma_chroma", writes="planes", kind=Kind.YCBCR)
+    leave: ClassVar[Pass] = Pass("from_luma_chroma", reads=("filtered",))
+    extra_reach: ClassVar[int] = 0  # px that it reads beyond its window
+    block: ClassVar[int] = 0
+
+    luma_size: int = size_of("luma", 5, 15)
+    chroma_size: int = size_of("chroma", 5, 15)
+    luma_strength: float = parameter(
+        1.0, "Filtering of luma, in multiples of what its noise asks for; 0 is off.", ge=0, le=100
+    )
+    chroma_strength: float = parameter(
+        2.0, "Filtering of chroma, in multiples of what its noise asks for; 0 is off.", ge=0, le=100
+    )
+    luma_noise: float | None = parameter(
+        None,
+        "Standard deviation of luma noise at mid grey.",
+        "signal",
+        PREDICTED.format("luma"),
+        ge=0,
+    )
+    chroma_noise: float | None = parameter(
+        None,
+        "Standard deviation of chroma noise (Cb and Cr together) at mid grey.",
+        "signal",
+        PREDICTED.format("chroma"),
+        ge=0,
+    )
+
+    @field_validator("luma_size", "chroma_size")
+    @classmethod
+    def _odd(cls, size: int) -> int:
+        return odd_size(size, cls.largest_size)
+
+    def resolve(self, context: Context) -> Self:
+        luma, chroma = predicted_noise(context)
+        return self.filled(luma_noise=luma, chroma_noise=chroma)
+
+    @property
+    def reaches(self) -> tuple[int, int]:
+        """How far the windows of luma and chroma go from their centre, px."""
+        return self.luma_size // 2, self.chroma_size // 2
+
+    @property
+    def amounts(self) -> tuple[float, float]:
+        """Strength times noise of luma and chroma, in signal units."""
+        assert self.luma_noise is not None and self.chroma_noise is not None
+        return self.luma_strength * self.luma_noise, self.chroma_strength * self.chroma_noise
+
+    @property
+    def effect(self) -> str:
+        """What the (resolved) strengths and noises come to, in a few words."""
+        raise NotImplementedError(type(self).__name__)
+
+    def numbers(self, context: Context) -> Mapping[str, np.float32]:
+        """The run-time arguments of all passes, by name."""
+        raise NotImplementedError(type(self).__name__)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (
+            self.enter,
+            Pass(
+                self.function,
+                Access.STENCIL,
+                ("luma_reach", "chroma_reach", *self.names),
+                reads=("planes",),
+                writes="filtered",
+                kind=Kind.YCBCR,
+                radius=max(self.reaches) + self.extra_reach,
+                block=self.block,
+            ),
+            self.leave,
+        )
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        luma, chroma = self.reaches
+        reaches = {"luma_reach": Literal(str(luma)), "chroma_reach": Literal(str(chroma))}
+        return {**reaches, **self.numbers(context)}
