@@ -54,7 +54,7 @@ def same(one: Result, two: Result) -> None:
     assert one.kept.keys() == two.kept.keys()
     for name, image in one.kept.items():
         assert image.tobytes() == two.kept[name].tobytes(), name
-    assert one.found == two.found
+    assert one.estimates == two.estimates
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_every_stage(device, scalar_device, monkeypatch, stage, method, lanes):
     result, count = in_tiles(runner, example(source, (150, 203)), 70, 56, monkeypatch)
     assert count >= 6
     if method.method in ("gray_world", "white_patch"):
-        assert result.found["white_balance"]["red_gain"] != 1
+        assert result.estimates["white_balance"]["red_gain"] != 1
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
@@ -136,9 +136,9 @@ def test_numbers_found_twice_and_kept_images(device, monkeypatch):
     kept, count = in_tiles(Runner(chain, device, keep), image, 64, 48, monkeypatch)
     assert count >= 6
     assert list(kept.kept) == keep
-    assert set(kept.found) == {"white_balance", "white_balance_2"}
+    assert set(kept.estimates) == {"white_balance", "white_balance_2"}
     fused, _ = in_tiles(Runner(chain, device, final=True), image, 64, 48, monkeypatch)
-    assert fused.found == kept.found
+    assert fused.estimates == kept.estimates
     assert fused.final.tobytes() == kept.final.tobytes()
 
 

@@ -144,7 +144,7 @@ def check_passes(name: str, stage: Stage, method: Method, context: Context) -> N
     with user_code_errors(f"stage {name}", stage.folder):
         passes, arguments = method.passes(), method.arguments(context)
         for pass_ in passes:
-            known = [*arguments, *(n for p in passes for n in (*p.found, p.writes))]
+            known = [*arguments, *(n for p in passes for n in (*p.estimates, p.writes))]
             for argument in (*pass_.arguments, *pass_.finish_arguments):
                 if argument not in known:
                     raise RequestError(

@@ -13,15 +13,15 @@ from clpipe.stage import Kind
 
 
 @dataclass
-class Output:
-    """What a run brings back: planes by image number, eight-bit pixels, and numbers found."""
+class HostImages:
+    """What a run brings back: planes by image number, eight-bit pixels, and estimates by step."""
 
     images: dict[int, Array]
     encoded: Array | None
-    found: dict[str, Array]
+    estimates: dict[str, Array]
 
 
-def room_for(plan: Plan, width: int, height: int, into: Array | None) -> Output:
+def room_for(plan: Plan, width: int, height: int, into: Array | None) -> HostImages:
     """Whole images on the host for all that a plan gives; ``into`` is for the encoded one."""
 
     def shape(kind: Kind) -> tuple[int, ...]:
@@ -36,10 +36,10 @@ def room_for(plan: Plan, width: int, height: int, into: Array | None) -> Output:
             raise ValueError(
                 f"into is {encoded.shape} {encoded.dtype}; {shape(plan.encoded)} uint8"
             )
-    return Output(
+    return HostImages(
         images={image.number: np.empty(shape(image.kind), np.float32) for image in images},
         encoded=encoded,
-        found={
+        estimates={
             x.op.step: np.empty(4, np.float32) for x in plan.launches if isinstance(x, Finalize)
         },
     )
@@ -97,8 +97,8 @@ def buffer_name(parameter: Parameter) -> str | None:
             return "dst"
         case "slot":
             return f"slot{parameter.number}"
-        case "lines" | "found":
+        case "lines" | "estimates":
             return f"{parameter.role}.{parameter.step}"
-        case "sums" | "shares" | "counts" | "histogram":
+        case "sums" | "partials" | "counts" | "histogram":
             return parameter.role
     return None

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.engine.buffers import Pool, buffer_name
-from clpipe.engine.codegen import LOCAL_SIZE, SHARES, Kernel, Parameter, round_up
+from clpipe.engine.codegen import LOCAL_SIZE, PARTIALS, Kernel, Parameter, round_up
 from clpipe.engine.plan import Finalize, Histogram, Launch, Lines, Reduce
 from clpipe.engine.tiles import Extent
 
@@ -24,7 +24,7 @@ def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[
             longest = round_up(max(extent.width, extent.height), extent.lanes)
             return (round_up(longest // extent.lanes, LOCAL_SIZE),), (LOCAL_SIZE,)
         case Histogram() | Reduce():
-            return (SHARES,), (LOCAL_SIZE,)
+            return (PARTIALS,), (LOCAL_SIZE,)
         case Finalize():
             return (1,), (1,)
 

@@ -1,23 +1,21 @@
 """OpenCL devices: which there are, and running a plan on one. The only importer of pyopencl."""
 
-import re
 import time
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from clpipe.base.errors import DeviceError, ImageError, RequestError
+from clpipe.base.errors import DeviceError, ImageError
 from clpipe.base.types import Array
-from clpipe.engine.buffers import Output, Pool, room_for
+from clpipe.engine.buffers import HostImages, Pool, room_for
 from clpipe.engine.calls import Bind, Call, index_space
-from clpipe.engine.codegen import Kernel, Parameter, border_left, write_kernel
+from clpipe.engine.codegen import Parameter, border_left, write_kernel
 from clpipe.engine.discovery import DeviceInfo, choose, choose_all, find_devices, usable_memory
 from clpipe.engine.plan import Plan
+from clpipe.engine.programs import programs_of
 from clpipe.engine.tiles import Extent, Tiling, tiling_of
 
 
@@ -33,17 +31,6 @@ class Timing:
     seconds: float
     start: float
     transfer: bool
-
-
-def build_log(text: str) -> str:
-    """What the compiler said, out of pyopencl's error message.
-
-    >>> build_log("failed\\n\\nBuild on <x>:\\n\\nerror: a.cl:2:7: no\\n\\n(options: -a)")
-    'error: a.cl:2:7: no'
-    """
-    log = re.sub(r"\n*\(options: .*", "", text.partition(">:\n")[2], flags=re.DOTALL)
-    lines = [line for line in log.splitlines() if "failed to build the program" not in line]
-    return "\n".join(lines).strip() or text
 
 
 def timed(events: Sequence[tuple[str, Any]]) -> list[Timing]:
@@ -83,15 +70,12 @@ class Device:
         self.info = chosen
         self.memory = memory or usable_memory(chosen)
         self._cl = cl
-        try:
-            self._context = cl.Context([chosen.handle])
-            self._queue = cl.CommandQueue(
-                self._context, properties=cl.command_queue_properties.PROFILING_ENABLE
-            )
-        except cl.Error as error:
-            raise DeviceError(f"{chosen.label} cannot be opened: {error}") from None
+        self._programs = programs_of(chosen)
+        self._context = self._programs.context
+        self._queue = cl.CommandQueue(
+            self._context, properties=cl.command_queue_properties.PROFILING_ENABLE
+        )
         self._calls: dict[Plan, list[Call]] = {}
-        self._programs: dict[str, Any] = {}
         self._pool = Pool(self._new_buffer)
         self._tables: dict[int, tuple[Array, Any]] = {}
 
@@ -100,6 +84,10 @@ class Device:
         """Device memory of the buffers that are kept from image to image."""
         return self._pool.bytes
 
+    def is_ready(self, plan: Plan) -> bool:
+        """Whether the kernels of a plan are compiled."""
+        return plan in self._calls
+
     def prepare(self, plan: Plan) -> list[Call]:
         """The compiled kernels of a plan, from the first call on without compiling.
 
@@ -107,37 +95,9 @@ class Device:
             DeviceError: a kernel does not compile; the message is the compiler's.
         """
         if plan not in self._calls:
-            lanes = self.info.lanes
-            kernels = [write_kernel(plan, x, i, lanes) for i, x in enumerate(plan.launches)]
-            self._calls[plan] = [Call(k, self._compile(k)) for k in kernels]
+            kernels = [write_kernel(plan, launch, self.info.lanes) for launch in plan.launches]
+            self._calls[plan] = [Call(k, self._programs.kernel(k)) for k in kernels]
         return self._calls[plan]
-
-    def _compile(self, kernel: Kernel) -> Any:
-        cl = self._cl
-        program = self._programs.get(kernel.source)
-        if program is None:
-            options = ["-cl-std=CL1.2"]
-            exact = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
-            if self.info.handle.single_fp_config & exact:
-                options.append("-cl-fp32-correctly-rounded-divide-sqrt")
-            # PoCL keeps a cache of its own; a second copy only costs time.
-            own_cache = "Portable Computing" in self.info.platform
-            # Not within catch_warnings, which is no matter of one thread.
-            warnings.filterwarnings("ignore", category=cl.CompilerWarning)
-            try:
-                program = cl.Program(self._context, kernel.source).build(
-                    options, cache_dir=False if own_cache else None
-                )
-            except cl.MemoryError:
-                raise
-            except cl.Error as error:
-                log = build_log(str(error))
-                for file in kernel.files:
-                    if Path(file).is_absolute():
-                        raise RequestError(f"{file}: does not compile:\n{log}") from None
-                raise DeviceError(f"{kernel.launch.name}: does not compile:\n{log}") from None
-            self._programs[kernel.source] = program
-        return cl.Kernel(program, kernel.name)
 
     def run(
         self,
@@ -147,7 +107,7 @@ class Device:
         timings: list[Timing] | None = None,
         download: bool = True,
         into: Array | None = None,
-    ) -> Output:
+    ) -> HostImages:
         """Put one image through a plan; in tiles where it does not fit into the memory.
 
         Where the memory that is allowed is not there, buffers of earlier images are given back,
@@ -203,7 +163,7 @@ class Device:
         timings: list[Timing] | None,
         download: bool,
         into: Array | None,
-    ) -> Output:
+    ) -> HostImages:
         calls = self.prepare(plan)
         if len(self._tables) > 32:
             self._tables.clear()
@@ -234,11 +194,11 @@ class Device:
                     events += [("download", e) for e in self._download(plan, extent, output)]
             launch(phase.last, tiling.tiles[0], 0)
         if download:
-            events += [("download", e) for e in self._find(output)]
+            events += [("download", e) for e in self._download_estimates(output)]
         self._queue.finish()
         if timings is not None:
             timings += timed(events)
-        return output if download else Output({}, None, {})
+        return output if download else HostImages({}, None, {})
 
     def _new_buffer(self, size: int) -> Any:
         return self._cl.Buffer(self._context, self._cl.mem_flags.READ_WRITE, size)
@@ -269,7 +229,7 @@ class Device:
             event.wait()  # or the event would hold the copy until the image is done
         return event
 
-    def _download(self, plan: Plan, extent: Extent, output: Output) -> Iterator[Any]:
+    def _download(self, plan: Plan, extent: Extent, output: HostImages) -> Iterator[Any]:
         """Bring the core of a tile into the whole images."""
         core, stored, held = extent.core, extent.stored, self._pool.held
         if output.encoded is not None:
@@ -308,10 +268,10 @@ class Device:
                 rows = plane[: height * extent.pitch].reshape(height, extent.pitch)
                 part[..., channel] = rows[top : top + core.height, left : left + core.width]
 
-    def _find(self, output: Output) -> Iterator[Any]:
-        """Bring what was found in the image."""
-        for step, values in output.found.items():
-            yield self._cl.enqueue_copy(self._queue, values, self._pool.held[f"found.{step}"])
+    def _download_estimates(self, output: HostImages) -> Iterator[Any]:
+        """Bring what was estimated from the image."""
+        for step, values in output.estimates.items():
+            yield self._cl.enqueue_copy(self._queue, values, self._pool.held[f"estimates.{step}"])
 
     def copy_speed(self, size: int = 96 * 2**20) -> float:
         """Bytes a second, read plus written, of the device's own buffer copy; the best of five."""
@@ -353,8 +313,8 @@ def open_devices(selectors: Sequence[str] = (), memory: int | None = None) -> li
             raise DeviceError(f"found devices {', '.join(selectors)}; numpy is used alone")
         return []
     chosen = choose_all(selectors, find_devices())
-    sharing = sum(found.type != "GPU" for found in chosen)
+    sharing = sum(info.type != "GPU" for info in chosen)
     return [
-        Device(found, memory or usable_memory(found) // (1 if found.type == "GPU" else sharing))
-        for found in chosen
+        Device(info, memory or usable_memory(info) // (1 if info.type == "GPU" else sharing))
+        for info in chosen
     ]

@@ -9,6 +9,7 @@ from typing import Any
 from clpipe.base.errors import DeviceError
 from clpipe.base.memory import available_memory
 from clpipe.base.text import one_of
+from clpipe.engine.cache_folder import keep_pocl_programs
 
 _process: int | None = None  # the one that has used OpenCL, of this and those before it
 
@@ -49,6 +50,7 @@ def find_devices() -> list[DeviceInfo]:
             'be spawned (multiprocessing\'s "spawn" or "forkserver"), or fork before'
         )
     _process = os.getpid()
+    keep_pocl_programs()
     try:
         import pyopencl as cl
     except (ImportError, OSError) as error:

@@ -13,6 +13,7 @@ from clpipe.chain.registry import user_code_errors
 from clpipe.engine.codegen import Parameter
 from clpipe.engine.device import Device, Timing
 from clpipe.engine.plan import Finalize, Plan, make_plan, ops_of
+from clpipe.engine.programs import announced
 from clpipe.reference.curve import compose, to_8_bit
 from clpipe.reference.random import Stream, stream_of
 from clpipe.stage import Frame, NoiseScope
@@ -23,13 +24,14 @@ class Result:
     """What came out of a chain.
 
     ``final`` is the last image in float32, ``encoded`` the same in eight bits, ``kept`` the images
-    of the steps that were asked for, ``found`` what stages found in the image.
+    of the steps that were asked for, ``estimates`` what stages estimated from the image, such as
+    gains, by step and name.
     """
 
     final: Floats | None
     encoded: Array | None
     kept: dict[str, Floats]
-    found: dict[str, dict[str, float]]
+    estimates: dict[str, dict[str, float]]
 
     @property
     def image(self) -> Array:
@@ -105,8 +107,19 @@ class Runner:
     def warm_up(self, half: bool = True) -> None:
         """Compile everything, so that the first image does not wait for it."""
         if self.device:
+            self._make_ready(self.plan(half))
+
+    def _make_ready(self, plan: Plan) -> None:
+        """Compile the kernels of a plan, by running it on a tiny image.
+
+        PoCL compiles a kernel again when it is first launched.
+        """
+        assert self.device
+        if not self.device.is_ready(plan):
             shape = (8, 8, 3)[: 2 if len(self.chain.source.channels) == 1 else 3]
-            self.run(np.zeros(shape, np.float16 if half else np.float32), "")
+            tiny = np.zeros(shape, np.float16 if plan.half else np.float32)
+            with announced(self.device.info):
+                self._run_plan(plan, tiny, "")
 
     def run(
         self,
@@ -142,6 +155,20 @@ class Runner:
         if not self.device:
             return self._run_numpy(np.asarray(image, np.float32), image_key)
         plan = self.plan(image.dtype == np.float16, fold=min(image.shape[:2]) > 1)
+        self._make_ready(plan)
+        return self._run_plan(plan, image, image_key, timings, download, into)
+
+    def _run_plan(
+        self,
+        plan: Plan,
+        image: Array,
+        image_key: str,
+        timings: list[Timing] | None = None,
+        download: bool = True,
+        into: Array | None = None,
+    ) -> Result:
+        """Put an image through a plan on the device; arguments as for :meth:`run`."""
+        assert self.device
         keys: dict[str, dict[NoiseScope, Stream]] = {}
 
         def bind(parameter: Parameter) -> Any:
@@ -159,14 +186,14 @@ class Runner:
             return np.uint32(stream.key1 if parameter.item.endswith("1") else stream.key0)
 
         output = self.device.run(plan, image, bind, timings, download, into)
-        names = {x.op.step: x.op.pass_.found for x in plan.launches if isinstance(x, Finalize)}
+        names = {x.op.step: x.op.pass_.estimates for x in plan.launches if isinstance(x, Finalize)}
         return Result(
             final=output.images.get(plan.final.number) if plan.final else None,
             encoded=output.encoded,
             kept={name: output.images[i.number] for name, i in plan.kept if output.images},
-            found={
+            estimates={
                 step: dict(zip(names[step], map(float, values), strict=False))
-                for step, values in output.found.items()
+                for step, values in output.estimates.items()
             },
         )
 
@@ -191,7 +218,7 @@ class Runner:
 
     def _run_numpy(self, image: Floats, image_key: str) -> Result:
         kept: dict[str, Floats] = {}
-        found: dict[str, dict[str, float]] = {}
+        estimates: dict[str, dict[str, float]] = {}
         whole = self.encode or self.final
         steps = (self.chain if whole else self.chain.through(self.keep)).steps
         for step in steps:
@@ -200,11 +227,11 @@ class Runner:
                 image = step.method.reference(image, frame)
             if step.name in self.keep:
                 kept[step.name] = image
-            if frame.found:
-                found[step.name] = frame.found
+            if frame.estimates:
+                estimates[step.name] = frame.estimates
         return Result(
             final=image if self.final or steps[-1].name in self.keep else None,
             encoded=to_8_bit(image) if self.encode else None,
             kept=kept,
-            found=found,
+            estimates=estimates,
         )

@@ -15,7 +15,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError
 from clpipe.base.memory import in_words
-from clpipe.engine.codegen import SHARES, border_left, round_up
+from clpipe.engine.codegen import PARTIALS, border_left, round_up
 from clpipe.engine.plan import (
     AnyLaunch,
     Finalize,
@@ -109,6 +109,7 @@ class Extent:
             "top": self.stored.top // 4,
             "columns": self.stored.width,
             "rows": self.stored.height,
+            "border": self.border,
             "blocks": self.blocks,
             **core,
         }
@@ -130,13 +131,13 @@ def buffer_sizes(plan: Plan, extent: Extent) -> dict[str, int]:
             case Lines(ops=ops):
                 sizes |= {f"lines.{op.step}": longest * 4 for op in ops}
             case Launch(sums=sums) if sums:
-                sizes |= {"sums": extent.blocks * 16, "shares": SHARES * 32}
+                sizes |= {"sums": extent.blocks * 16, "partials": PARTIALS * 32}
             case Histogram(op=op):
                 bins = op.pass_.bins
-                sizes["counts"] = max(sizes.get("counts", 0), SHARES * bins * 4)
+                sizes["counts"] = max(sizes.get("counts", 0), PARTIALS * bins * 4)
                 sizes["histogram"] = max(sizes.get("histogram", 0), bins * 4)
             case Finalize(op=op):
-                sizes[f"found.{op.step}"] = 16
+                sizes[f"estimates.{op.step}"] = 16
     return sizes
 
 
@@ -166,8 +167,8 @@ class Tiling:
 def phases_of(plan: Plan) -> tuple[Phase, ...]:
     """The phases in which tiles go through a plan.
 
-    What is found in the whole image stands between two phases: each but the last goes, over all
-    tiles, as far as one reduction, and the next begins again at the source.
+    A number that is estimated from the whole image ends a phase: each phase but the last goes, over
+    all tiles, as far as one reduction, and the next begins again at the source.
     """
     numbered = tuple(enumerate(plan.launches))
     lines = tuple(i for i, launch in numbered if isinstance(launch, Lines))

@@ -247,7 +247,11 @@ def sidecar(
                 "stage": step.stage.name,
                 "method": step.method.method,
                 "parameters": step.method.model_dump(),
-                **({"found": result.found[step.name]} if step.name in result.found else {}),
+                **(
+                    {"estimates": result.estimates[step.name]}
+                    if step.name in result.estimates
+                    else {}
+                ),
             }
             for step in chain.steps
         ],

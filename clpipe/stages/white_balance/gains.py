@@ -18,7 +18,7 @@ def balanced(image: Floats, context: Context, red: np.float32, blue: np.float32)
 
 
 class EstimatedGains(Method):
-    """Gains that are found in the image itself. Subclasses say how."""
+    """Gains that are estimated from the image itself. Subclasses say how."""
 
     tolerance: ClassVar = 1e-6  # of the gains: division is not exact on every device
 
@@ -36,12 +36,12 @@ class EstimatedGains(Method):
 
     def passes(self) -> tuple[Pass, ...]:
         search = self.search()
-        apply = Pass("white_balance", arguments=("pattern", *search.found), cheap=True)
+        apply = Pass("white_balance", arguments=("pattern", *search.estimates), cheap=True)
         return search, apply
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
         red, blue = self.gains(image, frame.context.pattern)
-        frame.found["red_gain"], frame.found["blue_gain"] = float(red), float(blue)
+        frame.estimates["red_gain"], frame.estimates["blue_gain"] = float(red), float(blue)
         return balanced(image, frame.context, red, blue)
 
 
