@@ -148,6 +148,10 @@ class _Planner:
         self.images: list[Image] = []
         self.group: Launch | None = Launch("load", ())  # open, still to be stored
         self.stored: Image | None = None  # the current image, when no group is open
+        # Where the current image was kept, how a stencil reads it all the same; and the image that
+        # only keeping has stored, in the midst of a group.
+        self.folded: Read | None = None
+        self.split: Image | None = None
 
     def close(self, sums: Op | None = None) -> Image:
         """End the open group and store its result; the stored current image if none is open."""
@@ -181,14 +185,35 @@ class _Planner:
         rows = 4 if shared else 2
         self.launches.append(replace(group, name=name, rows=rows, columns=max(block, 1)))
 
+    def keep(self) -> Image:
+        """Store the current image because it is wanted.
+
+        Stencils after it read what they would read otherwise, so they are the same kernels.
+        """
+        folded, is_open = self.foldable(), self.group is not None
+        image = self.close()
+        self.folded = folded
+        if is_open and not folded:
+            self.split = image
+        return image
+
+    def foldable(self) -> Read | None:
+        """The current image as cheap pointwise passes on a stored one, if it is that."""
+        group = self.group
+        if not (self.fold and group and group.reads) or group.stencil:
+            return self.folded
+        cheap = all(op.pass_.cheap for op in group.ops)
+        read = Read(group.reads[0].image, group.ops)
+        return read if cheap and read.image is not self.split else None
+
     def input_of_stencil(self) -> Read:
         """The current image for a stencil: cheap pointwise passes on a stored one are redone."""
-        group = self.group
-        loaded = group and group.reads and not group.stencil
-        if group and loaded and self.fold and all(op.pass_.cheap for op in group.ops):
-            self.group, self.stored = None, group.reads[0].image
-            return Read(group.reads[0].image, group.ops)
-        return Read(self.close())
+        read = self.foldable()
+        if read is None:
+            return Read(self.close())
+        if self.group:
+            self.group, self.stored = None, read.image
+        return read
 
     def add_step(self, ops: Sequence[Op]) -> None:
         local: dict[str, Read] = {}
@@ -203,11 +228,13 @@ class _Planner:
                     continue
                 case Access.SUMS:
                     self.close(sums=op)
+                    self.split = None
                     self.launches.append(Reduce(op, f"{op.step}.add_up"))
                     self.launches.append(Finalize(op, f"{op.step}.{pass_.finish}"))
                     continue
                 case Access.HISTOGRAM:
                     stored = Read(self.close())
+                    self.split = None
                     self.launches.append(Histogram(op, (stored,), f"{op.step}.count"))
                     self.launches.append(Reduce(op, f"{op.step}.add_up"))
                     self.launches.append(Finalize(op, f"{op.step}.{pass_.finish}"))
@@ -221,6 +248,7 @@ class _Planner:
                         assert self.stored is not None
                         self.group = Launch("", (), (Read(self.stored),))
                     self.group = replace(self.group, ops=(*self.group.ops, op))
+            self.folded = None
             self.kind, written = op.kind, pass_.writes
 
 
@@ -280,7 +308,7 @@ def make_plan(
     for step in chain.steps:
         planner.add_step(ops_of(step, step.method.arguments(step.context)))
         if step.name in keep and step.name != last:
-            kept[step.name] = planner.close()
+            kept[step.name] = planner.keep()
     group = planner.group or Launch("encode", (), (Read(planner.close()),))
     final_image = None
     if final:
