@@ -20,9 +20,9 @@ def check_row(check: Check) -> tuple[str, ...]:
         check.stage,
         check.method,
         str(check.cases),
-        str(check.samples),
-        str(check.differing),
-        f"{check.largest:.2g}",
+        str(check.difference.samples),
+        str(check.difference.differing),
+        f"{check.difference.largest:.2g}",
         f"{check.tolerance:.2g}",
         "ok" if check.passed else "FAILED",
     )

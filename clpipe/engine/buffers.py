@@ -1,4 +1,4 @@
-"""TODO."""
+"""Memory of a run: buffers on the device, and arrays on the host for what comes back."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -14,7 +14,11 @@ from clpipe.stage import Kind
 
 @dataclass
 class HostImages:
-    """What a run brings back: planes by image number, eight-bit pixels, and estimates by step."""
+    """The results of a run on the host.
+
+    ``images`` are float images by their number in the plan, (height, width[, channel]);
+    ``encoded`` are eight-bit pixels of the same shape; ``estimates`` are four floats a step.
+    """
 
     images: dict[int, Array]
     encoded: Array | None
@@ -22,7 +26,17 @@ class HostImages:
 
 
 def room_for(plan: Plan, width: int, height: int, into: Array | None) -> HostImages:
-    """Whole images on the host for all that a plan gives; ``into`` is for the encoded one."""
+    """Empty arrays for all results of a plan.
+
+    Args:
+        plan: the plan.
+        width: of the image in pixels, and its height.
+        height: see above.
+        into: an array to use for the eight-bit pixels.
+
+    Raises:
+        ValueError: ``into`` has another shape or type.
+    """
 
     def shape(kind: Kind) -> tuple[int, ...]:
         channels = len(kind.channels)
@@ -51,12 +65,12 @@ class Pool:
     def __init__(self, make: Callable[[int], Any]) -> None:
         self._make = make
         self.held: dict[str, Any] = {}
-        self.generation = 0  # another one when other buffers are held
+        self.generation = 0  # counts up when a buffer is replaced
 
     def reserve(self, sizes: Mapping[str, int], memory: int) -> None:
-        """See that there is a buffer of at least these sizes (bytes by name).
+        """Make sure that there are buffers of at least these sizes (bytes by name).
 
-        Those that an earlier image needed stay, as long as all together take no more than
+        Buffers that only earlier images needed are kept while all together take no more than
         ``memory`` bytes.
         """
         enough = {name: b for name, b in self.held.items() if b.size >= sizes.get(name, 0)}
@@ -77,11 +91,11 @@ class Pool:
 
     @property
     def bytes(self) -> int:
-        """What all of them take."""
+        """The size of all buffers together."""
         return sum(buffer.size for buffer in self.held.values())
 
     def release(self) -> None:
-        """Give all of them back."""
+        """Give all buffers back to the device."""
         self.generation += 1
         held, self.held = self.held, {}
         for buffer in held.values():

@@ -1,4 +1,4 @@
-"""OpenCL devices: which there are, and running a plan on one. The only importer of pyopencl."""
+"""An open OpenCL device: it puts images through plans, whole or in tiles."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -21,7 +21,7 @@ from clpipe.engine.tiles import Extent, Tiling, tiling_of
 
 @dataclass(frozen=True)
 class Timing:
-    """What one launch or transfer took, in seconds on the device.
+    """How long one launch or transfer took, in seconds on the device.
 
     ``start`` is on the clock of :func:`time.perf_counter`. Transfers are called "upload" and
     "download".
@@ -34,7 +34,7 @@ class Timing:
 
 
 def timed(events: Sequence[tuple[str, Any]]) -> list[Timing]:
-    """How long each took. The queue has just been finished, so the last of them ends now."""
+    """The timings of events. The queue has just been finished, so the last one ends now."""
     if not events:
         return []
     offset = time.perf_counter() - events[-1][1].profile.end * 1e-9
@@ -51,9 +51,9 @@ def timed(events: Sequence[tuple[str, Any]]) -> list[Timing]:
 
 
 class Device:
-    """A device with its queue, compiled kernels and buffers, kept from image to image.
+    """An open device with its queue, compiled kernels and buffers, kept from image to image.
 
-    It is for one thread at a time; several devices can run at once, each in its own.
+    One thread may use it at a time; several devices can run at once, each in a thread of its own.
 
     Args:
         chosen: which device.
@@ -108,20 +108,20 @@ class Device:
         download: bool = True,
         into: Array | None = None,
     ) -> HostImages:
-        """Put one image through a plan; in tiles where it does not fit into the memory.
+        """Put one image through a plan, in tiles if it does not fit into the memory.
 
-        Where the memory that is allowed is not there, buffers of earlier images are given back,
-        then tiles become smaller.
+        If the device runs out of memory before the limit is reached, buffers of earlier images are
+        given back, then tiles become smaller.
 
         Args:
-            plan: what to do.
-            source: the image, (height, width[, channel]), of a type that becomes half floats or
-                floats, as the plan says, without loss.
+            plan: the plan.
+            source: the image, (height, width[, channel]), of a type that converts without loss to
+                what the plan reads, half or float.
             bind: the value of a "value", "key" or "table8" parameter: a NumPy scalar or array.
-            timings: is given one entry a launch and transfer, in order.
-            download: bring results back; False leaves them on the device (for measuring).
-            into: where the eight-bit pixels are put, (height, width[, channel]) uint8,
-                C-contiguous; memory that is new to the process costs time.
+            timings: one entry a launch and transfer is appended, in order.
+            download: bring results back; False leaves them on the device, for measuring.
+            into: an array to use for the eight-bit pixels, (height, width[, channel]) uint8,
+                C-contiguous; a used one saves the time that new memory takes.
 
         Raises:
             ImageError: the image does not fit into the device's memory, not even in tiles, or the
@@ -131,7 +131,7 @@ class Device:
         cl = self._cl
         height, width = source.shape[:2]
         memory = self.memory
-        full: Exception | None = None  # what the device said when there was no more
+        full: Exception | None = None  # the device's error when its memory ran out
         while True:
             try:
                 tiling = tiling_of(
@@ -204,7 +204,7 @@ class Device:
         return self._cl.Buffer(self._context, self._cl.mem_flags.READ_WRITE, size)
 
     def _abandon(self) -> None:
-        """Wait for what is still to be done of an image that failed, and give all memory back."""
+        """After a failure: wait for the rest of that image, and give all memory back."""
         with suppress(self._cl.Error):
             self._queue.finish()
         with suppress(self._cl.Error):
@@ -230,7 +230,7 @@ class Device:
         return event
 
     def _download(self, plan: Plan, extent: Extent, output: HostImages) -> Iterator[Any]:
-        """Bring the core of a tile into the whole images."""
+        """Copy the core of a tile into the whole images."""
         core, stored, held = extent.core, extent.stored, self._pool.held
         if output.encoded is not None:
             channels = output.encoded.size // (extent.width * extent.height)
@@ -269,7 +269,7 @@ class Device:
                 part[..., channel] = rows[top : top + core.height, left : left + core.width]
 
     def _download_estimates(self, output: HostImages) -> Iterator[Any]:
-        """Bring what was estimated from the image."""
+        """Copy the numbers that stages estimated from the image."""
         for step, values in output.estimates.items():
             yield self._cl.enqueue_copy(self._queue, values, self._pool.held[f"estimates.{step}"])
 
@@ -288,12 +288,12 @@ class Device:
 
 
 def open_device(selector: str | None, memory: int | None = None) -> Device | None:
-    """The device that a selector names, as :func:`choose` has it; None for "numpy".
+    """Open the device that a selector names, see :func:`choose`; None stands for "numpy".
 
-    ``memory`` is how many bytes of it may be used.
+    ``memory`` is how many bytes its buffers may take.
 
     Raises:
-        DeviceError: there is none, none matches, or the one that was asked for cannot be used.
+        DeviceError: there is no device, none matches, or the one that matches cannot be used.
     """
     if selector is not None and selector.lower() == "numpy":
         return None
@@ -301,9 +301,9 @@ def open_device(selector: str | None, memory: int | None = None) -> Device | Non
 
 
 def open_devices(selectors: Sequence[str] = (), memory: int | None = None) -> list[Device]:
-    """The devices that selectors name, as :func:`choose_all` has them; none for "numpy".
+    """Open the devices that selectors name, see :func:`choose_all`; an empty list for "numpy".
 
-    ``memory`` is how many bytes may be used of each; without it, CPUs share what there is.
+    ``memory`` is how many bytes the buffers of each may take; without it, CPUs share what is free.
 
     Raises:
         DeviceError: as :func:`open_device`, or "numpy" stands beside others.

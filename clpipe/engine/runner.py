@@ -21,10 +21,11 @@ from clpipe.stage import Frame, NoiseScope
 
 @dataclass(frozen=True)
 class Result:
-    """What came out of a chain.
+    """The images that one image became in a chain.
 
-    ``final`` is the last image in float32, ``encoded`` the same in eight bits, ``kept`` the images
-    of the steps that were asked for, ``estimates`` what stages estimated from the image, such as
+    ``final`` is the last image in float32, ``encoded`` the same in eight bits; both are (height,
+    width[, channel]), and None where not requested. ``kept`` has the images of the steps to keep,
+    float32, by step. ``estimates`` has the numbers that stages estimated from the image, such as
     gains, by step and name.
     """
 
@@ -35,10 +36,21 @@ class Result:
 
     @property
     def image(self) -> Array:
-        """The last image: in eight bits where these were asked for, else in float."""
+        """The last image: in eight bits if the chain ends in display values, else in float."""
         image = self.final if self.encoded is None else self.encoded
         assert image is not None
         return image
+
+    def __repr__(self) -> str:
+        shapes = {"final": self.final, "encoded": self.encoded, **self.kept}
+        parts = [f"{k}: {v.shape} {v.dtype}" for k, v in shapes.items() if v is not None]
+        return f"Result({', '.join(parts)})"
+
+    def _repr_png_(self) -> bytes | None:
+        """The last image as notebooks show it."""
+        from clpipe.images.preview import png_bytes
+
+        return None if self.final is None and self.encoded is None else png_bytes(self.image)
 
 
 def streams(chain: Chain, step: Step, image_key: str) -> dict[NoiseScope, Stream]:
@@ -53,14 +65,14 @@ def streams(chain: Chain, step: Step, image_key: str) -> dict[NoiseScope, Stream
 
 
 class Runner:
-    """Runs one chain over images, on a device, or in NumPy where there is none.
+    """Runs one chain over images, on a device or in NumPy.
 
     Args:
         chain: the chain.
         device: where to run; None is NumPy.
-        keep: steps whose image is wanted.
-        encode: whether the last image is wanted in eight bits.
-        final: whether the last image is wanted in float.
+        keep: steps whose image is returned.
+        encode: whether the last image is returned in eight bits.
+        final: whether the last image is returned in float.
     """
 
     def __init__(
@@ -78,14 +90,14 @@ class Runner:
         self.final = final
         self._arguments = {s.name: s.method.arguments(s.context) for s in chain.steps}
         self._own_plans: dict[tuple[bool, bool], Plan] = {}
-        # Those that runners of other chains have made too, by the structure of a chain.
+        # Shared with the runners of other chains, by a chain's structure.
         self._plans: dict[Any, Plan] = {}
         self._tables: dict[Any, tuple[Sequence[Array], Array]] = {}
 
     def of(self, chain: Chain) -> "Runner":
-        """The same for another chain.
+        """A runner for another chain that shares plans and tables with this one.
 
-        Where only values are different, nothing is planned or compiled again.
+        A chain that differs in run-time values alone is neither planned nor compiled again.
         """
         other = Runner(chain, self.device, self.keep, self.encode, self.final)
         other._plans, other._tables = self._plans, self._tables
@@ -134,11 +146,11 @@ class Runner:
         Args:
             image: (height, width, 3) linear RGB, or (height, width) for a chain that starts on a
                 mosaic; finite, of float16 or any type that fits into float32.
-            image_key: what the image's noise is keyed on.
-            timings: is given one entry a launch (devices only).
-            download: False leaves the results on the device (for measuring).
-            into: where the eight-bit pixels are put (devices only), of their shape; a batch that
-                uses its arrays again spares the time that new memory takes.
+            image_key: the key of the image's noise.
+            timings: one entry a launch and transfer is appended (devices only).
+            download: False leaves the results on the device, for measuring.
+            into: an array to use for the eight-bit pixels (devices only), of their shape; a used
+                one saves the time that new memory takes.
 
         Raises:
             ImageError: an image of the wrong shape, or one that does not fit the device.

@@ -107,7 +107,7 @@ INLINE int lowest_place(int place, int period, int lowest) {
     return lowest + (above < 0 ? above + period : above);
 }
 
-static void store_row(vf v, __global float *row, int x, extent e) {
+static __attribute__((noinline)) void store_row(vf v, __global float *row, int x, extent e) {
     const int border = (int)e.border, width = (int)e.columns, period = mirror_period(width);
     if (x > border && x + LANES + border < width) {
         store(v, row + x);
@@ -126,7 +126,7 @@ static void store_row(vf v, __global float *row, int x, extent e) {
 }
 
 // `x` and `y` are counted from where the planes begin.
-static void store_at_edge(vf v, __global float *dst, int x, int y, extent e) {
+static __attribute__((noinline)) void store_at_edge(vf v, __global float *dst, int x, int y, extent e) {
     const int border = (int)e.border, rows = (int)e.rows, period = mirror_period(rows);
     __global float *origin = dst + (size_t)border * e.pitch + border_left(e);
 #pragma unroll 1
