@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,12 @@ def written(folder: Path) -> list[str]:
 @pytest.fixture(scope="session")
 def device() -> Device:
     return Device(choose(None, find_devices()))
+
+
+@pytest.fixture(scope="session")
+def scalar_device(device: Device) -> Device:
+    """The same device as if it were a GPU: one lane, so the kernels are plain scalar code."""
+    return Device(replace(device.info, lanes=1))
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,5 @@
 """Every kernel against its NumPy reference: odd sizes, 1xN images, all four patterns."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,6 @@ from clpipe.chain.chain import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.engine.check import SIZES, check_ends, check_method, check_raw, compare, example
-from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
 from clpipe.engine.sources import kernel_folder
 from clpipe.reference.cfa import PATTERNS
@@ -26,12 +23,6 @@ SMALL_SIZES = SIZES[:6]
 
 def patterns_of(values):
     return ("GRBG",) if values else PATTERNS
-
-
-@pytest.fixture(scope="module")
-def scalar_device(device: Device) -> Device:
-    """The same device as if it were a GPU: one lane, so the kernels are plain scalar code."""
-    return Device(replace(device.info, lanes=1))
 
 
 @pytest.mark.parametrize(("stage", "method", "values"), VARIANTS)
