@@ -31,7 +31,7 @@ def test_the_example_stage_works(device, tmp_path, monkeypatch):
     stage = load_stage_file(tmp_path / "vignette.py")
     for any_device in (device, Device(replace(device.info, lanes=1))):
         result = check_method(any_device, stage, stage.methods[0])
-        assert result.samples > 1000
+        assert result.difference.samples > 1000
         assert result.passed, result
 
 

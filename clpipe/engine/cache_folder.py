@@ -44,8 +44,8 @@ def prepare_environment() -> None:
     """Have the libraries below keep their caches where they can; before OpenCL is first used.
 
     PoCL keeps its programs in our folder too, unless the user named another one. Both it and
-    pyopencl fail to start where the user's cache folder cannot be written to, so there pyopencl gets
-    ours as well.
+    pyopencl fail to start where the user's cache folder cannot be written to, so there pyopencl
+    gets ours as well.
     """
     folder = cache_folder()
     os.environ.setdefault("POCL_CACHE_DIR", str(folder / "pocl"))

@@ -103,18 +103,10 @@ def chain_for(
     stage: Stage, method: type[Method], values: Mapping[str, Any], pattern: Pattern
 ) -> Chain:
     """One method of a stage as a chain that starts on what it reads, in that pattern."""
-    before = (
-        ("mosaic",) if stage.reads in (Kind.MOSAIC, Kind.RAW) and stage.name != "mosaic" else ()
-    )
-    parameters = {
-        "mosaic": {"pattern": pattern},
-        stage.name: {
-            "method": method.method,
-            **method.example,
-            **values,
-            **({"pattern": pattern} if stage.name == "mosaic" else {}),
-        },
-    }
+    before = {Kind.MOSAIC: ("mosaic",), Kind.RAW: ("mosaic", "quantize")}.get(stage.reads, ())
+    parameters: dict[str, dict[str, Any]] = {"mosaic": {"pattern": pattern}}
+    own = {"method": method.method, **method.example, **values}
+    parameters[stage.name] = parameters.get(stage.name, {}) | own
     settings = Settings(iso=ISO, stages=(*before, stage.name), parameters=parameters)
     return make_chain(settings, start_at=stage.name)
 

@@ -322,15 +322,18 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
         once.append(f"{kind.c_type} values[{launch.rows}];")
         lines.append(f"values[row] = {value};")
         value = "values[row]"
-    stores = []
+    writes, encodes = [], []
     if launch.writes:
         slots = [writer.slot(n, True) for n in plan.slots[launch.writes.number]]
-        stores.append(f"store_{kind.c_name}({', '.join([value, *slots])}, at, e);")
+        writes.append(f"store_{kind.c_name}({', '.join([value, *slots])}, at, e);")
     if launch.encodes:
-        stores.append(_encode(writer, value, kind, curves))
-    loops = _over_block([*lines, *stores], launch) if block else [lines, stores]
+        encodes.append(_encode(writer, value, kind, curves))
     start = "".join(f"    {line}\n" for line in once)
-    body = "".join(_over_rows(part, launch.rows, unroll=not block) for part in loops)
+    if block:
+        body = _over_rows(_over_columns([*lines, *writes, *encodes], launch), launch.rows, False)
+    else:
+        body = _over_rows(lines, launch.rows) + _store(writes, launch.rows)
+        body += _over_rows(encodes, launch.rows) if encodes else ""
     return (
         f"    const uint x = left * LANES + (uint)get_global_id(0) * {max(block, 1)} * LANES;\n"
         f"    const uint y = top * 4 + (uint)get_global_id(1) * {launch.rows};\n"
@@ -339,20 +342,34 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
     )
 
 
-def _over_block(lines: Sequence[str], launch: Launch) -> list[list[str]]:
+def _over_columns(lines: Sequence[str], launch: Launch) -> list[str]:
     """Lines for each vector of a row of a stencil's block."""
     head = f"for (uint column = 0; column < {launch.columns}; ++column) {{"
     beyond = "    if (x - e.left + column * LANES >= columns) break;"
     place = "    const site at = site_at(x + column * LANES, y + row);"
-    return [[head, beyond, place, *(f"    {line}" for line in lines), "}"]]
+    return [head, beyond, place, *(f"    {line}" for line in lines), "}"]
 
 
-def _over_rows(lines: Sequence[str], rows: int, unroll: bool) -> str:
+def _over_rows(lines: Sequence[str], rows: int, unroll: bool = True) -> str:
     """A loop over the rows of a work item. What is in an array already need not be unrolled."""
     place = ["const site at = site_at(x, y + row);"] if unroll else []
     body = "".join(f"        {line}\n" for line in [*place, *lines])
     pragma = "#pragma unroll" if unroll else "#pragma unroll 1"
     return f"{pragma}\n    for (uint row = 0; row < {rows}; ++row) {{\n{body}    }}\n"
+
+
+def _store(writes: Sequence[str], rows: int) -> str:
+    """The stores of all rows of a work item: at edges in a loop of its own, which is slow code."""
+    if not writes:
+        return ""
+    place = "        const site at = site_at(x, y + row);\n"
+    loop = f"    for (uint row = 0; row < {rows}; ++row) {{\n{place}"
+    at_edge = "".join(f"        {line}\n" for line in writes)
+    inside = at_edge.replace("(", "_inside(", 1)
+    return (
+        f"    if (near_edge(first, {rows}, e)) {{\n#pragma unroll 1\n{loop}{at_edge}    }}\n"
+        f"    }} else {{\n#pragma unroll\n{loop}{inside}    }}\n    }}\n"
+    )
 
 
 def _lines(writer: _Writer, launch: Lines) -> str:

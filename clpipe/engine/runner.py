@@ -1,6 +1,7 @@
 """One image through a chain, on a device or in NumPy."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -167,7 +168,8 @@ class Runner:
         if not self.device:
             return self._run_numpy(np.asarray(image, np.float32), image_key)
         plan = self.plan(image.dtype == np.float16, fold=min(image.shape[:2]) > 1)
-        self._make_ready(plan)
+        with suppress(ImageError):  # of the tiny image; the one below says it of this image
+            self._make_ready(plan)
         return self._run_plan(plan, image, image_key, timings, download, into)
 
     def _run_plan(

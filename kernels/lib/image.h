@@ -97,8 +97,8 @@ INLINE ycbcr tap_ycbcr(image i, int dx, int dy) {
 #undef TAP
 
 // Reflect-101 shows the pixel at place i of n at i and -i, and at both again a period further. Stores
-// go over these places from the lowest one in the border on. They are loops that are not unrolled,
-// since few blocks come here and the code stands behind every store of a kernel.
+// at edges go over these places from the lowest one in the border on. Their loops are not unrolled,
+// since few blocks come there, and they would be most of a kernel's code.
 INLINE int mirror_period(int n) { return n > 1 ? 2 * (n - 1) : 1; }
 
 // The lowest place not below `lowest` that is a whole number of periods from `place`.
@@ -107,7 +107,7 @@ INLINE int lowest_place(int place, int period, int lowest) {
     return lowest + (above < 0 ? above + period : above);
 }
 
-static __attribute__((noinline)) void store_row(vf v, __global float *row, int x, extent e) {
+static void store_row(vf v, __global float *row, int x, extent e) {
     const int border = (int)e.border, width = (int)e.columns, period = mirror_period(width);
     if (x > border && x + LANES + border < width) {
         store(v, row + x);
@@ -126,7 +126,7 @@ static __attribute__((noinline)) void store_row(vf v, __global float *row, int x
 }
 
 // `x` and `y` are counted from where the planes begin.
-static __attribute__((noinline)) void store_at_edge(vf v, __global float *dst, int x, int y, extent e) {
+static void store_at_edge(vf v, __global float *dst, int x, int y, extent e) {
     const int border = (int)e.border, rows = (int)e.rows, period = mirror_period(rows);
     __global float *origin = dst + (size_t)border * e.pitch + border_left(e);
 #pragma unroll 1
@@ -137,36 +137,49 @@ static __attribute__((noinline)) void store_at_edge(vf v, __global float *dst, i
     }
 }
 
-INLINE bool near_edge(uint x, uint y, extent e) {
+// Whether a block of rows has pixels that the border mirrors, or that are none of the image's.
+INLINE bool near_edge(site at, uint rows, extent e) {
+    const uint x = at.x - e.left, y = at.y - e.top;
     return x <= e.border || x + LANES + e.border >= e.columns || y <= e.border ||
-           y + 1 + e.border >= e.rows;
+           y + rows + e.border >= e.rows;
 }
 
+// A pixel of a block that is not near an edge.
+INLINE void store_plane_inside(vf v, __global float *dst, site at, extent e) {
+    store(v, dst + plane_offset(at, e));
+}
+
+// Any pixel, with its mirror images.
 INLINE void store_plane(vf v, __global float *dst, site at, extent e) {
     const uint x = at.x - e.left, y = at.y - e.top;
-    if (near_edge(x, y, e)) {
-        if (y < e.rows) store_at_edge(v, dst, (int)x, (int)y, e);
-    } else {
-        store(v, dst + plane_offset(at, e));
-    }
+    if (!near_edge(at, 1, e)) store_plane_inside(v, dst, at, e);
+    else if (y < e.rows) store_at_edge(v, dst, (int)x, (int)y, e);
 }
 
-INLINE void store_mosaic(vf v, __global float *p0, site at, extent e) { store_plane(v, p0, at, e); }
-INLINE void store_pair(pair v, __global float *p0, __global float *p1, site at, extent e) {
-    store_plane(v.first, p0, at, e);
-    store_plane(v.second, p1, at, e);
-}
-INLINE void store_rgb(rgb v, __global float *p0, __global float *p1, __global float *p2, site at,
-                      extent e) {
-    store_plane(v.r, p0, at, e);
-    store_plane(v.g, p1, at, e);
-    store_plane(v.b, p2, at, e);
-}
-INLINE void store_ycbcr(ycbcr v, __global float *p0, __global float *p1, __global float *p2,
-                        site at, extent e) {
-    store_plane(v.y, p0, at, e);
-    store_plane(v.cb, p1, at, e);
-    store_plane(v.cr, p2, at, e);
-}
+// store_rgb(v, plane0, plane1, plane2, at, e), store_rgb_inside(...) and so on for each kind.
+#define STORES(STORE, suffix)                                                                     \
+    INLINE void store_mosaic##suffix(vf v, __global float *p0, site at, extent e) {               \
+        STORE(v, p0, at, e);                                                                      \
+    }                                                                                             \
+    INLINE void store_pair##suffix(pair v, __global float *p0, __global float *p1, site at,       \
+                                   extent e) {                                                    \
+        STORE(v.first, p0, at, e);                                                                \
+        STORE(v.second, p1, at, e);                                                               \
+    }                                                                                             \
+    INLINE void store_rgb##suffix(rgb v, __global float *p0, __global float *p1,                  \
+                                  __global float *p2, site at, extent e) {                        \
+        STORE(v.r, p0, at, e);                                                                    \
+        STORE(v.g, p1, at, e);                                                                    \
+        STORE(v.b, p2, at, e);                                                                    \
+    }                                                                                             \
+    INLINE void store_ycbcr##suffix(ycbcr v, __global float *p0, __global float *p1,              \
+                                    __global float *p2, site at, extent e) {                      \
+        STORE(v.y, p0, at, e);                                                                    \
+        STORE(v.cb, p1, at, e);                                                                   \
+        STORE(v.cr, p2, at, e);                                                                   \
+    }
+STORES(store_plane, )
+STORES(store_plane_inside, _inside)
+#undef STORES
 
 #endif
