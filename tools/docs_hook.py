@@ -130,7 +130,7 @@ def stage_part(record: dict[str, Any]) -> str:
     stage = all_stages()[record["name"]]
     parts = [f"## {stage.name}\n", f"{record['summary']} Image: {kinds(record)}.\n"]
     for each in record["methods"]:
-        parts.append(f"### {stage.name}: {each['name']}\n")
+        parts.append(f"### {each['name']} {{ #{stage.name}-{each['name']} }}\n")
         parts.append(f"{sentence(each['summary'])}\n")
         method = stage.by_name[each["name"]]
         if own := method.__dict__.get("__doc__"):
@@ -234,7 +234,7 @@ wrong and nothing is written; 3, there is no usable device; 130, interrupted.
     :command: main
     :prog_name: clpipe
     :depth: 1
-    :style: table
+    :style: plain
 """
 
 
@@ -268,6 +268,8 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
-def on_page_content(html: str, **_: Any) -> str:
-    """Show roles of reStructuredText in docstrings as code; called by mkdocs."""
+def on_page_content(html: str, page: Any, **_: Any) -> str:
+    """Show roles of reStructuredText and examples of commands as code; called by mkdocs."""
+    if page.file.src_uri == "cli.md":
+        html = re.sub(r"<p>(clpipe [^<]+)</p>", r"<pre><code>\1</code></pre>", html)
     return re.sub(r":\w+:<code>~?([^<]+)</code>", r"<code>\1</code>", html)
