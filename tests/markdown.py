@@ -1,11 +1,11 @@
 """Code blocks of Markdown pages: found, and run in order, as a reader would.
 
-A block of ``sh`` is a script, with ``clpipe`` and ``python`` on the PATH. A block of ``python`` goes
-on where the one before it on the page ended. A block with a title, as in ``toml title="a.toml"``, is
-that file. Blocks of ``toml`` without one are configurations or camera profiles; they must be valid.
+A block of ``sh`` is a script, with ``clpipe`` and ``python`` on the PATH. A block of ``python``
+goes on where the one before it on the page ended. A block with a title (``toml title="a.toml"``) is
+that file. Blocks of ``toml`` are configurations or camera profiles, and must be valid.
 
-A comment before a block changes that: ``<!-- not run: why -->``, or ``<!-- needs: torch -->``, for a
-block that is run only where these modules are installed.
+A comment before a block changes that: ``<!-- not run: why -->``, or ``<!-- needs: torch -->``, for
+a block that is run only where these modules are installed.
 """
 
 import os
@@ -16,6 +16,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from glob import glob
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,8 @@ BLOCK = re.compile(
 )
 RUN = ("sh", "python", "toml")
 WRITTEN = (*RUN, "csv", "json", "c")
-PLAIN = re.compile(r"[^*?\[\]$|;&<>`()\n]*")  # what the command line splits without a shell
+QUOTED = re.compile(r"'[^'\n]*'|\"[^\"\n]*\"")
+SHELL = re.compile(r"[$|;&<`(){}\n]")  # outside of quotes: what only a shell understands
 
 
 @dataclass(frozen=True)
@@ -129,10 +131,29 @@ class PageRunner:
 
     def _script(self, block: Block) -> None:
         lines = list(commands(block.text))
-        if all(line.startswith("clpipe ") and PLAIN.fullmatch(line) for line in lines):
-            for line in lines:  # in this process, which saves the start of another one
-                self._clpipe(*shlex.split(line)[1:])
+        if any(SHELL.search(QUOTED.sub("", line)) for line in lines):
+            self._shell(block, block.text)
             return
+        for line in lines:
+            if line.startswith("clpipe "):  # in this process, which saves the start of another one
+                self._command(line)
+            else:
+                self._shell(block, line)
+
+    def _command(self, line: str) -> None:
+        """Run a line that needs no shell but for globs and ``> FILE``."""
+        words: list[str] = []
+        for word in shlex.split(line, posix=False)[1:]:
+            found = [] if word[0] in "'\"" else sorted(glob(word, root_dir=self._folder))
+            words += found or [word.strip("'\"")]
+        target = ""
+        if ">" in words:
+            words, (target,) = words[: words.index(">")], words[words.index(">") + 1 :]
+        result = self._clpipe(*words)
+        if target:
+            (self._folder / target).write_text(result.stdout)
+
+    def _shell(self, block: Block, script: str) -> None:
         environment = {
             **os.environ,
             "PATH": f"{self._tools}:{os.environ['PATH']}",
@@ -140,7 +161,7 @@ class PageRunner:
             "CLPIPE_CHECKOUT": str(ROOT),
         }
         done = subprocess.run(
-            ["sh", "-eu", "-c", block.text],
+            ["sh", "-eu", "-c", script],
             cwd=self._folder,
             env=environment,
             capture_output=True,

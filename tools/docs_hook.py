@@ -159,10 +159,17 @@ def sentence(text: str) -> str:
 def figure(value: object) -> str:
     """A number with four digits; a dash where none is known."""
     if value is None:
-        return "–"
+        return "-"
     if isinstance(value, list):
         return ", ".join(map(figure, value))
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    return str(value)
+
+
+def nowrap(text: str) -> str:
+    """A number in one line: a hyphen that does not break."""
+    return text.replace("-", "\N{NON-BREAKING HYPHEN}")
 
 
 def cameras_page() -> str:
@@ -199,7 +206,7 @@ def cameras_page() -> str:
             signal, emva = noise["signal"], noise["emva1288"]
             values = [noise["iso"], signal["a"], signal["b"], *emva.values()]
             values += [noise["dark_noise"], noise["row_noise"], noise["column_noise"]]
-            rows.append([figure(float(value)) for value in values])
+            rows.append([nowrap(figure(float(value))) for value in values])
         parts.append(table(headings, rows))
         parts.append("Sources:\n")
         parts += [f"- `{key}`: {text}" for key, text in camera["sources"].items()]
