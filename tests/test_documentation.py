@@ -98,6 +98,8 @@ def the_camera_that_was_simulated(folder):
         true = package.Pipeline(iso=iso).chain.noise
         assert again.a == pytest.approx(true.a, rel=0.05)
         assert again.b == pytest.approx(true.b, rel=0.05)
+    found = package.Pipeline(camera=str(folder / "my_camera.toml")).chain.camera
+    assert found.prnu == pytest.approx(0.005, rel=0.05)
 
 
 def the_drawn_values(folder):
