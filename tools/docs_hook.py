@@ -13,8 +13,8 @@ from typing import Any
 
 from click.testing import CliRunner
 
-from clpipe.cli import main
-from clpipe.registry import all_stages
+from clpipe.chain.registry import all_stages
+from clpipe.commands.main import main
 from clpipe.stage import Method
 
 ROOT = Path(__file__).resolve().parent.parent
