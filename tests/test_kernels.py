@@ -21,14 +21,9 @@ VARIANTS = [
 SMALL_SIZES = SIZES[:6]
 
 
-def patterns_of(values):
-    return ("GRBG",) if values else PATTERNS
-
-
 @pytest.mark.parametrize(("stage", "method", "values"), VARIANTS)
 def test_kernel_agrees_with_its_reference(device, stage, method, values):
-    # A variant reads the pattern through the same functions as the method's default.
-    result = check_method(device, stage, method, patterns=patterns_of(values), values=values)
+    result = check_method(device, stage, method, values=values)
     assert result.difference.samples > 1000
     assert result.passed, result
 

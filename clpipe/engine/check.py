@@ -129,12 +129,14 @@ def check_method(
     patterns: Sequence[Pattern] = PATTERNS,
     values: Mapping[str, Any] | None = None,
 ) -> Check:
-    """One method of a stage, in all these patterns where it depends on the pattern.
+    """One method of a stage, in all these patterns if it depends on the pattern.
 
-    ``values`` are parameters of the method that are not left at their defaults.
+    ``values`` are parameters that choose a variant of the method; a variant is checked in the first
+    of the patterns.
     """
     values = values or {}
-    if not depends_on_pattern(stage, method, values):
+    # A variant reads the pattern through the same functions as the method's default.
+    if values or not depends_on_pattern(stage, method, values):
         patterns = patterns[:1]
     total = Difference()
     for pattern in patterns:
