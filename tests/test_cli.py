@@ -319,9 +319,6 @@ def test_check(clpipe):
     record = json.loads(clpipe("check", "mosaic", "quantize", "--small", "--json").stdout)
     assert record["failed"] == 0
     assert [c["stage"] for c in record["checks"]] == ["mosaic", "quantize"]
-    whole = json.loads(clpipe("check", "--small", "--json").stdout)
-    assert whole["failed"] == 0
-    assert {c["stage"] for c in whole["checks"]} >= {*DEFAULT_CHAIN, "exposure..quantize"}
     assert "unknown stage 'mosiac'" in clpipe("check", "mosiac", status=2).stderr
     assert "numpy is the reference" in clpipe("check", "--device", "numpy", status=2).stderr
 
