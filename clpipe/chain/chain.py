@@ -9,7 +9,7 @@ from clpipe.camera.noise import NoiseModel
 from clpipe.camera.profile import Camera, load_camera
 from clpipe.chain.drawing import check_camera
 from clpipe.chain.draws import Draw
-from clpipe.chain.methods import base_name, make_method, named_errors
+from clpipe.chain.methods import base_name, make_method, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
 from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
@@ -204,7 +204,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
             if isinstance(method, Unchanged) and stage.reads is stage.writes:
                 continue  # so that gamma can be skipped without picture_noise, which does nothing
             raise RequestError(misfit(name, stage, before, kind or stage.reads))
-        with named_errors(name, type(method)), user_code_errors(f"stage {name}", stage.folder):
+        with validation_errors(name, type(method)), user_code_errors(f"stage {name}", stage.folder):
             method = method.resolve(context)
             after = method.after(context)
         if stage.folder:

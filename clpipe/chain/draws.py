@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from clpipe.base.errors import KeyedError
 from clpipe.base.text import one_of
+from clpipe.base.validation import first_fault
 
 TINY = math.ulp(0.0)
 
@@ -307,16 +308,14 @@ def parse_draw(key: str, table: Mapping[str, Any]) -> Draw:
     law = LAWS[named[0]]
     try:
         return law.model_validate(dict(table))
-    except ValidationError as errors:
-        error = errors.errors()[0]
-        field = str(error["loc"][0]) if error["loc"] else named[0]
-        reason = error["msg"].removeprefix("Value error, ").removeprefix("Input ")
-        if error["type"] == "extra_forbidden":
+    except ValidationError as error:
+        fault = first_fault(error)
+        field = str(fault.path[0]) if fault.path else named[0]
+        reason = fault.text
+        if fault.problem == "unknown":
             reason = one_of(f"key of {named[0]}", field, law.model_fields)
-        elif error["type"] == "missing":
+        elif fault.problem == "missing":
             reason = f"it needs {field}"
-        elif error["loc"]:
-            reason = f"found {error['input']!r}: {reason}"
         raise KeyedError(key, f"{key}: {field}: {reason}") from None
 
 

@@ -1,4 +1,4 @@
-"""TODO."""
+"""The methods of stages: found by their names, made from a table of parameters and validated."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -10,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from clpipe.base.errors import KeyedError
 from clpipe.base.text import one_of
+from clpipe.base.validation import first_fault
 from clpipe.chain.keys import OUTPUT
 from clpipe.chain.registry import all_stages
 from clpipe.images.encoding import Output
@@ -53,7 +54,7 @@ def make_method(stage: Stage, name: str, table: Mapping[str, Any]) -> Method:
         KeyedError: an unknown method or parameter, or a value that is not allowed.
     """
     method = method_named(stage, name, table.get("method", stage.methods[0].method))
-    with named_errors(name, method):
+    with validation_errors(name, method):
         return method.model_validate({k: v for k, v in table.items() if k != "method"})
 
 
@@ -75,35 +76,30 @@ def make_output(table: Mapping[str, Any]) -> Output:
     Raises:
         KeyedError: an unknown key, or a value that is not allowed.
     """
-    try:
+    with validation_errors(OUTPUT, Output):
         return Output.model_validate(dict(table))
-    except ValidationError as errors:
-        error = errors.errors()[0]
-        name = str(error["loc"][0])
-        key = f"{OUTPUT}.{name}"
-        if error["type"] == "extra_forbidden":
-            raise unknown_parameter(OUTPUT, Output, name) from None
-        reason = error["msg"].removeprefix("Input ")
-        raise KeyedError(key, f"{key}: found {error['input']!r}: {reason}") from None
 
 
 @contextmanager
-def named_errors(name: str, method: type[Method]) -> Iterator[None]:
-    """Turn what pydantic says of a step's parameters into a message that names the step.
+def validation_errors(name: str, model: type[BaseModel]) -> Iterator[None]:
+    """Turn what pydantic refuses in a table into a message that names the table.
+
+    Args:
+        name: of the step, or of the table of output.
+        model: what declares the table's keys.
 
     Raises:
-        KeyedError: a parameter is unknown, or its value is not allowed.
+        KeyedError: a key is unknown, or its value is not allowed.
     """
     try:
         yield
-    except ValidationError as errors:
-        error = errors.errors()[0]
-        key = ".".join([name, *(str(part) for part in error["loc"])])
-        if error["type"] == "extra_forbidden":
-            raise unknown_parameter(name, method, str(error["loc"][0])) from None
-        reason = error["msg"].removeprefix("Value error, ").removeprefix("Input ")
-        found = f" found {error['input']!r}:" if error["loc"] else ""
-        raise KeyedError(key, f"{key}:{found} {reason}") from None
+    except ValidationError as error:
+        fault = first_fault(error)
+        if fault.problem == "unknown":
+            raise unknown_parameter(name, model, str(fault.path[0])) from None
+        key = ".".join([name, *(str(part) for part in fault.path[:1])])
+        place = f"{name}.{fault.key}" if fault.path else name
+        raise KeyedError(key, f"{place}: {fault.text}") from None
 
 
 def unknown_parameter(step: str, model: type[BaseModel], parameter: str) -> KeyedError:
