@@ -7,9 +7,8 @@ from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.profile import Camera, load_camera
-from clpipe.chain.drawing import check_camera
 from clpipe.chain.draws import Draw
-from clpipe.chain.methods import base_name, make_method, validation_errors
+from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
 from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
@@ -136,7 +135,7 @@ def make_chain(
         RequestError: a chain whose image kinds do not fit, an unknown camera, an ISO it has not,
             a step that is not there.
     """
-    check_camera(settings)
+    settings.check_cameras()
     draws, settings = settings.draws, settings.drawn("")
     camera = load_camera(settings.camera)
     steps = resolved_steps(settings, camera, source or (None if start_at else entry(settings)))
@@ -199,7 +198,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     before = "the input"
     for name in step_names(settings):
         stage = all_stages()[base_name(name)]
-        method = make_method(stage, name, settings.parameters.get(name, {}))
+        method = settings.method(name)
         if stage.reads is not (kind or stage.reads):
             if isinstance(method, Unchanged) and stage.reads is stage.writes:
                 continue  # so that gamma can be skipped without picture_noise, which does nothing

@@ -13,7 +13,6 @@ from typing import Any, Protocol
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
 from clpipe.chain.chain import step_names
-from clpipe.chain.drawing import check_camera
 from clpipe.chain.files import toml_value
 from clpipe.chain.keys import OUTPUT
 from clpipe.chain.methods import base_name
@@ -131,7 +130,7 @@ def check_rows(
         try:
             own = overlay(settings, row.values)
             if not brings(row.path):
-                check_camera(own)
+                own.check_cameras()
                 for step in row.values:
                     if step not in (*PLAIN, OUTPUT, *steps):
                         raise RequestError(one_of("stage in this chain", step, steps))

@@ -14,7 +14,6 @@ from typing import Any
 from clpipe.base.about import __version__
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of, write_beside
-from clpipe.chain.paths import files_of
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
@@ -45,7 +44,7 @@ def wanted(asked: Request, reading: ReadOptions, target: OutputWriter) -> dict[s
         "transfer": reading.transfer,
         "formats": target.formats,
         "keep": target.keep,
-        "files": digests([*files_of(asked.settings()), *asked.stage_files]),
+        "files": digests([*asked.settings().files(), *asked.stage_files]),
     }
     found: dict[str, Any] = json.loads(json.dumps(record))  # as a sidecar will have it
     return found
