@@ -14,15 +14,13 @@ from typing import Any, Self
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.chain import Chain
-from clpipe.chain.files import own_values
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_device
 from clpipe.engine.runner import Runner
-from clpipe.images.read import ReadOptions, set_codec_threads
+from clpipe.images.read import set_codec_threads
 from clpipe.inputs.find import Job, find_jobs
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.inputs.raw import RawImage
-from clpipe.outputs.writer import named
 from clpipe.pipeline import plain
 from clpipe.stage import Kind
 
@@ -99,17 +97,23 @@ class Dataset:
         threads: int | None = None,
         **settings: Any,
     ) -> None:
-        own = None if config is None else own_values(str(config))
-        asked = Request(own, plain(settings), start_at=start_at, until=until)
-        self._entrance = ImageLoader(asked, ReadOptions(layer=layer, transfer=transfer))
+        request = Request.from_options(
+            config=None if config is None else str(config),
+            values=plain(settings),
+            start_at=start_at,
+            until=until,
+            layer=layer,
+            transfer=transfer,
+        )
+        self._loader = ImageLoader(request)
         several = [inputs] if isinstance(inputs, str | Path) else inputs
-        self._jobs = find_jobs([str(i) for i in several], NOWHERE, self._entrance.endings())
-        self._entrance.check(self._jobs)
+        self._jobs = find_jobs([str(i) for i in several], NOWHERE, self._loader.endings())
+        self._loader.check(self._jobs)
         _check_keys(self._jobs)
-        chain = self._entrance.first_chain(self._jobs)
+        chain = self._loader.first_chain(self._jobs)
         if truth:
             chain.without_noise()  # refuses a chain that adds no noise
-        self._keep = chain.kept([keep] if isinstance(keep, str) else keep)
+        self._keep = chain.select([keep] if isinstance(keep, str) else keep)
         self._encode = chain.result is Kind.DISPLAY
         self._truth = truth
         self._selector = None if device is None else str(device)
@@ -145,8 +149,7 @@ class Dataset:
         return part
 
     def __getstate__(self) -> Mapping[str, Any]:
-        # What was found out and opened stays with the process.
-        return {**self.__dict__, "_entrance": replace(self._entrance), "_opened": None}
+        return {**self.__dict__, "_opened": None}  # a device stays with its process
 
     def __len__(self) -> int:
         """How many samples there are, over all epochs.
@@ -202,34 +205,34 @@ class Dataset:
         return self._jobs[image], self._epoch + epoch
 
     def _read(self, job: Job, epoch: int) -> LoadedImage:
-        entrance = self._entrance
+        loader = self._loader
         try:
-            entrance = entrance.of(replace(job, key=key_in(epoch, job.key)))
-            entered = entrance.enter(job, entrance.read(job))
+            loader = loader.for_job(replace(job, key=key_in(epoch, job.key)))
+            loaded = loader.enter(job, loader.read(job))
         except (ImageError, RequestError, MemoryError) as error:
-            raise ImageError(entrance.explain(job, error)) from None
-        if entered is None:
+            raise ImageError(loader.error_text(job, error)) from None
+        if loaded is None:
             raise ImageError(
                 f"{job.path}: was kept after another step than the one before "
-                f"{entrance.asked.start_at}; name those to go on from by a glob"
+                f"{loader.request.start_at}; name the images to go on from by a glob"
             )
-        for warning in entered.source.warnings:
+        for warning in loaded.source.warnings:
             warnings.warn(f"{job.path}: {warning}", stacklevel=2)
-        return entered
+        return loaded
 
     def _develop_read(self, job: Job, epoch: int, read: Future[LoadedImage]) -> Sample:
         return self._develop(job, epoch, read.result())
 
-    def _develop(self, job: Job, epoch: int, entered: LoadedImage) -> Sample:
-        chain = entered.chain
+    def _develop(self, job: Job, epoch: int, loaded: LoadedImage) -> Sample:
+        chain = loaded.chain
         try:
-            made = self._developer().develop(entered, key_in(epoch, entered.key))
+            arrays = self._developer().develop(loaded, key_in(epoch, loaded.key))
         except (ImageError, RequestError, MemoryError) as error:
-            raise ImageError(self._entrance.explain(job, error)) from None
-        is_known = chain.is_noisy or not isinstance(entered.source, RawImage)
-        noise = chain.noise if is_known else None
+            raise ImageError(self._loader.error_text(job, error)) from None
+        adds_noise = chain.is_noisy or not isinstance(loaded.source, RawImage)
+        noise = chain.noise if adds_noise else None
         a, b = (noise.a, noise.b) if noise else (0.0, 0.0)
-        return {**made, "key": job.key, "epoch": epoch, "iso": chain.iso, "a": a, "b": b}
+        return {**arrays, "key": job.key, "epoch": epoch, "iso": chain.iso, "a": a, "b": b}
 
     def _developer(self) -> "_Developer":
         """What develops in this process.
@@ -262,21 +265,21 @@ class _Developer:
         self._chain: Chain | None = None
         self._runners: dict[str, Runner] = {}
 
-    def develop(self, entered: LoadedImage, key: str) -> Sample:
-        """The pictures of an image, and what is kept on the way.
+    def develop(self, loaded: LoadedImage, key: str) -> Sample:
+        """The arrays of a sample: "image", "truth" and kept images.
 
         Raises:
-            ImageError, RequestError, MemoryError: it cannot be developed.
+            ImageError, RequestError, MemoryError: the image cannot be developed.
         """
-        made: Sample = {}
+        arrays: Sample = {}
         with self._lock:
-            self._prepare(entered.chain)
+            self._prepare(loaded.chain)
             for name, runner in self._runners.items():
-                result = runner.run(entered.source.pixels, key)
-                inside = "" if name == "image" else f"{name}."
-                made |= {inside + step: image for step, image in result.kept.items()}
-                made[name] = result.image
-        return made
+                result = runner.run(loaded.source.pixels, key)
+                prefix = "" if name == "image" else f"{name}."
+                arrays |= {prefix + step: image for step, image in result.kept.items()}
+                arrays[name] = result.image
+        return arrays
 
     def _prepare(self, chain: Chain) -> None:
         """Have runners for a chain, which is mostly the one before."""
@@ -305,6 +308,6 @@ def _check_keys(jobs: Sequence[Job]) -> None:
         other = owners.setdefault(job.key, job)
         if other is not job:
             raise RequestError(
-                f"{named(other)} and {named(job)} have the same image key, {job.key}, and would "
+                f"{other.label} and {job.label} have the same image key, {job.key}, and would "
                 "have the same noise; give the folder that both are in"
             )

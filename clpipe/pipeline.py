@@ -47,7 +47,7 @@ class Pipeline:
         self._settings = overlay(load_settings(str(config)), plain(settings))
         self._ends = start_at, until
         chain = self._chain(self._settings)
-        kept = chain.kept([keep] if isinstance(keep, str) else keep)
+        kept = chain.select([keep] if isinstance(keep, str) else keep)
         encode = chain.result is Kind.DISPLAY
         on = open_device(None if device is None else str(device))
         self._runner = Runner(chain, on, kept, encode=encode, final=not encode)

@@ -1,6 +1,6 @@
-"""WebDataset shards: the pictures of so many images at a time, with their sidecars, in one tar.
+"""WebDataset tars: each holds the pictures of a number of images, with their sidecars.
 
-The pictures of a tar are written into a hidden folder of its own, and packed when all are there.
+The pictures of a tar are first written to a hidden folder, and packed when all are there.
 """
 
 import json
@@ -20,20 +20,18 @@ from clpipe.base.errors import ImageError, OutputError, RequestError
 from clpipe.base.files import write_beside
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, Outcome
 from clpipe.batch.threads import Batch
+from clpipe.batch.work import ImageWorker
 from clpipe.chain.chain import Chain
 from clpipe.engine.device import Device
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.folder import RESUMABLE, remove_unfinished
-from clpipe.outputs.formats import SIDECAR
-from clpipe.outputs.sidecar import OWN, is_as_wanted, read_sidecar
-from clpipe.outputs.writer import OutputWriter, named
+from clpipe.outputs.sidecar import OWN, SIDECAR, is_current, read_sidecar
+from clpipe.outputs.writer import OutputWriter
 
-STAGING = ".clpipe."  # before the name of a tar: the folder of its pictures until it is packed
-
+STAGING = ".clpipe."  # begins the name of the folder that holds a tar's pictures until it is packed
 
 NUMBERED = re.compile(rf"({re.escape(STAGING)})?(\d{{6,}})\.tar")
-
 
 HIDDEN_BY_READERS = re.compile("__[^/]*__/")  # the webdataset package skips such folders
 
@@ -50,7 +48,7 @@ def sample_name(job: Job) -> str:
 
 @dataclass(frozen=True)
 class Tar:
-    """One shard of a run, which has ``of`` of them; its jobs are named as samples."""
+    """One tar of a run, which has ``of`` of them; its jobs are named as samples."""
 
     folder: Path
     name: str
@@ -69,22 +67,22 @@ class Tar:
 
 
 def cut(jobs: Sequence[Job], count: int, folder: Path) -> list[Tar]:
-    """The tars of a run, of ``count`` jobs each, in their order.
+    """The tars of a run, of ``count`` jobs each, in the order of the jobs.
 
     Raises:
-        RequestError: two jobs would be the same sample, or readers would not see one.
+        RequestError: two jobs would be the same sample, or WebDataset would skip one.
     """
     owners: dict[str, Job] = {}
     for job in jobs:
         name = sample_name(job)
         if name in owners:
             raise RequestError(
-                f"{named(owners[name])} and {named(job)} would both be the sample {name} "
+                f"{owners[name].label} and {job.label} would both be the sample {name} "
                 "(a key of WebDataset has no dots); give one of them another name"
             )
         if HIDDEN_BY_READERS.match(name):
             raise RequestError(
-                f"{named(job)}: would be the sample {name}, but WebDataset takes a folder "
+                f"{job.label}: would be the sample {name}, but WebDataset takes a folder "
                 "__NAME__ for its own and skips it; give it another name"
             )
         owners[name] = job
@@ -94,11 +92,14 @@ def cut(jobs: Sequence[Job], count: int, folder: Path) -> list[Tar]:
 
 
 def prepare(tars: Sequence[Tar], overwrite: bool) -> None:
-    """Clear the output folder of what a killed run left of these tars, and see that they may be
-    written; with ``overwrite`` also over tars of others.
+    """Remove what a killed run left of these tars, and see that they may be written.
+
+    Args:
+        tars: of this run.
+        overwrite: whether tars that clpipe did not write may be overwritten.
 
     Raises:
-        RequestError: a tar is somebody else's, or one of a run with more tars.
+        RequestError: a tar is somebody else's, or is one of a run with more tars.
     """
     folder, total = tars[0].folder, tars[0].of
     remove_unfinished(folder, [Job(tar.path, tar.name) for tar in tars])
@@ -134,18 +135,18 @@ def is_own(path: Path) -> bool:
 
 
 @dataclass(frozen=True)
-class Staged(OutputWriter):
-    """The same target, but for each picture in the folder of its tar."""
+class StagedWriter(OutputWriter):
+    """A writer that puts each picture into the folder of its tar."""
 
     folders: Mapping[str, str] = field(default_factory=dict)  # by the stem of a job
 
     def path(self, job: Job, ending: str, name: str = "") -> Path:
-        """The output of a job with that ending, until it is packed."""
+        """The file of a job with an ending, until it is packed."""
         return self.folder / self.folders[job.stem] / f"{job.stem}{name}.{ending}"
 
 
 class Members:
-    """What lies where in a tar; nothing where there is none, or behind damage."""
+    """Where each file lies in a tar, up to the first damage; a missing tar is empty."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -160,27 +161,27 @@ class Members:
             pass
 
     def sidecar(self, name: str) -> Mapping[str, Any]:
-        """A sidecar's values; empty where it is not there, or not whole."""
+        """A sidecar's values; empty where it is missing or damaged."""
         if name not in self.places:
             return {}
         start, size = self.places[name]
         try:
             with open(self._path, "rb") as file:
                 file.seek(start)
-                found = json.loads(file.read(size))
+                values = json.loads(file.read(size))
         except (OSError, ValueError):
             return {}
-        return found if isinstance(found, dict) else {}
+        return values if isinstance(values, dict) else {}
 
 
-class _Shard:
-    """A tar on its way: what it holds from before, and what became of its jobs."""
+class Packer:
+    """Packs one tar: what an earlier run left in it, and what became of its jobs."""
 
-    def __init__(self, tar: Tar, target: OutputWriter) -> None:
+    def __init__(self, tar: Tar, writer: OutputWriter) -> None:
         self._tar = tar
-        self._target = target
+        self._writer = writer
         self._lock = threading.Lock()
-        self._from_before: dict[str, list[str]] = {}  # sidecars, and the files that they name
+        self._reused: dict[str, list[str]] = {}  # sidecars of the tar, and the files that they name
         self._statuses: dict[str, str] = {}
 
     @cached_property
@@ -188,37 +189,40 @@ class _Shard:
         return Members(self._tar.path)
 
     def _member(self, job: Job, name: str) -> str:
-        path = self._target.path(job, SIDECAR, name)
+        path = self._writer.path(job, SIDECAR, name)
         return path.relative_to(self._tar.staging).as_posix()
 
-    def has(self, job: Job, name: str, wanted: Mapping[str, Any]) -> bool:
-        """Whether the tar holds a picture as it is wanted; it is then taken from there."""
+    def has(self, job: Job, name: str, request: Mapping[str, Any]) -> bool:
+        """Whether the tar holds a rendition that was made by the same request; it is then reused.
+
+        Arguments as for :meth:`clpipe.batch.work.ImageWorker.is_done`.
+        """
         member = self._member(job, name)
         with self._lock:
-            found = self._old.sidecar(member)
-        if not found or not is_as_wanted(found, job, wanted):
+            values = self._old.sidecar(member)
+        if not values or not is_current(values, job, request):
             return False
-        files = [str(PurePosixPath(member).with_name(n)) for n in found["outputs"]]
+        files = [str(PurePosixPath(member).with_name(n)) for n in values["outputs"]]
         if not all(file in self._old.places for file in files):
             return False
-        self._from_before[member] = files
+        self._reused[member] = files
         return True
 
-    def shown(self, outcome: Outcome) -> Outcome:
-        """An outcome as it is told: with the tar in place of the folder."""
+    def packed(self, outcome: Outcome) -> Outcome:
+        """An outcome that names the tar in place of the hidden folder."""
         job = replace(outcome.job, name=f"{self._tar.name}/{outcome.job.stem}")
         outputs = tuple(file.removeprefix(STAGING) for file in outcome.outputs)
         return replace(outcome, job=job, outputs=outputs)
 
     def add(self, outcome: Outcome) -> bool:
-        """Note what became of a job; whether it was the last one."""
+        """Note what became of a job, and say whether it was the last one."""
         self._statuses[outcome.job.stem] = outcome.status
         return len(self._statuses) == len(self._tar.jobs)
 
     def pack(self) -> None:
-        """Write the tar, where that changes it, and remove the folder of its pictures.
+        """Write the tar, unless it would stay the same, and remove the folder of its pictures.
 
-        An image that failed is left out; where others failed too and none is new, the tar stays.
+        Images that failed are left out. Where some failed and none is new, the tar stays as it is.
 
         Raises:
             OutputError: it cannot be written.
@@ -236,19 +240,19 @@ class _Shard:
         shutil.rmtree(self._tar.staging, ignore_errors=True)
 
     def _members(self) -> Iterator[tuple[str, Path | tuple[int, int]]]:
-        """The names of what belongs into the tar, in order, and where it is: a file, or where in
-        the tar from before.
+        """The members of the tar, in order: the name of each, and where its bytes are, in a file or
+        at an offset and size in the old tar.
         """
         for job in self._tar.jobs:
             if self._statuses[job.stem] not in (DONE, SKIPPED):
                 continue
-            for name in self._target.pictures_of(job):
+            for name in self._writer.names_of(job):
                 member = self._member(job, name)
-                if files := self._from_before.get(member):
+                if files := self._reused.get(member):
                     for file in (*files, member):
                         yield file, self._old.places[file]
                     continue
-                sidecar = self._target.path(job, SIDECAR, name)
+                sidecar = self._writer.path(job, SIDECAR, name)
                 paths = [sidecar.with_name(n) for n in read_sidecar(sidecar)["outputs"]]
                 for path in (*paths, sidecar):
                     yield path.relative_to(self._tar.staging).as_posix(), path
@@ -272,43 +276,66 @@ class _Shard:
             os.fsync(file.fileno())
 
 
+class TarWorker(ImageWorker):
+    """A worker whose pictures may be done in a tar."""
+
+    def __init__(self, packers: "Packers", *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._packers = packers
+
+    def is_done(self, job: Job, name: str, request: Mapping[str, Any]) -> bool:
+        """Whether a rendition is done, in its tar or in the folder that will be packed."""
+        return self._packers.of(job).has(job, name, request) or super().is_done(job, name, request)
+
+
+class Packers:
+    """The packers of all tars of a run that are not packed yet."""
+
+    def __init__(self, tars: Sequence[Tar], writer: StagedWriter) -> None:
+        self._folders = writer.folders
+        self._packers = {tar.staging.name: Packer(tar, writer) for tar in tars}
+
+    def of(self, job: Job) -> Packer:
+        """The packer of a job's tar."""
+        return self._packers[self._folders[job.stem]]
+
+    def drop(self, job: Job) -> None:
+        """Forget the packer of a job's tar."""
+        del self._packers[self._folders[job.stem]]
+
+
 class TarBatch(Batch):
-    """A run over many images whose pictures are packed into tars.
+    """One run over many images whose pictures are packed into tars.
 
     Args:
-        tars: which.
-        entrance, target, devices, chain, threads, overwrite, trace: as for the base.
+        tars: what is made.
+        loader, writer, chain, overwrite, trace: as for :class:`clpipe.batch.work.ImageWorker`.
+        devices, threads: as for the base.
     """
 
     def __init__(
         self,
         tars: Sequence[Tar],
-        entrance: ImageLoader,
-        target: OutputWriter,
-        devices: Sequence[Device | None],
+        loader: ImageLoader,
+        writer: OutputWriter,
         chain: Chain,
+        devices: Sequence[Device | None],
         threads: int | None = None,
         overwrite: bool = False,
         trace: bool = False,
     ) -> None:
         folders = {job.stem: tar.staging.name for tar in tars for job in tar.jobs}
-        staged = Staged(**vars(target), folders=folders)
-        super().__init__(entrance, staged, devices, chain, threads, overwrite, trace)
+        staged = StagedWriter(writer.folder, writer.request, folders)
         self._tars = tars
-        self._folders = folders
-        self._shards = {tar.staging.name: _Shard(tar, staged) for tar in tars}
-
-    def _shard_of(self, job: Job) -> _Shard:
-        return self._shards[self._folders[job.stem]]
-
-    def is_there(self, job: Job, name: str, wanted: Mapping[str, Any]) -> bool:
-        """Whether a picture is there already, in its tar or in the folder that will be one."""
-        return self._shard_of(job).has(job, name, wanted) or super().is_there(job, name, wanted)
+        self._overwrite = overwrite
+        self._packers = Packers(tars, staged)
+        worker = TarWorker(self._packers, loader, staged, chain, overwrite, trace)
+        super().__init__(worker, devices, threads)
 
     def run(self, jobs: Sequence[Job]) -> Generator[Outcome, None, None]:
-        """The same; a tar is packed while the next one is made.
+        """Do every job, as the base does; a tar is packed while the next one is made.
 
-        What a killed run left is cleared away first.
+        What a killed run left is removed first.
 
         Raises:
             RequestError: as :func:`prepare`.
@@ -317,15 +344,15 @@ class TarBatch(Batch):
         """
         prepare(self._tars, self._overwrite)
         packing: Future[None] | None = None
-        with ThreadPoolExecutor(1, "pack") as packer:
+        with ThreadPoolExecutor(1, "pack") as pool:
             for outcome in super().run(jobs):
-                shard = self._shard_of(outcome.job)
-                is_last = shard.add(outcome)
-                yield shard.shown(outcome)
+                packer = self._packers.of(outcome.job)
+                is_last = packer.add(outcome)
+                yield packer.packed(outcome)
                 if is_last:
                     if packing:
                         packing.result()
-                    packing = packer.submit(shard.pack)
-                    del self._shards[self._folders[outcome.job.stem]]
+                    packing = pool.submit(packer.pack)
+                    self._packers.drop(outcome.job)
             if packing:
                 packing.result()

@@ -1,4 +1,4 @@
-"""Plans, stages and devices in words, for people and for programs."""
+"""``clpipe bench``: how fast a chain, a stage's methods or whole batches are on a device."""
 
 import os
 from dataclasses import asdict
@@ -9,7 +9,7 @@ import click
 from clpipe.base.errors import RequestError
 from clpipe.batch.bench import BatchSpeed, bench_batch, loads
 from clpipe.chain.methods import stage_named
-from clpipe.chain.request import request_from_options
+from clpipe.chain.request import Request
 from clpipe.commands.options import chain_options, device_option, json_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.bench import bench as run_bench
@@ -70,7 +70,7 @@ def bench(
     methods: str | None,
     batch: bool,
     as_json: bool,
-    **request: Any,
+    **options: Any,
 ) -> None:
     """Time the chain and each launch, from half RGB to eight-bit RGB on the device."""
     width, _, height = size.partition("x")
@@ -80,8 +80,8 @@ def bench(
             f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 6000x4000, "
             f"at most {MAX_PIXELS} pixels"
         )
-    asked = request_from_options(**request)
-    chain = asked.chain()
+    request = Request.from_options(**options)
+    chain = request.chain()
     device = open_device(selector)
     if device is None:
         raise RequestError("bench: it times the kernels of a device; numpy has none")
@@ -96,7 +96,7 @@ def bench(
         show(("method", "launches", "ms", "MP/s"), rows, left=1)
         return
     if batch:
-        batches = [bench_batch(device, asked, load) for load in loads()]
+        batches = [bench_batch(device, request, load) for load in loads()]
         if as_json:
             show_json({"device": device.info.label, "batches": [b.record() for b in batches]})
             return

@@ -7,8 +7,8 @@ from typing import Any
 import click
 
 from clpipe.chain.files import built_in_configs
+from clpipe.chain.formats import EVERY_FORMAT
 from clpipe.chain.request import DEFAULTS
-from clpipe.outputs.formats import EVERY_FORMAT
 
 stage_file_option = click.option(
     "--stage-file",
