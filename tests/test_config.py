@@ -8,10 +8,11 @@ import pytest
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import load_camera
 from clpipe.chain.chain import make_chain
-from clpipe.chain.files import built_in_configs, load_settings, parse_assignment, toml_text
+from clpipe.chain.files import built_in_configs, load_settings, toml_text
 from clpipe.chain.methods import default_method
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import overlay, settings_from
+from clpipe.chain.toml import parse_assignment
 from clpipe.stage import Kind, Method
 from clpipe.stages import DEFAULT_CHAIN
 

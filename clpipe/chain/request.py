@@ -11,11 +11,12 @@ from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
 from clpipe.chain.chain import Chain, make_chain
-from clpipe.chain.files import load_config, parse_assignment
+from clpipe.chain.files import load_config
 from clpipe.chain.formats import EVERY_FORMAT
 from clpipe.chain.keys import KEYS, OUTPUT
 from clpipe.chain.registry import load_stage_file
 from clpipe.chain.settings import Settings, overlay
+from clpipe.chain.toml import parse_assignment
 from clpipe.stage import Kind
 
 DEFAULTS = Settings()

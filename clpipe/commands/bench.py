@@ -10,7 +10,9 @@ from clpipe.base.errors import RequestError
 from clpipe.batch.bench import BatchSpeed, bench_batch, loads
 from clpipe.chain.methods import stage_named
 from clpipe.chain.request import Request
-from clpipe.commands.options import chain_options, device_option, json_option
+from clpipe.commands.chain_options import chain_options
+from clpipe.commands.completion import methods_of
+from clpipe.commands.options import device_option, json_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.bench import bench as run_bench
 from clpipe.engine.bench import bench_methods
@@ -52,15 +54,22 @@ def batch_row(speed: BatchSpeed) -> tuple[str, ...]:
     "--size", default="6000x4000", show_default=True, metavar="WxH", help="The picture's size."
 )
 @click.option(
-    "--repeat", default=7, show_default=True, type=click.IntRange(1), help="Runs; the best counts."
+    "--repeat",
+    default=7,
+    show_default=True,
+    type=click.IntRange(1),
+    help="Number of runs; the best counts.",
 )
 @click.option(
-    "--methods", metavar="STAGE", help="Time each method of this stage instead, on its own."
+    "--methods",
+    metavar="STAGE",
+    shell_complete=methods_of,
+    help="Time each method of this stage alone, instead of the chain.",
 )
 @click.option(
     "--batch",
     is_flag=True,
-    help="Time whole batches of files instead, half EXR to JPEG, in threads and serially.",
+    help="Time batches of files instead, half EXR to JPEG, in threads and serially.",
 )
 @json_option
 def bench(

@@ -1,4 +1,4 @@
-"""TODO."""
+"""``clpipe calibrate``: the noise of a sensor from raw frames, as a camera profile."""
 
 from pathlib import Path
 

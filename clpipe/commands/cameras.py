@@ -1,4 +1,4 @@
-"""TODO."""
+"""``clpipe cameras``: the built-in cameras, or the noise of one."""
 
 from typing import Any
 
@@ -6,6 +6,7 @@ import click
 
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import Camera, built_in_cameras, load_camera
+from clpipe.commands.completion import cameras as camera_names
 from clpipe.commands.options import json_option
 from clpipe.commands.printing import Rows, short_text, show, show_json
 
@@ -125,7 +126,7 @@ def camera_record(camera: Camera, iso: float | None = None) -> dict[str, Any]:
 
 
 @click.command("cameras")
-@click.argument("name", required=False, metavar="[NAME|FILE]")
+@click.argument("name", required=False, metavar="[NAME|FILE]", shell_complete=camera_names)
 @click.option("--iso", type=float, help="The ISO. [default: those that were measured]")
 @json_option
 def cameras(name: str | None, iso: float | None, as_json: bool) -> None:

@@ -1,4 +1,4 @@
-"""TODO."""
+"""``clpipe check``: kernels compared with their NumPy references."""
 
 import sys
 from pathlib import Path
@@ -8,6 +8,7 @@ import click
 from clpipe.base.errors import RequestError
 from clpipe.chain.methods import stage_named
 from clpipe.chain.registry import load_stage_file
+from clpipe.commands.completion import steps
 from clpipe.commands.options import device_option, json_option, stage_file_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.check import SIZES, Check, check_all
@@ -15,7 +16,7 @@ from clpipe.engine.device import open_device
 
 
 def check_row(check: Check) -> tuple[str, ...]:
-    """A comparison of a kernel with its reference, in a line."""
+    """The row of one comparison of a kernel with its reference."""
     return (
         check.stage,
         check.method,
@@ -29,9 +30,9 @@ def check_row(check: Check) -> tuple[str, ...]:
 
 
 @click.command("check")
-@click.argument("names", nargs=-1, metavar="[STAGE]...")
+@click.argument("names", nargs=-1, metavar="[STAGE]...", shell_complete=steps)
 @device_option
-@click.option("--small", is_flag=True, help="Only tiny images, for slow devices.")
+@click.option("--small", is_flag=True, help="Compare tiny images only, for slow devices.")
 @stage_file_option
 @json_option
 def check(
@@ -41,8 +42,9 @@ def check(
     stage_files: tuple[Path, ...],
     as_json: bool,
 ) -> None:
-    """Compare kernels with their NumPy references on a device: of these stages, or of all, and then
-    the raw bit for bit.
+    """Compare kernels with their NumPy references on a device.
+
+    Without STAGE, all stages are compared, and then the raw bit for bit.
     """
     for file in stage_files:
         load_stage_file(file)

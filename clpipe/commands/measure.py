@@ -1,4 +1,4 @@
-"""The command line. Thin: it turns options into settings and results into text."""
+"""``clpipe measure``: the noise of images, as tables, JSON or a plot."""
 
 import math
 from pathlib import Path

@@ -23,7 +23,7 @@ from clpipe.batch.work import ImageWorker
 from clpipe.chain.chain import Chain
 from clpipe.chain.request import Request
 from clpipe.chain.truth import TRUTHS
-from clpipe.commands.options import chain_options, format_option, keep_option
+from clpipe.commands.chain_options import chain_options, format_option, keep_option
 from clpipe.commands.progress import Reporter
 from clpipe.engine.device import Device, open_devices
 from clpipe.images.dump import TYPES

@@ -1,4 +1,4 @@
-"""TODO."""
+"""``clpipe stages``: the stages, or the methods and parameters of one."""
 
 import types
 from pathlib import Path
@@ -10,11 +10,13 @@ from pydantic import ValidationError
 from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.base.text import one_of
 from clpipe.chain.chain import make_chain
-from clpipe.chain.files import value_text
 from clpipe.chain.registry import all_stages, load_stage_file
 from clpipe.chain.request import DEFAULTS
 from clpipe.chain.settings import Settings, overlay
-from clpipe.commands.options import camera_option, iso_option, json_option, stage_file_option
+from clpipe.chain.toml import value_text
+from clpipe.commands.chain_options import camera_option, iso_option
+from clpipe.commands.completion import steps
+from clpipe.commands.options import json_option, stage_file_option
 from clpipe.commands.printing import short_text, show, show_json
 from clpipe.stage import Context, Method, Stage
 
@@ -100,7 +102,7 @@ def stage_row(stage: Stage) -> tuple[str, ...]:
 
 
 @click.command("stages")
-@click.argument("name", required=False)
+@click.argument("name", required=False, shell_complete=steps)
 @camera_option
 @iso_option
 @stage_file_option

@@ -13,12 +13,12 @@ from typing import Any, Protocol
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
 from clpipe.chain.chain import step_names
-from clpipe.chain.files import toml_value
 from clpipe.chain.keys import OUTPUT
 from clpipe.chain.methods import base_name
 from clpipe.chain.paths import from_folder
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings, overlay
+from clpipe.chain.toml import toml_value
 from clpipe.images.encoding import Output
 
 MANIFEST_SUFFIXES = (".csv", ".jsonl")

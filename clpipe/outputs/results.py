@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 from clpipe.chain.chain import Chain
 from clpipe.chain.formats import DNG, FORMATS
-from clpipe.outputs.negative import negative_of
 
 
 class Results(NamedTuple):
@@ -29,8 +28,11 @@ def results_of(chain: Chain, formats: Sequence[str], keep: Sequence[str]) -> Res
     """
     last = [FORMATS[name] for name in formats if name != DNG]
     steps = [step.name for step in chain.steps if step.name in keep]
-    if DNG in formats and (raw := negative_of(chain).step):
-        steps.append(raw)
+    if DNG in formats:
+        from clpipe.outputs.negative import negative_of  # and all that writes DNGs
+
+        if raw := negative_of(chain).step:
+            steps.append(raw)
     return Results(
         tuple(dict.fromkeys(steps)),
         encode=any(each.bits == 8 for each in last),
