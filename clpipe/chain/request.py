@@ -152,11 +152,11 @@ class Request:
         formats = tuple(dict.fromkeys(self.formats)) or (("jpg",) if is_whole else ("exr",))
         return self._changed(formats=formats, keep=chain.select(self.keep))
 
-    def settings(self, brought: Settings | None = None) -> Settings:
+    def settings(self, carried: Settings | None = None) -> Settings:
         """The settings that are asked for, drawn for the image where there is one.
 
         Args:
-            brought: what an image itself says, which holds where nothing else is set.
+            carried: the settings that an image carries, which hold where nothing else is set.
 
         Raises:
             RequestError: a name or value that is not allowed.
@@ -164,21 +164,21 @@ class Request:
         for file in self.stage_files:
             load_stage_file(Path(file))
         settings = self._general
-        if brought is not None:
+        if carried is not None:
             for values in (self.config, self.options):
-                brought = overlay(brought, values) if values else brought
-            settings = brought
+                carried = overlay(carried, values) if values else carried
+            settings = carried
         if self.image:
             settings = overlay(settings, self.image)
         return settings.drawn(self.image_key) if self.image_key else settings
 
-    def chain(self, brought: Settings | None = None) -> Chain:
-        """The chain that is asked for; ``brought`` as for :meth:`settings`.
+    def chain(self, carried: Settings | None = None) -> Chain:
+        """The chain that is asked for; ``carried`` as for :meth:`settings`.
 
         Raises:
             RequestError: it cannot be made.
         """
-        return self.chain_from(self.settings(brought), self.start_at)
+        return self.chain_from(self.settings(carried), self.start_at)
 
     def chain_from(self, settings: Settings, start_at: str | None) -> Chain:
         """The chain of settings, from a step on.

@@ -37,7 +37,7 @@ class LoadedImage:
 
 @dataclass(frozen=True)
 class ImageLoader:
-    """Loads the images of a request. What follows from the request is found out once and kept."""
+    """Loads the images of a request."""
 
     request: Request
 
@@ -49,7 +49,7 @@ class ImageLoader:
 
     @cached_property
     def settings(self) -> Settings:
-        """The settings of an image that brings none."""
+        """The settings of an image that carries none."""
         return self.request.settings()
 
     @cached_property
@@ -59,7 +59,7 @@ class ImageLoader:
 
     @cached_property
     def chain(self) -> Chain:
-        """The chain of an image that brings no settings."""
+        """The chain of an image that carries no settings."""
         return self.request.chain()
 
     @cached_property
@@ -105,8 +105,8 @@ class ImageLoader:
             RequestError: they are not; the message says in which row.
         """
         if rows := [job for job in jobs if job.values]:
-            brings = self.raw.takes if self.kept is None else lambda path: True
-            check_rows(rows, self.settings, brings)
+            carries = self.raw.takes if self.kept is None else lambda path: True
+            check_rows(rows, self.settings, carries)
 
     def read(self, job: Job) -> SourceImage:
         """The image of a job.
@@ -154,5 +154,5 @@ class ImageLoader:
         return message if str(job.path) in message else f"{job.path}: {message}"
 
     def __getstate__(self) -> dict[str, Any]:
-        # What was found out stays with the process: it may be large, or of stage files.
+        # Cached values stay with the process: they may hold classes of stage files.
         return {each.name: getattr(self, each.name) for each in fields(self)}

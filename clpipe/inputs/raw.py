@@ -101,12 +101,12 @@ class RawLoader:
 
     def _chain(self, path: Path, facts: RawFacts | Dump) -> tuple[Chain, list[str]]:
         """The chain for a raw, and warnings about what its file does not say, or says wrongly."""
-        brought, warnings = settings_of(facts)
-        parameters = dict(brought.parameters)
+        carried, warnings = settings_of(facts)
+        parameters = dict(carried.parameters)
         own = self.request.settings(Settings()).drawn("")  # an example, where there is no image yet
         if "white_balance" in warnings and own.parameters.get("white_balance"):
             del parameters["white_balance"]  # the user's own replaces what stands in for the file's
-        settings = self.request.settings(replace(brought, parameters=parameters)).drawn("")
+        settings = self.request.settings(replace(carried, parameters=parameters)).drawn("")
         camera = load_camera(settings.camera)
         low, high = camera.iso_range
         iso = min(max(settings.iso, low), high)
@@ -119,7 +119,7 @@ class RawLoader:
             settings = replace(settings, iso=iso)
         chain = self._chain_from(settings)
         self._check(path, facts, chain)
-        return chain, _remaining(warnings, chain, brought)
+        return chain, _remaining(warnings, chain, carried)
 
     def _check(self, path: Path, facts: RawFacts | Dump, chain: Chain) -> None:
         """See that a chain can take a raw.
@@ -148,22 +148,22 @@ class RawLoader:
             )
 
 
-def _remaining(warnings: dict[str, str], chain: Chain, brought: Settings) -> list[str]:
+def _remaining(warnings: dict[str, str], chain: Chain, carried: Settings) -> list[str]:
     """The warnings that still hold: not about what the user set, or what no step of the chain uses.
 
     Args:
         warnings: by what they are about.
         chain: the chain for the raw.
-        brought: the settings that the raw brought.
+        carried: the settings that the raw carries.
     """
     settings, stages = chain.settings, {step.stage.name for step in chain.steps}
     is_denoised = "denoise" in stages
     is_current = {
-        "no_iso": is_denoised and settings.iso == brought.iso,
-        "camera": is_denoised and settings.camera == brought.camera,
+        "no_iso": is_denoised and settings.iso == carried.iso,
+        "camera": is_denoised and settings.camera == carried.camera,
     }
     for name in ("white_balance", "color_matrix"):
-        same = settings.parameters.get(name) == brought.parameters.get(name)
+        same = settings.parameters.get(name) == carried.parameters.get(name)
         is_current[name] = same and name in stages
     return [text for about, text in warnings.items() if is_current.get(about, True)]
 
@@ -184,7 +184,7 @@ def first_raw_step(settings: Settings) -> str:
 
 
 def settings_of(facts: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
-    """The settings that a raw brings, and warnings by what they are about."""
+    """The settings that a raw carries, and warnings by what they are about."""
     if isinstance(facts, Dump):
         gray_world = {"white_balance": {"method": "gray_world"}}
         return Settings(parameters=gray_world), {
