@@ -1,4 +1,4 @@
-"""Training straight from renders: samples as NumPy arrays, developed on the way."""
+"""Training data straight from renders: each sample is developed when it is needed."""
 
 import copy
 import itertools
@@ -29,7 +29,7 @@ NOWHERE = Path(os.devnull)  # nothing is written
 
 
 def key_in(epoch: int, key: str) -> str:
-    """The image key of an epoch: as frames of a burst have them, the first is the image's own.
+    """The image key of an image in an epoch; epochs are keyed as the frames of a burst are.
 
     >>> key_in(0, "a.exr"), key_in(2, "a.exr")
     ('a.exr', 'a.exr#2')
@@ -44,8 +44,8 @@ class Dataset:
     dict of
 
     - "image": (height, width, 3) uint8 where the chain ends in display values, else float32,
-    - "truth", if asked for: the same without noise; images of ``keep`` by the names of their
-      steps, and "truth.NAME" for each that is kept without noise; float32,
+    - "truth", with ``truth=True``: the same without noise; images of ``keep`` by the names of their
+      steps, and "truth.NAME" for each of them without noise; float32,
     - "key": the image key of the render, and "epoch",
     - "iso", "a" and "b": the sensor noise that was added, Var[y] = a*y + b in signal units (1 is
       the white level), zeros where none was.
@@ -53,26 +53,25 @@ class Dataset:
     All arrays are in the sensor's orientation. The noise of an image in epoch E is that of frame E
     of ``clpipe run --frames``: its image key is the render's, with "#E" behind it from epoch 1 on.
     So a sample depends on its render, the settings and the epoch alone, and not on order, sharding,
-    workers or restarts. What is declared to be drawn at random for each image is drawn anew in each
-    epoch, but for kept images, which keep what was drawn for them.
+    workers or restarts. Draws are made again in each epoch; kept images keep theirs.
 
     The device is opened by the process that first makes a sample. OpenCL does not survive a fork:
     workers of a process that has used it must be spawned (``multiprocessing_context="spawn"``).
 
     Args:
         inputs: files, folders, globs and manifests, as ``clpipe run`` takes them.
-        config: as for :class:`~clpipe.Pipeline`; None holds what kept images carry, else the
-            default.
+        config: as for :class:`~clpipe.Pipeline`; None is the settings that a kept image carries,
+            else the default.
         device: as for :class:`~clpipe.Pipeline`.
-        keep: steps whose image is wanted too, or "all".
+        keep: steps whose image a sample has, too, or "all".
         start_at: the first step to run; inputs are then images that were kept before it.
         until: the last step to run.
-        truth: whether each sample is wanted without noise too.
-        layer: of an EXR, which is the picture.
-        transfer: of renders in whole numbers: "srgb", "linear".
-        epoch: the first.
-        epochs: how many there are, one after the other; None is no end.
-        threads: how many images are decoded at a time; None is one for each processor.
+        truth: whether a sample has its image without noise, too.
+        layer: the layer of an EXR that is the picture; None chooses.
+        transfer: the transfer curve of renders in whole numbers: "srgb" or "linear".
+        epoch: the number of the first epoch.
+        epochs: how many epochs there are; None is no end.
+        threads: how many images are decoded at once; None is one for each processor.
         **settings: what a configuration file may hold, over ``config``.
 
     Raises:
@@ -127,7 +126,7 @@ class Dataset:
         self.set_epoch(epoch)
 
     def set_epoch(self, epoch: int) -> None:
-        """Begin with this epoch, from the next sample on; for a run that goes on, for example.
+        """Begin with this epoch, from the next sample on; use it to resume a training run.
 
         Raises:
             RequestError: it is negative.
@@ -137,7 +136,9 @@ class Dataset:
         self._epoch = epoch
 
     def shard(self, index: int, of: int) -> Self:
-        """One part of several, for a worker: every ``of``-th image, from the ``index``-th (from 0).
+        """A part for one of several workers: every ``of``-th image, from the ``index``-th on.
+
+        Indices count from 0.
 
         Raises:
             RequestError: there is no such part.
@@ -155,10 +156,10 @@ class Dataset:
         """How many samples there are, over all epochs.
 
         Raises:
-            TypeError: there is no end of them.
+            TypeError: epochs are endless.
         """
         if self._epochs is None:
-            raise TypeError("a dataset of endless epochs has no length; say epochs=N")
+            raise TypeError("a dataset of endless epochs has no length; set epochs=N")
         return len(self._jobs) * self._epochs
 
     def __getitem__(self, index: int) -> Sample:
@@ -235,7 +236,7 @@ class Dataset:
         return {**arrays, "key": job.key, "epoch": epoch, "iso": chain.iso, "a": a, "b": b}
 
     def _developer(self) -> "_Developer":
-        """What develops in this process.
+        """The developer of this process.
 
         Raises:
             DeviceError: there is no usable device, or another process had opened it.
@@ -251,7 +252,7 @@ _opening = threading.Lock()
 
 
 class _Developer:
-    """What develops images on a device, one at a time."""
+    """Develops images on a device, one at a time."""
 
     def __init__(
         self, device: Device | None, keep: Sequence[str], encode: bool, truth: bool
@@ -282,7 +283,7 @@ class _Developer:
         return arrays
 
     def _prepare(self, chain: Chain) -> None:
-        """Have runners for a chain, which is mostly the one before."""
+        """Make runners for a chain, unless it is that of the image before."""
         if chain is self._chain:
             return
         chains = {"image": chain, **({"truth": chain.without_noise()} if self._truth else {})}
@@ -293,12 +294,12 @@ class _Developer:
         kept = tuple(step.name for step in chain.steps if step.name in self._keep)
         latest = self._runners.get(name)
         if latest and latest.keep == kept:
-            return latest.of(chain)  # with the plans that are there
+            return latest.of(chain)  # shares its plans
         return Runner(chain, self._device, kept, self._encode, final=not self._encode)
 
 
 def _check_keys(jobs: Sequence[Job]) -> None:
-    """See that no two images have the same key, and with it the same noise.
+    """See that no two images have the same key, and so the same noise.
 
     Raises:
         RequestError: two have.

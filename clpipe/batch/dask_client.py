@@ -261,6 +261,7 @@ class _Chunks:
     Chunks grow while they take little time, and get smaller towards the end. ``suspects`` are jobs
     whose workers died; each is tried alone in the end.
 
+    >>> from pathlib import Path
     >>> chunks = _Chunks(deque(Job(Path(str(i)), "") for i in range(100)))
     >>> chunks.took(1.0)
     >>> [len(chunks.cut(2)) for _ in range(4)], len(chunks.jobs)

@@ -33,20 +33,6 @@ BATCH_HEADINGS = (
 )
 
 
-def batch_row(speed: BatchSpeed) -> tuple[str, ...]:
-    """One load of ``clpipe bench --batch``."""
-    return (
-        f"{speed.images} of {speed.width}x{speed.height}",
-        f"{speed.megapixels_per_second:.1f}",
-        f"{speed.serial_s:.1f}",
-        f"{speed.batch_s:.1f}",
-        f"{speed.share_of_limit:.2f}",
-        *(f"{ms:.1f}" for ms in speed.cpu_ms.values()),
-        f"{speed.overhead_ms:.1f}",
-        f"{speed.peak_mib:.0f}",
-    )
-
-
 @click.command("bench")
 @chain_options
 @device_option
@@ -81,7 +67,11 @@ def bench(
     as_json: bool,
     **options: Any,
 ) -> None:
-    """Time the chain and each launch, from half RGB to eight-bit RGB on the device."""
+    """Time a chain and each of its launches on a device.
+
+    The image is in half floats when it enters, and in eight bits when it leaves; both stay on the
+    device.
+    """
     width, _, height = size.partition("x")
     numbers = width.isdecimal() and height.isdecimal()
     if not numbers or not 0 < int(width) * int(height) <= MAX_PIXELS:
@@ -133,4 +123,18 @@ def bench(
             for speed in (*report.launches, report.chain)
         ),
         left=1,
+    )
+
+
+def batch_row(speed: BatchSpeed) -> tuple[str, ...]:
+    """The row of one load."""
+    return (
+        f"{speed.images} of {speed.width}x{speed.height}",
+        f"{speed.megapixels_per_second:.1f}",
+        f"{speed.serial_s:.1f}",
+        f"{speed.batch_s:.1f}",
+        f"{speed.share_of_limit:.2f}",
+        *(f"{ms:.1f}" for ms in speed.cpu_ms.values()),
+        f"{speed.overhead_ms:.1f}",
+        f"{speed.peak_mib:.0f}",
     )

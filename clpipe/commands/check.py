@@ -15,20 +15,6 @@ from clpipe.engine.check import SIZES, Check, check_all
 from clpipe.engine.device import open_device
 
 
-def check_row(check: Check) -> tuple[str, ...]:
-    """The row of one comparison of a kernel with its reference."""
-    return (
-        check.stage,
-        check.method,
-        str(check.cases),
-        str(check.samples),
-        str(check.differing),
-        f"{check.largest:.2g}",
-        f"{check.tolerance:.2g}",
-        "ok" if check.passed else "FAILED",
-    )
-
-
 @click.command("check")
 @click.argument("names", nargs=-1, metavar="[STAGE]...", shell_complete=steps)
 @device_option
@@ -63,3 +49,17 @@ def check(
         show(headings, map(check_row, checks))
         click.echo(f"{len(checks) - failed} passed, {failed} failed")
     sys.exit(1 if failed else 0)
+
+
+def check_row(check: Check) -> tuple[str, ...]:
+    """The row of one comparison of a kernel with its reference."""
+    return (
+        check.stage,
+        check.method,
+        str(check.cases),
+        str(check.samples),
+        str(check.differing),
+        f"{check.largest:.2g}",
+        f"{check.tolerance:.2g}",
+        "ok" if check.passed else "FAILED",
+    )

@@ -11,6 +11,17 @@ from clpipe.commands.printing import show, show_json
 from clpipe.engine.discovery import DeviceInfo, choose, find_devices
 
 
+@click.command("devices")
+@json_option
+def devices(as_json: bool) -> None:
+    """List the OpenCL devices, and say which one is used and why others are not."""
+    rows = device_rows(find_devices())
+    if as_json:
+        show_json(rows)
+        return
+    show([key.replace("_", " ") for key in rows[0]], [[*map(str, r.values())] for r in rows])
+
+
 def device_rows(devices: Sequence[DeviceInfo]) -> list[dict[str, Any]]:
     """A row for each device, with its status: used, or why it is passed over. NumPy is the last."""
     try:
@@ -50,14 +61,3 @@ def device_rows(devices: Sequence[DeviceInfo]) -> list[dict[str, Any]]:
         | {"status": numpy}
     )
     return rows
-
-
-@click.command("devices")
-@json_option
-def devices(as_json: bool) -> None:
-    """List the OpenCL devices, and say which one is used and why others are not."""
-    rows = device_rows(find_devices())
-    if as_json:
-        show_json(rows)
-        return
-    show([key.replace("_", " ") for key in rows[0]], [[*map(str, r.values())] for r in rows])

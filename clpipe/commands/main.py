@@ -28,7 +28,7 @@ COMMANDS = (
 
 
 class LazyGroup(click.Group):
-    """Commands that are imported on use, and whose errors are one message and an exit status."""
+    """Commands that are imported on use. An error becomes one message and an exit status."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -76,7 +76,7 @@ def summary(name: str) -> str:
 
 
 def fail(error: ClpipeError) -> NoReturn:
-    """Print what was wrong and exit with the error's status."""
+    """Print an error and exit with its status."""
     click.echo(f"clpipe: {error}", err=True)
     sys.exit(error.exit_status)
 
