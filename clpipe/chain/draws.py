@@ -77,7 +77,7 @@ def limits_of(model: type[BaseModel], name: str) -> Limits | None:
 
 
 class Draw(BaseModel):
-    """A law that values are drawn from. The fields of a subclass are its keys in a configuration."""
+    """A law that values are drawn from. The fields of a subclass are its keys in a table."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
