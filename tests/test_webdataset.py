@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.batch import tars as webdataset
+from clpipe.batch import tar_batch
 from clpipe.batch.run_log import read_log
 from clpipe.batch.tars import cut
 from clpipe.inputs.find import Job
@@ -291,7 +291,7 @@ def test_the_disk_is_full(clpipe, renders, when):
             real(path, pixels, tags)
 
         if when == "tar":
-            patch.setattr(webdataset, "write_beside", full)
+            patch.setattr(tar_batch, "write_beside", full)
         else:
             patch.setattr(writer, "write_display", write)
         result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)

@@ -1,5 +1,7 @@
 """What a run prints on stderr: a bar on a terminal, otherwise a line for each image."""
 
+from typing import Self
+
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -12,7 +14,7 @@ REPEATED = 20  # failures that are printed again at the end
 
 
 class Reporter:
-    """Prints outcomes as they come, and a summary at the end.
+    """Prints outcomes as they come, and a summary when it is left as a context.
 
     Args:
         summary: what became of the images so far; the caller adds to it.
@@ -40,7 +42,14 @@ class Reporter:
                 transient=True,
             )
             self._task = self._bar.add_task("", total=summary.total)
+
+    def __enter__(self) -> Self:
+        if self._bar:
             self._bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.end()
 
     def print(self, text: str) -> None:
         """Print a line."""

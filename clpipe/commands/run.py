@@ -16,7 +16,8 @@ from clpipe.batch.dask_worker import RunSpec
 from clpipe.batch.interrupt import interruptible
 from clpipe.batch.replay import replay_of
 from clpipe.batch.run_log import RunLog, Summary, log_name
-from clpipe.batch.tars import Tar, TarBatch, cut
+from clpipe.batch.tar_batch import TarBatch
+from clpipe.batch.tars import Tar, cut
 from clpipe.batch.threads import Batch
 from clpipe.batch.trace import Trace, check_trace
 from clpipe.batch.work import ImageWorker
@@ -28,7 +29,7 @@ from clpipe.commands.progress import Reporter
 from clpipe.engine.device import Device, open_devices
 from clpipe.images.dump import TYPES
 from clpipe.images.read import MAX_PIXELS, TRANSFERS, USUAL_MAX_PIXELS
-from clpipe.inputs.find import Shard, find_jobs, parse_shard
+from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.folder import output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
@@ -201,33 +202,46 @@ def run(
     spec = RunSpec(
         request, output, selectors, budget, threads, overwrite, trace is not None, first=jobs[0]
     )
-    summary = Summary(len(jobs))
-    with batch_of(spec, loader, chain, tars, dask) as batch, output_folder(output, shard):
+    opened = batch_of(spec, loader, chain, tars, dask)
+    summary = Summary(len(jobs))  # counts seconds from here on
+    reporter = Reporter(summary, writer, Console(stderr=True), quiet)
+    events = Trace() if trace else None
+    with opened as batch, output_folder(output, shard):
         remove_unfinished(output, jobs)
-        events = Trace() if trace else None
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
-        with (
-            closing(batch.run(jobs)) as outcomes,
-            closing(RunLog(output / log_name(shard), start)) as log,
-            interruptible(batch.stop),
-        ):
-            reporter = Reporter(summary, writer, Console(stderr=True), quiet)
-            try:
-                for outcome in outcomes:
-                    summary.add(outcome)
-                    log.add(outcome)
-                    reporter.report(outcome)
-                    if events:
-                        events.add(outcome)
-            finally:
-                summary.interrupted = summary.finished < summary.total
-                log.end(summary)
-                reporter.end()
+        with closing(RunLog(output / log_name(shard), start)) as log:
+            follow(batch, jobs, summary, reporter, log, events)
     if events and trace:
         events.write(trace)
     if summary.interrupted:
         sys.exit(130)
     sys.exit(1 if summary.failures else 0)
+
+
+def follow(
+    batch: "Batch | Cluster",
+    jobs: Sequence[Job],
+    summary: Summary,
+    reporter: Reporter,
+    log: RunLog,
+    events: Trace | None,
+) -> None:
+    """Run jobs, and note and print the outcome of each as it comes.
+
+    Raises:
+        ClpipeError: the run cannot go on; what is finished is noted.
+    """
+    with closing(batch.run(jobs)) as outcomes, interruptible(batch.stop), reporter:
+        try:
+            for outcome in outcomes:
+                summary.add(outcome)
+                log.add(outcome)
+                reporter.report(outcome)
+                if events:
+                    events.add(outcome)
+        finally:
+            summary.interrupted = summary.finished < summary.total
+            log.end(summary)
 
 
 def check_read_options(request: Request, chain: Chain) -> None:
