@@ -637,6 +637,17 @@ def test_a_sidecar_that_somebody_edited(clpipe, renders, key, value):
     assert not Path("b").exists()
 
 
+@pytest.mark.parametrize(("key", "value"), [("formats", []), ("options", 3), ("image_key", None)])
+def test_a_sidecar_whose_request_somebody_edited(clpipe, renders, key, value):
+    clpipe("run", renders(1), *RUN)
+    record = json.loads(Path("out/r000.json").read_text())
+    record["request"][key] = value
+    Path("edited.json").write_text(json.dumps(record))
+    stderr = clpipe("run", "--replay", "edited.json", "-o", "b", status=2).stderr
+    assert "edited.json: it is damaged" in stderr
+    assert not Path("b").exists()
+
+
 def test_a_sidecar_made_with_other_libraries(clpipe, renders):
     clpipe("run", renders(1), *RUN)
     sidecar_ = Path("out/r000.json")

@@ -67,7 +67,17 @@ def test_records_are_equal_where_the_bytes_of_a_picture_are(change):
     assert records[0] == records[1]
 
 
-@pytest.mark.parametrize("damage", [{"formats": ["gif"]}, {"keep": None}, {"stage_files": 3}])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"formats": ["gif"]},
+        {"keep": None},
+        {"stage_files": 3},
+        {"image_key": 3},
+        {"until": ["demosaic"]},
+        {"options": [1]},
+    ],
+)
 def test_a_damaged_record(damage):
     with pytest.raises(RequestError, match=r"formats|damaged"):
         Request.from_record({**Request().record(), **damage})

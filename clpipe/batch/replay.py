@@ -97,6 +97,8 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
     if picture not in RenditionPlan(frames, truths).names():
         raise RequestError(f"found picture {picture!r}")
     request = Request.from_record(values["request"])
+    if not request.formats:
+        raise RequestError("found no formats")
     request = replace(request, max_pixels=max_pixels, frames=frames, truths=truths)
     path = inputs[0] if inputs else Path(values["input"])
     job = Job(path, request.image_key, name, values=request.image, pictures=(picture,))

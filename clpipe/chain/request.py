@@ -133,7 +133,13 @@ class Request:
             raise RequestError(f"the request in it is damaged: {error}") from None
         if not set(lists["formats"]) <= set(EVERY_FORMAT):
             raise RequestError(f"found formats {', '.join(map(str, lists['formats']))}")
-        return cls(**{**values, **lists})
+        request = cls(**{**values, **lists})
+        tables = (request.config or {}, request.options, request.image)
+        texts = (request.start_at, request.until, request.layer, request.transfer)
+        are_texts = all(isinstance(text, str) for text in (request.image_key, *filter(None, texts)))
+        if not are_texts or not all(isinstance(table, Mapping) for table in tables):
+            raise RequestError("the request in it is damaged: a value is of the wrong type")
+        return request
 
     def for_image(self, key: str, values: Mapping[str, Any]) -> "Request":
         """The request for one image: its key, and values that hold for it alone."""

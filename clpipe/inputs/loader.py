@@ -94,7 +94,8 @@ class ImageLoader:
             RequestError: it cannot be made.
         """
         loader, path = self.for_job(jobs[0]), jobs[0].path
-        if all(self.raw.takes(job.path) for job in jobs):
+        takes = self.raw.takes
+        if all(takes(job.path) for job in jobs):
             return loader.raw.first_chain(path)
         return loader.kept.first_chain(path) if loader.kept else loader.chain
 
