@@ -1,6 +1,7 @@
 """Requests: what is wrong with one is said in one message that names it."""
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -279,6 +280,12 @@ def test_parameters_are_validated_once_and_the_model_is_kept(validated):
     brighter = overlay(settings, {"iso": 800, "exposure": {"ev": 2}})
     assert [s.name for s in make_chain(brighter).steps] == [s.name for s in steps]
     assert [cls for cls, count in validated.items() if count > 1] == [type(steps[0].method)]
+
+
+def test_a_model_is_that_of_its_table():
+    settings = settings_from({"exposure": {"ev": 1}})
+    other = replace(settings, parameters={"exposure": {"ev": 2}})
+    assert (settings.method("exposure").ev, other.method("exposure").ev) == (1, 2)
 
 
 def test_a_draw_validates_its_own_step_alone(validated):

@@ -54,8 +54,10 @@ class Settings:
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     output: Output = field(default_factory=Output)
     draws: Mapping[str, Draw] = field(default_factory=dict)
-    # The validated model of each table of parameters that overlay() has seen whole.
-    methods: Mapping[str, Method] = field(default_factory=dict, compare=False, repr=False)
+    # By step: the table that overlay() validated, and the model that it made of it.
+    validated: Mapping[str, tuple[Mapping[str, Any], Method]] = field(
+        default_factory=dict, compare=False, repr=False
+    )
 
     def record(self) -> dict[str, Any]:
         """The settings as nested JSON values, which :func:`settings_from` reads back."""
@@ -112,10 +114,10 @@ class Settings:
         Raises:
             KeyedError: an unknown stage, method or parameter, or a value that is not allowed.
         """
-        model = self.methods.get(step)
-        if model is None:
-            stage = stage_named(step, base_name(step))
-            model = make_method(stage, step, self.parameters.get(step, {}))
+        table = self.parameters.get(step, {})
+        validated, model = self.validated.get(step, (None, None))
+        if model is None or validated is not table:
+            model = make_method(stage_named(step, base_name(step)), step, table)
         return model
 
     @property
@@ -227,7 +229,7 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
     plain = _checked_plain(settings, plain)
     draws = {k: draw for k, draw in settings.draws.items() if k.partition(".")[0] not in values}
     draws |= {key: draw_of(key, tables.pop(key)) for key in KEYS if key in tables}
-    parameters, methods = dict(settings.parameters), dict(settings.methods)
+    parameters, validated = dict(settings.parameters), dict(settings.validated)
     output = settings.output
     for step, table in tables.items():
         stage = None if step == OUTPUT else stage_named(step, base_name(step))
@@ -239,11 +241,10 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
             output = make_output(constants)
             continue
         parameters[step] = constants
-        methods.pop(step, None)
         if not step_draws:
-            methods[step] = make_method(stage, step, constants)
+            validated[step] = constants, make_method(stage, step, constants)
     changed = replace(
-        settings, parameters=parameters, methods=methods, output=output, draws=draws, **plain
+        settings, parameters=parameters, validated=validated, output=output, draws=draws, **plain
     )
     if draws:
         _check_draws(changed, values)
