@@ -122,9 +122,9 @@ def test_float_exr_of_the_last_stage(clpipe, small):
 def test_gray_world_gains_are_in_the_sidecar(clpipe, small, tmp_path):
     clpipe("run", small, "-o", "out", "--set", "white_balance.method=gray_world")
     sidecar = json.loads((tmp_path / "out" / "small.json").read_text())
-    found = next(s["estimates"] for s in sidecar["stages"] if s["name"] == "white_balance")
-    assert found["red_gain"] == pytest.approx(2.77, rel=0.1)
-    assert found["blue_gain"] == pytest.approx(1.36, rel=0.1)
+    estimates = next(s["estimates"] for s in sidecar["stages"] if s["name"] == "white_balance")
+    assert estimates["red_gain"] == pytest.approx(2.77, rel=0.1)
+    assert estimates["blue_gain"] == pytest.approx(1.36, rel=0.1)
 
 
 def test_a_configuration_with_options_over_it(clpipe, small, tmp_path):

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
+from clpipe.base.validation import first_fault
 from clpipe.camera.noise import NoiseModel
 
 DEFAULT_CAMERA = "sony-a7r2"
@@ -260,14 +261,10 @@ def _parsed(text: str) -> Camera:
 
 def _reason(error: ValidationError) -> str:
     """What is wrong with a profile first, with the key, what was found and what is allowed."""
-    first = error.errors()[0]
-    key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in first["loc"]).lstrip(".")
-    last = str(first["loc"][-1]) if first["loc"] else ""
-    if first["type"] == "extra_forbidden":
-        model = GainStage if "." in key else Camera
-        return f"{key.removesuffix(last)}{one_of('key', last, model.model_fields)}"
-    if first["type"] == "missing":
-        return f"{key}: it is missing, and a profile needs it"
-    reason = first["msg"].removeprefix("Value error, ").removeprefix("Input ")
-    found = "" if isinstance(first["input"], dict) else f" found {first['input']!r}:"
-    return f"{key}:{found} {reason}" if key else reason
+    fault = first_fault(error)
+    if fault.problem == "unknown":
+        model = GainStage if "." in fault.key else Camera
+        return fault.key.removesuffix(fault.name) + one_of("key", fault.name, model.model_fields)
+    if fault.problem == "missing":
+        return f"{fault.key}: it is missing, and a profile needs it"
+    return f"{fault.key}: {fault.text}" if fault.path else fault.text
