@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.readonly import ReadOnly
 from clpipe.chain.chain import Chain
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_device
@@ -37,7 +38,7 @@ def key_in(epoch: int, key: str) -> str:
     return f"{key}#{epoch}" if epoch else key
 
 
-class Dataset:
+class Dataset(ReadOnly):
     """Renders as a camera sees them, sample by sample, with new noise in each epoch.
 
     Iterate over it, or index it: ``torch.utils.data.DataLoader`` takes it as it is. A sample is a
@@ -124,6 +125,10 @@ class Dataset:
         self._threads = threads or len(os.sched_getaffinity(0))
         self._opened: _Developer | None = None
         self.set_epoch(epoch)
+
+    def __repr__(self) -> str:
+        epochs = "endless epochs" if self._epochs is None else f"{self._epochs} epochs"
+        return f"Dataset({len(self._jobs)} images, {epochs}, {self._loader.settings.label})"
 
     def set_epoch(self, epoch: int) -> None:
         """Begin with this epoch, from the next sample on; use it to resume a training run.

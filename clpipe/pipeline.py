@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.errors import ImageError
+from clpipe.base.readonly import ReadOnly
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.files import load_settings
@@ -16,7 +17,7 @@ from clpipe.engine.runner import Result, Runner
 from clpipe.stage import Kind
 
 
-class Pipeline:
+class Pipeline(ReadOnly):
     """A chain of stages on a device, ready for images.
 
     Args:
@@ -55,6 +56,11 @@ class Pipeline:
     def _chain(self, settings: Settings) -> Chain:
         start_at, until = self._ends
         return make_chain(settings, start_at=start_at, until=until)
+
+    def __repr__(self) -> str:
+        device = self._runner.device
+        where = device.info.label if device else "numpy"
+        return f"Pipeline({self._settings.label}, {self.chain.label}, on {where})"
 
     @property
     def chain(self) -> Chain:

@@ -12,6 +12,7 @@ from click.testing import Result as ClickResult
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.commands.main import main
+from clpipe.engine import programs
 from clpipe.engine.device import Device
 from clpipe.engine.discovery import choose, find_devices
 from clpipe.engine.runner import Result, Runner
@@ -26,6 +27,12 @@ def written(folder: Path) -> list[str]:
     """The files in a folder at any depth, sorted, but for the run's log."""
     files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
     return sorted(files - {"run.jsonl"})
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compiling_is_not_announced() -> None:
+    # With a cold cache the line would stand in the output of whichever test comes first.
+    programs._announced.set()
 
 
 @pytest.fixture(scope="session")

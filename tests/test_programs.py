@@ -15,6 +15,7 @@ from clpipe.chain.settings import settings_from
 from clpipe.engine import programs
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
+from tests.conftest import STILL_LIFE
 
 SMALL = {"stages": ["exposure", "gamma"]}
 FOLDER = "from clpipe.engine.cache_folder import cache_folder; print(cache_folder())"
@@ -85,3 +86,11 @@ def test_slow_compiling_is_announced_once(device, monkeypatch, caplog):
     (record,) = caplog.records
     assert "compiling kernels for" in record.getMessage()
     assert device.info.label in record.getMessage()
+
+
+@pytest.mark.parametrize(("options", "count"), [((), 1), (("--quiet",), 0)])
+def test_the_command_line_prints_it(clpipe, monkeypatch, options, count):
+    monkeypatch.setattr(programs, "LONG", 0.0)
+    monkeypatch.setattr(programs, "_announced", programs.threading.Event())
+    done = clpipe("run", STILL_LIFE, "-o", "out", "--stages", "exposure,gamma", *options)
+    assert done.stderr.count("clpipe: compiling kernels for") == count

@@ -23,6 +23,9 @@ class Step:
     method: Method
     context: Context
 
+    def __repr__(self) -> str:
+        return f"Step({self.name}, {self.method.method})"
+
 
 @dataclass(frozen=True, eq=False)
 class Chain:
@@ -37,6 +40,15 @@ class Chain:
     settings: Settings
     names: tuple[str, ...]  # of all steps, with those before start_at and after until
     draws: Mapping[str, Draw] = field(default_factory=dict)  # the settings are an example of these
+
+    def __repr__(self) -> str:
+        return f"Chain({self.settings.label}, {self.label})"
+
+    @property
+    def label(self) -> str:
+        """The first and the last step, for people."""
+        names = [step.name for step in self.steps]
+        return f"{names[0]}..{names[-1]}" if len(names) > 1 else "".join(names)
 
     @property
     def iso(self) -> float:

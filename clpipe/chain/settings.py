@@ -59,6 +59,12 @@ class Settings:
         default_factory=dict, compare=False, repr=False
     )
 
+    @property
+    def label(self) -> str:
+        """Camera and ISO in a few words, for people."""
+        camera = "drawn camera" if "camera" in self.draws else self.camera
+        return f"{camera}, {'drawn ISO' if 'iso' in self.draws else f'ISO {self.iso:g}'}"
+
     def record(self) -> dict[str, Any]:
         """The settings as nested JSON values, which :func:`settings_from` reads back."""
         plain: dict[str, Any] = {"camera": self.camera, "iso": self.iso, "seed": self.seed}

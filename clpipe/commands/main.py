@@ -1,6 +1,7 @@
 """The program: a group of commands, each imported when it is used."""
 
 import ast
+import logging
 import re
 import sys
 from importlib import import_module
@@ -25,6 +26,16 @@ COMMANDS = (
     "check",
     "bench",
 )
+
+
+class Notices(logging.Handler):
+    """Prints what the package logs, such as that kernels are being compiled."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        click.echo(f"clpipe: {record.getMessage()}", err=True)
+
+
+NOTICES = Notices()
 
 
 class LazyGroup(click.Group):
@@ -93,3 +104,7 @@ def main() -> None:
     clpipe run render.exr -o out --iso 3200
     clpipe stages sensor_noise
     """
+    logger = logging.getLogger("clpipe")
+    logger.setLevel(logging.INFO)
+    if NOTICES not in logger.handlers:
+        logger.addHandler(NOTICES)

@@ -1,5 +1,6 @@
 """``clpipe run``: images through the chain, on this machine or on a cluster."""
 
+import logging
 import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
@@ -204,6 +205,8 @@ def run(
     )
     opened = batch_of(spec, loader, chain, tars, dask)
     summary = Summary(len(jobs))  # counts seconds from here on
+    if quiet:
+        logging.getLogger("clpipe").setLevel(logging.WARNING)
     reporter = Reporter(summary, writer, Console(stderr=True), quiet)
     events = Trace() if trace else None
     with opened as batch, output_folder(output, shard):
