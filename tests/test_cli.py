@@ -381,7 +381,7 @@ def test_cameras_are_listed_and_shown(clpipe):
     text = clpipe("cameras", "canon-5d2", "--iso", 12800, status=2).stderr
     assert "found 12800, but camera canon-5d2 goes from 100 to 6400" in text
     assert "did you mean 'sony-a7s2'" in clpipe("cameras", "sony-a7s", status=2).stderr
-    assert "name the camera" in clpipe("cameras", "--iso", 100, status=2).stderr
+    assert "needs the name of a camera" in clpipe("cameras", "--iso", 100, status=2).stderr
 
 
 def test_a_burst_is_frames_and_one_truth(clpipe, write_exr, tmp_path):

@@ -98,7 +98,7 @@ def test_without_a_matrix_the_profile_has_one_or_colours_stay(tmp_path):
     assert np.allclose(parameters(tmp_path / "a.json")["color_matrix"]["matrix"], known, atol=2e-3)
     write_dng(tmp_path / "c.dng", mosaic(), matrix=None, model=b"Nonesuch")
     output = clpipe("run", tmp_path / "c.dng", "-o", tmp_path)
-    assert "its colour matrix is not known" in output
+    assert "its colour matrix is unknown" in output
     assert "there is no profile of Canon Nonesuch; denoising takes the noise of sony-a7r2" in output
     output = clpipe("run", tmp_path / "c.dng", "-o", tmp_path, "--camera", "canon-5d2")
     assert "profile" not in output
@@ -396,7 +396,7 @@ def test_a_dump_by_configuration_and_what_it_does_not_say(tmp_path):
         "does not say its levels; black 512 and white 16383 are taken",
         "does not say its ISO; 100 is taken",
         "does not say its white balance; gray_world estimates it",
-        "its colour matrix is not known",
+        "its colour matrix is unknown",
     ):
         assert output.count(message) == 1
     assert clpipe("plan", "-c", tmp_path / "c.toml", "--toml").count('raw_size = "64x48"') == 1

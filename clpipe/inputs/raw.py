@@ -24,7 +24,7 @@ from clpipe.images.tags import Tags, carry
 from clpipe.inputs.plausibility import brightness_warnings, input_warnings
 from clpipe.stage import Kind
 
-UNKNOWN_COLOURS = "its colour matrix is not known; its colours stay those of the sensor"
+UNKNOWN_COLOURS = "its colour matrix is unknown; its colours stay those of the sensor"
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class RawLoader:
         try:
             return self._chain(path, self._facts(path))[0]
         except ImageError:
-            return self._chain_from(self.request.settings(Settings()))
+            return self._chain_from(self.request.settings())
 
     def enter(self, path: Path, image: RawImage) -> tuple[Chain, RawImage]:
         """The chain for a raw, and the raw with its warnings and what it carries to the output.
@@ -103,7 +103,7 @@ class RawLoader:
         """The chain for a raw, and warnings about what its file does not say, or says wrongly."""
         carried, warnings = settings_of(facts)
         parameters = dict(carried.parameters)
-        own = self.request.settings(Settings()).drawn("")  # an example, where there is no image yet
+        own = self.request.settings().drawn("")  # an example, where there is no image yet
         if "white_balance" in warnings and own.parameters.get("white_balance"):
             del parameters["white_balance"]  # the user's own replaces what stands in for the file's
         settings = self.request.settings(replace(carried, parameters=parameters)).drawn("")
