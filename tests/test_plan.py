@@ -4,7 +4,7 @@ import pytest
 
 from clpipe.base.errors import RequestError
 from clpipe.chain.chain import make_chain
-from clpipe.chain.files import own_values
+from clpipe.chain.files import load_config
 from clpipe.chain.settings import settings_from
 from clpipe.engine.codegen import write_kernel
 from clpipe.engine.plan import Finalize, Launch, Lines, Reduce, make_plan
@@ -144,7 +144,7 @@ CHAINS = {
     "default": {},
     "gray_world": GRAY_WORLD,
     "white_patch": {"white_balance": {"method": "white_patch"}},
-    "paper": own_values("paper"),
+    "paper": load_config("paper").values,
     "slow": {"demosaic": {"method": "menon2007"}, "denoise": {"method": "non_local_means"}},
 }
 
