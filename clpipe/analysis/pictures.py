@@ -16,8 +16,6 @@ from clpipe.reference.cfa import Pattern
 from clpipe.stage import Context, Kind
 
 SITES = ("R", "G1", "G2", "B")  # G1 stands in the rows of red
-
-
 WHOLE = "mosaic"  # the channel that is all sites together
 
 

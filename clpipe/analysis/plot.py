@@ -24,10 +24,7 @@ INK = {
     "mosaic": "#222222",
 }
 
-
 MAPS = {"display": ("Y", "Cb", "Cr"), "rgb": ("Y", "Cb", "Cr")}
-
-
 SITE_MAPS = ("mosaic", "R", "G1", "B")
 
 

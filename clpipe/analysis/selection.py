@@ -6,14 +6,8 @@ from clpipe.analysis.statistics import Doubles, Mask, bin_of
 from clpipe.base.types import Floats
 
 CLIPPED = 1e-3  # share of a bin's samples from which clipping bends its statistics
-
-
 WINDOW = 5  # pixels, in which a flat place has to be flat
-
-
 FLATTEST = 0.25  # share of a picture that counts as flat whatever its noise
-
-
 MAD_TO_SIGMA = 1.4826  # of a normal distribution
 
 

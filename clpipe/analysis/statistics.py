@@ -15,23 +15,11 @@ from numpy.typing import NDArray
 from clpipe.base.types import Floats
 
 Doubles = NDArray[np.float64]
-
-
 Mask = NDArray[np.bool_]
-
-
 LAGS = 8
-
-
 BINS = 24
-
-
 FEWEST = 100  # samples, below which a bin's sigma is worth nothing
-
-
 SIGMAS = (2, 3, 4, 5)
-
-
 HISTOGRAM = np.linspace(-6.05, 6.05, 122)  # edges, so that 0 is in the middle of a bin
 
 

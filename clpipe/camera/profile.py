@@ -15,16 +15,9 @@ from clpipe.base.text import one_of
 from clpipe.camera.noise import NoiseModel
 
 DEFAULT_CAMERA = "sony-a7r2"
-
-
 Row = tuple[float, float, float]
-
-
 Matrix = tuple[Row, Row, Row]
-
-
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
 
 # Linear sRGB to XYZ, D65 (IEC 61966-2-1, 1999).
 SRGB_TO_XYZ = np.array(
@@ -35,13 +28,8 @@ SRGB_TO_XYZ = np.array(
     ]
 )
 
-
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-
-
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-
-
 Share = Annotated[float, Field(ge=0, le=0.1)]
 
 

@@ -9,10 +9,7 @@ from clpipe.base.types import Array, Floats
 
 # x and y of red, green, blue and white: ITU-R BT.709-6 (2015), and so sRGB.
 SRGB = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-
-
 CIE_XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
-
 
 # The cone response of the Bradford transform (Lam 1985), as Lindbloom, "Chromatic Adaptation".
 BRADFORD = np.array(

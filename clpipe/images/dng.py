@@ -37,11 +37,7 @@ from clpipe.reference.curve import to_8_bit
 from clpipe.reference.transfer import srgb_curve
 
 PREVIEW_SIDE = 512
-
-
 D65 = 21  # as EXIF's LightSource counts illuminants
-
-
 D50_XYZ = np.array([0.9642, 1.0, 0.8251])
 
 

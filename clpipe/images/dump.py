@@ -20,7 +20,6 @@ TYPES = {
     "raw12": Fraction(3, 2),
 }
 
-
 MAX_SIDE = 65535
 
 

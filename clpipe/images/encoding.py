@@ -6,11 +6,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 SIMULATED = "clpipe "  # what the model of a camera begins with in a DNG of clpipe
-
-
 FULL_FRAME = 36.0  # mm, the longer side of 35 mm film
-
-
 Length = Annotated[float, Field(gt=0, le=10000, allow_inf_nan=False)]
 
 

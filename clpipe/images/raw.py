@@ -27,30 +27,17 @@ RAW_SUFFIXES = (
     *(".srf", ".srw", ".x3f"),
 )
 
-
 LEAST_BITS = 0.25  # a pixel, in any compressed raw
-
-
 MOST_GAIN = 20.0  # of white balance; what is above is damaged or a joke
-
 
 # LibRaw's flip (1: left to right, 2: upside down, 4: then transposed) as EXIF's orientation.
 ORIENTATIONS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
 
-
 # Where the EXIF of files begins that are no TIFF: in a CR3's boxes, in a RAF's JPEG.
 EXIF_MARKS = (b"CMT1", b"CMT2", b"Exif\0\0")
-
-
 PARTS = ("EXIF", "Image")  # of EXIF, where exifread finds tags
-
-
 DATE_TAGS = ("DateTimeOriginal", "DateTime")
-
-
 DATE = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")
-
-
 OTHERS = {b"\xff\xd8\xff": "a JPEG", b"\x89PNG": "a PNG", b"v/1\x01": "an OpenEXR image"}
 
 

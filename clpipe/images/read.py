@@ -22,17 +22,9 @@ from clpipe.reference.transfer import inverse_srgb_curve
 from clpipe.stage import Kind
 
 RENDER_SUFFIXES = (".exr", ".hdr", ".pfm", ".tif", ".tiff")
-
-
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
-
-
 HALF_MAX = np.float32(65504)  # so bright that nothing is lost, and no square overflows
-
-
 MAX_PIXELS = 1_000_000_000  # what a device is ever given
-
-
 USUAL_MAX_PIXELS = 200_000_000  # what a file may claim, where nobody says otherwise
 
 

@@ -20,7 +20,6 @@ from clpipe.images.tags import ATTRIBUTES, Tags
 
 JPEG_MAX_SIDE = 65500
 
-
 # Else the time of writing is put in, and no two runs make the same bytes.
 NO_TIME = "1970:01:01 00:00:00"
 

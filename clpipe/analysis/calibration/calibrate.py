@@ -20,20 +20,10 @@ from clpipe.base.errors import ImageError
 from clpipe.base.types import Floats
 
 ROUNDING = 1 / 12  # variance of rounding to whole DN
-
-
 ROUGH = 0.4  # DN of noise below which rounding is not independent of the noise
-
-
 LEAST_USED = 0.25  # of the pixels
-
-
 UNALIKE = 0.2  # of the variance about the mean
-
-
 BENT = 0.1  # of the variance
-
-
 CLIPPED = 1e-3  # share of a dark frame's samples at 0 DN
 
 

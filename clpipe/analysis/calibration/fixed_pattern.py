@@ -9,20 +9,10 @@ from clpipe.analysis.calibration.repeats import Sensor, Stack
 from clpipe.base.types import Array, Floats
 
 SURE = 7.0  # standard deviations that none of 1e8 pixels lies out by chance
-
-
 BLOCK = 16  # pixels of one colour, a side
-
-
 LEAST_BLOCKS = 30
-
-
 DARKEST = 0.05  # signal of a block that tells PRNU
-
-
 UNEVEN = 0.03  # relative standard deviation of the scene in a block
-
-
 LEAST_DEVIATION = 0.05  # DN, in a mean dark frame
 
 

@@ -16,20 +16,10 @@ from numpy.typing import NDArray
 from clpipe.base.types import Array
 
 CLASSES = 2048
-
-
 GROUPS = 64  # of rows
-
-
 BINS = 32  # for pictures
-
-
 LEAST_IN_BIN = 50
-
-
 DARKEST = 0.01  # of the pixels
-
-
 ROUNDS = 12  # of weights from the line before
 
 

@@ -9,11 +9,7 @@ import numpy as np
 from clpipe.analysis.calibration.calibrate import Calibration
 
 COLOURS = {"R": "#c8312b", "G1": "#2f9e44", "G2": "#8fb339", "B": "#2b62c8", "all": "#6b6b6b"}
-
-
 WIDTH = 1600  # px
-
-
 COLUMNS = 3
 
 

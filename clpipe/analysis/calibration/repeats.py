@@ -12,14 +12,8 @@ from clpipe.base.types import Array, Floats
 from clpipe.reference.cfa import Pattern, red_site
 
 CHANNELS = ("R", "G1", "G2", "B")
-
-
 FAR_FROM_CLIPPING = 4.0  # standard deviations
-
-
 LARGEST_FLICKER = 0.05  # a lamp flickers by less; more is another exposure
-
-
 MOVING = 0.02  # share of the variance that neighbours have in common
 
 

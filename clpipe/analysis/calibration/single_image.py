@@ -26,35 +26,15 @@ from clpipe.base.types import Floats
 # Daubechies' scaling and wavelet functions with three vanishing moments (sec. II-A): the wavelet of
 # norm 1, the scaling function of sum 1.
 WAVELET = np.array([0.035226, 0.085441, -0.135011, -0.459878, 0.806892, -0.332671])
-
-
 SCALING = np.array([0.332671, 0.806892, 0.459878, -0.135011, -0.085441, 0.035226]) / np.sqrt(2)
-
-
 LEVELS = 150  # level sets of a colour, at most
-
-
 LEAST = 400  # places in a level set
-
-
 LEAST_EXPLAINED = 40  # of them
-
-
 WINDOW = 7  # of the smoothing, and of local variances
-
-
 EDGE = 1.0  # tau, in standard deviations of the details (sec. II-B1)
-
-
 EXPLAINED = 1.4  # times the line's variance, two standard deviations of a local variance
-
-
 ROUNDS = 8  # of choosing places by the line before
-
-
 GRID = 2000
-
-
 Values = NDArray[np.float64]
 
 

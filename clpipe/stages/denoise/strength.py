@@ -19,8 +19,6 @@ from clpipe.reference.colour import LUMA
 from clpipe.stage import Access, Argument, Context, Kind, Literal, Method, Pass, odd_size, parameter
 
 MID_GREY = 0.18
-
-
 PREDICTED = "the {} noise at mid grey that a, b and the gains predict"
 
 
