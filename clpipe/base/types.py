@@ -1,4 +1,4 @@
-"""Names for the array types that go through the whole package."""
+"""Names for the array types that the whole package uses."""
 
 from typing import Any
 

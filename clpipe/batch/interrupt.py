@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-from clpipe.base.files import drop_unfinished
+from clpipe.base.files import remove_unfinished
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -30,7 +30,7 @@ def interruptible(stop: Callable[[], None]) -> Iterator[None]:
     def handle(number: int, frame: FrameType | None) -> None:
         nonlocal asked
         if asked:
-            drop_unfinished()
+            remove_unfinished()
             os._exit(INTERRUPTED)
         asked = True
         stop()
