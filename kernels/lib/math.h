@@ -3,8 +3,9 @@
 #ifndef CLPIPE_MATH_H
 #define CLPIPE_MATH_H
 
-// -ln(t) for t > 0; relative error 3e-7. Only * and +, so NumPy gives the same bits. Polynomials
-// are summed in pairs (Estrin), not one power after the other: the wait for each sum is what costs.
+// -ln(t) for t > 0; error 4e-7, relative where |ln(t)| is above 1, else absolute. Only * and +, so
+// NumPy gives the same bits. Polynomials are summed in pairs (Estrin), not one power after the other,
+// because waiting for each sum is what takes the time.
 INLINE vf negative_log(vf t) {
     const vi bits = float_bits(t);
     const vi exponent = (bits - 0x3f3504f3) >> 23;  // mantissa in [sqrt(1/2), sqrt(2))
@@ -37,7 +38,8 @@ INLINE vf power_of_two(vf x, __private vf *e) {
     return bits_to_float((to_int(whole) + 127) << 23);
 }
 
-// e^x and e^x - 1 for |x| < 87; relative error 1e-6, the latter near 0 too.
+// e^x and e^x - 1 for |x| < 87; relative error 1e-6 for |x| < 20 and 4e-6 beyond, for the latter also
+// near 0.
 INLINE vf exponential(vf x) {
     vf e;
     const vf s = power_of_two(x * 1.442695f, &e);
