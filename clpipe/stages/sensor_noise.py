@@ -1,4 +1,4 @@
-"""Shot and read noise of the sensor."""
+"""Sensor noise: shot noise and read noise."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,23 +19,24 @@ from clpipe.stage import Argument, Context, Frame, Kind, Method, NoiseScope, Pas
 
 EMVA = ("system_gain", "read_noise", "adc_noise")
 PAPER = ("chi", "theta", "b_before", "b_after", "p0")
-NEVER_FULL = 1e30
+NEVER_FULL = 1e30  # stands for no full well, in electrons or in signal units
 
 
-def _or(given: float | None, known: float) -> float:
-    """What is given, else what is known."""
-    return known if given is None else given
+def _or_default(value: float | None, default: float) -> float:
+    return default if value is None else value
 
 
 class SensorNoise(Method):
-    """How strong the noise is, said in one of three ways, and what bounds it.
+    """The strength of the noise in one of three parametrisations, and the full well.
 
-    What is left out follows from the camera and the ISO. Subclasses draw the noise.
+    The parametrisations are those of :mod:`clpipe.camera.noise`: a and b, EMVA 1288's or the
+    paper's (Bielova et al. 2019). Parameters that are not set follow from the camera and the ISO.
+    Subclasses draw the noise.
     """
 
     a: float | None = parameter(
         None,
-        "Shot noise: variance a unit of signal.",
+        "Shot noise: the variance per unit of signal.",
         "signal",
         "from the camera and ISO",
         ge=0,
@@ -43,38 +44,66 @@ class SensorNoise(Method):
     )
     b: float | None = parameter(
         None,
-        "Read noise: variance without light.",
+        "Read noise: the variance without light.",
         "signal^2",
         "from the camera and ISO",
         ge=0,
         le=1,
     )
     system_gain: float | None = parameter(
-        None, "Instead of a: what an electron is worth (EMVA 1288).", "DN/e-", "not used", gt=0
+        None, "Instead of a: the system gain (EMVA 1288).", "DN/e-", "not used", gt=0
     )
     read_noise: float | None = parameter(
-        None, "Instead of b: noise before the gain (EMVA 1288).", "e-", "not used", ge=0
+        None,
+        "Instead of b: standard deviation of the noise before the gain (EMVA 1288).",
+        "e-",
+        "not used",
+        ge=0,
     )
     adc_noise: float | None = parameter(
-        None, "With read_noise: noise after the gain.", "DN", "not used", ge=0
+        None,
+        "With read_noise: standard deviation of the noise after the gain.",
+        "DN",
+        "not used",
+        ge=0,
     )
     chi: float | None = parameter(
-        None, "Instead of a and b: electrons at y = 1, theta = 1.", "e-", "not used", gt=0
+        None,
+        "Instead of a and b, with theta: electrons at y = 1 and theta = 1 (the paper).",
+        "e-",
+        "not used",
+        gt=0,
     )
-    theta: float | None = parameter(None, "With chi: the analogue gain.", "", "not used", gt=0)
+    theta: float | None = parameter(
+        None, "With chi: the analogue gain (the paper).", "", "not used", gt=0
+    )
     b_before: float | None = parameter(
-        None, "With chi: b', variance before the gain.", "signal^2", "not used", ge=0
+        None,
+        "With chi: b', the variance of the noise before the gain (the paper).",
+        "signal^2",
+        "not used",
+        ge=0,
     )
     b_after: float | None = parameter(
-        None, "With chi: b'', variance after the gain.", "signal^2", "not used", ge=0
+        None,
+        "With chi: b'', the variance of the noise after the gain (the paper).",
+        "signal^2",
+        "not used",
+        ge=0,
     )
-    p0: float | None = parameter(None, "With chi: the pedestal.", "signal", "not used", ge=0)
+    p0: float | None = parameter(
+        None, "With chi: the pedestal (the paper).", "signal", "not used", ge=0
+    )
     full_well: float | None = parameter(
-        None, "The most electrons that a pixel holds.", "e-", "from the camera; else no limit", gt=0
+        None,
+        "The largest number of electrons that a pixel holds.",
+        "e-",
+        "from the camera; else no limit",
+        gt=0,
     )
     tukey_lambda: float | None = parameter(
         None,
-        "Shape of the read noise; 0.14 is nearly Gaussian, below it has heavier tails.",
+        "Shape of the read noise: 0.14 is nearly Gaussian, lower values have heavier tails.",
         "",
         "from the camera; else Gaussian",
         gt=-0.5,
@@ -83,50 +112,56 @@ class SensorNoise(Method):
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
-        emva, paper = self._given(EMVA), self._given(PAPER)
+        emva, paper = self._set_names(EMVA), self._set_names(PAPER)
         if emva and paper:
             raise ValueError(
-                f"noise is given in one way, EMVA 1288's or the paper's; "
+                f"set the noise in one parametrisation, EMVA 1288's or the paper's; "
                 f"found {', '.join(emva)} and {', '.join(paper)}"
             )
         if paper and (self.chi is None or self.theta is None):
-            raise ValueError(f"the paper's parameters need both chi and theta; found {paper}")
+            raise ValueError(
+                f"the paper's parameters need both chi and theta; found {', '.join(paper)} only"
+            )
         return self
 
-    def _given(self, names: tuple[str, ...]) -> list[str]:
+    def _set_names(self, names: tuple[str, ...]) -> list[str]:
         return [name for name in names if getattr(self, name) is not None]
 
     def model(self, context: Context) -> NoiseModel:
-        """The noise, from what is given and, for the rest, from the camera at the ISO.
+        """The noise model: the parameters that are set, the others from the camera at the ISO.
 
         Raises:
-            RequestError: a and b are given and do not agree with what else is given, or b comes
-                out negative, or the ISO is outside the camera's range.
+            RequestError: a or b is set and does not agree with another parametrisation that is set,
+                or b comes out negative, or the ISO is outside the camera's range.
         """
         camera = context.camera.noise(context.iso)
         unit = camera.signal_range
-        known, law = camera.emva(), camera.paper()
-        assert known and law  # a camera's gain is above 0
-        other = self._given(EMVA) or self._given(PAPER)
+        emva, paper = camera.emva(), camera.paper()
+        assert emva and paper  # a camera's gain is above 0
+        names = self._set_names(EMVA) or self._set_names(PAPER)
         if self.chi and self.theta:
-            before, after = _or(self.b_before, law.b_before), _or(self.b_after, law.b_after)
+            before = _or_default(self.b_before, paper.b_before)
+            after = _or_default(self.b_after, paper.b_after)
             a, b = Paper(self.chi, self.theta, before, after, self.p0 or 0.0).signal()
             if b < 0:
-                raise RequestError(f"sensor_noise: p0 = {self.p0:g} makes b negative, {b:.4g}")
+                raise RequestError(
+                    f"sensor_noise: p0 = {self.p0:g} makes b negative, {b:.4g}; lower p0"
+                )
             model = NoiseModel(a, b, unit, min(after, b), self.theta)
-        elif other:
-            gain = _or(self.system_gain, known.system_gain)
-            after = _or(self.adc_noise, known.adc_noise)
-            a, b = Emva(gain, _or(self.read_noise, known.read_noise), after).signal(unit)
+        elif names:
+            gain = _or_default(self.system_gain, emva.system_gain)
+            read_noise = _or_default(self.read_noise, emva.read_noise)
+            after = _or_default(self.adc_noise, emva.adc_noise)
+            a, b = Emva(gain, read_noise, after).signal(unit)
             model = NoiseModel(a, b, unit, (after / unit) ** 2, camera.theta)
         else:
-            a, b = _or(self.a, camera.a), _or(self.b, camera.b)
+            a, b = _or_default(self.a, camera.a), _or_default(self.b, camera.b)
             return camera if (a, b) == (camera.a, camera.b) else NoiseModel(a, b, unit)
-        for name, given, found in (("a", self.a, model.a), ("b", self.b, model.b)):
-            if given is not None and not isclose(given, found, rel_tol=1e-6):
+        for name, own, derived in (("a", self.a, model.a), ("b", self.b, model.b)):
+            if own is not None and not isclose(own, derived, rel_tol=1e-6):
                 raise RequestError(
-                    f"sensor_noise: noise is given in one way; found {name} = {given:g} beside "
-                    f"{', '.join(other)}, which comes to {name} = {found:g}"
+                    f"sensor_noise: set the noise in one parametrisation; found {name} = {own:g} "
+                    f"beside {', '.join(names)}, which make {name} = {derived:g}"
                 )
         return model
 
@@ -144,29 +179,27 @@ class SensorNoise(Method):
 
     @property
     def full_signal(self) -> float | None:
-        """The signal at which the well is full; None without a limit, or where a is 0 and an
-        electron is worth nothing.
-        """
+        """The signal at which the well is full; None without a full well, or where a is 0."""
         return self.full_well * self.a if self.full_well and self.a else None
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        """a*y + b, y from 0 to the full well (of which it is not modelled that it cuts noise)."""
-        return self.added(np.maximum(signal, np.float32(0))) + before
+        """a*y + b, y clipped to 0..full well; that a full well cuts the noise is not modelled."""
+        return self.own_variance(np.maximum(signal, np.float32(0))) + before
 
-    def added(self, signal: Floats) -> Floats:
-        """The variance of this noise, a*y + b, y at most the full well."""
-        y = np.minimum(signal, np.float32(_or(self.full_signal, NEVER_FULL)))
+    def own_variance(self, signal: Floats) -> Floats:
+        """The variance of this stage's noise, a*y + b, y at most the full well; signal squared."""
+        y = np.minimum(signal, np.float32(_or_default(self.full_signal, NEVER_FULL)))
         return y * np.float32(self.a) + np.float32(self.b)
 
-    def values(self) -> dict[str, np.float32]:
+    def numbers(self) -> dict[str, np.float32]:
         """The kernel's arguments, by name."""
         raise NotImplementedError(type(self).__name__)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
-        return self.values()
+        return self.numbers()
 
-    def read_values(self) -> dict[str, np.float32]:
-        """Those of read noise: its sigma and, where it is no Gaussian, its law."""
+    def read_noise_numbers(self) -> dict[str, np.float32]:
+        """The kernel's arguments for read noise: sigma and, unless Gaussian, shape and scale."""
         assert self.b is not None
         sigma = {"read_noise": np.float32(self.b**0.5)}
         if self.tukey_lambda is None:
@@ -174,8 +207,8 @@ class SensorNoise(Method):
         shape, scale = shape_and_scale(self.tukey_lambda)
         return {**sigma, "shape": shape, "scale": scale}
 
-    def read_reference(self, image: Floats, frame: Frame) -> Floats:
-        """Read noise of variance 1, in NumPy."""
+    def unit_read_noise(self, image: Floats, frame: Frame) -> Floats:
+        """Read noise of variance 1 for each pixel, in NumPy; (height, width)."""
         stream = frame.stream[NoiseScope.IMAGE]
         if self.tukey_lambda is None:
             return normal_at(image.shape, 1, stream)
@@ -184,7 +217,10 @@ class SensorNoise(Method):
 
 
 class Gaussian(SensorNoise):
-    """Heteroscedastic Gaussian, Var[y] = a*y + b (Foi et al., IEEE TIP 2008, eq. 2).
+    """Heteroscedastic Gaussian noise, Var[y] = a*y + b (Foi et al., IEEE TIP 2008, eq. 2).
+
+    The noisy signal is limited to the full well. With ``tukey_lambda`` the read noise, of variance
+    b, is drawn from a Tukey lambda distribution instead and added after the full well.
 
     >>> from clpipe.stage import run_reference
     >>> noisy = run_reference(Gaussian(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
@@ -206,32 +242,33 @@ class Gaussian(SensorNoise):
         return (Pass("sensor_noise_tukey", arguments=names, random=NoiseScope.IMAGE),)
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        if self.tukey_lambda is None:  # below 0 it goes on to fall
-            return np.maximum(self.added(signal), np.float32(0)) + before
+        if self.tukey_lambda is None:  # here a negative signal lowers the variance below b
+            return np.maximum(self.own_variance(signal), np.float32(0)) + before
         return super().variance(before, signal, context)
 
-    def values(self) -> dict[str, np.float32]:
-        full = np.float32(_or(self.full_signal, NEVER_FULL))
-        signal = {"a": np.float32(self.a), "full_well": full}
+    def numbers(self) -> dict[str, np.float32]:
+        full = np.float32(_or_default(self.full_signal, NEVER_FULL))
+        numbers = {"a": np.float32(self.a), "full_well": full}
         if self.tukey_lambda is None:
-            return {**signal, "b": np.float32(self.b)}
-        return {**signal, **self.read_values()}
+            return {**numbers, "b": np.float32(self.b)}
+        return {**numbers, **self.read_noise_numbers()}
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        given = self.values()
+        n = self.numbers()
         normals = normal_at(image.shape, 0, frame.stream[NoiseScope.IMAGE])
-        variance = given["a"] * image + given.get("b", np.float32(0))
+        variance = n["a"] * image + n.get("b", np.float32(0))
         noise = normals * square_root(np.maximum(variance, np.float32(0)))
-        noisy = np.minimum(image + noise, given["full_well"])
+        noisy = np.minimum(image + noise, n["full_well"])
         if self.tukey_lambda is None:
             return noisy
-        return noisy + self.read_reference(image, frame) * given["read_noise"]
+        return noisy + self.unit_read_noise(image, frame) * n["read_noise"]
 
 
 class Poisson(SensorNoise):
-    """Whole photo-electrons, Poisson at mean y / a, plus read noise of variance b (EMVA 1288).
+    """Whole photo-electrons: a * min(Poisson(max(y, 0) / a), full well) + read noise (EMVA 1288).
 
-    Light below 0 gives no electrons. Drawn by inverse CDF (Giles, ACM TOMS 42(1), 2016).
+    Poisson numbers come by inverse CDF (Giles, ACM TOMS 42(1), 2016); the read noise has the
+    variance b and is Gaussian or, with ``tukey_lambda``, of a Tukey lambda distribution.
 
     >>> from clpipe.stage import run_reference
     >>> noisy = run_reference(Poisson(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
@@ -241,7 +278,7 @@ class Poisson(SensorNoise):
 
     method: ClassVar = "poisson"
     kernel: ClassVar = "sensor_noise_poisson"
-    summary: ClassVar = "draw whole photo-electrons at the gain and add read noise"
+    summary: ClassVar = "draw whole photo-electrons and add read noise"
     other_examples: ClassVar = (
         {"a": 0.05, "b": 1e-4},
         {"tukey_lambda": -0.2, "full_well": 1000.0},
@@ -251,7 +288,7 @@ class Poisson(SensorNoise):
         resolved = super().resolve(context)
         if not resolved.a:
             raise RequestError(
-                "sensor_noise: poisson needs an a above 0; without shot noise use gaussian"
+                "sensor_noise: poisson needs an a above 0; without shot noise use method gaussian"
             )
         return resolved
 
@@ -266,25 +303,25 @@ class Poisson(SensorNoise):
             ),
         )
 
-    def values(self) -> dict[str, np.float32]:
+    def numbers(self) -> dict[str, np.float32]:
         assert self.a
         return {
             "chi": np.float32(1 / self.a),
             "full_well": np.float32(self.full_well or NEVER_FULL),
             "a": np.float32(self.a),
-            **self.read_values(),
+            **self.read_noise_numbers(),
         }
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        given = self.values()
+        n = self.numbers()
         words = word_at(image.shape, 0, frame.stream[NoiseScope.IMAGE])
-        mean = np.maximum(image, np.float32(0)) * given["chi"]
-        electrons = np.minimum(poisson_of(mean, words), given["full_well"])
-        return electrons * given["a"] + self.read_reference(image, frame) * given["read_noise"]
+        mean = np.maximum(image, np.float32(0)) * n["chi"]
+        electrons = np.minimum(poisson_of(mean, words), n["full_well"])
+        return electrons * n["a"] + self.unit_read_noise(image, frame) * n["read_noise"]
 
 
 class NoNoise(Method):
-    """No noise; but a full well is no noise, and stays.
+    """No noise: min(y, full_signal), since an ideal sensor still has a full well.
 
     >>> from clpipe.stage import run_reference
     >>> run_reference(NoNoise(full_signal=0.5), np.float32([[0.25, 0.75]])).tolist()
@@ -293,7 +330,7 @@ class NoNoise(Method):
 
     method: ClassVar = "none"
     kernel: ClassVar = "full_well"
-    summary: ClassVar = "no noise; only a full well clips"
+    summary: ClassVar = "no noise; the full well still clips"
     example: ClassVar = {"full_signal": 0.5}
 
     full_signal: float | None = parameter(
@@ -306,20 +343,20 @@ class NoNoise(Method):
 
     def resolve(self, context: Context) -> "NoNoise":
         camera = context.camera
-        known = camera.signal_of(camera.full_well, context.iso) if camera.full_well else None
-        return self.filled(full_signal=known)
+        full = camera.signal_of(camera.full_well, context.iso) if camera.full_well else None
+        return self.filled(full_signal=full)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("full_well", arguments=("full_signal",)),) if self.full_signal else ()
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
-        return {"full_signal": np.float32(_or(self.full_signal, NEVER_FULL))}
+        return {"full_signal": np.float32(_or_default(self.full_signal, NEVER_FULL))}
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
         return before
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        return np.minimum(image, np.float32(_or(self.full_signal, NEVER_FULL)))
+        return np.minimum(image, np.float32(_or_default(self.full_signal, NEVER_FULL)))
 
 
 STAGE = Stage(
