@@ -26,8 +26,8 @@ from clpipe.stage import (
     parameter,
 )
 
-# h = FACTOR * strength * noise. Found by trying: the factor of the highest PSNR on the picture in
-# tests/data at ISO 1600 to 12800; tools/quality measures the PSNR at strength 1.
+# h = FACTOR * strength * noise. Found by trying: at strength 1 it is within 0.1 dB of the highest
+# PSNR of the picture in tests/data, ISO 1600 to 12800. tools/quality measures that PSNR.
 FACTOR = 1.3
 LARGEST = 15  # px, of the window
 
