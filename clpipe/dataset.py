@@ -18,7 +18,8 @@ from clpipe.chain.files import own_values
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_device
 from clpipe.engine.runner import Runner
-from clpipe.images.read import ReadOptions, set_codec_threads
+from clpipe.images.openimageio import set_codec_threads
+from clpipe.images.read import ReadOptions
 from clpipe.inputs.find import Job, find_jobs
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.inputs.raw import RawImage

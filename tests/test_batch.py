@@ -14,15 +14,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clpipe.base.errors import RequestError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.batch.run_log import read_log
 from clpipe.batch.threads import Batch
 from clpipe.chain.request import request_from_options
-from clpipe.images import read as image_io
+from clpipe.images import write as image_write
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
+from clpipe.outputs import folder as output_folders
 from clpipe.outputs import sidecar
-from clpipe.outputs import writer as target
 from clpipe.outputs.folder import LOCK, output_folder, remove_unfinished
 from clpipe.outputs.formats import EVERY_FORMAT, ending_of
 from clpipe.outputs.writer import OutputWriter
@@ -354,16 +354,16 @@ def test_halves_of_a_killed_run_are_removed(tmp_path):
 
 def test_the_disk_is_full(clpipe, renders, monkeypatch):
     renders(5)
-    real, count = image_io._write, []
+    real, count = image_write._write, []
 
     def write(path, spec, pixels):
         count.append(path)
         if len(count) > 2:
-            monkeypatch.setattr(target, "ROOM", 2**62)  # more than any disk has
-            raise image_io.ImageError(f"{path}: cannot be written: the disk is full")
+            monkeypatch.setattr(output_folders, "ROOM", 2**62)  # more than any disk has
+            raise ImageError(f"{path}: cannot be written: the disk is full")
         real(path, spec, pixels)
 
-    monkeypatch.setattr(image_io, "_write", write)
+    monkeypatch.setattr(image_write, "_write", write)
     result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)
     assert "clpipe: out: cannot write there: " in result.stderr
     assert "the same command goes on" in result.stderr
@@ -373,14 +373,14 @@ def test_the_disk_is_full(clpipe, renders, monkeypatch):
 
 def test_the_folder_has_gone(clpipe, renders, monkeypatch):
     renders(5)
-    real = image_io._write
+    real = image_write._write
 
     def write(path, spec, pixels):
         real(path, spec, pixels)
         if path.name == "r002.jpg":
             Path("out").rename("elsewhere")
 
-    monkeypatch.setattr(image_io, "_write", write)
+    monkeypatch.setattr(image_write, "_write", write)
     result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)
     assert "out: " in result.stderr and "the same command goes on" in result.stderr
     assert not Path("out").exists()

@@ -68,8 +68,8 @@ def test_the_right_refusal(shared_data, name):
 REFUSED_IN_PEACE = r"""
 import re, sys, time
 from pathlib import Path
-from clpipe.errors import ImageError
-from clpipe.image_io import ReadOptions, read_image, read_source
+from clpipe.base.errors import ImageError
+from clpipe.images.read import ReadOptions, read_image, read_source
 from clpipe.stage import Kind
 for path in map(Path, sys.argv[1:]):
     start = time.perf_counter()

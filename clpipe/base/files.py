@@ -22,7 +22,7 @@ def sha256_of(path: Path) -> tuple[str, int]:
         return digest.hexdigest(), file.tell()
 
 
-_unfinished: set[Path] = set()  # temporary files of this process, for `remove_unfinished`
+_unfinished: set[Path] = set()  # temporary files of this process, for `remove_temporary_files`
 
 
 def write_beside(path: Path, write: Callable[[Path], object]) -> None:
@@ -61,7 +61,7 @@ def write_new(path: Path, write: Callable[[Path], object]) -> None:
     write_beside(path, write)
 
 
-def remove_unfinished() -> None:
+def remove_temporary_files() -> None:
     """Delete the temporary files that are being written now; call it just before exiting."""
     for path in list(_unfinished):
         with contextlib.suppress(OSError):

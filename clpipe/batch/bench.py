@@ -20,7 +20,7 @@ from clpipe.chain.request import Request
 from clpipe.engine.bench import scene
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
-from clpipe.images.read import decode_alone
+from clpipe.images.read import decode_first_part
 from clpipe.images.tags import Tags
 from clpipe.images.write import write_display, write_exr
 from clpipe.inputs.find import find_jobs
@@ -127,7 +127,7 @@ def bench_batch(device: Device, asked: Request, load: Load) -> BatchSpeed:
         # A few first, so that nothing is compiled and no file is cold in what is timed.
         list(batch().run(jobs[: 2 * DISTINCT]))
         clock = _Clock()
-        encoded = Runner(chain, device).run(decode_alone(jobs[0].path), "").image
+        encoded = Runner(chain, device).run(decode_first_part(jobs[0].path), "").image
         tags = Tags(chain.camera.make, chain.camera.model, chain.iso)
         serial = []
         for outcome in batch(trace=True).one_by_one(jobs, clock.on):
@@ -135,7 +135,7 @@ def bench_batch(device: Device, asked: Request, load: Load) -> BatchSpeed:
             if len(serial) % max(load.images // CODED, 1) == 0:
                 # In between, for machines are not always as fast.
                 with clock.on("decoder"):
-                    decode_alone(outcome.job.path)
+                    decode_first_part(outcome.job.path)
                 with clock.on("encoder"):
                     write_display(folder / "alone.jpg", encoded, tags)
         forget_peak_memory()

@@ -22,7 +22,7 @@ from clpipe.batch.work import Made, Work, _Spare
 from clpipe.chain.chain import Chain
 from clpipe.engine.device import Device, Timing
 from clpipe.engine.runner import Result, Runner
-from clpipe.images.read import set_codec_threads
+from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.formats import DNG, SIDECAR

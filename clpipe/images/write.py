@@ -14,9 +14,11 @@ from PIL import Image, ImageCms
 from clpipe.base.about import __version__
 from clpipe.base.files import write_beside
 from clpipe.base.types import Array, Floats
+from clpipe.images.attributes import PREFIX
 from clpipe.images.encoding import exif
-from clpipe.images.read import HALF_MAX, _reason
-from clpipe.images.tags import ATTRIBUTES, Tags
+from clpipe.images.openimageio import error_text
+from clpipe.images.pixels import HALF_MAX
+from clpipe.images.tags import Tags
 
 JPEG_MAX_SIDE = 65500
 
@@ -95,7 +97,7 @@ def write_exr(
     spec.attribute("compression", "zip")
     spec.attribute("DateTime", NO_TIME)
     for name, value in attributes.items():
-        spec.attribute(ATTRIBUTES + name, value)
+        spec.attribute(PREFIX + name, value)
     data = np.clip(pixels, -HALF_MAX, HALF_MAX) if half else pixels
     _write(path, spec, data.reshape(height, width, len(channels)))
 
@@ -130,9 +132,9 @@ def _encode(format_: str, to: str, spec: Any, pixels: Array) -> None:
     file = oiio.ImageOutput.create(format_)
     data = np.ascontiguousarray(pixels)
     if file is None or not file.open(to, spec) or not file.write_image(data):
-        raise OSError(0, _reason(file.geterror() if file else oiio.geterror()))
+        raise OSError(0, error_text(file.geterror() if file else oiio.geterror()))
     if not file.close():
-        raise OSError(0, _reason(file.geterror()))
+        raise OSError(0, error_text(file.geterror()))
 
 
 def versions() -> dict[str, str]:

@@ -10,8 +10,8 @@ from clpipe.chain.chain import Chain, Step
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings, settings_from
+from clpipe.images.attributes import read_attributes
 from clpipe.images.read import SourceImage
-from clpipe.images.tags import read_attributes
 from clpipe.stage import Kind
 
 NOISE = "sensor_noise"  # the attribute of an image that says "none", where others have some

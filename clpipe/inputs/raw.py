@@ -19,7 +19,7 @@ from clpipe.chain.settings import Settings
 from clpipe.images.dump import Dump, read_dump
 from clpipe.images.raw import RAW_SUFFIXES, RawFacts, read_facts, read_raw
 from clpipe.images.read import RENDER_SUFFIXES, ReadOptions, SourceImage, read_source
-from clpipe.images.tags import Tags, carry
+from clpipe.images.tags import Tags, to_attributes
 from clpipe.inputs.kept import brightness_warnings, input_warnings
 from clpipe.stage import Kind
 
@@ -100,7 +100,7 @@ class RawLoader:
         white = getattr(chain.steps[0].method, "white_level", 65535.0)
         if np.count_nonzero(image.pixels >= white) > image.pixels.size / 2:
             found.append(f"most of its samples are not below the white level of {white:g} DN")
-        attributes = carry(tags_of(image.said, chain), image.said.orientation)
+        attributes = to_attributes(tags_of(image.said, chain), image.said.orientation)
         return chain, replace(image, warnings=tuple(found), attributes=attributes)
 
     def _chain(self, path: Path, said: RawFacts | Dump) -> tuple[Chain, list[str]]:

@@ -12,7 +12,7 @@ from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.dng import write_dng
 from clpipe.images.read import SourceImage
-from clpipe.images.tags import CARRIED, Tags, carried, upright
+from clpipe.images.tags import TAG_ATTRIBUTES, Tags, from_attributes, upright
 from clpipe.images.write import JPEG_MAX_SIDE, write_display, write_exr
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import attributes_of
@@ -164,10 +164,12 @@ class OutputWriter:
         self._make_folder_of(job)
         chain, camera = shot.chain, shot.chain.camera
         own = Tags(camera.make, camera.model, chain.iso)
-        tags, orientation = carried(source.attributes, own)
+        tags, orientation = from_attributes(source.attributes, own)
         how = chain.settings.output.filled({**source.shot, **tags.shot})
         tags = replace(tags, output=how)
-        brought = {name: source.attributes[name] for name in CARRIED if name in source.attributes}
+        brought = {
+            name: source.attributes[name] for name in TAG_ATTRIBUTES if name in source.attributes
+        }
         mosaic = chain.result in (Kind.RAW, Kind.MOSAIC)
         turn = 1 if mosaic else orientation  # to turn a mosaic would be to change its pattern
         outputs: list[Path] = []

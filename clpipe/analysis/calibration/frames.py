@@ -16,9 +16,9 @@ from clpipe.base.files import write_new
 from clpipe.base.types import Floats
 from clpipe.camera.profile import Matrix, load_camera
 from clpipe.chain.chain import make_chain
+from clpipe.images.attributes import read_attributes
 from clpipe.images.raw import RAW_SUFFIXES, RawFacts, read_facts, read_raw
 from clpipe.images.read import RENDER_SUFFIXES, read_image
-from clpipe.images.tags import read_attributes
 from clpipe.inputs.kept import carried_settings
 from clpipe.reference.cfa import Pattern
 from clpipe.stage import Kind
