@@ -28,7 +28,7 @@ INLINE vf inverse_root(vf x) {
 // sqrt(x) for x >= 0; relative error 5e-6.
 INLINE vf square_root(vf x) { return x * inverse_root(x); }
 
-// 2^x = s * (1 + e) for |x| < 126: s, a whole power, and e, which is small where x is. Only * and +.
+// 2^x = s * (1 + e) for |x| < 126: s is a whole power of two, e is accurate near x = 0. Only * and +.
 INLINE vf power_of_two(vf x, __private vf *e) {
     const vf whole = nearest(x);
     const vf f = x - whole;
@@ -52,8 +52,8 @@ INLINE vf exponential_minus_1(vf x) {
     return s * e + (s - 1.0f);
 }
 
-// 2^x for x <= 0; relative error 8e-5. Below 2^-30 it stays there: a filter weight that small is
-// nothing, and smaller ones would turn into denormals, which are slow.
+// 2^x for x <= 0, at least 2^-30; relative error 8e-5. Filter weights below that do not matter, and
+// denormals are slow.
 INLINE vf exp2_of_negative(vf x) {
 #pragma OPENCL FP_CONTRACT ON
     const vf round_magic = (vf)(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer
