@@ -1,9 +1,9 @@
-"""Sensor noise: shot noise and read noise."""
+"""The strength of sensor noise: its parameters, and the noise model that they define."""
 
 from collections.abc import Mapping
 from dataclasses import replace
 from math import isclose
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 from pydantic import model_validator
@@ -11,19 +11,14 @@ from pydantic import model_validator
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.camera.noise import Emva, NoiseModel, Paper
-from clpipe.reference.math import square_root
-from clpipe.reference.poisson import poisson_of
 from clpipe.reference.random import normal_at, word_at
 from clpipe.reference.tukey_lambda import shape_and_scale, tukey_lambda_of
-from clpipe.stage import Argument, Context, Frame, Kind, Method, NoiseScope, Pass, Stage, parameter
+from clpipe.stage import Argument, Context, Frame, Method, NoiseScope, parameter
+from clpipe.stages.sensor_noise.common import NEVER_FULL, or_default
+from clpipe.stages.sensor_noise.no_noise import NoNoise
 
 EMVA = ("system_gain", "read_noise", "adc_noise")
 PAPER = ("chi", "theta", "b_before", "b_after", "p0")
-NEVER_FULL = 1e30  # stands for no full well, in electrons or in signal units
-
-
-def _or_default(value: float | None, default: float) -> float:
-    return default if value is None else value
 
 
 class SensorNoise(Method):
@@ -140,8 +135,8 @@ class SensorNoise(Method):
         assert emva and paper  # a camera's gain is above 0
         names = self._set_names(EMVA) or self._set_names(PAPER)
         if self.chi and self.theta:
-            before = _or_default(self.b_before, paper.b_before)
-            after = _or_default(self.b_after, paper.b_after)
+            before = or_default(self.b_before, paper.b_before)
+            after = or_default(self.b_after, paper.b_after)
             a, b = Paper(self.chi, self.theta, before, after, self.p0 or 0.0).signal()
             if b < 0:
                 raise RequestError(
@@ -149,13 +144,13 @@ class SensorNoise(Method):
                 )
             model = NoiseModel(a, b, unit, min(after, b), self.theta)
         elif names:
-            gain = _or_default(self.system_gain, emva.system_gain)
-            read_noise = _or_default(self.read_noise, emva.read_noise)
-            after = _or_default(self.adc_noise, emva.adc_noise)
+            gain = or_default(self.system_gain, emva.system_gain)
+            read_noise = or_default(self.read_noise, emva.read_noise)
+            after = or_default(self.adc_noise, emva.adc_noise)
             a, b = Emva(gain, read_noise, after).signal(unit)
             model = NoiseModel(a, b, unit, (after / unit) ** 2, camera.theta)
         else:
-            a, b = _or_default(self.a, camera.a), _or_default(self.b, camera.b)
+            a, b = or_default(self.a, camera.a), or_default(self.b, camera.b)
             return camera if (a, b) == (camera.a, camera.b) else NoiseModel(a, b, unit)
         for name, own, derived in (("a", self.a, model.a), ("b", self.b, model.b)):
             if own is not None and not isclose(own, derived, rel_tol=1e-6):
@@ -188,7 +183,7 @@ class SensorNoise(Method):
 
     def own_variance(self, signal: Floats) -> Floats:
         """The variance of this stage's noise, a*y + b, y at most the full well; signal squared."""
-        y = np.minimum(signal, np.float32(_or_default(self.full_signal, NEVER_FULL)))
+        y = np.minimum(signal, np.float32(or_default(self.full_signal, NEVER_FULL)))
         return y * np.float32(self.a) + np.float32(self.b)
 
     def numbers(self) -> dict[str, np.float32]:
@@ -214,155 +209,3 @@ class SensorNoise(Method):
             return normal_at(image.shape, 1, stream)
         words = word_at(image.shape, 1, stream)
         return tukey_lambda_of(words, *shape_and_scale(self.tukey_lambda))
-
-
-class Gaussian(SensorNoise):
-    """Heteroscedastic Gaussian noise, Var[y] = a*y + b (Foi et al., IEEE TIP 2008, eq. 2).
-
-    The noisy signal is limited to the full well. With ``tukey_lambda`` the read noise, of variance
-    b, is drawn from a Tukey lambda distribution instead and added after the full well.
-
-    >>> from clpipe.stage import run_reference
-    >>> noisy = run_reference(Gaussian(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
-    >>> round(float(noisy.mean()), 2), round(float(noisy.var()), 4)
-    (0.5, 0.0006)
-    """
-
-    method: ClassVar = "gaussian"
-    kernel: ClassVar = "sensor_noise_gaussian"
-    summary: ClassVar = "add Gaussian noise of variance a*y + b"
-    other_examples: ClassVar = ({"tukey_lambda": -0.2, "full_well": 1000.0},)
-
-    def passes(self) -> tuple[Pass, ...]:
-        if self.tukey_lambda is None:
-            return (
-                Pass("sensor_noise", arguments=("a", "b", "full_well"), random=NoiseScope.IMAGE),
-            )
-        names = ("a", "full_well", "read_noise", "shape", "scale")
-        return (Pass("sensor_noise_tukey", arguments=names, random=NoiseScope.IMAGE),)
-
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        if self.tukey_lambda is None:  # here a negative signal lowers the variance below b
-            return np.maximum(self.own_variance(signal), np.float32(0)) + before
-        return super().variance(before, signal, context)
-
-    def numbers(self) -> dict[str, np.float32]:
-        full = np.float32(_or_default(self.full_signal, NEVER_FULL))
-        numbers = {"a": np.float32(self.a), "full_well": full}
-        if self.tukey_lambda is None:
-            return {**numbers, "b": np.float32(self.b)}
-        return {**numbers, **self.read_noise_numbers()}
-
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        n = self.numbers()
-        normals = normal_at(image.shape, 0, frame.stream[NoiseScope.IMAGE])
-        variance = n["a"] * image + n.get("b", np.float32(0))
-        noise = normals * square_root(np.maximum(variance, np.float32(0)))
-        noisy = np.minimum(image + noise, n["full_well"])
-        if self.tukey_lambda is None:
-            return noisy
-        return noisy + self.unit_read_noise(image, frame) * n["read_noise"]
-
-
-class Poisson(SensorNoise):
-    """Whole photo-electrons: a * min(Poisson(max(y, 0) / a), full well) + read noise (EMVA 1288).
-
-    Poisson numbers come by inverse CDF (Giles, ACM TOMS 42(1), 2016); the read noise has the
-    variance b and is Gaussian or, with ``tukey_lambda``, of a Tukey lambda distribution.
-
-    >>> from clpipe.stage import run_reference
-    >>> noisy = run_reference(Poisson(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
-    >>> round(float(noisy.mean()), 2), round(float(noisy.var()), 4)
-    (0.5, 0.0006)
-    """
-
-    method: ClassVar = "poisson"
-    kernel: ClassVar = "sensor_noise_poisson"
-    summary: ClassVar = "draw whole photo-electrons and add read noise"
-    other_examples: ClassVar = (
-        {"a": 0.05, "b": 1e-4},
-        {"tukey_lambda": -0.2, "full_well": 1000.0},
-    )
-
-    def resolve(self, context: Context) -> Self:
-        resolved = super().resolve(context)
-        if not resolved.a:
-            raise RequestError(
-                "sensor_noise: poisson needs an a above 0; without shot noise use method gaussian"
-            )
-        return resolved
-
-    def passes(self) -> tuple[Pass, ...]:
-        gaussian = self.tukey_lambda is None
-        names = ("chi", "full_well", "a", "read_noise")
-        return (
-            Pass(
-                "sensor_noise_poisson" if gaussian else "sensor_noise_poisson_tukey",
-                arguments=names if gaussian else (*names, "shape", "scale"),
-                random=NoiseScope.IMAGE,
-            ),
-        )
-
-    def numbers(self) -> dict[str, np.float32]:
-        assert self.a
-        return {
-            "chi": np.float32(1 / self.a),
-            "full_well": np.float32(self.full_well or NEVER_FULL),
-            "a": np.float32(self.a),
-            **self.read_noise_numbers(),
-        }
-
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        n = self.numbers()
-        words = word_at(image.shape, 0, frame.stream[NoiseScope.IMAGE])
-        mean = np.maximum(image, np.float32(0)) * n["chi"]
-        electrons = np.minimum(poisson_of(mean, words), n["full_well"])
-        return electrons * n["a"] + self.unit_read_noise(image, frame) * n["read_noise"]
-
-
-class NoNoise(Method):
-    """No noise: min(y, full_signal), since an ideal sensor still has a full well.
-
-    >>> from clpipe.stage import run_reference
-    >>> run_reference(NoNoise(full_signal=0.5), np.float32([[0.25, 0.75]])).tolist()
-    [[0.25, 0.5]]
-    """
-
-    method: ClassVar = "none"
-    kernel: ClassVar = "full_well"
-    summary: ClassVar = "no noise; the full well still clips"
-    example: ClassVar = {"full_signal": 0.5}
-
-    full_signal: float | None = parameter(
-        None,
-        "The signal at which the well is full.",
-        "signal",
-        "from the camera and ISO; else no limit",
-        gt=0,
-    )
-
-    def resolve(self, context: Context) -> "NoNoise":
-        camera = context.camera
-        full = camera.signal_of(camera.full_well, context.iso) if camera.full_well else None
-        return self.filled(full_signal=full)
-
-    def passes(self) -> tuple[Pass, ...]:
-        return (Pass("full_well", arguments=("full_signal",)),) if self.full_signal else ()
-
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
-        return {"full_signal": np.float32(_or_default(self.full_signal, NEVER_FULL))}
-
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        return before
-
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        return np.minimum(image, np.float32(_or_default(self.full_signal, NEVER_FULL)))
-
-
-STAGE = Stage(
-    "sensor_noise",
-    "Add shot and read noise.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Gaussian, Poisson, NoNoise),
-)
