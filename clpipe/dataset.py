@@ -18,7 +18,7 @@ from clpipe.chain.chain import Chain
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_device
 from clpipe.engine.runner import Runner
-from clpipe.images.read import set_codec_threads
+from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.find import Job, find_jobs
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.inputs.raw import RawImage

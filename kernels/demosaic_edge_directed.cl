@@ -3,10 +3,10 @@
 enum { HAMILTON_ADAMS, LAROCHE_PRESCOTT, HIBBARD };
 
 // Green from the direction with the smaller gradient; equal gradients take the mean of both. The
-// classifier says what the gradient is: the change of green (Hibbard 1995), the second derivative
-// of the site's own colour (Laroche and Prescott 1994), or the sum of both (Hamilton and Adams
-// 1997), who also let green follow that derivative. The result is held in one plane: green at
-// green sites, the colour difference (R-G or B-G) at red and blue ones.
+// classifier defines the gradient: the change of green (Hibbard 1995), the second derivative of the
+// site's own colour (Laroche and Prescott 1994), or the sum of both (Hamilton and Adams 1997), who
+// also add a quarter of that derivative to green. The result is one plane: green at green sites, R-G at
+// red sites and B-G at blue sites.
 INLINE vf green_or_difference(site at, src_image src, cfa pattern, int classifier) {
     const vf centre = src_tap(src, 0, 0);
     const vf west = src_tap(src, -1, 0), east = src_tap(src, 1, 0);

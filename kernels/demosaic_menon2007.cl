@@ -1,6 +1,6 @@
 // Demosaicing with directional filtering and a posteriori decision (Menon, Andriani and Calvagno
-// 2007), with their refining step, in four passes. At a red or blue site "own" is the site's
-// colour and "other" is blue or red.
+// 2007), with their refining step, in four passes. "Own" is the colour of a red or blue site, and
+// "other" is blue at a red site and red at a blue site.
 
 // Own minus green, green interpolated along the row and along the column by the same filter that
 // Hamilton and Adams use; 0 at green sites.
@@ -16,9 +16,9 @@ INLINE pair directional_differences(site at, src_image src, cfa pattern) {
     return v;
 }
 
-// How much the horizontal differences change along five rows, the vertical ones along five columns:
-// the direction in which they change less wins, the row where they do not differ. First the
-// chosen difference (green at green sites), then 1 where the row won, else 0.
+// Chooses the direction in which differences change less: horizontal ones along five rows, vertical
+// ones along five columns; the row where both are equal. The first plane is the chosen difference
+// (green at green sites), the second is 1 where the row was chosen, else 0.
 INLINE pair decide(site at, src_image src, image both, cfa pattern) {
 #define CHANGE_X(x0, x1, y) magnitude(tap_pair(both, x0, y).first - tap_pair(both, x1, y).first)
 #define CHANGE_Y(y0, y1, x) magnitude(tap_pair(both, x, y0).second - tap_pair(both, x, y1).second)
@@ -40,8 +40,8 @@ INLINE pair decide(site at, src_image src, image both, cfa pattern) {
     return v;
 }
 
-// At the two green sites beside a red or blue one, in the direction that won there: own minus green
-// (the mean of the two `known` beside that site), and own minus other.
+// Own minus green and own minus other at the two green sites beside a red or blue one, in its chosen
+// direction. A difference at a green site is the mean of those in `known` at the two sites beside it.
 typedef struct { vf own_green1, own_green2, own_other1, own_other2; } beside;
 
 INLINE beside along(image known, vi in_row) {
@@ -62,8 +62,8 @@ INLINE beside along(image known, vi in_row) {
 
 #define THIRD 0.33333334f
 
-// Refining, first half: own minus green as the mean of three along the direction; and own minus
-// other, still from what was known before.
+// Refining, first half: own minus green as the mean of three along the direction; and a first estimate
+// of own minus other.
 INLINE pair refine(site at, image chosen, cfa pattern) {
     const vf centre = tap_mosaic(chosen, 0, 0);
     const beside b = along(chosen, tap_pair(chosen, 0, 0).second > 0.5f);

@@ -2,9 +2,9 @@
 // Scales come in as -log2(e) / (2 sigma^2), so that a weight is one power of two.
 #include "lib/luma_chroma.h"
 
-// Contraction to fma is welcome here: it is exact to one rounding, and only the raw has to be the
-// same on every device. Luma and chroma go over the window one after the other, because both at
-// once need more registers than a CPU has.
+// Contraction to fma is allowed here: it rounds only once, and only the raw has to be the same on every
+// device. Luma and chroma go through the window one after the other, because both at once need more
+// registers than a CPU has.
 INLINE ycbcr bilateral(site at, image planes, int luma_reach, int chroma_reach,
                        float spatial_scale, float luma_scale, float chroma_scale) {
 #pragma OPENCL FP_CONTRACT ON

@@ -1,4 +1,4 @@
-// Median of a square window of luma and of chroma, mixed with the centre.
+// Median of a square window of luma and of chroma, blended with the centre.
 #include "lib/luma_chroma.h"
 
 INLINE vf mixed_with_median(__global const float *plane, image planes, int reach, float share) {

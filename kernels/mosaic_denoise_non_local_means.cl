@@ -1,15 +1,16 @@
-// Non-local means (Buades, Coll and Morel 2005) on the mosaic, patches of 3x3. The window is gone
-// over in steps of two, so that two patches have the same colours in the same places.
+// Non-local means (Buades, Coll and Morel 2005) on the mosaic, patches of 3x3. Offsets in the window
+// are even, so that two patches have the same colours in the same places.
 #include "lib/patch.h"
 
-// First a sample as the sensor saw it, second a function of it whose noise is the same in light and shade
-// (generalized Anscombe transform; Murtagh, Starck and Bijaoui 1995): the difference of two roots,
-// written as a quotient that also holds where a is 0. Patches are compared in it.
+// The first plane is the sample as the sensor saw it. The second, in which patches are compared, is a
+// function of it whose noise has the same variance at all levels (generalized Anscombe transform;
+// Murtagh, Starck and Bijaoui 1995): a difference of two roots, written as a quotient that also holds
+// for a = 0.
 INLINE pair stabilize(vf y, site at, cfa pattern, float red_inverse, float blue_inverse,
                             float a, float offset, float root_of_offset) {
     const vf signal = y * by_site(at, pattern, (vf)(red_inverse), (vf)(1.0f), (vf)(blue_inverse));
     const vf root = square_root(vmax(a * signal + offset, (vf)(0.0f)));
-    // Of the factor 2, a third: nine squares of it then add up to their mean.
+    // A third of the factor 2, so that the nine squares of a patch add up to their mean.
     const pair v = {signal, signal * 0.6666667f / (root + root_of_offset)};
     return v;
 }

@@ -1,5 +1,5 @@
-// Independent Gaussian noise whose sigma follows each channel's intensity, by a table of 256
-// entries a channel (SyB3R; Ley, Haensch, Hellwich 2016).
+// Independent Gaussian noise whose sigma follows each channel's intensity, by a table of 256 entries
+// for each channel (SyB3R; Ley, Haensch, Hellwich 2016).
 INLINE vf sigma_at(vf v, __global const float *table) {
     const vi index = to_8_bit(v);
 #if LANES == 1

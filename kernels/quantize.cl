@@ -1,4 +1,4 @@
-// The ADC: signal to whole DN, clipped to what it can tell (0 and the white level).
+// The ADC: signal to whole DN, clipped to 0..white level.
 INLINE vf quantize(vf y, site at, float range, float black_level, float white_level) {
     return vmin(vmax(nearest(y * range + black_level), (vf)(0.0f)), (vf)(white_level));
 }

@@ -7,7 +7,7 @@ INLINE vf sensor_noise(vf y, site at, stream s, float a, float b, float full_wel
     return vmin(y + noise, (vf)(full_well));
 }
 
-// The same with read noise of its own law.
+// The same, with read noise of a Tukey lambda distribution.
 INLINE vf sensor_noise_tukey(vf y, site at, stream s, float a, float full_well, float read_noise, float shape, float scale) {
     const vf shot = normal_at(at, 0, s) * square_root(vmax(a * y, (vf)(0.0f)));
     const vf read = tukey_lambda_of(word_at(at, 1, s), shape, scale);

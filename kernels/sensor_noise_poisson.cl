@@ -1,4 +1,4 @@
-// Whole photo-electrons, as many as the well holds, and read noise of variance b (EMVA 1288).
+// Whole photo-electrons, at most the full well, and read noise of variance b (EMVA 1288).
 #include "lib/poisson.h"
 #include "lib/tukey_lambda.h"
 

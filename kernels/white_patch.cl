@@ -1,10 +1,10 @@
 #include "site_gains.cl"
-// White patch: gains that make the brightest samples of the three colours equal. A histogram a
-// colour, 12 octaves below 1 with 512 bins each, indexed by the upper bits of the float.
+// White patch: gains that make the brightest samples of the three colours equal. Each colour has a
+// histogram, 12 octaves below 1 with 512 bins each, indexed by the upper bits of the float.
 #define WHITE_PATCH_BINS 6144
 
-// The bin of a pixel, or -1 where its 2x2 cell clips: what is left of a burnt-out light says nothing
-// of its colour. The last column or row of an odd image is a cell of its own.
+// The bin of a pixel, or -1 where its 2x2 cell has a clipped sample, since the colour of a burnt-out
+// light is unknown. The last column or row of an image of odd size is a cell of its own.
 INLINE int white_patch_bin(__global const float *origin, uint x, uint y, extent e, cfa pattern,
                            float clip) {
     const uint left = x & ~1u, right = left + 1 < e.width ? left + 1 : left;
@@ -19,7 +19,7 @@ INLINE int white_patch_bin(__global const float *origin, uint x, uint y, extent 
     return (int)off_red * WHITE_PATCH_BINS + ((as_int(inside) - 0x39800000) >> 14);
 }
 
-// The middle of the bin that the percentile, in millionths, falls into; 0 where nothing was counted.
+// The middle of the bin that holds the percentile, given in millionths; 0 where nothing was counted.
 INLINE float white_patch_level(__global const uint *bins, uint millionths) {
     ulong count = 0, below = 0;
     for (uint k = 0; k < WHITE_PATCH_BINS; ++k) count += bins[k];

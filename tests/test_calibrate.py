@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from clpipe import Pipeline
-from clpipe.analysis.calibration.calibrate import ROUNDING, Calibration, calibrate, gain_stages
+from clpipe.analysis.calibration.calibrate import ROUNDING, calibrate
+from clpipe.analysis.calibration.gain_stages import gain_stages
 from clpipe.analysis.calibration.line_fit import Estimate, Line, Table, fit_line
 from clpipe.analysis.calibration.repeats import CHANNELS, Sensor, neighbours
+from clpipe.analysis.calibration.result import Calibration
 from clpipe.base.errors import ImageError
 from clpipe.camera.profile import load_camera
 from clpipe.reference.cfa import PATTERNS

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from clpipe.analysis.calibration.frames import Given, find_frames, read_frame
+from clpipe.analysis.calibration.frames import FrameOverrides, find_frames, read_frame
 from clpipe.base.errors import ImageError
 from clpipe.camera.profile import load_camera
 from clpipe.commands.main import main
@@ -127,8 +127,8 @@ def test_dark_frames_among_the_frames_are_dark_frames(shots, tmp_path):
 def test_signal_and_dn_say_the_same(shots, tmp_path):
     call("run", f"{shots}/scene/640_0.exr", "-o", tmp_path, "--start-at", "normalize", "--until",
          "normalize", "--device", "numpy")  # fmt: skip
-    dn = read_frame(shots / "scene" / "640_0.exr", Given())
-    signal = read_frame(tmp_path / "640_0.exr", Given())
+    dn = read_frame(shots / "scene" / "640_0.exr", FrameOverrides())
+    signal = read_frame(tmp_path / "640_0.exr", FrameOverrides())
     assert signal.signal and not dn.signal
     assert np.array_equal(dn.read(), signal.read())
 
@@ -170,7 +170,7 @@ def test_frames_that_do_not_belong_together(shots, tmp_path):
         ("camera", ("--camera", "sony-a7s2"), "has the camera Sony ILCE-7SM2"),
         ("pattern", ("--set", "mosaic.pattern=GRBG"), "has the pattern GRBG"),
         ("levels", ("--set", "quantize.black_level=500"), "has the levels black 500"),
-        ("exposure", ("--set", "exposure.ev=1"), "was exposed +1 EV"),
+        ("exposure", ("--set", "exposure.ev=1"), "is +1 EV, that of"),
     ):
         call("run", shots / "scene.exr", "-o", tmp_path / name, *options, *more)
         message = call("calibrate", one, tmp_path / name / "scene.exr", *out, status=2).stderr
@@ -189,9 +189,9 @@ def test_what_is_no_frame(shots, tmp_path):
     assert "no such file" in call("calibrate", tmp_path / "x.exr", *out, status=1).stderr
     assert "no such file" in call("calibrate", tmp_path / "x.nef", *out, status=1).stderr
     assert "no mosaic or raw" in call("calibrate", "nothing*.dng", *out, status=2).stderr
-    assert "ends in .toml" in call("calibrate", shots, "-o", "p.png", status=2).stderr
+    assert "must end in .toml" in call("calibrate", shots, "-o", "p.png", status=2).stderr
     (tmp_path / "bad.cr2").write_bytes(b"not a raw" * 100)
-    assert "no raw that LibRaw" in call("calibrate", tmp_path / "bad.cr2", *out, status=1).stderr
+    assert "not a raw that LibRaw" in call("calibrate", tmp_path / "bad.cr2", *out, status=1).stderr
     call("run", shots / "scene.exr", "-o", tmp_path, "--until", "demosaic", "--device", "numpy")
     message = call("calibrate", tmp_path / "scene.exr", *out, status=1).stderr
     assert "holds rgb, kept after demosaic" in message
@@ -210,7 +210,7 @@ def test_signal_that_is_taken_for_dn_is_told(tmp_path):
 
 
 def test_options_win_over_what_the_file_says(shots):
-    frame = read_frame(shots / "scene" / "500_0.exr", Given(500, 16000, "BGGR", 1234))
+    frame = read_frame(shots / "scene" / "500_0.exr", FrameOverrides(500, 16000, "BGGR", 1234))
     assert (frame.iso, frame.sensor.black_level, frame.sensor.pattern) == (1234, 500, "BGGR")
 
 
@@ -233,7 +233,7 @@ def test_a_real_raw(shared_data, tmp_path):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("exiftool_DNG.dng", "there are no pixels in it"),
+        ("exiftool_DNG.dng", "holds no pixels"),
         ("magicknet_DSC8695.dng", "holds every colour at every pixel"),
         ("bep_truncated.cr2", "damaged, or no raw"),
         ("mei_issue247-1.nef", "it is a JPEG, not a camera's raw"),

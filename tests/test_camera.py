@@ -113,7 +113,7 @@ def test_what_arises_after_the_gain_is_what_the_fit_says(own):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("system_gain = [0.1, 0.2, 0.4]\n", "", r"gain_stages\[0\]\.system_gain: it is missing"),
+        ("system_gain = [0.1, 0.2, 0.4]\n", "", r"gain_stages\[0\]\.system_gain: missing"),
         (
             "[0.1, 0.2, 0.4]",
             "[0.1, -0.2, 0.4]",
@@ -137,7 +137,7 @@ def test_what_arises_after_the_gain_is_what_the_fit_says(own):
         ("iso_range = [100, 6400]", "iso_range = [6400, 100]", "iso_range must ascend"),
         ("iso_range = [100, 6400]", "iso_range = [10, 50]", "before the first gain stage"),
         ("white_level = 1023", "white_level = 70000", "white_level: .*65535"),
-        ("[sources]", "[source]", "sources: it is missing"),
+        ("[sources]", "[source]", "sources: missing"),
     ],
 )
 def test_a_profile_that_cannot_be_is_refused(own, old, new, message):

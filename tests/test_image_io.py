@@ -9,9 +9,10 @@ import pytest
 from PIL import Image, ImageCms
 
 from clpipe.base.errors import ImageError
-from clpipe.images import read as image_io
+from clpipe.images import write as image_write
 from clpipe.images.layers import picture_channels
-from clpipe.images.read import display_window, holds_mosaic, read_finished, read_image
+from clpipe.images.pixels import display_window
+from clpipe.images.read import holds_mosaic, read_finished, read_image
 from clpipe.images.tags import Tags
 from clpipe.images.write import write_display
 from tests.conftest import STILL_LIFE
@@ -176,7 +177,7 @@ def test_a_jpeg_that_does_not_fit_on_the_disk_does_not_end_the_process(tmp_path,
         target.write(source.read(100))
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(image_io.shutil, "copyfileobj", copy)
+    monkeypatch.setattr(image_write.shutil, "copyfileobj", copy)
     with pytest.raises(ImageError, match=r"a\.jpg: cannot be written: No space left on device"):
         write_display(tmp_path / "a.jpg", np.zeros((32, 32, 3), np.uint8), Tags("", "", 100))
     assert not list(tmp_path.iterdir())

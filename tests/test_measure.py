@@ -229,7 +229,7 @@ def test_settings_that_cannot_be_used(write_exr, clpipe, tmp_path):
     out.write_image(pixels)
     out.close()
     result = clpipe("measure", "bad.exr", "bad.exr", status=1)
-    assert "bad.exr: what it was made with cannot be used: unknown camera 'box'" in result.stderr
+    assert "bad.exr: its settings cannot be used: unknown camera 'box'" in result.stderr
 
 
 def test_odd_and_tiny_mosaics():
@@ -274,7 +274,7 @@ def test_wrong_partners_are_refused(clpipe):
     other = run(clpipe, "other", "--until", "quantize", "--iso", 1600, "--seed", 1)
     before = run(clpipe, "before", "--until", "mosaic")
     found = clpipe("measure", f"{noisy}.exr", f"{other}.exr", status=2)
-    assert "repeats have one ISO" in found.stderr
+    assert "repeats must have one ISO" in found.stderr
     found = clpipe("measure", f"{noisy}.exr", "--truth", f"{before}.exr", status=2)
     assert "keep both after the same stage" in found.stderr
 

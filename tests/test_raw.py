@@ -281,11 +281,11 @@ XTRANS = "GGRGGBGGBGGRBRGRBGGGBGGRGGRGGBRBGBRG"
         ("linear", "holds every colour at every pixel"),
         ("x-trans", "its colours repeat every 6x6 pixels"),
         ("one colour", "its colours repeat every 1x1 pixels"),
-        ("half", "damaged, or no raw that LibRaw knows"),
-        ("no pixels", "there are no pixels in it"),
+        ("half", "damaged, or not a raw that LibRaw knows"),
+        ("no pixels", "holds no pixels"),
         ("empty", "the file is empty"),
         ("jpeg", "it is a JPEG, not a camera's raw"),
-        ("text", "damaged, or no raw that LibRaw knows"),
+        ("text", "damaged, or not a raw that LibRaw knows"),
         ("missing", "no such file"),
     ],
 )
@@ -336,12 +336,12 @@ def test_a_chain_without_mosaic_cannot_know_the_pattern(tmp_path):
 
 
 def test_exif_is_found_in_files_that_are_no_tiff(tmp_path):
-    from clpipe.images.raw import _exif
+    from clpipe.images.raw import read_exif
 
     tiff = write_dng(tmp_path / "a.dng", mosaic()).read_bytes()
     for start in (b"\0\0\0\x18ftypcrx " + bytes(60) + b"CMT1", b"FUJIFILM" * 9 + b"Exif\0\0"):
         (tmp_path / "b.raf").write_bytes(start + tiff)
-        said = _exif(tmp_path / "b.raf")
+        said = read_exif(tmp_path / "b.raf")
         assert said.text("Model") == "Canon EOS 5D Mark II"
         assert said.number("ISOSpeedRatings", 0) == 400
 
@@ -410,7 +410,7 @@ def test_a_dump_of_another_size_is_told_what_would_fit(tmp_path):
     output = clpipe("run", tmp_path / "a.raw", "-o", tmp_path, *options, status=1)
     assert "a.raw: 6144 bytes, but 64x40 uint16le has 5120; it would fit 64x48 uint16le" in output
     output = clpipe("run", tmp_path / "a.raw", "-o", tmp_path, status=1)
-    assert "no raw that LibRaw knows" in output or "--raw-size" in output
+    assert "not a raw that LibRaw knows" in output or "--raw-size" in output
 
 
 @pytest.mark.parametrize(
@@ -427,9 +427,9 @@ def test_geometries_that_cannot_be(size, type_):
 DUMP = ("--raw-type", "uint16le", "--raw-size")
 MUSHFIQ = ("--set", "normalize.black_level=600", "--set", "normalize.white_level=16383")
 REAL = {
-    "bep_truncated.cr2": "damaged, or no raw that LibRaw knows",
-    "exiftool_DNG.dng": "there are no pixels in it",
-    "exiftool_Nikon.nef": "damaged, or no raw that LibRaw knows",
+    "bep_truncated.cr2": "damaged, or not a raw that LibRaw knows",
+    "exiftool_DNG.dng": "holds no pixels",
+    "exiftool_Nikon.nef": "damaged, or not a raw that LibRaw knows",
     "infisp_BlackImage_1920x1080_12bits_BGGR.raw": (*DUMP, "1920x1080"),
     "magicknet_DSC8695.dng": "holds every colour at every pixel",
     "magicknet_RAW_KODAK_DC50.KDC": (),

@@ -5,22 +5,10 @@ from math import erfc, sqrt
 import numpy as np
 import pytest
 
-from clpipe.analysis.selection import flat, unclipped
-from clpipe.analysis.statistics import (
-    LAGS,
-    SIGMAS,
-    autocorrelation,
-    bin_edges,
-    by_intensity,
-    channel,
-    correlation,
-    energy_left,
-    fit_law,
-    line_noise,
-    pairs_of,
-    pooled,
-    tails,
-)
+from clpipe.analysis.intensity import bin_edges, fit_variance, noise_by_intensity, pool_curves
+from clpipe.analysis.selection import select_flat, select_unclipped
+from clpipe.analysis.spatial import LAGS, autocorrelation, count_pairs, energy_left, line_noise
+from clpipe.analysis.statistics import SIGMAS, channel_statistics, correlation, tails
 
 RANDOM = np.random.default_rng(5)
 START = RANDOM.bit_generator.state
@@ -47,7 +35,7 @@ def box(noise):
 
 def test_white_noise_is_white():
     white = normal(1, *SIZE)
-    table = autocorrelation(white, pairs_of(ALL))
+    table = autocorrelation(white, count_pairs(ALL))
     assert table[LAGS, LAGS] == pytest.approx(1)
     table[LAGS, LAGS] = 0
     assert np.abs(table).max() < 5 / sqrt(white.size)
@@ -65,7 +53,7 @@ def test_blurred_noise_has_the_autocorrelation_of_its_kernel(share):
     # A 3x3 box: 1, 2/3, 1/3, 0 in each direction, the product of both on a diagonal.
     mask = RANDOM.random(SIZE) < share
     blurred = np.where(mask, box(normal(1, *SIZE)), 0)
-    table = autocorrelation(blurred, pairs_of(mask))
+    table = autocorrelation(blurred, count_pairs(mask))
     line = np.zeros(LAGS + 1)
     line[:3] = 1, 2 / 3, 1 / 3
     expected = np.concatenate([line[:0:-1], line])
@@ -77,7 +65,7 @@ def test_blurred_noise_has_the_autocorrelation_of_its_kernel(share):
 
 def test_a_lag_right_is_not_a_lag_down():
     noise = normal(1, *SIZE)
-    table = autocorrelation(noise + np.roll(noise, (2, 3), (1, 2)), pairs_of(ALL))
+    table = autocorrelation(noise + np.roll(noise, (2, 3), (1, 2)), count_pairs(ALL))
     assert table[LAGS + 2, LAGS + 3] == pytest.approx(0.5, abs=0.01)
     assert table[LAGS - 2, LAGS - 3] == pytest.approx(0.5, abs=0.01)
     assert abs(table[LAGS + 2, LAGS - 3]) < 0.01
@@ -87,8 +75,8 @@ def test_a_lag_right_is_not_a_lag_down():
 def test_the_law_of_a_sensor_is_recovered():
     a, b = 2e-3, 4e-5
     noise = normal(3, *SIZE) * np.sqrt(a * RAMP + b) + 0.01 * RAMP**2  # and a tone shift
-    curve, without, standard = by_intensity(RAMP, noise, ALL, EDGES)
-    law = fit_law(curve)
+    curve, without, standard = noise_by_intensity(RAMP, noise, ALL, EDGES)
+    law = fit_variance(curve)
     assert law.a == pytest.approx(a, rel=0.01)
     assert law.b == pytest.approx(b, rel=0.02)
     assert abs(law.a - a) < 3 * law.a_error < 0.02 * a
@@ -108,8 +96,10 @@ def test_standard_errors_are_honest():
     for blur in (lambda x: x, box):
         for _ in range(40):
             noise = blur(normal(1, *ramp.shape)) * np.sqrt(a * ramp + b)
-            curve, without, standard = by_intensity(ramp, noise, mask, EDGES)
-            law = channel("R", curve, without, standard, mask, pairs_of(mask), lawful=True).law
+            curve, without, standard = noise_by_intensity(ramp, noise, mask, EDGES)
+            law = channel_statistics(
+                "R", curve, without, standard, mask, count_pairs(mask), fits_line=True
+            ).law
             off += [(law.a - a) / law.a_error, (law.b - b) / law.b_error]
         assert 0.7 < np.std(off) < 1.35
         assert abs(np.mean(off)) < 0.4
@@ -146,7 +136,7 @@ def test_clipped_intensities_do_not_count():
     noise = normal(1, *SIZE) * np.float32(0.05)
     seen = RAMP + noise
     clipped = (seen <= 0) | (seen >= 1)
-    mask = unclipped(RAMP, clipped, EDGES, ALL)
+    mask = select_unclipped(RAMP, clipped, EDGES, ALL)
     assert not mask[:, RAMP[0] < 0.1].any()
     assert not mask[:, RAMP[0] > 0.9].any()
     assert mask[:, (RAMP[0] > 0.2) & (RAMP[0] < 0.8)].mean() > 0.999
@@ -158,22 +148,22 @@ def test_flat_places():
     truth = np.zeros((100, 200, 3), np.float32)
     truth[:, 100:] = 0.5
     truth += np.linspace(0, 0.05, 200, dtype=np.float32)[:, None]
-    found = flat(truth, normal(1, 100, 200, 3) * np.float32(0.01), np.ones((100, 200), bool))
+    found = select_flat(truth, normal(1, 100, 200, 3) * np.float32(0.01), np.ones((100, 200), bool))
     assert not found[:, 97:103].any()
     assert found[:, :95].all() and found[:, 105:].all()
     # Without noise the flattest quarter counts.
     steep = np.linspace(0, 1, 200, dtype=np.float32) ** 2 * np.ones((100, 3, 1), np.float32)
     steep = np.ascontiguousarray(steep.transpose(0, 2, 1))
-    found = flat(steep, np.zeros((1, 100, 200, 3), np.float32), np.ones((100, 200), bool))
+    found = select_flat(steep, np.zeros((1, 100, 200, 3), np.float32), np.ones((100, 200), bool))
     assert 0.2 < found.mean() < 0.3
     assert found[:, :45].all()
 
 
 def test_pooled_curves():
     noise = normal(1, *SIZE) * np.sqrt(1e-3 * RAMP + 1e-5)
-    whole, *_ = by_intensity(RAMP, noise, ALL, EDGES)
-    halves = [by_intensity(RAMP[i::2], noise[:, i::2], ALL[i::2], EDGES)[0] for i in (0, 1)]
-    both = pooled(halves)
+    whole, *_ = noise_by_intensity(RAMP, noise, ALL, EDGES)
+    halves = [noise_by_intensity(RAMP[i::2], noise[:, i::2], ALL[i::2], EDGES)[0] for i in (0, 1)]
+    both = pool_curves(halves)
     assert both.count.tolist() == whole.count.tolist()
     assert both.mean == pytest.approx(whole.mean)
     assert both.sigma == pytest.approx(whole.sigma, rel=2e-3)
@@ -183,16 +173,18 @@ def test_pooled_curves():
 def test_tiny_images(shape):
     mask = np.ones(shape[1:], bool)
     intensity = RANDOM.random(shape[1:], np.float32)
-    curve, without, standard = by_intensity(intensity, normal(*shape), mask, EDGES)
-    one = channel("R", curve, without, standard, mask, pairs_of(mask), lawful=True)
+    curve, without, standard = noise_by_intensity(intensity, normal(*shape), mask, EDGES)
+    one = channel_statistics("R", curve, without, standard, mask, count_pairs(mask), fits_line=True)
     assert one.count == np.prod(shape)
     assert one.sigma > 0
     assert one.law is None
 
 
 def test_no_noise_at_all():
-    curve, without, standard = by_intensity(RAMP, np.zeros((1, *SIZE), np.float32), ALL, EDGES)
-    one = channel("R", curve, without, standard, ALL, pairs_of(ALL), lawful=True)
+    curve, without, standard = noise_by_intensity(
+        RAMP, np.zeros((1, *SIZE), np.float32), ALL, EDGES
+    )
+    one = channel_statistics("R", curve, without, standard, ALL, count_pairs(ALL), fits_line=True)
     assert one.sigma == 0
     assert one.law is None
     assert np.isnan([one.energy_left, one.tails.skewness, one.autocorrelation[8, 8]]).all()

@@ -1,13 +1,12 @@
-"""TODO."""
+"""The images that are measured: their kind, levels and clipping, from files of any stage."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from clpipe.analysis.statistics import Mask
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.types import Floats
+from clpipe.base.types import Floats, Mask
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import Settings
 from clpipe.images.read import holds_mosaic, read_finished, read_image
@@ -15,19 +14,17 @@ from clpipe.inputs.kept import carried_settings
 from clpipe.reference.cfa import Pattern
 from clpipe.stage import Context, Kind
 
-SITES = ("R", "G1", "G2", "B")  # G1 stands in the rows of red
-
-
-WHOLE = "mosaic"  # the channel that is all sites together
+SITES = ("R", "G1", "G2", "B")  # the channels of a mosaic; G1 is in the rows of red
+WHOLE = "mosaic"  # the channel of all sites together
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An image to be measured.
+    """An image whose noise is measured.
 
-    ``kind`` is display, rgb, mosaic (signal) or values (a mosaic that does not say its levels);
-    ``pixels`` is (height, width, 3) or (height, width). Samples at ``black`` and ``white``, and
-    beyond, are clipped; None where nothing is known to be.
+    ``kind`` is display, rgb, mosaic (signal) or values (a mosaic of unknown levels); ``pixels`` is
+    (height, width, 3) or (height, width). Samples at and beyond ``black`` and ``white`` are
+    clipped; None where no such limit is known.
     """
 
     path: Path
@@ -36,22 +33,22 @@ class Picture:
     pattern: Pattern = "RGGB"
     black: float | None = None
     white: float | None = None
-    balance: str = ""  # which white balance gains a kept mosaic is without and with
+    balance: str = ""  # of a kept mosaic, in words: the white balance gains taken out and applied
     iso: float | None = None  # of an image that clpipe kept
 
     @property
     def what(self) -> str:
-        """Kind and size in words."""
+        """The kind, pattern and size in words."""
         height, width = self.pixels.shape[:2]
         name = "mosaic that does not say its levels" if self.kind == "values" else self.kind
         bayer = f" {self.pattern}" if self.pixels.ndim == 2 else ""
         return f"{name}{bayer}, {width}x{height}"
 
     def clipped(self) -> Mask:
-        """True where a sample is at the end of its range; the shape is that of the pixels."""
+        """True where a sample is clipped, in the shape of the pixels."""
         clipped = np.zeros(self.pixels.shape, bool)
         if self.kind == "rgb":
-            # Below 0 is nothing special here; exactly 0 is what clipping leaves.
+            # Linear RGB may be negative; clipping leaves exactly 0.
             clipped |= self.pixels == 0
         if self.black is not None:
             clipped |= self.pixels <= self.black
@@ -61,13 +58,13 @@ class Picture:
 
 
 def load_picture(path: Path, pattern: Pattern = "RGGB") -> Picture:
-    """Read an image of any stage: a kept EXR, a render, a mosaic, a finished picture.
+    """Read an image of any stage: a kept EXR, a render, a mosaic or a finished picture.
 
-    A kept raw is turned from DN to signal by its own levels. A mosaic that carries no settings is
-    taken as it is, with ``pattern``.
+    A kept raw is converted from DN to signal by its own levels. A mosaic without clpipe's settings
+    stays in the unit of the file and gets ``pattern``.
 
     Raises:
-        ImageError: it cannot be read, or the settings that it carries are of no use.
+        ImageError: the file cannot be read, or its settings cannot be used.
     """
     finished = read_finished(path)
     if finished is not None:
@@ -80,7 +77,7 @@ def load_picture(path: Path, pattern: Pattern = "RGGB") -> Picture:
         settings = carried_settings(source.attributes)
         context = context_after(settings, source.attributes.get("stage")) if settings else None
     except RequestError as error:
-        raise ImageError(f"{path}: what it was made with cannot be used: {error}") from None
+        raise ImageError(f"{path}: its settings cannot be used: {error}") from None
     iso = context.iso if context else None
     if not mosaic:
         if kind == Kind.DISPLAY.label:
@@ -88,12 +85,12 @@ def load_picture(path: Path, pattern: Pattern = "RGGB") -> Picture:
         return Picture(path, "rgb", pixels, white=1.0, iso=iso)
     if context is None:
         return Picture(path, "values", pixels, pattern)
-    without, with_ = (
+    removed, applied = (
         f"red {red:g}, blue {blue:g}" for red, blue in (context.gains, context.applied_gains)
     )
-    balance = f"without the gains {without} and with the gains {with_}"
+    balance = f"without the gains {removed} and with the gains {applied}"
     black, white = context.black_level, context.white_level
-    if black is None or white is None:  # not digitised: nothing clips below
+    if black is None or white is None:  # not digitised, so nothing clips at a lower end
         clean = Picture(path, "mosaic", pixels, context.pattern, white=1.0)
         return replace(clean, balance=balance, iso=iso)
     lowest = -black / (white - black)
@@ -103,10 +100,10 @@ def load_picture(path: Path, pattern: Pattern = "RGGB") -> Picture:
 
 
 def context_after(settings: Settings, stage: str | None) -> Context:
-    """What is known of an image after a step of the chain of some settings.
+    """The context of an image that the chain of these settings kept after ``stage``.
 
     Raises:
-        RequestError: the chain has no such step.
+        RequestError: the chain has no such stage.
     """
     step = make_chain(settings).step_named(stage or "")
     return step.method.after(step.context)

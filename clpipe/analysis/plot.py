@@ -1,4 +1,4 @@
-"""A report of measured noise as a picture."""
+"""The picture of a noise report: noise by intensity, tails, autocorrelation."""
 
 from pathlib import Path
 
@@ -8,8 +8,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from clpipe.analysis.measure import UNITS, NoiseReport
-from clpipe.analysis.statistics import HISTOGRAM, LAGS, Channel, gaussian_beyond
+from clpipe.analysis.report import UNITS, NoiseReport
+from clpipe.analysis.spatial import LAGS
+from clpipe.analysis.statistics import HISTOGRAM, Channel, gaussian_beyond
 from clpipe.base.files import write_new
 
 INK = {
@@ -24,15 +25,13 @@ INK = {
     "mosaic": "#222222",
 }
 
-
+# The channels whose autocorrelation is drawn: of pictures by their kind, and of mosaics.
 MAPS = {"display": ("Y", "Cb", "Cr"), "rgb": ("Y", "Cb", "Cr")}
-
-
 SITE_MAPS = ("mosaic", "R", "G1", "B")
 
 
 def draw(report: NoiseReport, path: Path) -> None:
-    """Draw noise by intensity, tails and autocorrelation as a PNG, 1600 pixels wide.
+    """Draw a report as a PNG, 1600 px wide.
 
     Raises:
         ImageError: the file cannot be written.
@@ -53,16 +52,16 @@ def draw(report: NoiseReport, path: Path) -> None:
         picture = draw_autocorrelation(axis, one, limit, report)
     below.colorbar(picture, ax=axes, shrink=0.85, label="correlation (lag 0 is 1)")
     first, *more = report.images
-    of = short_name(first) + (f" and {len(more)} more" if more else "")
+    subject = short_name(first) + (f" and {len(more)} more" if more else "")
     against = short_name(report.truth) if report.truth else "their mean"
-    title = f"Noise of {of} against {against} ({report.kind}, {report.share:.0%} of it counts)"
+    title = f"Noise of {subject} against {against} ({report.kind}, {report.share:.0%} used)"
     figure.suptitle(title, fontsize=15)
     FigureCanvasAgg(figure)
     write_new(path, figure.savefig)
 
 
 def short_name(path: str) -> str:
-    """The end of a path: the file and its folder, which tell truth and noisy image apart.
+    """The last folder and the file of a path; the folder tells truth and noisy image apart.
 
     >>> short_name("a/b/c.exr")
     'b/c.exr'
@@ -71,14 +70,14 @@ def short_name(path: str) -> str:
 
 
 def peak(one: Channel) -> float:
-    """The largest correlation of a channel apart from lag 0."""
+    """The largest absolute autocorrelation of a channel, lag 0 left out."""
     table = np.nan_to_num(one.autocorrelation.copy())
     table[LAGS, LAGS] = 0
     return float(np.abs(table).max())
 
 
 def draw_intensity(axes: Axes, report: NoiseReport) -> None:
-    """Sigma over intensity, with the fitted sqrt(a*y + b) where there is one."""
+    """Draw sigma over intensity, and the fitted sqrt(a*y + b) where there is one."""
     for one in report.channels:
         ink, curve = INK[one.name], one.curve
         dashed = one.name in ("Y", "Cb", "Cr")
@@ -98,14 +97,14 @@ def draw_intensity(axes: Axes, report: NoiseReport) -> None:
     axes.set_ylim(bottom=0)
     axes.set_xlabel(f"intensity of the truth ({UNITS[report.kind]})", fontsize=12)
     axes.set_ylabel("sigma of the noise", fontsize=12)
-    lawful = any(one.law for one in report.channels)
-    axes.set_title("Noise by intensity" + ("; lines: sqrt(a·y + b)" if lawful else ""), fontsize=13)
+    fitted = any(one.law for one in report.channels)
+    axes.set_title("Noise by intensity" + ("; lines: sqrt(a·y + b)" if fitted else ""), fontsize=13)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=12)
 
 
 def draw_tails(axes: Axes, report: NoiseReport) -> None:
-    """The share of standardised noise beyond each value, on its side of 0, over a Gaussian's."""
+    """Draw the share of standardised noise further out than each value, over a Gaussian's share."""
     beyond = [gaussian_beyond(abs(z)) / 2 for z in HISTOGRAM]
     axes.fill_between(HISTOGRAM, beyond, 1e-12, color="0.85", label="Gaussian")
     for one in report.channels:
@@ -129,7 +128,7 @@ def draw_tails(axes: Axes, report: NoiseReport) -> None:
 
 
 def draw_autocorrelation(axes: Axes, one: Channel, limit: float, report: NoiseReport) -> AxesImage:
-    """The autocorrelation of one channel as a map, lag 0 left white."""
+    """Draw the autocorrelation of one channel as a map; lag 0 is white."""
     table = one.autocorrelation.copy()
     table[LAGS, LAGS] = np.nan
     extent = (-LAGS - 0.5, LAGS + 0.5, LAGS + 0.5, -LAGS - 0.5)

@@ -1,5 +1,5 @@
-"""What every other room may use: errors, array types, text and memory helpers, whole-file writes.
+"""Helpers that every other room may use: errors, array types, text, memory, whole-file writes.
 
-Nothing here knows what an image, a stage or a device is. It imports only the standard library and
-NumPy.
+Nothing here knows what an image, a stage or a device is. This room imports only the standard
+library and NumPy.
 """

@@ -1,4 +1,4 @@
-"""What can go wrong, by whose fault it is. Each class carries the exit status of the program."""
+"""The errors that a user sees, by their cause. Each class carries the program's exit status."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +17,7 @@ class RequestError(ClpipeError):
 
 
 class KeyedError(RequestError):
-    """A bad setting; ``key`` is its dotted name."""
+    """A bad setting; ``key`` is its dotted name, such as ``sensor_noise.a``."""
 
     def __init__(self, key: str, message: str) -> None:
         super().__init__(message)
@@ -25,33 +25,33 @@ class KeyedError(RequestError):
 
 
 class ImageError(ClpipeError):
-    """One image cannot be read, processed or written; the others go on."""
+    """One image cannot be read, processed or written; the run goes on with the others."""
 
     exit_status = 1
 
 
 class KindError(ImageError):
-    """A kept image has not the channels that are wanted; ``attributes`` is what it says."""
+    """A kept image lacks the channels that are needed; ``attributes`` are those of the file."""
 
     def __init__(self, path: Path, attributes: Mapping[str, str]) -> None:
-        kept = attributes.get("stage", "nothing that it names")
-        super().__init__(f"{path}: holds {attributes['kind']}, kept after {kept}")
+        stage = attributes.get("stage", "a stage that it does not name")
+        super().__init__(f"{path}: holds {attributes['kind']}, kept after {stage}")
         self.attributes = attributes
 
 
 class DeviceError(ClpipeError):
-    """There is no usable device, or the one that was asked for cannot be used."""
+    """There is no usable device, or the requested one cannot be used."""
 
     exit_status = 3
 
 
 class OutputError(ClpipeError):
-    """Nothing can be written any more: the disk is full, or the folder has gone."""
+    """Nothing more can be written: the disk is full, or the folder has gone."""
 
     exit_status = 1
 
 
 class ClusterError(ClpipeError):
-    """The cluster has gone in the midst of a run; what is finished is there."""
+    """The cluster was lost during a run; the images finished until then are written."""
 
     exit_status = 1

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Whole files: their digest, and writing them so that none is ever left half-written."""
 
 import contextlib
 import hashlib
@@ -22,11 +22,15 @@ def sha256_of(path: Path) -> tuple[str, int]:
         return digest.hexdigest(), file.tell()
 
 
-_unfinished: set[Path] = set()
+_unfinished: set[Path] = set()  # temporary files of this process, for `remove_temporary_files`
 
 
 def write_beside(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file under a temporary name beside ``path``, then rename it: never half a file.
+    """Write a file under a temporary name beside ``path``, then rename it to ``path``.
+
+    Args:
+        path: the file; an existing one is replaced.
+        write: writes the whole content to the path that it is called with.
 
     Raises:
         ImageError: the file cannot be written.
@@ -45,7 +49,7 @@ def write_beside(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def write_new(path: Path, write: Callable[[Path], object]) -> None:
-    """The same, where the folders above it may have to be made.
+    """Make the folders above ``path`` where they are missing, then :func:`write_beside`.
 
     Raises:
         ImageError: the file cannot be written.
@@ -57,8 +61,8 @@ def write_new(path: Path, write: Callable[[Path], object]) -> None:
     write_beside(path, write)
 
 
-def drop_unfinished() -> None:
-    """Remove the halves of files that are being written now, before the process is ended."""
+def remove_temporary_files() -> None:
+    """Delete the temporary files that are being written now; call it just before exiting."""
     for path in list(_unfinished):
         with contextlib.suppress(OSError):
             path.unlink(missing_ok=True)

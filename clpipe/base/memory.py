@@ -1,4 +1,4 @@
-"""Amounts of memory: as people write them, and how much of it is free on this machine."""
+"""Amounts of memory: parsed from text, formatted as text, and how much is free on this machine."""
 
 import re
 from pathlib import Path
@@ -15,7 +15,7 @@ def parse_size(text: str) -> int:
     (536870912, 1610612736, 4096)
 
     Raises:
-        RequestError: it is no such size, or none at all.
+        RequestError: the text is not a size, or the size is 0 or beyond 63 bits.
     """
     match = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*([kmgt]?)(?:i?b)?", text.strip(), re.IGNORECASE)
     size = int(float(match[1]) * UNITS[match[2].upper()]) if match else 0
@@ -25,7 +25,7 @@ def parse_size(text: str) -> int:
 
 
 def in_words(size: float) -> str:
-    """Bytes as people read them, rounded.
+    """A number of bytes as text, rounded to a tenth of KiB, MiB or GiB.
 
     >>> in_words(8.2 * 2**30), in_words(5_000_000), in_words(1000)
     ('8.2 GiB', '4.8 MiB', '1.0 KiB')
@@ -38,12 +38,12 @@ def in_words(size: float) -> str:
 
 
 def available_memory(root: Path = Path("/")) -> int | None:
-    """Bytes that this process could still take, by the kernel's account and its control groups.
+    """Bytes that this process can still allocate: the least of MemAvailable and its cgroup limits.
 
-    None where neither is told (not Linux).
+    None where the system gives neither, as outside Linux. ``root`` is for tests.
     """
-    known = [_available(root / "proc/meminfo"), *_left_in_groups(root)]
-    return min((size for size in known if size is not None), default=None)
+    limits = [_available(root / "proc/meminfo"), *_left_in_groups(root)]
+    return min((size for size in limits if size is not None), default=None)
 
 
 def _available(meminfo: Path) -> int | None:
@@ -55,7 +55,7 @@ def _available(meminfo: Path) -> int | None:
 
 
 def _left_in_groups(root: Path) -> list[int | None]:
-    """What the control groups of this process leave it, version 1 or 2, each with its parents'."""
+    """Bytes left in each control group of this process and in its parents (version 1 or 2)."""
     try:
         lines = (root / "proc/self/cgroup").read_text().splitlines()
     except OSError:
@@ -80,7 +80,7 @@ def _left_in_groups(root: Path) -> list[int | None]:
 
 
 def _left_in_group(folder: Path, limit: str, used: str) -> int | None:
-    """The rest up to a limit; cached files that can be dropped are not counted as used."""
+    """Bytes left in one group; None without a limit. Cached files count as free: they can go."""
     try:
         rest = int((folder / limit).read_text()) - int((folder / used).read_text())
         files = re.search(

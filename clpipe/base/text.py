@@ -1,11 +1,11 @@
-"""Telling a user what a wrong name should have been."""
+"""Text for messages: suggestions for misspelt names, and text that is safe to print."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
 
 
 def one_of(what: str, found: str, allowed: Iterable[str]) -> str:
-    """A message for an unknown name, with the nearest right one first.
+    """A message for an unknown name, with the most similar allowed name as a suggestion.
 
     >>> one_of("stage", "demosiac", ["mosaic", "demosaic"])
     "unknown stage 'demosiac' (did you mean 'demosaic'?); allowed: mosaic, demosaic"
@@ -17,7 +17,7 @@ def one_of(what: str, found: str, allowed: Iterable[str]) -> str:
 
 
 def printable(text: str) -> str:
-    """Text in one line, with ? for what cannot be printed.
+    """The text in one line, with ? for each character that cannot be printed.
 
     >>> printable("R" + chr(1) + chr(10) + "G")
     'R? G'

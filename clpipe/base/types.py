@@ -1,4 +1,4 @@
-"""Names for the array types that go through the whole package."""
+"""Names for the array types that the whole package uses."""
 
 from typing import Any
 
@@ -6,6 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
-
-
+Doubles = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Array = NDArray[Any]

@@ -21,7 +21,7 @@ from clpipe.chain.request import Request
 from clpipe.engine.bench import scene
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
-from clpipe.images.read import decode_alone
+from clpipe.images.read import decode_first_part
 from clpipe.images.tags import Tags
 from clpipe.images.write import write_display, write_exr
 from clpipe.inputs.find import Job, find_jobs
@@ -132,7 +132,7 @@ def bench_batch(device: Device, request: Request, load: Load) -> BatchSpeed:
         # A few first, so that nothing is compiled and no file is cold in what is timed.
         list(Batch(worker(), [device]).run(jobs[: 2 * DISTINCT]))
         clock = _Clock()
-        encoded = Runner(chain, device).run(decode_alone(jobs[0].path), "").image
+        encoded = Runner(chain, device).run(decode_first_part(jobs[0].path), "").image
         tags = Tags(chain.camera.make, chain.camera.model, chain.iso)
         serial = []
         for outcome in one_by_one(worker(trace=True), device, jobs, clock.on):
@@ -140,7 +140,7 @@ def bench_batch(device: Device, request: Request, load: Load) -> BatchSpeed:
             if len(serial) % max(load.images // CODED, 1) == 0:
                 # In between, because the speed of machines changes with time.
                 with clock.on("decoder"):
-                    decode_alone(outcome.job.path)
+                    decode_first_part(outcome.job.path)
                 with clock.on("encoder"):
                     write_display(folder / "alone.jpg", encoded, tags)
         forget_peak_memory()

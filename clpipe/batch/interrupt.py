@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-from clpipe.base.files import drop_unfinished
+from clpipe.base.files import remove_temporary_files
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -30,7 +30,7 @@ def interruptible(stop: Callable[[], None]) -> Iterator[None]:
     def handle(number: int, frame: FrameType | None) -> None:
         nonlocal is_stopping
         if is_stopping:
-            drop_unfinished()
+            remove_temporary_files()
             os._exit(INTERRUPTED)
         is_stopping = True
         stop()

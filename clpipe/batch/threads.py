@@ -17,7 +17,7 @@ from clpipe.batch.outcome import Outcome
 from clpipe.batch.work import ImageWorker, Task
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
-from clpipe.images.read import set_codec_threads
+from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.find import Job
 from clpipe.outputs.renditions import Rendition
 

@@ -1,8 +1,11 @@
-"""Three ways to say how strong a sensor's noise is, and how they follow from each other.
+"""The three parametrisations of a sensor's noise, and the conversions between them.
 
-Signal: Var[y] = a*y + b, y = 1 at the white level (Foi et al., IEEE TIP 2008, eq. 2). EMVA 1288:
-system gain in DN/e-, noise before the gain in e-, noise after it in DN. The paper (Bielova et al.,
-CVPR Workshops 2019): chi, theta, b', b'' and p0.
+- Signal: Var[y] = a*y + b, with y = 0 at the black level and y = 1 at the white level (Foi et al.,
+  IEEE TIP 2008, eq. 2).
+- EMVA 1288: the system gain in DN/e-, noise before the gain in e-, noise after it in DN.
+- "The paper", here and elsewhere in clpipe: Bielova, Haensch, Ley, Hellwich, "A Digital Image
+  Processing Pipeline for Modelling of Realistic Noise in Synthetic Images", CVPR Workshops 2019:
+  chi, theta, b', b'' and p0.
 """
 
 from dataclasses import asdict, dataclass
@@ -11,14 +14,16 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Emva:
-    """EMVA 1288 (release 4.0, 2021, sec. 2): what an electron is worth, and the dark noise."""
+    """EMVA 1288 (release 4.0, 2021, sec. 2): the system gain and the noise without light."""
 
     system_gain: float  # DN/e-
     read_noise: float  # e-, before the gain
     adc_noise: float = 0.0  # DN, after the gain; the rounding to whole DN is not part of it
 
     def signal(self, signal_range: float) -> tuple[float, float]:
-        """The a and b of this, for a white level that lies ``signal_range`` DN above black.
+        """a and b in signal units, where the white level lies ``signal_range`` DN above black.
+
+        a = K / range and b = ((K * read_noise)^2 + adc_noise^2) / range^2, K the system gain.
 
         >>> Emva(2.0, 3.0).signal(1000)
         (0.002, 3.6e-05)
@@ -29,10 +34,11 @@ class Emva:
 
 @dataclass(frozen=True)
 class Paper:
-    """Bielova et al. 2019, after Foi et al. 2008, eq. 4 to 8.
+    """The paper's parameters (Bielova et al. 2019, after Foi et al. 2008, eq. 4 to 8).
 
-    chi is the number of photo-electrons that make y = 1 at theta = 1, theta the analogue gain, b'
-    the variance before the gain and b'' after it (signal squared), p0 the pedestal (signal).
+    chi is the number of photo-electrons that gives y = 1 at theta = 1; theta is the analogue gain;
+    b' and b'' are the variances of the noise before and after the gain, in signal units squared;
+    p0 is the pedestal in signal units.
     """
 
     chi: float
@@ -56,11 +62,12 @@ class Paper:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """How strong shot and read noise are, in all three ways.
+    """The strength of shot and read noise, convertible to all three parametrisations.
 
-    ``signal_range`` is the white level above black in DN. ``after`` is the part of b that arises
-    after the gain, ``theta`` the analogue gain over the one that is called 1; neither can be told
-    from a and b, so where nothing is known of them all of b arises before, at theta = 1.
+    ``a`` and ``b`` are in signal units and signal units squared; ``signal_range`` is the white
+    level minus the black level in DN. ``after`` is the part of b that arises after the gain, and
+    ``theta`` is the analogue gain relative to the camera's lowest. Neither follows from a and b;
+    the defaults put all of b before the gain and set theta to 1.
     """
 
     a: float
@@ -70,7 +77,7 @@ class NoiseModel:
     theta: float = 1.0
 
     def emva(self) -> Emva | None:
-        """The same by EMVA 1288; None without shot noise, where an electron is worth nothing.
+        """The EMVA 1288 parameters; None for a = 0, where the gain would be 0 DN/e-.
 
         >>> NoiseModel(0.002, 3.6e-5, 1000).emva()
         Emva(system_gain=2.0, read_noise=3.0, adc_noise=0.0)
@@ -82,7 +89,7 @@ class NoiseModel:
         return Emva(gain, read_noise, self.after**0.5 * self.signal_range)
 
     def paper(self) -> Paper | None:
-        """The same in the paper's parameters, with p0 = 0; None without shot noise.
+        """The paper's parameters, with p0 = 0; None for a = 0, where chi would be infinite.
 
         >>> NoiseModel(0.125, 0.75, 1000, after=0.25, theta=2).paper()
         Paper(chi=16.0, theta=2, b_before=0.125, b_after=0.25, p0=0.0)
@@ -93,7 +100,7 @@ class NoiseModel:
         return Paper(self.theta / self.a, self.theta, before, self.after)
 
     def record(self) -> dict[str, Any]:
-        """All three as JSON values."""
+        """All three parametrisations as JSON values, as the sidecar holds them."""
         emva, paper = self.emva(), self.paper()
         return {
             "signal": {"a": self.a, "b": self.b},

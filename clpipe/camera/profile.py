@@ -1,4 +1,4 @@
-"""Cameras: what a sensor does at an ISO, from a small TOML file with the source of every number."""
+"""Camera profiles: what a sensor does at each ISO, from a TOML file that cites every number."""
 
 import tomllib
 from functools import cache, cached_property, lru_cache
@@ -7,27 +7,20 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
+from clpipe.base.types import Doubles
 from clpipe.base.validation import first_fault
 from clpipe.camera.noise import NoiseModel
 
 DEFAULT_CAMERA = "sony-a7r2"
-
-
 Row = tuple[float, float, float]
-
-
 Matrix = tuple[Row, Row, Row]
-
-
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
-
-# Linear sRGB to XYZ, D65 (IEC 61966-2-1, 1999).
+# Linear sRGB to CIE XYZ, white D65 at Y = 1 (IEC 61966-2-1, 1999).
 SRGB_TO_XYZ = np.array(
     [
         [0.4123908, 0.3575843, 0.1804808],
@@ -36,18 +29,13 @@ SRGB_TO_XYZ = np.array(
     ]
 )
 
-
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-
-
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-
-
 Share = Annotated[float, Field(ge=0, le=0.1)]
 
 
 class GainStage(BaseModel):
-    """ISOs that share one conversion gain, with what was measured at each, ascending."""
+    """The measurements at ISOs that share one conversion gain, in ascending order of ISO."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -70,9 +58,10 @@ class GainStage(BaseModel):
         return self
 
     def at(self, iso: float, values: tuple[float, ...]) -> float:
-        """One of its tables in DN at an ISO, interpolated in electrons, linearly in log ISO.
+        """The value in DN of one of this stage's tables at an ISO.
 
-        Before the first and after the last ISO, electrons stay what they are there.
+        The table is converted to electrons and interpolated linearly in log ISO; outside the
+        table, the value in electrons stays that of the nearest end.
         """
         electrons = np.interp(np.log(iso), np.log(self.iso), np.divide(values, self.system_gain))
         return float(electrons) * self.gain_at(iso)
@@ -84,10 +73,11 @@ class GainStage(BaseModel):
 
     @cached_property
     def adc_noise(self) -> float:
-        """The part of the read noise that arises after the gain, in DN; never above the least one.
+        """The part of the read noise that arises after the gain, in DN.
 
-        Least squares of read_noise^2 = gain^2 * before^2 + after^2, each ISO by its own figure
-        (EMVA 1288); 0 where fewer than three ISOs leave it open.
+        A least-squares fit of read_noise^2 = gain^2 * before^2 + after^2 (EMVA 1288), with each
+        ISO's residual relative to its read_noise^2. It is limited to the smallest read noise, and
+        0 where the stage has fewer than three ISOs, too few to fit.
         """
         if len(self.iso) < 3:
             return 0.0
@@ -98,10 +88,10 @@ class GainStage(BaseModel):
 
 
 class Camera(BaseModel):
-    """A camera profile. Levels in DN, gains with green = 1.
+    """A camera profile. Levels are in DN, white balance gains relative to green = 1.
 
-    What is None or 0 is either so or not known; ``sources`` says which, and where each figure is
-    from.
+    A value of None or 0 is either a fact or unknown; ``sources`` says which, and names the source
+    of each figure.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -113,18 +103,24 @@ class Camera(BaseModel):
     white_level: Annotated[float, Field(gt=0, le=65535)]
     white_balance_gains: tuple[Positive, Positive]  # red, blue
     xyz_to_camera: Matrix | None = None  # XYZ to camera RGB at D65, as a DNG's ColorMatrix2
-    row_noise_ratio: NotNegative = 0.0  # row sigma over read noise, where there is no table
+    row_noise_ratio: NotNegative = 0.0  # row sigma over read noise, for stages without a table
     column_noise_ratio: NotNegative = 0.0
     full_well: Positive | None = None  # e-; None: the ADC clips first
-    tukey_lambda: Annotated[float, Field(gt=-0.5, le=1)] | None = None  # None: Gaussian
+    tukey_lambda: Annotated[float, Field(gt=-0.5, le=1)] | None = (
+        None  # of read noise; None: Gaussian
+    )
     prnu: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # standard deviation over mean
     dsnu: NotNegative = 0.0  # e-
     hot_pixel_share: Share = 0.0
-    hot_pixel_level: NotNegative = 0.0  # e-, least extra charge of a hot pixel
+    hot_pixel_level: NotNegative = 0.0  # e-, the smallest extra charge of a hot pixel
     dead_pixel_share: Share = 0.0
     iso_range: tuple[Positive, Positive]
     gain_stages: Annotated[tuple[GainStage, ...], Field(min_length=1)]
     sources: dict[str, str]
+
+    def __repr__(self) -> str:
+        low, high = self.iso_range
+        return f"Camera({self.name}, ISO {low:g} to {high:g})"
 
     @model_validator(mode="after")
     def _ordered(self) -> "Camera":
@@ -133,7 +129,10 @@ class Camera(BaseModel):
         if self.xyz_to_camera and abs(np.linalg.det(self.xyz_to_camera)) < 1e-6:
             raise ValueError("xyz_to_camera is singular")
         if self.hot_pixel_share and not self.hot_pixel_level:
-            raise ValueError("hot_pixel_share needs hot_pixel_level, the least charge of one in e-")
+            raise ValueError(
+                "hot_pixel_share needs hot_pixel_level, the smallest extra charge of a hot pixel "
+                "in e-"
+            )
         low, high = self.iso_range
         if low > high:
             raise ValueError(f"iso_range must ascend; found {low:g} and {high:g}")
@@ -148,34 +147,38 @@ class Camera(BaseModel):
 
     @property
     def signal_range(self) -> float:
-        """The white level above black, in DN."""
+        """The white level minus the black level, in DN: the DN of signal 1."""
         return self.white_level - self.black_level
 
     @property
     def bits(self) -> int:
-        """The bit depth that its white level needs."""
+        """The number of bits that the white level needs."""
         return int(self.white_level).bit_length()
 
-    def srgb_to_camera(self) -> NDArray[np.float64]:
-        """The matrix from linear sRGB to white-balanced camera RGB; a grey stays what it is.
+    def srgb_to_camera(self) -> Doubles:
+        """The 3x3 matrix from linear sRGB to white-balanced camera RGB; it maps grey to grey.
 
-        sRGB goes to XYZ and from there to the camera's RGB; each row is then scaled to the sum 1,
-        which is what white balance does (Coffin, dcraw: cam_xyz_coeff).
+        It is the product of sRGB to XYZ and XYZ to camera RGB, each row scaled to the sum 1, which
+        is what white balance does (Coffin, dcraw: cam_xyz_coeff).
 
         Raises:
             RequestError: the profile has no ``xyz_to_camera``.
         """
         if self.xyz_to_camera is None:
-            raise RequestError(f"camera {self.name}: its profile has no xyz_to_camera")
+            raise RequestError(
+                f"camera {self.name}: its profile has no xyz_to_camera matrix, which this needs; "
+                "add it to the profile or choose another camera"
+            )
         matrix = np.array(self.xyz_to_camera) @ SRGB_TO_XYZ
         return matrix / matrix.sum(1, keepdims=True)
 
     def noise(self, iso: float) -> NoiseModel:
         """Shot and read noise at an ISO: a = K / range, b = (read noise / range)^2 (EMVA 1288).
 
-        Between the ISOs of a gain stage, the system gain K is interpolated in proportion to the ISO
-        and read noise in electrons linearly in log ISO; a gain stage holds until the next begins.
-        Beyond the last measured ISO, K goes on in proportion and read noise stays in electrons.
+        Between the ISOs of a gain stage, K / ISO is interpolated (K the system gain), and read
+        noise is interpolated in electrons, linearly in log ISO. A gain stage holds until the next
+        one begins. Beyond the last measured ISO, K stays proportional to the ISO and read noise
+        stays the same in electrons.
 
         Raises:
             RequestError: the ISO is outside the camera's range.
@@ -193,12 +196,12 @@ class Camera(BaseModel):
         )
 
     def row_noise(self, iso: float) -> float:
-        """Standard deviation of the offsets that rows share, signal units; errors as ``noise``."""
+        """Standard deviation of row offsets in signal units; raises as :meth:`noise`."""
         stage = self.gain_stage(iso)
         return self._line_noise(iso, stage, stage.row_noise, self.row_noise_ratio)
 
     def column_noise(self, iso: float) -> float:
-        """Standard deviation of the offsets that columns share, as ``row_noise``."""
+        """Standard deviation of column offsets in signal units; raises as :meth:`noise`."""
         stage = self.gain_stage(iso)
         return self._line_noise(iso, stage, stage.column_noise, self.column_noise_ratio)
 
@@ -209,11 +212,11 @@ class Camera(BaseModel):
         return dn / self.signal_range
 
     def signal_of(self, electrons: float, iso: float) -> float:
-        """What a charge in e- is worth at an ISO, in signal units; errors as ``noise``."""
+        """The signal that a charge in e- makes at an ISO; raises as :meth:`noise`."""
         return electrons * self.noise(iso).a
 
     def gain_stage(self, iso: float) -> GainStage:
-        """The gain stage that an ISO belongs to: the last one that begins at or below it.
+        """The gain stage of an ISO: the last one that begins at or below it, else the first.
 
         Raises:
             RequestError: the ISO is outside the camera's range.
@@ -223,29 +226,29 @@ class Camera(BaseModel):
             raise RequestError(
                 f"iso: found {iso:g}, but camera {self.name} goes from {low:g} to {high:g}"
             )
-        begun = [s for s in self.gain_stages if s.iso[0] <= iso]
-        return begun[-1] if begun else self.gain_stages[0]
+        lower = [stage for stage in self.gain_stages if stage.iso[0] <= iso]
+        return lower[-1] if lower else self.gain_stages[0]
 
 
 @cache
 def built_in_cameras() -> dict[str, Path]:
-    """The profiles inside the package, by name."""
+    """The paths of the profiles inside the package, by name."""
     folder = Path(str(resources.files("clpipe.camera") / "profiles"))
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
 def load_camera(name: str) -> Camera:
-    """A built-in camera by its name, or a profile file by its path (ending in .toml).
+    """Load a built-in camera by its name, or a profile file by its path (ending in .toml).
 
     Raises:
-        RequestError: no such camera or file, or a file that is not a valid profile.
+        RequestError: there is no such camera or file, or the file is not a valid profile.
     """
     built_in = built_in_cameras()
     path = built_in.get(name, Path(name))
     if path.suffix != ".toml":
         raise RequestError(one_of("camera", name, built_in) + ", or a .toml file")
     try:
-        return _parsed(path.read_text())
+        return _parse(path.read_text("utf-8"))
     except OSError as error:
         raise RequestError(f"{path}: cannot read this camera profile: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -254,8 +257,8 @@ def load_camera(name: str) -> Camera:
         raise RequestError(f"{path}: {_reason(error)}") from None
 
 
-@lru_cache(maxsize=64)  # a batch asks again for each image
-def _parsed(text: str) -> Camera:
+@lru_cache(maxsize=64)  # a batch loads the camera once for each image
+def _parse(text: str) -> Camera:
     return Camera.model_validate(tomllib.loads(text))
 
 

@@ -4,14 +4,10 @@ from pathlib import Path
 
 import click
 
-from clpipe.analysis.calibration.calibrate import Calibration
-from clpipe.analysis.calibration.frames import (
-    Given,
-    calibrate_files,
-    check_profile_name,
-    write_profile,
-)
+from clpipe.analysis.calibration.files import calibrate_files, check_profile_name, write_profile
+from clpipe.analysis.calibration.frames import FrameOverrides
 from clpipe.analysis.calibration.line_fit import Estimate
+from clpipe.analysis.calibration.result import Calibration
 from clpipe.commands.options import json_option
 from clpipe.commands.printing import show, show_json
 from clpipe.reference.cfa import PATTERNS, Pattern
@@ -69,8 +65,8 @@ def calibrate(
     clpipe run render.exr -o out --camera my_camera.toml --iso 800
     """
     check_profile_name(output)
-    given = Given(black_level, white_level, pattern, iso)
-    frames, calibrations = calibrate_files(inputs, dark, given)
+    overrides = FrameOverrides(black_level, white_level, pattern, iso)
+    frames, calibrations = calibrate_files(inputs, dark, overrides)
     picture = write_profile(output, frames, calibrations)
     if as_json:
         record = {

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import click
 
-from clpipe.analysis.measure import UNITS, NoiseReport
 from clpipe.analysis.measure import measure as measure_images
 from clpipe.analysis.pictures import load_picture
-from clpipe.analysis.statistics import LAGS, SIGMAS, LineNoise, gaussian_beyond
+from clpipe.analysis.report import UNITS, NoiseReport
+from clpipe.analysis.spatial import LAGS, LineNoise
+from clpipe.analysis.statistics import SIGMAS, gaussian_beyond
 from clpipe.base.errors import RequestError
 from clpipe.commands.options import json_option
 from clpipe.commands.printing import Rows, number, show, show_json

@@ -1,4 +1,4 @@
-"""From the primaries that a file states to linear sRGB."""
+"""Colour spaces of files: from the chromaticities that a file states to linear sRGB."""
 
 from collections.abc import Sequence
 
@@ -7,23 +7,20 @@ import numpy as np
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Floats
 
-# x and y of red, green, blue and white: ITU-R BT.709-6 (2015), and so sRGB.
+# x and y of red, green, blue and white: ITU-R BT.709-6 (2015), which sRGB shares.
 SRGB = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-
-
 CIE_XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
 
-
-# The cone response of the Bradford transform (Lam 1985), as Lindbloom, "Chromatic Adaptation".
+# Cone response of the Bradford transform (Lam 1985), after B. Lindbloom, "Chromatic Adaptation".
 BRADFORD = np.array(
     [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
 )
 
 
 def rgb_to_xyz(chromaticities: Sequence[float]) -> Array:
-    """The 3x3 matrix from linear RGB to CIE XYZ, white at Y = 1 (SMPTE RP 177-1993).
+    """The 3x3 matrix from linear RGB to CIE XYZ, with white at Y = 1 (SMPTE RP 177-1993).
 
-    Its middle row is the luminance of red, green and blue.
+    Its middle row holds the luminances of red, green and blue.
 
     >>> rgb_to_xyz(SRGB)[1].round(4).tolist()
     [0.2126, 0.7152, 0.0722]
@@ -32,7 +29,7 @@ def rgb_to_xyz(chromaticities: Sequence[float]) -> Array:
         chromaticities: x and y of red, green, blue and white, eight numbers.
 
     Raises:
-        ImageError: they are those of no colours.
+        ImageError: no such colours exist.
     """
     x, y = _numbers("chromaticities", chromaticities, 8).reshape(4, 2).T
     colours = np.stack([x, y, 1 - x - y])
@@ -43,43 +40,43 @@ def rgb_to_xyz(chromaticities: Sequence[float]) -> Array:
             if np.isfinite(matrix).all() and abs(np.linalg.det(matrix)) > 1e-6:
                 return matrix
     found = ", ".join(f"{value:g}" for value in chromaticities)
-    raise ImageError(f"its chromaticities are no red, green, blue and white: {found}")
+    raise ImageError(f"its chromaticities, {found}, are not those of a red, green, blue and white")
 
 
 def _numbers(name: str, values: object, count: int) -> Array:
-    """An attribute of a file as so many numbers.
+    """An attribute of a file as an array of ``count`` numbers.
 
     Raises:
-        ImageError: it is something else.
+        ImageError: it is not that.
     """
     try:
         numbers = np.asarray(values, np.float64)
     except (TypeError, ValueError):
         numbers = np.empty(0)
     if numbers.shape != (count,):
-        raise ImageError(f"its {name} are not {count} numbers")
+        raise ImageError(f"its attribute {name} is not {count} numbers")
     return numbers
 
 
-def adaptation(white: Array, to: Array) -> Array:
-    """The 3x3 matrix on CIE XYZ that turns one white into another (Bradford, linear).
+def adaptation(source_white: Array, target_white: Array) -> Array:
+    """The 3x3 matrix on CIE XYZ that maps one white to another (linear Bradford transform).
 
     Args:
-        white: X, Y and Z of the white that there is.
-        to: of the white that is wanted.
+        source_white: X, Y and Z.
+        target_white: X, Y and Z.
     """
-    gains = (BRADFORD @ to) / (BRADFORD @ white)
+    gains = (BRADFORD @ target_white) / (BRADFORD @ source_white)
     return np.linalg.inv(BRADFORD) @ (gains[:, None] * BRADFORD)
 
 
 def to_linear_srgb(
     chromaticities: Sequence[float], neutral: Sequence[float] | None = None
 ) -> Floats | None:
-    """The 3x3 matrix from a file's RGB to linear sRGB; None where it is linear sRGB.
+    """The 3x3 matrix from a file's RGB to linear sRGB; None where the file is in linear sRGB.
 
-    What is neutral in the file stays neutral: the white of its chromaticities, if it does not name
-    another one. CIE XYZ itself has no white; its values are taken as seen under D65, which is how
-    the OpenEXR project defines the conversion and made its test image (openexr issue 686, 2020).
+    The file's neutral colour stays neutral: ``neutral``, else the white of its chromaticities. CIE
+    XYZ itself has no white; its values count as seen under D65, as in the OpenEXR project's
+    definition of the conversion and its test image (openexr issue 686, 2020).
 
     >>> p3 = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.314, 0.351)
     >>> to_linear_srgb(p3).sum(axis=1).round(4).tolist()
@@ -89,10 +86,10 @@ def to_linear_srgb(
 
     Args:
         chromaticities: x and y of red, green, blue and white, eight numbers.
-        neutral: x and y of what shall become neutral (OpenEXR's adoptedNeutral).
+        neutral: x and y of the colour that becomes neutral (OpenEXR's adoptedNeutral).
 
     Raises:
-        ImageError: they are those of no colours.
+        ImageError: no such colours exist.
     """
     to_xyz, srgb_to_xyz = rgb_to_xyz(chromaticities), rgb_to_xyz(SRGB)
     d65 = srgb_to_xyz.sum(axis=1)

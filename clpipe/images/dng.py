@@ -1,7 +1,7 @@
-"""Digital Negatives: the raw of a chain as a file that any raw converter opens.
+"""Digital Negatives (DNG): the raw of a chain as a file that any raw converter opens.
 
-Adobe, Digital Negative (DNG) Specification 1.4.0.0, 2012: a preview in the first directory, the
-mosaic in a second one below it.
+After Adobe, Digital Negative (DNG) Specification 1.4.0.0, 2012: the first directory holds a preview
+and what applies to the whole file, a second one below it holds the mosaic.
 """
 
 import struct
@@ -9,49 +9,36 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clpipe.base.about import __version__
 from clpipe.base.errors import ImageError
 from clpipe.base.files import write_beside
-from clpipe.base.types import Array, Floats
+from clpipe.base.types import Array, Doubles, Floats
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.profile import SRGB_TO_XYZ
+from clpipe.images import tiff
 from clpipe.images.encoding import SIMULATED, exif
 from clpipe.images.tags import Tags
-from clpipe.images.tiff import (
-    _byte,
-    _double,
-    _exif_directory,
-    _image,
-    _long,
-    _packed,
-    _rational,
-    _short,
-    _signed_rational,
-    _size,
-    _text,
-)
 from clpipe.reference.cfa import Pattern, red_site
 from clpipe.reference.curve import to_8_bit
 from clpipe.reference.transfer import srgb_curve
 
-PREVIEW_SIDE = 512
+PREVIEW_SIDE = 512  # px, at most
+D65 = 21  # EXIF's LightSource of that illuminant
+D50_XYZ = np.array([0.9642, 1.0, 0.8251])  # CIE XYZ of the white D50, Y = 1; sources differ by 1e-4
 
-
-D65 = 21  # as EXIF's LightSource counts illuminants
-
-
-D50_XYZ = np.array([0.9642, 1.0, 0.8251])
+# Tags of fields that point to other parts of the file; their values are known last.
+STRIP_OFFSETS, SUB_IFDS, EXIF_IFD = 273, 330, 34665
 
 
 @dataclass(frozen=True)
 class Negative:
-    """What a converter must know of a raw.
+    """What a raw converter needs to know of a raw.
 
-    ``step`` makes it; None is the image that enters the chain. Levels are in DN, gains (red, blue)
-    those of white balance with green = 1; ``xyz_to_camera`` is 3x3, from XYZ under D65 to what the
-    sensor sees.
+    ``step`` is the step of the chain whose image is the raw; None is the image that enters the
+    chain. Levels are in DN; ``gains`` are those of white balance for red and blue (green = 1).
+    ``xyz_to_camera`` is the 3x3 matrix from CIE XYZ under D65 to the sensor's RGB before white
+    balance. ``noise`` is None where it is unknown.
     """
 
     step: str | None
@@ -59,19 +46,19 @@ class Negative:
     black_level: float
     white_level: int
     gains: tuple[float, float]
-    xyz_to_camera: NDArray[np.float64]
+    xyz_to_camera: Doubles
     noise: NoiseModel | None
 
 
-def xyz_to_camera(colours: NDArray[np.float64], gains: tuple[float, float]) -> NDArray[np.float64]:
-    """The ColorMatrix of a raw: XYZ under D65 to what the sensor sees, before white balance.
+def xyz_to_camera(colours: Doubles, gains: tuple[float, float]) -> Doubles:
+    """The 3x3 ColorMatrix of a raw: CIE XYZ under D65 to the sensor's RGB before white balance.
 
-    The white of D65 becomes 1/gain, which is AsShotNeutral, so that a converter has no other light
-    to adapt to. Scaled as Adobe's are: the white of D50 becomes 1 in the strongest channel.
+    It maps the white D65 to 1/gain, which is AsShotNeutral, so a converter needs no chromatic
+    adaptation. It is scaled as Adobe's matrices: the white D50 becomes 1 in the strongest channel.
 
     Args:
         colours: 3x3, linear sRGB to the mosaic's colours after white balance.
-        gains: red, blue.
+        gains: white balance gains of red and blue.
 
     >>> from clpipe.camera.profile import load_camera
     >>> camera = load_camera("sony-a7r2")
@@ -83,10 +70,10 @@ def xyz_to_camera(colours: NDArray[np.float64], gains: tuple[float, float]) -> N
     return np.asarray(matrix / (matrix @ D50_XYZ).max())
 
 
-def preview(dn: Array, negative: Negative) -> NDArray[np.uint8]:
-    """A small sRGB picture of a mosaic, (height, width, 3), at most 512 pixels a side.
+def preview(dn: Array, negative: Negative) -> Array:
+    """A small sRGB picture of a mosaic, (height, width, 3) uint8, at most 512 pixels a side.
 
-    Each of its pixels is a block's mean, red, green and blue of their own sites.
+    Each pixel is the mean of a block of the mosaic: of its red, its green and its blue sites.
     """
     rows, columns = (max(side // 2, 1) for side in dn.shape)
     block = -(-max(rows, columns) // PREVIEW_SIDE)
@@ -110,71 +97,101 @@ def preview(dn: Array, negative: Negative) -> NDArray[np.uint8]:
     return to_8_bit(srgb_curve(np.clip(linear, 0, 1)).astype(np.float32))
 
 
+def main_directory(
+    small: Array, negative: Negative, tags: Tags, orientation: int
+) -> tiff.Directory:
+    """The first directory: the preview, the camera, and what a converter needs for colour.
+
+    Its offsets are 0 until the file is laid out. Arguments as :func:`write_dng`, with the preview.
+    """
+    whole_name = tags.model if tags.model.startswith(tags.make) else f"{tags.make} {tags.model}"
+    red, blue = negative.gains
+    return {
+        **tiff.image_fields(small, subfile_type=1, photometric=2),  # RGB
+        **noise_fields(negative),
+        271: tiff.text(tags.make),  # Make
+        # Model. It is not the real camera's name: for that one RawTherapee cuts off optically black
+        # columns and sets its own white level, and LibRaw uses its own matrix, even for a name that
+        # only begins like it.
+        272: tiff.text(SIMULATED + tags.model),
+        274: tiff.short(orientation),  # Orientation
+        305: tiff.text(f"clpipe {__version__}"),  # Software
+        SUB_IFDS: tiff.long(0),
+        EXIF_IFD: tiff.long(0),
+        50706: tiff.byte(1, 4, 0, 0),  # DNGVersion
+        50707: tiff.byte(1, 1, 0, 0),  # DNGBackwardVersion
+        50708: tiff.text(SIMULATED + whole_name),  # UniqueCameraModel
+        50721: tiff.signed_rational(*negative.xyz_to_camera.ravel().round(7)),  # ColorMatrix1
+        50728: tiff.rational(1 / red, 1, 1 / blue),  # AsShotNeutral
+        50778: tiff.short(D65),  # CalibrationIlluminant1
+    }
+
+
+def raw_directory(dn: Array, negative: Negative) -> tiff.Directory:
+    """The directory of the mosaic, (height, width) in DN; its offset is 0 until it is known."""
+    return {
+        **tiff.image_fields(dn, subfile_type=0, photometric=32803),  # a colour filter array
+        **noise_fields(negative),
+        33421: tiff.short(2, 2),  # CFARepeatPatternDim
+        33422: tiff.byte(*("RGB".index(colour) for colour in negative.pattern)),  # CFAPattern
+        50710: tiff.byte(0, 1, 2),  # CFAPlaneColor
+        50711: tiff.short(1),  # CFALayout: rectangular
+        50713: tiff.short(1, 1),  # BlackLevelRepeatDim
+        50714: tiff.rational(negative.black_level),  # BlackLevel
+        50717: tiff.long(negative.white_level),  # WhiteLevel
+        50719: tiff.long(0, 0),  # DefaultCropOrigin
+        50720: tiff.long(dn.shape[1], dn.shape[0]),  # DefaultCropSize
+    }
+
+
+def noise_fields(negative: Negative) -> tiff.Directory:
+    """NoiseProfile: a and b for each colour; nothing where the noise is unknown.
+
+    The specification puts it beside the mosaic, but Adobe's SDK looks for it in the first
+    directory, so both have it.
+    """
+    noise = negative.noise
+    return {51041: tiff.double(*[noise.a, noise.b] * 3)} if noise else {}
+
+
 def write_dng(
     path: Path, mosaic: Floats, negative: Negative, tags: Tags, orientation: int = 1
 ) -> None:
-    """Write a raw as a DNG 1.4: every DN as it is, in 16 bits, not compressed.
+    """Write a raw as a DNG 1.4: every DN unchanged, in 16 bits, uncompressed.
 
     Args:
         path: the file.
         mosaic: (height, width), whole DN of 0 to 65535.
-        negative: what is to be said of it.
+        negative: what a converter needs to know of it.
         tags: the camera, the ISO and the shot.
-        orientation: as EXIF has it; whoever develops the raw turns the picture by it.
+        orientation: EXIF's; a converter turns the picture by it.
 
     Raises:
-        ImageError: the file cannot be written, or there are samples that are no whole DN.
+        ImageError: the file cannot be written, or a sample is not a whole DN of 0 to 65535.
     """
     with np.errstate(invalid="ignore"):
         dn = mosaic.astype("<u2")
     if not np.array_equal(dn, mosaic):
-        raise ImageError(f"{path}: holds samples that are not whole DN of 0 to 65535, as in a DNG")
+        raise ImageError(
+            f"{path}: holds samples that are not whole DN of 0 to 65535, which a DNG needs"
+        )
     small = preview(dn, negative)
-    whole = tags.model if tags.model.startswith(tags.make) else f"{tags.make} {tags.model}"
-    noise, (red, blue) = negative.noise, negative.gains
-    # The specification puts it beside the mosaic, Adobe's SDK looks for it in the first directory.
-    profile = {51041: _double(*[noise.a, noise.b] * 3)} if noise else {}
-    main = _image(small, 1, 2) | profile  # RGB
-    main |= {
-        271: _text(tags.make),
-        # Not the real camera's name: RawTherapee cuts off its optically black columns and sets its
-        # white level by what it knows of that one, LibRaw gives its matrix, even if the name only
-        # begins like it.
-        272: _text(SIMULATED + tags.model),
-        274: _short(orientation),
-        305: _text(f"clpipe {__version__}"),
-        330: _long(0),
-        34665: _long(0),
-        50706: _byte(1, 4, 0, 0),  # DNGVersion
-        50707: _byte(1, 1, 0, 0),  # DNGBackwardVersion
-        50708: _text(SIMULATED + whole),  # UniqueCameraModel
-        50721: _signed_rational(*negative.xyz_to_camera.ravel().round(7)),  # ColorMatrix1
-        50728: _rational(1 / red, 1, 1 / blue),  # AsShotNeutral
-        50778: _short(D65),  # CalibrationIlluminant1
-    }
-    raw = _image(dn, 0, 32803) | profile  # a colour filter array
-    raw |= {
-        33421: _short(2, 2),  # CFARepeatPatternDim
-        33422: _byte(*("RGB".index(colour) for colour in negative.pattern)),  # CFAPattern
-        50710: _byte(0, 1, 2),  # CFAPlaneColor
-        50711: _short(1),  # CFALayout: rectangular
-        50713: _short(1, 1),  # BlackLevelRepeatDim
-        50714: _rational(negative.black_level),
-        50717: _long(negative.white_level),
-        50719: _long(0, 0),  # DefaultCropOrigin
-        50720: _long(dn.shape[1], dn.shape[0]),  # DefaultCropSize
-    }
-    shot = _exif_directory(exif(tags.iso, tags.output, max(dn.shape)))
+    main, raw = main_directory(small, negative, tags, orientation), raw_directory(dn, negative)
+    shot = tiff.exif_fields(exif(tags.iso, tags.output, max(dn.shape)))
 
-    raw_at = 8 + _size(main)
-    shot_at = raw_at + _size(raw)
-    small_at = shot_at + _size(shot)
-    dn_at = small_at + small.nbytes + small.nbytes % 2
-    main |= {273: _long(small_at), 330: _long(raw_at), 34665: _long(shot_at)}
-    raw[273] = _long(dn_at)
+    # The file: header, the three directories, the preview, the mosaic.
+    raw_offset = 8 + tiff.directory_size(main)
+    shot_offset = raw_offset + tiff.directory_size(raw)
+    small_offset = shot_offset + tiff.directory_size(shot)
+    dn_offset = small_offset + small.nbytes + small.nbytes % 2
+    main[STRIP_OFFSETS] = tiff.long(small_offset)
+    main[SUB_IFDS] = tiff.long(raw_offset)
+    main[EXIF_IFD] = tiff.long(shot_offset)
+    raw[STRIP_OFFSETS] = tiff.long(dn_offset)
     head = b"II*\0" + struct.pack("<I", 8)
-    head += _packed(main, 8) + _packed(raw, raw_at) + _packed(shot, shot_at)
-    head += small.tobytes().ljust(dn_at - small_at, b"\0")
+    for directory, offset in ((main, 8), (raw, raw_offset), (shot, shot_offset)):
+        head += tiff.directory_bytes(directory, offset)
+    head += small.tobytes().ljust(dn_offset - small_offset, b"\0")
 
     def write(to: Path) -> None:
         with to.open("wb") as file:

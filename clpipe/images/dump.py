@@ -1,4 +1,4 @@
-"""Headerless dumps of a sensor: samples of one mosaic, row by row, and nothing else."""
+"""Headerless dumps of a sensor: the samples of one mosaic, row by row, and nothing else."""
 
 import math
 import re
@@ -11,7 +11,7 @@ import numpy as np
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array, Floats
 
-# Bytes a sample. RAW10 and RAW12 are packed as MIPI CSI-2 sends them, without padding of rows.
+# Bytes of a sample. RAW10 and RAW12 are packed as in MIPI CSI-2, without padding after rows.
 TYPES = {
     "uint8": Fraction(1),
     "uint16le": Fraction(2),
@@ -20,13 +20,12 @@ TYPES = {
     "raw12": Fraction(3, 2),
 }
 
-
 MAX_SIDE = 65535
 
 
 @dataclass(frozen=True)
 class Dump:
-    """The geometry of a dump: its size in pixels, and how samples are stored."""
+    """The format of a dump: its size in pixels, and its type of samples, of :data:`TYPES`."""
 
     width: int
     height: int
@@ -34,7 +33,7 @@ class Dump:
 
     @property
     def byte_count(self) -> int:
-        """How many bytes it has."""
+        """The size of the file in bytes."""
         return int(self.width * self.height * TYPES[self.type])
 
     def unpack(self, data: bytes) -> Floats:
@@ -46,32 +45,32 @@ class Dump:
         [[291.0, 2748.0]]
 
         Raises:
-            ImageError: it has not that many bytes.
+            ImageError: the data has another size; the message says what would fit.
         """
         if len(data) != self.byte_count:
             raise ImageError(
                 f"{len(data)} bytes, but {self.width}x{self.height} {self.type} has "
-                f"{self.byte_count}; {fitting(len(data), self)}"
+                f"{self.byte_count}; {fitting_formats(len(data), self)}"
             )
         if self.type in ("uint16le", "uint16be"):
             samples: Array = np.frombuffer(data, "<u2" if self.type == "uint16le" else ">u2")
         else:
             samples = np.frombuffer(data, np.uint8)
             if self.type == "raw10":
-                samples = _unpacked(samples, 4, 2)
+                samples = _unpack_mipi(samples, 4, 2)
             elif self.type == "raw12":
-                samples = _unpacked(samples, 2, 4)
+                samples = _unpack_mipi(samples, 2, 4)
         return samples.astype(np.float32).reshape(self.height, self.width)
 
 
 def dump_of(size: str, type_: str) -> Dump:
-    """The geometry that ``raw_size`` and ``raw_type`` give.
+    """The format that the settings ``raw_size`` and ``raw_type`` describe.
 
     >>> dump_of("768x512", "uint16le").byte_count
     786432
 
     Raises:
-        RequestError: one is missing or not allowed.
+        RequestError: a value is missing or not allowed.
     """
     if type_ not in TYPES:
         raise RequestError(f"raw_type: found {type_!r}; expected one of {', '.join(TYPES)}")
@@ -82,10 +81,10 @@ def dump_of(size: str, type_: str) -> Dump:
             f"raw_size: found {size!r}; expected WIDTHxHEIGHT in pixels, such as 1920x1080, "
             f"each 2 to {MAX_SIDE}"
         )
-    together = TYPES[type_].denominator
-    if width % together:
+    group = TYPES[type_].denominator
+    if width % group:
         raise RequestError(
-            f"raw_size: found {size!r}; a row of {type_} has a multiple of {together} pixels"
+            f"raw_size: found {size!r}; the width of {type_} must be a multiple of {group} pixels"
         )
     return Dump(width, height, type_)
 
@@ -94,7 +93,7 @@ def read_dump(data: bytes, path: Path, dump: Dump) -> Floats:
     """The mosaic of a dump in DN, (height, width).
 
     Raises:
-        ImageError: it has another size; the message says what would fit.
+        ImageError: the data has another size; the message says what would fit.
     """
     try:
         return dump.unpack(data)
@@ -102,9 +101,11 @@ def read_dump(data: bytes, path: Path, dump: Dump) -> Floats:
         raise ImageError(f"{path}: {error}") from None
 
 
-def _unpacked(data: Array, count: int, low: int) -> Array:
-    """Groups of ``count`` samples: their upper eight bits each, then a byte of ``low`` lower bits
-    each, the first sample's lowest (MIPI Alliance, CSI-2, RAW10 and RAW12).
+def _unpack_mipi(data: Array, count: int, low: int) -> Array:
+    """Samples of 8 + ``low`` bits from packed groups of ``count`` (MIPI Alliance, CSI-2).
+
+    A group holds the upper eight bits of each sample, then one byte with the ``low`` lower bits of
+    each, those of the first sample lowest.
     """
     groups = data.reshape(-1, count + 1).astype(np.uint16)
     shifts = np.arange(count, dtype=np.uint16) * low
@@ -112,29 +113,29 @@ def _unpacked(data: Array, count: int, low: int) -> Array:
     return (groups[:, :count] << low) | rest
 
 
-def fitting(count: int, asked: Dump) -> str:
-    """What types of the size asked for, and what sizes of the type, have so many bytes.
+def fitting_formats(count: int, dump: Dump) -> str:
+    """The formats of ``count`` bytes that share the size or the type of ``dump``, in words.
 
-    >>> fitting(24, Dump(6, 4, "uint16le"))
+    >>> fitting_formats(24, Dump(6, 4, "uint16le"))
     'it would fit 6x4 uint8, 3x4 uint16le, 4x3 uint16le, 6x2 uint16le, 2x6 uint16le'
     """
-    same = [name for name, size in TYPES.items() if asked.width * asked.height * size == count]
-    found = [f"{asked.width}x{asked.height} {name}" for name in same]
-    found += [f"{w}x{h} {asked.type}" for w, h in sizes_of(count, asked)[:5]]
-    return f"it would fit {', '.join(found)}" if found else f"no size of {asked.type} fits"
+    types = [name for name, size in TYPES.items() if dump.width * dump.height * size == count]
+    formats = [f"{dump.width}x{dump.height} {name}" for name in types]
+    formats += [f"{w}x{h} {dump.type}" for w, h in fitting_sizes(count, dump)[:5]]
+    return f"it would fit {', '.join(formats)}" if formats else f"no size of {dump.type} fits"
 
 
-def sizes_of(count: int, asked: Dump) -> list[tuple[int, int]]:
-    """Widths and heights of so many bytes, those that are most like what was asked for first."""
-    samples = count / TYPES[asked.type]
+def fitting_sizes(count: int, dump: Dump) -> list[tuple[int, int]]:
+    """Widths and heights with ``count`` bytes in the type of ``dump``, most similar sizes first."""
+    samples = count / TYPES[dump.type]
     if samples.denominator != 1:
         return []
-    total, together = samples.numerator, TYPES[asked.type].denominator
-    widths = range(max(2, together), min(total // 2, MAX_SIDE) + 1, together)
+    total, group = samples.numerator, TYPES[dump.type].denominator
+    widths = range(max(2, group), min(total // 2, MAX_SIDE) + 1, group)
     pairs = [(w, total // w) for w in widths if total % w == 0 and total // w <= MAX_SIDE]
 
-    def unlike(pair: tuple[int, int]) -> float:
-        ratios = pair[0] / asked.width, pair[1] / asked.height
+    def difference(pair: tuple[int, int]) -> float:
+        ratios = pair[0] / dump.width, pair[1] / dump.height
         return round(sum(abs(math.log(r)) for r in ratios), 6)
 
-    return sorted(pairs, key=unlike)
+    return sorted(pairs, key=difference)

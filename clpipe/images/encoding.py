@@ -1,21 +1,17 @@
-"""How results are written: the [output] table of a configuration."""
+"""How pictures are encoded and tagged: the ``[output]`` table of a configuration, and EXIF."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-SIMULATED = "clpipe "  # what the model of a camera begins with in a DNG of clpipe
-
-
-FULL_FRAME = 36.0  # mm, the longer side of 35 mm film
-
-
+SIMULATED = "clpipe "  # prefix of the camera's model in a DNG that clpipe writes
+FULL_FRAME = 36.0  # mm, the longer side of a frame of 35 mm film
 Length = Annotated[float, Field(gt=0, le=10000, allow_inf_nan=False)]
 
 
 class Output(BaseModel):
-    """How JPEGs are encoded, and what files say of the shot; None is not said."""
+    """How JPEGs are encoded, and the exposure data for EXIF; None leaves a tag out."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
@@ -27,7 +23,7 @@ class Output(BaseModel):
     sensor_width: Length | None = None  # mm, along the longer side of the image
 
     def filled(self, shot: Mapping[str, float]) -> "Output":
-        """The same, with what a source says of its shot where nothing else is said.
+        """A copy in which ``shot``, what a source says of itself, fills the fields that are None.
 
         >>> Output(focal_length=24.0).filled({"focal_length": 50.0, "exposure_time": 0.5}).shot
         {'exposure_time': 0.5, 'focal_length': 24.0}
@@ -36,7 +32,7 @@ class Output(BaseModel):
 
     @property
     def shot(self) -> dict[str, float]:
-        """What is known of the shot, by the names of the fields."""
+        """The exposure data that is set, by the names of the fields."""
         return self.model_dump(include=SHOT, exclude_none=True)
 
 
@@ -44,12 +40,12 @@ SHOT = {"exposure_time", "focal_length", "sensor_width"}
 
 
 def exif(iso: float, shot: Output, longer_side: int) -> dict[str, float]:
-    """The EXIF (2.3, 2010) of a shot, by the names of its tags.
+    """EXIF tags (EXIF 2.3, 2010) by their names.
 
     Args:
         iso: the ISO; EXIF holds at most 65535.
-        shot: what is said of it.
-        longer_side: of the image, in pixels.
+        shot: the exposure data.
+        longer_side: of the image, px.
 
     >>> shot = Output(focal_length=24.0, sensor_width=24.0)
     >>> for name, value in exif(800, shot, 6000).items():

@@ -1,9 +1,9 @@
-"""OpenEXR files of luminance and chroma. The only importer of OpenEXR."""
+"""OpenEXR files of luminance and subsampled chroma. Only this module imports OpenEXR."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,9 +17,10 @@ CHANNELS = ("Y", "RY", "BY")
 
 @dataclass(frozen=True)
 class DataWindow:
-    """RGB of a data window, (height, width, 3) float32, and where it and the picture lie.
+    """A data window: RGB, (rows, columns, 3) float32, and its place in the display window.
 
-    ``x`` and ``y`` are its place in the display window, which is ``width`` x ``height``.
+    Its upper left pixel is at column ``x`` and row ``y`` of the display window, which is ``width``
+    x ``height`` px. ``attributes`` is the file's header.
     """
 
     pixels: Floats
@@ -31,23 +32,23 @@ class DataWindow:
 
 
 def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
-    """Read an EXR whose chroma is subsampled, which OpenImageIO cannot.
+    """Read an EXR whose chroma is subsampled, which OpenImageIO cannot do.
 
     Raises:
-        ImageError: it is damaged, too large, deep, or has other subsampled channels.
+        ImageError: the file is damaged, too large, deep, or has other subsampled channels.
     """
     import OpenEXR
 
-    def found(what: str) -> Any:
+    def read(part: Literal["header", "channels"]) -> Any:
         try:
             file = OpenEXR.File(
-                str(path), separate_channels=True, header_only=what == "header", num_threads=1
+                str(path), separate_channels=True, header_only=part == "header", num_threads=1
             )
-            return getattr(file, what)()
-        except Exception as error:  # the package raises what its C++ library did, of many types
+            return getattr(file, part)()
+        except Exception as error:  # exceptions of the C++ library arrive as many types
             raise ImageError(f"{path}: damaged: {printable(str(error))}") from None
 
-    header = found("header")
+    header = read("header")
     names = sorted(channel.name for channel in header["channels"])
     if not set(CHANNELS) <= set(names) or header["type"] != OpenEXR.scanlineimage:
         raise ImageError(
@@ -60,7 +61,7 @@ def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
     for width, height in (size, picture):
         if width < 1 or height < 1 or width * height > max_pixels:
             raise ImageError(f"{path}: {width}x{height} pixels; at most {max_pixels} are read")
-    channels = found("channels")
+    channels = read("channels")
     luminance, red, blue = (channels[name] for name in CHANNELS)
     planes = luminance.pixels, red.pixels, blue.pixels
     sampling = [(c.xSampling, c.ySampling) for c in (luminance, red, blue)]
@@ -75,14 +76,14 @@ def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
 def to_rgb(luminance: Array, red: Array, blue: Array, weights: Array) -> Floats:
     """RGB, (height, width, 3) float32, from luminance and subsampled chroma.
 
-    RY = (R - Y) / Y and BY = (B - Y) / Y (OpenEXR, ImfRgbaYca.h), at even rows and columns; linear
-    between them, which makes no new extremes of colour.
+    RY = (R - Y) / Y and BY = (B - Y) / Y (OpenEXR, ImfRgbaYca.h) are given at even rows and columns
+    and interpolated linearly, which makes no new extremes of colour.
 
     Args:
-        luminance: (height, width).
-        red: RY, one for each second row and column.
-        blue: BY, likewise.
-        weights: the luminance of red, green and blue.
+        luminance: Y, (height, width).
+        red: RY at every second row and column.
+        blue: BY at every second row and column.
+        weights: the luminances of red, green and blue.
     """
     y = luminance.astype(np.float32)
     wr, wg, wb = (np.float32(weight) for weight in weights)
@@ -92,14 +93,14 @@ def to_rgb(luminance: Array, red: Array, blue: Array, weights: Array) -> Floats:
 
 
 def upsampled(plane: Array, shape: tuple[int, ...]) -> Floats:
-    """A plane of twice the rows and columns, linear between the given ones.
+    """A plane of twice the rows and columns, cut to ``shape``, by linear interpolation.
 
     >>> upsampled(np.array([[0, 1]]), (1, 4)).tolist()
     [[0.0, 0.5, 1.0, 1.0]]
     """
     for axis, size in enumerate(shape):
-        given = np.moveaxis(plane.astype(np.float32), axis, 0)
-        wide = np.repeat(given, 2, axis=0)
-        wide[1:-1:2] = (given[:-1] + given[1:]) / 2
+        narrow = np.moveaxis(plane.astype(np.float32), axis, 0)
+        wide = np.repeat(narrow, 2, axis=0)
+        wide[1:-1:2] = (narrow[:-1] + narrow[1:]) / 2
         plane = np.moveaxis(wide[:size], 0, axis)
     return plane

@@ -1,6 +1,6 @@
-"""Camera raw files in: CR2, NEF, ARW, DNG and what else LibRaw reads.
+"""Reading camera raws: CR2, NEF, ARW, DNG and the other formats of LibRaw, with a Bayer mosaic.
 
-The only importer of rawpy and exifread.
+This is the only module that imports rawpy and exifread.
 """
 
 import io
@@ -27,45 +27,32 @@ RAW_SUFFIXES = (
     *(".srf", ".srw", ".x3f"),
 )
 
+LEAST_BITS = 0.25  # of a pixel; assumed to be less than any compressed raw has
+MOST_GAIN = 20.0  # of white balance; assumed to be more than any camera needs
 
-LEAST_BITS = 0.25  # a pixel, in any compressed raw
-
-
-MOST_GAIN = 20.0  # of white balance; what is above is damaged or a joke
-
-
-# LibRaw's flip (1: left to right, 2: upside down, 4: then transposed) as EXIF's orientation.
+# EXIF's orientation by LibRaw's flip (1: left to right, 2: upside down, 4: then transposed).
 ORIENTATIONS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
 
-
-# Where the EXIF of files begins that are no TIFF: in a CR3's boxes, in a RAF's JPEG.
+# What stands before the EXIF in files that are not TIFF: in a CR3's boxes, in a RAF's JPEG.
 EXIF_MARKS = (b"CMT1", b"CMT2", b"Exif\0\0")
-
-
-PARTS = ("EXIF", "Image")  # of EXIF, where exifread finds tags
-
-
+PARTS = ("EXIF", "Image")  # exifread's prefixes of tags, in order of preference
 DATE_TAGS = ("DateTimeOriginal", "DateTime")
-
-
 DATE = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")
-
-
 OTHERS = {b"\xff\xd8\xff": "a JPEG", b"\x89PNG": "a PNG", b"v/1\x01": "an OpenEXR image"}
 
 
 @dataclass(frozen=True)
 class RawFacts:
-    """What a raw file says of itself. Levels in DN, gains with green = 1; None is not said.
+    """The metadata of a raw file. Levels are in DN, gains relative to green = 1; None is unknown.
 
-    Gains that cannot be (not above 0, or above 20) are None; ``as_shot`` has what the file says.
+    Implausible gains (not above 0, or above 20) are None; ``as_shot`` holds what the file says.
     """
 
     make: str
     model: str
     iso: float | None
     exposure: float | None  # s
-    visible_area: tuple[int, int, int, int]  # of the sensor: left, top, width, height; px
+    visible_area: tuple[int, int, int, int]  # of the sensor, px: left, top, width, height
     pattern: Pattern  # of the visible area
     black_levels: tuple[int, int, int, int]  # of the pattern's four sites, row by row
     white_level: int
@@ -81,23 +68,23 @@ class RawFacts:
 
     @property
     def black_level(self) -> int:
-        """The black level that :func:`read_raw` brings all channels to."""
+        """The common black level to which :func:`read_raw` shifts all four sites, DN."""
         return round(sum(self.black_levels) / 4)
 
 
 def read_facts(path: Path) -> RawFacts:
-    """What a raw file says of itself, without its pixels being decoded.
+    """Read the metadata of a raw file, without decoding its pixels.
 
     Raises:
-        ImageError: it is missing, damaged, no raw, or holds no Bayer mosaic; the message says why.
+        ImageError: the file is missing, damaged or not a raw, or holds no Bayer mosaic.
     """
-    said = _exif(path)
+    exif = read_exif(path)
     with _opened(path) as raw:
         pattern = _pattern(path, raw)
         speed, shutter, aperture, focal_length = _shot(raw)
-        iso = speed or said.number("ISOSpeedRatings", 0)
-        exposure = said.number("ExposureTime", shutter)
-        if not (said.tags or iso or exposure):
+        iso = speed or exif.number("ISOSpeedRatings", 0)
+        exposure = exif.number("ExposureTime", shutter)
+        if not (exif.tags or iso or exposure):
             raise ImageError(
                 f"{path}: names no camera, ISO or exposure; a dump of samples, not a camera's raw "
                 "(clpipe run takes it with --raw-size and --raw-type)"
@@ -108,14 +95,14 @@ def read_facts(path: Path) -> RawFacts:
         first, second, third, fourth = (int(by_colour[c]) for c in cell)
         red, green, blue = map(float, raw.camera_whitebalance[:3])
         matrix = _matrix(raw.rgb_xyz_matrix[:3])
-        # cmatrix is the file's own, where there is one, and LibRaw's else.
+        # rawpy's color_matrix is the file's own, where it has one, else LibRaw's.
         to_srgb = _matrix(raw.color_matrix[:, :3])
         if to_srgb is None and matrix is not None:
             to_camera = np.array(matrix) @ SRGB_TO_XYZ
             to_srgb = _matrix(np.linalg.inv(to_camera / to_camera.sum(1, keepdims=True)))
         return RawFacts(
-            make=said.text("Make") or "unknown",
-            model=said.text("Model").removeprefix(SIMULATED) or "unknown",
+            make=exif.text("Make") or "unknown",
+            model=exif.text("Model").removeprefix(SIMULATED) or "unknown",
             iso=iso or None,
             exposure=exposure,
             visible_area=(size.left_margin, size.top_margin, size.width, size.height),
@@ -128,14 +115,14 @@ def read_facts(path: Path) -> RawFacts:
             xyz_to_camera=matrix,
             camera_to_srgb=to_srgb,
             orientation=ORIENTATIONS.get(size.flip, 1),
-            aperture=said.number("FNumber", aperture),
-            focal_length=said.number("FocalLength", focal_length),
-            taken=next(filter(DATE.fullmatch, map(said.text, DATE_TAGS)), ""),
+            aperture=exif.number("FNumber", aperture),
+            focal_length=exif.number("FocalLength", focal_length),
+            taken=next(filter(DATE.fullmatch, map(exif.text, DATE_TAGS)), ""),
         )
 
 
 def _gains(red: float, green: float, blue: float) -> tuple[float, float] | None:
-    """White balance multipliers as gains of red and blue; None if they cannot be.
+    """White balance multipliers as gains of red and blue (green = 1); None if implausible.
 
     >>> _gains(1024.0, 512.0, 768.0), _gains(-2.0, 1.0, 1.5), _gains(2.0, 1.0, 100.0)
     ((2.0, 1.5), None, None)
@@ -146,7 +133,7 @@ def _gains(red: float, green: float, blue: float) -> tuple[float, float] | None:
 
 
 def _matrix(rows: Any) -> Matrix | None:
-    """Three rows of three; None where they are no matrix that can be inverted."""
+    """A 3x3 matrix, rounded to six digits; None where it is not finite or singular."""
     values = np.asarray(rows, np.float64).round(6)
     if not np.isfinite(values).all() or abs(np.linalg.det(values)) < 1e-6:
         return None
@@ -155,18 +142,19 @@ def _matrix(rows: Any) -> Matrix | None:
 
 
 def read_raw(path: Path, facts: RawFacts) -> Floats:
-    """The mosaic of the visible area in DN, (height, width), every channel's black level brought to
-    ``facts.black_level``.
+    """Read the mosaic of the visible area in DN, (height, width).
+
+    The sites of each colour are shifted to the common ``facts.black_level``.
 
     Raises:
-        ImageError: as :func:`read_facts`; or there are no pixels in it.
+        ImageError: as :func:`read_facts`; or the file holds no pixels.
     """
     with _opened(path) as raw:
         _pattern(path, raw)
         mosaic = np.array(raw.raw_image_visible, np.float32)
-    # LibRaw gives whatever was in memory for a file whose pixels were taken out.
+    # For a file whose pixels were removed, LibRaw returns whatever was in memory.
     if path.stat().st_size * 8 < LEAST_BITS * mosaic.size or mosaic.min() == mosaic.max():
-        raise ImageError(f"{path}: there are no pixels in it, only what describes them")
+        raise ImageError(f"{path}: holds no pixels, only metadata")
     for site, black in enumerate(facts.black_levels):
         mosaic[site // 2 :: 2, site % 2 :: 2] += np.float32(facts.black_level - black)
     return mosaic
@@ -193,16 +181,16 @@ def _opened(path: Path) -> Iterator[Any]:
             yield raw
     except rawpy.LibRawError as error:
         reason = error.args[0].decode() if isinstance(error.args[0], bytes) else str(error)
-        raise ImageError(f"{path}: damaged, or no raw that LibRaw knows: {reason}") from None
+        raise ImageError(f"{path}: damaged, or not a raw that LibRaw knows: {reason}") from None
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
 def _shot(raw: Any) -> tuple[float, float, float, float]:
-    """ISO, exposure (s), aperture and focal length (mm) as LibRaw has them; 0 is not known."""
+    """ISO, exposure time (s), f-number and focal length (mm) as LibRaw has them; 0 is unknown."""
     try:
         other = raw.other
-    except (ValueError, OverflowError, OSError):  # of a date that cannot be
+    except (ValueError, OverflowError, OSError):  # rawpy fails on an impossible date
         return 0.0, 0.0, 0.0, 0.0
     return other.iso_speed, other.shutter_speed, other.aperture, other.focal_length
 
@@ -225,39 +213,39 @@ def _pattern(path: Path, raw: Any) -> Pattern:
             "a Bayer mosaic is needed"
         )
     letters = raw.color_desc.decode()
-    found = "".join(letters[c] for c in raw.raw_colors_visible[:2, :2].ravel())
+    spelled = "".join(letters[c] for c in raw.raw_colors_visible[:2, :2].ravel())
     for pattern in PATTERNS:
-        if pattern == found:
+        if pattern == spelled:
             return pattern
-    raise ImageError(f"{path}: its pattern is {found}; one of {', '.join(PATTERNS)} is needed")
+    raise ImageError(f"{path}: its pattern is {spelled}; one of {', '.join(PATTERNS)} is needed")
 
 
 @dataclass(frozen=True)
-class _Exif:
-    """A file's EXIF, by the names that exifread gives."""
+class Exif:
+    """The EXIF of a file, by exifread's names."""
 
     tags: dict[str, Any]
 
     def text(self, name: str) -> str:
-        """What a tag says, in the main part or in EXIF's own; "" if it is not there."""
+        """The text of a tag in the first part that has it; "" where none does."""
         both = (str(self.tags.get(f"{part} {name}", "")).strip("\0 ") for part in PARTS)
         return next((text for text in both if text), "")
 
-    def number(self, name: str, otherwise: float) -> float | None:
-        """A tag's first number, or what holds where there is no such tag; None if not above 0."""
-        found = otherwise
+    def number(self, name: str, default: float) -> float | None:
+        """The first number of a tag, else ``default``; None where it is not above 0 or infinite."""
+        value = default
         for part in PARTS:
             if tag := self.tags.get(f"{part} {name}"):
                 try:
-                    found = float(tag.values[0])
+                    value = float(tag.values[0])
                 except (AttributeError, IndexError, TypeError, ValueError, ZeroDivisionError):
-                    found = 0
+                    value = 0
                 break
-        return found if 0 < found < math.inf else None
+        return value if 0 < value < math.inf else None
 
 
-def _exif(path: Path) -> _Exif:
-    """A file's EXIF, as far as it has one.
+def read_exif(path: Path) -> Exif:
+    """The EXIF of a file; without tags where the file has none.
 
     Raises:
         ImageError: the file cannot be read.
@@ -274,15 +262,15 @@ def _exif(path: Path) -> _Exif:
         raise ImageError(f"{path}: no such file") from None
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror or error}") from None
-    return _Exif(tags)
+    return Exif(tags)
 
 
 def _tags(file: Any) -> dict[str, Any]:
-    """The tags of an open file; none where it is damaged, of which LibRaw says more."""
+    """The EXIF tags of an open file; none where it is damaged, which LibRaw reports better."""
     import exifread
 
     logging.getLogger("exifread").setLevel(logging.CRITICAL)
     try:
         return dict(exifread.process_file(file, details=False))
-    except Exception:  # of any kind, on damaged files
+    except Exception:  # on damaged files exifread raises exceptions of any type
         return {}

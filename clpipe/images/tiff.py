@@ -1,4 +1,7 @@
-"""TODO."""
+"""The bytes of a TIFF file: fields and directories, little-endian (TIFF 6.0, 1992).
+
+Each function named after a TIFF type makes a field of that type from its values.
+"""
 
 import struct
 from collections.abc import Callable
@@ -8,20 +11,9 @@ from fractions import Fraction
 from clpipe.base.types import Array
 
 
-def rational(value: float) -> tuple[int, int]:
-    """A number as EXIF has it: two whole numbers of 31 bits, as near as they come.
-
-    >>> rational(1 / 2.77), rational(-0.4618), rational(1e7)
-    ((100, 277), (-2309, 5000), (10000000, 1))
-    """
-    largest = min(1_000_000, int((2**31 - 1) / max(abs(value), 1.0)))
-    found = Fraction(value).limit_denominator(max(largest, 1))
-    return found.numerator, found.denominator
-
-
 @dataclass(frozen=True)
 class Field:
-    """A field of a TIFF directory (TIFF 6.0, 1992): its type, how many values, their bytes."""
+    """A field of a directory: its TIFF type, the number of its values, and their bytes."""
 
     type: int
     count: int
@@ -29,92 +21,118 @@ class Field:
 
     @property
     def padded(self) -> int:
-        """The bytes that it takes outside the directory."""
+        """The bytes that the values take outside the directory: 0 for up to four."""
         return 0 if len(self.data) <= 4 else len(self.data) + len(self.data) % 2
 
 
-Directory = dict[int, Field]
+Directory = dict[int, Field]  # by tag
 
 
-def _byte(*values: int) -> Field:
+def byte(*values: int) -> Field:
+    """BYTE: whole numbers of 8 bits."""
     return Field(1, len(values), bytes(values))
 
 
-def _text(text: str) -> Field:
-    data = text.encode("ascii", "replace") + b"\0"
+def text(value: str) -> Field:
+    """ASCII: text, with ? for other characters, and a NUL at its end."""
+    data = value.encode("ascii", "replace") + b"\0"
     return Field(2, len(data), data)
 
 
-def _short(*values: int) -> Field:
+def short(*values: int) -> Field:
+    """SHORT: whole numbers of 16 bits."""
     return Field(3, len(values), struct.pack(f"<{len(values)}H", *values))
 
 
-def _long(*values: int) -> Field:
+def long(*values: int) -> Field:
+    """LONG: whole numbers of 32 bits."""
     return Field(4, len(values), struct.pack(f"<{len(values)}I", *values))
 
 
-def _rational(*values: float) -> Field:
-    pairs = [part for value in values for part in rational(value)]
-    return Field(5, len(values), struct.pack(f"<{len(pairs)}I", *pairs))
+def rational(*values: float) -> Field:
+    """RATIONAL: fractions of whole numbers of 32 bits, not negative."""
+    parts = [part for value in values for part in fraction(value)]
+    return Field(5, len(values), struct.pack(f"<{len(parts)}I", *parts))
 
 
-def _signed_rational(*values: float) -> Field:
-    pairs = [part for value in values for part in rational(value)]
-    return Field(10, len(values), struct.pack(f"<{len(pairs)}i", *pairs))
+def signed_rational(*values: float) -> Field:
+    """SRATIONAL: fractions of signed whole numbers of 32 bits."""
+    parts = [part for value in values for part in fraction(value)]
+    return Field(10, len(values), struct.pack(f"<{len(parts)}i", *parts))
 
 
-def _double(*values: float) -> Field:
+def double(*values: float) -> Field:
+    """DOUBLE: float64."""
     return Field(12, len(values), struct.pack(f"<{len(values)}d", *values))
 
 
-def _size(fields: Directory) -> int:
+def fraction(value: float) -> tuple[int, int]:
+    """The numerator and denominator nearest to a number that fit into 31 bits each.
+
+    >>> fraction(1 / 2.77), fraction(-0.4618), fraction(1e7)
+    ((100, 277), (-2309, 5000), (10000000, 1))
+    """
+    largest = min(1_000_000, int((2**31 - 1) / max(abs(value), 1.0)))
+    nearest = Fraction(value).limit_denominator(max(largest, 1))
+    return nearest.numerator, nearest.denominator
+
+
+def directory_size(fields: Directory) -> int:
+    """The bytes of a directory and of the values behind it."""
     return 6 + 12 * len(fields) + sum(field.padded for field in fields.values())
 
 
-def _packed(fields: Directory, at: int) -> bytes:
-    """A directory that stands ``at`` bytes into the file, with the values of its fields."""
-    head, rest = struct.pack("<H", len(fields)), b""
-    after = at + 6 + 12 * len(fields)
+def directory_bytes(fields: Directory, offset: int) -> bytes:
+    """A directory at ``offset`` in the file, followed by the values of its fields."""
+    head, values = struct.pack("<H", len(fields)), b""
+    values_offset = offset + 6 + 12 * len(fields)
     for tag, field in sorted(fields.items()):
         value = field.data.ljust(4, b"\0")
         if field.padded:
-            value = struct.pack("<I", after + len(rest))
-            rest += field.data.ljust(field.padded, b"\0")
+            value = struct.pack("<I", values_offset + len(values))
+            values += field.data.ljust(field.padded, b"\0")
         head += struct.pack("<HHI", tag, field.type, field.count) + value
-    return head + struct.pack("<I", 0) + rest
+    return head + struct.pack("<I", 0) + values
 
 
-def _image(pixels: Array, kind: int, photometric: int) -> Directory:
-    """What any picture in a TIFF says of itself; its place is 0 until it is known."""
+def image_fields(pixels: Array, subfile_type: int, photometric: int) -> Directory:
+    """The fields that any uncompressed image needs; the offset of its strip is 0 until it is known.
+
+    Args:
+        pixels: (height, width[, channel]).
+        subfile_type: 0 for the image itself, 1 for a smaller version of it.
+        photometric: the value of PhotometricInterpretation.
+    """
     height, width = pixels.shape[:2]
     samples = pixels.shape[2] if pixels.ndim == 3 else 1
     return {
-        254: _long(kind),  # 0: the picture itself, 1: a smaller one
-        256: _long(width),
-        257: _long(height),
-        258: _short(*[pixels.itemsize * 8] * samples),
-        259: _short(1),  # not compressed
-        262: _short(photometric),
-        273: _long(0),
-        277: _short(samples),
-        278: _long(height),  # rows, all in one strip
-        279: _long(pixels.nbytes),
-        284: _short(1),  # samples side by side
+        254: long(subfile_type),  # NewSubfileType
+        256: long(width),  # ImageWidth
+        257: long(height),  # ImageLength
+        258: short(*[pixels.itemsize * 8] * samples),  # BitsPerSample
+        259: short(1),  # Compression: none
+        262: short(photometric),  # PhotometricInterpretation
+        273: long(0),  # StripOffsets
+        277: short(samples),  # SamplesPerPixel
+        278: long(height),  # RowsPerStrip: all rows
+        279: long(pixels.nbytes),  # StripByteCounts
+        284: short(1),  # PlanarConfiguration: interleaved
     }
 
 
-def _exif_directory(tags: dict[str, float]) -> Directory:
-    of: dict[str, tuple[int, Callable[..., Field]]] = {
-        "ExposureTime": (33434, _rational),
-        "PhotographicSensitivity": (34855, _short),
-        "FocalLength": (37386, _rational),
-        "FocalPlaneXResolution": (41486, _rational),
-        "FocalPlaneYResolution": (41487, _rational),
-        "FocalPlaneResolutionUnit": (41488, _short),
-        "FocalLengthIn35mmFilm": (41989, _short),
+def exif_fields(tags: dict[str, float]) -> Directory:
+    """The EXIF directory; ``tags`` are those of :func:`clpipe.images.encoding.exif`."""
+    types: dict[str, tuple[int, Callable[..., Field]]] = {
+        "ExposureTime": (33434, rational),
+        "PhotographicSensitivity": (34855, short),
+        "FocalLength": (37386, rational),
+        "FocalPlaneXResolution": (41486, rational),
+        "FocalPlaneYResolution": (41487, rational),
+        "FocalPlaneResolutionUnit": (41488, short),
+        "FocalLengthIn35mmFilm": (41989, short),
     }
     fields = {36864: Field(7, 4, b"0230")}  # ExifVersion
     for name, value in tags.items():
-        tag, field = of[name]
-        fields[tag] = field(value)
+        tag, make_field = types[name]
+        fields[tag] = make_field(value)
     return fields

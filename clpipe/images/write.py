@@ -1,4 +1,4 @@
-"""TODO."""
+"""Writing pictures: JPEG, PNG and TIFF with EXIF and an ICC profile, and float OpenEXR."""
 
 import os
 import shutil
@@ -14,20 +14,21 @@ from PIL import Image, ImageCms
 from clpipe.base.about import __version__
 from clpipe.base.files import write_beside
 from clpipe.base.types import Array, Floats
+from clpipe.images.attributes import PREFIX
 from clpipe.images.encoding import exif
-from clpipe.images.read import HALF_MAX, _reason
-from clpipe.images.tags import ATTRIBUTES, Tags
+from clpipe.images.openimageio import error_text
+from clpipe.images.pixels import HALF_MAX
+from clpipe.images.tags import Tags
 
 JPEG_MAX_SIDE = 65500
 
-
-# Else the time of writing is put in, and no two runs make the same bytes.
+# Without it, OpenImageIO puts in the time of writing, and no two runs make the same bytes.
 NO_TIME = "1970:01:01 00:00:00"
 
 
 @cache
 def srgb_profile() -> bytes:
-    """An ICC profile of sRGB, always the same bytes."""
+    """An ICC profile of sRGB, the same bytes at every call."""
     profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
     profile[24:36] = bytes(12)  # the date of creation
     return bytes(profile)
@@ -36,8 +37,8 @@ def srgb_profile() -> bytes:
 def write_display(path: Path, pixels: Array, tags: Tags) -> None:
     """Write a picture, (height, width[, 3]), as JPEG, PNG or TIFF, with EXIF.
 
-    Whole numbers of 8 or 16 bits get an sRGB profile; float samples (TIFF) do not. JPEG is encoded
-    as ``tags.output`` says. A TIFF's EXIF is without the ISO, for which OpenImageIO has no way.
+    Whole numbers of 8 or 16 bits get an sRGB profile; float samples (TIFF) do not. ``tags.output``
+    says how a JPEG is encoded. The EXIF of a TIFF lacks the ISO, which OpenImageIO cannot write.
 
     Raises:
         ImageError: the file cannot be written.
@@ -61,7 +62,7 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> None:
     spec.attribute("Software", f"clpipe {__version__}")
     for name, value in exif(tags.iso, output, max(height, width)).items():
         if name == "ExposureTime":
-            # OpenImageIO cuts off after the sixth digit, and 0.01 is 0.0099999998 in float.
+            # OpenImageIO cuts off after the sixth digit, and 0.01 is 0.0099999998 as float32.
             above = float(np.nextafter(np.float32(value), np.float32(np.inf)))
             spec.attribute(name, above)
         else:
@@ -82,10 +83,14 @@ def write_exr(
     attributes: Mapping[str, str],
     half: bool = False,
 ) -> None:
-    """Write a float image, (height, width[, channel]), as OpenEXR (ZIP), channels named.
+    """Write a float image, (height, width[, channel]), as OpenEXR with ZIP compression.
 
-    The names of ``attributes`` get clpipe's prefix in the file. Half holds 11 bits and at most
-    65504; what is beyond is clipped.
+    Args:
+        path: the file.
+        pixels: the samples.
+        channels: the names of the channels.
+        attributes: clpipe's own; their names get clpipe's prefix in the file.
+        half: as half floats: 11 bits, clipped to -65504..65504.
 
     Raises:
         ImageError: the file cannot be written.
@@ -96,13 +101,13 @@ def write_exr(
     spec.attribute("compression", "zip")
     spec.attribute("DateTime", NO_TIME)
     for name, value in attributes.items():
-        spec.attribute(ATTRIBUTES + name, value)
+        spec.attribute(PREFIX + name, value)
     data = np.clip(pixels, -HALF_MAX, HALF_MAX) if half else pixels
     _write(path, spec, data.reshape(height, width, len(channels)))
 
 
 def _write(path: Path, spec: Any, pixels: Array) -> None:
-    """Write (height, width, channel) as OpenImageIO does, which does not hold the GIL.
+    """Write (height, width, channel) with OpenImageIO, which releases the GIL while it encodes.
 
     Raises:
         ImageError: the file cannot be written.
@@ -112,7 +117,7 @@ def _write(path: Path, spec: Any, pixels: Array) -> None:
         if to.suffix != ".jpg":
             _encode(str(to), str(to), spec, pixels)
             return
-        # libjpeg ends the process when it cannot write, so it writes to memory.
+        # libjpeg ends the process where it cannot write, so it writes to memory.
         memory = os.memfd_create("jpeg")
         with open(memory, "rb", buffering=0) as encoded:
             _encode("jpeg", f"/proc/self/fd/{memory}", spec, pixels)
@@ -123,19 +128,25 @@ def _write(path: Path, spec: Any, pixels: Array) -> None:
 
 
 def _encode(format_: str, to: str, spec: Any, pixels: Array) -> None:
-    """Write pixels in a format, which may be that of a file's name.
+    """Encode pixels to a file.
+
+    Args:
+        format_: an ending such as "jpeg", or a file name that has one.
+        to: the path to write to.
+        spec: the ``oiio.ImageSpec``.
+        pixels: (height, width, channel).
 
     Raises:
-        OSError: they cannot be written.
+        OSError: the file cannot be written.
     """
     file = oiio.ImageOutput.create(format_)
     data = np.ascontiguousarray(pixels)
     if file is None or not file.open(to, spec) or not file.write_image(data):
-        raise OSError(0, _reason(file.geterror() if file else oiio.geterror()))
+        raise OSError(0, error_text(file.geterror() if file else oiio.geterror()))
     if not file.close():
-        raise OSError(0, _reason(file.geterror()))
+        raise OSError(0, error_text(file.geterror()))
 
 
 def versions() -> dict[str, str]:
-    """The versions of what reads and writes files."""
+    """The versions of the libraries that read and write pictures."""
     return {"OpenImageIO": oiio.__version__, "Pillow": Image.__version__}  # type: ignore[attr-defined]

@@ -14,8 +14,8 @@ from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings, settings_from
+from clpipe.images.attributes import read_attributes
 from clpipe.images.read import SourceImage
-from clpipe.images.tags import read_attributes
 from clpipe.inputs.plausibility import input_warnings
 
 NOISE = "sensor_noise"  # the attribute of an image without sensor noise; its value is "none"

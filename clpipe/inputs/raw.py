@@ -20,7 +20,7 @@ from clpipe.chain.settings import Settings
 from clpipe.images.dump import Dump, read_dump
 from clpipe.images.raw import RAW_SUFFIXES, RawFacts, read_facts, read_raw
 from clpipe.images.read import RENDER_SUFFIXES, SourceImage
-from clpipe.images.tags import Tags, carry
+from clpipe.images.tags import Tags, to_attributes
 from clpipe.inputs.plausibility import brightness_warnings, input_warnings
 from clpipe.stage import Kind
 
@@ -93,7 +93,7 @@ class RawLoader:
         white = getattr(chain.steps[0].method, "white_level", 65535.0)
         if np.count_nonzero(image.pixels >= white) > image.pixels.size / 2:
             warnings.append(f"most of its samples are not below the white level of {white:g} DN")
-        attributes = carry(tags_of(image.facts, chain), image.facts.orientation)
+        attributes = to_attributes(tags_of(image.facts, chain), image.facts.orientation)
         return chain, replace(image, warnings=tuple(warnings), attributes=attributes)
 
     def _chain_from(self, settings: Settings) -> Chain:

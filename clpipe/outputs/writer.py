@@ -15,7 +15,7 @@ from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.dng import write_dng
 from clpipe.images.read import SourceImage
-from clpipe.images.tags import CARRIED, Tags, carried, upright
+from clpipe.images.tags import TAG_ATTRIBUTES, Tags, from_attributes, upright
 from clpipe.images.write import JPEG_MAX_SIDE, write_display, write_exr
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import attributes_of
@@ -175,11 +175,13 @@ class OutputWriter:
         """
         self._make_folder_of(job)
         chain, camera = rendition.chain, rendition.chain.camera
-        tags, orientation = carried(source.attributes, Tags(camera.make, camera.model, chain.iso))
+        tags, orientation = from_attributes(
+            source.attributes, Tags(camera.make, camera.model, chain.iso)
+        )
         output = chain.settings.output.filled({**source.shot, **tags.shot})
         tags = replace(tags, output=output)
         tag_attributes = {
-            name: source.attributes[name] for name in CARRIED if name in source.attributes
+            name: source.attributes[name] for name in TAG_ATTRIBUTES if name in source.attributes
         }
         is_mosaic = chain.result in (Kind.RAW, Kind.MOSAIC)
         turn = 1 if is_mosaic else orientation  # turning a mosaic would change its pattern

@@ -11,7 +11,7 @@ PATTERNS: tuple[Pattern, ...] = get_args(Pattern)
 
 
 def red_site(pattern: Pattern) -> tuple[int, int]:
-    """Column and row (0 or 1) of red in the 2x2 cell that the pattern spells row by row.
+    """Column and row (each 0 or 1) of red in the 2x2 cell; the pattern spells the cell by rows.
 
     >>> red_site("GRBG")
     (1, 0)
@@ -26,7 +26,10 @@ def by_site(
     green: Floats | np.float32,
     blue: Floats | np.float32,
 ) -> Floats:
-    """One value (or image) a colour in, at each pixel the site's own colour's out.
+    """At each pixel, the value that is given for the colour of that site; (height, width).
+
+    ``shape`` begins with height and width. Red, green and blue are each one value or an image of
+    that height and width.
 
     >>> by_site((2, 2), "RGGB", np.float32(1), np.float32(2), np.float32(3)).tolist()
     [[1.0, 2.0], [2.0, 3.0]]

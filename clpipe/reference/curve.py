@@ -1,8 +1,8 @@
 """One-dimensional curves as tables, as ``kernels/lib/curve.h`` has them.
 
-The index is the upper part of the float itself: 20 octaves below 1, 4096 steps each. A value takes
-the nearest entry (relative error at most 2^-13), so a table of tables gives, bit for bit, what
-two look-ups one after the other would.
+The index is the upper part of the float's own bits: 20 octaves below 1, 4096 steps each. A value
+takes the nearest entry (relative error at most 2^-13). So two curves compose into one table that
+gives, bit for bit, what two look-ups one after the other give.
 """
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from clpipe.base.types import Array, Floats
+from clpipe.base.types import Array, Doubles, Floats
 
 OCTAVES, STEPS = 20, 4096
 SIZE = OCTAVES * STEPS + 1
@@ -19,7 +19,7 @@ _FIRST = int(_SMALLEST.view(np.int32)) >> 11
 
 
 def curve_index(values: Floats) -> NDArray[np.int32]:
-    """The table entry nearest to each value; below 2^-20 entry 0, above 1 the last.
+    """The index of the table entry nearest to each value: 0 below 2^-20, the last above 1.
 
     >>> curve_index(np.float32([-1, 0, 2**-20, 0.5, 1, 7])).tolist()
     [0, 0, 0, 77824, 81920, 81920]
@@ -28,25 +28,28 @@ def curve_index(values: Floats) -> NDArray[np.int32]:
     return ((inside.view(np.int32) + np.int32(0x400)) >> np.int32(11)) - np.int32(_FIRST)
 
 
-def tabulate(function: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Floats:
-    """The table of a function on 0..1, at each entry's own float; entry 0 stands for 0."""
+def tabulate(function: Callable[[Doubles], Doubles]) -> Floats:
+    """The table of a function on 0..1, (:data:`SIZE`,).
+
+    Each entry is the function's value at that entry's own float; entry 0 is its value at 0.
+    """
     points = ((np.arange(SIZE, dtype=np.int32) + _FIRST) << 11).view(np.float32).astype(np.float64)
     points[0] = 0
     return function(points).astype(np.float32)
 
 
 def compose(first: Floats, second: Array) -> Array:
-    """The table that does in one look-up what ``first`` and then ``second`` do in two."""
+    """One table that gives what a look-up in ``first`` and then in ``second`` gives."""
     return second[curve_index(first)]
 
 
 def to_8_bit(values: Floats) -> NDArray[np.uint8]:
-    """0..1 to 0..255, rounded to nearest (ties to even), clipped."""
+    """0..1 to 0..255, rounded to nearest (ties to even) and clipped; NaN becomes 0."""
     return _scaled(values, 255).astype(np.uint8)
 
 
 def to_16_bit(values: Floats) -> NDArray[np.uint16]:
-    """0..1 to 0..65535, as :func:`to_8_bit`.
+    """0..1 to 0..65535, otherwise as :func:`to_8_bit`.
 
     >>> to_16_bit(np.float32([-1, 0.25, 1, 7])).tolist()
     [0, 16384, 65535, 65535]

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from clpipe.base.types import Floats
+from clpipe.base.types import Array, Floats
 
 
-def mirror(index: np.ndarray, size: int) -> np.ndarray:
-    """The pixels of 0..size-1 that reflect-101 shows at these places.
+def mirror(index: Array, size: int) -> Array:
+    """The pixel (0..size-1) that reflect-101 puts at each index; the edge pixel is not repeated.
 
     >>> mirror(np.arange(-3, 7), 4).tolist()
     [3, 2, 1, 0, 1, 2, 3, 2, 1, 0]
@@ -19,9 +19,9 @@ def mirror(index: np.ndarray, size: int) -> np.ndarray:
 
 
 def tap(image: Floats, dx: int, dy: int) -> Floats:
-    """The image as seen from each pixel ``dx`` to the right and ``dy`` down, mirrored at borders.
+    """At each pixel, the value ``dx`` px to the right and ``dy`` px below, mirrored at the borders.
 
-    ``image`` is (height, width) or (height, width, channel); so is the answer.
+    ``image`` is (height, width) or (height, width, channel); the result has the same shape.
     """
     rows = mirror(np.arange(image.shape[0]) + dy, image.shape[0])
     columns = mirror(np.arange(image.shape[1]) + dx, image.shape[1])
@@ -29,7 +29,7 @@ def tap(image: Floats, dx: int, dy: int) -> Floats:
 
 
 def mirrored(image: Floats, margin: int) -> Floats:
-    """The image with a margin of that many pixels all round, mirrored at the borders.
+    """The image with ``margin`` pixels added on every side, mirrored at the borders.
 
     >>> mirrored(np.float32([[1, 2, 3]]), 1).tolist()
     [[2.0, 1.0, 2.0, 3.0, 2.0], [2.0, 1.0, 2.0, 3.0, 2.0], [2.0, 1.0, 2.0, 3.0, 2.0]]

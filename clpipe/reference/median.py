@@ -7,9 +7,10 @@ from clpipe.reference.image import tap
 
 
 def median_filter(image: Floats, size: int) -> Floats:
-    """Median of the ``size`` x ``size`` pixels around each pixel, mirrored at borders.
+    """Median of the ``size`` x ``size`` pixels around each pixel, mirrored at the borders.
 
-    ``image`` is (height, width) or (height, width, plane), each plane by itself; so is the answer.
+    ``image`` is (height, width) or (height, width, plane); each plane is filtered by itself, and
+    the result has the same shape.
 
     >>> median_filter(np.float32([[1, 9, 2, 3, 4]]), 3).tolist()
     [[9.0, 2.0, 3.0, 3.0, 3.0]]

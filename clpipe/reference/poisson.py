@@ -1,4 +1,8 @@
-"""Poisson numbers by inverse CDF, bit for bit as ``kernels/lib/poisson.h`` has them."""
+"""Poisson numbers by inverse CDF, bit for bit as ``kernels/lib/poisson.h`` has them.
+
+After M. Giles, "Algorithm 955: Approximation of the inverse Poisson cumulative distribution
+function", ACM TOMS 42(1), 2016.
+"""
 
 import numpy as np
 
@@ -6,10 +10,10 @@ from clpipe.base.types import Floats
 from clpipe.reference.math import estrin, exponential, inverse_root
 from clpipe.reference.random import Words, in_upper_half, normal_of, tail_probability
 
-LARGE = np.float32(10)
-TERMS = 36
+LARGE = np.float32(10)  # the mean from which on the expansion is used
+TERMS = 36  # a Poisson number of mean 10 exceeds this with a probability of 1e-10
 
-# Lowest power first.
+# The polynomials of the expansion, lowest power first: our own weighted least-squares fits.
 A = np.array(
     [
         0.16666667,
@@ -37,10 +41,10 @@ C = np.array([-0.0197614673525095, 0.016855543479323387], np.float32)
 
 
 def poisson_of(mean: Floats, words: Words) -> Floats:
-    """Poisson numbers of these means (>= 0, float32), one for each random word, as whole floats.
+    """Poisson numbers, one for each random word, as whole float32; ``mean`` is float32, >= 0.
 
-    After Giles, "Algorithm 955", ACM TOMS 42(1), 2016: a sum below a mean of 10, from there on an
-    expansion of the quantile whose error is 3e-4 of a number within 3 sigma.
+    Below a mean of 10 the CDF is summed; from there on the quantile is expanded, with an error of
+    3e-4 of a number within 3 sigma.
 
     >>> poisson_of(np.float32([0, 3, 50]), np.uint32([1 << 30] * 3)).tolist()
     [0.0, 4.0, 55.0]
@@ -51,7 +55,11 @@ def poisson_of(mean: Floats, words: Words) -> Floats:
 
 
 def poisson_small(mean: Floats, words: Words) -> Floats:
-    """Poisson numbers of means up to 10: how many k have a CDF below u, or a rest above 1 - u."""
+    """Poisson numbers for means up to 10.
+
+    The number is how many k have a CDF below u; for u above 1/2, how many k have P(X >= k) above
+    1 - u. Both sums begin with their smallest terms, which keeps the tails exact.
+    """
     p = tail_probability(words)
     one = np.float32(1)
     terms = [exponential(-mean)]
@@ -69,7 +77,11 @@ def poisson_small(mean: Floats, words: Words) -> Floats:
 
 
 def poisson_large(mean: Floats, words: Words) -> Floats:
-    """Poisson numbers of means from 10 on, from an expansion around the normal quantile."""
+    """Poisson numbers for means from 10 on, the whole part of a continuous quantile.
+
+    The quantile is mean + sqrt(mean) w + w^2 A(s) + B(s) + C(s) / mean, with w the normal quantile
+    and s = w / sqrt(mean).
+    """
     w = normal_of(words)
     r = inverse_root(mean)
     s = np.maximum(w * r, np.float32(-1.3))
@@ -82,6 +94,6 @@ def poisson_large(mean: Floats, words: Words) -> Floats:
 
 
 def nearest(v: Floats) -> Floats:
-    """To the nearest whole number, ties to even, |v| < 2^22."""
+    """The nearest whole number, ties to even, for |v| < 2^22."""
     magic = np.float32(12582912)
     return (v + magic) - magic

@@ -1,4 +1,9 @@
-"""Philox4x32-10 and inverse-CDF normals, bit for bit as ``kernels/lib/random.h`` has them."""
+"""Counter-based random numbers, bit for bit as ``kernels/lib/random.h`` has them.
+
+Words come from Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3",
+SC 2011), normals from words by inverse CDF. A number depends only on the key and on the pixel's
+place, so not on order, tiles or device.
+"""
 
 import zlib
 from dataclasses import dataclass
@@ -13,7 +18,8 @@ from clpipe.reference.math import estrin, negative_log, square_root
 
 Words = NDArray[np.uint32]
 
-# Lowest power first.
+# Lowest power first. The form is after M. Giles, "Approximating the erfinv function", GPU Computing
+# Gems 2011; the fit is our own, and tests/test_noise.py holds its error.
 NORMAL_COEFFICIENTS = np.array(
     [
         2.9601128,
@@ -34,7 +40,7 @@ NORMAL_COEFFICIENTS = np.array(
 
 @dataclass(frozen=True)
 class Stream:
-    """Where the random numbers of one stage come from: a key, and the stage's own number."""
+    """The source of one stage's random numbers: a 64-bit key in two words, the stage's number."""
 
     key0: int
     key1: int
@@ -42,10 +48,12 @@ class Stream:
 
 
 def stream_of(owner: str, stage: str) -> Stream:
-    """The stream of a stage's noise for its owner.
+    """The stream of one stage's noise.
 
-    ``owner`` names what the noise belongs to (seed and image key, or the camera id); the key is
-    its 64-bit BLAKE2b hash. ``stage`` is the stage's name in the chain.
+    Args:
+        owner: names what the noise belongs to (seed and image key, or the camera id); the key is
+            its 64-bit BLAKE2b hash.
+        stage: the stage's name in the chain; its number is the name's CRC-32.
     """
     return Stream(*_key_of(owner), zlib.crc32(stage.encode()))
 
@@ -57,7 +65,7 @@ def _key_of(owner: str) -> tuple[int, int]:
 
 
 def philox(c0: Words, c1: Words, c2: Words, c3: Words, stream: Stream) -> tuple[Words, ...]:
-    """Philox4x32-10 (Salmon et al., SC 2011) of four broadcastable counters; four words.
+    """Philox4x32-10 of four counters, which are broadcast against each other; four words.
 
     >>> zero = np.zeros(1, np.uint32)
     >>> [hex(int(w[0])) for w in philox(zero, zero, zero, zero, Stream(0, 0, 0))]
@@ -76,18 +84,18 @@ def philox(c0: Words, c1: Words, c2: Words, c3: Words, stream: Stream) -> tuple[
 
 
 def tail_probability(words: Words) -> Floats:
-    """The distance of a uniform number to the nearer of 0 and 1, from 31 bits; (0, 1/2]."""
+    """The probability of the nearer tail, in (0, 1/2], from the lower 31 bits of each word."""
     low = words.view(np.int32) & np.int32(0x7FFFFFFF)
     return (low.astype(np.float32) + np.float32(0.5)) * np.float32(2.3283064e-10)
 
 
 def in_upper_half(words: Words) -> NDArray[np.bool_]:
-    """Whether that uniform number is above 1/2."""
+    """Whether the word stands for the upper half of the distribution: its top bit is 0."""
     return words.view(np.int32) >= 0
 
 
 def normal_of(words: Words) -> Floats:
-    """Standard normals from 32-bit words by inverse CDF, out to 6.2 sigma, relative error 4e-5.
+    """Standard normals from 32-bit words by inverse CDF: up to 6.3 sigma, relative error 8e-5.
 
     >>> normal_of(np.uint32([0x7fffffff, 0x14514514, 0x94514514])).round(3).tolist()
     [0.0, 1.409000039100647, -1.409000039100647]
@@ -101,7 +109,11 @@ def normal_of(words: Words) -> Floats:
 
 
 def word_at(shape: tuple[int, ...], draw: int, stream: Stream) -> Words:
-    """One random word a pixel: counter (x, y // 4, draw, stage), word y % 4."""
+    """One random word for each pixel, (height, width).
+
+    Pixel (x, y) takes word y % 4 of the counter (x, y // 4, draw, stage). ``shape`` begins with
+    height and width; ``draw`` numbers the draws of one stage.
+    """
     height, width = shape[:2]
     quarter = np.arange((height + 3) // 4, dtype=np.uint32)[:, None]
     words = philox(
@@ -115,12 +127,12 @@ def word_at(shape: tuple[int, ...], draw: int, stream: Stream) -> Words:
 
 
 def normal_at(shape: tuple[int, ...], draw: int, stream: Stream) -> Floats:
-    """One standard normal a pixel."""
+    """One standard normal for each pixel, (height, width); arguments as :func:`word_at`."""
     return normal_of(word_at(shape, draw, stream))
 
 
 def normal_of_line(count: int, stream: Stream) -> Floats:
-    """One standard normal for each of the first ``count`` rows or columns."""
+    """One standard normal for each of the first ``count`` rows or columns, (count,)."""
     zero = np.zeros(1, np.uint32)
     stage = np.full(1, stream.stage, np.uint32)
     return normal_of(philox(np.arange(count, dtype=np.uint32), zero, zero, stage, stream)[0])

@@ -1,11 +1,15 @@
-"""TODO."""
+"""Transfer functions: between linear light and display values, both 0..1.
+
+No kernel header has these: kernels read them from tables, see :mod:`clpipe.reference.curve`.
+"""
 
 import numpy as np
-from numpy.typing import NDArray
+
+from clpipe.base.types import Doubles
 
 
-def srgb_curve(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The transfer function of sRGB (IEC 61966-2-1, 1999): linear below 0.0031308.
+def srgb_curve(x: Doubles) -> Doubles:
+    """From linear light to sRGB (IEC 61966-2-1, 1999): a straight line up to 0.0031308.
 
     >>> srgb_curve(np.array([0.001, 0.5])).round(5).tolist()
     [0.01292, 0.73536]
@@ -13,8 +17,8 @@ def srgb_curve(x: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
-def inverse_srgb_curve(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """From sRGB back to linear light (IEC 61966-2-1, 1999).
+def inverse_srgb_curve(x: Doubles) -> Doubles:
+    """From sRGB to linear light (IEC 61966-2-1, 1999): a straight line up to 0.04045.
 
     >>> inverse_srgb_curve(np.array([0.01292, 0.73536])).round(4).tolist()
     [0.001, 0.5]

@@ -1,4 +1,8 @@
-"""The symmetric Tukey lambda distribution, as ``kernels/lib/tukey_lambda.h`` has it."""
+"""The symmetric Tukey lambda distribution, as ``kernels/lib/tukey_lambda.h`` has it.
+
+It models read noise with heavy tails (Wei et al., "A physics-based noise formation model for
+extreme low-light raw denoising", CVPR 2020).
+"""
 
 from math import gamma
 
@@ -8,14 +12,15 @@ from clpipe.base.types import Floats
 from clpipe.reference.math import exponential_minus_1, negative_log
 from clpipe.reference.random import Words, in_upper_half, tail_probability
 
-NEARLY_ZERO = 1e-4  # there, what stands in for 0, the logistic distribution
+NEARLY_ZERO = 1e-4  # replaces smaller lambdas: at 0, the logistic distribution, 1 / lambda fails
 
 
 def shape_and_scale(shape: float) -> tuple[np.float32, np.float32]:
-    """The kernel's arguments for a lambda above -1/2: itself, and 1 / (lambda * sigma).
+    """The kernel's arguments for a shape lambda above -1/2: lambda and 1 / (lambda * sigma).
 
-    sigma^2 = 2 / lambda^2 * (1 / (1 + 2 lambda) - G(lambda + 1)^2 / G(2 lambda + 2)), G the gamma
-    function (Joiner and Rosenblatt, JASA 66, 1971).
+    sigma is the standard deviation of the distribution at scale 1: sigma^2 = 2 / lambda^2 *
+    (1 / (1 + 2 lambda) - G(lambda + 1)^2 / G(2 lambda + 2)), G the gamma function (Joiner and
+    Rosenblatt, JASA 66, 1971).
 
     >>> shape, scale = shape_and_scale(1)  # uniform, of width sqrt(12) at a variance of 1
     >>> round(float(shape * scale * scale), 4)
@@ -27,7 +32,9 @@ def shape_and_scale(shape: float) -> tuple[np.float32, np.float32]:
 
 
 def tukey_lambda_of(words: Words, shape: np.float32, scale: np.float32) -> Floats:
-    """Numbers of mean 0 and variance 1, one for each random word.
+    """Tukey lambda numbers of mean 0 and variance 1, one for each random word, by inverse CDF.
+
+    ``shape`` and ``scale`` are those of :func:`shape_and_scale`.
 
     >>> words = np.uint32([0x7fffffff, 0x14514514, 0x94514514])
     >>> tukey_lambda_of(words, *shape_and_scale(0.14)).round(2).tolist()

@@ -1,8 +1,9 @@
-"""The stages, one a file or folder, found by looking; and the default chain.
+"""The stages, one in each file or folder, and the default chain.
 
 A file declares one stage: its methods, their parameters, kernels and NumPy references. Every module
-here must define ``STAGE``; code that several stages share belongs in ``reference`` or ``stage``.
-It imports ``stage``, ``reference``, ``camera`` and ``base``.
+here must define ``STAGE``: :func:`own_stages` imports them all, so nothing else lists them. Code
+that several stages share belongs in ``reference`` or ``stage``. This room imports ``stage``,
+``reference``, ``camera`` and ``base``.
 """
 
 from functools import cache
@@ -35,10 +36,10 @@ DEFAULT_CHAIN = (
 
 @cache
 def own_stages() -> dict[str, Stage]:
-    """clpipe's own stages by name: the default chain first, in its order, then the others."""
-    found = {
+    """clpipe's own stages by name: those of the default chain in its order, then the others."""
+    stages: dict[str, Stage] = {
         module.name: import_module(f"{__name__}.{module.name}").STAGE
         for module in iter_modules(__path__)
     }
-    rest = [name for name in found if name not in DEFAULT_CHAIN]
-    return {name: found[name] for name in (*DEFAULT_CHAIN, *rest)}
+    others = [name for name in stages if name not in DEFAULT_CHAIN]
+    return {name: stages[name] for name in (*DEFAULT_CHAIN, *others)}

@@ -1,4 +1,4 @@
-"""From the camera's colours to those of linear sRGB."""
+"""Colour matrices: between a camera's white-balanced RGB and linear sRGB."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,7 +15,7 @@ NAMES = tuple(f"{row}_{column}" for row in "rgb" for column in "rgb")
 
 
 def _as_tuples(value: Any) -> Any:
-    """Lists, as TOML has them, as the tuples that strict validation wants."""
+    """A 3x3 list of numbers, as TOML has it, as the tuples that strict validation needs."""
     if value is None:
         return None
     rows = value if isinstance(value, list | tuple) else ()
@@ -26,33 +26,35 @@ def _as_tuples(value: Any) -> Any:
     return tuple(tuple(float(x) for x in row) for row in rows)
 
 
-def mixed(image: Floats, matrix: Floats) -> Floats:
-    """A (height, width, 3) image, each pixel times a (3, 3) matrix.
+def apply_matrix(image: Floats, matrix: Floats) -> Floats:
+    """Multiply a (3, 3) matrix by the colour of each pixel; (height, width, 3) in and out.
 
-    >>> mixed(np.float32([[[1, 2, 4]]]), np.float32([[0, 1, 0], [1, 0, 0], [1, 1, 1]])).tolist()
+    >>> swap = np.float32([[0, 1, 0], [1, 0, 0], [1, 1, 1]])
+    >>> apply_matrix(np.float32([[[1, 2, 4]]]), swap).tolist()
     [[[2.0, 1.0, 7.0]]]
     """
     red, green, blue = np.moveaxis(image, -1, 0)
     return np.stack([r * red + g * green + b * blue for r, g, b in matrix], axis=-1)
 
 
-class Rendered(Unchanged):
-    """A render's colours never were a camera's."""
+class NoMatrix(Unchanged):
+    """No matrix: a render is in linear sRGB already."""
 
     method: ClassVar = "none"
-    summary: ClassVar = "a render is in linear sRGB already"
+    summary: ClassVar = "no matrix: a render is in linear sRGB already"
 
 
-class Given(Method):
-    """A 3x3 matrix on each pixel's linear RGB."""
+class FixedMatrix(Method):
+    """A user's 3x3 matrix: each pixel's linear RGB becomes matrix * RGB."""
 
     method: ClassVar = "given"
     kernel: ClassVar = "color_matrix"
-    summary: ClassVar = "a matrix of one's own"
+    summary: ClassVar = "a 3x3 matrix of your own"
     example: ClassVar = {"matrix": [[1.6, -0.5, -0.1], [-0.2, 1.5, -0.3], [0.05, -0.6, 1.55]]}
 
     matrix: Annotated[Matrix, BeforeValidator(_as_tuples)] | None = parameter(
-        IDENTITY, "Three rows of three: what red, green and blue are made of."
+        IDENTITY,
+        "Three rows of three numbers: the new red, green and blue, each as a sum of the old ones.",
     )
 
     @field_validator("matrix")
@@ -67,49 +69,56 @@ class Given(Method):
         return replace(context, colours=_as_tuples(colours.tolist()))
 
     @property
-    def _rows(self) -> Floats:
+    def _array(self) -> Floats:
         return np.array(self.matrix, np.float32)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("color_matrix", arguments=NAMES),)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
-        return dict(zip(NAMES, self._rows.ravel(), strict=True))
+        return dict(zip(NAMES, self._array.ravel(), strict=True))
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        return mixed(image, self._rows)
+        return apply_matrix(image, self._array)
 
 
-class Camera(Given):
-    """The inverse of the camera's matrix: white-balanced camera RGB to linear sRGB."""
+class CameraToSrgb(FixedMatrix):
+    """White-balanced camera RGB to linear sRGB: the inverse of the camera's matrix.
+
+    The camera's matrix is :meth:`clpipe.camera.profile.Camera.srgb_to_camera`.
+    """
 
     method: ClassVar = "camera"
-    summary: ClassVar = "camera RGB to linear sRGB, for a camera's own raws"
+    summary: ClassVar = "camera RGB to linear sRGB, for a camera's raws"
     example: ClassVar = {}
 
     matrix: Annotated[Matrix, BeforeValidator(_as_tuples)] | None = parameter(
-        None, "Three rows of three, camera RGB to linear sRGB.", auto="from the camera"
+        None,
+        "Three rows of three numbers, from camera RGB to linear sRGB.",
+        auto="from the camera",
     )
 
-    def resolve(self, context: Context) -> "Camera":
+    def resolve(self, context: Context) -> "CameraToSrgb":
         if self.matrix is not None:
             return self
         inverse = np.linalg.inv(context.camera.srgb_to_camera())
         return self.filled(matrix=_as_tuples(inverse.tolist()))
 
 
-class InverseCamera(Given):
-    """The camera's matrix, to stand before the mosaic of a render."""
+class SrgbToCamera(FixedMatrix):
+    """Linear sRGB to white-balanced camera RGB: the camera's matrix, for a render before mosaic."""
 
     method: ClassVar = "inverse_camera"
     summary: ClassVar = "linear sRGB to camera RGB, for a render, before mosaic"
     example: ClassVar = {}
 
     matrix: Annotated[Matrix, BeforeValidator(_as_tuples)] | None = parameter(
-        None, "Three rows of three, linear sRGB to camera RGB.", auto="from the camera"
+        None,
+        "Three rows of three numbers, from linear sRGB to camera RGB.",
+        auto="from the camera",
     )
 
-    def resolve(self, context: Context) -> "InverseCamera":
+    def resolve(self, context: Context) -> "SrgbToCamera":
         if self.matrix is not None:
             return self
         return self.filled(matrix=_as_tuples(context.camera.srgb_to_camera().tolist()))
@@ -117,8 +126,8 @@ class InverseCamera(Given):
 
 STAGE = Stage(
     "color_matrix",
-    "Mix colours: from what the camera's filters see to linear sRGB.",
+    "Convert between the camera's colours and linear sRGB.",
     Kind.RGB,
     Kind.RGB,
-    (Rendered, Camera, InverseCamera, Given),
+    (NoMatrix, CameraToSrgb, SrgbToCamera, FixedMatrix),
 )

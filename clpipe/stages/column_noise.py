@@ -1,4 +1,4 @@
-"""Noise that a whole column shares."""
+"""Column noise: offsets that all pixels of a column share, from that column's readout circuit."""
 
 from typing import ClassVar
 
@@ -10,7 +10,9 @@ from clpipe.stage import Access, Context, Frame, GaussianNoise, Kind, NoiseScope
 
 
 class Gaussian(GaussianNoise):
-    """One Gaussian offset a column, the same in every image of a camera.
+    """y + sigma * n_x: one Gaussian offset for each column, the same in every image of a camera.
+
+    n_x is a standard normal of column x; sigma is in signal units.
 
     >>> from clpipe.stage import run_reference
     >>> noisy = run_reference(Gaussian(sigma=0.01), np.zeros((2, 1000), np.float32))
@@ -19,7 +21,7 @@ class Gaussian(GaussianNoise):
     """
 
     kernel: ClassVar = "line_noise"
-    summary: ClassVar = "add one Gaussian offset a column, the same in every image of a camera"
+    summary: ClassVar = "add a Gaussian offset to each column, the same in every image of a camera"
 
     def resolve(self, context: Context) -> "Gaussian":
         return self.filled(sigma=context.camera.column_noise(context.iso))
@@ -43,5 +45,5 @@ class Gaussian(GaussianNoise):
 
 
 STAGE = Stage(
-    "column_noise", "Add noise that a whole column shares.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,)
+    "column_noise", "Add an offset to each column.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,)
 )

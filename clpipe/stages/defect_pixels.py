@@ -1,4 +1,4 @@
-"""Hot and dead pixels."""
+"""Defect pixels: hot ones, with too much charge, and dead ones, without signal."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -10,15 +10,16 @@ from clpipe.reference.math import negative_log
 from clpipe.reference.random import word_at
 from clpipe.stage import Argument, Context, Frame, Kind, Method, NoiseScope, Pass, Stage, parameter
 
-WORDS = 1 << 31  # as many random words tell pixels apart
-VISIBLE = 0.1  # signal of a hot pixel where the camera does not say its charge
+WORDS = 1 << 31  # the number of different random words that choose the pixels
+DEFAULT_LEVEL = 0.1  # signal units; chosen to be visible, where the camera gives no charge
 
 
 class Random(Method):
-    """Pixels here and there, the same in every image of a camera.
+    """Hot and dead pixels at random places, the same in every image of a camera.
 
-    A hot one has an extra charge of hot_level * (1 + e), e exponential of mean 1, at every ISO the
-    same number of electrons; a dead one gives no signal.
+    A hot pixel gets y + hot_level * (1 + e), e from an exponential distribution of mean 1; in
+    electrons, the camera's level is the same at every ISO. A dead pixel gets 0. Levels are in
+    signal units.
 
     >>> from clpipe.stage import run_reference
     >>> image = np.full((300, 300), 0.1, np.float32)
@@ -29,28 +30,28 @@ class Random(Method):
 
     method: ClassVar = "random"
     kernel: ClassVar = "defect_pixels"
-    summary: ClassVar = "make some pixels of a camera hot or dead"
+    summary: ClassVar = "make pixels at random places of the sensor hot or dead"
     example: ClassVar = {"hot_share": 0.05, "hot_level": 0.3, "dead_share": 0.05}
 
     hot_share: float | None = parameter(
-        None, "Hot pixels, as a share of all.", "", "from the camera", ge=0, le=0.1
+        None, "Share of the pixels that are hot.", "", "from the camera", ge=0, le=0.1
     )
     hot_level: float | None = parameter(
         None,
-        "The least that a hot pixel adds.",
+        "The smallest extra signal of a hot pixel; the mean is twice as much.",
         "signal",
         "from the camera and ISO; else 0.1",
         ge=0,
     )
     dead_share: float | None = parameter(
-        None, "Dead pixels, as a share of all.", "", "from the camera", ge=0, le=0.1
+        None, "Share of the pixels that are dead.", "", "from the camera", ge=0, le=0.1
     )
 
     def resolve(self, context: Context) -> "Random":
         camera = context.camera
         return self.filled(
             hot_share=camera.hot_pixel_share,
-            hot_level=camera.signal_of(camera.hot_pixel_level, context.iso) or VISIBLE,
+            hot_level=camera.signal_of(camera.hot_pixel_level, context.iso) or DEFAULT_LEVEL,
             dead_share=camera.dead_pixel_share,
         )
 
@@ -74,7 +75,7 @@ class Random(Method):
         }
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        """A few pixels that are wrong are no noise of all the others: they are left out."""
+        """The variance without the defect pixels: they are few, and not part of the noise model."""
         return before
 
     def reference(self, image: Floats, frame: Frame) -> Floats:

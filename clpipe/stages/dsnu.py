@@ -1,4 +1,4 @@
-"""Dark-signal non-uniformity; the part that columns share is column_noise."""
+"""Dark-signal non-uniformity (DSNU); the part that a column shares is ``column_noise``."""
 
 from typing import ClassVar
 
@@ -10,9 +10,10 @@ from clpipe.stage import Context, Frame, GaussianNoise, Kind, NoiseScope, Pass, 
 
 
 class Gaussian(GaussianNoise):
-    """An offset of its own for each pixel, fixed for a camera (EMVA 1288, DSNU).
+    """y + sigma * n: one Gaussian offset for each pixel, fixed for a camera (EMVA 1288, DSNU).
 
-    In electrons it is the same at every ISO.
+    n is a standard normal of the pixel; sigma is in signal units. In electrons, the camera's sigma
+    is the same at every ISO.
 
     >>> from clpipe.stage import run_reference
     >>> uneven = run_reference(Gaussian(sigma=0.01), np.zeros((300, 300), np.float32))
@@ -21,7 +22,7 @@ class Gaussian(GaussianNoise):
     """
 
     kernel: ClassVar = "dsnu"
-    summary: ClassVar = "give each pixel of a camera an offset of its own"
+    summary: ClassVar = "add a Gaussian offset to each pixel, the same in every image of a camera"
 
     def resolve(self, context: Context) -> "Gaussian":
         camera = context.camera
@@ -35,4 +36,4 @@ class Gaussian(GaussianNoise):
         return image + normals * np.float32(self.sigma)
 
 
-STAGE = Stage("dsnu", "Give pixels offsets of their own.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,))
+STAGE = Stage("dsnu", "Add a fixed offset to each pixel.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,))

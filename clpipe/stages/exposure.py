@@ -10,7 +10,7 @@ from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, pa
 
 
 class Gain(Method):
-    """Linear light times 2^EV.
+    """Linear light times 2^ev.
 
     >>> from clpipe.stage import run_reference
     >>> run_reference(Gain(ev=-1.0), np.float32([[[0.5, 1, 4]]])).tolist()
@@ -22,7 +22,7 @@ class Gain(Method):
     summary: ClassVar = "multiply linear light by 2^ev"
     example: ClassVar = {"ev": 0.7}
 
-    ev: float = parameter(0.0, "Exposure compensation.", "EV", ge=-20, le=20)
+    ev: float = parameter(0.0, "Exposure compensation; +1 doubles the light.", "EV", ge=-20, le=20)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("exposure", arguments=("gain",)),)

@@ -1,4 +1,4 @@
-"""The transfer curve of the display."""
+"""Gamma: encoding of linear light for a display."""
 
 from functools import lru_cache
 from typing import ClassVar
@@ -11,17 +11,17 @@ from clpipe.stage import Curve, Kind, Stage, parameter
 
 @lru_cache(maxsize=16)
 def power_table(exponent: float) -> Floats:
-    """The table of x^(1/exponent)."""
+    """The table of x^(1/exponent); cached, so that it is uploaded once."""
     return tabulate(lambda x: x ** (1 / exponent))
 
 
 class Power(Curve):
-    """x^(1/exponent), as the paper."""
+    """x^(1/exponent), the encoding of the paper (Bielova et al., CVPR Workshops 2019)."""
 
     method: ClassVar = "power"
     summary: ClassVar = "x^(1/exponent)"
 
-    exponent: float = parameter(2.2, "Gamma; 1 is linear.", ge=0.1, le=10)
+    exponent: float = parameter(2.2, "Gamma; 1 leaves the light linear.", ge=0.1, le=10)
 
     def table(self) -> Floats:
         return power_table(self.exponent)
@@ -31,7 +31,7 @@ SRGB_TABLE = tabulate(srgb_curve)
 
 
 class Srgb(Curve):
-    """The transfer function of sRGB: what a screen undoes."""
+    """The transfer function of sRGB (IEC 61966-2-1, 1999)."""
 
     method: ClassVar = "srgb"
     summary: ClassVar = "the transfer function of sRGB"

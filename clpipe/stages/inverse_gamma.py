@@ -1,4 +1,4 @@
-"""The transfer curve of the display, undone."""
+"""Inverse gamma: from display values back to linear light."""
 
 from functools import lru_cache
 from typing import ClassVar
@@ -12,7 +12,7 @@ SRGB_TABLE = tabulate(inverse_srgb_curve)
 
 
 class Srgb(Curve):
-    """Undoes the transfer function of sRGB: what photographs and screens have."""
+    """The inverse of sRGB's transfer function (IEC 61966-2-1, 1999), for photographs."""
 
     method: ClassVar = "srgb"
     summary: ClassVar = "undo the transfer function of sRGB"
@@ -23,17 +23,17 @@ class Srgb(Curve):
 
 @lru_cache(maxsize=16)
 def power_table(exponent: float) -> Floats:
-    """The table of x^exponent."""
+    """The table of x^exponent; cached, so that it is uploaded once."""
     return tabulate(lambda x: x**exponent)
 
 
 class Power(Curve):
-    """Undoes gamma's power."""
+    """x^exponent, the inverse of ``gamma`` with its method ``power``."""
 
     method: ClassVar = "power"
     summary: ClassVar = "x^exponent"
 
-    exponent: float = parameter(2.2, "Gamma; 1 is linear.", ge=0.1, le=10)
+    exponent: float = parameter(2.2, "Gamma; 1 leaves the values unchanged.", ge=0.1, le=10)
 
     def table(self) -> Floats:
         return power_table(self.exponent)

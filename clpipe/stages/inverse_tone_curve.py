@@ -1,4 +1,4 @@
-"""The tone curve, undone."""
+"""Inverse tone curve: from a photograph's contrast back to that of the scene."""
 
 from functools import lru_cache
 from typing import ClassVar
@@ -15,22 +15,21 @@ from clpipe.stages.tone_curve.table import table_of
 
 @lru_cache(maxsize=16)
 def inverse_table(path: str) -> Floats:
-    """The table that undoes a file's curve; where that is level, its darkest value.
+    """The table of the inverse of a file's curve; where the curve is level, the darkest input.
 
     Raises:
-        ValueError: the file holds no curve, or one that falls somewhere or stays at 0 at white.
+        ValueError: the file holds no curve, or the curve falls somewhere, or it never rises.
     """
     table = table_of(path).astype(np.float64)
     if np.any(np.diff(table) < 0) or table[-1] <= table[0]:
         raise ValueError(f"{path}: only a curve that rises can be undone")
     linear = tabulate(lambda x: x).astype(np.float64)
-    # What comes out between two entries lies between the light of both.
     value, first = np.unique(table, return_index=True)
     return tabulate(lambda y: np.interp(y, value, linear[first]))
 
 
 class Default(Curve):
-    """Undoes the default curve of Adobe Camera Raw.
+    """The inverse of the default curve of Adobe Camera Raw, on each channel.
 
     >>> from clpipe.reference.curve import curve_index
     >>> from clpipe.stages.tone_curve import Default as Forward
@@ -48,20 +47,23 @@ class Default(Curve):
 
 
 class Linear(Unchanged):
-    """No curve was there."""
+    """No curve to undo: the image stays as it is."""
 
     method: ClassVar = "linear"
     summary: ClassVar = "no curve to undo"
 
 
 class File(Curve):
-    """Undoes a curve of one's own."""
+    """The inverse of a curve from a file, on each channel."""
 
     method: ClassVar = "file"
     summary: ClassVar = "undo a curve from a .csv or one-dimensional .cube file"
 
     path: str = parameter(
-        DEFAULT, "The file; in a configuration, relative to it.", auto="default.csv", file=True
+        DEFAULT,
+        "The file of the curve; a configuration gives it relative to itself.",
+        auto="default.csv",
+        file=True,
     )
 
     @field_validator("path")

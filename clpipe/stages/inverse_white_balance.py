@@ -1,4 +1,4 @@
-"""Taking white balance out, so that the noise falls on the signal as the sensor saw it."""
+"""Inverse white balance: it comes before the noise, which depends on the sensor's own signal."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,7 +12,7 @@ from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, pa
 
 
 class Gains(Method):
-    """Each colour divided by the gain that white balance would give it (green = 1).
+    """y / gain: red and blue divided by their white balance gains (green = 1).
 
     >>> from clpipe.stage import run_reference
     >>> run_reference(Gains(red_gain=2.0, blue_gain=4.0), np.ones((2, 2), np.float32)).tolist()
@@ -59,7 +59,7 @@ class Gains(Method):
 
 STAGE = Stage(
     "inverse_white_balance",
-    "Undo white balance: the render becomes what the sensor would see.",
+    "Divide by the white balance gains: the render becomes what the sensor sees.",
     Kind.MOSAIC,
     Kind.MOSAIC,
     (Gains,),

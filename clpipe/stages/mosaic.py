@@ -12,7 +12,7 @@ from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, pa
 
 
 class Bayer(Method):
-    """A Bayer pattern (US patent 3,971,065, 1976): a pixel keeps one of its three colours.
+    """A Bayer pattern (US patent 3,971,065, 1976): each pixel keeps one of its three colours.
 
     >>> from clpipe.stage import run_reference
     >>> image = np.float32([1, 2, 3]) * np.ones((2, 2, 1), np.float32)
@@ -22,10 +22,10 @@ class Bayer(Method):
 
     method: ClassVar = "bayer"
     kernel: ClassVar = "mosaic"
-    summary: ClassVar = "keep one colour a pixel, by a Bayer pattern"
+    summary: ClassVar = "keep one colour of each pixel, by a Bayer pattern"
 
     pattern: Pattern = parameter(
-        "RGGB", "Colours of the upper left 2x2 pixels, row by row.", structural=True
+        "RGGB", "Colours of the 2x2 pixels in the upper left corner, row by row.", structural=True
     )
 
     def after(self, context: Context) -> Context:

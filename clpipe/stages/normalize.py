@@ -1,4 +1,4 @@
-"""Levels: the first thing a raw converter does."""
+"""Levels: from DN to signal, the first step of a raw converter."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -11,7 +11,7 @@ from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, pa
 
 
 class Linear(Method):
-    """(DN - black) / (white - black); what lies below black stays negative.
+    """(DN - black) / (white - black); values below black stay negative.
 
     >>> from clpipe.stage import run_reference
     >>> linear = Linear(black_level=100, white_level=1124)
@@ -21,7 +21,7 @@ class Linear(Method):
 
     method: ClassVar = "linear"
     kernel: ClassVar = "normalize"
-    summary: ClassVar = "subtract the black level, scale the white level to 1"
+    summary: ClassVar = "subtract the black level and scale the white level to 1"
 
     black_level: float | None = parameter(
         None,
@@ -75,4 +75,4 @@ class Linear(Method):
         return (image - np.float32(self.black_level)) * scale
 
 
-STAGE = Stage("normalize", "Levels: DN back to signal.", Kind.RAW, Kind.MOSAIC, (Linear,))
+STAGE = Stage("normalize", "Apply the levels: DN to signal.", Kind.RAW, Kind.MOSAIC, (Linear,))

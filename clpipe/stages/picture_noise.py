@@ -1,7 +1,7 @@
-"""Noise on the finished picture: what synthetic data usually gets, as baselines to compare with.
+"""Noise on the finished picture, as synthetic data usually has it: baselines to compare with.
 
-Real noise comes before the processing, which shapes it; see ``sensor_noise``. Here the same sigma,
-given or as ``clpipe measure --json`` found it, is added after it, to a clean picture.
+Real noise arises before the processing, which shapes it; see ``sensor_noise``. Here independent
+noise is added after the processing, with a sigma of the user's or of ``clpipe measure --json``.
 """
 
 import json
@@ -29,8 +29,8 @@ from clpipe.stage import (
     parameter,
 )
 
-ENTRIES = 256
-RESOLVED = 65  # entries of a measured curve, as the sidecar has it
+ENTRIES = 256  # of the kernel's table
+RESOLVED = 65  # entries of a measured curve in the resolved parameters, and so in the sidecar
 CHANNELS = Kind.DISPLAY.channels
 
 Sigma = Annotated[float, Field(ge=0, le=1)]
@@ -38,30 +38,30 @@ Sigmas = Annotated[tuple[Sigma, ...], Field(min_length=2, max_length=ENTRIES)]
 
 
 class NoNoise(Unchanged):
-    """Noise belongs before the processing."""
+    """No noise on the finished picture."""
 
     method: ClassVar = "none"
-    summary: ClassVar = "no noise here; it was added where a sensor adds it"
+    summary: ClassVar = "no noise here; sensor_noise adds it where a sensor does"
 
 
 def _as_three(value: Any) -> Any:
-    """One number as the same for red, green and blue; a list, as TOML has it, as a tuple."""
+    """One number as three equal ones, and a list, as TOML has it, as a tuple."""
     if isinstance(value, float | int) and not isinstance(value, bool):
         return (float(value),) * 3
     return tuple(value) if isinstance(value, list) else value
 
 
 def _as_tuples(value: Any) -> Any:
-    """Lists, as TOML has them, as the tuples that strict validation wants."""
+    """Nested lists, as TOML has them, as the tuples that strict validation needs."""
     return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple) else value
 
 
-class Matched(Method):
-    """Gaussian noise, new in each pixel, channel and image; its sigma is given or measured."""
+class IndependentNoise(Method):
+    """Gaussian noise, independent in each pixel, channel and image; sigma is set or measured."""
 
     measured: str = parameter(
         "",
-        "A report of clpipe measure --json on finished pictures, whose noise to match.",
+        "A report of clpipe measure --json on finished pictures; the noise gets its sigma.",
         file=True,
     )
 
@@ -74,16 +74,18 @@ class Matched(Method):
 
     @model_validator(mode="after")
     def _one_of_two(self) -> Self:
-        given = getattr(self, "sigma", None) is not None
-        if given and self.measured:
-            raise ValueError("found both sigma and measured; give one of them")
-        if not given and not self.measured:
-            raise ValueError("needs sigma, or measured, the file of a clpipe measure --json")
+        has_sigma = getattr(self, "sigma", None) is not None
+        if has_sigma and self.measured:
+            raise ValueError("found both sigma and measured; set one of them")
+        if not has_sigma and not self.measured:
+            raise ValueError("needs sigma, or measured, a report of clpipe measure --json")
         return self
 
 
-class IidGaussian(Matched):
-    """Independent Gaussian noise of one sigma: the usual baseline.
+class IidGaussian(IndependentNoise):
+    """v + sigma * n: independent Gaussian noise of one sigma, the usual baseline.
+
+    v is a display value, 0..1; n is a standard normal for each pixel and channel.
 
     >>> from clpipe.stage import run_reference
     >>> noisy = run_reference(IidGaussian(sigma=0.02), np.full((300, 300, 3), 0.5, np.float32))
@@ -98,7 +100,7 @@ class IidGaussian(Matched):
 
     sigma: Annotated[tuple[Sigma, Sigma, Sigma], BeforeValidator(_as_three)] | None = parameter(
         None,
-        "Standard deviation; one number, or one each for red, green and blue.",
+        "Standard deviation: one number, or one each for red, green and blue.",
         "of full scale",
         "as measured",
     )
@@ -119,12 +121,13 @@ class IidGaussian(Matched):
         return image + _normals(image, frame) * np.array(self.sigma, np.float32)
 
 
-class IntensityDependent(Matched):
-    """Independent Gaussian noise whose sigma follows the intensity of each channel.
+class IntensityDependent(IndependentNoise):
+    """v + sigma(v) * n: independent Gaussian noise whose sigma follows each channel's intensity.
 
-    As SyB3R adds it to finished pictures (Ley, Haensch, Hellwich, "SyB3R: A realistic synthetic
-    benchmark for 3D reconstruction from images", ECCV 2016): sigma by intensity, as a table. Beyond
-    the intensities that were measured the last sigma holds.
+    SyB3R adds such noise to finished pictures (Ley, Haensch, Hellwich, "SyB3R: A realistic
+    synthetic benchmark for 3D reconstruction from images", ECCV 2016). v is a display value, 0..1,
+    n a standard normal for each pixel and channel; sigma(v) comes from a table. Beyond the measured
+    intensities, sigma stays that of the nearest one.
 
     >>> from clpipe.stage import run_reference
     >>> grey = np.full((300, 300, 3), 0.5, np.float32)
@@ -135,14 +138,14 @@ class IntensityDependent(Matched):
 
     method: ClassVar = "intensity_dependent"
     kernel: ClassVar = "picture_noise_intensity_dependent"
-    summary: ClassVar = "independent Gaussian noise, sigma by intensity as a table (SyB3R)"
+    summary: ClassVar = "independent Gaussian noise, sigma from a table by intensity (SyB3R)"
     example: ClassVar = {"sigma": [0.01, 0.08, 0.03]}
 
     sigma: Annotated[Sigmas | tuple[Sigmas, Sigmas, Sigmas], BeforeValidator(_as_tuples)] | None = (
         parameter(
             None,
-            "Standard deviations at intensities evenly spaced from 0 to 1, lines between; one "
-            "list, or one each for red, green and blue.",
+            "Standard deviations at intensities evenly spaced from 0 to 1, linear between them: "
+            "one list, or one each for red, green and blue.",
             "of full scale",
             "as measured",
         )
@@ -156,7 +159,7 @@ class IntensityDependent(Matched):
         return self.filled(sigma=tuple(tuple(curve.round(6).tolist()) for curve in curves))
 
     def table(self) -> Floats:
-        """Sigma at 256 intensities of red, of green and of blue, (768,)."""
+        """Sigma at the 256 intensities v = i / 255 of red, of green and of blue, (768,)."""
         assert self.sigma is not None
         return _table(self.sigma)
 
@@ -172,7 +175,7 @@ class IntensityDependent(Matched):
 
 
 def _normals(image: Floats, frame: Frame) -> Floats:
-    """A standard normal a sample, of the image's own stream."""
+    """A standard normal for each sample, (height, width, 3), of the image's stream."""
     stream = frame.stream[NoiseScope.IMAGE]
     return np.stack([normal_at(image.shape, draw, stream) for draw in range(3)], axis=-1)
 
@@ -186,7 +189,10 @@ def _table(sigma: tuple[Any, ...]) -> Floats:
 
 
 class ChannelNoise(NamedTuple):
-    """The noise of one channel: sigma, and sigma by intensity."""
+    """The measured noise of one channel, in display values, 0..1.
+
+    ``sigma`` is that of all samples; ``sigmas`` are those at each ``intensity``, ascending.
+    """
 
     sigma: float
     intensity: tuple[float, ...]
@@ -196,10 +202,10 @@ class ChannelNoise(NamedTuple):
 def measured_noise(path: str) -> tuple[ChannelNoise, ...]:
     """The noise of red, green and blue in a report of ``clpipe measure --json``.
 
-    Read again when the file changes.
+    The file is read again when it changes.
 
     Raises:
-        ValueError: it cannot be read, is no such report, or reports on something else than display
+        ValueError: the file cannot be read, is not such a report, or does not report on display
             values.
     """
     try:

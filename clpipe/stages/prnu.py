@@ -1,4 +1,4 @@
-"""Photo-response non-uniformity."""
+"""Photo-response non-uniformity (PRNU): pixels differ in sensitivity."""
 
 from typing import ClassVar
 
@@ -10,7 +10,9 @@ from clpipe.stage import Context, Frame, GaussianNoise, Kind, NoiseScope, Pass, 
 
 
 class Gaussian(GaussianNoise):
-    """A sensitivity of its own for each pixel, fixed for a camera (EMVA 1288, PRNU).
+    """y * (1 + sigma * n): one sensitivity for each pixel, fixed for a camera (EMVA 1288, PRNU).
+
+    n is a standard normal of the pixel; sigma is relative to the mean sensitivity.
 
     >>> from clpipe.stage import run_reference
     >>> uneven = run_reference(Gaussian(sigma=0.01), np.full((300, 300), 0.5, np.float32))
@@ -19,7 +21,7 @@ class Gaussian(GaussianNoise):
     """
 
     kernel: ClassVar = "prnu"
-    summary: ClassVar = "give each pixel of a camera a sensitivity of its own"
+    summary: ClassVar = "multiply each pixel by a sensitivity, the same in every image of a camera"
 
     sigma: float | None = parameter(
         None,
@@ -37,6 +39,7 @@ class Gaussian(GaussianNoise):
         return (Pass("prnu", arguments=("sigma",), random=NoiseScope.CAMERA),)
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        """(1 + sigma^2) * before + sigma^2 * signal^2, exact for independent noise."""
         return (signal * signal + before) * np.float32(self.sigma) ** 2 + before
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
@@ -44,4 +47,4 @@ class Gaussian(GaussianNoise):
         return image * (normals * np.float32(self.sigma) + np.float32(1))
 
 
-STAGE = Stage("prnu", "Make pixels unequally sensitive.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,))
+STAGE = Stage("prnu", "Make pixels differ in sensitivity.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,))

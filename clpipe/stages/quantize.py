@@ -12,7 +12,7 @@ from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, pa
 
 
 class Linear(Method):
-    """Signal to whole DN, rounded to nearest, clipped to 0..white level.
+    """Signal to DN: black + y * (white - black), rounded to nearest and clipped to 0..white.
 
     >>> from clpipe.stage import run_reference
     >>> signal = np.float32([[-1, 0, 0.1, 0.5, 7]])
@@ -25,7 +25,12 @@ class Linear(Method):
     summary: ClassVar = "round to whole DN and clip to 0..white_level"
 
     bits: int | None = parameter(
-        None, "Bit depth; the camera's levels are scaled to it.", "", "from the levels", ge=8, le=16
+        None,
+        "Bit depth of the raw; the camera's levels are scaled to it.",
+        "",
+        "from the levels",
+        ge=8,
+        le=16,
     )
     black_level: float | None = parameter(
         None, "DN without light.", "DN", "from the camera", ge=0, le=65535
@@ -78,7 +83,7 @@ class Linear(Method):
         }
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        """Rounding adds 1/12 DN^2; clipping, which takes some away, is not modelled."""
+        """In DN^2; rounding adds 1/12, and clipping, which reduces variance, is not modelled."""
         return before * np.float32(self._range**2) + np.float32(1 / 12)
 
     def reference(self, image: Floats, frame: Frame) -> Floats:

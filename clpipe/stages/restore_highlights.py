@@ -1,4 +1,4 @@
-"""Highlights of a photograph, before its white balance is undone."""
+"""Restored highlights: for a photograph, before its white balance is undone."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -10,12 +10,13 @@ from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, pa
 
 
 class Brooks2019(Method):
-    """What is white stays white in the raw, although red and blue are divided by their gains.
+    """Red and blue of nearly white pixels, raised so that dividing by the gains leaves them white.
 
-    A camera's white is where the sensor clips, in all three colours; dividing by the gains alone
-    would tint it. So red and blue are raised to m*gain + 1 - m times what they are, with
-    m = (max(grey - 0.9, 0) / 0.1)^2; inverse_white_balance divides later (Brooks et al.,
-    "Unprocessing images for learned raw denoising", CVPR 2019, sec. 3.3).
+    Where a photograph is white, all three colours of the sensor are clipped; dividing red and blue
+    by their gains would tint it. So each is multiplied by max(m*gain + 1 - m, 1), with
+    m = (max(grey - 0.9, 0) / 0.1)^2, at most 1, and grey the mean of the colours;
+    ``inverse_white_balance`` divides later (Brooks et al., "Unprocessing images for learned raw
+    denoising", CVPR 2019, sec. 3.3).
 
     >>> from clpipe.stage import run_reference
     >>> image = np.float32([[[1, 1, 1], [0.5, 0.5, 0.5]]])
@@ -25,7 +26,7 @@ class Brooks2019(Method):
 
     method: ClassVar = "brooks2019"
     kernel: ClassVar = "restore_highlights"
-    summary: ClassVar = "raise red and blue of what is nearly white by the gains"
+    summary: ClassVar = "raise red and blue of nearly white pixels by the gains"
 
     red_gain: float | None = parameter(
         None, "White balance gain of red, green = 1.", auto="from the camera", gt=0, le=64
@@ -62,7 +63,7 @@ class Brooks2019(Method):
 
 STAGE = Stage(
     "restore_highlights",
-    "Give a photograph's white back what clipping took from red and blue.",
+    "Give the highlights of a photograph the red and blue that clipping took.",
     Kind.RGB,
     Kind.RGB,
     (Brooks2019,),

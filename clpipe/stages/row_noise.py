@@ -1,4 +1,4 @@
-"""Noise that a whole row shares."""
+"""Row noise: offsets that all pixels of a row share, from the readout of that row."""
 
 from typing import ClassVar
 
@@ -10,7 +10,9 @@ from clpipe.stage import Access, Context, Frame, GaussianNoise, Kind, NoiseScope
 
 
 class Gaussian(GaussianNoise):
-    """One Gaussian offset a row, new in each image.
+    """y + sigma * n_r: one Gaussian offset for each row, new in each image.
+
+    n_r is a standard normal of row r; sigma is in signal units.
 
     >>> from clpipe.stage import run_reference
     >>> noisy = run_reference(Gaussian(sigma=0.01), np.zeros((1000, 2), np.float32))
@@ -19,7 +21,7 @@ class Gaussian(GaussianNoise):
     """
 
     kernel: ClassVar = "line_noise"
-    summary: ClassVar = "add one Gaussian offset a row, new in each image"
+    summary: ClassVar = "add a Gaussian offset to each row, new in each image"
 
     def resolve(self, context: Context) -> "Gaussian":
         return self.filled(sigma=context.camera.row_noise(context.iso))
@@ -42,6 +44,4 @@ class Gaussian(GaussianNoise):
         return image + (normals * np.float32(self.sigma))[:, None]
 
 
-STAGE = Stage(
-    "row_noise", "Add noise that a whole row shares.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,)
-)
+STAGE = Stage("row_noise", "Add an offset to each row.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,))

@@ -8,7 +8,7 @@ typedef struct { uint red_x, red_y; } cfa;
 INLINE bool in_red_row(site at, cfa pattern) { return ((at.y ^ pattern.red_y) & 1) == 0; }
 INLINE vi in_red_column(site at, cfa pattern) { return pattern.red_x ? at.odd : ~at.odd; }
 
-// One value a colour in, the site's own colour's value out.
+// Of three values, one for each colour, the one for the colour of the site.
 INLINE vf by_site(site at, cfa pattern, vf red, vf green, vf blue) {
     const vi red_column = in_red_column(at, pattern);
     return in_red_row(at, pattern) ? (red_column ? red : green) : (red_column ? green : blue);

@@ -1,10 +1,10 @@
-// What demosaicing methods share: values by site, and colours from colour differences.
+// Parts that demosaicing methods share: values by site, and colours from colour differences.
 #ifndef CLPIPE_DEMOSAIC_H
 #define CLPIPE_DEMOSAIC_H
 
-// Two colours (red first) at any site. `own` is the site's own where that is red or blue, `across`
-// the other one there; at green sites `in_row` is that of the two that stands in the site's row,
-// `in_column` the one that stands in its column.
+// Red and blue at any site, chosen from four values. At red and blue sites, `own` is for the site's
+// own colour and `across` for the other one (blue at red sites, red at blue sites). At green sites,
+// `in_row` is for the colour, red or blue, whose sites are in that row, and `in_column` for the other.
 INLINE pair red_and_blue(site at, cfa pattern, vf own, vf in_row, vf in_column, vf across) {
     const vi red_column = in_red_column(at, pattern);
     pair v;
@@ -18,8 +18,8 @@ INLINE pair red_and_blue(site at, cfa pattern, vf own, vf in_row, vf in_column, 
     return v;
 }
 
-// Colour differences R-G and B-G at every pixel, bilinear from plane 0 of an image that holds them
-// at red and blue sites.
+// Colour differences R-G and B-G at every pixel, by bilinear interpolation. Plane 0 of `known` holds
+// R-G at red sites and B-G at blue sites.
 INLINE pair spread_differences(site at, image known, cfa pattern) {
     const vf in_row = (tap_mosaic(known, -1, 0) + tap_mosaic(known, 1, 0)) * 0.5f;
     const vf in_column = (tap_mosaic(known, 0, -1) + tap_mosaic(known, 0, 1)) * 0.5f;
@@ -28,7 +28,7 @@ INLINE pair spread_differences(site at, image known, cfa pattern) {
     return red_and_blue(at, pattern, tap_mosaic(known, 0, 0), in_row, in_column, across);
 }
 
-// The sample that the sensor took, and the other colours that follow from it and from R-G and B-G.
+// RGB from the sensor's sample, R-G and B-G. The sample stays as it is.
 INLINE rgb from_differences(site at, cfa pattern, vf sample, pair differences) {
     const vf red = differences.first, blue = differences.second;
     const vf green = by_site(at, pattern, sample - red, sample, sample - blue);

@@ -1,4 +1,4 @@
-// Eight-bit interleaved pixels, as an image file wants them.
+// Interleaved pixels of eight bits, as image files have them.
 #ifndef CLPIPE_DISPLAY_H
 #define CLPIPE_DISPLAY_H
 
@@ -8,7 +8,7 @@ INLINE vi to_8_bit(vf v) {
     return to_int(nearest(inside * 255.0f));
 }
 
-// Three channels of levels, or of indices into a table of levels if there is one.
+// Stores three channels of levels, or of indices into a table of levels if there is one.
 typedef struct {
     int r[LANES], g[LANES], b[LANES];
     __global const uchar *table;
@@ -24,7 +24,7 @@ INLINE void store_levels(const levels *v, __global uchar *dst, site at, extent e
     __global uchar *p = dst + 3 * pixel_number(at, e);
 #if LANES > 1
     if (x + LANES <= e.columns) {
-        // Whole words: a store for each byte is what takes the time.
+        // Whole words, because a store for each byte would take most of the time.
         typedef uint unaligned_uint __attribute__((aligned(1)));
         __global unaligned_uint *word = (__global unaligned_uint *)p;
 #pragma unroll

@@ -1,9 +1,9 @@
 // Where a block of lanes stands, and how lanes are read from and written to images.
 //
-// A stored image is one to three planes of float32. Its rows are `pitch` apart and it is
-// surrounded by a border of `border` pixels that mirrors the image (reflect-101: the edge pixel is
-// not repeated, so the phase of a Bayer pattern goes on). Whoever writes a pixel writes its mirror
-// images in the border too, so a stencil never has to look where it is.
+// A stored image is one to three planes of float32. Its rows are `pitch` apart, and it is surrounded
+// by a border of `border` pixels that mirrors the image (reflect-101: the edge pixel is not repeated,
+// so the Bayer pattern continues in the border). Whatever writes a pixel also writes its mirror
+// images in the border, so a stencil never has to check where it is.
 #ifndef CLPIPE_IMAGE_H
 #define CLPIPE_IMAGE_H
 
@@ -12,9 +12,9 @@ typedef struct {
     vi odd;     // -1 in the lanes whose column is odd, else 0
 } site;
 
-// What is stored is the whole image or a tile of it with its halo: a site is a place in the image, and
-// `left`, `top` is where the planes begin in it. A tile has a border too; at edges that are none of
-// the image it mirrors what nobody uses, because the halo is wide enough.
+// Stored is the whole image or a tile of it with its halo. A site is a place in the image, and `left`,
+// `top` is where the planes begin in it. A tile has a border too; at edges that are not the image's it
+// mirrors pixels that nothing uses, because the halo is wide enough.
 typedef struct {
     uint width, height;  // of the image
     uint pitch;
@@ -23,16 +23,16 @@ typedef struct {
     uint border;         // around the planes, in pixels: as wide as the plan's widest stencil
 } extent;
 
-// The pixels that a tile is there for, without its halo.
+// The pixels of a tile without its halo.
 typedef struct { uint left, top, right, bottom; } core;
 
 typedef struct { vf r, g, b; } rgb;
 typedef struct { vf y, cb, cr; } ycbcr;
 typedef struct { vf first, second; } pair;
 
-// Planes of a stored image, each pointing at the first lane of the block's first row, and the row
-// of the block that is being done. All rows tap from the same pointers, so that the compiler sees
-// which taps of two rows are the same and loads them once.
+// Planes of a stored image, each pointing at the first lane of the block's first row, and the current
+// row of the block. All rows tap from the same pointers, so that the compiler sees which taps of two
+// rows are the same, and loads them once.
 typedef struct {
     __global const float *plane0, *plane1, *plane2;
     uint pitch;
@@ -41,7 +41,7 @@ typedef struct {
 } image;
 
 INLINE site site_at(uint x, uint y) {
-    // x is a multiple of LANES, so from two lanes up the parity of a lane is a constant.
+    // x is a multiple of LANES, so with two lanes or more the parity of each lane is a constant.
     const site at = {x, y, -((iota() + (vi)((int)(LANES == 1 ? x : 0))) & 1)};
     return at;
 }
@@ -51,7 +51,7 @@ INLINE site shifted(site at, int dx, int dy) {
     return to;
 }
 
-// In what has no border and no padding: source and result.
+// The index of a pixel in images without border and padding: the source and the result.
 INLINE size_t pixel_number(site at, extent e) {
     return (size_t)(at.y - e.top) * e.columns + (at.x - e.left);
 }
@@ -63,7 +63,7 @@ INLINE size_t plane_offset(site at, extent e) {
     return (size_t)(at.y - e.top + e.border) * e.pitch + border_left(e) + (at.x - e.left);
 }
 
-// Where the image's first pixel would be, so that its pixels can be found by their places in it.
+// The address that the image's first pixel would have, from which places in the image are counted.
 INLINE __global const float *image_origin(__global const float *plane, extent e) {
     return plane + ((long)e.border - (long)e.top) * (long)e.pitch + (long)border_left(e) -
            (long)e.left;

@@ -96,7 +96,7 @@ INLINE vu join_lanes(vh even, vh odd) { return (uint)even; }
 #else
 #define AS_HALVES as_ulong8
 #endif
-// The even and the odd lanes as 64-bit numbers; the upper halves of the even ones are rubbish.
+// The even and the odd lanes as 64-bit numbers; the upper halves of the even ones are undefined.
 INLINE vh even_lanes(vu v) { return AS_HALVES(v); }
 INLINE vh odd_lanes(vu v) { return AS_HALVES(v) >> (vh)(32); }
 // Back again, from the lower halves.

@@ -3,8 +3,9 @@
 #ifndef CLPIPE_MATH_H
 #define CLPIPE_MATH_H
 
-// -ln(t) for t > 0; relative error 3e-7. Only * and +, so NumPy gives the same bits. Polynomials
-// are summed in pairs (Estrin), not one power after the other: the wait for each sum is what costs.
+// -ln(t) for t > 0; error 4e-7, relative where |ln(t)| is above 1, else absolute. Only * and +, so
+// NumPy gives the same bits. Polynomials are summed in pairs (Estrin), not one power after the other,
+// because waiting for each sum is what takes the time.
 INLINE vf negative_log(vf t) {
     const vi bits = float_bits(t);
     const vi exponent = (bits - 0x3f3504f3) >> 23;  // mantissa in [sqrt(1/2), sqrt(2))
@@ -27,7 +28,7 @@ INLINE vf inverse_root(vf x) {
 // sqrt(x) for x >= 0; relative error 5e-6.
 INLINE vf square_root(vf x) { return x * inverse_root(x); }
 
-// 2^x = s * (1 + e) for |x| < 126: s, a whole power, and e, which is small where x is. Only * and +.
+// 2^x = s * (1 + e) for |x| < 126: s is a whole power of two, e is accurate near x = 0. Only * and +.
 INLINE vf power_of_two(vf x, __private vf *e) {
     const vf whole = nearest(x);
     const vf f = x - whole;
@@ -37,7 +38,8 @@ INLINE vf power_of_two(vf x, __private vf *e) {
     return bits_to_float((to_int(whole) + 127) << 23);
 }
 
-// e^x and e^x - 1 for |x| < 87; relative error 1e-6, the latter near 0 too.
+// e^x and e^x - 1 for |x| < 87; relative error 1e-6 for |x| < 20 and 4e-6 beyond, for the latter also
+// near 0.
 INLINE vf exponential(vf x) {
     vf e;
     const vf s = power_of_two(x * 1.442695f, &e);
@@ -50,8 +52,8 @@ INLINE vf exponential_minus_1(vf x) {
     return s * e + (s - 1.0f);
 }
 
-// 2^x for x <= 0; relative error 8e-5. Below 2^-30 it stays there: a filter weight that small is
-// nothing, and smaller ones would turn into denormals, which are slow.
+// 2^x for x <= 0, at least 2^-30; relative error 8e-5. Filter weights below that do not matter, and
+// denormals are slow.
 INLINE vf exp2_of_negative(vf x) {
 #pragma OPENCL FP_CONTRACT ON
     const vf round_magic = (vf)(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer

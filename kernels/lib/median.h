@@ -1,15 +1,15 @@
 // Medians of the 3x3 and 5x5 pixels around a pixel, in one plane.
 //
-// Both sort the rows of the window first. A sorted row is the same for every window that it is in,
-// and the rows that the windows of lines 2n and 2n+1 share are taken first and in the same order in
-// both; so a work item, which does both lines, does this work once (the compiler sees to it, and
-// drops the halves of exchanges that nothing uses).
+// Both sort the rows of the window first. A sorted row is the same for every window that holds it, and
+// the rows that the windows of lines 2n and 2n+1 share are sorted first and in the same order in both.
+// So the compiler computes them once for a work item, which does both lines. It also drops the halves
+// of exchanges that nothing uses.
 #ifndef CLPIPE_MEDIAN_H
 #define CLPIPE_MEDIAN_H
 
 #define ORDER(a, b) { const vf smaller = vmin(a, b); b = vmax(a, b); a = smaller; }
 
-// In ascending order.
+// Sorts three values in ascending order.
 typedef struct { vf a, b, c; } sorted3;
 typedef struct { vf a, b, c, d, e; } sorted5;
 
@@ -30,7 +30,7 @@ INLINE sorted5 sort5(vf a, vf b, vf c, vf d, vf e) {
     return s;
 }
 
-// Four are sorted, then the fifth is put in its place.
+// Sorts four values, then inserts the fifth.
 INLINE sorted5 sort4_and_insert(vf a, vf b, vf c, vf d, vf x) {
     ORDER(a, b) ORDER(c, d)
     ORDER(a, c) ORDER(b, d)
@@ -42,17 +42,17 @@ INLINE sorted5 sort4_and_insert(vf a, vf b, vf c, vf d, vf x) {
 
 INLINE vf median3(vf a, vf b, vf c) { return vmax(vmin(a, b), vmin(vmax(a, b), c)); }
 
-// Of three sorted rows, in any order: the median is that of the largest of the small ones, the
-// median of the middle ones and the smallest of the large ones (Smith 1996).
+// The median of three sorted rows, in any order: the median of the largest of their first values, the
+// median of their middle values and the smallest of their last values (Smith 1996).
 INLINE vf median9(sorted3 p, sorted3 q, sorted3 r) {
     return median3(vmax(vmax(p.a, q.a), r.a), median3(p.b, q.b, r.b),
                    vmin(vmin(p.c, q.c), r.c));
 }
 
-// Of five sorted rows, in any order. Sorted by columns too, 12 of the 25 cannot be the median: a
-// value in row i and column j has i*j - 1 that are not larger and (6-i)*(6-j) - 1 that are not
-// smaller. Among the other 13 the search below leaves out whatever is known to lie on one side; it
-// holds for all 252 ways in which zeros and ones can be sorted by rows and columns, and so for all
+// The median of five sorted rows, in any order. With columns sorted too, 12 of the 25 values cannot be
+// the median: the value in row i and column j has i*j - 1 that are not larger and (6-i)*(6-j) - 1 that
+// are not smaller. Among the other 13, the search below drops whatever must lie on one side. It is
+// right for all 252 ways in which zeros and ones can be sorted by rows and columns, and so for all
 // values (Knuth's zero-one principle).
 INLINE vf median25(sorted5 p, sorted5 q, sorted5 r, sorted5 s, sorted5 t) {
     const sorted5 column1 = sort4_and_insert(p.a, q.a, r.a, s.a, t.a);
@@ -76,7 +76,7 @@ INLINE vf median25(sorted5 p, sorted5 q, sorted5 r, sorted5 s, sorted5 t) {
 }
 #undef ORDER
 
-// Of the pixels around the block at `i`, whose samples are in `plane`.
+// The median of the 3x3 or 5x5 pixels around those at `i`, whose samples are in `plane`.
 INLINE vf median_3x3(__global const float *plane, image i) {
 #define ROW(dy) sort3(TAP(dy, -1), TAP(dy, 0), TAP(dy, 1))
 #define TAP(dy, dx) tap_plane(plane, i, dx, dy)

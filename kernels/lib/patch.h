@@ -1,8 +1,8 @@
-// What non-local means over 3x3 patches share: a block of 4 rows and COLUMNS vectors at once, which
-// is the block that the pass declares. Columns of three squared differences are written down once,
-// and added up across from wherever a patch begins. The first patch begins a pixel to the left of
-// the block and the last one ends a pixel to its right, so there are more columns of differences
-// than of pixels.
+// Parts that non-local means over 3x3 patches share. They work on blocks of 4 rows and COLUMNS
+// vectors, as the pass declares. Sums of three squared differences, one below the other, are stored
+// once, and each patch adds three of them side by side. The first patch begins a pixel to the left of
+// the block and the last one ends a pixel to its right, so there are more columns of sums than of
+// pixels.
 #ifndef CLPIPE_PATCH_H
 #define CLPIPE_PATCH_H
 

@@ -4,8 +4,8 @@
 #ifndef CLPIPE_POISSON_H
 #define CLPIPE_POISSON_H
 
-#define POISSON_LARGE 10.0f  // from this mean on the expansion is better than the sum is cheap
-#define POISSON_TERMS 36     // a Poisson number of mean 10 is above with a probability of 1e-10
+#define POISSON_LARGE 10.0f  // the mean from which on the expansion is used
+#define POISSON_TERMS 36     // a Poisson number of mean 10 exceeds this with a probability of 1e-10
 
 __constant float POISSON_INVERSES[POISSON_TERMS + 1] = {
     0.0f,         1.0f,         1.0f / 2.0f,  1.0f / 3.0f,  1.0f / 4.0f,  1.0f / 5.0f,
@@ -16,8 +16,9 @@ __constant float POISSON_INVERSES[POISSON_TERMS + 1] = {
     1.0f / 30.0f, 1.0f / 31.0f, 1.0f / 32.0f, 1.0f / 33.0f, 1.0f / 34.0f, 1.0f / 35.0f,
     1.0f / 36.0f};
 
-// Of a mean below POISSON_LARGE. The number is how many k have a CDF below u; in the upper half how
-// many k have a rest above 1 - u. Both sums begin with their small terms, so the tails are exact too.
+// For a mean below POISSON_LARGE. The number is how many k have a CDF below u; for u above 1/2, how
+// many k have P(X >= k) above 1 - u. Both sums begin with their smallest terms, which keeps the tails
+// exact.
 INLINE vf poisson_small(vf mean, vu word) {
     const vf p = tail_probability(word);
     vf terms[POISSON_TERMS + 1];
@@ -40,14 +41,15 @@ INLINE vf poisson_small(vf mean, vu word) {
     return in_upper_half(word) ? upper : lower;
 }
 
-// Of a mean from POISSON_LARGE on: the continuous quantile, whose whole part is the number, as
-// mean + sqrt(mean) w + w^2 A(s) + B(s) + C(s) / mean, w the normal quantile, s = w / sqrt(mean),
-// the form of Temme's expansion. A, B, C: our own weighted least-squares fit; error 3e-4 of a number
-// within 3 sigma, 4e-3 within 5. The mean's whole part is added last, so large means lose nothing.
+// For a mean from POISSON_LARGE on: the whole part of the continuous quantile
+// mean + sqrt(mean) w + w^2 A(s) + B(s) + C(s) / mean, with w the normal quantile and
+// s = w / sqrt(mean), the form of Temme's expansion. A, B and C are our own weighted least-squares
+// fits; the error is 3e-4 of a number within 3 sigma and 4e-3 within 5. The mean's whole part is added
+// last, so that large means lose no digits.
 INLINE vf poisson_large(vf mean, vu word) {
     const vf w = normal_of(word);
     const vf r = inverse_root(mean);
-    const vf s = vmax(w * r, (vf)(-1.3f));  // below, it is 0 anyway
+    const vf s = vmax(w * r, (vf)(-1.3f));  // below that, the number is 0 anyway
     const vf s2 = s * s, s4 = s2 * s2;
     const vf a0 = (s * -0.01394692063331604f + 0.16666667f) +
                   (s * -0.001212189788930118f + 0.003954051993787289f) * s2;

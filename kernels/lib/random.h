@@ -13,7 +13,7 @@ typedef struct { vu word0, word1, word2, word3; } words;
 
 typedef struct { vh c0, c1, c2, c3; } counters;
 
-// Ten rounds on 64-bit numbers whose upper halves are rubbish: the multiply ignores them.
+// Ten rounds on 64-bit numbers whose upper halves are undefined; the multiplication ignores them.
 INLINE counters philox_rounds(vh c0, vh c1, vh c2, vh c3, stream s) {
     const vh mask = (vh)(0xffffffffUL);
     uint k0 = s.key0, k1 = s.key1;
@@ -40,8 +40,8 @@ INLINE words philox(vu x, uint y, uint draw, stream s) {
     return w;
 }
 
-// A random word as a probability u: its lower 31 bits give the tail probability in (0, 1/2], which is
-// u or 1 - u, and its top bit the half of the distribution.
+// A random word as a probability u: its lower 31 bits give the probability of the nearer tail, u or
+// 1 - u, in (0, 1/2]; its top bit gives the half of the distribution.
 INLINE vf tail_probability(vu word) {
     return (to_float(signed_bits(word) & 0x7fffffff) + 0.5f) * 2.3283064e-10f;
 }
@@ -50,7 +50,7 @@ INLINE vi in_upper_half(vu word) { return signed_bits(word) >= 0; }
 
 // Standard normal from one random word, by inverse CDF. Form after Giles ("Approximating the erfinv
 // function", GPU Computing Gems 2011), a polynomial in sqrt(w), w = -ln(4p(1-p)); our own fit,
-// relative error 4e-5 out to 6.2 sigma. Only * + and bit operations, so NumPy gives the same bits.
+// relative error 8e-5, up to 6.3 sigma. Only * + and bit operations, so NumPy gives the same bits.
 INLINE vf normal_of(vu word) {
     const vf p = tail_probability(word);
     const vf s = square_root(vmax(negative_log(4.0f * p * (1.0f - p)), (vf)(0.0f))) - 2.25f;
@@ -62,7 +62,7 @@ INLINE vf normal_of(vu word) {
     return bits_to_float(float_bits(z) ^ (signed_bits(word) & (int)0x80000000));
 }
 
-// The random word of a pixel. Four rows share one Philox call, which the compiler finds by itself.
+// The random word of a pixel. Four rows share one Philox call; the compiler sees that by itself.
 INLINE vu word_at(site at, uint draw, stream s) {
     const words w = philox(lane_indices(at.x), at.y >> 2, draw, s);
     const vu upper = (at.y & 1) ? w.word1 : w.word0, lower = (at.y & 1) ? w.word3 : w.word2;

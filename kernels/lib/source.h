@@ -1,6 +1,6 @@
 // Lanes out of an image, or a tile of it, as a file holds it: interleaved channels, half or float, no
 // padding between rows. The buffer has room for whole blocks beyond its last pixel, so a block at the
-// right or lower edge may read on; what it reads there is never stored.
+// right or lower edge may read beyond the image; what it reads there is never stored.
 #ifndef CLPIPE_SOURCE_H
 #define CLPIPE_SOURCE_H
 

@@ -1,5 +1,5 @@
 // Sums over an image in integers: exact, so order, lanes, tiles and devices do not matter.
-// A block writes one int4 of partial sums, one a site of the 2x2 cell of a mosaic:
+// A block writes one int4 of partial sums, one for each site of the 2x2 cell of a mosaic:
 // (even x, even y), (odd x, even y), (even x, odd y), (odd x, odd y).
 #ifndef CLPIPE_SUMS_H
 #define CLPIPE_SUMS_H

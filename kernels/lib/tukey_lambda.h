@@ -3,8 +3,8 @@
 #ifndef CLPIPE_TUKEY_LAMBDA_H
 #define CLPIPE_TUKEY_LAMBDA_H
 
-// (q^lambda - p^lambda) / lambda times what makes its variance 1, for the tail probability p and
-// q = 1 - p. Only * + and bit operations, so NumPy gives the same bits.
+// (q^lambda - p^lambda) / lambda, scaled to variance 1, for the tail probability p and q = 1 - p. Only
+// * + and bit operations, so NumPy gives the same bits.
 INLINE vf tukey_lambda_of(vu word, float shape, float scale) {
     const vf p = tail_probability(word);
     const vf low = exponential_minus_1(negative_log(p) * -shape);

@@ -1,5 +1,8 @@
-"""Noise parameters of a sensor from its frames: statistics on arrays, a profile, a picture.
+"""Calibration: the noise parameters of a sensor from its frames, as a camera profile.
 
-``frames`` groups files by ISO; ``calibrate`` finds the parameters of one ISO; ``profile`` writes
-what was found as a camera profile. It imports ``images`` and ``camera``, and no device.
+``files`` is the whole way: ``frames`` reads what each file says of its camera, ``groups`` joins
+frames of one ISO, ``calibrate`` estimates the parameters of one ISO, ``gain_stages`` cuts ISOs
+where the conversion gain changes, ``profile`` writes the TOML and ``plot`` draws the fit. The
+statistics behind ``calibrate`` work on arrays alone: ``line_fit``, ``repeats``, ``single_image``,
+``dark``, ``fixed_pattern``, ``checks``.
 """

@@ -1,4 +1,4 @@
-"""What stays put from frame to frame: column offsets, DSNU, PRNU, hot and dead pixels."""
+"""Fixed-pattern noise, the same in every frame: columns, DSNU, PRNU, hot and dead pixels."""
 
 from dataclasses import dataclass
 
@@ -8,28 +8,20 @@ from clpipe.analysis.calibration.line_fit import Estimate, Line
 from clpipe.analysis.calibration.repeats import Sensor, Stack
 from clpipe.base.types import Array, Floats
 
-SURE = 7.0  # standard deviations that none of 1e8 pixels lies out by chance
-
-
-BLOCK = 16  # pixels of one colour, a side
-
-
-LEAST_BLOCKS = 30
-
-
-DARKEST = 0.05  # signal of a block that tells PRNU
-
-
-UNEVEN = 0.03  # relative standard deviation of the scene in a block
-
-
-LEAST_DEVIATION = 0.05  # DN, in a mean dark frame
+SURE = 7.0  # standard deviations; by chance not one of 1e8 pixels is further out
+# Choices; tests/test_calibrate.py shows what they find and refuse.
+BLOCK = 16  # px of one colour, the side of a block
+LEAST_BLOCKS = 30  # flat blocks that PRNU needs
+DARKEST = 0.05  # signal units, the least light of a block that shows PRNU
+UNEVEN = 0.03  # relative standard deviation of the scene in a flat block, at most
+LEAST_DEVIATION = 0.05  # DN, the least deviation that a mean dark frame is taken to have
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """Bad pixels: rows and columns, how far each lies above its neighbours in DN, and the share of
-    the sensor on which one would have been seen.
+    """Hot or dead pixels: their rows and columns, and their excess over their neighbours in DN.
+
+    ``seen_on`` is the share of the sensor on which such a pixel would have been found.
     """
 
     rows: Array
@@ -38,19 +30,22 @@ class Pixels:
     seen_on: float
 
     def record(self) -> dict[str, object]:
-        """Positions as [column, row], and the share of the pixels that could be judged."""
+        """Positions as [column, row] and excess in DN, as JSON values."""
         at = np.stack([self.columns, self.rows], axis=1).tolist()
         return {"positions": at, "excess_dn": np.round(self.excess, 2).tolist()}
 
 
-def _found(mask: Array, excess: Array, seen_on: float) -> Pixels:
+def _pixels(mask: Array, excess: Array, seen_on: float) -> Pixels:
+    """The pixels where a mask is True."""
     rows, columns = np.nonzero(mask)
     return Pixels(rows, columns, excess[mask].astype(np.float64), seen_on)
 
 
 def hot_in_dark(dark: Floats, sensor: Sensor) -> Pixels:
-    """Hot pixels of a mean dark frame: 7 standard deviations above the median of the 3x3 pixels of
-    the same colour; the deviation is a quarter of what the middle 95 % of all pixels span.
+    """Hot pixels of a mean dark frame, (height, width) in DN.
+
+    They are 7 standard deviations above the median of the 3x3 pixels of the same colour. The
+    standard deviation is a quarter of the range from -2 to 2 sigma (95 %) of all pixels.
     """
     from scipy.ndimage import median_filter
     from scipy.stats import norm
@@ -61,14 +56,14 @@ def hot_in_dark(dark: Floats, sensor: Sensor) -> Pixels:
         excess[site] = dark[site] - median_filter(dark[site], 3, mode="mirror")
         low, high = np.quantile(excess[site], norm.cdf([-2, 2]))
         hot[site] = excess[site] > SURE * max((high - low) / 4, LEAST_DEVIATION)
-    return _found(hot, excess, 1.0)
+    return _pixels(hot, excess, 1.0)
 
 
 def hot_in_scene(stack: Stack, line: Line) -> Pixels:
-    """Hot pixels of a scene, brighter than the brightest of the 8 neighbours of the same colour.
+    """Hot pixels of a scene: those that exceed all 8 neighbours of the same colour by far.
 
-    They are so by 7 standard deviations of the mean, by all that these neighbours differ among
-    themselves, and by three times what any adjacent pixel differs from its own.
+    The excess must be above 7 standard deviations of the mean plus the range of these neighbours,
+    and above three times the excess of any adjacent pixel over its own neighbours.
     """
     from scipy.ndimage import maximum_filter
 
@@ -80,21 +75,23 @@ def hot_in_scene(stack: Stack, line: Line) -> Pixels:
     nearby[1, 1] = False
     hot = excess > np.maximum(SURE * deviation + (high - low), 0)
     hot &= excess > 3 * maximum_filter(out, footprint=nearby, mode="mirror")
-    return _found(stack.used & hot, excess, 1.0)
+    return _pixels(stack.used & hot, excess, 1.0)
 
 
 def dead_in_scene(stack: Stack, line: Line) -> Pixels:
-    """Dead pixels: without light, where all 8 neighbours of the same colour have much, and more
-    than they differ among themselves.
+    """Dead pixels of a scene: without light where all 8 neighbours of the same colour have light.
+
+    Without light is less than 7 standard deviations of the dark; the neighbours must have four
+    times as much, and more than their range.
     """
     low, high = _extremes(stack)
-    nothing = SURE * float(np.sqrt(line.at(np.zeros(1))[0] / len(stack.rest)))
-    lit = low > np.maximum(4 * nothing, high - low)
-    return _found(lit & (stack.light < nothing), stack.light - low, float(lit.mean()))
+    dark = SURE * float(np.sqrt(line.at(np.zeros(1))[0] / len(stack.rest)))
+    lit = low > np.maximum(4 * dark, high - low)
+    return _pixels(lit & (stack.light < dark), stack.light - low, float(lit.mean()))
 
 
 def _extremes(stack: Stack) -> tuple[Floats, Floats]:
-    """The least and the largest of each pixel's 8 neighbours of the same colour."""
+    """The smallest and the largest light of each pixel's 8 neighbours of the same colour, DN."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     around = np.ones((3, 3), bool)
@@ -113,13 +110,14 @@ def dark_pattern(
 
     Args:
         dark: the mean of the dark frames, DN.
-        temporal: the variance that a pixel of it has from its frames' noise, row noise apart, DN^2.
+        temporal: the variance that the frames' noise leaves in a pixel of it, without row noise,
+            DN^2.
         bad: hot pixels, which are left out.
-        sensor: its pattern; each channel's mean is taken out, as channels may differ in black.
+        sensor: its pattern; each channel's mean is subtracted, as channels may differ in black.
 
     Returns:
-        Columns, corrected for what all pixel scatter leaves in a column's mean; DSNU, after
-        columns and rows are taken out, corrected for the temporal noise that is left.
+        The variance of columns, without what the scatter of pixels leaves in a column's mean; and
+        that of DSNU, with columns and rows subtracted, without the temporal noise.
     """
     values = dark.astype(np.float64)
     good = np.ones(dark.shape, bool)
@@ -132,7 +130,7 @@ def dark_pattern(
     in_column = good.sum(axis=0).clip(1)
     columns = values.sum(axis=0) / in_column
     values -= columns * good
-    # Rows and columns took degrees of freedom along.
+    # The means of rows and columns cost degrees of freedom.
     freedom = good.sum() * (1 - 1 / height) * (1 - 1 / width)
     scatter = (values**2).sum() / freedom
     scatter_error = np.sqrt(max((values**4).sum() / freedom - scatter**2, 0) / freedom)
@@ -145,17 +143,17 @@ def dark_pattern(
 
 
 def response_pattern(stack: Stack, line: Line, dsnu: float) -> Estimate | None:
-    """PRNU squared, from places where the scene is flat; None where it has too few.
+    """PRNU squared, from places where the scene is flat; None where there are too few.
 
-    In blocks of 16x16 pixels of one colour, a smooth surface and the means of rows and columns are
-    taken out. What then scatters, less temporal noise and DSNU, is (PRNU * light)^2. A block is
-    flat where that surface is nearly level and diagonal neighbours do not scatter together; and all
-    flat blocks must tell the same PRNU, else it is the scene's texture.
+    From blocks of 16x16 pixels of one colour, a smooth surface and the means of rows and columns
+    are subtracted. The variance that remains, without temporal noise and DSNU, is (PRNU * light)^2.
+    A block is flat where that surface is nearly level and diagonal neighbours are uncorrelated. All
+    flat blocks must agree on the PRNU, else it is taken for texture of the scene.
 
     Args:
         stack: the frames of a scene.
-        line: their noise, DN^2, rounding included.
-        dsnu: variance of DSNU in DN^2, 0 where it is not known.
+        line: their noise, rounding included.
+        dsnu: the variance of DSNU in DN^2, 0 where it is unknown.
     """
     surface = _surface()
     freedom = BLOCK**2 - surface.shape[1]
@@ -188,8 +186,9 @@ def response_pattern(stack: Stack, line: Line, dsnu: float) -> Estimate | None:
 
 
 def _surface() -> Array:
-    """What is taken out of a block, as orthonormal columns: each row's and each column's mean, and
-    a surface of the fourth degree.
+    """What is subtracted from a block, as orthonormal columns, (BLOCK^2, functions).
+
+    These are the mean of each row and column, and a polynomial surface of the fourth degree.
     """
     one = np.linspace(-1, 1, BLOCK)
     row, column = np.repeat(np.eye(BLOCK), BLOCK, axis=0), np.tile(np.eye(BLOCK), (BLOCK, 1))

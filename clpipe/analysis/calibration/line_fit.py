@@ -1,9 +1,10 @@
 """The line variance = gain*light + floor through the pixels of repeated frames.
 
-What a pixel's frames say of its light is noisy itself, and a plain least-squares line through noisy
-abscissas is too flat. So the line is found with an instrument (Fuller, Measurement Error Models,
-1987, sec. 1.4): the mean of neighbours of the same colour, which follows the light but shares no
-noise with the pixel. Only sums by classes of the instrument are kept, so a line costs nothing.
+A pixel's mean over the frames is itself noisy, and a plain least-squares line through noisy
+abscissas is too flat. So the line is fitted with an instrumental variable (Fuller, Measurement
+Error Models, 1987, sec. 1.4): the mean of neighbours of the same colour, which follows the light
+but shares no noise with the pixel. Only sums by classes of the instrument are stored, so that a fit
+costs little.
 """
 
 from collections.abc import Sequence
@@ -15,22 +16,12 @@ from numpy.typing import NDArray
 
 from clpipe.base.types import Array
 
-CLASSES = 2048
-
-
-GROUPS = 64  # of rows
-
-
+CLASSES = 2048  # of the instrument
+GROUPS = 64  # of rows, for the standard errors
 BINS = 32  # for pictures
-
-
-LEAST_IN_BIN = 50
-
-
-DARKEST = 0.01  # of the pixels
-
-
-ROUNDS = 12  # of weights from the line before
+LEAST_IN_BIN = 50  # pixels
+DARKEST = 0.01  # share of the pixels through which the first weights go
+ROUNDS = 12  # of weights from the line of the round before
 
 
 @dataclass(frozen=True)
@@ -41,17 +32,18 @@ class Estimate:
     error: float
 
     @property
-    def seen(self) -> bool:
-        """Whether it is above zero by more than two standard errors."""
+    def significant(self) -> bool:
+        """Whether the value is above zero by more than two standard errors."""
         return self.value > 2 * self.error
 
     def scaled(self, factor: float) -> "Estimate":
-        """The same in another unit."""
+        """Value and error times a factor, such as that of another unit."""
         return Estimate(self.value * factor, self.error * abs(factor))
 
     def root(self) -> "Estimate":
-        """The standard deviation of a variance; of one that is not above zero, 0 with the deviation
-        that a variance of one standard error would have.
+        """The standard deviation, where this is a variance.
+
+        For a variance that is not above zero it is 0, with the root of the standard error as error.
 
         >>> Estimate(4.0, 0.4).root(), Estimate(-1.0, 0.25).root()
         (Estimate(value=2.0, error=0.1), Estimate(value=0.0, error=0.5))
@@ -64,21 +56,25 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Line:
-    """variance = gain*light + floor: the gain in DN (or DN/e-), the floor in DN^2."""
+    """variance = gain*light + floor, the gain in DN (which is DN/e-), the floor in DN^2.
+
+    ``pixels`` is the number of pixels behind it.
+    """
 
     gain: Estimate
     floor: Estimate
     pixels: int
 
     def at(self, light: Array) -> Array:
-        """The variance at light above black in DN; never less than a ten-thousandth of the gain's
-        share at the white end, so that it can be divided by.
+        """The variance at each light above black in DN; it is safe to divide by.
+
+        It is at least a ten-thousandth of the largest variance that comes out.
         """
         variance = self.gain.value * light + self.floor.value
         return np.maximum(variance, 1e-4 * max(np.max(variance), 1e-9))
 
     def lowered(self, variance: float) -> "Line":
-        """The same less a variance that is known."""
+        """The line with ``variance``, DN^2, subtracted from its floor."""
         floor = Estimate(self.floor.value - variance, self.floor.error)
         return Line(self.gain, floor, self.pixels)
 
@@ -97,8 +93,8 @@ class Line:
 class Table:
     """Sums over pixels by classes of the instrument, in groups of rows.
 
-    ``sums`` is (GROUPS, 4, CLASSES): count, instrument, light and variance; ``squares`` (CLASSES,)
-    has the variance squared. ``degrees`` of freedom are those of each pixel's variance.
+    ``sums`` is (GROUPS, 4, CLASSES): count, instrument, light and variance. ``squares`` is
+    (CLASSES,), the squared variances. ``degrees`` are the degrees of freedom of a pixel's variance.
     """
 
     sums: NDArray[np.float64] = field(repr=False)
@@ -109,15 +105,15 @@ class Table:
     def of(
         variance: Array, light: Array, instrument: Array, rows: Array, unit: float, degrees: int
     ) -> "Table":
-        """The table of some pixels, all arrays alike.
+        """The table of some pixels; all arrays have one value for each pixel.
 
         Args:
-            variance: of each pixel over the frames, DN^2, unbiased.
-            light: mean of each pixel above black, DN.
-            instrument: what follows the light without sharing the pixel's noise, DN.
-            rows: of each pixel; pixels of one row may share noise.
-            unit: white level above black, DN.
-            degrees: frames less one.
+            variance: over the frames, DN^2, unbiased.
+            light: the mean over the frames above black, DN.
+            instrument: a value that follows the light but shares no noise with the pixel, DN.
+            rows: the number of the row; pixels of one row may share noise.
+            unit: the white level minus the black level, DN.
+            degrees: the number of frames minus one.
         """
         place = class_of(instrument, unit)
         grouped = place + CLASSES * (rows % GROUPS)
@@ -131,7 +127,7 @@ class Table:
 
 
 def class_of(instrument: Array, unit: float) -> NDArray[np.intp]:
-    """The class of each value: as wide as the root of the signal, so narrow in the dark.
+    """The class of each value; classes are of equal width in the root of the signal.
 
     >>> class_of(np.array([-3.0, 0.0, 250.0, 9e9]), 1000).tolist()
     [0, 0, 975, 2045]
@@ -141,11 +137,12 @@ def class_of(instrument: Array, unit: float) -> NDArray[np.intp]:
 
 
 def fit_line(tables: Sequence[Table]) -> Line:
-    """The line through tables, and its standard errors.
+    """Fit the line through tables, with its standard errors.
 
-    Weighted by the inverse variance of a sample variance, degrees/(2 variance^2), with the variance
-    from the line itself. Errors by the sandwich formula over groups of rows (Liang and Zeger,
-    Biometrika 1986), so they hold for noise that is not Gaussian, and for what rows share.
+    A pixel's weight is the inverse variance of its sample variance, degrees / (2 variance^2), with
+    the variance from the line itself. The errors come from the sandwich formula over groups of rows
+    (Liang and Zeger, Biometrika 1986), so they also hold for noise that is not Gaussian and for
+    noise that a row shares.
 
     >>> light, rows = np.linspace(0, 900, 1001), np.arange(1001)
     >>> line = fit_line([Table.of(0.5 * light + 4, light, light, rows, 1000, 7)])
@@ -153,7 +150,7 @@ def fit_line(tables: Sequence[Table]) -> Line:
     (0.5, 4.0)
 
     Raises:
-        ValueError: no line is defined: fewer than three pixels, or all alike in light.
+        ValueError: there are fewer than three pixels, or all have the same light.
     """
     groups = np.concatenate([t.sums for t in tables], axis=2)
     degrees = np.repeat([float(t.degrees) for t in tables], CLASSES)
@@ -164,8 +161,9 @@ def fit_line(tables: Sequence[Table]) -> Line:
     total = count.sum()
     if total < 3 or np.ptp(z) == 0:
         raise ValueError("too few pixels count, or all have the same light")
-    # Weights start from a rising line through the darkest pixels and all; they never take a
-    # variance for less than half of the darkest pixels', or few of these could run away with all.
+    # The first weights are those of a rising line through the darkest pixels and the mean of all.
+    # No variance is taken for less than half of the darkest pixels', or the weights of a few pixels
+    # could grow without limit.
     order = np.argsort(z)
     darkest = order[np.cumsum(count[order]) <= max(DARKEST * total, count[order[0]], LEAST_IN_BIN)]
     dark = s[darkest].sum() / count[darkest].sum()
@@ -192,7 +190,7 @@ def fit_line(tables: Sequence[Table]) -> Line:
 
 @dataclass(frozen=True)
 class Bin:
-    """Pixels of about the same light: mean light and mean variance, in DN and DN^2."""
+    """Pixels of similar light: mean light in DN, mean variance and its standard error in DN^2."""
 
     light: float
     variance: float
@@ -201,12 +199,12 @@ class Bin:
 
 
 def binned(table: Table) -> tuple[Bin, ...]:
-    """A table in few bins of equal width in the root of the light, those with enough pixels."""
+    """A table in 32 bins of equal width in the root of the light, without those of few pixels."""
     sums = np.vstack([table.sums.sum(axis=0), table.squares]).reshape(5, BINS, -1).sum(axis=-1)
-    found = []
+    bins = []
     for count, _, light, variance, square in sums.T:
         if count >= LEAST_IN_BIN:
             scatter = max(square / count - (variance / count) ** 2, 0.0)
             error = float(np.sqrt(scatter / count))
-            found.append(Bin(float(light / count), float(variance / count), error, int(count)))
-    return tuple(found)
+            bins.append(Bin(float(light / count), float(variance / count), error, int(count)))
+    return tuple(bins)

@@ -6,46 +6,44 @@ from pathlib import Path
 
 import numpy as np
 
-from clpipe.analysis.calibration.calibrate import Calibration
+from clpipe.analysis.calibration.result import Calibration
 
 COLOURS = {"R": "#c8312b", "G1": "#2f9e44", "G2": "#8fb339", "B": "#2b62c8", "all": "#6b6b6b"}
-
-
 WIDTH = 1600  # px
+COLUMNS = 3  # of panels, one for each ISO
 
 
-COLUMNS = 3
+def plot_calibration(path: Path, calibrations: Sequence[Calibration], title: str) -> None:
+    """Draw a calibration as a PNG, 1600 px wide.
 
-
-def plot_calibration(path: Path, found: Sequence[Calibration], title: str) -> None:
-    """Write a PNG of 1600 px width: for each ISO variance over mean with the fitted line, and the
-    photon-transfer curves of all (log noise over log light), in DN.
+    For each ISO it shows variance over mean with the fitted lines, and below the photon-transfer
+    curves of all ISOs (log noise over log light), all in DN.
 
     Args:
         path: of the PNG.
-        found: one calibration an ISO.
-        title: what was calibrated.
+        calibrations: one calibration for each ISO.
+        title: the name of the camera.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    columns = min(COLUMNS, len(found))
-    rows = math.ceil(len(found) / columns)
+    columns = min(COLUMNS, len(calibrations))
+    rows = math.ceil(len(calibrations) / columns)
     figure = Figure(figsize=(16, 7.5 + 4.2 * rows), dpi=WIDTH / 16, layout="constrained")
     figure.suptitle(title, fontsize=17)
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[4.2 * rows, 7]).ravel()
     panels = np.ravel(upper.subplots(rows, columns, squeeze=False))
-    for panel, one in zip(panels, found, strict=False):
+    for panel, one in zip(panels, calibrations, strict=False):
         _variance_over_mean(panel, one)
-    for panel in panels[len(found) :]:
+    for panel in panels[len(calibrations) :]:
         panel.axis("off")
-    _photon_transfer(lower.subplots(), found)
+    _photon_transfer(lower.subplots(), calibrations)
     canvas = FigureCanvasAgg(figure)
     canvas.print_png(str(path))
 
 
 def _variance_over_mean(panel: object, one: Calibration) -> None:
-    """One ISO: the channels' bins and the line through all."""
+    """Draw one ISO: the channels' bins, their lines, and the line of all channels."""
     from matplotlib.axes import Axes
 
     assert isinstance(panel, Axes)
@@ -75,16 +73,16 @@ def _variance_over_mean(panel: object, one: Calibration) -> None:
     panel.legend(fontsize=9, loc="upper left")
 
 
-def _photon_transfer(panel: object, found: Sequence[Calibration]) -> None:
-    """All ISOs: noise over light, both logarithmic."""
+def _photon_transfer(panel: object, calibrations: Sequence[Calibration]) -> None:
+    """Draw noise over light, both logarithmic, of all ISOs."""
     from matplotlib import colormaps
     from matplotlib.axes import Axes
 
     assert isinstance(panel, Axes)
-    unit = found[0].sensor.unit
-    shades = colormaps["viridis"](np.linspace(0, 0.85, len(found)))
+    unit = calibrations[0].sensor.unit
+    shades = colormaps["viridis"](np.linspace(0, 0.85, len(calibrations)))
     light = np.geomspace(unit * 1e-4, unit, 200)
-    for shade, one in zip(shades, found, strict=True):
+    for shade, one in zip(shades, calibrations, strict=True):
         gain, floor = one.pooled.gain.value, one.pooled.floor.value
         label = f"ISO {one.iso:g}: K {gain:.3g} DN/e⁻, read {one.read_noise.value:.3g} DN"
         panel.plot(light, np.sqrt(np.maximum(gain * light + floor, 1e-9)), color=shade, label=label)

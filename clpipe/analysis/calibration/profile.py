@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.analysis.calibration.calibrate import Calibration, gain_stages
+from clpipe.analysis.calibration.gain_stages import gain_stages
 from clpipe.analysis.calibration.line_fit import Estimate
+from clpipe.analysis.calibration.result import Calibration
 from clpipe.camera.profile import Matrix
 
 Gains = tuple[float, float]
@@ -18,7 +19,7 @@ def profile_text(
     name: str,
     make: str,
     model: str,
-    found: Sequence[Calibration],
+    calibrations: Sequence[Calibration],
     gains: Gains | None = None,
     xyz_to_camera: Matrix | None = None,
 ) -> str:
@@ -28,12 +29,12 @@ def profile_text(
         name: of the profile.
         make: of the camera.
         model: of the camera.
-        found: one calibration an ISO, at least one, all of one sensor.
-        gains: white-balance gains of red and blue, if the frames say them.
-        xyz_to_camera: the camera's matrix, if the frames say it.
+        calibrations: one calibration for each ISO, at least one, all of one sensor.
+        gains: white balance gains of red and blue (green = 1), if the frames state them.
+        xyz_to_camera: the camera's matrix, if the frames state it.
     """
-    found = sorted(found, key=lambda c: c.iso)
-    sensor = found[0].sensor
+    calibrations = sorted(calibrations, key=lambda c: c.iso)
+    sensor = calibrations[0].sensor
     values: dict[str, Any] = {
         "name": name,
         "make": make,
@@ -45,28 +46,28 @@ def profile_text(
     if xyz_to_camera:
         values["xyz_to_camera"] = xyz_to_camera
     sources = {
-        "gain_stages": _gain_source(found),
-        "levels": "as the frames or the options say",
-        "white_balance_gains": "as the frames say" if gains else "not known; 1 stands in",
-        "xyz_to_camera": "as the frames say" if xyz_to_camera else "not known",
-        "full_well": f"not known; {_white_in_electrons(found[0])}",
+        "gain_stages": _gain_source(calibrations),
+        "levels": "as stated by the frames or the options",
+        "white_balance_gains": "as stated by the frames" if gains else "not known; 1 stands in",
+        "xyz_to_camera": "as stated by the frames" if xyz_to_camera else "not known",
+        "full_well": f"not known; {_white_in_electrons(calibrations[0])}",
     }
-    values["iso_range"] = (found[0].iso, found[-1].iso)
-    for key, (value, source) in _fixed_pattern(found).items():
+    values["iso_range"] = (calibrations[0].iso, calibrations[-1].iso)
+    for key, (value, source) in _fixed_pattern(calibrations).items():
         if value is not None:
             values[key] = value
         sources[key] = source
     for key in ("row_noise", "column_noise"):
-        sources[key] = _line_source(found, key)
+        sources[key] = _line_source(calibrations, key)
     lines = [f"{key} = {_toml(value)}" for key, value in values.items()]
-    for stage in gain_stages(found):
+    for stage in gain_stages(calibrations):
         lines += ["", "[[gain_stages]]", *_stage_lines(stage)]
     lines += ["", "[sources]", *(f"{key} = {_toml(text)}" for key, text in sources.items())]
     return "\n".join(lines) + "\n"
 
 
 def _toml(value: Any) -> str:
-    """A text, a number to six digits, or a list of such.
+    """A TOML value: a text, a number to six digits, or a list of these.
 
     >>> _toml((100.0, 1 / 3)), _toml('a "b"')
     ('[100, 0.333333]', '"a \\\\"b\\\\""')
@@ -79,44 +80,44 @@ def _toml(value: Any) -> str:
 
 
 def _stage_lines(stage: Sequence[Calibration]) -> list[str]:
-    """The tables of a gain stage."""
+    """The lines of a gain stage in the profile; tables that lack an ISO are left out."""
     tables: Mapping[str, list[float | None]] = {
         "iso": [c.iso for c in stage],
         "system_gain": [c.pooled.gain.value for c in stage],
         "read_noise": [read_noise(c) for c in stage],
-        "row_noise": [_seen(c.row_noise) for c in stage],
-        "column_noise": [_seen(c.column_noise) for c in stage],
+        "row_noise": [_significant(c.row_noise) for c in stage],
+        "column_noise": [_significant(c.column_noise) for c in stage],
     }
     return [f"{key} = {_toml(row)}" for key, row in tables.items() if None not in row]
 
 
 def read_noise(one: Calibration) -> float:
-    """The read noise in DN; where b is not above zero, what its standard error would make."""
+    """The read noise in DN; where b is not above zero, the root of b's standard error."""
     own = one.read_noise
     return own.value or own.error
 
 
-def _seen(estimate: Estimate | None) -> float | None:
-    """The value, 0 where it is not above zero by two standard errors, None where it is unknown."""
-    return None if estimate is None else estimate.value if estimate.seen else 0.0
+def _significant(estimate: Estimate | None) -> float | None:
+    """The value, or 0 where it is not above zero by two standard errors; None where unknown."""
+    return None if estimate is None else estimate.value if estimate.significant else 0.0
 
 
 def _plus_minus(estimate: Estimate, unit: str = "") -> str:
-    """A value with its error, or below what it is.
+    """A value with its error, or an upper limit where it is not significant.
 
     >>> _plus_minus(Estimate(1.41, 0.012), "DN"), _plus_minus(Estimate(0.0, 0.1), "DN")
     ('1.41 +- 0.012 DN', 'not seen, below 0.2 DN')
     """
     unit = unit and f" {unit}"
-    if not estimate.seen:
+    if not estimate.significant:
         return f"not seen, below {estimate.value + 2 * estimate.error:.2g}{unit}"
     return f"{estimate.value:.4g} +- {estimate.error:.2g}{unit}"
 
 
-def _gain_source(found: Sequence[Calibration]) -> str:
-    """How system gain and read noise were found at each ISO."""
+def _gain_source(calibrations: Sequence[Calibration]) -> str:
+    """The source of system gain and read noise: method, frames and values at each ISO."""
     parts = []
-    for c in found:
+    for c in calibrations:
         frames = f"{c.scene_frames} frame{'s' if c.scene_frames > 1 else ''}"
         if c.dark_frames:
             frames += f" and {c.dark_frames} dark"
@@ -126,76 +127,77 @@ def _gain_source(found: Sequence[Calibration]) -> str:
     return text + "; ".join(parts)
 
 
-def _line_source(found: Sequence[Calibration], key: str) -> str:
-    """Where row or column noise is from."""
-    known = [(c.iso, e) for c in found if (e := getattr(c, key)) is not None]
-    if not known:
+def _line_source(calibrations: Sequence[Calibration], key: str) -> str:
+    """The source of row or column noise."""
+    estimates = [(c.iso, e) for c in calibrations if (e := getattr(c, key)) is not None]
+    if not estimates:
         needs = "two frames" if key == "row_noise" else "dark frames"
         return f"not known, for want of {needs}; zero stands in"
-    told = "; ".join(f"ISO {iso:g} {_plus_minus(e, 'DN')}" for iso, e in known)
+    values = "; ".join(f"ISO {iso:g} {_plus_minus(e, 'DN')}" for iso, e in estimates)
     what = "means of rows" if key == "row_noise" else "means of columns of the mean dark frame"
-    return f"{what}, corrected for pixel noise: {told}"
+    return f"{what}, corrected for pixel noise: {values}"
 
 
 def _white_in_electrons(lowest: Calibration) -> str:
+    """The charge at the white level of the lowest ISO, in words."""
     electrons = lowest.sensor.unit / lowest.pooled.gain.value
     return f"at ISO {lowest.iso:g} the white level is {electrons:.0f} e-, and the ADC clips there"
 
 
 def _weighted(estimates: Sequence[Estimate]) -> Estimate:
-    """The mean of figures by their errors."""
+    """The mean of estimates, weighted by their inverse squared errors."""
     weight = np.array([1 / max(e.error, 1e-12) ** 2 for e in estimates])
     value = float(weight @ [e.value for e in estimates] / weight.sum())
     return Estimate(value, float(weight.sum() ** -0.5))
 
 
-def _fixed_pattern(found: Sequence[Calibration]) -> dict[str, tuple[float | None, str]]:
-    """PRNU, DSNU, hot and dead pixels: the value, None where it is not known, and its source."""
+def _fixed_pattern(calibrations: Sequence[Calibration]) -> dict[str, tuple[float | None, str]]:
+    """PRNU, DSNU, hot and dead pixels by key: the value, None where unknown, and its source."""
     result: dict[str, tuple[float | None, str]] = {}
-    prnu = [c.prnu for c in found if c.prnu]
-    result["prnu"] = (None, "not known: no scene was flat enough, or it was not seen")
+    prnu = [c.prnu for c in calibrations if c.prnu]
+    result["prnu"] = (None, "not known: no scene was flat enough, or it was not significant")
     if prnu:
         mean = _weighted(prnu)
         result["prnu"] = mean.value, f"flat places of the mean frame: {_plus_minus(mean)}"
-    dsnu = {c.iso: c.dsnu.scaled(1 / c.pooled.gain.value) for c in found if c.dsnu}
+    dsnu = {c.iso: c.dsnu.scaled(1 / c.pooled.gain.value) for c in calibrations if c.dsnu}
     result["dsnu"] = (None, "not known, for want of dark frames")
     if dsnu:
         each = "; ".join(f"ISO {iso:g} {_plus_minus(e, 'e-')}" for iso, e in dsnu.items())
-        told = f"pixels of the mean dark frame, temporal noise apart: {each}"
-        result["dsnu"] = _seen(_weighted(list(dsnu.values()))), told
-    result |= _hot(found)
-    judged = [c for c in found if c.dead and c.dead.seen_on > 0.05]
+        source = f"pixels of the mean dark frame, temporal noise subtracted: {each}"
+        result["dsnu"] = _significant(_weighted(list(dsnu.values()))), source
+    result |= _hot(calibrations)
+    judged = [c for c in calibrations if c.dead and c.dead.seen_on > 0.05]
     result["dead_pixel_share"] = (None, "not known: too little light in the frames")
     if judged:
         best = max(judged, key=lambda c: c.dead.seen_on if c.dead else 0)
         assert best.dead
         share = len(best.dead.rows) / (best.dead.seen_on * best.size)
-        told = f"{len(best.dead.rows)} dark among bright neighbours at ISO {best.iso:g}, "
-        told += f"on the {best.dead.seen_on:.0%} of the pixels that had light enough to tell"
-        result["dead_pixel_share"] = share, told
+        source = f"{len(best.dead.rows)} dark among bright neighbours at ISO {best.iso:g}, "
+        source += f"on the {best.dead.seen_on:.0%} of the pixels that had enough light to judge"
+        result["dead_pixel_share"] = share, source
     return result
 
 
-def _hot(found: Sequence[Calibration]) -> dict[str, tuple[float | None, str]]:
-    """Hot pixels, from the dark frames of the ISO that shows most of them."""
-    judged = [c for c in found if c.hot and c.dark_frames]
+def _hot(calibrations: Sequence[Calibration]) -> dict[str, tuple[float | None, str]]:
+    """Hot pixels, from the dark frames of the ISO that shows most of them; as _fixed_pattern."""
+    judged = [c for c in calibrations if c.hot and c.dark_frames]
     if not judged:
-        seen = max((len(c.hot.rows) for c in found if c.hot), default=0)
-        told = "not known, for want of dark frames"
-        if seen:
-            told += f"; {seen} pixels of a scene look hot, but a glint of one pixel does so too"
-        return {"hot_pixel_share": (None, told), "hot_pixel_level": (None, told)}
+        candidates = max((len(c.hot.rows) for c in calibrations if c.hot), default=0)
+        source = "not known, for want of dark frames"
+        if candidates:
+            source += f"; {candidates} pixels of a scene look hot, but so does a glint of one pixel"
+        return {"hot_pixel_share": (None, source), "hot_pixel_level": (None, source)}
     best = max(judged, key=lambda c: len(c.hot.rows) if c.hot else 0)
     assert best.hot
     count = len(best.hot.rows)
-    told = f"{count} among {best.size} pixels, dark frames of ISO {best.iso:g}"
-    share = (count / best.size, told)
+    source = f"{count} among {best.size} pixels, dark frames of ISO {best.iso:g}"
+    share = (count / best.size, source)
     if not count:
         return {"hot_pixel_share": share}
-    # The median of level*(1 + Exp(1)); it does not mind that the hottest ones clip.
+    # The median of level * (1 + Exp(1)) is level * (1 + ln 2), also where the hottest pixels clip.
     median = float(np.median(best.hot.excess))
     level = median / best.pooled.gain.value / (1 + math.log(2))
-    told = f"median charge of {count} hot pixels over 1 + ln 2, as level*(1 + Exp(1)) has it"
+    source = f"median charge of {count} hot pixels over 1 + ln 2, the median of 1 + Exp(1)"
     if median > 0.95 * best.sensor.unit:
-        told += "; most of them clip, so it is more"
-    return {"hot_pixel_share": share, "hot_pixel_level": (level, told)}
+        source += "; most of them clip, so the true level is higher"
+    return {"hot_pixel_share": share, "hot_pixel_level": (level, source)}

@@ -1,4 +1,4 @@
-"""Stacks of frames that show the same: what moves from frame to frame is noise."""
+"""Stacks of frames of one static scene: what varies from frame to frame is noise."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,20 +12,15 @@ from clpipe.base.types import Array, Floats
 from clpipe.reference.cfa import Pattern, red_site
 
 CHANNELS = ("R", "G1", "G2", "B")
-
-
-FAR_FROM_CLIPPING = 4.0  # standard deviations
-
-
-LARGEST_FLICKER = 0.05  # a lamp flickers by less; more is another exposure
-
-
-MOVING = 0.02  # share of the variance that neighbours have in common
+# The limits are choices; tests/test_calibrate.py has a case on each side of the last two.
+FAR_FROM_CLIPPING = 4.0  # standard deviations of a frame
+LARGEST_FLICKER = 0.05  # of the mean brightness; more is taken for another exposure
+MOVING = 0.02  # share of the variance that neighbours share; more is taken for motion
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """What must be known of a sensor to read its frames."""
+    """The pattern and levels of a sensor, which give its frames a meaning."""
 
     pattern: Pattern
     black_level: float  # DN
@@ -33,11 +28,11 @@ class Sensor:
 
     @property
     def unit(self) -> float:
-        """The white level above black in DN: signal 1."""
+        """The white level minus the black level in DN: the DN of signal 1."""
         return self.white_level - self.black_level
 
     def sites(self) -> dict[str, tuple[slice, slice]]:
-        """Where a mosaic's channels are; G1 stands in the rows of red.
+        """The slices of rows and columns of each channel in a mosaic; G1 is in the rows of red.
 
         >>> Sensor("GRBG", 0, 1).sites()["R"]
         (slice(0, None, 2), slice(1, None, 2))
@@ -52,20 +47,20 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Rows:
-    """Offsets of rows: their mean square over the frames, what pixel noise explains of it."""
+    """The offsets of rows: their mean square over the frames, and the part that is pixel noise."""
 
     square: Array  # (rows,), DN^2
-    explained: Array
-    degrees: int
+    explained: Array  # by pixel noise; (rows,), DN^2
+    degrees: int  # of freedom
 
 
 @dataclass(frozen=True)
 class Stack:
-    """Frames less their mean, all of one exposure.
+    """Frames of one exposure as their mean and the deviations from it, in DN.
 
-    ``light`` is the mean above black (height, width), ``around`` the mean of its neighbours of the
-    same colour in other rows, ``rest`` (frames, height, width) what is left of the frames, all in
-    DN; ``used`` are the pixels that count.
+    ``light``, (height, width), is the mean above black; ``around`` is the mean of each pixel's
+    neighbours of the same colour in other rows, see :func:`neighbours`; ``rest``, (frames, height,
+    width), is the frames minus their mean. ``used`` is True for the pixels that count.
     """
 
     light: Floats
@@ -84,25 +79,25 @@ class Stack:
         return np.einsum("kij,kij->ij", self.rest, self.rest) / self.degrees
 
     def without_columns(self, offsets: Floats) -> "Stack":
-        """The stack without the columns' own offsets, (width,), which are no light."""
+        """The stack with the offsets of columns, (width,), subtracted from its light."""
         light = self.light - offsets
         return replace(self, light=light, around=neighbours(light))
 
     def tables(self, variance: Array) -> dict[str, Table]:
-        """A table of variances a channel."""
-        found = {}
+        """The table of each channel, from the variances of pixels, (height, width), DN^2."""
+        tables = {}
         for name, site in self.sensor.sites().items():
             used = self.used[site]
             rows = 2 * np.nonzero(used)[0] + site[0].start
             s, light, around = (x[site][used] for x in (variance, self.light, self.around))
-            found[name] = Table.of(s, light, around, rows, self.sensor.unit, self.degrees)
-        return found
+            tables[name] = Table.of(s, light, around, rows, self.sensor.unit, self.degrees)
+        return tables
 
 
 def stacked(frames: Floats, sensor: Sensor, what: str = "frames") -> Stack:
-    """Frames (frames, height, width) in DN, which are used up, as a stack; all pixels count.
+    """Frames, (frames, height, width) in DN, as a stack in which all pixels count.
 
-    ``what`` the frames are called in messages.
+    The frames are overwritten. ``what`` they are called in messages.
 
     Raises:
         ImageError: two frames are equal sample by sample.
@@ -122,9 +117,9 @@ def stacked(frames: Floats, sensor: Sensor, what: str = "frames") -> Stack:
 
 
 def neighbours(image: Floats) -> Floats:
-    """The mean of the six pixels of the same colour two rows above and below each pixel.
+    """The mean of the six pixels of the same colour in the rows two above and two below.
 
-    They share no noise with it, that of its row included.
+    They share no noise with the pixel, row noise included.
     """
     padded = np.pad(image, 2, mode="reflect")
     rows = padded[:-4] + padded[4:]
@@ -132,18 +127,21 @@ def neighbours(image: Floats) -> Floats:
 
 
 def ceiling(frames: Floats, sensor: Sensor) -> float:
-    """Where the samples clip, in DN: the white level, or the largest sample if it stays put.
+    """The DN at which samples clip: the largest sample if it repeats, else the white level.
 
-    Many cameras clip below the white level that their files name.
+    Many cameras clip below the white level that their files state. The largest sample repeats if at
+    least ten pixels have it in every frame, a number that was chosen.
     """
     top = float(frames.max())
-    stuck = int((frames == top).all(axis=0).sum())
-    return min(top, sensor.white_level) if stuck >= 10 else sensor.white_level
+    constant = int((frames == top).all(axis=0).sum())
+    return min(top, sensor.white_level) if constant >= 10 else sensor.white_level
 
 
 def unclipped(stack: Stack, line: Line | None, top: float) -> Stack:
-    """The stack with those pixels counted whose light, and whose neighbours', lies more than 4
-    standard deviations of a frame from clipping; without a line, those that touch neither end.
+    """The stack without pixels that clip, or so near to clipping that their noise may.
+
+    With a line, the light of a pixel and of its neighbours must be more than 4 standard deviations
+    from 0 DN and from ``top``, DN; without one, no sample may be at either.
     """
     black = stack.sensor.black_level
     if line is None:
@@ -158,11 +156,12 @@ def unclipped(stack: Stack, line: Line | None, top: float) -> Stack:
 
 
 def without_flicker(stack: Stack) -> tuple[Stack, Array]:
-    """The stack with all frames scaled to the same mean, where their means differ by more than
-    four standard errors (which rows give, since noise may be shared within a row).
+    """The stack with all frames scaled to the same mean, if their means differ significantly.
+
+    That is by more than four standard errors, taken over rows, since a row may share noise.
 
     Returns:
-        The stack, and by how much each frame was brighter than the mean; zeros if none was.
+        The stack, and each frame's brightness relative to the mean minus 1; zeros if unchanged.
 
     Raises:
         ImageError: a frame differs by more than a lamp's flicker.
@@ -172,20 +171,20 @@ def without_flicker(stack: Stack) -> tuple[Stack, Array]:
     rest = np.einsum("ij,kij->ki", weight, stack.rest, dtype=np.float64)
     total = light.sum()
     count = weight.sum()
-    none = np.zeros(len(stack.rest))
-    if total <= 1e-3 * count * stack.sensor.unit:
-        return stack, none  # too dark to tell
+    unchanged = np.zeros(len(stack.rest))
+    if total <= 1e-3 * count * stack.sensor.unit:  # too dark to judge
+        return stack, unchanged
     brighter = rest.sum(axis=1) / total
     scatter = rest - brighter[:, None] * light
     errors = np.sqrt((scatter**2).sum(axis=1)) / total
     if np.abs(brighter).max() > LARGEST_FLICKER:
         k = int(np.abs(brighter).argmax())
         raise ImageError(
-            f"frame {k + 1} of {len(none)} is {brighter[k]:+.0%} from the mean brightness of all; "
-            "frames of one ISO must have one exposure and steady light"
+            f"frame {k + 1} of {len(brighter)} is {brighter[k]:+.0%} from the mean brightness of "
+            "all; frames of one ISO must have one exposure and steady light"
         )
     if not (np.abs(brighter) > 4 * errors).any():
-        return stack, none
+        return stack, unchanged
     for frame, by in zip(stack.rest, brighter, strict=True):
         frame -= np.float32(by) * stack.light
         frame /= np.float32(1 + by)
@@ -193,11 +192,12 @@ def without_flicker(stack: Stack) -> tuple[Stack, Array]:
 
 
 def row_offsets(stack: Stack, line: Line) -> tuple[Array, Array, Rows]:
-    """The offset that each row has in each frame: its mean, weighted by inverse variance, so a
-    bright row's shot noise does not hide it.
+    """The offset of each row in each frame: its mean, weighted by the pixels' inverse variance.
+
+    The weights keep the shot noise of bright pixels out of it.
 
     Returns:
-        The weights (height, width), the offsets (frames, height), and what the rows say.
+        The weights, (height, width), the offsets, (frames, height) in DN, and their mean squares.
     """
     weight = np.where(stack.used, 1 / line.at(stack.around), 0).astype(np.float32)
     total = weight.sum(axis=1, dtype=np.float64)
@@ -207,13 +207,18 @@ def row_offsets(stack: Stack, line: Line) -> tuple[Array, Array, Rows]:
 
 
 def without_rows(stack: Stack, line: Line) -> tuple[Array, Rows]:
-    """Take the rows' offsets out of the stack, in place, by a line that has no row noise in it.
+    """Subtract the offsets of rows from the stack, in place.
 
-    That takes 1/sum(1/variance) of each pixel's variance along, which is given back.
+    Subtracting a row's weighted mean lowers each pixel's variance by 1 / sum(1 / variance), which
+    is added again.
+
+    Args:
+        stack: the frames.
+        line: their noise without row noise.
 
     Returns:
-        The variance of each pixel, unbiased, and what the rows say, pixel noise now by the pixels'
-        own variances.
+        The unbiased variance of each pixel, (height, width) in DN^2, and the rows, their pixel
+        noise now computed from the pixels' own variances.
     """
     weight, offsets, rows = row_offsets(stack, line)
     stack.rest[...] -= offsets[:, :, None].astype(np.float32)
@@ -223,8 +228,9 @@ def without_rows(stack: Stack, line: Line) -> tuple[Array, Rows]:
 
 
 def row_variance(parts: Sequence[Rows]) -> Estimate:
-    """The variance of row offsets in DN^2: mean square less what pixel noise explains, weighted by
-    how well each row tells it.
+    """The variance of row offsets in DN^2: their mean square minus the part that is pixel noise.
+
+    Rows are weighted by the inverse variance of that difference.
     """
     square = np.concatenate([rows.square for rows in parts])
     explained = np.concatenate([rows.explained for rows in parts])
@@ -240,9 +246,9 @@ def row_variance(parts: Sequence[Rows]) -> Estimate:
 
 
 def common_motion(stack: Stack, line: Line) -> Estimate:
-    """The share of the variance that a pixel has in common with the neighbour two rows below.
+    """The share of its variance that a pixel shares with the pixel two rows below.
 
-    Noise has none; a scene that moves, changing light and raws that were denoised have.
+    It is 0 for noise, and above for a scene that moves, changing light and denoised raws.
     """
     weight = np.where(stack.used, 1 / np.sqrt(line.at(stack.around)), 0).astype(np.float32)
     products = squares = 0.0
@@ -258,9 +264,9 @@ def common_motion(stack: Stack, line: Line) -> Estimate:
 
 
 def noise_by_frame(stack: Stack, line: Line) -> Array:
-    """How strong each frame's own noise is, as variance over that of the median frame, (frames,).
+    """The variance of each frame's noise relative to that of the median frame, (frames,).
 
-    All frames have the same, up to a per mille; the mean of others, or a clean picture, has less.
+    Frames of one setting agree closely; a mean of frames, or a clean picture, has less.
     """
     weight = np.where(stack.used, 1 / line.at(stack.around), 0)
     squares = np.einsum("ij,kij,kij->k", weight, stack.rest, stack.rest, dtype=np.float64)
@@ -268,8 +274,9 @@ def noise_by_frame(stack: Stack, line: Line) -> Array:
 
 
 def share_beyond_noise(stack: Stack, line: Line) -> float:
-    """The share of pixels whose variance no noise has (one in a million would), from a line that
-    is first brought down to the median pixel.
+    """The share of pixels with more variance than noise has in one of a million pixels.
+
+    The line is first scaled so that it holds for the median pixel.
     """
     from scipy.stats import chi2
 

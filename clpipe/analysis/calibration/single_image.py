@@ -1,15 +1,16 @@
 """Noise of a single raw image: Foi, Trimeche, Katkovnik, Egiazarian, "Practical
 Poissonian-Gaussian noise modeling and fitting for single-image raw-data", IEEE TIP 17(10), 2008.
 
-Wavelet details of smooth places hold noise alone. Places of equal smoothed value make a level set;
-each gives a mean and a standard deviation, and the line variance = a*y + b is the most likely one
-behind all these pairs. Clipped samples are modelled, not left out (sec. III).
+Wavelet details of smooth places hold only noise. Places of similar smoothed value form a level set,
+which has a mean and a standard deviation; the line variance = a*y + b is the most likely one for
+all these pairs. Clipped samples are modelled, not left out (sec. III).
 
-What departs from the paper. A level set's deviation comes from those of its places whose local
-variance a line found before explains, not from the median of all details: where half of a picture
-is textured, the median is far too large. The integral of the likelihood over the unknown y of a
-level set is taken to first order, since a set's mean is known far better than its deviation. The
-optimum is searched for over the variance at both ends of the light, so b may come out below zero.
+It differs from the paper in three ways. The deviation of a level set comes from those of its places
+whose local variance the line of the round before explains, not from the median of all details,
+which is far too large where half of a picture is textured. The integral of the likelihood over the
+unknown y of a level set is computed to first order, since the mean of a set is known far better
+than its deviation. The optimum is searched over the variances at both ends of the light, so b may
+come out below zero.
 """
 
 import contextlib
@@ -23,58 +24,39 @@ from clpipe.analysis.calibration.line_fit import Estimate, Line
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.base.types import Floats
 
-# Daubechies' scaling and wavelet functions with three vanishing moments (sec. II-A): the wavelet of
-# norm 1, the scaling function of sum 1.
+# Daubechies' wavelet and scaling function with three vanishing moments (sec. II-A). The wavelet has
+# the norm 1, the scaling function the sum 1.
 WAVELET = np.array([0.035226, 0.085441, -0.135011, -0.459878, 0.806892, -0.332671])
-
-
 SCALING = np.array([0.332671, 0.806892, 0.459878, -0.135011, -0.085441, 0.035226]) / np.sqrt(2)
-
-
+# EDGE is the paper's; the others are choices. tests/test_calibrate.py holds the accuracy they give.
 LEVELS = 150  # level sets of a colour, at most
-
-
-LEAST = 400  # places in a level set
-
-
-LEAST_EXPLAINED = 40  # of them
-
-
-WINDOW = 7  # of the smoothing, and of local variances
-
-
+LEAST = 400  # places in a level set, at least
+LEAST_EXPLAINED = 40  # places of a level set that the line explains, at least
+WINDOW = 7  # px, of the smoothing and of local variances
 EDGE = 1.0  # tau, in standard deviations of the details (sec. II-B1)
-
-
-EXPLAINED = 1.4  # times the line's variance, two standard deviations of a local variance
-
-
-ROUNDS = 8  # of choosing places by the line before
-
-
-GRID = 2000
-
-
+EXPLAINED = 1.4  # times the line's variance: two standard deviations of a local variance above it
+ROUNDS = 8  # of selecting places by the line of the round before
+GRID = 2000  # points at which the model of clipping is tabulated
 Values = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Places:
-    """Smooth places of one colour: the smoothed signal, the signal, the local variance."""
+    """Smooth places of one colour: smoothed signal, signal and local variance of each."""
 
     smooth: Values
     signal: Values
     variance: Values
 
     def sets(self) -> list[NDArray[np.intp]]:
-        """The level sets, as indices: places in order of their smoothed signal, cut evenly."""
+        """The level sets as indices: places by their smoothed signal, in sets of equal size."""
         order = np.argsort(self.smooth, kind="stable")
         return np.array_split(order, min(LEVELS, len(order) // LEAST) or 1)
 
 
 @dataclass(frozen=True)
 class LevelSets:
-    """Level sets: mean of the clipped signal, its standard deviation, how many places."""
+    """Level sets: the mean of the clipped signal, its standard deviation, the number of places."""
 
     mean: Values
     deviation: Values
@@ -82,16 +64,16 @@ class LevelSets:
 
 
 def joined(parts: Sequence[LevelSets]) -> LevelSets:
-    """All sets of several collections."""
+    """The sets of several collections in one."""
     columns = ([getattr(p, name) for p in parts] for name in ("mean", "deviation", "count"))
     return LevelSets(*(np.concatenate(column) for column in columns))
 
 
 def smooth_places(plane: Floats) -> Places:
-    """The smooth places of one colour's plane of signal (sec. II-A and II-B).
+    """The smooth places in the plane of one colour, (height, width) signal (sec. II-A and II-B).
 
-    A place is smooth where the Laplacian of the smoothed image, and the Laplacian's gradient, are
-    less than the local deviation of the details.
+    A place is smooth where the Laplacian of the smoothed image plus the magnitude of the
+    Laplacian's gradient is less than the local standard deviation of the details.
     """
     from scipy.ndimage import convolve1d, laplace, sobel, uniform_filter
 
@@ -105,7 +87,7 @@ def smooth_places(plane: Floats) -> Places:
     bend = laplace(smooth, mode="mirror")
     slope = np.hypot(sobel(bend, 0, mode="mirror"), sobel(bend, 1, mode="mirror")) / 8
     flat = slope + np.abs(bend) < EDGE * local
-    # A running sum may leave less than nothing.
+    # The filter's running sum may come out below zero.
     variance = np.maximum(uniform_filter(detail * detail, WINDOW, mode="mirror"), 0)
     return Places(smooth[flat], approximation[flat], variance[flat])
 
@@ -115,15 +97,20 @@ def explained_line(
 ) -> tuple[float, float, LevelSets, Values]:
     """The line behind the places that it explains, and their level sets.
 
-    The first line goes through each set's lowest twentieth of local variances. Then those below
-    1.4 times the line count, whose mean is brought up by what a chi-square distribution loses when
-    it is cut there, and so on. ``dark`` are level sets that are known otherwise.
+    The first line goes through each set's 5 % quantile of local variances, scaled to the variance
+    that a chi-square distribution has there. In each further round the places below 1.4 times the
+    line count; their mean is divided by that of a chi-square distribution cut at 1.4.
+
+    Args:
+        parts: the smooth places of each colour.
+        low: the signal at 0 DN, where it clips.
+        dark: further level sets, from dark frames.
 
     Returns:
-        a and b, signal units; the level sets; the standard errors of a and b.
+        a and b in signal units; the level sets; the standard errors of a and b.
 
     Raises:
-        ValueError: there are too few sets, or they are all alike in light.
+        ValueError: there are too few sets, or all have the same light.
     """
     from scipy.stats import chi2
 
@@ -131,29 +118,30 @@ def explained_line(
     cut = chi2.cdf(EXPLAINED * freedom, freedom + 2) / chi2.cdf(EXPLAINED * freedom, freedom)
     lowest = chi2.ppf(0.05, freedom) / freedom
     places = [(part, chosen) for part in parts for chosen in part.sets()]
-    found = [
+    moments = [
         (part.signal[i].mean(), np.quantile(part.variance[i], 0.05) / lowest, len(i))
         for part, i in places
     ]
     for _ in range(ROUNDS):
-        mean, variance, count = np.array(found, np.float64).reshape(-1, 3).T
+        mean, variance, count = np.array(moments, np.float64).reshape(-1, 3).T
         sets = joined([LevelSets(mean, np.sqrt(variance), count), *dark])
         a, b, errors = most_likely_line(sets, low)
-        found = []
+        moments = []
         for part, i in places:
-            i = i[part.variance[i] < EXPLAINED * np.maximum(a * part.smooth[i] + b, 1e-12)]
-            # Not more: sets that lose places by chance would go, those that keep them stay.
-            if len(i) >= LEAST_EXPLAINED:
-                found.append((part.signal[i].mean(), part.variance[i].mean() / cut, len(i)))
+            explained = i[part.variance[i] < EXPLAINED * np.maximum(a * part.smooth[i] + b, 1e-12)]
+            # A higher minimum would drop sets that lost places by chance, which biases the line.
+            if len(explained) >= LEAST_EXPLAINED:
+                mean_variance = part.variance[explained].mean() / cut
+                moments.append((part.signal[explained].mean(), mean_variance, len(explained)))
     return a, b, sets, errors
 
 
 def clipped_moments(y: Values, deviation: Values, low: float) -> tuple[Values, Values]:
-    """Mean and deviation of y plus Gaussian noise after clipping to low..1 (sec. III-B).
+    """Mean and standard deviation of y plus Gaussian noise, clipped to low..1 (sec. III-B).
 
-    E_m(u) = Phi(u) u + phi(u) and S_m(u)^2 = Phi(u) + phi(u) u - phi(u)^2
-    + Phi(u) u (u - Phi(u) u - 2 phi(u)) are those of a normal of mean u and deviation 1, clipped at
-    0 from below; the two ends are put together as if apart.
+    A normal of mean u and deviation 1, clipped to values above 0, has the mean
+    E_m(u) = Phi(u) u + phi(u) and the variance S_m(u)^2 = Phi(u) + phi(u) u - phi(u)^2
+    + Phi(u) u (u - Phi(u) u - 2 phi(u)). The two ends are combined as if they were far apart.
 
     >>> mean, deviation = clipped_moments(np.array([0.0, 0.5]), np.array([0.1, 0.1]), 0.0)
     >>> mean.round(4).tolist(), deviation.round(4).tolist()
@@ -174,11 +162,11 @@ def clipped_moments(y: Values, deviation: Values, low: float) -> tuple[Values, V
 
 
 def most_likely_line(sets: LevelSets, low: float) -> tuple[float, float, Values]:
-    """The most likely line behind level sets (sec. II-C and III-C), signal units.
+    """The most likely line behind level sets (sec. II-C and III-C), in signal units.
 
-    Each set's deviation is compared with that of the clipped model at the set's mean; its square
-    scatters as 1.35/(n + 1.5) of itself, half as a Gaussian and half as a Cauchy distribution,
-    which forgives the sets that hold texture.
+    Each set's deviation is compared with that of the clipped model at the set's mean. Its relative
+    variance is 1.35 / (n + 1.5) for n places. Its distribution is half a Gaussian and half a
+    Cauchy, which tolerates sets with texture.
 
     Args:
         sets: of signal, 1 = white level.
@@ -188,12 +176,12 @@ def most_likely_line(sets: LevelSets, low: float) -> tuple[float, float, Values]
         a, b, and their standard errors (from the curvature of the likelihood).
 
     Raises:
-        ValueError: there are too few sets, or they are all alike in light.
+        ValueError: there are too few sets, or all have the same light.
     """
     from scipy.optimize import minimize
 
     mean, deviation, count = sets.mean, sets.deviation, sets.count
-    # Where nearly all is clipped, nothing is left to measure.
+    # Sets in which nearly every sample is clipped have nothing to measure.
     used = (mean < 0.995) & (mean > low + 0.005 * (1 - low)) & (deviation > 0)
     mean, deviation, count = mean[used], deviation[used], count[used]
     if len(mean) < 8 or np.ptp(mean) < 0.02:
@@ -210,10 +198,11 @@ def most_likely_line(sets: LevelSets, low: float) -> tuple[float, float, Values]
     def cost(ends: Values) -> float:
         a, b = line(ends)
         sigma = np.sqrt(np.maximum(a * grid + b, 1e-12))
-        seen, seen_sigma = clipped_moments(grid, sigma, low)
-        rising = np.maximum.accumulate(seen)
-        model = np.interp(mean, rising, seen_sigma)
-        steep = np.interp(mean, rising, np.gradient(seen_sigma) / (np.gradient(seen) + 1e-12))
+        clipped_mean, clipped_sigma = clipped_moments(grid, sigma, low)
+        rising = np.maximum.accumulate(clipped_mean)
+        model = np.interp(mean, rising, clipped_sigma)
+        slope = np.gradient(clipped_sigma) / (np.gradient(clipped_mean) + 1e-12)
+        steep = np.interp(mean, rising, slope)
         width = model * np.sqrt(scatter + np.clip(steep, -9, 9) ** 2 / (4 * count))
         t = (deviation - model) / width
         gauss = np.exp(-0.5 * np.minimum(np.abs(t), 38) ** 2) / np.sqrt(2 * np.pi)
@@ -249,26 +238,26 @@ def _errors(
 def single_image(
     light: Floats, sensor: Sensor, dark: LevelSets | None = None
 ) -> tuple[dict[str, Line], Line, LevelSets]:
-    """The lines of one mosaic's channels, the line of all, and the level sets behind it.
+    """The lines of a mosaic's channels, the line of all channels, and the level sets behind it.
 
-    The details are those across both directions: what a row or a column shares is not in them. A
-    channel with too few smooth places has no line.
+    The wavelet details are diagonal ones, which row and column noise does not reach. A channel with
+    too few smooth places has no line.
 
     Args:
         light: (height, width) above black, DN.
         sensor: its pattern and levels.
-        dark: what dark frames say of noise without light, signal units.
+        dark: a level set of dark frames, signal units, or None.
 
     Raises:
-        ValueError: there are too few smooth places, or they are all alike in light.
+        ValueError: there are too few smooth places, or all have the same light.
     """
     unit = sensor.unit
     low = -sensor.black_level / unit
-    known = [dark] if dark else []
+    dark_sets = [dark] if dark else []
     places = {name: smooth_places(light[site] / unit) for name, site in sensor.sites().items()}
 
     def line(parts: Sequence[Places]) -> tuple[Line, LevelSets]:
-        a, b, sets, errors = explained_line(parts, low, known)
+        a, b, sets, errors = explained_line(parts, low, dark_sets)
         gain, floor = Estimate(a, float(errors[0])), Estimate(b, float(errors[1]))
         pixels = int(sets.count.sum()) * 4  # a place is a detail, one of every 2x2 pixels
         return Line(gain.scaled(unit), floor.scaled(unit**2), pixels), sets

@@ -1,4 +1,4 @@
-"""Demosaicing: three colours at every pixel from one. One algorithm a file."""
+"""Demosaicing: three colours at every pixel from one; each algorithm has its own file."""
 
 from clpipe.stage import Kind, Stage
 from clpipe.stages.demosaic.bilinear import Bilinear

@@ -1,4 +1,7 @@
-"""What demosaicing methods share, as ``kernels/lib/demosaic.h`` has it."""
+"""Parts that demosaicing methods share, as ``kernels/lib/demosaic.h`` has them.
+
+Mosaics and planes are (height, width) in signal units; borders are mirrored.
+"""
 
 import numpy as np
 
@@ -10,7 +13,7 @@ HALF, QUARTER, EIGHTH = np.float32(0.5), np.float32(0.25), np.float32(0.125)
 
 
 def mean_beside(image: Floats) -> Floats:
-    """Mean of the two pixels to the left and right.
+    """Mean of the pixels to the left and right of each pixel.
 
     >>> mean_beside(np.float32([[1, 2, 5]])).tolist()
     [[2.0, 3.0, 2.0]]
@@ -19,12 +22,12 @@ def mean_beside(image: Floats) -> Floats:
 
 
 def mean_above_below(image: Floats) -> Floats:
-    """Mean of the two pixels above and below."""
+    """Mean of the pixels above and below each pixel."""
     return (tap(image, 0, -1) + tap(image, 0, 1)) * HALF
 
 
 def sum_of_corners(image: Floats) -> Floats:
-    """Sum of the four diagonal neighbours."""
+    """Sum of the four diagonal neighbours of each pixel."""
     upper, lower = (tap(image, -1, dy) + tap(image, 1, dy) for dy in (-1, 1))
     return upper + lower
 
@@ -32,14 +35,14 @@ def sum_of_corners(image: Floats) -> Floats:
 def red_and_blue(
     pattern: Pattern, own: Floats, in_row: Floats, in_column: Floats, across: Floats
 ) -> tuple[Floats, Floats]:
-    """Red and blue, (height, width) each, picked by site.
+    """Red and blue at every pixel, (height, width) each, chosen from four images by site.
 
     Args:
         pattern: the CFA pattern.
-        own: at red and blue sites, the site's own colour.
-        in_row: at green sites, that of the two that stands in the site's row.
-        in_column: at green sites, that of the two that stands in the site's column.
-        across: at red and blue sites, the other one.
+        own: at red and blue sites, the value for the site's own colour.
+        in_row: at green sites, the value for the colour (red or blue) whose sites are in that row.
+        in_column: at green sites, the value for the colour whose sites are in that column.
+        across: at red sites the value for blue, at blue sites the value for red.
 
     >>> values = [np.full((2, 2), v, np.float32) for v in (0, 1, 2, 3)]
     >>> [colour.tolist() for colour in red_and_blue("RGGB", *values)]
@@ -54,19 +57,21 @@ def red_and_blue(
     )
 
 
-def spread_differences(known: Floats, pattern: Pattern) -> tuple[Floats, Floats]:
-    """R-G and B-G at every pixel, bilinear from where they are known.
+def spread_differences(sparse: Floats, pattern: Pattern) -> tuple[Floats, Floats]:
+    """R-G and B-G at every pixel, (height, width) each, by bilinear interpolation.
 
-    ``known`` is (height, width) and holds R-G at red sites and B-G at blue ones.
+    ``sparse`` is (height, width) and holds R-G at red sites and B-G at blue sites.
     """
-    across = sum_of_corners(known) * QUARTER
-    return red_and_blue(pattern, known, mean_beside(known), mean_above_below(known), across)
+    across = sum_of_corners(sparse) * QUARTER
+    return red_and_blue(pattern, sparse, mean_beside(sparse), mean_above_below(sparse), across)
 
 
 def from_differences(
     samples: Floats, pattern: Pattern, red_difference: Floats, blue_difference: Floats
 ) -> Floats:
-    """RGB, (height, width, 3), from the sensor's samples, R-G and B-G; the samples are kept.
+    """RGB, (height, width, 3), from the sensor's samples, R-G and B-G.
+
+    The samples stay as they are; the missing colours follow from them and the differences.
 
     >>> samples, one = np.float32([[5, 3], [3, 2]]), np.ones((2, 2), np.float32)
     >>> from_differences(samples, "RGGB", one, -one)[0].tolist()

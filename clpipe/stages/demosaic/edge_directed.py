@@ -23,16 +23,17 @@ Classifier = typing.Literal["hamilton_adams", "laroche_prescott", "hibbard"]
 
 
 def green_or_difference(image: Floats, pattern: Pattern, classifier: Classifier) -> Floats:
-    """Green at green sites, R-G at red and B-G at blue ones, (height, width), from a mosaic.
+    """Green at green sites, R-G at red sites and B-G at blue sites, (height, width), from a mosaic.
 
-    At red and blue sites green is the mean of its two neighbours in the direction with the smaller
-    gradient, or of all four where the gradients are equal. The gradient is
+    At red and blue sites, green is the mean of its two neighbours in the direction with the smaller
+    gradient, or of all four where the gradients are equal. The classifier defines the gradient in a
+    direction:
 
-    - ``hibbard`` (US patent 5,382,976, 1995): the difference of these two neighbours;
-    - ``laroche_prescott`` (US patent 5,373,322, 1994): the second derivative of the site's own
-      colour, over its next samples to both sides;
-    - ``hamilton_adams`` (US patent 5,629,734, 1997): the sum of both; and a quarter of the second
-      derivative, with its sign, is added to the mean.
+    - ``hibbard`` (US patent 5,382,976, 1995): the absolute difference of the two green neighbours;
+    - ``laroche_prescott`` (US patent 5,373,322, 1994): the absolute second derivative of the site's
+      own colour, from the site and the samples 2 px to both sides;
+    - ``hamilton_adams`` (US patent 5,629,734, 1997): the sum of both; a quarter of the second
+      derivative, with its sign, is then added to the mean.
 
     >>> edge = np.repeat(np.float32([[0, 0, 0, 8, 8, 8]]), 6, axis=0)
     >>> green_or_difference(edge, "RGGB", "hibbard")[2].tolist()
@@ -58,7 +59,7 @@ def green_or_difference(image: Floats, pattern: Pattern, classifier: Classifier)
 
 
 class EdgeDirected(Method):
-    """Green along edges, red and blue by bilinear colour differences from it.
+    """Green along edges; red and blue from bilinearly interpolated R-G and B-G.
 
     The classifiers: Hamilton and Adams (US patent 5,629,734, 1997), Laroche and Prescott
     (US patent 5,373,322, 1994), Hibbard (US patent 5,382,976, 1995).
@@ -69,7 +70,9 @@ class EdgeDirected(Method):
     summary: ClassVar = "green along edges, then bilinear colour differences"
 
     classifier: Classifier = parameter(
-        "hamilton_adams", "How the direction of an edge is found.", structural=True
+        "hamilton_adams",
+        "The gradient that decides the direction of an edge; see the patents of these authors.",
+        structural=True,
     )
 
     def passes(self) -> tuple[Pass, ...]:
@@ -90,5 +93,5 @@ class EdgeDirected(Method):
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
         pattern = frame.context.pattern
-        known = green_or_difference(image, pattern, self.classifier)
-        return from_differences(image, pattern, *spread_differences(known, pattern))
+        sparse = green_or_difference(image, pattern, self.classifier)
+        return from_differences(image, pattern, *spread_differences(sparse, pattern))

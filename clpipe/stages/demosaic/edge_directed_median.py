@@ -12,7 +12,10 @@ from clpipe.stages.demosaic.median import Median
 
 
 class EdgeDirectedMedian(Median, EdgeDirected):
-    """As ``edge_directed``, but the colour differences are median filtered as in ``median``."""
+    """``edge_directed`` with its colour differences median filtered, as ``median`` does.
+
+    The paper's own combination (Bielova et al., CVPR Workshops 2019).
+    """
 
     method: ClassVar = "edge_directed_median"
     kernel: ClassVar = "demosaic_edge_directed_median"
@@ -36,6 +39,6 @@ class EdgeDirectedMedian(Median, EdgeDirected):
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
         pattern = frame.context.pattern
-        known = green_or_difference(image, pattern, self.classifier)
-        differences = spread_differences(known, pattern)
+        sparse = green_or_difference(image, pattern, self.classifier)
+        differences = spread_differences(sparse, pattern)
         return from_differences(image, pattern, *(median_filter(d, self.size) for d in differences))

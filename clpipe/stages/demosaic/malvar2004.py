@@ -15,12 +15,12 @@ TWO, FOUR, FIVE, SIX = np.float32(2), np.float32(4), np.float32(5), np.float32(6
 
 
 def malvar2004(image: Floats, pattern: Pattern) -> Floats:
-    """RGB, (height, width, 3), from a mosaic, by the linear 5x5 filters of their figure 2.
+    """RGB, (height, width, 3), from a mosaic, by linear 5x5 filters.
 
     H. S. Malvar, L. He, R. Cutler: "High-quality linear interpolation for demosaicing of
-    Bayer-patterned color images", ICASSP 2004. Each filter is the bilinear one plus a Laplacian
-    of the colour that is known at the site, times a gain: 1/2 for green, 5/8 for red and blue at
-    green sites, 3/4 for one of them at a site of the other.
+    Bayer-patterned color images", ICASSP 2004, figure 2. Each filter is the bilinear one plus the
+    Laplacian of the site's own colour times a gain: 1/2 for green, 5/8 for red and blue at green
+    sites, 3/4 for red at blue sites and blue at red sites.
 
     >>> grey_ramp = np.arange(49, dtype=np.float32).reshape(7, 7)
     >>> malvar2004(grey_ramp, "GRBG")[3, 3].tolist()
@@ -43,7 +43,7 @@ class Malvar2004(Method):
 
     method: ClassVar = "malvar2004"
     kernel: ClassVar = "demosaic_malvar2004"
-    summary: ClassVar = "linear 5x5 filters, gradient corrected (Malvar, He, Cutler)"
+    summary: ClassVar = "linear 5x5 filters with gradient correction (Malvar, He, Cutler)"
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("malvar2004", Access.STENCIL, ("pattern",), radius=2),)

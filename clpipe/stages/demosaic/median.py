@@ -1,4 +1,4 @@
-"""Freeman's demosaicing: median filtered colour differences."""
+"""Freeman's demosaicing: bilinear, with median filtered colour differences."""
 
 import typing
 from collections.abc import Mapping
@@ -14,10 +14,10 @@ from clpipe.stages.demosaic.common import from_differences
 
 
 class Median(Method):
-    """Bilinear, then colour differences R-G and B-G median filtered (Freeman, 1988).
+    """Bilinear interpolation, then a median filter on R-G and B-G (Freeman, 1988).
 
-    US patent 4,724,395. The samples that the sensor took are kept; the other colours follow from
-    them and the filtered differences.
+    US patent 4,724,395. The sensor's samples stay as they are; the missing colours follow from them
+    and the filtered differences.
     """
 
     method: ClassVar = "median"
@@ -42,7 +42,7 @@ class Median(Method):
         )
 
     def median_pass(self) -> Pass:
-        """The pass from colour differences, named "spread", to RGB."""
+        """The pass that filters the colour differences, an image named "spread", and gives RGB."""
         arguments, reads = ("pattern", "size"), ("src", "spread")
         return Pass("freeman", Access.STENCIL, arguments, reads, radius=self.size // 2)
 

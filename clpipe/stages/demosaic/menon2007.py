@@ -1,8 +1,8 @@
 """Menon, Andriani and Calvagno's demosaicing with a posteriori decision.
 
 D. Menon, S. Andriani, G. Calvagno: "Demosaicing with directional filtering and a posteriori
-decision", IEEE Transactions on Image Processing 16(1), 2007. In what follows, at a red or blue
-site "own" is the site's colour and "other" is blue or red.
+decision", IEEE Transactions on Image Processing 16(1), 2007. Below, "own" is the colour of a red or
+blue site, and "other" is blue at a red site and red at a blue site.
 """
 
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.types import Array, Floats
+from clpipe.base.types import Floats, Mask
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
 from clpipe.stage import Access, Argument, Context, Frame, Kind, Method, Pass
@@ -20,7 +20,9 @@ THIRD = np.float32(1 / 3)
 
 
 def directional_differences(image: Floats, pattern: Pattern) -> tuple[Floats, Floats]:
-    """Own minus green, green interpolated along the row and along the column; 0 at green sites.
+    """Own minus green, with green interpolated along the row and along the column.
+
+    Two (height, width) images, 0 at green sites. Green is interpolated as by ``hamilton_adams``.
 
     >>> ramp = np.tile(np.arange(8, dtype=np.float32) ** 2, (8, 1))
     >>> [abs(d[:, 2:6]).max().item() for d in directional_differences(ramp, "RGGB")]
@@ -38,10 +40,10 @@ def directional_differences(image: Floats, pattern: Pattern) -> tuple[Floats, Fl
 
 
 def change(differences: Floats) -> Floats:
-    """How much horizontal differences change around a red or blue site.
+    """How much horizontal differences change around each red or blue site, (height, width).
 
-    The sum of absolute changes between next neighbours in the rows of a 5x5 window, those of the
-    middle row three times.
+    The sum of absolute changes between next neighbours of one colour, 2 px apart, in the five rows
+    of a 5x5 window; the middle row counts three times.
     """
     own = abs(tap(differences, -2, 0) - differences) + abs(differences - tap(differences, 2, 0))
     other = abs(tap(differences, -1, 0) - tap(differences, 1, 0))
@@ -50,44 +52,48 @@ def change(differences: Floats) -> Floats:
     return np.float32(3) * own + near + far
 
 
-def along(known: Floats, row_won: Array) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
-    """The two green sites beside each red or blue one, in the direction that won there.
+def along(sparse: Floats, in_row: Mask) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+    """Differences at the two green neighbours of each red or blue site, in its chosen direction.
 
-    ``known`` holds own minus green at red and blue sites, green at the others. Returns own minus
-    green and own minus other, each for the left or upper and for the right or lower neighbour; a
-    difference that is not known at a green site is the mean of the two that are known beside it.
+    Args:
+        sparse: (height, width), own minus green at red and blue sites, green at green sites.
+        in_row: (height, width), True where the chosen direction is the row.
+
+    Returns:
+        Own minus green and own minus other, each for the left or upper and for the right or lower
+        neighbour. A difference at a green site is the mean of those at the two sites beside it.
     """
-    beside, above_below = mean_beside(known), mean_above_below(known)
+    beside, above_below = mean_beside(sparse), mean_above_below(sparse)
     own_green, own_other = [], []
     for step in (-1, 1):
-        own = np.where(row_won, tap(beside, step, 0), tap(above_below, 0, step))
-        other = np.where(row_won, tap(above_below, step, 0), tap(beside, 0, step))
+        own = np.where(in_row, tap(beside, step, 0), tap(above_below, 0, step))
+        other = np.where(in_row, tap(above_below, step, 0), tap(beside, 0, step))
         own_green.append(own)
         own_other.append(own - other)
     return (own_green[0], own_green[1]), (own_other[0], own_other[1])
 
 
 def menon2007(image: Floats, pattern: Pattern) -> Floats:
-    """RGB, (height, width, 3), from a mosaic, with the refining step.
+    """RGB, (height, width, 3), from a mosaic, with the paper's refining step.
 
     >>> edge = np.repeat(np.float32([0.2, 0.7]), 5)[None].repeat(10, axis=0)
     >>> bool(np.allclose(menon2007(edge, "BGGR"), edge[..., None]))
     True
     """
-    # Directional green, and the decision: the direction in which colour differences change less.
-    in_row, in_column = directional_differences(image, pattern)
-    row_won = change(in_row) <= change(in_column.T).T
-    chosen = np.where(row_won, in_row, in_column)
+    # Directional green, and the decision for the direction in which colour differences change less.
+    by_row, by_column = directional_differences(image, pattern)
+    in_row = change(by_row) <= change(by_column.T).T
+    chosen = np.where(in_row, by_row, by_column)
     chosen = by_site(image.shape, pattern, chosen, image, chosen)
-    # Own minus other from what is known now; it is refined after green.
-    (left, right), (left_other, right_other) = along(chosen, row_won)
+    # A first estimate of own minus other; it is refined after green.
+    (left, right), (left_other, right_other) = along(chosen, in_row)
     own_other = (left_other + right_other) * HALF
-    # Refining green: own minus green becomes the mean of three along the direction.
+    # Refine green: own minus green becomes the mean of three along the direction.
     refined = (left + chosen + right) * THIRD
     refined = by_site(image.shape, pattern, refined, image, refined)
     green = by_site(image.shape, pattern, image - refined, image, image - refined)
-    # Refining the other colour likewise; red and blue at green sites are bilinear.
-    _, (left_other, right_other) = along(refined, row_won)
+    # Refine the other colour likewise; red and blue at green sites are bilinear.
+    _, (left_other, right_other) = along(refined, in_row)
     other = image - (left_other + own_other + right_other) * THIRD
     red, blue = red_and_blue(
         pattern, image, image + mean_beside(refined), image + mean_above_below(refined), other
@@ -96,11 +102,11 @@ def menon2007(image: Floats, pattern: Pattern) -> Floats:
 
 
 class Menon2007(Method):
-    """Directional filtering and a posteriori decision, refined (Menon et al., TIP 2007)."""
+    """Directional filtering with a posteriori decision and refinement (Menon et al., TIP 2007)."""
 
     method: ClassVar = "menon2007"
     kernel: ClassVar = "demosaic_menon2007"
-    summary: ClassVar = "directional green, chosen afterwards, and refined (Menon et al.)"
+    summary: ClassVar = "green in both directions, the better one chosen and refined (Menon et al.)"
 
     def passes(self) -> tuple[Pass, ...]:
         def stencil(function: str, radius: int, *reads: str, writes: str = "dst") -> Pass:

@@ -1,7 +1,7 @@
-"""Denoising in luma and chroma, chroma stronger, as strong as the ISO asks for."""
+"""Denoising of luma and, more strongly, of chroma; the strength follows the predicted noise."""
 
 from clpipe.stage import Context, Kind, Stage
-from clpipe.stages.denoise import strength as law
+from clpipe.stages.denoise import strength
 from clpipe.stages.denoise.bilateral import Bilateral
 from clpipe.stages.denoise.mean import Mean
 from clpipe.stages.denoise.median import Median
@@ -11,14 +11,14 @@ METHODS = (Bilateral, NonLocalMeans, Median, Mean)
 
 
 def explain(context: Context) -> str:
-    """The law, and what it makes of each method at its default strengths, in lines."""
+    """How the strength follows from the noise, and its effect in each method, in a few lines."""
     effects = [f"  {m.method}: {m().resolve(context).effect}" for m in METHODS]
-    return "\n".join([law.explain(context), *effects])
+    return "\n".join([strength.explain(context), *effects])
 
 
 STAGE = Stage(
     "denoise",
-    "Take noise away, as a camera does.",
+    "Reduce noise, as a camera does.",
     Kind.RGB,
     Kind.RGB,
     METHODS,

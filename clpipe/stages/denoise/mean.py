@@ -1,4 +1,4 @@
-"""The mean of a window."""
+"""The mean filter."""
 
 from typing import ClassVar
 
@@ -7,21 +7,24 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.image import tap
 from clpipe.stages.denoise.blended import BlendedFilter
-from clpipe.stages.denoise.strength import size_of
+from clpipe.stages.denoise.strength import size_parameter
 
 
 class Mean(BlendedFilter):
-    """Mean of a square window. It does not know an edge from noise; it is here to compare with."""
+    """Mean of a square window, blended with the image.
+
+    It blurs edges as much as noise; it is a baseline to compare with.
+    """
 
     method: ClassVar = "mean"
     kernel: ClassVar = "denoise_mean"
-    summary: ClassVar = "mean of a window, more of it the more noise there is"
+    summary: ClassVar = "mean of a window, blended in more strongly where there is more noise"
     tolerance: ClassVar = 2e-6  # sums come in another order
     function: ClassVar = "mean_filter"
     block: ClassVar = 1
 
-    luma_size: int = size_of("luma", 3, 15)
-    chroma_size: int = size_of("chroma", 3, 15)
+    luma_size: int = size_parameter("luma", 3, 15)
+    chroma_size: int = size_parameter("chroma", 3, 15)
 
     def window(self, image: Floats, reach: int) -> Floats:
         return box(image, reach)

@@ -1,10 +1,10 @@
-"""The law by which the ISO steers denoising, and the parameters that every method has.
+"""How the strength of denoising follows the noise, and the parameters that every method has.
 
-A sensor's noise has the variance a*y + b (Foi et al., IEEE TIP 2008, eq. 2), with a and b from the
-camera at that ISO, or as ``sensor_noise`` used them. White balance gains amplify it; luma and
-chroma are sums of the three colours, whose noise is independent. So grey of level v has luma noise
-of a variance that is linear in v, and at mid grey it is one number: what every method takes its
-strength from.
+A sensor's noise has the variance a*y + b (Foi et al., IEEE TIP 2008, eq. 2), with a and b as
+``sensor_noise`` used them, else from the camera at the ISO. White balance gains amplify it. Luma
+and chroma are weighted sums of the three colours, whose noise is independent. So the variance of
+luma noise in a grey of level v is linear in v. Its value at mid grey, one number, sets the strength
+of every method; chroma likewise.
 """
 
 from collections.abc import Mapping
@@ -18,21 +18,19 @@ from pydantic import field_validator
 from clpipe.reference.colour import LUMA
 from clpipe.stage import Access, Argument, Context, Kind, Literal, Method, Pass, odd_size, parameter
 
-MID_GREY = 0.18
-
-
+MID_GREY = 0.18  # signal units
 PREDICTED = "the {} noise at mid grey that a, b and the gains predict"
 
 
 @dataclass(frozen=True)
 class Variance:
-    """A variance that is linear in the level of grey: ``slope`` * level + ``offset``."""
+    """A variance that is linear in the level of a grey: slope * level + offset, signal squared."""
 
     slope: float
     offset: float
 
     def at(self, level: float) -> float:
-        """The variance at a level of grey.
+        """The variance in a grey of this level.
 
         >>> Variance(2.0, 1.0).at(0.5)
         2.0
@@ -41,10 +39,10 @@ class Variance:
 
 
 def noise_of_colours(context: Context) -> tuple[Variance, Variance, Variance]:
-    """The noise of red, green and blue of a grey, after white balance, in signal units squared.
+    """The variances of red, green and blue in a grey after white balance, in signal units squared.
 
-    Grey of level v is v/k at a colour with gain k; its variance there, a*v/k + b, comes out k^2
-    times as large. Noise that demosaicing takes away is not counted.
+    In a colour with gain k, a grey of level v has the signal v/k and the variance a*v/k + b before
+    the gain, so a*v*k + b*k^2 after it. Noise that demosaicing averages out is not deducted.
     """
     a, b = context.known_noise()
     red, blue = context.applied_gains
@@ -53,7 +51,7 @@ def noise_of_colours(context: Context) -> tuple[Variance, Variance, Variance]:
 
 
 def noise_of_luma_and_chroma(context: Context) -> tuple[Variance, Variance]:
-    """The noise of luma, and of both chroma planes together, of a grey, in signal units squared."""
+    """The variances of luma and of Cb + Cr together in a grey, in signal units squared."""
     luma = np.asarray(LUMA, float)
     cb, cr = 0.564 * (np.eye(3)[2] - luma), 0.713 * (np.eye(3)[0] - luma)
     colours = noise_of_colours(context)
@@ -73,14 +71,14 @@ def predicted_noise(context: Context) -> tuple[float, float]:
 
 
 def explain(context: Context) -> str:
-    """The law in a few lines, with the numbers of a context."""
+    """The steps from a and b to luma and chroma noise, in a few lines, with a context's numbers."""
     a, b = context.known_noise()
     red, blue = context.applied_gains
     sigmas = [sqrt(colour.at(MID_GREY)) for colour in noise_of_colours(context)]
     luma, chroma = predicted_noise(context)
     source = "as sensor_noise used them" if context.noise else "from the camera"
     return (
-        f"Strength follows the noise that is predicted at mid grey (v = {MID_GREY:g}):\n"
+        f"The strength follows the noise that is predicted at mid grey (v = {MID_GREY:g}):\n"
         f"  {context.camera.name}, ISO {context.iso:g}: a = {a:.4g}, b = {b:.4g} ({source})\n"
         f"  white balance gains k: red {red:.4g}, green 1, blue {blue:.4g}\n"
         "  sigma of a colour after its gain = sqrt(k*a*v + k^2*b):"
@@ -89,45 +87,49 @@ def explain(context: Context) -> str:
         f" = {luma:.3g}\n"
         "  chroma_noise = the same for Cb and Cr together"
         f" = {chroma:.3g}\n"
-        "  Methods filter as luma_strength * luma_noise, chroma_strength * chroma_noise ask for."
+        "  Methods filter luma by luma_strength * luma_noise, chroma by chroma_strength *"
+        " chroma_noise."
     )
 
 
-def size_of(plane: str, default: int, largest: int) -> Any:
+def size_parameter(plane: str, default: int, largest: int) -> Any:
     """Declare the width of a plane's window; each method has its own default and limit."""
-    text = f"Width of the {plane} window: odd, 1 to {largest}; 1 leaves {plane} alone."
+    text = f"Width of the {plane} window: odd, 1 to {largest}; 1 leaves {plane} unchanged."
     return parameter(default, text, "px", structural=True)
 
 
 class Denoiser(Method):
-    """What all methods have in common: luma and chroma, each with a size, a strength, its noise."""
+    """The base of all methods: luma and chroma, each with a window, a strength and its noise.
+
+    Subclasses name the stencil of their kernel file; the passes into and out of YCbCr are shared.
+    """
 
     largest_size: ClassVar[int] = 15
     function: ClassVar[str]  # the stencil in the kernel file
-    names: ClassVar[tuple[str, ...]]  # its run-time arguments, after the two reaches
+    names: ClassVar[tuple[str, ...]]  # the stencil's run-time arguments, after the two reaches
     enter: ClassVar[Pass] = Pass("to_luma_chroma", writes="planes", kind=Kind.YCBCR)
     leave: ClassVar[Pass] = Pass("from_luma_chroma", reads=("filtered",))
-    extra_reach: ClassVar[int] = 0  # px that it reads beyond its window
-    block: ClassVar[int] = 0
+    extra_reach: ClassVar[int] = 0  # px that the stencil reads beyond its window
+    block: ClassVar[int] = 0  # as in Pass
 
-    luma_size: int = size_of("luma", 5, 15)
-    chroma_size: int = size_of("chroma", 5, 15)
+    luma_size: int = size_parameter("luma", 5, 15)
+    chroma_size: int = size_parameter("chroma", 5, 15)
     luma_strength: float = parameter(
-        1.0, "Filtering of luma, in multiples of what its noise asks for; 0 is off.", ge=0, le=100
+        1.0, "Strength on luma, relative to luma_noise; 0 is off.", ge=0, le=100
     )
     chroma_strength: float = parameter(
-        2.0, "Filtering of chroma, in multiples of what its noise asks for; 0 is off.", ge=0, le=100
+        2.0, "Strength on chroma, relative to chroma_noise; 0 is off.", ge=0, le=100
     )
     luma_noise: float | None = parameter(
         None,
-        "Standard deviation of luma noise at mid grey.",
+        "Standard deviation of the luma noise at mid grey.",
         "signal",
         PREDICTED.format("luma"),
         ge=0,
     )
     chroma_noise: float | None = parameter(
         None,
-        "Standard deviation of chroma noise (Cb and Cr together) at mid grey.",
+        "Standard deviation of the chroma noise (Cb and Cr together) at mid grey.",
         "signal",
         PREDICTED.format("chroma"),
         ge=0,
@@ -144,18 +146,18 @@ class Denoiser(Method):
 
     @property
     def reaches(self) -> tuple[int, int]:
-        """How far the windows of luma and chroma go from their centre, px."""
+        """The largest offsets in the windows of luma and chroma, px."""
         return self.luma_size // 2, self.chroma_size // 2
 
     @property
     def amounts(self) -> tuple[float, float]:
-        """Strength times noise of luma and chroma, in signal units."""
+        """strength * noise of luma and of chroma, in signal units."""
         assert self.luma_noise is not None and self.chroma_noise is not None
         return self.luma_strength * self.luma_noise, self.chroma_strength * self.chroma_noise
 
     @property
     def effect(self) -> str:
-        """What the (resolved) strengths and noises come to, in a few words."""
+        """The effect of the (resolved) strengths and noises, in a few words."""
         raise NotImplementedError(type(self).__name__)
 
     def numbers(self, context: Context) -> Mapping[str, np.float32]:

@@ -1,4 +1,4 @@
-"""The tone curve."""
+"""Tone curve: the contrast of a photograph, on linear RGB, before gamma."""
 
 from importlib import resources
 from typing import ClassVar
@@ -15,7 +15,8 @@ DEFAULT = str(resources.files("clpipe.stages.tone_curve") / "default.csv")
 class Default(Curve):
     """The default curve of Adobe Camera Raw, on each channel of linear RGB, 0..1.
 
-    Its knots are those of the DNG SDK (the paper's reference [15]), a monotone cubic between them.
+    The knots are from the DNG SDK (reference [15] of Bielova et al. 2019), with a monotone cubic
+    between them.
     """
 
     method: ClassVar = "default"
@@ -26,20 +27,23 @@ class Default(Curve):
 
 
 class Linear(Unchanged):
-    """No curve: contrast as in the scene."""
+    """No curve: the contrast of the scene."""
 
     method: ClassVar = "linear"
     summary: ClassVar = "no curve"
 
 
 class File(Curve):
-    """A curve of one's own on each channel of linear RGB, 0..1."""
+    """A curve from a file, on each channel of linear RGB, 0..1."""
 
     method: ClassVar = "file"
     summary: ClassVar = "a curve from a .csv (x,y; monotone cubic) or one-dimensional .cube file"
 
     path: str = parameter(
-        DEFAULT, "The file; in a configuration, relative to it.", auto="default.csv", file=True
+        DEFAULT,
+        "The file of the curve; a configuration gives it relative to itself.",
+        auto="default.csv",
+        file=True,
     )
 
     @field_validator("path")
@@ -54,7 +58,7 @@ class File(Curve):
 
 STAGE = Stage(
     "tone_curve",
-    "Contrast, as a photograph has it.",
+    "Give the image the contrast of a photograph.",
     Kind.RGB,
     Kind.RGB,
     (Default, Linear, File),

@@ -1,4 +1,7 @@
-"""Tone curves from files: ``.csv`` with two columns, ``.cube`` with one dimension."""
+"""Tone curves from files: ``.csv`` with two columns and one-dimensional ``.cube``.
+
+Knots are (n, 2): x and y of the curve, x ascending.
+"""
 
 import re
 from collections.abc import Callable
@@ -6,19 +9,18 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from clpipe.base.types import Floats
+from clpipe.base.types import Doubles, Floats
 from clpipe.reference.curve import tabulate
 
-Knots = NDArray[np.float64]
+Knots = Doubles
 
 
-def monotone_cubic(knots: Knots, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The monotone cubic through (n, 2) knots (Fritsch and Butland, SIAM J. Sci. Stat. 1984).
+def monotone_cubic(knots: Knots, x: Doubles) -> Doubles:
+    """The monotone cubic through knots (Fritsch and Butland, SIAM J. Sci. Stat. Comput. 1984).
 
-    Slopes inside are the harmonic means of the two chords beside, at the ends those of the chords;
-    beyond the ends the curve is level.
+    The slope at an inner knot is the harmonic mean of its two chords' slopes, at an end knot that
+    of its chord; beyond the ends the curve is level.
 
     >>> monotone_cubic(np.array([(0, 0), (1, 1), (2, 1)]), np.array([0.0, 1.0, 1.5])).tolist()
     [0.0, 1.0, 1.0]
@@ -40,8 +42,8 @@ def monotone_cubic(knots: Knots, x: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def linear(knots: Knots, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Straight lines through (n, 2) knots, level beyond the ends.
+def linear(knots: Knots, x: Doubles) -> Doubles:
+    """Straight lines between knots, level beyond the ends.
 
     >>> linear(np.array([(0, 0), (1, 4)]), np.array([0.25, 3.0])).tolist()
     [1.0, 4.0]
@@ -56,7 +58,8 @@ def parse_csv(text: str) -> Knots:
     [[0.0, 0.0], [1.0, 1.0]]
 
     Raises:
-        ValueError: a line that is no such pair; the message has its number.
+        ValueError: a line is not such a pair, and the message has its number; or there are fewer
+            than two knots.
     """
     knots: list[tuple[float, float]] = []
     header = True
@@ -92,8 +95,8 @@ def parse_cube(text: str) -> Knots:
     [[0.0, 0.0], [1.0, 1.0]]
 
     Raises:
-        ValueError: a table of three dimensions, with three different curves, of another size than
-            it says, or a line that is none of the format; the message has its number.
+        ValueError: the table has three dimensions, or red, green and blue differ, or its size is
+            not LUT_1D_SIZE, or a line is not in the format, and the message has its number.
     """
     low, high, size = 0.0, 1.0, None
     rows: list[float] = []
@@ -107,7 +110,7 @@ def parse_cube(text: str) -> Knots:
             raise ValueError(f"line {number}: found {line!r}, but expected numbers") from None
         match fields[0]:
             case "LUT_3D_SIZE":
-                raise ValueError(f"line {number}: a table of three dimensions; it must have one")
+                raise ValueError(f"line {number}: a table of three dimensions; give one of one")
             case "LUT_1D_SIZE":
                 size = int(values[0]) if values else 0
             case "LUT_1D_INPUT_RANGE" if len(values) == 2:
@@ -115,37 +118,41 @@ def parse_cube(text: str) -> Knots:
             case "DOMAIN_MIN" | "DOMAIN_MAX" if len(set(values)) == 1:
                 low, high = (values[0], high) if fields[0][-1] == "N" else (low, values[0])
             case word if word[0].isalpha():
-                raise ValueError(f"line {number}: {line!r} is not understood here")
+                raise ValueError(
+                    f"line {number}: {line!r} is not understood in a one-dimensional .cube file"
+                )
             case _ if len(values) != 3:
                 raise ValueError(f"line {number}: found {len(values)} numbers, but expected three")
             case _ if not np.allclose(values, values[0], rtol=0, atol=1e-6):
                 raise ValueError(
-                    f"line {number}: red, green and blue differ; a tone curve is one for all three"
+                    f"line {number}: red, green and blue differ; they must share one tone curve"
                 )
             case _:
                 rows.append(values[0])
     if size is None or size != len(rows) or size < 2:
-        said = "no LUT_1D_SIZE" if size is None else f"LUT_1D_SIZE {size}"
-        raise ValueError(f"{said}, but {len(rows)} rows; they must agree, and be at least 2")
+        declared = "no LUT_1D_SIZE" if size is None else f"LUT_1D_SIZE {size}"
+        raise ValueError(f"{declared}, but {len(rows)} rows; they must agree, and be at least 2")
     if not low < high or not np.isfinite([low, high, *rows]).all():
-        raise ValueError(f"its domain goes from {low:g} to {high:g}; all must be finite and ascend")
+        raise ValueError(
+            f"its domain goes from {low:g} to {high:g}; it must ascend, and every number be finite"
+        )
     return np.stack([np.linspace(low, high, size), rows], axis=1)
 
 
-FORMATS: dict[
-    str,
-    tuple[
-        Callable[[str], Knots],
-        Callable[[Knots, NDArray[np.float64]], NDArray[np.float64]],
-    ],
-] = {".csv": (parse_csv, monotone_cubic), ".cube": (parse_cube, linear)}
+# By a file's ending: how it is parsed, and how its knots are interpolated.
+FORMATS: dict[str, tuple[Callable[[str], Knots], Callable[[Knots, Doubles], Doubles]]] = {
+    ".csv": (parse_csv, monotone_cubic),
+    ".cube": (parse_cube, linear),
+}
 
 
 def table_of(path: str) -> Floats:
-    """The curve table (see :mod:`clpipe.reference.curve`) of a file; read again when it changes.
+    """The table of a file's curve, see :mod:`clpipe.reference.curve`.
+
+    The file is read again when it changes.
 
     Raises:
-        ValueError: it cannot be read, is of no known format, or is not a curve.
+        ValueError: the file cannot be read, has an unknown format, or holds no curve.
     """
     try:
         status = Path(path).stat()

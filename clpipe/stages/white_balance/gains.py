@@ -1,4 +1,4 @@
-"""White balance with gains that are known beforehand."""
+"""White balance with gains that do not depend on the image, and the base of those that do."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,8 +11,8 @@ from clpipe.reference.cfa import Pattern, by_site
 from clpipe.stage import Argument, Context, Frame, Method, Pass, Unchanged, parameter
 
 
-def balanced(image: Floats, context: Context, red: np.float32, blue: np.float32) -> Floats:
-    """The mosaic with its gains, clipped at white."""
+def apply_gains(image: Floats, context: Context, red: np.float32, blue: np.float32) -> Floats:
+    """min(y * gain, 1), with the gain of each site's colour (green = 1); (height, width)."""
     gains = by_site(image.shape, context.pattern, red, np.float32(1), blue)
     return np.minimum(image * gains, np.float32(1))
 
@@ -20,18 +20,18 @@ def balanced(image: Floats, context: Context, red: np.float32, blue: np.float32)
 class EstimatedGains(Method):
     """Gains that are estimated from the image itself. Subclasses say how."""
 
-    tolerance: ClassVar = 1e-6  # of the gains: division is not exact on every device
+    tolerance: ClassVar = 1e-6  # division is not exact on every device
 
     def after(self, context: Context) -> Context:
-        # What the image will ask for is not known yet; the gains as shot are the best guess.
+        # The estimates are known only when the image is processed; the as-shot gains stand in.
         return replace(context, applied_gains=context.gains)
 
     def search(self) -> Pass:
-        """The pass that finds "red_gain" and "blue_gain"."""
+        """The pass that estimates "red_gain" and "blue_gain"."""
         raise NotImplementedError(type(self).__name__)
 
     def gains(self, image: Floats, pattern: Pattern) -> tuple[np.float32, np.float32]:
-        """The gains of red and blue for a (height, width) mosaic."""
+        """The gains of red and blue (green = 1) for a (height, width) mosaic."""
         raise NotImplementedError(type(self).__name__)
 
     def passes(self) -> tuple[Pass, ...]:
@@ -42,11 +42,11 @@ class EstimatedGains(Method):
     def reference(self, image: Floats, frame: Frame) -> Floats:
         red, blue = self.gains(image, frame.context.pattern)
         frame.estimates["red_gain"], frame.estimates["blue_gain"] = float(red), float(blue)
-        return balanced(image, frame.context, red, blue)
+        return apply_gains(image, frame.context, red, blue)
 
 
 class AsShot(Method):
-    """The gains that inverse_white_balance took out (none, if it did not run).
+    """min(y * gain, 1), with the gains that ``inverse_white_balance`` divided by, else 1.
 
     >>> from clpipe.stage import run_reference
     >>> as_shot = AsShot(red_gain=2.0, blue_gain=4.0)
@@ -56,7 +56,7 @@ class AsShot(Method):
 
     method: ClassVar = "as_shot"
     kernel: ClassVar = "site_gains"
-    summary: ClassVar = "give back the gains that inverse_white_balance took out"
+    summary: ClassVar = "the gains that inverse_white_balance divided by"
 
     red_gain: float | None = parameter(
         None, "Gain of red, green = 1.", auto="as inverse_white_balance used it", gt=0, le=64
@@ -81,14 +81,16 @@ class AsShot(Method):
         return {"pattern": context.cfa, "red_gain": red, "blue_gain": blue}
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        return balanced(image, frame.context, np.float32(self.red_gain), np.float32(self.blue_gain))
+        return apply_gains(
+            image, frame.context, np.float32(self.red_gain), np.float32(self.blue_gain)
+        )
 
 
 class Gains(AsShot):
-    """Fixed gains, those of the camera if none are given."""
+    """min(y * gain, 1), with fixed gains: the user's, else the camera's."""
 
     method: ClassVar = "gains"
-    summary: ClassVar = "fixed gains, the camera's unless given"
+    summary: ClassVar = "fixed gains, by default the camera's"
 
     red_gain: float | None = parameter(
         None, "Gain of red, green = 1.", auto="from the camera", gt=0, le=64
@@ -103,7 +105,7 @@ class Gains(AsShot):
 
 
 class Unbalanced(Unchanged):
-    """The mosaic stays as it is; with inverse_white_balance before it, as the sensor saw it."""
+    """No gains: after ``inverse_white_balance`` the mosaic keeps the sensor's own colours."""
 
     method: ClassVar = "none"
     summary: ClassVar = "no gains"

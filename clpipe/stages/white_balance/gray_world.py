@@ -1,4 +1,4 @@
-"""Gray world."""
+"""White balance by gray world: the mean colour of a scene is grey."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -12,9 +12,10 @@ from clpipe.stages.white_balance.gains import EstimatedGains
 
 
 class GrayWorld(EstimatedGains):
-    """k_c = mean(G) / mean(c) (Buchsbaum, J. Franklin Institute 1980).
+    """The gain of a colour c is mean(G) / mean(c) (Buchsbaum, J. Franklin Institute 1980).
 
-    Samples are clipped to -1..1 and summed as integers in steps of 2^-20, so the sums are exact.
+    Samples are clipped to -1..1 and summed as integers in steps of 2^-20, so the sums are exact and
+    do not depend on order.
     """
 
     method: ClassVar = "gray_world"
@@ -38,7 +39,9 @@ class GrayWorld(EstimatedGains):
 
 
 def gray_world_gains(image: Floats, pattern: Pattern) -> tuple[np.float32, np.float32]:
-    """mean(G) / mean(R) and mean(G) / mean(B) of a (height, width) mosaic; 1 for a dark colour.
+    """mean(G) / mean(R) and mean(G) / mean(B) of a (height, width) mosaic.
+
+    A gain is 1 where the mean of its colour or of green is not above 0.
 
     >>> gray_world_gains(np.float32([[0.125, 0.25], [0.5, 0.75]]), "RGGB")
     (np.float32(3.0), np.float32(0.5))

@@ -1,4 +1,4 @@
-"""White patch."""
+"""White balance by white patch: the brightest place of a scene is white."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -10,12 +10,12 @@ from clpipe.reference.cfa import Pattern, by_site
 from clpipe.stage import Access, Argument, Context, Pass, parameter
 from clpipe.stages.white_balance.gains import EstimatedGains
 
-STEPS = 6144  # bins a colour: 12 octaves below 1, 512 each
+STEPS = 6144  # bins of each colour: 12 octaves below 1, with 512 bins each
 _FIRST = int(np.float32(2.0**-12).view(np.int32))
 
 
 def cell_maximum(image: Floats) -> Floats:
-    """At each pixel the largest sample of its 2x2 cell; (height, width) in and out.
+    """At each pixel, the largest sample of its 2x2 cell; (height, width) in and out.
 
     >>> cell_maximum(np.float32([[1, 2, 9], [3, 4, 0]])).tolist()
     [[4.0, 4.0, 9.0], [4.0, 4.0, 9.0]]
@@ -27,7 +27,9 @@ def cell_maximum(image: Floats) -> Floats:
 
 
 def percentile_level(samples: Floats, millionths: int) -> np.float32:
-    """The middle of the bin that holds the sample of that rank; 0 where there are no samples.
+    """The middle of the histogram bin that holds a percentile; 0 where there are no samples.
+
+    ``millionths`` is the percentile as a share of the samples, in millionths.
 
     >>> percentile_level(np.float32([0.1, 0.2, 0.5]), 500_000)
     np.float32(0.20007324)
@@ -42,22 +44,22 @@ def percentile_level(samples: Floats, millionths: int) -> np.float32:
 
 
 class WhitePatch(EstimatedGains):
-    """k_c = max(G) / max(c), the maximum as a percentile (Land and McCann, J. Opt. Soc. Am. 1971).
+    """The gain of a colour c is max(G) / max(c) (Land and McCann, J. Opt. Soc. Am. 1971).
 
-    Cells of 2x2 samples that clip are left out: of a burnt-out light nothing is known but that it
-    was too bright. Levels are told apart in steps of 1/512 of an octave's lower end.
+    The maximum is a percentile. A 2x2 cell with a clipped sample is left out, because the colour of
+    a burnt-out light is unknown. Levels are resolved in steps of 1/512 of an octave's lower end.
     """
 
     method: ClassVar = "white_patch"
     kernel: ClassVar = "white_patch"
-    summary: ClassVar = "make the brightest samples that do not clip equal"
+    summary: ClassVar = "make the brightest unclipped samples of the three colours equal"
 
     percentile: float = parameter(
-        99.0, "Share of a colour's samples that are darker than its white.", "%", gt=0, le=100
+        99.0, "Share of a colour's samples that are darker than its white level.", "%", gt=0, le=100
     )
     clip: float = parameter(
         0.99,
-        "Level from which a sample counts as clipped; its 2x2 cell is left out.",
+        "Level from which a sample counts as clipped; its 2x2 cell is then left out.",
         "signal",
         gt=0,
         le=1,
@@ -92,7 +94,9 @@ class WhitePatch(EstimatedGains):
 def white_patch_gains(
     image: Floats, pattern: Pattern, clip: np.float32, millionths: int
 ) -> tuple[np.float32, np.float32]:
-    """White of G over white of R, and over white of B, of a (height, width) mosaic.
+    """The gains of red and blue of a (height, width) mosaic: the level of G over that of R and B.
+
+    A gain is 1 where the level of its colour or of green is not above 0.
 
     >>> cells = np.float32([[0.2, 0.4, 1.0, 1.0], [0.4, 0.1, 1.0, 0.3]])
     >>> [gain.item() for gain in white_patch_gains(cells, "RGGB", np.float32(0.99), 1_000_000)]

@@ -1,0 +1,91 @@
+"""Calibration of a camera from files: frames in, a profile and a picture of the fit out."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from clpipe.analysis.calibration.frames import (
+    CalibrationFrame,
+    FrameOverrides,
+    find_frames,
+    read_frame,
+)
+from clpipe.analysis.calibration.groups import calibrate_group, group_frames
+from clpipe.analysis.calibration.plot import plot_calibration
+from clpipe.analysis.calibration.profile import profile_text
+from clpipe.analysis.calibration.result import Calibration
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.files import write_new
+from clpipe.camera.profile import load_camera
+
+
+def calibrate_files(
+    inputs: Sequence[str], dark: Sequence[str], overrides: FrameOverrides
+) -> tuple[CalibrationFrame, list[Calibration]]:
+    """Estimate the noise at each ISO of the frames.
+
+    Args:
+        inputs: files, folders and globs of frames of a scene; what is also in ``dark`` is left out.
+        dark: files, folders and globs of frames without light.
+        overrides: replace what the files say.
+
+    Returns:
+        The first frame, for what it says of the camera, and the calibrations in ascending order of
+        ISO.
+
+    Raises:
+        RequestError: the frames do not belong together, or needed metadata is missing.
+        ImageError: a file cannot be read, or the frames do not allow an estimate.
+    """
+    overrides.check()
+    dark_paths = find_frames(dark)
+    without_light = {path.resolve() for path in dark_paths}
+    scene_paths = [p for p in find_frames(inputs) if p.resolve() not in without_light]
+    if not scene_paths:
+        raise RequestError("all frames are dark frames; give frames of a scene too")
+    scene = [read_frame(path, overrides) for path in scene_paths]
+    groups = group_frames(scene, [read_frame(path, overrides) for path in dark_paths])
+    return scene[0], [calibrate_group(group) for group in groups]
+
+
+def check_profile_name(path: Path) -> None:
+    """See that the name of a profile ends in .toml.
+
+    Raises:
+        RequestError: it does not.
+    """
+    if path.suffix != ".toml":
+        raise RequestError(
+            f"{path}: the name of a camera profile must end in .toml, such as camera.toml"
+        )
+
+
+def write_profile(path: Path, frame: CalibrationFrame, calibrations: Sequence[Calibration]) -> Path:
+    """Write the profile, and the picture of the fit beside it.
+
+    Args:
+        path: of the profile.
+        frame: one of the frames, for what it says of the camera.
+        calibrations: one for each ISO.
+
+    Returns:
+        The path of the picture.
+
+    Raises:
+        ImageError: a file cannot be written, or the estimates make no valid profile.
+    """
+    text = profile_text(
+        path.stem, frame.make, frame.model, calibrations, frame.gains, frame.xyz_to_camera
+    )
+
+    def write(to: Path) -> None:
+        to.write_text(text, "utf-8")
+        load_camera(str(to))  # raises RequestError for a profile that no run could use
+
+    picture = path.with_suffix(".png")
+    title = f"{frame.make} {frame.model}"
+    write_new(picture, lambda to: plot_calibration(to, calibrations, title))
+    try:
+        write_new(path, write)
+    except RequestError as error:
+        raise ImageError(f"the estimates make no valid profile: {error}") from None
+    return picture

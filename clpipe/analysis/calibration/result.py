@@ -1,0 +1,68 @@
+"""The result of a calibration at one ISO, and its JSON form."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from clpipe.analysis.calibration.fixed_pattern import Pixels
+from clpipe.analysis.calibration.line_fit import Bin, Estimate, Line
+from clpipe.analysis.calibration.repeats import Sensor
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The noise at one ISO, in DN unless a comment says otherwise; None where frames cannot tell.
+
+    ``lines`` are those of the channels and ``pooled`` that of all channels together; the variance
+    of rounding to whole DN is subtracted from them, but not from ``bins``.
+    """
+
+    iso: float
+    sensor: Sensor
+    scene_frames: int
+    dark_frames: int
+    lines: dict[str, Line]
+    pooled: Line
+    bins: dict[str, tuple[Bin, ...]]
+    size: int  # pixels of a frame
+    used: float  # the share of them that counts
+    rounding: float  # the variance of rounding to whole DN, DN^2
+    row_noise: Estimate | None = None
+    column_noise: Estimate | None = None
+    dsnu: Estimate | None = None
+    prnu: Estimate | None = None  # relative
+    hot: Pixels | None = None
+    dead: Pixels | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def method(self) -> str:
+        """How a and b were estimated, in words."""
+        if self.scene_frames > 1:
+            return "variance over repeated frames"
+        return "single image (Foi et al. 2008)"
+
+    @property
+    def read_noise(self) -> Estimate:
+        """The read noise in DN: 0 where b is not above zero."""
+        return self.pooled.floor.root()
+
+    def record(self) -> dict[str, Any]:
+        """The calibration as JSON values."""
+        unit, gain = self.sensor.unit, self.pooled.gain.value
+        electrons = self.dsnu and asdict(self.dsnu.scaled(1 / gain))
+        return {
+            "iso": self.iso,
+            "method": self.method,
+            "scene_frames": self.scene_frames,
+            "dark_frames": self.dark_frames,
+            "share_used": self.used,
+            "pooled": self.pooled.record(unit),
+            "channels": {name: line.record(unit) for name, line in self.lines.items()},
+            "row_noise_dn": self.row_noise and asdict(self.row_noise),
+            "column_noise_dn": self.column_noise and asdict(self.column_noise),
+            "dsnu_e": electrons,
+            "prnu": self.prnu and asdict(self.prnu),
+            "hot_pixels": self.hot and self.hot.record(),
+            "dead_pixels": self.dead and self.dead.record(),
+            "notes": list(self.notes),
+        }

@@ -1,0 +1,177 @@
+"""Noise by intensity: its size in intensity bins, and the line variance = a*intensity + b.
+
+Functions take planes: ``intensity`` (height, width) and ``noise`` (frame, height, width) in one
+unit, and ``mask`` (height, width), True where a pixel counts.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clpipe.base.types import Doubles, Floats, Mask
+
+BINS = 24
+FEWEST = 100  # samples of a bin; the standard error of its sigma is then 7 %
+
+
+@dataclass(frozen=True)
+class NoiseCurve:
+    """Noise by intensity: one value for each bin with enough samples, in ascending order."""
+
+    bins: NDArray[np.int64]  # the numbers of the bins
+    mean: Doubles  # intensity
+    shift: Doubles  # the mean of the noise
+    sigma: Doubles  # the standard deviation of the noise about the shift
+    count: NDArray[np.int64]  # samples
+
+
+@dataclass(frozen=True)
+class VarianceLaw:
+    """The line variance = a*intensity + b, with the standard errors of a and b."""
+
+    a: float
+    b: float
+    a_error: float
+    b_error: float
+
+
+def bin_edges(low: float, high: float, linear: bool) -> Doubles:
+    """The edges of :data:`BINS` bins from the lowest intensity to the highest.
+
+    Display values get bins of equal width. For ``linear`` light the edges are the squares of evenly
+    spaced numbers: fine in the shadows, where a sensor's sigma, about the root of the intensity,
+    changes most.
+
+    >>> bin_edges(0, 576, linear=True)[:4].tolist()
+    [0.0, 1.0, 4.0, 9.0]
+    """
+    steps = np.linspace(0, 1, BINS + 1)
+    return np.asarray(low + (high - low) * (steps**2 if linear else steps))
+
+
+def bin_of(intensity: Floats, edges: Doubles) -> NDArray[np.int64]:
+    """The number of each intensity's bin; intensities beyond the edges are in the first or last.
+
+    >>> bin_of(np.float32([-1, 0.2, 7]), np.linspace(0, 1, BINS + 1)).tolist()
+    [0, 4, 23]
+    """
+    return np.clip(np.searchsorted(edges, intensity, "right") - 1, 0, len(edges) - 2)
+
+
+def noise_by_intensity(
+    intensity: Floats, noise: Floats, mask: Mask, edges: Doubles, spread: float = 0.0
+) -> tuple[NoiseCurve, Floats, Floats]:
+    """Noise by intensity, and the noise with its dependence on intensity removed.
+
+    The mean of the noise at an intensity is a difference of tone between image and truth, not
+    noise; it is subtracted, interpolated linearly between bins. Standardised noise is the rest over
+    its sigma at that intensity, so that dark and bright places have equal weight.
+
+    Args:
+        intensity: (height, width).
+        noise: (frame, height, width).
+        mask: (height, width), the pixels that count; at least one.
+        edges: of the intensity bins.
+        spread: the variance of the intensity's own error relative to that of the noise: 1 / n where
+            the intensity is the mean of n frames.
+
+    Returns:
+        The curve, the noise without the shift, and the standardised noise of variance 1; both
+        (frame, height, width), 0 where the mask is False.
+    """
+    values = intensity[mask].astype(np.float64)
+    samples = noise[:, mask].astype(np.float64)
+    index = bin_of(intensity[mask], edges)
+    if np.bincount(index).max() * len(noise) < FEWEST:
+        edges, index = edges[[0, -1]], np.zeros_like(index)
+    bins = len(edges) - 1
+    count = np.bincount(index, minlength=bins) * len(noise)
+    used = np.flatnonzero(count >= min(FEWEST, count.max()))
+
+    def mean_in_bins(weights: Doubles, per: int) -> Doubles:
+        return np.bincount(index, weights, minlength=bins)[used] * per / count[used]
+
+    mean = mean_in_bins(values, len(noise))
+    shift = mean_in_bins(samples.sum(0), 1)
+    samples -= np.interp(values, mean, shift)
+    sigma = np.sqrt(mean_in_bins((samples**2).sum(0), 1))
+    if spread and bins > 1:
+        error = np.sqrt(spread * np.interp(edges[1:-1], mean, sigma**2))
+        mean = mean + (_selection_bias(values, edges, error) * len(noise))[used] / count[used]
+    curve = NoiseCurve(used, mean, shift, sigma, count[used])
+    without = np.zeros(noise.shape, np.float32)
+    without[:, mask] = samples
+    here = np.sqrt(np.interp(values, mean, sigma**2))
+    np.divide(samples, here, out=samples, where=here > 0)
+    size = np.sqrt((samples**2).mean())
+    standard = np.zeros(noise.shape, np.float32)
+    standard[:, mask] = samples / size if size > 0 else 0
+    return curve, without, standard
+
+
+def _selection_bias(values: Doubles, edges: Doubles, error: Doubles) -> Doubles:
+    """For each bin, the sum of the true values in it less the sum of the observed ones.
+
+    Values with an error of sigma s are sorted into bins by what was observed. The true value of an
+    observed one is higher by s^2 p'/p in the mean, with p the density of observed values (Efron,
+    "Tweedie's formula and selection bias", JASA 2011). Summed over a bin this is s^2 p at its upper
+    edge less s^2 p at its lower edge; p is estimated from the values within one s of the edge.
+
+    Args:
+        values: the observed values that count.
+        edges: of the bins.
+        error: s at each inner edge.
+    """
+    ordered = np.sort(values)
+    near = np.searchsorted(ordered, edges[1:-1] + error) - np.searchsorted(
+        ordered, edges[1:-1] - error
+    )
+    return np.diff(near * error / 2, prepend=0, append=0)
+
+
+def pool_curves(curves: Sequence[NoiseCurve]) -> NoiseCurve:
+    """The curve of several channels together; all curves have the same edges."""
+    bins, place = np.unique(np.concatenate([c.bins for c in curves]), return_inverse=True)
+    count = np.concatenate([c.count for c in curves])
+    total = np.bincount(place, count)
+
+    def weighted_mean(values: Sequence[Doubles]) -> Doubles:
+        return np.bincount(place, np.concatenate(values) * count) / total
+
+    variance = weighted_mean([c.sigma**2 for c in curves])
+    mean = weighted_mean([c.mean for c in curves])
+    shift = weighted_mean([c.shift for c in curves])
+    return NoiseCurve(bins, mean, shift, np.sqrt(variance), total.astype(np.int64))
+
+
+def fit_variance(curve: NoiseCurve, independent: float = 1.0) -> VarianceLaw | None:
+    """Fit variance = a*intensity + b to a curve by weighted least squares.
+
+    The variance v of a bin of n independent normal samples has the standard error v*sqrt(2/n). The
+    weights take v from the fitted line, in ten rounds: with the measured v, bins that came out low
+    by chance would get too much weight. Where bins scatter more than that about the line, the
+    standard errors grow in proportion.
+
+    Args:
+        curve: noise by intensity.
+        independent: the share of the samples that are independent.
+
+    Returns:
+        The law; None for fewer than two bins, or without noise.
+    """
+    if len(curve.mean) < 2 or not curve.sigma.any():
+        return None
+    variance, count = curve.sigma**2, curve.count * independent
+    terms = np.stack([curve.mean, np.ones_like(curve.mean)], axis=1)
+    expected = np.full_like(variance, np.average(variance, weights=count))
+    for _ in range(10):
+        weights = count / (2 * expected**2)
+        inverse = np.linalg.inv((terms.T * weights) @ terms)
+        a, b = inverse @ (terms.T * weights) @ variance
+        expected = np.maximum(a * curve.mean + b, variance.max() * 1e-6)
+    scatter = ((variance - terms @ (a, b)) ** 2 * weights).sum()
+    excess = max(1.0, scatter / (len(variance) - 2)) if len(variance) > 2 else 1.0
+    errors = np.sqrt(np.diag(inverse) * excess)
+    return VarianceLaw(float(a), float(b), float(errors[0]), float(errors[1]))

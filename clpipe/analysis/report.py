@@ -1,0 +1,86 @@
+"""The report of a measurement: the statistics of all channels, and its JSON form."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from clpipe.analysis.spatial import LineNoise
+from clpipe.analysis.statistics import HISTOGRAM, SIGMAS, Channel, gaussian_beyond
+from clpipe.base.types import Doubles
+
+# The unit of intensities and sigmas, by the kind of the images.
+UNITS = {
+    "display": "of full scale, display values",
+    "rgb": "RGB before gamma",
+    "mosaic": "signal: 0 = black level, 1 = white level",
+    "values": "as in the file",
+}
+
+
+@dataclass(frozen=True)
+class NoiseReport:
+    """The measured noise of some images, channel by channel."""
+
+    kind: str
+    images: tuple[str, ...]
+    truth: str | None  # None: the mean of the images
+    width: int
+    height: int
+    share: float  # of the pixels (of a mosaic: of the samples) that count
+    edges: Doubles  # of the intensity bins
+    channels: tuple[Channel, ...]
+    correlations: Mapping[tuple[str, str], float]
+    notes: tuple[str, ...]
+
+    def record(self) -> dict[str, Any]:
+        """The report as JSON values; what could not be computed is null."""
+        return {
+            "kind": self.kind,
+            "unit": UNITS[self.kind],
+            "images": list(self.images),
+            "truth": self.truth,
+            "width": self.width,
+            "height": self.height,
+            "share_used": self.share,
+            "notes": list(self.notes),
+            "channels": {channel.name: channel_record(channel) for channel in self.channels},
+            "correlation": {f"{a}-{b}": json_number(r) for (a, b), r in self.correlations.items()},
+        }
+
+
+def json_number(value: float) -> float | None:
+    """A number as JSON can hold it: NaN becomes null."""
+    return None if math.isnan(value) else float(value)
+
+
+def line_record(lines: LineNoise) -> dict[str, float | None]:
+    """Row or column noise as JSON values."""
+    return {"sigma": json_number(lines.sigma), "limit": json_number(lines.limit)}
+
+
+def channel_record(channel: Channel) -> dict[str, Any]:
+    """A channel as JSON values."""
+    curve, law, tails = channel.curve, channel.law, channel.tails
+    return {
+        "samples": channel.count,
+        "sigma": channel.sigma,
+        "law": law and {"a": law.a, "b": law.b, "a_error": law.a_error, "b_error": law.b_error},
+        "intensity": {
+            "mean": curve.mean.tolist(),
+            "sigma": curve.sigma.tolist(),
+            "shift": curve.shift.tolist(),
+            "samples": curve.count.tolist(),
+        },
+        "row": line_record(channel.rows),
+        "column": line_record(channel.columns),
+        "autocorrelation": [
+            [json_number(r) for r in row] for row in channel.autocorrelation.tolist()
+        ],
+        "energy_left_2x2": json_number(channel.energy_left),
+        "skewness": json_number(tails.skewness),
+        "excess_kurtosis": json_number(tails.excess_kurtosis),
+        "beyond": {str(k): json_number(p) for k, p in zip(SIGMAS, tails.beyond, strict=True)},
+        "gaussian_beyond": {str(k): gaussian_beyond(k) for k in SIGMAS},
+        "histogram": {"edges": HISTOGRAM.round(2).tolist(), "samples": tails.histogram.tolist()},
+    }

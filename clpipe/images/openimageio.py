@@ -1,0 +1,62 @@
+"""Opening files with OpenImageIO, and its errors and threads."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import OpenImageIO as oiio
+
+from clpipe.base.errors import ImageError
+from clpipe.base.files import sha256_of
+from clpipe.base.text import printable
+
+
+class SubsampledError(ImageError):
+    """OpenImageIO cannot read a file, because its channels differ in size."""
+
+
+def set_codec_threads(count: int) -> None:
+    """Set how many threads OpenImageIO may use to read or write one file."""
+    oiio.attribute("threads", count)
+    oiio.attribute("exr_threads", count)
+
+
+@contextlib.contextmanager
+def open_image(path: Path) -> Iterator[tuple[str, Any]]:
+    """The SHA-256 of a file, and the file open as an ``oiio.ImageInput``.
+
+    Raises:
+        ImageError: the file is missing, empty, damaged, or of no known format.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise ImageError(f"{str(path)!a}: its name is not UTF-8; rename it") from None
+    try:
+        digest, size = sha256_of(path)
+    except FileNotFoundError:
+        raise ImageError(f"{path}: no such file") from None
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+    if not size:
+        raise ImageError(f"{path}: the file is empty")
+    try:
+        hints = oiio.ImageSpec()
+        hints.attribute("pnm:pfmflip", 1)  # else OpenImageIO 3.2 reads PFM upside down
+        file = oiio.ImageInput.open(str(path), hints)
+        if file is None:
+            reason = error_text(oiio.geterror())
+            failure = SubsampledError if reason.startswith("Subsampled channels") else ImageError
+            raise failure(f"{path}: cannot be read as an image: {reason}")
+        with contextlib.closing(file):
+            yield digest, file
+    except UnicodeDecodeError:  # any call that returns text from the file can raise it
+        raise ImageError(f"{path}: damaged: a name or attribute in it is not UTF-8") from None
+
+
+def error_text(text: str) -> str:
+    """An error of OpenImageIO in one line; it gives none for some damaged files."""
+    if not text or "could not find a format reader" in text:
+        return "it is damaged, or of no known format"
+    return printable(text)

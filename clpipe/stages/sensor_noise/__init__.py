@@ -1,0 +1,14 @@
+"""Sensor noise: shot noise and read noise."""
+
+from clpipe.stage import Kind, Stage
+from clpipe.stages.sensor_noise.gaussian import Gaussian
+from clpipe.stages.sensor_noise.no_noise import NoNoise
+from clpipe.stages.sensor_noise.poisson import Poisson
+
+STAGE = Stage(
+    "sensor_noise",
+    "Add shot and read noise.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (Gaussian, Poisson, NoNoise),
+)

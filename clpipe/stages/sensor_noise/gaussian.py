@@ -1,0 +1,60 @@
+"""Sensor noise as one heteroscedastic Gaussian."""
+
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.base.types import Floats
+from clpipe.reference.math import square_root
+from clpipe.reference.random import normal_at
+from clpipe.stage import Context, Frame, NoiseScope, Pass
+from clpipe.stages.sensor_noise.common import NEVER_FULL, or_default
+from clpipe.stages.sensor_noise.model import SensorNoise
+
+
+class Gaussian(SensorNoise):
+    """Heteroscedastic Gaussian noise, Var[y] = a*y + b (Foi et al., IEEE TIP 2008, eq. 2).
+
+    The noisy signal is limited to the full well. With ``tukey_lambda`` the read noise, of variance
+    b, is drawn from a Tukey lambda distribution instead and added after the full well.
+
+    >>> from clpipe.stage import run_reference
+    >>> noisy = run_reference(Gaussian(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
+    >>> round(float(noisy.mean()), 2), round(float(noisy.var()), 4)
+    (0.5, 0.0006)
+    """
+
+    method: ClassVar = "gaussian"
+    kernel: ClassVar = "sensor_noise_gaussian"
+    summary: ClassVar = "add Gaussian noise of variance a*y + b"
+    other_examples: ClassVar = ({"tukey_lambda": -0.2, "full_well": 1000.0},)
+
+    def passes(self) -> tuple[Pass, ...]:
+        if self.tukey_lambda is None:
+            return (
+                Pass("sensor_noise", arguments=("a", "b", "full_well"), random=NoiseScope.IMAGE),
+            )
+        names = ("a", "full_well", "read_noise", "shape", "scale")
+        return (Pass("sensor_noise_tukey", arguments=names, random=NoiseScope.IMAGE),)
+
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        if self.tukey_lambda is None:  # here a negative signal lowers the variance below b
+            return np.maximum(self.own_variance(signal), np.float32(0)) + before
+        return super().variance(before, signal, context)
+
+    def numbers(self) -> dict[str, np.float32]:
+        full = np.float32(or_default(self.full_signal, NEVER_FULL))
+        numbers = {"a": np.float32(self.a), "full_well": full}
+        if self.tukey_lambda is None:
+            return {**numbers, "b": np.float32(self.b)}
+        return {**numbers, **self.read_noise_numbers()}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        n = self.numbers()
+        normals = normal_at(image.shape, 0, frame.stream[NoiseScope.IMAGE])
+        variance = n["a"] * image + n.get("b", np.float32(0))
+        noise = normals * square_root(np.maximum(variance, np.float32(0)))
+        noisy = np.minimum(image + noise, n["full_well"])
+        if self.tukey_lambda is None:
+            return noisy
+        return noisy + self.unit_read_noise(image, frame) * n["read_noise"]

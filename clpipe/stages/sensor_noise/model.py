@@ -1,0 +1,211 @@
+"""The strength of sensor noise: its parameters, and the noise model that they define."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from math import isclose
+from typing import Self
+
+import numpy as np
+from pydantic import model_validator
+
+from clpipe.base.errors import RequestError
+from clpipe.base.types import Floats
+from clpipe.camera.noise import Emva, NoiseModel, Paper
+from clpipe.reference.random import normal_at, word_at
+from clpipe.reference.tukey_lambda import shape_and_scale, tukey_lambda_of
+from clpipe.stage import Argument, Context, Frame, Method, NoiseScope, parameter
+from clpipe.stages.sensor_noise.common import NEVER_FULL, or_default
+from clpipe.stages.sensor_noise.no_noise import NoNoise
+
+EMVA = ("system_gain", "read_noise", "adc_noise")
+PAPER = ("chi", "theta", "b_before", "b_after", "p0")
+
+
+class SensorNoise(Method):
+    """The strength of the noise in one of three parametrisations, and the full well.
+
+    The parametrisations are those of :mod:`clpipe.camera.noise`: a and b, EMVA 1288's or the
+    paper's (Bielova et al. 2019). Parameters that are not set follow from the camera and the ISO.
+    Subclasses draw the noise.
+    """
+
+    a: float | None = parameter(
+        None,
+        "Shot noise: the variance per unit of signal.",
+        "signal",
+        "from the camera and ISO",
+        ge=0,
+        le=1,
+    )
+    b: float | None = parameter(
+        None,
+        "Read noise: the variance without light.",
+        "signal^2",
+        "from the camera and ISO",
+        ge=0,
+        le=1,
+    )
+    system_gain: float | None = parameter(
+        None, "Instead of a: the system gain (EMVA 1288).", "DN/e-", "not used", gt=0
+    )
+    read_noise: float | None = parameter(
+        None,
+        "Instead of b: standard deviation of the noise before the gain (EMVA 1288).",
+        "e-",
+        "not used",
+        ge=0,
+    )
+    adc_noise: float | None = parameter(
+        None,
+        "With read_noise: standard deviation of the noise after the gain.",
+        "DN",
+        "not used",
+        ge=0,
+    )
+    chi: float | None = parameter(
+        None,
+        "Instead of a and b, with theta: electrons at y = 1 and theta = 1 (the paper).",
+        "e-",
+        "not used",
+        gt=0,
+    )
+    theta: float | None = parameter(
+        None, "With chi: the analogue gain (the paper).", "", "not used", gt=0
+    )
+    b_before: float | None = parameter(
+        None,
+        "With chi: b', the variance of the noise before the gain (the paper).",
+        "signal^2",
+        "not used",
+        ge=0,
+    )
+    b_after: float | None = parameter(
+        None,
+        "With chi: b'', the variance of the noise after the gain (the paper).",
+        "signal^2",
+        "not used",
+        ge=0,
+    )
+    p0: float | None = parameter(
+        None, "With chi: the pedestal (the paper).", "signal", "not used", ge=0
+    )
+    full_well: float | None = parameter(
+        None,
+        "The largest number of electrons that a pixel holds.",
+        "e-",
+        "from the camera; else no limit",
+        gt=0,
+    )
+    tukey_lambda: float | None = parameter(
+        None,
+        "Shape of the read noise: 0.14 is nearly Gaussian, lower values have heavier tails.",
+        "",
+        "from the camera; else Gaussian",
+        gt=-0.5,
+        le=1,
+    )
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        emva, paper = self._set_names(EMVA), self._set_names(PAPER)
+        if emva and paper:
+            raise ValueError(
+                f"set the noise in one parametrisation, EMVA 1288's or the paper's; "
+                f"found {', '.join(emva)} and {', '.join(paper)}"
+            )
+        if paper and (self.chi is None or self.theta is None):
+            raise ValueError(
+                f"the paper's parameters need both chi and theta; found {', '.join(paper)} only"
+            )
+        return self
+
+    def _set_names(self, names: tuple[str, ...]) -> list[str]:
+        return [name for name in names if getattr(self, name) is not None]
+
+    def model(self, context: Context) -> NoiseModel:
+        """The noise model: the parameters that are set, the others from the camera at the ISO.
+
+        Raises:
+            RequestError: a or b is set and does not agree with another parametrisation that is set,
+                or b comes out negative, or the ISO is outside the camera's range.
+        """
+        camera = context.camera.noise(context.iso)
+        unit = camera.signal_range
+        emva, paper = camera.emva(), camera.paper()
+        assert emva and paper  # a camera's gain is above 0
+        names = self._set_names(EMVA) or self._set_names(PAPER)
+        if self.chi and self.theta:
+            before = or_default(self.b_before, paper.b_before)
+            after = or_default(self.b_after, paper.b_after)
+            a, b = Paper(self.chi, self.theta, before, after, self.p0 or 0.0).signal()
+            if b < 0:
+                raise RequestError(
+                    f"sensor_noise: p0 = {self.p0:g} makes b negative, {b:.4g}; lower p0"
+                )
+            model = NoiseModel(a, b, unit, min(after, b), self.theta)
+        elif names:
+            gain = or_default(self.system_gain, emva.system_gain)
+            read_noise = or_default(self.read_noise, emva.read_noise)
+            after = or_default(self.adc_noise, emva.adc_noise)
+            a, b = Emva(gain, read_noise, after).signal(unit)
+            model = NoiseModel(a, b, unit, (after / unit) ** 2, camera.theta)
+        else:
+            a, b = or_default(self.a, camera.a), or_default(self.b, camera.b)
+            return camera if (a, b) == (camera.a, camera.b) else NoiseModel(a, b, unit)
+        for name, own, derived in (("a", self.a, model.a), ("b", self.b, model.b)):
+            if own is not None and not isclose(own, derived, rel_tol=1e-6):
+                raise RequestError(
+                    f"sensor_noise: set the noise in one parametrisation; found {name} = {own:g} "
+                    f"beside {', '.join(names)}, which make {name} = {derived:g}"
+                )
+        return model
+
+    def resolve(self, context: Context) -> Self:
+        model, camera = self.model(context), context.camera
+        filled = self.filled(a=model.a, b=model.b, tukey_lambda=camera.tukey_lambda)
+        return filled.filled(full_well=camera.full_well)
+
+    def after(self, context: Context) -> Context:
+        return replace(context, noise=self.model(context))
+
+    def without_noise(self) -> Method | None:
+        full = self.full_signal
+        return None if full is None else NoNoise(full_signal=full)
+
+    @property
+    def full_signal(self) -> float | None:
+        """The signal at which the well is full; None without a full well, or where a is 0."""
+        return self.full_well * self.a if self.full_well and self.a else None
+
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        """a*y + b, y clipped to 0..full well; that a full well cuts the noise is not modelled."""
+        return self.own_variance(np.maximum(signal, np.float32(0))) + before
+
+    def own_variance(self, signal: Floats) -> Floats:
+        """The variance of this stage's noise, a*y + b, y at most the full well; signal squared."""
+        y = np.minimum(signal, np.float32(or_default(self.full_signal, NEVER_FULL)))
+        return y * np.float32(self.a) + np.float32(self.b)
+
+    def numbers(self) -> dict[str, np.float32]:
+        """The kernel's arguments, by name."""
+        raise NotImplementedError(type(self).__name__)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return self.numbers()
+
+    def read_noise_numbers(self) -> dict[str, np.float32]:
+        """The kernel's arguments for read noise: sigma and, unless Gaussian, shape and scale."""
+        assert self.b is not None
+        sigma = {"read_noise": np.float32(self.b**0.5)}
+        if self.tukey_lambda is None:
+            return sigma
+        shape, scale = shape_and_scale(self.tukey_lambda)
+        return {**sigma, "shape": shape, "scale": scale}
+
+    def unit_read_noise(self, image: Floats, frame: Frame) -> Floats:
+        """Read noise of variance 1 for each pixel, in NumPy; (height, width)."""
+        stream = frame.stream[NoiseScope.IMAGE]
+        if self.tukey_lambda is None:
+            return normal_at(image.shape, 1, stream)
+        words = word_at(image.shape, 1, stream)
+        return tukey_lambda_of(words, *shape_and_scale(self.tukey_lambda))

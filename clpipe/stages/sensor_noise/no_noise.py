@@ -1,0 +1,49 @@
+"""An ideal sensor: no noise, but a full well."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.base.types import Floats
+from clpipe.stage import Argument, Context, Frame, Method, Pass, parameter
+from clpipe.stages.sensor_noise.common import NEVER_FULL, or_default
+
+
+class NoNoise(Method):
+    """No noise: min(y, full_signal), since an ideal sensor still has a full well.
+
+    >>> from clpipe.stage import run_reference
+    >>> run_reference(NoNoise(full_signal=0.5), np.float32([[0.25, 0.75]])).tolist()
+    [[0.25, 0.5]]
+    """
+
+    method: ClassVar = "none"
+    kernel: ClassVar = "full_well"
+    summary: ClassVar = "no noise; the full well still clips"
+    example: ClassVar = {"full_signal": 0.5}
+
+    full_signal: float | None = parameter(
+        None,
+        "The signal at which the well is full.",
+        "signal",
+        "from the camera and ISO; else no limit",
+        gt=0,
+    )
+
+    def resolve(self, context: Context) -> "NoNoise":
+        camera = context.camera
+        full = camera.signal_of(camera.full_well, context.iso) if camera.full_well else None
+        return self.filled(full_signal=full)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("full_well", arguments=("full_signal",)),) if self.full_signal else ()
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {"full_signal": np.float32(or_default(self.full_signal, NEVER_FULL))}
+
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        return before
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        return np.minimum(image, np.float32(or_default(self.full_signal, NEVER_FULL)))

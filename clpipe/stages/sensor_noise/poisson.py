@@ -1,0 +1,69 @@
+"""Sensor noise as whole photo-electrons and read noise."""
+
+from typing import ClassVar, Self
+
+import numpy as np
+
+from clpipe.base.errors import RequestError
+from clpipe.base.types import Floats
+from clpipe.reference.poisson import poisson_of
+from clpipe.reference.random import word_at
+from clpipe.stage import Context, Frame, NoiseScope, Pass
+from clpipe.stages.sensor_noise.common import NEVER_FULL
+from clpipe.stages.sensor_noise.model import SensorNoise
+
+
+class Poisson(SensorNoise):
+    """Whole photo-electrons: a * min(Poisson(max(y, 0) / a), full well) + read noise (EMVA 1288).
+
+    Poisson numbers come by inverse CDF (Giles, ACM TOMS 42(1), 2016); the read noise has the
+    variance b and is Gaussian or, with ``tukey_lambda``, of a Tukey lambda distribution.
+
+    >>> from clpipe.stage import run_reference
+    >>> noisy = run_reference(Poisson(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
+    >>> round(float(noisy.mean()), 2), round(float(noisy.var()), 4)
+    (0.5, 0.0006)
+    """
+
+    method: ClassVar = "poisson"
+    kernel: ClassVar = "sensor_noise_poisson"
+    summary: ClassVar = "draw whole photo-electrons and add read noise"
+    other_examples: ClassVar = (
+        {"a": 0.05, "b": 1e-4},
+        {"tukey_lambda": -0.2, "full_well": 1000.0},
+    )
+
+    def resolve(self, context: Context) -> Self:
+        resolved = super().resolve(context)
+        if not resolved.a:
+            raise RequestError(
+                "sensor_noise: poisson needs an a above 0; without shot noise use method gaussian"
+            )
+        return resolved
+
+    def passes(self) -> tuple[Pass, ...]:
+        gaussian = self.tukey_lambda is None
+        names = ("chi", "full_well", "a", "read_noise")
+        return (
+            Pass(
+                "sensor_noise_poisson" if gaussian else "sensor_noise_poisson_tukey",
+                arguments=names if gaussian else (*names, "shape", "scale"),
+                random=NoiseScope.IMAGE,
+            ),
+        )
+
+    def numbers(self) -> dict[str, np.float32]:
+        assert self.a
+        return {
+            "chi": np.float32(1 / self.a),
+            "full_well": np.float32(self.full_well or NEVER_FULL),
+            "a": np.float32(self.a),
+            **self.read_noise_numbers(),
+        }
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        n = self.numbers()
+        words = word_at(image.shape, 0, frame.stream[NoiseScope.IMAGE])
+        mean = np.maximum(image, np.float32(0)) * n["chi"]
+        electrons = np.minimum(poisson_of(mean, words), n["full_well"])
+        return electrons * n["a"] + self.unit_read_noise(image, frame) * n["read_noise"]
