@@ -47,7 +47,7 @@ def test_the_installed_package_works_from_anywhere(tmp_path):
 def test_what_an_extra_installs_is_named_where_it_is_missing(clpipe, monkeypatch, command, message):
     found = extras.find_spec
     absent = ("scipy", "matplotlib", "distributed")
-    monkeypatch.setattr(extras, "find_spec", lambda name: name not in absent and found(name))
+    monkeypatch.setattr(extras, "find_spec", lambda name: None if name in absent else found(name))
     error = clpipe(*command, status=2).stderr
     extra = "dask" if "--dask" in command else "calibrate"
     assert f"{message}; pip install 'clpipe[{extra}]'" in error
