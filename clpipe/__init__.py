@@ -11,29 +11,39 @@ from clpipe.base.about import __version__
 
 if TYPE_CHECKING:
     from clpipe.base.errors import ClpipeError, DeviceError, ImageError, RequestError
+    from clpipe.camera.noise import NoiseModel
+    from clpipe.camera.profile import Camera, built_in_cameras, load_camera
     from clpipe.dataset import Dataset
     from clpipe.engine.runner import Result
     from clpipe.pipeline import Pipeline
 
 _MODULES = {
+    "Camera": "clpipe.camera.profile",
     "ClpipeError": "clpipe.base.errors",
     "Dataset": "clpipe.dataset",
     "DeviceError": "clpipe.base.errors",
     "ImageError": "clpipe.base.errors",
+    "NoiseModel": "clpipe.camera.noise",
     "Pipeline": "clpipe.pipeline",
     "RequestError": "clpipe.base.errors",
     "Result": "clpipe.engine.runner",
+    "built_in_cameras": "clpipe.camera.profile",
+    "load_camera": "clpipe.camera.profile",
 }
 
 __all__ = [
+    "Camera",
     "ClpipeError",
     "Dataset",
     "DeviceError",
     "ImageError",
+    "NoiseModel",
     "Pipeline",
     "RequestError",
     "Result",
     "__version__",
+    "built_in_cameras",
+    "load_camera",
 ]
 
 

@@ -1,4 +1,4 @@
-"""Training straight from renders: samples as NumPy arrays, developed on the way."""
+"""Training data straight from renders: each sample is developed when it is needed."""
 
 import copy
 import itertools
@@ -13,17 +13,15 @@ from pathlib import Path
 from typing import Any, Self
 
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.readonly import ReadOnly
 from clpipe.chain.chain import Chain
-from clpipe.chain.files import own_values
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_device
 from clpipe.engine.runner import Runner
 from clpipe.images.openimageio import set_codec_threads
-from clpipe.images.read import ReadOptions
 from clpipe.inputs.find import Job, find_jobs
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.inputs.raw import RawImage
-from clpipe.outputs.writer import named
 from clpipe.pipeline import plain
 from clpipe.stage import Kind
 
@@ -32,7 +30,7 @@ NOWHERE = Path(os.devnull)  # nothing is written
 
 
 def key_in(epoch: int, key: str) -> str:
-    """The image key of an epoch: as frames of a burst have them, the first is the image's own.
+    """The image key of an image in an epoch; epochs are keyed as the frames of a burst are.
 
     >>> key_in(0, "a.exr"), key_in(2, "a.exr")
     ('a.exr', 'a.exr#2')
@@ -40,15 +38,15 @@ def key_in(epoch: int, key: str) -> str:
     return f"{key}#{epoch}" if epoch else key
 
 
-class Dataset:
+class Dataset(ReadOnly):
     """Renders as a camera sees them, sample by sample, with new noise in each epoch.
 
     Iterate over it, or index it: ``torch.utils.data.DataLoader`` takes it as it is. A sample is a
     dict of
 
     - "image": (height, width, 3) uint8 where the chain ends in display values, else float32,
-    - "truth", if asked for: the same without noise; images of ``keep`` by the names of their
-      steps, and "truth.NAME" for each that is kept without noise; float32,
+    - "truth", with ``truth=True``: the same without noise; images of ``keep`` by the names of their
+      steps, and "truth.NAME" for each of them without noise; float32,
     - "key": the image key of the render, and "epoch",
     - "iso", "a" and "b": the sensor noise that was added, Var[y] = a*y + b in signal units (1 is
       the white level), zeros where none was.
@@ -56,26 +54,25 @@ class Dataset:
     All arrays are in the sensor's orientation. The noise of an image in epoch E is that of frame E
     of ``clpipe run --frames``: its image key is the render's, with "#E" behind it from epoch 1 on.
     So a sample depends on its render, the settings and the epoch alone, and not on order, sharding,
-    workers or restarts. What is declared to be drawn at random for each image is drawn anew in each
-    epoch, but for kept images, which keep what was drawn for them.
+    workers or restarts. Draws are made again in each epoch; kept images keep theirs.
 
     The device is opened by the process that first makes a sample. OpenCL does not survive a fork:
     workers of a process that has used it must be spawned (``multiprocessing_context="spawn"``).
 
     Args:
         inputs: files, folders, globs and manifests, as ``clpipe run`` takes them.
-        config: as for :class:`~clpipe.Pipeline`; None holds what kept images carry, else the
-            default.
+        config: as for :class:`~clpipe.Pipeline`; None is the settings that a kept image carries,
+            else the default.
         device: as for :class:`~clpipe.Pipeline`.
-        keep: steps whose image is wanted too, or "all".
+        keep: steps whose image a sample has, too, or "all".
         start_at: the first step to run; inputs are then images that were kept before it.
         until: the last step to run.
-        truth: whether each sample is wanted without noise too.
-        layer: of an EXR, which is the picture.
-        transfer: of renders in whole numbers: "srgb", "linear".
-        epoch: the first.
-        epochs: how many there are, one after the other; None is no end.
-        threads: how many images are decoded at a time; None is one for each processor.
+        truth: whether a sample has its image without noise, too.
+        layer: the layer of an EXR that is the picture; None chooses.
+        transfer: the transfer curve of renders in whole numbers: "srgb" or "linear".
+        epoch: the number of the first epoch.
+        epochs: how many epochs there are; None is no end.
+        threads: how many images are decoded at once; None is one for each processor.
         **settings: what a configuration file may hold, over ``config``.
 
     Raises:
@@ -100,17 +97,23 @@ class Dataset:
         threads: int | None = None,
         **settings: Any,
     ) -> None:
-        own = None if config is None else own_values(str(config))
-        asked = Request(own, plain(settings), start_at=start_at, until=until)
-        self._entrance = ImageLoader(asked, ReadOptions(layer=layer, transfer=transfer))
+        request = Request.from_options(
+            config=None if config is None else str(config),
+            values=plain(settings),
+            start_at=start_at,
+            until=until,
+            layer=layer,
+            transfer=transfer,
+        )
+        self._loader = ImageLoader(request)
         several = [inputs] if isinstance(inputs, str | Path) else inputs
-        self._jobs = find_jobs([str(i) for i in several], NOWHERE, self._entrance.endings())
-        self._entrance.check(self._jobs)
+        self._jobs = find_jobs([str(i) for i in several], NOWHERE, self._loader.endings())
+        self._loader.check(self._jobs)
         _check_keys(self._jobs)
-        chain = self._entrance.first_chain(self._jobs)
+        chain = self._loader.first_chain(self._jobs)
         if truth:
             chain.without_noise()  # refuses a chain that adds no noise
-        self._keep = chain.kept([keep] if isinstance(keep, str) else keep)
+        self._keep = chain.select([keep] if isinstance(keep, str) else keep)
         self._encode = chain.result is Kind.DISPLAY
         self._truth = truth
         self._selector = None if device is None else str(device)
@@ -123,8 +126,12 @@ class Dataset:
         self._opened: _Developer | None = None
         self.set_epoch(epoch)
 
+    def __repr__(self) -> str:
+        epochs = "endless epochs" if self._epochs is None else f"{self._epochs} epochs"
+        return f"Dataset({len(self._jobs)} images, {epochs}, {self._loader.settings.label})"
+
     def set_epoch(self, epoch: int) -> None:
-        """Begin with this epoch, from the next sample on; for a run that goes on, for example.
+        """Begin with this epoch, from the next sample on; use it to resume a training run.
 
         Raises:
             RequestError: it is negative.
@@ -134,7 +141,9 @@ class Dataset:
         self._epoch = epoch
 
     def shard(self, index: int, of: int) -> Self:
-        """One part of several, for a worker: every ``of``-th image, from the ``index``-th (from 0).
+        """A part for one of several workers: every ``of``-th image, from the ``index``-th on.
+
+        Indices count from 0.
 
         Raises:
             RequestError: there is no such part.
@@ -146,17 +155,16 @@ class Dataset:
         return part
 
     def __getstate__(self) -> Mapping[str, Any]:
-        # What was found out and opened stays with the process.
-        return {**self.__dict__, "_entrance": replace(self._entrance), "_opened": None}
+        return {**self.__dict__, "_opened": None}  # a device stays with its process
 
     def __len__(self) -> int:
         """How many samples there are, over all epochs.
 
         Raises:
-            TypeError: there is no end of them.
+            TypeError: epochs are endless.
         """
         if self._epochs is None:
-            raise TypeError("a dataset of endless epochs has no length; say epochs=N")
+            raise TypeError("a dataset of endless epochs has no length; set epochs=N")
         return len(self._jobs) * self._epochs
 
     def __getitem__(self, index: int) -> Sample:
@@ -203,37 +211,37 @@ class Dataset:
         return self._jobs[image], self._epoch + epoch
 
     def _read(self, job: Job, epoch: int) -> LoadedImage:
-        entrance = self._entrance
+        loader = self._loader
         try:
-            entrance = entrance.of(replace(job, key=key_in(epoch, job.key)))
-            entered = entrance.enter(job, entrance.read(job))
+            loader = loader.for_job(replace(job, key=key_in(epoch, job.key)))
+            loaded = loader.enter(job, loader.read(job))
         except (ImageError, RequestError, MemoryError) as error:
-            raise ImageError(entrance.explain(job, error)) from None
-        if entered is None:
+            raise ImageError(loader.error_text(job, error)) from None
+        if loaded is None:
             raise ImageError(
                 f"{job.path}: was kept after another step than the one before "
-                f"{entrance.asked.start_at}; name those to go on from by a glob"
+                f"{loader.request.start_at}; name the images to go on from by a glob"
             )
-        for warning in entered.source.warnings:
+        for warning in loaded.source.warnings:
             warnings.warn(f"{job.path}: {warning}", stacklevel=2)
-        return entered
+        return loaded
 
     def _develop_read(self, job: Job, epoch: int, read: Future[LoadedImage]) -> Sample:
         return self._develop(job, epoch, read.result())
 
-    def _develop(self, job: Job, epoch: int, entered: LoadedImage) -> Sample:
-        chain = entered.chain
+    def _develop(self, job: Job, epoch: int, loaded: LoadedImage) -> Sample:
+        chain = loaded.chain
         try:
-            made = self._developer().develop(entered, key_in(epoch, entered.key))
+            arrays = self._developer().develop(loaded, key_in(epoch, loaded.key))
         except (ImageError, RequestError, MemoryError) as error:
-            raise ImageError(self._entrance.explain(job, error)) from None
-        is_known = chain.is_noisy or not isinstance(entered.source, RawImage)
-        noise = chain.noise if is_known else None
+            raise ImageError(self._loader.error_text(job, error)) from None
+        adds_noise = chain.is_noisy or not isinstance(loaded.source, RawImage)
+        noise = chain.noise if adds_noise else None
         a, b = (noise.a, noise.b) if noise else (0.0, 0.0)
-        return {**made, "key": job.key, "epoch": epoch, "iso": chain.iso, "a": a, "b": b}
+        return {**arrays, "key": job.key, "epoch": epoch, "iso": chain.iso, "a": a, "b": b}
 
     def _developer(self) -> "_Developer":
-        """What develops in this process.
+        """The developer of this process.
 
         Raises:
             DeviceError: there is no usable device, or another process had opened it.
@@ -249,7 +257,7 @@ _opening = threading.Lock()
 
 
 class _Developer:
-    """What develops images on a device, one at a time."""
+    """Develops images on a device, one at a time."""
 
     def __init__(
         self, device: Device | None, keep: Sequence[str], encode: bool, truth: bool
@@ -263,24 +271,24 @@ class _Developer:
         self._chain: Chain | None = None
         self._runners: dict[str, Runner] = {}
 
-    def develop(self, entered: LoadedImage, key: str) -> Sample:
-        """The pictures of an image, and what is kept on the way.
+    def develop(self, loaded: LoadedImage, key: str) -> Sample:
+        """The arrays of a sample: "image", "truth" and kept images.
 
         Raises:
-            ImageError, RequestError, MemoryError: it cannot be developed.
+            ImageError, RequestError, MemoryError: the image cannot be developed.
         """
-        made: Sample = {}
+        arrays: Sample = {}
         with self._lock:
-            self._prepare(entered.chain)
+            self._prepare(loaded.chain)
             for name, runner in self._runners.items():
-                result = runner.run(entered.source.pixels, key)
-                inside = "" if name == "image" else f"{name}."
-                made |= {inside + step: image for step, image in result.kept.items()}
-                made[name] = result.image
-        return made
+                result = runner.run(loaded.source.pixels, key)
+                prefix = "" if name == "image" else f"{name}."
+                arrays |= {prefix + step: image for step, image in result.kept.items()}
+                arrays[name] = result.image
+        return arrays
 
     def _prepare(self, chain: Chain) -> None:
-        """Have runners for a chain, which is mostly the one before."""
+        """Make runners for a chain, unless it is that of the image before."""
         if chain is self._chain:
             return
         chains = {"image": chain, **({"truth": chain.without_noise()} if self._truth else {})}
@@ -291,12 +299,12 @@ class _Developer:
         kept = tuple(step.name for step in chain.steps if step.name in self._keep)
         latest = self._runners.get(name)
         if latest and latest.keep == kept:
-            return latest.of(chain)  # with the plans that are there
+            return latest.of(chain)  # shares its plans
         return Runner(chain, self._device, kept, self._encode, final=not self._encode)
 
 
 def _check_keys(jobs: Sequence[Job]) -> None:
-    """See that no two images have the same key, and with it the same noise.
+    """See that no two images have the same key, and so the same noise.
 
     Raises:
         RequestError: two have.
@@ -306,6 +314,6 @@ def _check_keys(jobs: Sequence[Job]) -> None:
         other = owners.setdefault(job.key, job)
         if other is not job:
             raise RequestError(
-                f"{named(other)} and {named(job)} have the same image key, {job.key}, and would "
+                f"{other.label} and {job.label} have the same image key, {job.key}, and would "
                 "have the same noise; give the folder that both are in"
             )

@@ -1,4 +1,4 @@
-"""The Python door: a camera as an object that takes NumPy images."""
+"""The Python API: a chain as an object that takes NumPy images."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.errors import ImageError
+from clpipe.base.readonly import ReadOnly
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.files import load_settings
@@ -16,14 +17,14 @@ from clpipe.engine.runner import Result, Runner
 from clpipe.stage import Kind
 
 
-class Pipeline:
+class Pipeline(ReadOnly):
     """A chain of stages on a device, ready for images.
 
     Args:
         config: a built-in configuration ("default", "paper") or a TOML file.
         device: an index or a part of a name as ``clpipe devices`` lists them, or "numpy"; None
             takes the first GPU, else the first CPU.
-        keep: steps whose image is wanted beside the last one, or "all".
+        keep: steps whose image is returned beside the last one, or "all".
         start_at: the first step to run; images are then of the kind that it reads.
         until: the last step to run.
         **settings: what a configuration file may hold, over ``config``: ``iso=3200``,
@@ -47,7 +48,7 @@ class Pipeline:
         self._settings = overlay(load_settings(str(config)), plain(settings))
         self._ends = start_at, until
         chain = self._chain(self._settings)
-        kept = chain.kept([keep] if isinstance(keep, str) else keep)
+        kept = chain.select([keep] if isinstance(keep, str) else keep)
         encode = chain.result is Kind.DISPLAY
         on = open_device(None if device is None else str(device))
         self._runner = Runner(chain, on, kept, encode=encode, final=not encode)
@@ -56,21 +57,26 @@ class Pipeline:
         start_at, until = self._ends
         return make_chain(settings, start_at=start_at, until=until)
 
+    def __repr__(self) -> str:
+        device = self._runner.device
+        where = device.info.label if device else "numpy"
+        return f"Pipeline({self._settings.label}, {self.chain.label}, on {where})"
+
     @property
     def chain(self) -> Chain:
         """The steps, each with its resolved parameters."""
         return self._runner.chain
 
     def process(self, image: Array, key: str, **settings: Any) -> Result:
-        """Put one image through.
+        """Run the chain on one image.
 
         Args:
             image: (height, width, 3) linear RGB, 1 = full scale of the sensor, of float16, float32
                 or float64; or (height, width) where the chain starts on a mosaic, also of uint16;
                 or a finished picture, also of uint8, where it starts on one.
-            key: what the image's noise and draws belong to: the same key gives the same.
-            **settings: other values for this image alone, as for the class. Values such as ISO,
-                gains and noise parameters cost nothing; another method or size is compiled.
+            key: the image key; noise and draws depend on it and on the seed alone.
+            **settings: values for this image alone, as for the class. Another ISO, gain or noise
+                parameter costs nothing; for another method or size, kernels are compiled.
 
         Returns:
             ``image`` is (height, width, 3) uint8 where the chain ends in display values, else
@@ -78,7 +84,7 @@ class Pipeline:
 
         Raises:
             ImageError: an image of the wrong shape or type, not finite, or too large.
-            RequestError: a setting that is not allowed.
+            RequestError: a name or value that is not allowed.
         """
         runner = self._runner
         own = overlay(self._settings, plain(settings)) if settings else self._settings
@@ -89,20 +95,21 @@ class Pipeline:
     def process_many(
         self, images: Iterable[Array | tuple[Array, str | Mapping[str, Any]]]
     ) -> Iterator[Result]:
-        """Put images through, one after the other, as they are asked for.
+        """Run the chain on images, each when its result is taken from the iterator.
 
-        An item is an image, whose key is then its number ("0", "1", ...), an image with its key, or
-        an image with the arguments that :meth:`process` takes beside it, such as
-        ``{"key": "a", "iso": 800}``.
+        Args:
+            images: each is an image, whose key is then its number ("0", "1", ...), or an image with
+                its key, or an image with a dict of further arguments of :meth:`process`, such as
+                ``{"key": "a", "iso": 800}``.
         """
         for number, item in enumerate(images):
             image, arguments = item if isinstance(item, tuple) else (item, {})
-            given = {"key": arguments} if isinstance(arguments, str) else arguments
-            yield self.process(image, **{"key": str(number), **given})
+            named = {"key": arguments} if isinstance(arguments, str) else arguments
+            yield self.process(image, **{"key": str(number), **named})
 
 
 def plain(values: Any) -> Any:
-    """Settings without NumPy types: what a configuration file could hold."""
+    """Values without NumPy types, as a configuration file can hold them."""
     if isinstance(values, Mapping):
         return {key: plain(value) for key, value in values.items()}
     if isinstance(values, list | tuple):
@@ -111,17 +118,17 @@ def plain(values: Any) -> Any:
 
 
 def _checked(image: Array, kind: Kind) -> Array:
-    """The image in a type that runs, refused where it cannot be what the chain starts on.
+    """The image in a type that a chain can start on: float16, float32 or whole DN.
 
     Raises:
-        ImageError: it is of a wrong type, or not finite.
+        ImageError: it is of another type, or not finite.
     """
     if not isinstance(image, np.ndarray):
         raise ImageError(f"found {type(image).__name__}; expected a NumPy array")
     if kind is Kind.DISPLAY and image.dtype in (np.uint8, np.uint16):
         return image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
-    whole = image.dtype in (np.uint16, np.uint32) and len(kind.channels) == 1
-    if image.dtype.kind != "f" and not whole:
+    is_dn = image.dtype in (np.uint16, np.uint32) and len(kind.channels) == 1
+    if image.dtype.kind != "f" and not is_dn:
         also = (
             " (or DN as uint16)" if len(kind.channels) == 1 else "; uint8 pictures are not linear"
         )
@@ -129,5 +136,5 @@ def _checked(image: Array, kind: Kind) -> Array:
     if image.dtype not in (np.float16, np.float32):
         image = image.astype(np.float32)
     if not np.isfinite(image).all():
-        raise ImageError("found NaN or infinity in an image; np.nan_to_num takes them out")
+        raise ImageError("found NaN or infinity in an image; np.nan_to_num replaces them")
     return image

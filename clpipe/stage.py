@@ -77,8 +77,8 @@ class Access(Enum):
     CURVE = "curve"  # pointwise, each channel through the table named "table"
     STENCIL = "stencil"  # a pixel from its neighbours
     LINES = "lines"  # a table with a value a row or column, from no image
-    SUMS = "sums"  # sums over the whole image, then a few numbers found from them
-    HISTOGRAM = "histogram"  # counts over the whole image, then a few numbers found from them
+    SUMS = "sums"  # sums over the whole image, then a few numbers estimated from them
+    HISTOGRAM = "histogram"  # counts over the whole image, then a few numbers estimated from them
 
 
 class NoiseScope(Enum):
@@ -95,7 +95,7 @@ class Pass:
     ``reads`` and ``writes`` name images of the stage: ``src`` is its input, ``dst`` its output, any
     other name is scratch. A STENCIL with a ``block`` gets an array for it, row by row, as its last
     argument, where others return a pixel. ``arguments`` are, in order, names from
-    :meth:`Method.arguments`, from ``found`` of an earlier SUMS pass, or the line table that an
+    :meth:`Method.arguments`, from ``estimates`` of an earlier SUMS pass, or the line table that an
     earlier LINES pass writes.
     """
 
@@ -110,9 +110,9 @@ class Pass:
     block: int = 0  # STENCIL: one call gives 4 rows of that many vectors, which share work
     cheap: bool = False  # so cheap that a stencil after it may redo it at each tap
     lines: str = ""  # LINES: "rows" or "columns"
-    finish: str = ""  # SUMS, HISTOGRAM: the function that turns these into what is found
+    finish: str = ""  # SUMS, HISTOGRAM: the function that turns these into the estimates
     finish_arguments: tuple[str, ...] = ()  # of that function
-    found: tuple[str, ...] = ()  # SUMS, HISTOGRAM: names of the numbers it finds, at most four
+    estimates: tuple[str, ...] = ()  # SUMS, HISTOGRAM: names of the numbers, at most four
     bins: int = 0  # HISTOGRAM: how many
 
 
@@ -346,12 +346,12 @@ def variant_label(method: type[Method], values: Mapping[str, Any]) -> str:
 class Frame:
     """What a reference needs besides the image and its parameters.
 
-    ``found`` is where a stage puts numbers that it found in the image, such as gains.
+    ``estimates`` is where a stage puts numbers that it estimates from the image, such as gains.
     """
 
     context: Context
     stream: Mapping[NoiseScope, Stream]
-    found: dict[str, float]
+    estimates: dict[str, float]
 
 
 def run_reference(

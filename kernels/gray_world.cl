@@ -5,7 +5,7 @@ INLINE vi gray_world_sample(vf y) {
     return to_int(nearest(vmin(vmax(y, (vf)(-1.0f)), (vf)(1.0f)) * 1048576.0f));
 }
 
-INLINE void gray_world(long4 sums, cfa pattern, extent e, __global float *found) {
+INLINE void gray_world(long4 sums, cfa pattern, extent e, __global float *estimates) {
     const long even_x = (e.width + 1) / 2, odd_x = e.width / 2;
     const long even_y = (e.height + 1) / 2, odd_y = e.height / 2;
     const long sum[4] = {sums.x, sums.y, sums.z, sums.w};
@@ -15,6 +15,6 @@ INLINE void gray_world(long4 sums, cfa pattern, extent e, __global float *found)
     const float green = (float)(sum[green1] + sum[green2]) / (float)(count[green1] + count[green2]);
     // A colour without light, or without a site in a tiny picture, gets the gain 1.
     const bool green_lit = sum[green1] + sum[green2] > 0;
-    found[0] = green_lit && sum[red] > 0 ? green / ((float)sum[red] / (float)count[red]) : 1.0f;
-    found[1] = green_lit && sum[blue] > 0 ? green / ((float)sum[blue] / (float)count[blue]) : 1.0f;
+    estimates[0] = green_lit && sum[red] > 0 ? green / ((float)sum[red] / (float)count[red]) : 1.0f;
+    estimates[1] = green_lit && sum[blue] > 0 ? green / ((float)sum[blue] / (float)count[blue]) : 1.0f;
 }

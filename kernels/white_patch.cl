@@ -31,10 +31,10 @@ INLINE float white_patch_level(__global const uint *bins, uint millionths) {
 }
 
 INLINE void white_patch(__global const uint *histogram, uint millionths, extent e,
-                        __global float *found) {
+                        __global float *estimates) {
     const float red = white_patch_level(histogram, millionths);
     const float green = white_patch_level(histogram + WHITE_PATCH_BINS, millionths);
     const float blue = white_patch_level(histogram + 2 * WHITE_PATCH_BINS, millionths);
-    found[0] = red > 0.0f && green > 0.0f ? green / red : 1.0f;
-    found[1] = blue > 0.0f && green > 0.0f ? green / blue : 1.0f;
+    estimates[0] = red > 0.0f && green > 0.0f ? green / red : 1.0f;
+    estimates[1] = blue > 0.0f && green > 0.0f ? green / blue : 1.0f;
 }

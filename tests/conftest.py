@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from click.testing import Result as ClickResult
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.commands.main import main
+from clpipe.engine import programs
 from clpipe.engine.device import Device
 from clpipe.engine.discovery import choose, find_devices
 from clpipe.engine.runner import Result, Runner
@@ -27,9 +29,21 @@ def written(folder: Path) -> list[str]:
     return sorted(files - {"run.jsonl"})
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _compiling_is_not_announced() -> None:
+    # With a cold cache the line would stand in the output of whichever test comes first.
+    programs._announced.set()
+
+
 @pytest.fixture(scope="session")
 def device() -> Device:
     return Device(choose(None, find_devices()))
+
+
+@pytest.fixture(scope="session")
+def scalar_device(device: Device) -> Device:
+    """The same device as if it were a GPU: one lane, so the kernels are plain scalar code."""
+    return Device(replace(device.info, lanes=1))
 
 
 @pytest.fixture(scope="session")

@@ -1,12 +1,9 @@
 """The Python API, as somebody who imports clpipe sees it."""
 
-import re
-
 import numpy as np
 import pytest
 
 import clpipe
-from tests.conftest import ROOT
 
 
 @pytest.fixture(scope="module")
@@ -17,15 +14,6 @@ def render():
 @pytest.fixture(scope="module")
 def camera():
     return clpipe.Pipeline(iso=3200, denoise={"luma_strength": 0.5}, keep=["quantize"])
-
-
-def test_the_example_in_the_readme(tmp_path, monkeypatch):
-    text = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1]
-    monkeypatch.chdir(tmp_path)
-    names: dict = {}
-    exec(text, names)
-    assert names["shot"].image.dtype == np.uint8
-    assert names["shot"].kept["quantize"].ndim == 2
 
 
 def test_one_image(camera, render):

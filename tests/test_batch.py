@@ -15,16 +15,18 @@ import numpy as np
 import pytest
 
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.batch import replay
 from clpipe.batch.run_log import read_log
 from clpipe.batch.threads import Batch
-from clpipe.chain.request import request_from_options
-from clpipe.images import write as image_write
+from clpipe.batch.work import ImageWorker
+from clpipe.chain.formats import EVERY_FORMAT, ending_of
+from clpipe.chain.request import Request
+from clpipe.images import write
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs import folder as output_folders
 from clpipe.outputs import sidecar
 from clpipe.outputs.folder import LOCK, output_folder, remove_unfinished
-from clpipe.outputs.formats import EVERY_FORMAT, ending_of
 from clpipe.outputs.writer import OutputWriter
 from tests.conftest import ROOT, written
 
@@ -44,6 +46,14 @@ def renders(write_exr):
         return folder
 
     return write
+
+
+def worker_of(folder):
+    """A worker that makes PNGs of the renders in a folder, and its jobs."""
+    loader = ImageLoader(Request.from_options(formats=("png",)))
+    jobs = find_jobs([str(folder / "in")], folder / "out")
+    writer = OutputWriter(folder / "out", loader.request)
+    return ImageWorker(loader, writer, loader.first_chain(jobs)), jobs
 
 
 def contents(folder):
@@ -107,7 +117,7 @@ def test_another_request_is_a_change(clpipe, renders, more):
 
 def test_the_content_of_a_file_that_is_named_is_a_part_of_the_request(clpipe, renders):
     camera = Path("mine.toml")
-    camera.write_text((ROOT / "clpipe/cameras/sony-a7r2.toml").read_text())
+    camera.write_text((ROOT / "clpipe/camera/profiles/sony-a7r2.toml").read_text())
     clpipe("run", renders(2), *RUN, "--camera", "mine.toml")
     clpipe("run", "in", *RUN, "--camera", "mine.toml")
     assert set(statuses("out").values()) == {"skipped"}
@@ -118,7 +128,8 @@ def test_the_content_of_a_file_that_is_named_is_a_part_of_the_request(clpipe, re
 
 def test_another_version_makes_everything_again(clpipe, renders, monkeypatch):
     clpipe("run", renders(2), *RUN)
-    monkeypatch.setattr(sidecar.clpipe, "__version__", "9.9.9")
+    for module in (sidecar, replay):
+        monkeypatch.setattr(module, "__version__", "9.9.9")
     clpipe("run", "in", *RUN)
     assert set(statuses("out").values()) == {"done"}
 
@@ -190,18 +201,15 @@ def test_several_devices_share_a_run(clpipe, renders, tmp_path):
 def test_devices_develop_at_the_same_time(renders, tmp_path, monkeypatch):
     renders(8)
     (tmp_path / "out").mkdir()
-    develop, both = Batch.develop, threading.Barrier(2)
+    develop, both = ImageWorker.develop, threading.Barrier(2)
 
-    def together(self, work, shot, runner):
+    def together(self, task, rendition, runner):
         both.wait(timeout=20)  # for the other device's image
-        return develop(self, work, shot, runner)
+        return develop(self, task, rendition, runner)
 
-    monkeypatch.setattr(Batch, "develop", together)
-    entrance = ImageLoader(request_from_options())
-    jobs = find_jobs([str(tmp_path / "in")], tmp_path / "out")
-    batch = Batch(
-        entrance, OutputWriter(tmp_path / "out", ("png",)), [None, None], entrance.first_chain(jobs)
-    )
+    monkeypatch.setattr(ImageWorker, "develop", together)
+    worker, jobs = worker_of(tmp_path)
+    batch = Batch(worker, [None, None])
     outcomes = list(batch.run(jobs))
     assert [o.status for o in outcomes] == ["done"] * 8
     workers = [s.worker for o in outcomes for s in o.spans if s.step == "device"]
@@ -211,17 +219,15 @@ def test_devices_develop_at_the_same_time(renders, tmp_path, monkeypatch):
 def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, monkeypatch):
     renders(30)
     (tmp_path / "out").mkdir()
-    entrance = ImageLoader(request_from_options())
-    jobs = find_jobs([str(tmp_path / "in")], tmp_path / "out")
-    target = OutputWriter(tmp_path / "out", ("png",))
-    batch = Batch(entrance, target, [None], entrance.first_chain(jobs), threads=2)
-    decode, decoded, seen = Batch.decode, [], []
+    worker, jobs = worker_of(tmp_path)
+    batch = Batch(worker, [None], threads=2)
+    decode, decoded, seen = ImageWorker.decode, [], []
 
     def counted(self, job, begin):
         decoded.append(job)
         return decode(self, job, begin)
 
-    monkeypatch.setattr(Batch, "decode", counted)
+    monkeypatch.setattr(ImageWorker, "decode", counted)
     for done, _ in enumerate(batch.run(jobs)):
         time.sleep(0.01)  # whoever waits for outcomes is slow
         seen.append(len(decoded) - done)
@@ -354,16 +360,16 @@ def test_halves_of_a_killed_run_are_removed(tmp_path):
 
 def test_the_disk_is_full(clpipe, renders, monkeypatch):
     renders(5)
-    real, count = image_write._write, []
+    real, count = write._write, []
 
-    def write(path, spec, pixels):
+    def fail_to_write(path, spec, pixels):
         count.append(path)
         if len(count) > 2:
             monkeypatch.setattr(output_folders, "ROOM", 2**62)  # more than any disk has
             raise ImageError(f"{path}: cannot be written: the disk is full")
         real(path, spec, pixels)
 
-    monkeypatch.setattr(image_write, "_write", write)
+    monkeypatch.setattr(write, "_write", fail_to_write)
     result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)
     assert "clpipe: out: cannot write there: " in result.stderr
     assert "the same command goes on" in result.stderr
@@ -373,14 +379,14 @@ def test_the_disk_is_full(clpipe, renders, monkeypatch):
 
 def test_the_folder_has_gone(clpipe, renders, monkeypatch):
     renders(5)
-    real = image_write._write
+    real = write._write
 
-    def write(path, spec, pixels):
+    def fail_to_write(path, spec, pixels):
         real(path, spec, pixels)
         if path.name == "r002.jpg":
             Path("out").rename("elsewhere")
 
-    monkeypatch.setattr(image_write, "_write", write)
+    monkeypatch.setattr(write, "_write", fail_to_write)
     result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)
     assert "out: " in result.stderr and "the same command goes on" in result.stderr
     assert not Path("out").exists()
@@ -535,7 +541,7 @@ def test_a_sidecar_makes_its_picture_again(clpipe, renders):
 
 
 def test_a_sidecar_whose_picture_cannot_be_the_same(clpipe, renders, monkeypatch):
-    Path("mine.toml").write_text((ROOT / "clpipe/cameras/sony-a7r2.toml").read_text())
+    Path("mine.toml").write_text((ROOT / "clpipe/camera/profiles/sony-a7r2.toml").read_text())
     clpipe("run", renders(2), *RUN, "--camera", "mine.toml")
 
     def refused(*more):
@@ -550,12 +556,13 @@ def test_a_sidecar_whose_picture_cannot_be_the_same(clpipe, renders, monkeypatch
     assert Path("b/r000.jpg").read_bytes() == Path("out/r000.jpg").read_bytes()
     Path("mine.toml").write_text(Path("mine.toml").read_text() + "\n")
     assert "mine.toml: has changed since" in refused("moved.exr")
-    monkeypatch.setattr(sidecar.clpipe, "__version__", "9.9.9")
+    for module in (sidecar, replay):
+        monkeypatch.setattr(module, "__version__", "9.9.9")
     assert "it is of clpipe 0" in refused("moved.exr")
     assert (
         "clpipe did not write" in clpipe("run", "--replay", "mine.toml", "-o", "b", status=2).stderr
     )
-    Path("half.json").write_text('{"clpipe": "9.9.9", "asked": {}}')
+    Path("half.json").write_text('{"clpipe": "9.9.9", "request": {}}')
     assert "it is damaged" in clpipe("run", "--replay", "half.json", "-o", "b", status=2).stderr
     assert "no such file" in clpipe("run", "--replay", "no.json", "-o", "b", status=2).stderr
 
@@ -590,7 +597,7 @@ def test_a_link_that_leads_nowhere_is_a_failed_image(clpipe, renders):
 
 
 def test_a_file_is_the_same_however_it_is_spelled(clpipe, renders, tmp_path, monkeypatch):
-    Path("mine.toml").write_text((ROOT / "clpipe/cameras/sony-a7r2.toml").read_text())
+    Path("mine.toml").write_text((ROOT / "clpipe/camera/profiles/sony-a7r2.toml").read_text())
     clpipe("run", renders(2), *RUN, "--camera", "mine.toml")
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
@@ -630,6 +637,17 @@ def test_a_sidecar_that_somebody_edited(clpipe, renders, key, value):
     assert not Path("b").exists()
 
 
+@pytest.mark.parametrize(("key", "value"), [("formats", []), ("options", 3), ("image_key", None)])
+def test_a_sidecar_whose_request_somebody_edited(clpipe, renders, key, value):
+    clpipe("run", renders(1), *RUN)
+    record = json.loads(Path("out/r000.json").read_text())
+    record["request"][key] = value
+    Path("edited.json").write_text(json.dumps(record))
+    stderr = clpipe("run", "--replay", "edited.json", "-o", "b", status=2).stderr
+    assert "edited.json: it is damaged" in stderr
+    assert not Path("b").exists()
+
+
 def test_a_sidecar_made_with_other_libraries(clpipe, renders):
     clpipe("run", renders(1), *RUN)
     sidecar_ = Path("out/r000.json")
@@ -644,9 +662,7 @@ def test_a_sidecar_made_with_other_libraries(clpipe, renders):
 def test_what_nobody_expected_ends_the_run_and_does_not_hang(renders, tmp_path, monkeypatch):
     renders(30)
     (tmp_path / "out").mkdir()
-    entrance = ImageLoader(request_from_options())
-    jobs = find_jobs([str(tmp_path / "in")], tmp_path / "out")
-    target, chain = OutputWriter(tmp_path / "out", ("png",)), entrance.first_chain(jobs)
+    worker, jobs = worker_of(tmp_path)
     for step in ("decode", "develop", "encode"):
         caught = []
 
@@ -660,8 +676,8 @@ def test_what_nobody_expected_ends_the_run_and_does_not_hang(renders, tmp_path, 
                 caught.append(str(error))
 
         with monkeypatch.context() as patch:
-            patch.setattr(Batch, step, fail)
-            batch = Batch(entrance, target, [None], chain, threads=1)
+            patch.setattr(ImageWorker, step, fail)
+            batch = Batch(worker, [None], threads=1)
             thread = threading.Thread(target=run, args=(batch,), daemon=True)
             thread.start()
             thread.join(20)

@@ -6,12 +6,13 @@ import pytest
 
 from clpipe.batch import bench as bench_batch
 from clpipe.batch.bench import Load
-from clpipe.commands import measure as cli
+from clpipe.chain.request import Request
+from clpipe.commands import bench as bench_command
 
 
 @pytest.fixture
 def short(monkeypatch):
-    monkeypatch.setattr(cli, "loads", lambda: (Load(6, 32, 24), Load(5, 40, 17)))
+    monkeypatch.setattr(bench_command, "loads", lambda: (Load(6, 32, 24), Load(5, 40, 17)))
 
 
 def test_a_batch_is_timed_against_the_same_work_done_serially(clpipe, short):
@@ -33,5 +34,5 @@ def test_the_table(clpipe, short):
 
 def test_it_leaves_no_files(device, tmp_path, monkeypatch):
     monkeypatch.setattr(bench_batch.tempfile, "tempdir", str(tmp_path))
-    bench_batch.bench_batch(device, cli.request_from_options(), Load(5, 24, 16))
+    bench_batch.bench_batch(device, Request.from_options(), Load(5, 24, 16))
     assert not list(tmp_path.iterdir())

@@ -122,9 +122,9 @@ def test_float_exr_of_the_last_stage(clpipe, small):
 def test_gray_world_gains_are_in_the_sidecar(clpipe, small, tmp_path):
     clpipe("run", small, "-o", "out", "--set", "white_balance.method=gray_world")
     sidecar = json.loads((tmp_path / "out" / "small.json").read_text())
-    found = next(s["found"] for s in sidecar["stages"] if s["name"] == "white_balance")
-    assert found["red_gain"] == pytest.approx(2.77, rel=0.1)
-    assert found["blue_gain"] == pytest.approx(1.36, rel=0.1)
+    estimates = next(s["estimates"] for s in sidecar["stages"] if s["name"] == "white_balance")
+    assert estimates["red_gain"] == pytest.approx(2.77, rel=0.1)
+    assert estimates["blue_gain"] == pytest.approx(1.36, rel=0.1)
 
 
 def test_a_configuration_with_options_over_it(clpipe, small, tmp_path):
@@ -319,9 +319,6 @@ def test_check(clpipe):
     record = json.loads(clpipe("check", "mosaic", "quantize", "--small", "--json").stdout)
     assert record["failed"] == 0
     assert [c["stage"] for c in record["checks"]] == ["mosaic", "quantize"]
-    whole = json.loads(clpipe("check", "--small", "--json").stdout)
-    assert whole["failed"] == 0
-    assert {c["stage"] for c in whole["checks"]} >= {*DEFAULT_CHAIN, "exposure..quantize"}
     assert "unknown stage 'mosiac'" in clpipe("check", "mosiac", status=2).stderr
     assert "numpy is the reference" in clpipe("check", "--device", "numpy", status=2).stderr
 
@@ -335,17 +332,19 @@ def test_bench(clpipe):
 
 
 def test_bench_of_methods(clpipe):
-    options = ("--size", "320x200", "--repeat", 1, "--set", "denoise.luma_size=3")
+    # Sizes that test_kernels.py compiles too.
+    sizes = ("--set", "denoise.luma_size=5", "--set", "denoise.chroma_size=3")
+    options = ("--size", "320x200", "--repeat", 1, *sizes)
     text = clpipe("bench", "--methods", "denoise", *options).stdout
-    assert "bilateral luma_size=3" in text
+    assert "bilateral luma_size=5 chroma_size=3" in text
     records = json.loads(clpipe("bench", "--methods", "demosaic", *options, "--json").stdout)
     launches = {record["method"]: record["launches"] for record in records}
     assert launches["bilinear"] == 1
     assert launches["edge_directed_median size=5"] == 3
     assert all(record["mp_per_s"] > 0 for record in records)
-    one = ("--set", "denoise.method=mean", "--set", "denoise.chroma_size=9", "--json")
+    one = ("--set", "denoise.method=mean", "--json")
     records = json.loads(clpipe("bench", "--methods", "denoise", *options, *one).stdout)
-    assert [record["method"] for record in records] == ["mean luma_size=3 chroma_size=9"]
+    assert [record["method"] for record in records] == ["mean luma_size=5 chroma_size=3"]
     assert "did you mean 'denoise'" in clpipe("bench", "--methods", "denoize", status=2).stderr
 
 
@@ -382,7 +381,7 @@ def test_cameras_are_listed_and_shown(clpipe):
     text = clpipe("cameras", "canon-5d2", "--iso", 12800, status=2).stderr
     assert "found 12800, but camera canon-5d2 goes from 100 to 6400" in text
     assert "did you mean 'sony-a7s2'" in clpipe("cameras", "sony-a7s", status=2).stderr
-    assert "name the camera" in clpipe("cameras", "--iso", 100, status=2).stderr
+    assert "needs the name of a camera" in clpipe("cameras", "--iso", 100, status=2).stderr
 
 
 def test_a_burst_is_frames_and_one_truth(clpipe, write_exr, tmp_path):

@@ -18,15 +18,12 @@ from distributed import Client, LocalCluster, WorkerPlugin
 import clpipe as package
 from clpipe.base.errors import OutputError
 from clpipe.batch import dask_client as cluster
-from clpipe.batch import dask_worker
-from clpipe.batch import threads as batch
+from clpipe.batch import dask_worker, work
 from clpipe.batch.dask_worker import RunSpec, WorkerEnvironment, probe_worker, worker_environment
 from clpipe.batch.run_log import RunLog
 from clpipe.chain.request import Request
 from clpipe.commands.progress import Reporter
 from clpipe.inputs.find import Job
-from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.writer import OutputWriter
 
 IMAGES = 40
 
@@ -66,7 +63,7 @@ def log(folder):
 
 def die_at_sidecar(number):
     """On a worker: be killed in the midst of writing the sidecar of that number."""
-    write, numbers = batch.write_sidecar, itertools.count(1)
+    write, numbers = work.write_sidecar, itertools.count(1)
 
     def planted(path, record):
         if next(numbers) == number:
@@ -74,7 +71,7 @@ def die_at_sidecar(number):
             os.kill(os.getpid(), signal.SIGKILL)
         write(path, record)
 
-    batch.write_sidecar = planted
+    work.write_sidecar = planted
 
 
 class DieOf(WorkerPlugin):
@@ -84,14 +81,14 @@ class DieOf(WorkerPlugin):
         self.name = name
 
     def setup(self, worker):
-        decode = batch.Batch.decode
+        decode = work.ImageWorker.decode
 
         def planted(this, job, begin):
             if job.path.name == self.name:
                 os.kill(os.getpid(), signal.SIGKILL)
             return decode(this, job, begin)
 
-        batch.Batch.decode = planted
+        work.ImageWorker.decode = planted
 
 
 def test_one_machine_three_shards_and_a_cluster_that_loses_a_worker(
@@ -152,14 +149,14 @@ def test_interrupted_it_finishes_what_is_in_flight(clpipe, renders, address, mon
         stops.append(stop)
         return nullcontext()
 
-    tell = Reporter.tell
+    report = Reporter.report
 
     def interrupting(self, outcome):
-        tell(self, outcome)
+        report(self, outcome)
         stops[0]()  # as Ctrl-C does
 
-    monkeypatch.setattr("clpipe.commands.measure.interruptible", interruptible)
-    monkeypatch.setattr(Reporter, "tell", interrupting)
+    monkeypatch.setattr("clpipe.commands.run.interruptible", interruptible)
+    monkeypatch.setattr(Reporter, "report", interrupting)
     told = clpipe("run", "in", "-o", "out", "--dask", address, status=130)
     assert "not begun" in told.stderr
     images = log("out")[1:-1]
@@ -219,15 +216,15 @@ def test_a_log_that_cannot_be_written_ends_the_run(clpipe, renders, address, mon
 
 
 def test_a_worker_of_another_make_that_comes_later(clpipe, renders, address, monkeypatch):
-    look = cluster.Cluster._look
+    probe = cluster.Cluster._probe
 
     def earlier(self, jobs):
-        look(self, jobs)
+        probe(self, jobs)
         self._spec = replace(
-            self._spec, make=WorkerEnvironment("0.1.0", "a device that was there", "")
+            self._spec, environment=WorkerEnvironment("0.1.0", "a device that was there", "")
         )
 
-    monkeypatch.setattr(cluster.Cluster, "_look", earlier)
+    monkeypatch.setattr(cluster.Cluster, "_probe", earlier)
     told = clpipe("run", "in", "-o", "out", "--dask", address, status=2)
     assert "workers differ in their device" in told.stderr
     assert not contents("out")
@@ -247,11 +244,9 @@ def test_a_trace_is_told_by_one_clock(clpipe, renders, address):
 def test_a_worker_sees_the_same_files(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "probe").touch()
-    entrance, target = ImageLoader(Request()), OutputWriter(Path("out"), ("jpg",))
     first = Job(Path("a.exr"), "a.exr")
-    spec = RunSpec(
-        entrance, target, ("numpy",), None, None, False, False, "run", str(tmp_path), first=first
-    )
+    options = (("numpy",), None, None, False, False, "run", str(tmp_path))
+    spec = RunSpec(Request(formats=("jpg",)), Path("out"), *options, first=first)
     elsewhere = replace(spec, folder=str(tmp_path / "elsewhere"))
     assert "elsewhere, where the run was started" in probe_worker(elsewhere, "probe", None)
     assert probe_worker(spec, "probe", None).startswith("does not see the output folder")

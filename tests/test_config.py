@@ -1,5 +1,7 @@
 """Requests: what is wrong with one is said in one message that names it."""
 
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -7,9 +9,12 @@ import pytest
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import load_camera
 from clpipe.chain.chain import make_chain
-from clpipe.chain.files import built_in_configs, load_settings, parse_assignment, toml_text
+from clpipe.chain.files import built_in_configs, load_settings, toml_text
+from clpipe.chain.methods import default_method
+from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import overlay, settings_from
-from clpipe.stage import Kind
+from clpipe.chain.toml import parse_assignment
+from clpipe.stage import Kind, Method
 from clpipe.stages import DEFAULT_CHAIN
 
 
@@ -133,7 +138,6 @@ def test_a_repeated_stage_has_settings_of_its_own():
 
 
 def test_every_parameter_says_what_it_is():
-    from clpipe.chain.registry import all_stages
     from clpipe.commands.stages import parameter_rows
 
     for stage in all_stages().values():
@@ -240,3 +244,54 @@ def test_a_camera_of_ones_own(tmp_path):
     own.write_text("name = ")
     with pytest.raises(RequestError, match=r"own.toml: not valid TOML"):
         load_camera(str(own))
+
+
+# quantize and normalize validate a second time, what they have from the camera.
+STEPS = ["exposure", "mosaic", "sensor_noise", "demosaic", "denoise", "gamma"]
+
+
+@pytest.fixture
+def validated(monkeypatch):
+    """How often a method's parameters were validated, by its class."""
+    counts = Counter()
+    validate, make = Method.model_validate.__func__, Method.__init__
+
+    def counted_validate(cls, values, **options):
+        counts[cls] += 1
+        return validate(cls, values, **options)
+
+    def counted_make(self, **values):
+        counts[type(self)] += 1
+        make(self, **values)
+
+    monkeypatch.setattr(Method, "model_validate", classmethod(counted_validate))
+    monkeypatch.setattr(Method, "__init__", counted_make)
+    default_method.cache_clear()
+    yield counts
+    default_method.cache_clear()
+
+
+def test_parameters_are_validated_once_and_the_model_is_kept(validated):
+    values = {"exposure": {"ev": 1}, "denoise": {"method": "mean"}}
+    settings = settings_from({"stages": STEPS, **values})
+    steps = make_chain(settings).steps
+    assert set(validated.values()) == {1}
+    assert len(validated) == len(steps)
+    brighter = overlay(settings, {"iso": 800, "exposure": {"ev": 2}})
+    assert [s.name for s in make_chain(brighter).steps] == [s.name for s in steps]
+    assert [cls for cls, count in validated.items() if count > 1] == [type(steps[0].method)]
+
+
+def test_a_model_is_that_of_its_table():
+    settings = settings_from({"exposure": {"ev": 1}})
+    other = replace(settings, parameters={"exposure": {"ev": 2}})
+    assert (settings.method("exposure").ev, other.method("exposure").ev) == (1, 2)
+
+
+def test_a_draw_validates_its_own_step_alone(validated):
+    values = {"exposure": {"ev": {"uniform": [-1, 1]}}, "denoise": {"method": "mean"}}
+    settings = settings_from({"stages": STEPS, **values})
+    make_chain(settings.drawn("a"))
+    before = validated.copy()
+    make_chain(settings.drawn("b"))
+    assert list(validated - before) == [all_stages()["exposure"].methods[0]]

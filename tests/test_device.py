@@ -158,7 +158,7 @@ def test_a_second_run_compiles_nothing(device, monkeypatch):
     def compile_again(kernel):
         raise AssertionError(f"{kernel.name} is compiled again")
 
-    monkeypatch.setattr(fresh, "_compile", compile_again)
+    monkeypatch.setattr(fresh._programs, "_compile", compile_again)
     runner.run(image, "other")
     runner.run(np.zeros((50, 10, 3), np.float16), "k")
     changed = make_chain(settings_from({"iso": 3200, "exposure": {"ev": 1}, "seed": 4}))
@@ -168,6 +168,7 @@ def test_a_second_run_compiles_nothing(device, monkeypatch):
 def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
     fresh = Device(device.info)
     runner = Runner(make_chain(settings_from({})), fresh)
+    runner.warm_up()
     made = []
     make = fresh._pool._make
     monkeypatch.setattr(fresh._pool, "_make", lambda size: made.append(size) or make(size))

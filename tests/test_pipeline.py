@@ -58,8 +58,8 @@ def test_device_and_numpy_agree(device, still_life, settings):
     assert np.array_equal(one.kept["quantize"], two.kept["quantize"])
     assert np.abs(one.kept["demosaic"] - two.kept["demosaic"]).max() < 1e-6
     assert np.abs(one.encoded.astype(int) - two.encoded).max() <= 1
-    for step, values in two.found.items():
-        assert one.found[step] == pytest.approx(values, rel=1e-6)
+    for step, values in two.estimates.items():
+        assert one.estimates[step] == pytest.approx(values, rel=1e-6)
 
 
 def test_images_of_all_sizes_one_after_the_other(device, still_life):
@@ -98,7 +98,7 @@ def test_gray_world_makes_means_equal(develop):
     green = (sites[1] + sites[2]) / 2
     assert sites[0] == pytest.approx(green, rel=1e-5)
     assert sites[3] == pytest.approx(green, rel=1e-5)
-    gains = result.found["white_balance"]
+    gains = result.estimates["white_balance"]
     assert gains["red_gain"] == pytest.approx(0.6, rel=0.05)
     assert gains["blue_gain"] == pytest.approx(3.0, rel=0.05)
 
@@ -111,7 +111,7 @@ def test_gray_world_of_darkness_changes_nothing(develop, numpy):
         stages=["mosaic", "white_balance"],
         white_balance={"method": "gray_world"},
     )
-    assert result.found["white_balance"] == {"red_gain": 1.0, "blue_gain": 1.0}
+    assert result.estimates["white_balance"] == {"red_gain": 1.0, "blue_gain": 1.0}
 
 
 WHITE = {"stages": ["mosaic", "white_balance"]}
@@ -127,7 +127,7 @@ def test_white_patch_makes_the_brightest_samples_equal(develop, numpy, pattern):
     settings = {"method": "white_patch", "percentile": 99.5}
     mosaic = {"pattern": pattern}
     result = develop(image, numpy=numpy, white_balance=settings, mosaic=mosaic, **WHITE)
-    gains = result.found["white_balance"]
+    gains = result.estimates["white_balance"]
     assert gains["red_gain"] == pytest.approx(2.0, rel=0.005)
     assert gains["blue_gain"] == pytest.approx(4.0, rel=0.005)
 
@@ -137,7 +137,7 @@ def test_white_patch_makes_the_brightest_samples_equal(develop, numpy, pattern):
 def test_white_patch_of_darkness_or_of_nothing_but_clipping(develop, numpy, level):
     image = np.full((9, 7, 3), level, np.float32)
     result = develop(image, numpy=numpy, white_balance={"method": "white_patch"}, **WHITE)
-    assert result.found["white_balance"] == {"red_gain": 1.0, "blue_gain": 1.0}
+    assert result.estimates["white_balance"] == {"red_gain": 1.0, "blue_gain": 1.0}
 
 
 def test_white_patch_counts_a_large_picture_exactly(device):
@@ -146,7 +146,7 @@ def test_white_patch_counts_a_large_picture_exactly(device):
     one, two = (
         runner(settings, d, encode=False, final=True).run(image, "k") for d in (device, None)
     )
-    assert one.found["white_balance"] == pytest.approx(two.found["white_balance"], rel=1e-6)
+    assert one.estimates["white_balance"] == pytest.approx(two.estimates["white_balance"], rel=1e-6)
 
 
 def test_fixed_gains_and_none(develop):

@@ -4,6 +4,7 @@ import pytest
 
 from clpipe.base.errors import RequestError
 from clpipe.chain.chain import make_chain
+from clpipe.chain.files import load_config
 from clpipe.chain.settings import settings_from
 from clpipe.engine.codegen import write_kernel
 from clpipe.engine.plan import Finalize, Launch, Lines, Reduce, make_plan
@@ -41,7 +42,7 @@ def test_default_chain_with_gray_world_is_eight_launches_and_at_most_48_bytes():
     assert plan.bytes_per_pixel(8) <= 48
 
 
-def test_gains_found_in_the_image_are_applied_where_the_stencil_reads():
+def test_gains_estimated_from_the_image_are_applied_where_the_stencil_reads():
     plan = plan_of(**GRAY_WORLD)
     prologues = [
         [op.step for read in launch.reads for op in read.prologue]
@@ -110,7 +111,7 @@ def test_a_plan_depends_on_structure_alone():
     assert one != plan_of(denoise={"luma_size": 7})
 
 
-def test_the_apron_is_as_wide_as_the_widest_stencil():
+def test_the_border_is_as_wide_as_the_widest_stencil():
     assert plan_of().border == 2
     assert plan_of(denoise={"chroma_size": 11}).border == 5
     assert plan_of(stages=["exposure", "gamma"]).border == 0
@@ -118,10 +119,10 @@ def test_the_apron_is_as_wide_as_the_widest_stencil():
 
 def test_curves_before_eight_bits_become_one_table():
     plan = plan_of()
-    kernel = write_kernel(plan, plan.launches[-1], 0, 8)
+    kernel = write_kernel(plan, plan.launches[-1], 8)
     assert [p.item for p in kernel.parameters if p.role == "table8"] == ["tone_curve,gamma"]
     kept = plan_of(keep=("tone_curve",))
-    kernel = write_kernel(kept, kept.launches[-1], 0, 8)
+    kernel = write_kernel(kept, kept.launches[-1], 8)
     assert [p.item for p in kernel.parameters if p.role == "table8"] == ["gamma"]
 
 
@@ -133,3 +134,43 @@ def test_a_stage_that_is_not_in_the_chain_cannot_be_kept():
 def test_a_chain_may_begin_with_a_stencil():
     chain = make_chain(settings_from({"stages": ["demosaic"]}), Kind.MOSAIC)
     assert names(make_plan(chain))[0] == "load"
+
+
+def texts(plan):
+    return {write_kernel(plan, launch, 8).source for launch in plan.launches}
+
+
+CHAINS = {
+    "default": {},
+    "gray_world": GRAY_WORLD,
+    "white_patch": {"white_balance": {"method": "white_patch"}},
+    "paper": load_config("paper").values,
+    "slow": {"demosaic": {"method": "menon2007"}, "denoise": {"method": "non_local_means"}},
+}
+
+
+@pytest.mark.parametrize("settings", CHAINS.values(), ids=CHAINS)
+def test_keeping_a_stage_compiles_at_most_the_two_halves_of_its_launch(settings):
+    warm = texts(plan_of(**settings))
+    for step in make_chain(settings_from(settings)).steps:
+        kept = plan_of(keep=(step.name,), **settings)
+        assert len(texts(kept) - warm) <= 2, step.name
+
+
+def test_a_kernel_does_not_depend_on_names_slots_places_or_the_border():
+    def blur(plan, number):
+        """The launches of the number-th denoise stage, which reads and writes RGB planes."""
+        launches = [x for x in plan.launches if isinstance(x, Launch) and x.stencil]
+        return write_kernel(plan, launches[number], 8)
+
+    alike = {"stages": ["exposure", "denoise", "denoise", "denoise", "color_matrix"]}
+    own = {"luma_size": 5, "chroma_size": 5}
+    plain = plan_of(**alike, denoise=own, denoise_2=own, denoise_3=own, encode=False, final=True)
+    first, second = blur(plain, 0), blur(plain, 1)
+    assert first.source == second.source
+    assert first.name == second.name
+    assert first.parameters != second.parameters  # they are bound to other slots and steps
+    wide = {"luma_size": 5, "chroma_size": 11}
+    other = plan_of(**alike, denoise=own, denoise_2=own, denoise_3=wide, encode=False, final=True)
+    assert other.border > plain.border
+    assert blur(other, 0).source == first.source

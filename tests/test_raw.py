@@ -98,7 +98,7 @@ def test_without_a_matrix_the_profile_has_one_or_colours_stay(tmp_path):
     assert np.allclose(parameters(tmp_path / "a.json")["color_matrix"]["matrix"], known, atol=2e-3)
     write_dng(tmp_path / "c.dng", mosaic(), matrix=None, model=b"Nonesuch")
     output = clpipe("run", tmp_path / "c.dng", "-o", tmp_path)
-    assert "its colour matrix is not known" in output
+    assert "its colour matrix is unknown" in output
     assert "there is no profile of Canon Nonesuch; denoising takes the noise of sony-a7r2" in output
     output = clpipe("run", tmp_path / "c.dng", "-o", tmp_path, "--camera", "canon-5d2")
     assert "profile" not in output
@@ -230,7 +230,7 @@ def test_noise_can_be_added_to_a_raw_where_that_is_asked_for(tmp_path):
     [
         ((-0.5, 1, 0.6), True, "as_shot", 2.57, "-2, 1, 1.667; those of daylight are taken"),
         ((0.5, 1, 0.01), True, "as_shot", 2.57, "2, 1, 100; those of daylight are taken"),
-        ((0.5, 1, -3), False, "gray_world", None, "gray_world finds others"),
+        ((0.5, 1, -3), False, "gray_world", None, "gray_world estimates others"),
     ],
 )
 def test_gains_that_cannot_be(tmp_path, neutral, matrix, method, red, message):
@@ -251,7 +251,7 @@ def test_gains_that_cannot_be(tmp_path, neutral, matrix, method, red, message):
 def test_levels_that_cannot_be(tmp_path):
     write_dng(tmp_path / "a.dng", mosaic(), white=300)
     output = clpipe("run", tmp_path / "a.dng", "-o", tmp_path, status=1)
-    assert "its levels cannot be: black 512, white 300" in output
+    assert "its levels cannot be right: black 512, white 300" in output
     levels = ("--set", "normalize.black_level=512", "--set", "normalize.white_level=16383")
     clpipe("run", tmp_path / "a.dng", "-o", tmp_path, *levels)
     write_dng(tmp_path / "b.dng", mosaic(), white=1000)
@@ -395,8 +395,8 @@ def test_a_dump_by_configuration_and_what_it_does_not_say(tmp_path):
         "does not say its pattern; RGGB is taken",
         "does not say its levels; black 512 and white 16383 are taken",
         "does not say its ISO; 100 is taken",
-        "does not say its white balance; gray_world finds it",
-        "its colour matrix is not known",
+        "does not say its white balance; gray_world estimates it",
+        "its colour matrix is unknown",
     ):
         assert output.count(message) == 1
     assert clpipe("plan", "-c", tmp_path / "c.toml", "--toml").count('raw_size = "64x48"') == 1

@@ -155,7 +155,7 @@ def test_an_image_of_another_kind_is_refused_and_the_others_go_on(
 def test_a_folder_gives_what_was_kept_right_before(kept, tmp_path):
     output = clpipe("run", kept, "-o", tmp_path, "--start-at", "denoise")
     assert written(tmp_path) == ["crop.demosaic.jpg", "crop.demosaic.json"]
-    assert "17 images in folders were kept elsewhere and left out" in output
+    assert "17 images in folders were kept after other stages and left out" in output
     assert "1 of 18 images done, 0 failed" in output
 
 

@@ -386,7 +386,7 @@ def test_renders_in_whole_numbers_with_a_stated_transfer(tmp_path, ending, trans
 def test_a_transfer_is_that_of_a_render(tmp_path):
     command = ["run", "a.png", "-o", str(tmp_path), "--transfer", "srgb", "-c", "unprocess"]
     result = CliRunner().invoke(main, command)
-    assert result.exit_code == 2 and "--transfer: it is one of a render" in result.output
+    assert result.exit_code == 2 and "--transfer: it is for renders" in result.output
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,10 @@ from clpipe.camera.profile import DEFAULT_CAMERA, load_camera
 from clpipe.chain.chain import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import settings_from
-from clpipe.chain.truth import noisy_mosaic, variance_of
+from clpipe.chain.truth import MOSAIC, VARIANCE, noisy_mosaic, variance_of
 from clpipe.engine.runner import Runner
 from clpipe.images.read import read_image
-from clpipe.outputs.renditions import MOSAIC, VARIANCE, truth_of
+from clpipe.outputs.renditions import truth_of
 from clpipe.reference.cfa import PATTERNS
 from clpipe.stage import Context, Kind, Method
 from clpipe.stages import DEFAULT_CHAIN
@@ -177,7 +177,7 @@ def test_a_truth_that_enters_again_claims_no_noise(clpipe, write_exr):
     assert json.loads(Path("b/a.truth_mosaic.json").read_text())["noise"] is None
     found = clpipe("run", "o", "-o", "c", "--start-at", "white_balance", "--format", "exr")
     assert written(Path("c")) == ["a.truth_mosaic.exr", "a.truth_mosaic.json"]
-    assert "1 images in folders were kept elsewhere" in found.stderr
+    assert "1 images in folders were kept after other stages" in found.stderr
     refused = ("run", "o/a.truth_variance.exr", "-o", "d", "--start-at", "white_balance")
     assert "holds variance" in clpipe(*refused, status=1).stderr
     # It does claim the noise that it is then given.

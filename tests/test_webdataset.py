@@ -17,11 +17,12 @@ import pytest
 from PIL import Image
 
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.batch import tars as webdataset
+from clpipe.batch import tar_batch
 from clpipe.batch.run_log import read_log
 from clpipe.batch.tars import cut
 from clpipe.inputs.find import Job
-from clpipe.outputs import writer as target
+from clpipe.outputs import folder as output_folders
+from clpipe.outputs import writer
 from tests.conftest import ROOT, written
 
 # A chain that other tests compile too.
@@ -275,7 +276,7 @@ def test_a_tar_that_is_cut_off_is_made_again(clpipe, renders):
 @pytest.mark.parametrize("when", ["picture", "tar"])
 def test_the_disk_is_full(clpipe, renders, when):
     clpipe("run", renders(), "-o", "whole", *RUN[2:])
-    real, count = target.write_display, []
+    real, count = writer.write_display, []
 
     with pytest.MonkeyPatch.context() as patch:
 
@@ -285,14 +286,14 @@ def test_the_disk_is_full(clpipe, renders, when):
         def write(path, pixels, tags):
             count.append(path)
             if len(count) > 5:
-                patch.setattr(target, "ROOM", 2**62)  # more than any disk has
+                patch.setattr(output_folders, "ROOM", 2**62)  # more than any disk has
                 full(path, None)
             real(path, pixels, tags)
 
         if when == "tar":
-            patch.setattr(webdataset, "write_beside", full)
+            patch.setattr(tar_batch, "write_beside", full)
         else:
-            patch.setattr(target, "write_display", write)
+            patch.setattr(writer, "write_display", write)
         result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)
     assert "the same command goes on" in result.stderr
     clpipe("run", "in", *RUN)

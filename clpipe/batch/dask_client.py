@@ -1,9 +1,9 @@
-"""Many images through the workers of a Dask cluster. The only importer of distributed.
+"""Many images through the workers of a Dask cluster.
 
-The one who started the run holds the output folder, cuts the images into chunks, gives every worker
-one at a time, and reports what became of each image; a worker runs a
-:class:`clpipe.batch.threads.Batch` on its chunk. Where a worker dies, Dask gives its chunk to
-another one, which sees by the sidecars what is done already: such images are reported as skipped.
+The process that starts a run holds the output folder, cuts the jobs into chunks, hands them out,
+and reports outcomes; a worker runs a :class:`clpipe.batch.threads.Batch` on its chunk.
+Where a worker dies, Dask gives its chunk to another one, which sees by the sidecars what is done
+already and reports it as skipped.
 """
 
 import asyncio
@@ -21,31 +21,28 @@ from clpipe.batch.dask_worker import (
     ChunkReport,
     RunSpec,
     WorkerEnvironment,
-    _moved,
-    _same,
-    _same_in,
+    check_same,
+    check_same_environment,
     close_devices,
     halt,
     probe_worker,
     run_chunk,
+    shifted,
 )
 from clpipe.batch.outcome import FAILED, Outcome
 from clpipe.inputs.find import Job
+from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.folder import remove_unfinished
 
 TIMEOUT = 10.0  # s, for the scheduler to answer and for its first worker
 
+PATIENCE = 60.0  # s without any worker, because nannies and job queues start new ones
 
-PATIENCE = 60.0  # s without any worker, as nannies and job queues start new ones
-
-
-RETRIES = 2  # of a chunk that raised what nobody expected
-
+RETRIES = 2  # of a chunk that ended with an unexpected error
 
 FIRST, LARGEST = 4, 64  # images in a chunk
 
-
-SHORT, LONG = 15.0, 60.0  # s; chunks that took less grow, those that took more shrink
+SHORT, LONG = 15.0, 60.0  # s; after a shorter chunk they grow, after a longer one they shrink
 
 
 @contextlib.contextmanager
@@ -54,7 +51,7 @@ def connected(address: str, spec: RunSpec) -> Iterator["Cluster"]:
 
     Raises:
         RequestError: distributed is not installed, the scheduler does not answer, it has no
-            workers, or they are of different make.
+            workers, or they have different versions of clpipe.
     """
     try:
         from distributed import Client
@@ -76,11 +73,11 @@ def connected(address: str, spec: RunSpec) -> Iterator["Cluster"]:
                 f"--dask: the scheduler at {address} has no workers; start some: "
                 f"dask worker {address}"
             )
-        found = client.run(lambda: __import__("clpipe").__version__, on_error="return")
-        for worker, version in found.items():
+        versions = client.run(lambda: __import__("clpipe").__version__, on_error="return")
+        for worker, version in versions.items():
             if isinstance(version, BaseException):
                 raise RequestError(f"--dask: worker {worker} cannot load clpipe: {version}")
-        _same_in("version of clpipe", {"this machine": __version__, **found})
+        check_same("version of clpipe", {"this machine": __version__, **versions})
         yield Cluster(client, address, spec)
     finally:
         with contextlib.suppress(OSError, TimeoutError):
@@ -89,10 +86,10 @@ def connected(address: str, spec: RunSpec) -> Iterator["Cluster"]:
 
 
 async def _reach(address: str) -> None:
-    """Speak to a scheduler; a Client waits without end for who listens and does not answer.
+    """Connect to a scheduler. A Client would wait for ever where something listens but is silent.
 
     Raises:
-        OSError, ValueError: nobody answers there, or it is no address.
+        OSError, ValueError: no scheduler answers there, or it is no address.
     """
     from distributed import Security
     from distributed.comm import connect
@@ -103,61 +100,58 @@ async def _reach(address: str) -> None:
 
 
 class Cluster:
-    """A cluster's workers, as something that puts jobs through, like a Batch."""
+    """The workers of a cluster, with the interface of a :class:`clpipe.batch.threads.Batch`."""
 
     def __init__(self, client: Any, address: str, spec: RunSpec) -> None:
         self._client = client
         self._address = address
         self._spec = spec
         self._stopping = False
-        self._news: queue.SimpleQueue[Any] = (
-            queue.SimpleQueue()
-        )  # chunks that are through; None: stop
-        self._running: dict[Any, tuple[list[Job], bool]] = {}
-        self._seen = time.monotonic()
+        self._finished: queue.SimpleQueue[Any] = queue.SimpleQueue()  # futures; None means stop
+        self._running: dict[Any, tuple[list[Job], bool]] = {}  # chunks, and whether each runs alone
+        self._seen = time.monotonic()  # when there was a worker
 
     def stop(self) -> None:
         """Let no more images in; those in flight are finished. May be called by a signal."""
         self._stopping = True
-        self._news.put(None)
+        self._finished.put(None)
 
     def run(self, jobs: Sequence[Job]) -> Generator[Outcome, None, None]:
-        """Put every job through; one that fails is reported and the others go on.
+        """Do every job; one that fails is reported and the others go on.
 
-        Outcomes come as chunks are finished, in any spec.
+        Outcomes come as chunks are finished, in any order.
 
         Raises:
-            RequestError: workers are of different make, lack the device, or do not see the files.
+            RequestError: workers have different environments, no such device, or do not see the
+                files.
             DeviceError: a kernel does not compile.
             OutputError: nothing can be written any more.
             ClusterError: the scheduler or all workers have gone.
         """
-        self._look(jobs)
+        self._probe(jobs)
         return self._outcomes(jobs)
 
-    def _look(self, jobs: Sequence[Job]) -> None:
-        """See that all workers are of one make, and see the same files as this machine."""
-        spec = self._spec
-        entrance = spec.entrance
-        others = (job for job in jobs if not entrance.raws.takes(job.path))
-        first = next(others, jobs[0])  # as ImageLoader.first_chain has it
-        # Without what is found out when it is asked for, which is long and may be of stage files.
-        spec = replace(spec, entrance=replace(entrance), first=first)
+    def _probe(self, jobs: Sequence[Job]) -> None:
+        """See that all workers have one environment, and see the same files as this machine."""
+        takes = ImageLoader(self._spec.request).raw.takes
+        # The chain of a raw is compiled only where all inputs are raws, as in first_chain().
+        first = next((job for job in jobs if not takes(job.path)), jobs[0])
+        spec = replace(self._spec, first=first)
         size = first.path.stat().st_size if first.path.is_file() else None
-        probe = spec.target.folder / f".clpipe.{spec.run}"
+        probe = spec.output / f".clpipe.{spec.run}"
         try:
             probe.touch()
-            found = self._client.run(probe_worker, spec, probe.name, size, on_error="return")
+            environments = self._client.run(probe_worker, spec, probe.name, size, on_error="return")
         finally:
             with contextlib.suppress(OSError):
                 probe.unlink()
-        if not found:
+        if not environments:
             raise self._gone()
-        for worker, made in found.items():
-            if not isinstance(made, WorkerEnvironment):
-                raise RequestError(f"--dask: worker {worker}: {made}")
-        _same(found)
-        self._spec = replace(spec, make=next(iter(found.values())))
+        for worker, environment in environments.items():
+            if not isinstance(environment, WorkerEnvironment):
+                raise RequestError(f"--dask: worker {worker}: {environment}")
+        check_same_environment(environments)
+        self._spec = replace(spec, environment=next(iter(environments.values())))
 
     def _outcomes(self, jobs: Sequence[Job]) -> Generator[Outcome, None, None]:
         chunks = _Chunks(deque(jobs))
@@ -166,7 +160,7 @@ class Cluster:
             while self._running or (chunks and not self._stopping):
                 self._hand_out(chunks)
                 try:
-                    future = self._news.get(timeout=1)
+                    future = self._finished.get(timeout=1)
                 except queue.Empty:
                     continue
                 if future is None:
@@ -176,21 +170,21 @@ class Cluster:
                 chunks.took(report.seconds)
                 here = time.perf_counter() - time.time()
                 for outcome in report.outcomes:
-                    yield _moved(outcome, here)
+                    yield shifted(outcome, here)
                 if report.error:
                     failure = failure or report.error
                     self._halt()
         except GeneratorExit:
             self._finish()
             raise
-        remove_unfinished(self._spec.target.folder, jobs)  # by workers that died
+        remove_unfinished(self._spec.output, jobs)  # by workers that died
         if failure:
             raise failure
 
     def _hand_out(self, chunks: "_Chunks") -> None:
-        """See that there are as many chunks at work as there are workers.
+        """Submit chunks until there are as many as workers.
 
-        Dask chooses the worker; a chunk that is tied to one would wait for it for ever.
+        Dask chooses the worker; a chunk that is tied to one would wait for ever where it dies.
 
         Raises:
             ClusterError: there have been no workers for long, or the scheduler has gone.
@@ -214,10 +208,10 @@ class Cluster:
     def _submit(self, chunk: list[Job], alone: bool = False) -> None:
         future = self._client.submit(run_chunk, self._spec, chunk, pure=False, retries=RETRIES)
         self._running[future] = (chunk, alone)
-        future.add_done_callback(self._news.put)
+        future.add_done_callback(self._finished.put)
 
     def _report(self, future: Any, chunks: "_Chunks") -> ChunkReport:
-        """What became of a chunk that is through.
+        """What became of a chunk that is finished.
 
         Raises:
             ClusterError: the scheduler has gone.
@@ -229,16 +223,16 @@ class Cluster:
             return future.result()
         except KilledWorker as error:
             if not alone:
-                chunks.suspects += chunk  # or another chunk on these workers is to blame
+                chunks.suspects += chunk  # another chunk on these workers may be to blame
                 return ChunkReport((), LONG)
-            deaths = f"{error.allowed_failures + 1} in all, the last one {_name(error)}"
+            deaths = f"{error.allowed_failures + 1} in all, the last one {_worker_name(error)}"
             return _failed(chunk, f"killed the worker that took it, {deaths}")
         except Exception as error:
             if future.status in ("cancelled", "lost"):
                 raise self._gone() from None
             return _failed(chunk, f"on a worker: {type(error).__name__}: {error}")
         finally:
-            future.release()  # or its worker's death would have it done again
+            future.release()  # else Dask does it again where its worker dies
 
     def _halt(self) -> None:
         """Let the workers finish what is in flight."""
@@ -246,7 +240,7 @@ class Cluster:
         self._client.run(halt, self._spec.run, on_error="ignore")
 
     def _finish(self) -> None:
-        """Wait until no worker is at it any more."""
+        """Wait until no worker is busy with the run."""
         from distributed import wait
 
         self._halt()
@@ -262,11 +256,12 @@ class Cluster:
 
 @dataclass
 class _Chunks:
-    """What is left of the jobs, to be cut into chunks.
+    """The jobs that are left, to be cut into chunks.
 
-    They grow as long as they take little time, and get smaller again towards the end.
-    ``suspects`` are jobs whose workers died: in the end each is tried with nothing beside it.
+    Chunks grow while they take little time, and get smaller towards the end. ``suspects`` are jobs
+    whose workers died; each is tried alone in the end.
 
+    >>> from pathlib import Path
     >>> chunks = _Chunks(deque(Job(Path(str(i)), "") for i in range(100)))
     >>> chunks.took(1.0)
     >>> [len(chunks.cut(2)) for _ in range(4)], len(chunks.jobs)
@@ -289,7 +284,7 @@ class _Chunks:
         return [self.jobs.popleft() for _ in range(size)]
 
     def took(self, seconds: float) -> None:
-        """Learn from how long a chunk took."""
+        """Adapt the size of chunks to how long one took."""
         if seconds < SHORT:
             self.size = min(2 * self.size, LARGEST)
         elif seconds > LONG:
@@ -300,5 +295,5 @@ def _failed(chunk: Sequence[Job], reason: str) -> ChunkReport:
     return ChunkReport([Outcome(job, FAILED, error=f"{job.path}: {reason}") for job in chunk], LONG)
 
 
-def _name(error: Any) -> str:
+def _worker_name(error: Any) -> str:
     return str(getattr(error.last_worker, "address", error.last_worker))

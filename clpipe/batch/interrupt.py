@@ -1,4 +1,4 @@
-"""Ctrl-C and a scheduler's SIGTERM: once to finish what is begun, twice to stop now."""
+"""Ctrl-C and a scheduler's SIGTERM: one lets images in flight be finished, two stop at once."""
 
 import contextlib
 import os
@@ -18,23 +18,23 @@ INTERRUPTED = 130
 
 @contextlib.contextmanager
 def interruptible(stop: Callable[[], None]) -> Iterator[None]:
-    """Call ``stop`` at the first signal; at the second end the process, leaving no half file.
+    """Call ``stop`` at the first signal; at the second, end the process and leave no half file.
 
-    Signals only come to the main thread; in another one this does nothing.
+    Signals only come to the main thread; in any other this does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    asked = False
+    is_stopping = False
 
     def handle(number: int, frame: FrameType | None) -> None:
-        nonlocal asked
-        if asked:
+        nonlocal is_stopping
+        if is_stopping:
             remove_temporary_files()
             os._exit(INTERRUPTED)
-        asked = True
+        is_stopping = True
         stop()
-        # Not print: the signal may have come in the midst of one.
+        # Not print(): the signal may have interrupted one.
         os.write(sys.stderr.fileno(), b"\nfinishing what is begun; again to stop now\n")
 
     before = {number: signal.signal(number, handle) for number in SIGNALS}

@@ -1,4 +1,4 @@
-"""TODO."""
+"""What became of one image, and how long each step took."""
 
 from dataclasses import dataclass
 
@@ -14,8 +14,11 @@ STEPS = ("decode", "device", "encode")
 class Span:
     """When something was done to an image, by which thread, and for how long.
 
-    ``step`` is one of :data:`STEPS`, or the name of a launch or a transfer within "device". Times
-    are in s, of time.perf_counter.
+    Args:
+        step: one of :data:`STEPS`, or the name of a launch or a transfer within "device".
+        worker: the name of the thread.
+        start: in s, by time.perf_counter.
+        seconds: how long it took.
     """
 
     step: str
@@ -28,9 +31,16 @@ class Span:
 class Outcome:
     """What became of one job.
 
-    ``status`` is "done", "skipped" (all was there already), "left out" (kept after another stage
-    than the one to go on from) or "failed". ``outputs`` are the files that were written, relative
-    to the output folder; ``began`` is in s since 1970.
+    Args:
+        job: the job.
+        status: "done", "skipped" (its pictures were there already), "left out" (kept after another
+            step than the one to go on from) or "failed".
+        megapixels: of the image that was read.
+        warnings: about the image.
+        error: why it failed; "" otherwise.
+        outputs: the files that were written, relative to the output folder.
+        began: in s since 1970.
+        spans: what was done when.
     """
 
     job: Job
@@ -43,5 +53,5 @@ class Outcome:
     spans: tuple[Span, ...] = ()
 
     def seconds(self, step: str) -> float:
-        """How long a step took, over all pictures of the image."""
+        """How many seconds a step took, over all renditions of the image."""
         return sum(span.seconds for span in self.spans if span.step == step)

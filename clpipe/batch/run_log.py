@@ -27,7 +27,7 @@ def log_name(shard: Shard) -> str:
 
 @dataclass
 class Summary:
-    """What became of the images of a run so far."""
+    """Counts of what became of the images of a run so far."""
 
     total: int
     counts: dict[str, int] = field(
@@ -40,7 +40,7 @@ class Summary:
     interrupted: bool = False
 
     def add(self, outcome: Outcome) -> None:
-        """Count one more."""
+        """Count one more image."""
         self.counts[outcome.status] += 1
         if outcome.status == DONE:
             self.megapixels += outcome.megapixels
@@ -51,7 +51,7 @@ class Summary:
 
     @property
     def finished(self) -> int:
-        """How many images are through, whatever became of them."""
+        """How many images have an outcome."""
         return sum(self.counts.values())
 
     @property
@@ -60,7 +60,7 @@ class Summary:
         return time.perf_counter() - self.began
 
     def shares(self) -> str:
-        """How the time of the threads is shared out.
+        """The share of each step in the time of all threads.
 
         >>> Summary(1, seconds={"decode": 1.0, "device": 2.0, "encode": 1.0}).shares()
         'decode 25 %, device 50 %, encode 25 %'
@@ -86,7 +86,7 @@ def _line(event: str, at: float, values: Mapping[str, Any]) -> bytes:
 
 
 class RunLog:
-    """The log of a run; lines are appended to those of runs before, from the first image on."""
+    """The log of a run, behind those of earlier runs; nothing is written before the first image."""
 
     def __init__(self, path: Path, start: Mapping[str, Any]) -> None:
         self._path = path
@@ -108,7 +108,7 @@ class RunLog:
             raise OutputError(f"{self._path}: cannot be written: {error.strerror}") from None
 
     def add(self, outcome: Outcome) -> None:
-        """A line for one image.
+        """Write the line of one image.
 
         Raises:
             OutputError: it cannot be written.
@@ -131,7 +131,7 @@ class RunLog:
         self._write(line)
 
     def end(self, summary: Summary) -> None:
-        """The last line, where there is a first one.
+        """Write the last line, where there is a first one.
 
         Raises:
             OutputError: it cannot be written.
@@ -146,7 +146,7 @@ class RunLog:
 
 
 def read_log(path: Path) -> Sequence[dict[str, Any]]:
-    """The lines of a log; one that was cut off is left out.
+    """The lines of a log, without one that was cut off.
 
     Raises:
         OSError: it cannot be read.

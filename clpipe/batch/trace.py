@@ -13,10 +13,10 @@ BEGINNING = b'{"traceEvents"'
 
 
 def check_trace(path: Path) -> None:
-    """See that a trace may be written under a name.
+    """See that a trace may be written to a file.
 
     Raises:
-        RequestError: there is something else of that name, or it does not end in .json.
+        RequestError: the name does not end in .json, or the file exists and is no trace.
     """
     if path.suffix != ".json":
         raise RequestError(f"--trace: found {path}; expected a name that ends in .json")
@@ -28,13 +28,13 @@ def check_trace(path: Path) -> None:
     except OSError:
         own = False
     if not own:
-        raise RequestError(f"--trace: {path} is there and is no trace; choose another name")
+        raise RequestError(f"--trace: {path} exists and is no trace; choose another name")
 
 
 class Trace:
-    """What each thread did when: the steps of each image, and each launch and transfer.
+    """What each thread did when: the steps of each image, each launch and each transfer.
 
-    The form is Chrome's "Trace Event Format" (complete events, in microseconds).
+    The file is in Chrome's "Trace Event Format" (complete events, in microseconds).
     """
 
     def __init__(self) -> None:
@@ -42,13 +42,13 @@ class Trace:
         self._threads: dict[str, int] = {}
 
     def add(self, outcome: Outcome) -> None:
-        """The spans of one image."""
+        """Add the spans of one image."""
         for span in outcome.spans:
-            own = span.step in STEPS
+            is_step = span.step in STEPS
             number = self._threads.setdefault(span.worker, len(self._threads) + 1)
             event = {
-                "name": f"{span.step} {outcome.job.stem}" if own else span.step,
-                "cat": span.step if own else "launch",
+                "name": f"{span.step} {outcome.job.stem}" if is_step else span.step,
+                "cat": span.step if is_step else "launch",
                 "ph": "X",
                 "ts": span.start * 1e6,
                 "dur": span.seconds * 1e6,

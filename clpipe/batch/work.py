@@ -1,36 +1,46 @@
-"""TODO."""
+"""One image's work: decode it, develop each rendition of it, encode the results."""
 
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
+import numpy as np
+
+from clpipe.base.digests import stamp_of
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
-from clpipe.batch.outcome import DONE, FAILED, Outcome, Span
-from clpipe.engine.device import Device
-from clpipe.engine.runner import Result
+from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome, Span
+from clpipe.chain.chain import Chain
+from clpipe.chain.formats import DNG
+from clpipe.engine.device import Device, Timing
+from clpipe.engine.runner import Result, Runner
 from clpipe.images.read import SourceImage
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.renditions import Rendition
+from clpipe.outputs.sidecar import SIDECAR, check_own, is_done, sidecar, write_sidecar
+from clpipe.outputs.writer import OutputWriter
+from clpipe.stage import Kind
 
 
 @dataclass
-class Work:
-    """A job on its way."""
+class Task:
+    """A job from the start of its decoding to its outcome."""
 
     job: Job
-    entrance: ImageLoader
+    loader: ImageLoader
     began: float = field(default_factory=time.time)
     spans: list[Span] = field(default_factory=list)
     source: SourceImage | None = None
     stamp: tuple[int, int] = (0, 0)
-    wanted: Mapping[str, Any] = field(default_factory=dict)
-    shots: list[Rendition] = field(default_factory=list)
-    unwritten: int = 0
+    request: Mapping[str, Any] = field(default_factory=dict)  # its record
+    renditions: list[Rendition] = field(default_factory=list)
+    unwritten: int = 0  # renditions
     status: str = DONE
     error: str = ""
     outputs: list[str] = field(default_factory=list)
@@ -46,7 +56,7 @@ class Work:
             self.spans.append(Span(step, name, start, time.perf_counter() - start))
 
     def outcome(self) -> Outcome:
-        """What became of it."""
+        """What became of the job."""
         width, height = self.source.pixels.shape[1::-1] if self.source else (0, 0)
         return Outcome(
             self.job,
@@ -60,14 +70,226 @@ class Work:
         )
 
 
-# A picture on its way from a device to its files.
-Made = tuple[Work, Rendition, Result, Device | None]
+class ImageWorker:
+    """Does the work of one image at a time, in each of the threads that call it.
+
+    Args:
+        loader: how images are loaded.
+        writer: how pictures are written.
+        chain: that of the first image, for which kernels are compiled early.
+        overwrite: make pictures that are done already, too.
+        trace: note each launch and transfer.
+    """
+
+    def __init__(
+        self,
+        loader: ImageLoader,
+        writer: OutputWriter,
+        chain: Chain,
+        overwrite: bool = False,
+        trace: bool = False,
+    ) -> None:
+        self.writer = writer
+        self._loader = loader
+        self._chain = chain
+        self._overwrite = overwrite
+        self._trace = trace
+        self._spare = SpareArrays(0)
+
+    def reserve(self, count: int) -> None:
+        """Keep so many arrays of results for later images."""
+        self._spare = SpareArrays(count)
+
+    def runners(self, device: Device | None) -> "Runners":
+        """The runners of a device; the kernels of the first chain are compiled here.
+
+        Raises:
+            RequestError: the memory of the device is too small for any image.
+            DeviceError: a kernel does not compile.
+        """
+        half = self._loader.kept is None and self._chain.source is Kind.RGB
+        return Runners(self.writer, device, self._chain, half)
+
+    def decode(self, job: Job, begin: Callable[[], None]) -> Task:
+        """Load a job's image, unless all of its pictures are done already.
+
+        Args:
+            job: the image.
+            begin: called where something is to be made.
+        """
+        task = Task(job, self._loader)
+        with task.timed("decode"):
+            try:
+                task.loader = self._loader.for_job(job)
+                task.request = self._request_of(task)
+                names = self._missing(task)
+                if names:
+                    begin()
+                    self._load(task, names)
+                else:
+                    task.status = SKIPPED
+            except (ImageError, RequestError, MemoryError) as error:
+                if task.loader.is_left_out(job, error):
+                    task.status = LEFT_OUT
+                else:
+                    task.error = task.loader.error_text(job, error)
+        return task
+
+    def _request_of(self, task: Task) -> Mapping[str, Any]:
+        """The record of the request for a task's image."""
+        job = task.job
+        if task.loader is self._loader:
+            return {**self._general_request, "image_key": job.key}
+        return self.writer.request.for_image(job.key, job.values).record()
+
+    @cached_property
+    def _general_request(self) -> Mapping[str, Any]:
+        return self.writer.request.record()
+
+    def _missing(self, task: Task) -> list[str]:
+        """The names of a job's renditions that are to be made."""
+        names = self.writer.names_of(task.job)
+        if self._overwrite:
+            return list(names)
+        return [name for name in names if not self.is_done(task.job, name, task.request)]
+
+    def is_done(self, job: Job, name: str, request: Mapping[str, Any]) -> bool:
+        """Whether a rendition is there already, made by the same request.
+
+        Args:
+            job: the image.
+            name: of the rendition.
+            request: the record of the request for the image.
+
+        Raises:
+            ImageError: a file of its name is somebody else's.
+        """
+        path, outputs = self.writer.path(job, SIDECAR, name), self.writer.outputs(job, name)
+        if is_done(path, job, request, outputs):
+            return True
+        if not path.exists():
+            for output in outputs:
+                check_own(output)
+        return False
+
+    def _load(self, task: Task, names: Sequence[str]) -> None:
+        """Load a task's image, and decide which renditions are made of it.
+
+        Raises:
+            ImageError, RequestError, MemoryError: it cannot be read, or cannot enter the chain.
+        """
+        job = task.job
+        task.stamp = stamp_of(job.path)
+        source = task.loader.read(job)
+        self.writer.check_size(source)
+        loaded = task.loader.enter(job, source)
+        if loaded is None:
+            task.status = LEFT_OUT
+            return
+        task.source = loaded.source
+        renditions = self.writer.plan_of(job).renditions(loaded.chain, loaded.key)
+        task.renditions = [rendition for rendition in renditions if rendition.name in names]
+        task.unwritten = len(task.renditions)
+
+    def develop(self, task: Task, rendition: Rendition, runner: Runner) -> Result | None:
+        """Develop one rendition; None where it fails."""
+        assert task.source
+        timings: list[Timing] | None = [] if self._trace and runner.device else None
+        with task.timed("device"):
+            try:
+                pixels = task.source.pixels
+                into = self._spare.take(pixels.shape) if runner.encode and runner.device else None
+                result = runner.run(pixels, rendition.key, timings, into=into)
+            except (ImageError, RequestError, MemoryError) as error:
+                task.error = task.loader.error_text(task.job, error)
+                return None
+        name = threading.current_thread().name
+        task.spans += [Span(t.name, name, t.start, t.seconds) for t in timings or []]
+        if rendition is task.renditions[-1] and DNG not in self.writer.formats:
+            # Of the pixels only their shape is still needed; their memory is not.
+            shape = task.source.pixels.shape
+            task.source = replace(task.source, pixels=np.broadcast_to(np.float16(0), shape))
+        return result
+
+    def encode(
+        self, task: Task, rendition: Rendition, result: Result, device: Device | None
+    ) -> None:
+        """Write one rendition and then its sidecar.
+
+        Raises:
+            OutputError: nothing can be written any more.
+        """
+        writer, job = self.writer, task.job
+        assert task.source
+        with task.timed("encode"):
+            try:
+                files = writer.write(job, rendition, task.source, result)
+                path = writer.path(job, SIDECAR, rendition.name)
+                record = sidecar(
+                    job,
+                    task.request,
+                    task.stamp,
+                    rendition,
+                    writer.plan_of(job).frames,
+                    device,
+                    task.source,
+                    result,
+                    [file.name for file in files],
+                )
+                write_sidecar(path, record)
+                task.outputs += [str(f.relative_to(writer.folder)) for f in (*files, path)]
+            except (ImageError, MemoryError) as error:
+                writer.check_folder()
+                task.error = task.loader.error_text(job, error)
+        if result.encoded is not None and device:
+            self._spare.give(result.encoded)
 
 
-class _Spare:
+class Runners:
+    """The runners of one device. Chains of one structure share plans and compiled kernels.
+
+    Args:
+        writer: what of a rendition is written.
+        device: where to run; None is NumPy.
+        chain: that of the first image; its kernels are compiled.
+        half: whether images are expected in half floats.
+
+    Raises:
+        RequestError: the memory of the device is too small for any image.
+        DeviceError: a kernel does not compile.
+    """
+
+    def __init__(
+        self, writer: OutputWriter, device: Device | None, chain: Chain, half: bool
+    ) -> None:
+        self._writer = writer
+        self._device = device
+        first = writer.runner(Rendition("", chain, ""), device)
+        try:
+            first.warm_up(half)
+        except ImageError as error:  # not even one of 8x8 pixels fits
+            raise RequestError(f"--memory: too little for any image: {error}") from None
+        self._latest = [(chain, first)]
+        self._by_results = {(first.keep, first.encode, first.final): first}
+
+    def of(self, rendition: Rendition) -> Runner:
+        """The runner of a rendition."""
+        for chain, runner in self._latest:
+            if chain is rendition.chain:
+                return runner
+        runner = self._writer.runner(rendition, self._device)
+        alike = self._by_results.setdefault((runner.keep, runner.encode, runner.final), runner)
+        if alike is not runner:
+            runner = alike.of(rendition.chain)  # shares the plans
+        self._latest.insert(1, (rendition.chain, runner))
+        del self._latest[4:]
+        return runner
+
+
+class SpareArrays:
     """Arrays that are not used any more, to be used again: new memory costs time.
 
-    >>> spare = _Spare(2)
+    >>> spare = SpareArrays(2)
     >>> spare.give(np.zeros((2, 3)))
     >>> spare.take((3, 2)) is None, spare.take((2, 3)).shape, spare.take((2, 3)) is None
     (True, (2, 3), True)
@@ -78,7 +300,7 @@ class _Spare:
         self._lock = threading.Lock()
 
     def take(self, shape: tuple[int, ...]) -> Array | None:
-        """One of that shape; None where there is none."""
+        """An array of that shape; None where there is none."""
         with self._lock:
             for place, array in enumerate(self._arrays):
                 if array.shape == shape:
@@ -87,6 +309,6 @@ class _Spare:
         return None
 
     def give(self, array: Array) -> None:
-        """One that may be used again; the oldest is dropped where there are too many."""
+        """Take back an array that may be used again; beyond ``count`` the oldest is dropped."""
         with self._lock:
             self._arrays.append(array)

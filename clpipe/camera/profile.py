@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
 from clpipe.base.types import Doubles
+from clpipe.base.validation import first_fault
 from clpipe.camera.noise import NoiseModel
 
 DEFAULT_CAMERA = "sony-a7r2"
@@ -116,6 +117,10 @@ class Camera(BaseModel):
     iso_range: tuple[Positive, Positive]
     gain_stages: Annotated[tuple[GainStage, ...], Field(min_length=1)]
     sources: dict[str, str]
+
+    def __repr__(self) -> str:
+        low, high = self.iso_range
+        return f"Camera({self.name}, ISO {low:g} to {high:g})"
 
     @model_validator(mode="after")
     def _ordered(self) -> "Camera":
@@ -258,15 +263,11 @@ def _parse(text: str) -> Camera:
 
 
 def _reason(error: ValidationError) -> str:
-    """The first problem of a profile: its key, the value found and what is allowed."""
-    first = error.errors()[0]
-    key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in first["loc"]).lstrip(".")
-    last = str(first["loc"][-1]) if first["loc"] else ""
-    if first["type"] == "extra_forbidden":
-        model = GainStage if "." in key else Camera
-        return f"{key.removesuffix(last)}{one_of('key', last, model.model_fields)}"
-    if first["type"] == "missing":
-        return f"{key}: missing; every profile needs this key"
-    reason = first["msg"].removeprefix("Value error, ").removeprefix("Input ")
-    found = "" if isinstance(first["input"], dict) else f" found {first['input']!r}:"
-    return f"{key}:{found} {reason}" if key else reason
+    """What is wrong with a profile first, with the key, what was found and what is allowed."""
+    fault = first_fault(error)
+    if fault.problem == "unknown":
+        model = GainStage if "." in fault.key else Camera
+        return fault.key.removesuffix(fault.name) + one_of("key", fault.name, model.model_fields)
+    if fault.problem == "missing":
+        return f"{fault.key}: it is missing, and a profile needs it"
+    return f"{fault.key}: {fault.text}" if fault.path else fault.text

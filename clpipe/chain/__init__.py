@@ -1,4 +1,4 @@
-"""What the user asks for, until it is a resolved chain of stages.
+"""Requests: from what the user asks for to a resolved chain of stages.
 
 TOML, ``--set``, manifest rows and sidecars become a :class:`~clpipe.chain.request.Request`, then
 :class:`~clpipe.chain.settings.Settings`, then a :class:`~clpipe.chain.chain.Chain`; random draws,

@@ -1,4 +1,4 @@
-"""TODO."""
+"""A chain: settings resolved for a camera, an ISO and each stage's place, ready to plan."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -7,9 +7,8 @@ from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.profile import Camera, load_camera
-from clpipe.chain.drawing import check_camera
 from clpipe.chain.draws import Draw
-from clpipe.chain.methods import base_name, make_method, named_errors
+from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
 from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
@@ -17,26 +16,39 @@ from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
 
 @dataclass(frozen=True)
 class Step:
-    """A stage in its place in a chain: its method with resolved parameters, and what is known."""
+    """A stage in its place in a chain: its method, resolved, and the context that it reads."""
 
     name: str
     stage: Stage
     method: Method
     context: Context
 
+    def __repr__(self) -> str:
+        return f"Step({self.name}, {self.method.method})"
+
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """A chain of stages, ready to plan. One is equal to itself alone, so what is made of it can be
-    remembered.
+    """A chain of stages, ready to plan.
+
+    Compared by identity, so that plans and runners can be cached per chain.
     """
 
     steps: tuple[Step, ...]
     source: Kind
     camera: Camera
-    settings: Settings  # it was made from
-    names: tuple[str, ...]  # of all steps, those before the first and after the last to run too
-    draws: Mapping[str, Draw] = field(default_factory=dict)  # of which the settings are an example
+    settings: Settings
+    names: tuple[str, ...]  # of all steps, with those before start_at and after until
+    draws: Mapping[str, Draw] = field(default_factory=dict)  # the settings are an example of these
+
+    def __repr__(self) -> str:
+        return f"Chain({self.settings.label}, {self.label})"
+
+    @property
+    def label(self) -> str:
+        """The first and the last step, for people."""
+        names = [step.name for step in self.steps]
+        return f"{names[0]}..{names[-1]}" if len(names) > 1 else "".join(names)
 
     @property
     def iso(self) -> float:
@@ -65,10 +77,12 @@ class Chain:
         return any(p.random for s in self.steps for p in s.method.passes())
 
     def without_noise(self) -> "Chain":
-        """The chain without what its steps draw at random; all else as it is, the last step too.
+        """The chain without the noise of its steps.
+
+        A step that only adds noise is left out, or, where it is the last, does nothing.
 
         Raises:
-            RequestError: no step draws anything.
+            RequestError: no step adds noise.
         """
         left = [(step, step.method.without_noise()) for step in self.steps]
         if all(method is step.method for step, method in left):
@@ -85,8 +99,8 @@ class Chain:
         )
         return replace(self, steps=steps)
 
-    def kept(self, names: Sequence[str]) -> tuple[str, ...]:
-        """The names of steps to keep, each once; ``all`` is every one.
+    def select(self, names: Sequence[str]) -> tuple[str, ...]:
+        """The names of steps, each once; "all" is every step.
 
         Raises:
             RequestError: the chain has no such step.
@@ -118,25 +132,25 @@ def make_chain(
     start_at: str | None = None,
     until: str | None = None,
 ) -> Chain:
-    """The chain that the settings ask for, every parameter resolved.
+    """The chain of settings, every parameter resolved.
 
-    A stage that comes a second time is called ``stage_2``, and so on. Settings with draws give an
-    example, that of the image key "", once it is seen that all that can be drawn is right; the
-    chain of an image is made of its :meth:`Settings.drawn`.
+    A stage that is listed a second time is called ``stage_2``, and so on. Settings with draws give
+    an example, that of the image key "", after a check of all that can be drawn; the chain of an
+    image is made of its :meth:`Settings.drawn`.
 
     Args:
-        settings: the request.
-        source: the kind of image that enters; None is what :func:`entry` says, or, with
-            ``start_at``, what that step reads.
-        start_at: the first step to run. The steps before it are resolved all the same: what they
-            say of the image (pattern, gains, noise, levels) holds.
+        settings: all values that are set.
+        source: the kind of image that enters; None is that of :func:`entry`, or, with ``start_at``,
+            what that step reads.
+        start_at: the first step to run. The steps before it are resolved too, because what they do
+            to the image (pattern, gains, noise, levels) has been done.
         until: the last step to run.
 
     Raises:
-        RequestError: a chain whose image kinds do not fit, an unknown camera, an ISO it has not,
-            a step that is not there.
+        RequestError: image kinds that do not fit, an unknown camera, an ISO outside its range, or a
+            step that is not in the chain.
     """
-    check_camera(settings)
+    settings.check_cameras()
     draws, settings = settings.draws, settings.drawn("")
     camera = load_camera(settings.camera)
     steps = resolved_steps(settings, camera, source or (None if start_at else entry(settings)))
@@ -164,7 +178,8 @@ def make_chain(
 
 
 def entry(settings: Settings) -> Kind:
-    """What enters a whole chain: linear RGB, or a finished picture where the first stage reads it.
+    """The kind of image that enters a whole chain: linear RGB, or display where the first stage
+    reads that.
 
     >>> entry(Settings(stages=("inverse_gamma", "mosaic"))).label, entry(Settings()).label
     ('display', 'rgb')
@@ -175,7 +190,7 @@ def entry(settings: Settings) -> Kind:
 
 
 def step_names(settings: Settings) -> list[str]:
-    """The names of the steps that are not skipped; that of a repeated one has its number.
+    """The names of the steps that are not skipped; a repeated stage gets a number.
 
     >>> step_names(Settings(stages=("exposure", "mosaic", "exposure"), skip=("mosaic",)))
     ['exposure', 'exposure_2']
@@ -187,9 +202,14 @@ def step_names(settings: Settings) -> list[str]:
 
 
 def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:
-    """The steps of the settings, in order, for an image of a kind; None is what the first reads.
+    """The steps of settings, in order, each resolved with what the steps before it did.
 
     A step that does nothing is left out where it does not fit.
+
+    Args:
+        settings: all values that are set.
+        camera: the camera of the settings.
+        kind: the kind of image that enters; None is what the first step reads.
 
     Raises:
         RequestError: image kinds do not fit.
@@ -199,12 +219,12 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     before = "the input"
     for name in step_names(settings):
         stage = all_stages()[base_name(name)]
-        method = make_method(stage, name, settings.parameters.get(name, {}))
+        method = settings.method(name)
         if stage.reads is not (kind or stage.reads):
             if isinstance(method, Unchanged) and stage.reads is stage.writes:
                 continue  # so that gamma can be skipped without picture_noise, which does nothing
             raise RequestError(misfit(name, stage, before, kind or stage.reads))
-        with named_errors(name, type(method)), user_code_errors(f"stage {name}", stage.folder):
+        with validation_errors(name, type(method)), user_code_errors(f"stage {name}", stage.folder):
             method = method.resolve(context)
             after = method.after(context)
         if stage.folder:
@@ -216,7 +236,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
 
 
 def misfit(name: str, stage: Stage, before: str, kind: Kind) -> str:
-    """Why a stage cannot follow, and which stages could stand between."""
+    """The message for a stage that cannot follow: why, and which stages could stand between."""
     bridges = [s.name for s in all_stages().values() if (s.reads, s.writes) == (kind, stage.reads)]
     help_ = f"put {' or '.join(bridges)} between them" if bridges else f"leave out {name} as well"
     if before == "the input":

@@ -1,8 +1,8 @@
-"""Random draws, declared in a configuration in the place of a value.
+"""The laws of random draws, which a configuration declares in the place of a value.
 
 A drawn value depends on the seed, the image key and the name of what is drawn, and on nothing else.
-It has nine digits, which is what a kernel's float can tell apart, so that the last bit of a
-platform's ``log`` changes nothing.
+It is rounded to nine digits, as many as a float32 needs, so that the last bit of a platform's
+``log`` changes nothing.
 """
 
 import math
@@ -16,26 +16,25 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from clpipe.base.errors import KeyedError
 from clpipe.base.text import one_of
+from clpipe.base.validation import first_fault
 
-TINY = math.ulp(0.0)
-
+TINY = math.ulp(0.0)  # the least number above 0
 
 FAR = 9.0  # standard deviations; a uniform number of 52 bits gives no normal beyond 8.3
 
-
-MOST_TRIED = 64  # whole numbers of a range
+MAX_TRIED = 64  # whole numbers of a range that are validated
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a number may be: from ``low`` to ``high``, both allowed; whole or not."""
+    """The range of a number, with both ends; ``whole`` where it must be a whole number."""
 
     low: float = -math.inf
     high: float = math.inf
     whole: bool = False
 
     def nearest(self, value: float) -> float:
-        """The allowed number next to a value, with nine digits unless it is a limit.
+        """The allowed number nearest to a value, to nine digits unless it is a limit.
 
         >>> Limits(0, 1).nearest(-0.5), Limits().nearest(1 / 3), Limits(whole=True).nearest(2.7)
         (0.0, 0.333333333, 3)
@@ -45,19 +44,19 @@ class Limits:
         return min(max(rounded, self.low), self.high)
 
     def between(self, low: float, high: float) -> list[float]:
-        """What to try of a range, so that all of it is known to be allowed or not.
+        """Numbers of a range to validate: its ends, and whole numbers between them.
 
         >>> Limits().between(1, 3), Limits(whole=True).between(1, 3)
         ([1, 3], [1, 2, 3, 3])
         """
         if not (self.whole and float(low).is_integer() and float(high).is_integer()):
             return [low, high]
-        return [*range(int(low), int(high) + 1)[:MOST_TRIED], int(high)]
+        return [*range(int(low), int(high) + 1)[:MAX_TRIED], int(high)]
 
 
 @cache
 def limits_of(model: type[BaseModel], name: str) -> Limits | None:
-    """The limits of a field of a model; None where it holds no number.
+    """The limits of a field of a model; None where the field holds no number.
 
     >>> from clpipe.images.encoding import Output
     >>> limits_of(Output, "jpeg_quality"), limits_of(Output, "jpeg_subsampling")
@@ -78,13 +77,13 @@ def limits_of(model: type[BaseModel], name: str) -> Limits | None:
 
 
 class Draw(BaseModel):
-    """A law that values are drawn from. The fields of a subclass are what a configuration holds."""
+    """A law that values are drawn from. The fields of a subclass are its keys in a table."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     @property
     def follows(self) -> str:
-        """The name of the value that the drawn one follows; empty where it follows none."""
+        """The dotted name of the value that this one follows; "" where it follows none."""
         return ""
 
     def record(self) -> dict[str, Any]:
@@ -93,19 +92,25 @@ class Draw(BaseModel):
         return {key: list(v) if isinstance(v, tuple) else v for key, v in values.items()}
 
     def extremes(self, limits: Limits | None, followed: Sequence[Any]) -> Sequence[Any]:
-        """Values that are all allowed only if every one is that can be drawn.
+        """The extreme values: if these are allowed, so is all that can be drawn.
 
         Args:
-            limits: of what is drawn; None for what is no number.
+            limits: of the drawn value; None where it is no number.
             followed: the extremes of the value that it follows.
 
         Raises:
-            ValueError: the law cannot draw such a thing, or follow such values.
+            ValueError: the law does not fit such a value, or cannot follow such values.
         """
         raise NotImplementedError(type(self).__name__)
 
     def value(self, uniform: float, limits: Limits | None, followed: Any) -> Any:
-        """The value that a uniform number, above 0 and below 1, comes to; arguments as above."""
+        """The value of a uniform number.
+
+        Args:
+            uniform: above 0 and below 1.
+            limits: as for :meth:`extremes`.
+            followed: the value that it follows; None where it follows none.
+        """
         raise NotImplementedError(type(self).__name__)
 
 
@@ -132,7 +137,7 @@ class Choice(Draw):
 
 
 class NumberDraw(Draw):
-    """A law of numbers. Subclasses say from where to where, and what a uniform number comes to."""
+    """A law of numbers. Subclasses give its range, and the number of a uniform one."""
 
     def extremes(self, limits: Limits | None, followed: Sequence[Any]) -> Sequence[Any]:
         if limits is None:
@@ -144,16 +149,16 @@ class NumberDraw(Draw):
         return limits.nearest(self.number(uniform, limits, followed))
 
     def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
-        """The least and the greatest value; errors as ``extremes``."""
+        """The lowest and the highest value; arguments and errors as :meth:`extremes`."""
         raise NotImplementedError(type(self).__name__)
 
     def number(self, uniform: float, limits: Limits, followed: Any) -> float:
-        """The value before it is rounded."""
+        """The value before it is rounded; arguments as :meth:`value`."""
         raise NotImplementedError(type(self).__name__)
 
 
 class Uniform(NumberDraw):
-    """Any number of a range, both ends included; whole numbers where such are wanted.
+    """Any number of a range, with both ends; a whole number where the value must be whole.
 
     >>> Uniform(uniform=(3, 5)).value(0.99, Limits(whole=True), None)
     5
@@ -202,7 +207,7 @@ class LogUniform(NumberDraw):
 
 
 class Normal(NumberDraw):
-    """A Gaussian of a mean and a standard deviation; what is beyond the limits is put on them.
+    """A Gaussian with a mean and a standard deviation; values beyond a limit become the limit.
 
     >>> Normal(normal=(0.8, 0.1)).value(0.5, Limits(), None)
     0.8
@@ -219,7 +224,7 @@ class Normal(NumberDraw):
     def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
         mean, sigma = self.normal
         if not limits.low <= mean <= limits.high:
-            return mean, mean  # which the parameter refuses
+            return mean, mean  # validation will refuse it
         return limits.nearest(mean - FAR * sigma), limits.nearest(mean + FAR * sigma)
 
     def number(self, uniform: float, limits: Limits, followed: Any) -> float:
@@ -228,7 +233,7 @@ class Normal(NumberDraw):
 
 
 class SameAs(Draw):
-    """What another one is."""
+    """The same value as another one."""
 
     same_as: str
 
@@ -244,11 +249,11 @@ class SameAs(Draw):
 
 
 class LogNormalOf(NumberDraw):
-    """A number whose logarithm is Gaussian, around a line over the logarithm of another one.
+    """A number whose logarithm is Gaussian about a line over the logarithm of another number.
 
-    As read noise follows shot noise, log b ~ N(2.18 log a + 1.2, 0.26) (Brooks et al.,
-    "Unprocessing images for learned raw denoising", CVPR 2019, sec. 3.1). What is beyond the limits
-    is put on them.
+    Read noise follows shot noise in this way: log b ~ N(2.18 log a + 1.2, 0.26) (Brooks et al.,
+    "Unprocessing images for learned raw denoising", CVPR 2019, sec. 3.1). Values beyond a limit
+    become the limit.
 
     >>> read = LogNormalOf(log_normal_of="sensor_noise.a", slope=2.18, intercept=1.2, sigma=0.26)
     >>> read.value(0.5, Limits(), 1e-3)
@@ -290,33 +295,31 @@ LAWS: dict[str, type[Draw]] = {
 
 
 def parse_draw(key: str, table: Mapping[str, Any]) -> Draw:
-    """A draw as a configuration holds it, such as ``{"uniform": [1, 2]}``.
+    """The draw of a table such as ``{"uniform": [1, 2]}``.
 
     >>> parse_draw("iso", {"choice": [100, 400]})
     Choice(choice=[100, 400])
 
     Raises:
-        KeyedError: it is none; the message begins with ``key``, the name of what is drawn.
+        KeyedError: the table is no draw; the message begins with ``key``, the name of the value.
     """
-    named = [law for law in LAWS if law in table]
-    if len(named) != 1:
+    laws = [law for law in LAWS if law in table]
+    if len(laws) != 1:
         wrong = one_of("draw", next((str(k) for k in table), ""), LAWS)
-        if named:
-            wrong = f"a draw has one law; found {' and '.join(named)}"
+        if laws:
+            wrong = f"a draw has one law; found {' and '.join(laws)}"
         raise KeyedError(key, f"{key}: found {dict(table)!r}: {wrong}")
-    law = LAWS[named[0]]
+    law = LAWS[laws[0]]
     try:
         return law.model_validate(dict(table))
-    except ValidationError as errors:
-        error = errors.errors()[0]
-        field = str(error["loc"][0]) if error["loc"] else named[0]
-        reason = error["msg"].removeprefix("Value error, ").removeprefix("Input ")
-        if error["type"] == "extra_forbidden":
-            reason = one_of(f"key of {named[0]}", field, law.model_fields)
-        elif error["type"] == "missing":
+    except ValidationError as error:
+        fault = first_fault(error)
+        field = str(fault.path[0]) if fault.path else laws[0]
+        reason = fault.text
+        if fault.problem == "unknown":
+            reason = one_of(f"key of {laws[0]}", field, law.model_fields)
+        elif fault.problem == "missing":
             reason = f"it needs {field}"
-        elif error["loc"]:
-            reason = f"found {error['input']!r}: {reason}"
         raise KeyedError(key, f"{key}: {field}: {reason}") from None
 
 

@@ -1,45 +1,48 @@
-"""TODO."""
+"""The keys of a configuration that stand in no table, and the types of their values."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from clpipe.base.errors import KeyedError
 
-OUTPUT = "output"  # the table that is no stage's
-
-
-MOST_ISO = 10**9
-
-
-DRAWN = ("iso", "camera")  # what can be, beside parameters
-
-
 KEYS = ("camera", "iso", "seed", "raw_size", "raw_type", "stages", "skip", "stage_files")
+
+OUTPUT = "output"  # the one table that belongs to no stage
+
+DRAWABLE = ("iso", "camera")  # of the keys; parameters of stages and of the output can be, too
+
+MAX_ISO = 10**9
+
+TYPES: dict[str, tuple[str, Any]] = {
+    "iso": ("a number", int | float),
+    "seed": ("a whole number", int),
+    **dict.fromkeys(("camera", "raw_size", "raw_type"), ("text", str)),
+}
 
 
 def check_type(key: str, value: Any) -> None:
-    """See that a key that stands in no table has a value of its type.
+    """See that the value of a key is of the key's type.
 
     Raises:
-        KeyedError: it has not.
+        KeyedError: it is not, or is an ISO above :data:`MAX_ISO`.
     """
-    types: dict[str, tuple[str, Any]] = {
-        "iso": ("a number", int | float),
-        "seed": ("a whole number", int),
-        **dict.fromkeys(("camera", "raw_size", "raw_type"), ("text", str)),
-    }
-    kind, expected = types.get(key, ("", object))
+    kind, expected = TYPES.get(key, ("", object))
     if not isinstance(value, expected) or isinstance(value, bool):
         raise KeyedError(key, f"{key}: found {value!r}, but it is {kind}")
-    if key == "iso" and value > MOST_ISO:
-        raise KeyedError(key, f"{key}: found {value!r}, but it is at most {MOST_ISO:g}")
+    if key == "iso" and value > MAX_ISO:
+        raise KeyedError(key, f"{key}: found {value!r}, but it is at most {MAX_ISO:g}")
 
 
 def names_in(values: Mapping[str, Any], key: str, what: str) -> tuple[str, ...]:
-    """The list of texts under a key; empty if it is not there.
+    """The list of texts under a key; empty where the key is missing.
+
+    Args:
+        values: nested values, as a TOML file holds them.
+        key: one whose value is a list of texts.
+        what: what the texts are, for the message.
 
     Raises:
-        KeyedError: it is something else.
+        KeyedError: the value is no list, or an item is no text.
     """
     names = values.get(key, [])
     if isinstance(names, str | Mapping) or not isinstance(names, Sequence):

@@ -1,4 +1,4 @@
-"""TODO."""
+"""The methods of stages: found by their names, made from a table of parameters and validated."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -10,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from clpipe.base.errors import KeyedError
 from clpipe.base.text import one_of
+from clpipe.base.validation import first_fault
 from clpipe.chain.keys import OUTPUT
 from clpipe.chain.registry import all_stages
 from clpipe.images.encoding import Output
@@ -34,34 +35,53 @@ def stage_named(key: str, name: str) -> Stage:
     """
     if name not in all_stages():
         if base_name(name) in all_stages():
-            again = f"{name}: a stage that is to come again is listed again, as {base_name(name)}"
-            raise KeyedError(key, f"{again}; the second is then called {base_name(name)}_2")
+            stage = base_name(name)
+            again = f"{name}: to repeat a stage, list {stage} again"
+            raise KeyedError(key, f"{again}; the second is then called {stage}_2")
         raise KeyedError(key, one_of("stage", name, all_stages()))
     return all_stages()[name]
 
 
-def method_of(name: str, table: Mapping[str, Any]) -> Any:
-    """The method that a step's settings choose: the one they name, or the stage's default."""
+def chosen_method(name: str, table: Mapping[str, Any]) -> Any:
+    """The name of the method in a step's table; without one, that of the stage's default method."""
     stage = all_stages().get(base_name(name))
     return table.get("method", stage.methods[0].method if stage else None)
 
 
 def make_method(stage: Stage, name: str, table: Mapping[str, Any]) -> Method:
-    """A stage's method from its settings, parameters validated.
+    """A stage's method from a table of its parameters, validated.
+
+    Args:
+        stage: the stage.
+        name: of the step, for messages.
+        table: values by parameter; "method" chooses the method, else it is the default.
 
     Raises:
         KeyedError: an unknown method or parameter, or a value that is not allowed.
     """
+    if not table:
+        return default_method(stage.methods[0], name)
     method = method_named(stage, name, table.get("method", stage.methods[0].method))
-    with named_errors(name, method):
+    with validation_errors(name, method):
         return method.model_validate({k: v for k, v in table.items() if k != "method"})
 
 
-def method_named(stage: Stage, name: str, chosen: Any) -> type[Method]:
-    """The method of a step's stage that has that name.
+@lru_cache(maxsize=1024)
+def default_method(method: type[Method], name: str) -> Method:
+    """A method with all parameters at their defaults; methods are frozen, so one serves all.
 
     Raises:
-        KeyedError: there is none.
+        KeyedError: a parameter has no default.
+    """
+    with validation_errors(name, method):
+        return method()
+
+
+def method_named(stage: Stage, name: str, chosen: Any) -> type[Method]:
+    """The method of a stage by its name, ``chosen``; ``name`` is the step's, for the message.
+
+    Raises:
+        KeyedError: the stage has no such method.
     """
     if not isinstance(chosen, str) or chosen not in stage.by_name:
         message = one_of("method", str(chosen), stage.by_name)
@@ -75,46 +95,41 @@ def make_output(table: Mapping[str, Any]) -> Output:
     Raises:
         KeyedError: an unknown key, or a value that is not allowed.
     """
-    try:
+    with validation_errors(OUTPUT, Output):
         return Output.model_validate(dict(table))
-    except ValidationError as errors:
-        error = errors.errors()[0]
-        name = str(error["loc"][0])
-        key = f"{OUTPUT}.{name}"
-        if error["type"] == "extra_forbidden":
-            raise unknown_parameter(OUTPUT, Output, name) from None
-        reason = error["msg"].removeprefix("Input ")
-        raise KeyedError(key, f"{key}: found {error['input']!r}: {reason}") from None
 
 
 @contextmanager
-def named_errors(name: str, method: type[Method]) -> Iterator[None]:
-    """Turn what pydantic says of a step's parameters into a message that names the step.
+def validation_errors(name: str, model: type[BaseModel]) -> Iterator[None]:
+    """Turn what pydantic refuses in a table into a message that names the table.
+
+    Args:
+        name: of the step, or of the table of output.
+        model: what declares the table's keys.
 
     Raises:
-        KeyedError: a parameter is unknown, or its value is not allowed.
+        KeyedError: a key is unknown, or its value is not allowed.
     """
     try:
         yield
-    except ValidationError as errors:
-        error = errors.errors()[0]
-        key = ".".join([name, *(str(part) for part in error["loc"])])
-        if error["type"] == "extra_forbidden":
-            raise unknown_parameter(name, method, str(error["loc"][0])) from None
-        reason = error["msg"].removeprefix("Value error, ").removeprefix("Input ")
-        found = f" found {error['input']!r}:" if error["loc"] else ""
-        raise KeyedError(key, f"{key}:{found} {reason}") from None
+    except ValidationError as error:
+        fault = first_fault(error)
+        if fault.problem == "unknown":
+            raise unknown_parameter(name, model, str(fault.path[0])) from None
+        key = ".".join([name, *(str(part) for part in fault.path[:1])])
+        place = f"{name}.{fault.key}" if fault.path else name
+        raise KeyedError(key, f"{place}: {fault.text}") from None
 
 
 def unknown_parameter(step: str, model: type[BaseModel], parameter: str) -> KeyedError:
-    """What to say of a parameter that a step, or the table of output, has not."""
+    """The error for a parameter that a step, or the table of output, does not have."""
     key = f"{step}.{parameter}"
     if not issubclass(model, Method):
         return KeyedError(key, one_of(f"key of {step}", parameter, model.model_fields))
     what = f"parameter of {step} ({model.method})"
     message = one_of(what, parameter, ["method", *model.model_fields])
     stage = all_stages()[base_name(step)]
-    having = [m for m, other in stage.by_name.items() if parameter in other.model_fields]
-    if having:
-        message += f"; '{parameter}' is a parameter of {' and '.join(having)}"
+    others = [m for m, other in stage.by_name.items() if parameter in other.model_fields]
+    if others:
+        message += f"; '{parameter}' is a parameter of {' and '.join(others)}"
     return KeyedError(key, message)

@@ -1,4 +1,4 @@
-"""Every stage there is: clpipe's own, those of installed packages, those of files a user named."""
+"""All stages: clpipe's own, those of installed packages, and those of stage files."""
 
 import re
 import traceback
@@ -22,18 +22,15 @@ from clpipe.stages import own_stages
 
 ARGUMENT_TYPES = (np.float32, np.int32, np.uint32, np.ndarray, Literal)
 
-
 ENTRY_POINTS = "clpipe.stages"
-
 
 _from_files: dict[Path, Stage] = {}
 
-
-_loading = RLock()  # a file is run once, and its name is then taken
+_loading = RLock()  # so that each file is run once
 
 
 def all_stages() -> dict[str, Stage]:
-    """Every stage by its name: clpipe's own, the default chain first, then the others."""
+    """All stages by name: clpipe's own, the default chain first, then the others."""
     return _all_stages(tuple(_from_files.values()))
 
 
@@ -47,22 +44,23 @@ def installed_stages() -> dict[str, Stage]:
     """The stages that installed packages offer as entry points of the group ``clpipe.stages``.
 
     Raises:
-        RequestError: one cannot be loaded, is no stage, or has a name that is taken.
+        RequestError: one cannot be loaded, is no stage, or has the name of another stage.
     """
-    found: dict[str, Stage] = {}
+    stages: dict[str, Stage] = {}
     for entry in entry_points(group=ENTRY_POINTS):
         package = f"package {entry.dist.name}" if entry.dist else f"entry point {entry.name}"
         stage, file = _loaded(package, entry)
-        _check_stage_name(package, stage.name, own_stages() | found)
-        found[stage.name] = replace(stage, folder=file.parent)
-    return found
+        _check_stage_name(package, stage.name, own_stages() | stages)
+        stages[stage.name] = replace(stage, folder=file.parent)
+    return stages
 
 
 def load_stage_file(path: Path) -> Stage:
     """Load a stage from a Python file that defines ``STAGE``; its kernels lie in the same folder.
 
     Raises:
-        RequestError: the file cannot be read or run, defines no stage, or one whose name is taken.
+        RequestError: the file cannot be read or run, defines no stage, or one with the name of
+            another stage.
     """
     with _loading:
         return _loaded_file(path, path.resolve())
@@ -83,7 +81,15 @@ def _loaded_file(path: Path, where: Path) -> Stage:
 
 
 def _loaded(place: str, source: EntryPoint | ModuleType) -> tuple[Stage, Path]:
-    """The stage of an entry point or of a module still to be run, and the file it stands in."""
+    """The stage of an entry point, or of a module that is run here, and its file.
+
+    Args:
+        place: the package or the file, for messages.
+        source: the entry point or the module.
+
+    Raises:
+        RequestError: it cannot be loaded, or is no valid stage.
+    """
     folder = Path(place).parent.resolve() if isinstance(source, ModuleType) else None
     with user_code_errors(place, folder):
         if isinstance(source, EntryPoint):
@@ -113,10 +119,14 @@ def _loaded(place: str, source: EntryPoint | ModuleType) -> tuple[Stage, Path]:
 
 @contextmanager
 def user_code_errors(place: str, folder: Path | None) -> Iterator[None]:
-    """Turn whatever the code of somebody else's stage raises into a message that names its line.
+    """Turn any error that a user's stage raises into a message with the line of its code.
+
+    Args:
+        place: the stage, for the message.
+        folder: of the stage's code; None is clpipe's own.
 
     Raises:
-        RequestError: it raised something.
+        RequestError: the stage raised an error.
     """
     try:
         yield
@@ -134,7 +144,7 @@ def user_code_errors(place: str, folder: Path | None) -> Iterator[None]:
 
 
 def check_passes(name: str, stage: Stage, method: Method, context: Context) -> None:
-    """See that the passes of somebody else's method fit its arguments and its kernel file.
+    """See that the passes of a user's method fit its arguments and its kernel file.
 
     Raises:
         RequestError: they do not.
@@ -144,11 +154,11 @@ def check_passes(name: str, stage: Stage, method: Method, context: Context) -> N
     with user_code_errors(f"stage {name}", stage.folder):
         passes, arguments = method.passes(), method.arguments(context)
         for pass_ in passes:
-            known = [*arguments, *(n for p in passes for n in (*p.found, p.writes))]
+            names = [*arguments, *(n for p in passes for n in (*p.estimates, p.writes))]
             for argument in (*pass_.arguments, *pass_.finish_arguments):
-                if argument not in known:
+                if argument not in names:
                     raise RequestError(
-                        f"stage {name}: pass {pass_.function} wants the argument '{argument}'; "
+                        f"stage {name}: pass {pass_.function} needs the argument '{argument}'; "
                         f"arguments() gives {', '.join(arguments) or 'none'}"
                     )
             for function in filter(None, (pass_.function, pass_.finish)):

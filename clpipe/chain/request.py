@@ -1,58 +1,181 @@
-"""What chain is asked for, as plain values: they can be written down, sent on and asked again."""
+"""All that is asked for, as plain values: from options, a configuration, a manifest, a sidecar."""
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
 from clpipe.chain.chain import Chain, make_chain
-from clpipe.chain.files import own_values, parse_assignment
+from clpipe.chain.files import load_config
+from clpipe.chain.formats import EVERY_FORMAT
 from clpipe.chain.keys import KEYS, OUTPUT
 from clpipe.chain.registry import load_stage_file
 from clpipe.chain.settings import Settings, overlay
+from clpipe.chain.toml import parse_assignment
+from clpipe.stage import Kind
 
 DEFAULTS = Settings()
+
+# What decides about the bytes of a picture. The rest decides which pictures are made, or whether.
+RECORDED = (
+    *("config", "options", "image", "start_at", "until", "stage_files", "image_key"),
+    *("layer", "transfer", "formats", "keep"),
+)
 
 
 @dataclass(frozen=True)
 class Request:
-    """A configuration's own values, options over them, and what an image says over both.
+    """All that is asked for. Every field is a plain value, so a request can be stored and sent.
 
-    ``config`` is None where none is named. All are nested values as a configuration file holds
-    them. What is drawn at random is drawn for ``image_key``, where there is one.
+    Args:
+        config: the values of a configuration, nested as in its file; None where none is named.
+        options: values over those of the configuration.
+        image: values of one image over both, from its row in a manifest.
+        start_at: the first step to run; None is the first of the chain.
+        until: the last step to run; None is the last of the chain.
+        stage_files: Python files that define further stages.
+        image_key: the image that noise and draws belong to; "" is none in particular.
+        layer: of an EXR, which is the picture; None chooses.
+        transfer: the transfer curve of renders in whole numbers; None refuses these.
+        max_pixels: larger files are refused; None is the reader's own limit.
+        formats: of the last image; () follows from the chain, see :meth:`with_outputs`.
+        keep: steps whose image is written too, or "all".
+        frames: how many frames of each image; None is one picture instead of a burst.
+        truths: which of :data:`clpipe.chain.truth.TRUTHS` are written beside each picture.
     """
 
     config: Mapping[str, Any] | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
-    row: Mapping[str, Any] = field(default_factory=dict)
+    image: Mapping[str, Any] = field(default_factory=dict)
     start_at: str | None = None
     until: str | None = None
     stage_files: tuple[str, ...] = ()
     image_key: str = ""
+    layer: str | None = None
+    transfer: str | None = None
+    max_pixels: int | None = None
+    formats: tuple[str, ...] = ()
+    keep: tuple[str, ...] = ()
+    frames: int | None = None
+    truths: tuple[str, ...] = ()
 
-    def of(self, image_key: str, row: Mapping[str, Any]) -> "Request":
-        """The same for one image, with what is said of it alone."""
-        return replace(self, image_key=image_key, row=row)
+    @classmethod
+    def from_options(
+        cls,
+        *,
+        config: str | None = None,
+        camera: str | None = None,
+        iso: float | None = None,
+        seed: int | None = None,
+        assignments: Sequence[str] = (),
+        stages: str | None = None,
+        skip: Sequence[str] = (),
+        stage_files: Sequence[Path] = (),
+        raw_size: str | None = None,
+        raw_type: str | None = None,
+        values: Mapping[str, Any] | None = None,
+        **fields_: Any,
+    ) -> "Request":
+        """The request of command-line options; None and () are options that are not set.
 
-    def settings(self, under: Settings = DEFAULTS, carried: Settings | None = None) -> Settings:
-        """The settings that are asked for.
+        Args:
+            config: the name of a built-in configuration, or of a TOML file.
+            camera, iso, seed, skip, raw_size, raw_type: settings.
+            assignments: texts of the form ``stage.parameter=value``.
+            stages: names, separated by commas.
+            stage_files: as for the class.
+            values: further settings, nested.
+            **fields_: further fields of the class.
 
-        ``under`` are settings that hold where nothing is said. ``carried`` are those of a kept
-        image; they hold where no configuration is named.
+        Raises:
+            RequestError: a name or value that is not allowed.
+        """
+        for file in stage_files:
+            load_stage_file(file)
+        plain = {"camera": camera, "iso": iso, "seed": seed}
+        plain |= {"raw_size": raw_size, "raw_type": raw_type}
+        options: dict[str, Any] = {k: v for k, v in plain.items() if v is not None}
+        if stages is not None:
+            options["stages"] = [s.strip() for s in stages.split(",") if s.strip()]
+        if skip:
+            options["skip"] = list(skip)
+        for text in assignments:
+            stage, parameter, value = parse_assignment(text)
+            options.setdefault(stage, {})[parameter] = value
+        configuration = load_config(config) if config is not None else None
+        request = cls(
+            configuration.values if configuration else None,
+            {**options, **(values or {})},
+            stage_files=tuple(str(file.resolve()) for file in stage_files),
+            **fields_,
+        )
+        if configuration:
+            vars(request)["_configured"] = configuration.settings  # is validated already
+        request.settings()
+        return request
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> "Request":
+        """The request that :meth:`record` stored. No stage file is loaded, no name looked up.
+
+        Raises:
+            RequestError: the record is not of that form.
+        """
+        try:
+            values = {name: record[name] for name in RECORDED}
+            lists = {name: tuple(record[name]) for name in ("stage_files", "formats", "keep")}
+        except (TypeError, KeyError) as error:
+            raise RequestError(f"the request in it is damaged: {error}") from None
+        if not set(lists["formats"]) <= set(EVERY_FORMAT):
+            raise RequestError(f"found formats {', '.join(map(str, lists['formats']))}")
+        request = cls(**{**values, **lists})
+        tables = (request.config or {}, request.options, request.image)
+        texts = (request.start_at, request.until, request.layer, request.transfer)
+        are_texts = all(isinstance(text, str) for text in (request.image_key, *filter(None, texts)))
+        if not are_texts or not all(isinstance(table, Mapping) for table in tables):
+            raise RequestError("the request in it is damaged: a value is of the wrong type")
+        return request
+
+    def for_image(self, key: str, values: Mapping[str, Any]) -> "Request":
+        """The request for one image: its key, and values that hold for it alone."""
+        return self._changed(image_key=key, image=values)
+
+    def with_outputs(self, chain: Chain) -> "Request":
+        """The request with every output named, as a chain has them.
+
+        The format, where none is chosen, is JPEG; where ``until`` ends the chain before it comes to
+        display values, EXR.
+
+        Raises:
+            RequestError: the chain has not a step of ``keep``.
+        """
+        is_whole = self.until is None or chain.result is Kind.DISPLAY
+        formats = tuple(dict.fromkeys(self.formats)) or (("jpg",) if is_whole else ("exr",))
+        return self._changed(formats=formats, keep=chain.select(self.keep))
+
+    def settings(self, carried: Settings | None = None) -> Settings:
+        """The settings that are asked for, drawn for the image where there is one.
+
+        Args:
+            carried: the settings that an image carries, which hold where nothing else is set.
 
         Raises:
             RequestError: a name or value that is not allowed.
         """
         for file in self.stage_files:
             load_stage_file(Path(file))
-        if self.config is not None:
-            settings = overlay(under, self.config) if self.config else under
-        else:
-            settings = carried or under
-        for values in (self.options, self.row):
-            settings = overlay(settings, values) if values else settings
+        settings = self._general
+        if carried is not None:
+            for values in (self.config, self.options):
+                carried = overlay(carried, values) if values else carried
+            settings = carried
+        if self.image:
+            settings = overlay(settings, self.image)
         return settings.drawn(self.image_key) if self.image_key else settings
 
     def chain(self, carried: Settings | None = None) -> Chain:
@@ -61,72 +184,52 @@ class Request:
         Raises:
             RequestError: it cannot be made.
         """
-        return self.chain_of(self.settings(carried=carried), self.start_at)
+        return self.chain_from(self.settings(carried), self.start_at)
 
-    def chain_of(self, settings: Settings, start_at: str | None) -> Chain:
-        """The chain of such settings, entered at a step.
+    def chain_from(self, settings: Settings, start_at: str | None) -> Chain:
+        """The chain of settings, from a step on.
 
         Raises:
             RequestError: it cannot be made, or the options name a stage that is not in it.
         """
         chain = make_chain(settings, start_at=start_at, until=self.until)
         for step, value in self.options.items():
-            named = isinstance(value, Mapping) and step not in KEYS  # or it is a draw
-            if named and step not in (*chain.names, OUTPUT):
+            is_table = isinstance(value, Mapping) and step not in KEYS  # where it is a draw
+            if is_table and step not in (*chain.names, OUTPUT):
                 raise RequestError(one_of("stage in this chain", step, chain.names))
         return chain
 
     def record(self) -> dict[str, Any]:
-        """The same as JSON values, from which :func:`request_from_record` makes it."""
-        return {**asdict(self), "stage_files": list(self.stage_files)}
+        """What a sidecar stores of the request, as JSON values.
 
+        Equal records make the same bytes of the same image: :data:`RECORDED`, and the SHA-256 of
+        all files that are named, as "files".
 
-def request_from_record(record: Mapping[str, Any]) -> Request:
-    """What :meth:`Request.record` wrote down.
+        Raises:
+            RequestError: as :meth:`settings`.
+        """
+        values = {name: getattr(self, name) for name in RECORDED}
+        values["files"] = digests([*self.settings().files(), *self.stage_files])
+        record: dict[str, Any] = json.loads(json.dumps(values))  # as it is read back
+        return record
 
-    Raises:
-        RequestError: it is not of that form.
-    """
-    try:
-        own = {name: record[name] for name in Request.__dataclass_fields__}
-        asked = Request(**{**own, "stage_files": tuple(record["stage_files"])})
-        asked.settings()
-    except (TypeError, KeyError, AttributeError) as error:
-        raise RequestError(f"what was asked for is damaged: {error}") from None
-    return asked
+    @cached_property
+    def _configured(self) -> Settings:
+        """The configuration over the defaults."""
+        return overlay(DEFAULTS, self.config) if self.config else DEFAULTS
 
+    @cached_property
+    def _general(self) -> Settings:
+        """The options over the configuration: the settings of all images, nothing drawn."""
+        return overlay(self._configured, self.options) if self.options else self._configured
 
-def request_from_options(
-    config: str | None = None,
-    camera: str | None = None,
-    iso: float | None = None,
-    seed: int | None = None,
-    assignments: Sequence[str] = (),
-    stages: str | None = None,
-    skip: Sequence[str] = (),
-    start_at: str | None = None,
-    until: str | None = None,
-    stage_files: Sequence[Path] = (),
-    raw_size: str | None = None,
-    raw_type: str | None = None,
-) -> Request:
-    """What the options of the command line ask for; None is not said.
+    def _changed(self, **changes: Any) -> "Request":
+        """A copy with other values for an image or its outputs; general settings are shared."""
+        other = replace(self, **changes)
+        shared = ("_configured", "_general")
+        vars(other).update({name: vars(self)[name] for name in shared if name in vars(self)})
+        return other
 
-    Raises:
-        RequestError: a name or value that is not allowed.
-    """
-    for file in stage_files:
-        load_stage_file(file)
-    plain = {"camera": camera, "iso": iso, "seed": seed, "raw_size": raw_size, "raw_type": raw_type}
-    values: dict[str, Any] = {k: v for k, v in plain.items() if v is not None}
-    if stages is not None:
-        values["stages"] = [s.strip() for s in stages.split(",") if s.strip()]
-    if skip:
-        values["skip"] = list(skip)
-    for text in assignments:
-        stage, parameter, value = parse_assignment(text)
-        values.setdefault(stage, {})[parameter] = value
-    own = own_values(config) if config is not None else None
-    asked = Request(own, values, {}, start_at, until, tuple(str(f.resolve()) for f in stage_files))
-    asked.settings()
-    return asked
+    def __getstate__(self) -> dict[str, Any]:
+        # Settings may hold models of stage files, whose classes cannot be sent.
+        return {each.name: getattr(self, each.name) for each in fields(self)}

@@ -1,30 +1,47 @@
-"""From a TOML file and the command line to a validated chain of stages."""
+"""Settings: every value that is set, checked by name and range, those left to chance declared.
 
-from collections.abc import Mapping
+Nothing here depends on the camera's data or on a stage's place in the chain; that is resolved in
+:mod:`clpipe.chain.chain`.
+"""
+
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
-from clpipe.camera.profile import DEFAULT_CAMERA
-from clpipe.chain.drawing import check_draws, draw_of, isos_of, limits_at, values_of
-from clpipe.chain.draws import Draw, Limits
+from clpipe.camera.profile import DEFAULT_CAMERA, load_camera
+from clpipe.chain.drawing import draw_of, extremes_of, values_of
+from clpipe.chain.draws import TINY, Choice, Draw, Limits, limits_of
 from clpipe.chain.keys import KEYS, OUTPUT, check_type, names_in
-from clpipe.chain.methods import base_name, make_method, make_output, method_of, stage_named
-from clpipe.chain.paths import from_folder
+from clpipe.chain.methods import (
+    base_name,
+    chosen_method,
+    make_method,
+    make_output,
+    method_named,
+    stage_named,
+    unknown_parameter,
+)
+from clpipe.chain.paths import file_parameters, from_folder
 from clpipe.chain.registry import all_stages, load_stage_file
 from clpipe.images.dump import Dump, dump_of
 from clpipe.images.encoding import Output
+from clpipe.stage import Method
 from clpipe.stages import DEFAULT_CHAIN
 
 
 @dataclass(frozen=True)
 class Settings:
-    """A request as it was written, names checked but nothing resolved yet.
+    """All that can be set, with nothing resolved yet: None and what is missing stay automatic.
 
-    Where ``draws`` has a law for something ("iso", "sensor_noise.a"), its value is still to come.
+    Where ``draws`` has a law for a dotted name ("iso", "sensor_noise.a"), the value is drawn for
+    each image, by :meth:`drawn`.
     """
 
     camera: str = DEFAULT_CAMERA
@@ -37,10 +54,30 @@ class Settings:
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     output: Output = field(default_factory=Output)
     draws: Mapping[str, Draw] = field(default_factory=dict)
+    # By step: the table that overlay() validated, and the model that it made of it.
+    validated: Mapping[str, tuple[Mapping[str, Any], Method]] = field(
+        default_factory=dict, compare=False, repr=False
+    )
+
+    @property
+    def label(self) -> str:
+        """Camera and ISO in a few words, for people."""
+        camera = "drawn camera" if "camera" in self.draws else self.camera
+        return f"{camera}, {'drawn ISO' if 'iso' in self.draws else f'ISO {self.iso:g}'}"
 
     def record(self) -> dict[str, Any]:
-        """The settings as nested values, from which :func:`settings_from` makes them again."""
-        return self._record({key: draw.record() for key, draw in self.draws.items()})
+        """The settings as nested JSON values, which :func:`settings_from` reads back."""
+        plain: dict[str, Any] = {"camera": self.camera, "iso": self.iso, "seed": self.seed}
+        if self.dump:
+            plain |= {"raw_size": self.raw_size, "raw_type": self.raw_type}
+        lists = {"stages": list(self.stages), "skip": list(self.skip)}
+        output = self.output.model_dump(exclude_defaults=True)
+        tables = {**self.parameters, **({OUTPUT: output} if output else {})}
+        record = {**plain, **lists, **{name: dict(t) for name, t in tables.items()}}
+        for key, draw in self.draws.items():
+            table, _, name = key.rpartition(".")
+            (record.setdefault(table, {}) if table else record)[name] = draw.record()
+        return record
 
     def drawn(self, image_key: str) -> "Settings":
         """The settings with a value for each draw; the same object where there are none.
@@ -53,12 +90,19 @@ class Settings:
         """
         if not self.draws:
             return self
-        limits = partial(limits_at, self, isos=isos_of(self) if "iso" in self.draws else Limits())
+        limits = partial(self.limits, isos=self.isos() if "iso" in self.draws else Limits())
         owner = f"draw:{self.seed}:{image_key}"
-        return settings_from(self._record(values_of(self.draws, self.given(), limits, owner)))
+        values: dict[str, Any] = {}
+        for key, value in values_of(self.draws, self.constants(), limits, owner).items():
+            step, _, name = key.rpartition(".")
+            if step:
+                values.setdefault(step, dict(self.parameters.get(step, {})))[name] = value
+            else:
+                values[name] = value
+        return overlay(replace(self, draws={}), values)
 
-    def given(self) -> dict[str, Any]:
-        """What has a value already, by its dotted name."""
+    def constants(self) -> dict[str, Any]:
+        """The values that are set and not drawn, by their dotted names."""
         tables = {**self.parameters, OUTPUT: self.output.model_dump(exclude_defaults=True)}
         named = {f"{name}.{key}": v for name, table in tables.items() for key, v in table.items()}
         return {"iso": self.iso, "camera": self.camera, **named}
@@ -70,29 +114,87 @@ class Settings:
         drawn = {names[key]: draw for key, draw in self.draws.items() if names[key] != key}
         return {**self.parameters.get(step, output), **drawn}
 
-    def _record(self, drawn: Mapping[str, Any]) -> dict[str, Any]:
-        """The settings as nested values, with others over them by their dotted names."""
-        plain: dict[str, Any] = {"camera": self.camera, "iso": self.iso, "seed": self.seed}
-        if self.dump:
-            plain |= {"raw_size": self.raw_size, "raw_type": self.raw_type}
-        lists = {"stages": list(self.stages), "skip": list(self.skip)}
-        output = self.output.model_dump(exclude_defaults=True)
-        tables = {**self.parameters, **({OUTPUT: output} if output else {})}
-        record = {**plain, **lists, **{name: dict(t) for name, t in tables.items()}}
-        for key, value in drawn.items():
-            table, _, name = key.rpartition(".")
-            (record.setdefault(table, {}) if table else record)[name] = value
-        return record
+    def method(self, step: str) -> Method:
+        """The method of a step with its parameters, validated.
+
+        Raises:
+            KeyedError: an unknown stage, method or parameter, or a value that is not allowed.
+        """
+        table = self.parameters.get(step, {})
+        validated, model = self.validated.get(step, (None, None))
+        if model is None or validated is not table:
+            model = make_method(stage_named(step, base_name(step)), step, table)
+        return model
 
     @property
     def dump(self) -> Dump | None:
-        """The geometry of headerless dumps, where it is given.
+        """The geometry of headerless dumps; None where it is not set.
 
         Raises:
-            RequestError: it is given in part, or is not allowed.
+            RequestError: only a part of it is set, or it is not allowed.
         """
-        given = self.raw_size or self.raw_type
-        return dump_of(self.raw_size, self.raw_type) if given else None
+        is_set = self.raw_size or self.raw_type
+        return dump_of(self.raw_size, self.raw_type) if is_set else None
+
+    def files(self) -> list[str]:
+        """The files that the settings name, whose contents are so a part of them."""
+        files = [self.camera] if self.camera.endswith(".toml") else []
+        for step, table in self.parameters.items():
+            for name in sorted(file_parameters(stage_named(step, base_name(step)))):
+                if isinstance(value := table.get(name), str) and value:
+                    files.append(value)
+        return files
+
+    def models(self, step: str) -> list[type[BaseModel]]:
+        """What declares the parameters of a step: its method, or all that its method is drawn from.
+
+        Raises:
+            KeyedError: there is no such method.
+        """
+        if step == OUTPUT:
+            return [Output]
+        stage, draw = stage_named(step, base_name(step)), self.draws.get(f"{step}.method")
+        chosen = chosen_method(step, self.parameters.get(step, {}))
+        names = draw.choice if isinstance(draw, Choice) else [chosen]
+        return [method_named(stage, step, name) for name in names]
+
+    def limits(self, key: str, isos: Limits) -> Limits | None:
+        """The limits of a value by its dotted name, None for what is no number; ``isos`` for iso.
+
+        Raises:
+            KeyedError: its step has no such method.
+        """
+        step, _, name = key.partition(".")
+        if key in ("iso", "camera") or name == "method":
+            return isos if key == "iso" else None
+        return limits_of(self.models(step)[0], name)
+
+    def cameras(self) -> list[str]:
+        """The camera, or all that it is drawn from."""
+        draw = self.draws.get("camera")
+        return list(draw.choice) if isinstance(draw, Choice) else [self.camera]
+
+    def isos(self) -> Limits:
+        """The ISOs that all :meth:`cameras` have.
+
+        Raises:
+            RequestError: a camera cannot be loaded.
+        """
+        ranges = [load_camera(name).iso_range for name in self.cameras()]
+        return Limits(max(low for low, _ in ranges), min(high for _, high in ranges))
+
+    def check_cameras(self) -> None:
+        """See that every camera that can be drawn exists, and has every ISO that can be drawn.
+
+        Raises:
+            RequestError: a camera cannot be loaded, or an ISO is outside its range.
+        """
+        isos: Sequence[float] = [self.iso]
+        if "iso" in self.draws:
+            limits = partial(self.limits, isos=self.isos())
+            isos = extremes_of(self.draws, self.constants(), limits)["iso"]
+        for camera, iso in product(map(load_camera, self.cameras()), isos):
+            camera.gain_stage(iso)
 
 
 def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Settings:
@@ -110,13 +212,14 @@ def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Sett
 
 
 def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None = None) -> Settings:
-    """The settings with others over them; what is to be skipped is added to what was.
+    """The settings with other values over them. Only steps that ``values`` names are validated.
 
-    Where another method is chosen for a step, the parameters of the one before are dropped. A value
-    takes the place of a draw, and the other way round.
+    Stages to skip are added to those that were skipped before. Where another method is chosen for a
+    step, the parameters of the method before are dropped. A value replaces a draw, and a draw a
+    value.
 
     Args:
-        settings: what holds where nothing else is said.
+        settings: what holds where ``values`` has nothing.
         values: as for :func:`settings_from`.
         folder: as for :func:`settings_from`.
 
@@ -129,49 +232,116 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
         values = from_folder(folder, values)
     tables = {key: value for key, value in values.items() if isinstance(value, Mapping)}
     plain = {k: v for k, v in values.items() if k not in tables and k != "stage_files"}
-    for key in plain:
+    plain = _checked_plain(settings, plain)
+    draws = {k: draw for k, draw in settings.draws.items() if k.partition(".")[0] not in values}
+    draws |= {key: draw_of(key, tables.pop(key)) for key in KEYS if key in tables}
+    parameters, validated = dict(settings.parameters), dict(settings.validated)
+    output = settings.output
+    for step, table in tables.items():
+        stage = None if step == OUTPUT else stage_named(step, base_name(step))
+        merged = _merged(settings, step, table)
+        step_draws = {f"{step}.{k}": v for k, v in merged.items() if isinstance(v, Draw)}
+        draws |= step_draws
+        constants = {k: v for k, v in merged.items() if not isinstance(v, Draw)}
+        if stage is None:
+            output = make_output(constants)
+            continue
+        parameters[step] = constants
+        if not step_draws:
+            validated[step] = constants, make_method(stage, step, constants)
+    changed = replace(
+        settings, parameters=parameters, validated=validated, output=output, draws=draws, **plain
+    )
+    if draws:
+        _check_draws(changed, values)
+    return changed
+
+
+def _checked_plain(settings: Settings, plain: Mapping[str, Any]) -> dict[str, Any]:
+    """The values that stand in no table, each checked, as the fields of :class:`Settings`.
+
+    Raises:
+        KeyedError: an unknown key, or a value that is not allowed.
+    """
+    checked = dict(plain)
+    for key, value in plain.items():
         if key in all_stages():
-            raise KeyedError(key, f"{key}: found {plain[key]!r}, but a stage is a table: [{key}]")
+            raise KeyedError(key, f"{key}: found {value!r}, but a stage is a table: [{key}]")
         if key == OUTPUT:
-            raise KeyedError(key, f"{key}: found {plain[key]!r}, but it is a table: [{key}]")
+            raise KeyedError(key, f"{key}: found {value!r}, but it is a table: [{key}]")
         if key not in KEYS:
             raise KeyedError(key, one_of("key", key, (*KEYS, OUTPUT, *all_stages())))
-        check_type(key, plain[key])
-    for key in {"stages", "skip"} & plain.keys():
-        names = names_in(plain, key, "stage names")
-        for name in names:
-            stage_named(key, name if key == "stages" else base_name(name))
-        plain[key] = (*settings.skip, *names) if key == "skip" else names
+        check_type(key, value)
+    for key in ("stages", "skip"):
+        if key in plain:
+            names = names_in(plain, key, "stage names")
+            for name in names:
+                stage_named(key, name if key == "stages" else base_name(name))
+            checked[key] = (*settings.skip, *names) if key == "skip" else names
     if "iso" in plain:
-        plain["iso"] = float(plain["iso"])
+        checked["iso"] = float(plain["iso"])
     if {"raw_size", "raw_type"} & plain.keys():
         size = plain.get("raw_size", settings.raw_size)
         try:
             dump_of(size, plain.get("raw_type", settings.raw_type))
         except RequestError as error:
             raise KeyedError(str(error).partition(":")[0], str(error)) from None
-    draws = {k: draw for k, draw in settings.draws.items() if k.partition(".")[0] not in values}
-    draws |= {key: draw_of(key, tables.pop(key)) for key in KEYS if key in tables}
-    parameters, output = dict(settings.parameters), settings.output
-    for name, table in tables.items():
-        stage = None if name == OUTPUT else stage_named(name, base_name(name))
-        said = {
-            k: draw_of(f"{name}.{k}", v) if isinstance(v, Mapping) else v for k, v in table.items()
-        }
-        merged = settings.table(name)
-        if "method" in said and said["method"] != method_of(name, merged):
-            merged = {}
-        merged |= said
-        drawn = {f"{name}.{k}": v for k, v in merged.items() if isinstance(v, Draw)}
-        draws |= drawn
-        given = {k: v for k, v in merged.items() if not isinstance(v, Draw)}
-        if stage is None:
-            output = make_output(given)
-            continue
-        parameters[name] = given
-        if not drawn:
-            make_method(stage, name, given)
-    made = replace(settings, parameters=parameters, output=output, draws=draws, **plain)
-    if draws:
-        check_draws(made, values)
-    return made
+    return checked
+
+
+def _merged(settings: Settings, step: str, table: Mapping[str, Any]) -> dict[str, Any]:
+    """The values and draws of a step with a table over them.
+
+    Raises:
+        KeyedError: a table within the table is no draw.
+    """
+    own = {k: draw_of(f"{step}.{k}", v) if isinstance(v, Mapping) else v for k, v in table.items()}
+    before = settings.table(step)
+    if "method" in own and own["method"] != chosen_method(step, before):
+        return own
+    return {**before, **own}
+
+
+def _check_draws(settings: Settings, changed: Container[str]) -> None:
+    """See that all that can be drawn is allowed, by validating each value at its extremes.
+
+    Args:
+        settings: with draws.
+        changed: the keys and steps that are new; others were checked before. A step with a draw
+            that follows another value is checked again.
+
+    Raises:
+        KeyedError: a draw has no such parameter, or can draw what is not allowed.
+    """
+    followers = {key.partition(".")[0] for key, draw in settings.draws.items() if draw.follows}
+    for key in settings.draws:
+        step, _, name = key.partition(".")
+        for model in settings.models(step) if name and step in changed else ():
+            if name not in ("method", *model.model_fields):
+                raise unknown_parameter(step, model, name)
+    limits = partial(settings.limits, isos=Limits(low=TINY))
+    by_step: dict[str, dict[str, Sequence[Any]]] = {}
+    for key, extremes in extremes_of(settings.draws, settings.constants(), limits).items():
+        step, _, name = key.partition(".")
+        if not name:
+            for value in extremes:
+                check_type(key, value)
+        elif step in changed or step in followers:
+            by_step.setdefault(step, {})[name] = extremes
+    for step, drawn in by_step.items():
+        constants = {k: v for k, v in settings.table(step).items() if not isinstance(v, Draw)}
+        for example in _examples(drawn):
+            table = {**constants, **example}
+            if step == OUTPUT:
+                make_output(table)
+            else:
+                make_method(stage_named(step, base_name(step)), step, table)
+
+
+def _examples(drawn: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
+    """Each method with each extreme of each parameter, the other parameters at their first."""
+    first = {name: values[0] for name, values in drawn.items()}
+    methods = [{"method": method} for method in drawn.get("method", ())] or [{}]
+    others = [{k: value} for k, values in drawn.items() if k != "method" for value in values]
+    for method, other in product(methods, others or [{}]):
+        yield {**first, **method, **other}

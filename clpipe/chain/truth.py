@@ -12,20 +12,22 @@ from clpipe.chain.chain import Chain, Step
 from clpipe.chain.registry import user_code_errors
 from clpipe.stage import Frame, Kind
 
+DEVELOPMENT, MOSAIC, VARIANCE = TRUTHS = ("development", "mosaic", "variance")
+
 
 def adds_noise(step: Step) -> bool:
-    """Whether a step is another one where there is no noise."""
+    """Whether a step adds noise, as its method says."""
     return step.method.without_noise() is not step.method
 
 
 def noisy_mosaic(chain: Chain) -> Chain:
-    """The chain up to the mosaic whose truth can be known: noisy, and in signal.
+    """The chain up to its noisy mosaic in signal, whose truth is the same mosaic without noise.
 
-    It is that of ``normalize``; without a ``quantize`` behind the first noise, that of the last
-    stage which adds noise to a mosaic.
+    It ends with ``normalize``; without a ``quantize`` behind the first noise, with the last stage
+    that adds noise to a mosaic.
 
     Raises:
-        RequestError: there is no such mosaic.
+        RequestError: the chain has no such mosaic.
     """
     chain.without_noise()  # refuses a chain without noise
     first = [adds_noise(step) for step in chain.steps].index(True)
@@ -46,11 +48,11 @@ def noisy_mosaic(chain: Chain) -> Chain:
 
 
 def signal_and_noise(chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
-    """The chain that makes the clean image which the first noise falls on, and the steps from there
-    to the :func:`noisy_mosaic`, for :func:`variance_of`.
+    """What :func:`variance_of` needs: the chain to the clean image that the first noise falls on,
+    and the steps from there to the :func:`noisy_mosaic`.
 
     Raises:
-        RequestError: there is no such mosaic, or a step does not say what variance it makes.
+        RequestError: the chain has no such mosaic, or a step does not know its variance.
     """
     steps = noisy_mosaic(chain).steps
     first = [adds_noise(step) for step in steps].index(True)
@@ -63,37 +65,35 @@ def signal_and_noise(chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
 def variance_of(noise: Sequence[Step], signal: Floats) -> Floats:
     """The variance of the noise in each pixel of a mosaic, (height, width), in signal squared.
 
-    It is that of the noisy mosaic about the clean one, over images and over cameras: what is fixed
-    to a sensor (PRNU, DSNU, columns) counts as much as what is new in each image, for the clean
-    mosaic has none of it. The rounding of the clean mosaic itself is left out. As each stage says
-    it, in the default chain
+    The noisy mosaic varies about the clean one by this much, over images and over cameras. Noise
+    that is fixed to a sensor (PRNU, DSNU, columns) is a part of it, because the clean mosaic is
+    that of an ideal sensor. Each stage gives its own share; the default chain has
 
         a*y + b + (prnu*y)^2 + dsnu^2 + row^2 + column^2 + 1/(12 range^2)
 
     with y the clean signal that the noise falls on, neither rounded nor cut at black, but at most 1
-    where the ADC follows; ``a*y + b`` is that of Foi et al. (IEEE TIP 2008, eq. 2), of Poisson
-    noise and of heavy-tailed read noise alike; ``range`` is the white level over black in DN, of
-    which rounding takes its twelfth. That clipping (at 0 DN, at white, in a full well) takes noise
-    away is not modelled, and hot and dead pixels are left out.
+    where the ADC follows. ``a*y + b`` is that of Foi et al. (IEEE TIP 2008, eq. 2), with Poisson
+    noise and with heavy-tailed read noise, too. ``range`` is the white level above black in DN;
+    rounding has the variance 1/12 DN^2. Clipping (at 0 DN, at white, in a full well) removes noise,
+    which is not modelled; hot and dead pixels, and the rounding of the clean mosaic, are left out.
 
     Args:
-        noise: the steps from the first that draws to the one that makes the mosaic.
+        noise: the steps from the first that adds noise to the last one of the mosaic.
         signal: the clean image that enters the first of them, (height, width[, channel]).
 
     Raises:
-        RequestError: a step does not say what variance it makes.
+        RequestError: a step does not know its variance.
     """
     analogue = list(takewhile(lambda step: step.stage.writes is not Kind.RAW, noise))
     if len(analogue) < len(noise) and all(adds_noise(s) or not s.method.passes() for s in analogue):
         signal = np.minimum(signal, np.float32(1))
     last = max(i for i, step in enumerate(noise) if adds_noise(step))
-    found: Floats = np.zeros((), np.float32)
+    variance: Floats = np.zeros((), np.float32)
     for i, step in enumerate(noise):
         with user_code_errors(f"stage {step.name}", step.stage.folder):
-            after = step.method.variance(found, signal, step.context)
-            clean = (
-                step.method.without_noise() if i < last else None
-            )  # behind it nobody asks for it
+            after = step.method.variance(variance, signal, step.context)
+            # Behind the last noise no variance depends on the signal.
+            clean = step.method.without_noise() if i < last else None
             if clean and clean.passes():
                 signal = clean.reference(signal, Frame(step.context, {}, {}))
         if after is None:
@@ -101,5 +101,5 @@ def variance_of(noise: Sequence[Step], signal: Floats) -> Floats:
                 f"--truth variance: {step.name} ({step.method.method}) does not say what it makes "
                 "of the variance of noise; skip it, or move it before the noise"
             )
-        found = after
-    return np.ascontiguousarray(np.broadcast_to(found, signal.shape[:2]))
+        variance = after
+    return np.ascontiguousarray(np.broadcast_to(variance, signal.shape[:2]))

@@ -1,4 +1,4 @@
-"""Plans, stages and devices in words, for people and for programs."""
+"""``clpipe bench``: how fast a chain, a stage's methods or whole batches are on a device."""
 
 import os
 from dataclasses import asdict
@@ -9,8 +9,10 @@ import click
 from clpipe.base.errors import RequestError
 from clpipe.batch.bench import BatchSpeed, bench_batch, loads
 from clpipe.chain.methods import stage_named
-from clpipe.chain.request import request_from_options
-from clpipe.commands.options import chain_options, device_option, json_option
+from clpipe.chain.request import Request
+from clpipe.commands.chain_options import chain_options
+from clpipe.commands.completion import methods_of
+from clpipe.commands.options import device_option, json_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.bench import bench as run_bench
 from clpipe.engine.bench import bench_methods
@@ -31,20 +33,6 @@ BATCH_HEADINGS = (
 )
 
 
-def batch_row(speed: BatchSpeed) -> tuple[str, ...]:
-    """One load of ``clpipe bench --batch``."""
-    return (
-        f"{speed.images} of {speed.width}x{speed.height}",
-        f"{speed.megapixels_per_second:.1f}",
-        f"{speed.serial_s:.1f}",
-        f"{speed.batch_s:.1f}",
-        f"{speed.share_of_limit:.2f}",
-        *(f"{ms:.1f}" for ms in speed.cpu_ms.values()),
-        f"{speed.overhead_ms:.1f}",
-        f"{speed.peak_mib:.0f}",
-    )
-
-
 @click.command("bench")
 @chain_options
 @device_option
@@ -52,15 +40,22 @@ def batch_row(speed: BatchSpeed) -> tuple[str, ...]:
     "--size", default="6000x4000", show_default=True, metavar="WxH", help="The picture's size."
 )
 @click.option(
-    "--repeat", default=7, show_default=True, type=click.IntRange(1), help="Runs; the best counts."
+    "--repeat",
+    default=7,
+    show_default=True,
+    type=click.IntRange(1),
+    help="Number of runs; the best counts.",
 )
 @click.option(
-    "--methods", metavar="STAGE", help="Time each method of this stage instead, on its own."
+    "--methods",
+    metavar="STAGE",
+    shell_complete=methods_of,
+    help="Time each method of this stage alone, instead of the chain.",
 )
 @click.option(
     "--batch",
     is_flag=True,
-    help="Time whole batches of files instead, half EXR to JPEG, in threads and serially.",
+    help="Time batches of files instead, half EXR to JPEG, in threads and serially.",
 )
 @json_option
 def bench(
@@ -70,9 +65,13 @@ def bench(
     methods: str | None,
     batch: bool,
     as_json: bool,
-    **request: Any,
+    **options: Any,
 ) -> None:
-    """Time the chain and each launch, from half RGB to eight-bit RGB on the device."""
+    """Time a chain and each of its launches on a device.
+
+    The image is in half floats when it enters, and in eight bits when it leaves; both stay on the
+    device.
+    """
     width, _, height = size.partition("x")
     numbers = width.isdecimal() and height.isdecimal()
     if not numbers or not 0 < int(width) * int(height) <= MAX_PIXELS:
@@ -80,8 +79,8 @@ def bench(
             f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 6000x4000, "
             f"at most {MAX_PIXELS} pixels"
         )
-    asked = request_from_options(**request)
-    chain = asked.chain()
+    request = Request.from_options(**options)
+    chain = request.chain()
     device = open_device(selector)
     if device is None:
         raise RequestError("bench: it times the kernels of a device; numpy has none")
@@ -96,7 +95,7 @@ def bench(
         show(("method", "launches", "ms", "MP/s"), rows, left=1)
         return
     if batch:
-        batches = [bench_batch(device, asked, load) for load in loads()]
+        batches = [bench_batch(device, request, load) for load in loads()]
         if as_json:
             show_json({"device": device.info.label, "batches": [b.record() for b in batches]})
             return
@@ -124,4 +123,18 @@ def bench(
             for speed in (*report.launches, report.chain)
         ),
         left=1,
+    )
+
+
+def batch_row(speed: BatchSpeed) -> tuple[str, ...]:
+    """The row of one load."""
+    return (
+        f"{speed.images} of {speed.width}x{speed.height}",
+        f"{speed.megapixels_per_second:.1f}",
+        f"{speed.serial_s:.1f}",
+        f"{speed.batch_s:.1f}",
+        f"{speed.share_of_limit:.2f}",
+        *(f"{ms:.1f}" for ms in speed.cpu_ms.values()),
+        f"{speed.overhead_ms:.1f}",
+        f"{speed.peak_mib:.0f}",
     )

@@ -1,4 +1,4 @@
-"""TODO."""
+"""``clpipe calibrate``: the noise of a sensor from raw frames, as a camera profile."""
 
 from pathlib import Path
 
@@ -18,29 +18,6 @@ CALIBRATION = (
 )
 
 
-def calibration_row(one: Calibration) -> tuple[str, ...]:
-    """What was found at an ISO in a line, figures with their standard errors."""
-
-    def told(estimate: Estimate | None, factor: float = 1) -> str:
-        if estimate is None:
-            return "-"
-        return f"{estimate.value * factor:.4g} ± {estimate.error * factor:.1g}"
-
-    return (
-        f"{one.iso:g}",
-        f"{one.scene_frames} + {one.dark_frames} dark",
-        told(one.pooled.gain),
-        told(one.read_noise),
-        told(one.row_noise),
-        told(one.column_noise),
-        told(one.dsnu, 1 / one.pooled.gain.value),
-        told(one.prnu, 100),
-        str(len(one.hot.rows)) if one.hot else "-",
-        str(len(one.dead.rows)) if one.dead else "-",
-        f"{one.used:.1%}",
-    )
-
-
 @click.command("calibrate")
 @click.argument("inputs", nargs=-1, required=True, metavar="FRAMES...")
 @click.option(
@@ -49,7 +26,7 @@ def calibration_row(one: Calibration) -> tuple[str, ...]:
     required=True,
     type=click.Path(path_type=Path),
     metavar="CAMERA.toml",
-    help="The profile; CAMERA.png, a picture of the fit, is written beside it.",
+    help="The profile to write; CAMERA.png, a picture of the fit, is written beside it.",
 )
 @click.option(
     "--dark",
@@ -57,13 +34,13 @@ def calibration_row(one: Calibration) -> tuple[str, ...]:
     metavar="FILES",
     help="Frames without light, or a quoted glob; may be repeated.",
 )
-@click.option("--black-level", type=float, metavar="DN", help="Instead of what the files say.")
-@click.option("--white-level", type=float, metavar="DN", help="Instead of what the files say.")
-@click.option("--pattern", type=click.Choice(PATTERNS), help="Instead of what the files say.")
+@click.option("--black-level", type=float, metavar="DN", help="In place of what the files say.")
+@click.option("--white-level", type=float, metavar="DN", help="In place of what the files say.")
+@click.option("--pattern", type=click.Choice(PATTERNS), help="In place of what the files say.")
 @click.option(
     "--iso",
     type=click.FloatRange(0, min_open=True),
-    help="Of all frames, instead of what the files say.",
+    help="The ISO of all frames, in place of what the files say.",
 )
 @json_option
 def calibrate(
@@ -79,9 +56,9 @@ def calibrate(
     """Measure a sensor's noise from raw frames, and write it as a camera profile.
 
     FRAMES are camera raws, mosaics that clpipe kept, or mosaics from elsewhere (EXR, 16-bit TIFF or
-    PNG, with the options for what they do not say): two or more of one static scene that has dark
-    and bright places, at each ISO. Dark frames (lens cap on) give column noise, DSNU, hot pixels
-    and a better b. A single frame at an ISO is judged alone, which is less exact.
+    PNG, with options for what they do not say). For each ISO, take two or more of one static scene
+    that has dark and bright places; a single frame gives less exact figures. Dark frames (lens cap
+    on) add column noise, DSNU, hot pixels and a better b.
 
     \b
     clpipe calibrate scene/*.CR2 --dark 'dark/*.CR2' -o my_camera.toml
@@ -89,20 +66,43 @@ def calibrate(
     """
     check_profile_name(output)
     overrides = FrameOverrides(black_level, white_level, pattern, iso)
-    frames, found = calibrate_files(inputs, dark, overrides)
-    picture = write_profile(output, frames, found)
+    frames, calibrations = calibrate_files(inputs, dark, overrides)
+    picture = write_profile(output, frames, calibrations)
     if as_json:
         record = {
             "profile": str(output),
             "picture": str(picture),
             "make": frames.make,
             "model": frames.model,
-            "isos": [c.record() for c in found],
+            "isos": [each.record() for each in calibrations],
         }
         show_json(record)
         return
-    show(CALIBRATION, map(calibration_row, found), left=0)
-    for one in found:
+    show(CALIBRATION, map(calibration_row, calibrations), left=0)
+    for one in calibrations:
         for note in one.notes:
             click.echo(f"ISO {one.iso:g}: {note}")
     click.echo(f"\nwrote {output} and {picture}")
+
+
+def calibration_row(one: Calibration) -> tuple[str, ...]:
+    """The row of one ISO, figures with their standard errors."""
+
+    def text(estimate: Estimate | None, factor: float = 1) -> str:
+        if estimate is None:
+            return "-"
+        return f"{estimate.value * factor:.4g} ± {estimate.error * factor:.1g}"
+
+    return (
+        f"{one.iso:g}",
+        f"{one.scene_frames} + {one.dark_frames} dark",
+        text(one.pooled.gain),
+        text(one.read_noise),
+        text(one.row_noise),
+        text(one.column_noise),
+        text(one.dsnu, 1 / one.pooled.gain.value),
+        text(one.prnu, 100),
+        str(len(one.hot.rows)) if one.hot else "-",
+        str(len(one.dead.rows)) if one.dead else "-",
+        f"{one.used:.1%}",
+    )

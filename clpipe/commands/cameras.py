@@ -1,4 +1,4 @@
-"""TODO."""
+"""``clpipe cameras``: the built-in cameras, or the noise of one."""
 
 from typing import Any
 
@@ -6,6 +6,7 @@ import click
 
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import Camera, built_in_cameras, load_camera
+from clpipe.commands.completion import cameras as camera_names
 from clpipe.commands.options import json_option
 from clpipe.commands.printing import Rows, short_text, show, show_json
 
@@ -25,14 +26,45 @@ FIXED = {
 }
 
 
+@click.command("cameras")
+@click.argument("name", required=False, metavar="[NAME|FILE]", shell_complete=camera_names)
+@click.option("--iso", type=float, help="The ISO. [default: all that were measured]")
+@json_option
+def cameras(name: str | None, iso: float | None, as_json: bool) -> None:
+    """List the cameras, or show the noise of one.
+
+    Noise is shown in three forms, with the source of each figure.
+    """
+    if name is None:
+        if iso is not None:
+            raise RequestError("--iso: it needs the name of a camera")
+        records = [camera_record(load_camera(n)) for n in built_in_cameras()]
+        if as_json:
+            show_json(records)
+            return
+        every = map(load_camera, built_in_cameras())
+        show(("camera", "make and model", "ISO", "gain stages from"), map(camera_row, every))
+        return
+    camera = load_camera(name)
+    if as_json:
+        show_json(camera_record(camera, iso))
+        return
+    for title, headings, rows in camera_tables(camera, iso):
+        click.echo(title)
+        show(headings, rows, left=1)
+        click.echo("")
+    for key, source in camera.sources.items():
+        click.echo(f"{key}: {source}")
+
+
 def make_and_model(camera: Camera) -> str:
-    """What is written on a camera; some makers begin the model with their name."""
+    """The name of a camera as people know it; some makers begin the model with their name."""
     model, make = camera.model, camera.make
     return model if model.startswith(make) else f"{make} {model}"
 
 
 def camera_row(camera: Camera) -> tuple[str, ...]:
-    """A camera in a line: name, make and model, ISOs, where its gain stages begin."""
+    """The row of a camera: name, make and model, ISOs, the first ISO of each gain stage."""
     stages = ", ".join(f"{stage.iso[0]:g}" for stage in camera.gain_stages)
     low, high = camera.iso_range
     return camera.name, make_and_model(camera), f"{low:g} to {high:g}", stages
@@ -42,7 +74,7 @@ def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[st
     """A camera's noise at an ISO, or at all that were measured, as titles, headings and rows.
 
     Raises:
-        RequestError: the camera has not that ISO.
+        RequestError: the ISO is outside the camera's range.
     """
     isos = [iso] if iso is not None else [i for stage in camera.gain_stages for i in stage.iso]
     signal: Rows = []
@@ -75,9 +107,9 @@ def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[st
         ),
         (
             "At every ISO",
-            ("", "found", "unit"),
+            ("", "value", "unit"),
             [
-                (key, short_text(value) if value is not None else "none known", unit)
+                (key, short_text(value) if value is not None else "unknown", unit)
                 for key, unit in FIXED.items()
                 for value in (getattr(camera, key),)
             ],
@@ -86,15 +118,15 @@ def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[st
 
 
 def figures(iso: float, *values: float) -> tuple[str, ...]:
-    """An ISO, and numbers with four digits."""
+    """An ISO and other numbers, to four digits, as a row."""
     return (f"{iso:g}", *(f"{value:.4g}" for value in values))
 
 
 def noise_at(camera: Camera, iso: float) -> dict[str, Any]:
-    """Noise at an ISO in all three ways; in the dark, of rows and of columns in DN; JSON values.
+    """The noise at an ISO in all three forms, and that of dark frames, rows and columns in DN.
 
     Raises:
-        RequestError: the camera has not that ISO.
+        RequestError: the ISO is outside the camera's range.
     """
     unit, model = camera.signal_range, camera.noise(iso)
     return {
@@ -110,7 +142,7 @@ def camera_record(camera: Camera, iso: float | None = None) -> dict[str, Any]:
     """A camera as JSON values, with its noise at an ISO or at all that were measured.
 
     Raises:
-        RequestError: the camera has not that ISO.
+        RequestError: the ISO is outside the camera's range.
     """
     isos = [iso] if iso is not None else [i for stage in camera.gain_stages for i in stage.iso]
     return {
@@ -122,31 +154,3 @@ def camera_record(camera: Camera, iso: float | None = None) -> dict[str, Any]:
         "noise": [noise_at(camera, i) for i in isos],
         "sources": camera.sources,
     }
-
-
-@click.command("cameras")
-@click.argument("name", required=False, metavar="[NAME|FILE]")
-@click.option("--iso", type=float, help="The ISO. [default: those that were measured]")
-@json_option
-def cameras(name: str | None, iso: float | None, as_json: bool) -> None:
-    """List the cameras, or show one: its noise in all three ways, and its sources."""
-    if name is None:
-        if iso is not None:
-            raise RequestError("--iso: name the camera that it is of")
-        records = [camera_record(load_camera(n)) for n in built_in_cameras()]
-        if as_json:
-            show_json(records)
-            return
-        every = map(load_camera, built_in_cameras())
-        show(("camera", "make and model", "ISO", "gain stages from"), map(camera_row, every))
-        return
-    camera = load_camera(name)
-    if as_json:
-        show_json(camera_record(camera, iso))
-        return
-    for title, headings, rows in camera_tables(camera, iso):
-        click.echo(title)
-        show(headings, rows, left=1)
-        click.echo("")
-    for key, source in camera.sources.items():
-        click.echo(f"{key}: {source}")

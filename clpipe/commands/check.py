@@ -1,4 +1,4 @@
-"""TODO."""
+"""``clpipe check``: kernels compared with their NumPy references."""
 
 import sys
 from pathlib import Path
@@ -8,30 +8,17 @@ import click
 from clpipe.base.errors import RequestError
 from clpipe.chain.methods import stage_named
 from clpipe.chain.registry import load_stage_file
+from clpipe.commands.completion import steps
 from clpipe.commands.options import device_option, json_option, stage_file_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.check import SIZES, Check, check_all
 from clpipe.engine.device import open_device
 
 
-def check_row(check: Check) -> tuple[str, ...]:
-    """A comparison of a kernel with its reference, in a line."""
-    return (
-        check.stage,
-        check.method,
-        str(check.cases),
-        str(check.samples),
-        str(check.differing),
-        f"{check.largest:.2g}",
-        f"{check.tolerance:.2g}",
-        "ok" if check.passed else "FAILED",
-    )
-
-
 @click.command("check")
-@click.argument("names", nargs=-1, metavar="[STAGE]...")
+@click.argument("names", nargs=-1, metavar="[STAGE]...", shell_complete=steps)
 @device_option
-@click.option("--small", is_flag=True, help="Only tiny images, for slow devices.")
+@click.option("--small", is_flag=True, help="Compare tiny images only, for slow devices.")
 @stage_file_option
 @json_option
 def check(
@@ -41,8 +28,9 @@ def check(
     stage_files: tuple[Path, ...],
     as_json: bool,
 ) -> None:
-    """Compare kernels with their NumPy references on a device: of these stages, or of all, and then
-    the raw bit for bit.
+    """Compare kernels with their NumPy references on a device.
+
+    Without STAGE, all stages are compared, and then the raw bit for bit.
     """
     for file in stage_files:
         load_stage_file(file)
@@ -61,3 +49,17 @@ def check(
         show(headings, map(check_row, checks))
         click.echo(f"{len(checks) - failed} passed, {failed} failed")
     sys.exit(1 if failed else 0)
+
+
+def check_row(check: Check) -> tuple[str, ...]:
+    """The row of one comparison of a kernel with its reference."""
+    return (
+        check.stage,
+        check.method,
+        str(check.cases),
+        str(check.difference.samples),
+        str(check.difference.differing),
+        f"{check.difference.largest:.2g}",
+        f"{check.tolerance:.2g}",
+        "ok" if check.passed else "FAILED",
+    )

@@ -1,4 +1,4 @@
-"""TODO."""
+"""``clpipe devices``: the OpenCL devices of this machine, and which one is used."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,8 +11,19 @@ from clpipe.commands.printing import show, show_json
 from clpipe.engine.discovery import DeviceInfo, choose, find_devices
 
 
+@click.command("devices")
+@json_option
+def devices(as_json: bool) -> None:
+    """List the OpenCL devices, and say which one is used and why others are not."""
+    rows = device_rows(find_devices())
+    if as_json:
+        show_json(rows)
+        return
+    show([key.replace("_", " ") for key in rows[0]], [[*map(str, r.values())] for r in rows])
+
+
 def device_rows(devices: Sequence[DeviceInfo]) -> list[dict[str, Any]]:
-    """A row a device with its status: used, usable, or why it is passed over; NumPy comes last."""
+    """A row for each device, with its status: used, or why it is passed over. NumPy is the last."""
     try:
         used: DeviceInfo | None = choose(None, list(devices))
     except DeviceError:
@@ -50,14 +61,3 @@ def device_rows(devices: Sequence[DeviceInfo]) -> list[dict[str, Any]]:
         | {"status": numpy}
     )
     return rows
-
-
-@click.command("devices")
-@json_option
-def devices(as_json: bool) -> None:
-    """List the OpenCL devices, which one is used, and why others are passed over."""
-    rows = device_rows(find_devices())
-    if as_json:
-        show_json(rows)
-        return
-    show([key.replace("_", " ") for key in rows[0]], [[*map(str, r.values())] for r in rows])

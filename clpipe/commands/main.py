@@ -1,12 +1,15 @@
-"""The program's command group: finds a command's module when the command is asked for."""
+"""The program: a group of commands, each imported when it is used."""
 
 import ast
+import logging
+import re
 import sys
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
 
 import click
+from click.shell_completion import CompletionItem
 
 from clpipe.base.about import __version__
 from clpipe.base.errors import ClpipeError, RequestError
@@ -25,8 +28,18 @@ COMMANDS = (
 )
 
 
+class Notices(logging.Handler):
+    """Prints what the package logs, such as that kernels are being compiled."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        click.echo(f"clpipe: {record.getMessage()}", err=True)
+
+
+NOTICES = Notices()
+
+
 class LazyGroup(click.Group):
-    """Commands that are imported on use, and whose errors are one message and an exit status."""
+    """Commands that are imported on use. An error becomes one message and an exit status."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -41,6 +54,12 @@ class LazyGroup(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl([(name, summary(name)) for name in COMMANDS])
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        # The base imports every command for this.
+        names = [name for name in COMMANDS if name.startswith(incomplete)]
+        items = [CompletionItem(name, help=summary(name)) for name in names]
+        return [*items, *click.Command.shell_complete(self, ctx, incomplete)]
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -57,23 +76,18 @@ class LazyGroup(click.Group):
 
 
 def summary(name: str) -> str:
-    """The first sentence of a command's help, read from its source.
+    """The first sentence of a command's help, up to a colon, read from its source.
 
-    Importing all commands to list them would take ten times as long as listing them.
+    Importing all commands takes ten times as long as listing them in this way.
     """
     module = ast.parse(Path(__file__).with_name(f"{name}.py").read_text("utf-8"))
     functions = (node for node in module.body if isinstance(node, ast.FunctionDef))
     text = next(ast.get_docstring(f) or "" for f in functions if f.name == name)
-    return (
-        " ".join(text.partition("\n\n")[0].split())
-        .partition(". ")[0]
-        .partition(": ")[0]
-        .rstrip(".")
-    )
+    return re.split(r"[.:](?=\s|$)", " ".join(text.split()))[0]
 
 
 def fail(error: ClpipeError) -> NoReturn:
-    """Print what was wrong and exit with the error's status."""
+    """Print an error and exit with its status."""
     click.echo(f"clpipe: {error}", err=True)
     sys.exit(error.exit_status)
 
@@ -90,3 +104,7 @@ def main() -> None:
     clpipe run render.exr -o out --iso 3200
     clpipe stages sensor_noise
     """
+    logger = logging.getLogger("clpipe")
+    logger.setLevel(logging.INFO)
+    if NOTICES not in logger.handlers:
+        logger.addHandler(NOTICES)

@@ -1,4 +1,4 @@
-"""The command line. Thin: it turns options into settings and results into text."""
+"""``clpipe measure``: the noise of images, as tables, JSON or a plot."""
 
 import math
 from pathlib import Path
@@ -16,66 +16,6 @@ from clpipe.commands.printing import Rows, number, show, show_json
 from clpipe.reference.cfa import PATTERNS, Pattern
 
 
-def line_text(lines: LineNoise) -> str:
-    """What rows or columns share, or what it is below where chance alone could be all of it."""
-    if lines.sigma > lines.limit:
-        return number(lines.sigma)
-    return "-" if math.isnan(lines.limit) else f"< {number(lines.limit)}"
-
-
-def measure_heading(report: NoiseReport) -> str:
-    """What was measured, of what, over which pixels, in a line or two."""
-    against = report.truth or "their mean"
-    what = "samples" if report.kind in ("mosaic", "values") else "pixels (flat, not clipped)"
-    lines = [
-        f"{len(report.images)} x {report.kind}, {report.width}x{report.height}, against {against}; "
-        f"unit: {UNITS[report.kind]}",
-        f"{report.share:.1%} of the {what} count",
-        *(f"note: {note}" for note in report.notes),
-    ]
-    return "\n".join(lines)
-
-
-def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
-    """The tables of a report: a title and rows of text, the first row being the headings."""
-    names = [one.name for one in report.channels]
-    laws = ["a", "b"] if any(one.law for one in report.channels) else []
-    size: Rows = [("", "samples", "sigma", *laws, "row sigma", "column sigma")]
-    shape: Rows = [("", *(f"{k}" for k in range(1, LAGS + 1)), "diagonal 1", "left after 2x2")]
-    far: Rows = [("", "skewness", "excess kurtosis", *(f"> {k} sigma" for k in SIGMAS))]
-    for one in report.channels:
-        found = [""] * len(laws)
-        if law := one.law:
-            found = [f"{law.a:.4g} ± {law.a_error:.1g}", f"{law.b:.4g} ± {law.b_error:.1g}"]
-        lines = line_text(one.rows), line_text(one.columns)
-        size.append((one.name, str(one.count), number(one.sigma, ".4g"), *found, *lines))
-        table, middle = one.autocorrelation, slice(LAGS + 1, None)
-        right = [number(r, ".3f") for r in table[LAGS, middle]]
-        down = [number(r, ".3f") for r in table[middle, LAGS]]
-        diagonal = number(table[LAGS + 1, LAGS + 1], ".3f")
-        shape.append((f"{one.name} right", *right, diagonal, number(one.energy_left, ".3f")))
-        shape.append((f"{one.name} down", *down, "", ""))
-        tails = one.tails
-        moments = number(tails.skewness, ".3f"), number(tails.excess_kurtosis, ".3f")
-        far.append((one.name, *moments, *(number(p, ".2g") for p in tails.beyond)))
-    far.append(("Gaussian", "0", "0", *(f"{gaussian_beyond(k):.2g}" for k in SIGMAS)))
-    sigmas = [dict(zip(one.curve.bins, one.curve.sigma, strict=True)) for one in report.channels]
-    curve: Rows = [("intensity", *names)]
-    for i in sorted(set().union(*sigmas)):
-        middle_of_bin = (report.edges[i] + report.edges[i + 1]) / 2
-        values = (f"{s[i]:.4g}" if i in s else "" for s in sigmas)
-        curve.append((f"{middle_of_bin:.3f}", *values))
-    pairs = [f"{a}-{b}" for a, b in report.correlations]
-    across: Rows = [tuple(pairs), tuple(number(r, ".3f") for r in report.correlations.values())]
-    return [
-        ("noise" + ("; variance = a * intensity + b" if laws else ""), size),
-        ("autocorrelation (independent noise: 0; left after 2x2: 0.25)", shape),
-        ("correlation between channels", across),
-        ("tails of standardised noise", far),
-        ("sigma by intensity", curve),
-    ]
-
-
 @click.command("measure")
 @click.argument(
     "images", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE..."
@@ -88,7 +28,7 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
     default="RGGB",
     show_default=True,
     type=click.Choice(PATTERNS),
-    help="Of mosaics that do not say their own.",
+    help="The pattern of mosaics that do not say theirs.",
 )
 @click.option(
     "--plot",
@@ -100,7 +40,7 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
 def measure(
     images: tuple[Path, ...], truth: Path | None, pattern: Pattern, plot: Path | None, as_json: bool
 ) -> None:
-    """Measure the noise of images: how large, how correlated, how Gaussian.
+    """Measure the noise of images: its size, correlation and distribution.
 
     IMAGE is a kept EXR of any stage, a mosaic, or a finished picture (JPEG, PNG, TIFF). Noise is
     the difference from --truth, or, of two or more frames of one scene, from their mean.
@@ -128,3 +68,63 @@ def measure(
     for title, (headings, *rows) in measure_tables(report):
         click.echo(f"\n{title}")
         show(headings, rows, left=0 if headings[0] else 1)
+
+
+def line_text(lines: LineNoise) -> str:
+    """The noise that rows or columns share, or its limit, where chance alone may explain it."""
+    if lines.sigma > lines.limit:
+        return number(lines.sigma)
+    return "-" if math.isnan(lines.limit) else f"< {number(lines.limit)}"
+
+
+def measure_heading(report: NoiseReport) -> str:
+    """What was measured, in which unit, and over which pixels."""
+    against = report.truth or "their mean"
+    what = "samples" if report.kind in ("mosaic", "values") else "pixels (flat, not clipped)"
+    lines = [
+        f"{len(report.images)} x {report.kind}, {report.width}x{report.height}, against {against}; "
+        f"unit: {UNITS[report.kind]}",
+        f"{report.share:.1%} of the {what} count",
+        *(f"note: {note}" for note in report.notes),
+    ]
+    return "\n".join(lines)
+
+
+def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
+    """The tables of a report, each a title and rows of text; the first row is the headings."""
+    names = [one.name for one in report.channels]
+    laws = ["a", "b"] if any(one.law for one in report.channels) else []
+    size: Rows = [("", "samples", "sigma", *laws, "row sigma", "column sigma")]
+    shape: Rows = [("", *(f"{k}" for k in range(1, LAGS + 1)), "diagonal 1", "left after 2x2")]
+    far: Rows = [("", "skewness", "excess kurtosis", *(f"> {k} sigma" for k in SIGMAS))]
+    for one in report.channels:
+        fit = [""] * len(laws)
+        if law := one.law:
+            fit = [f"{law.a:.4g} ± {law.a_error:.1g}", f"{law.b:.4g} ± {law.b_error:.1g}"]
+        lines = line_text(one.rows), line_text(one.columns)
+        size.append((one.name, str(one.count), number(one.sigma, ".4g"), *fit, *lines))
+        table, middle = one.autocorrelation, slice(LAGS + 1, None)
+        right = [number(r, ".3f") for r in table[LAGS, middle]]
+        down = [number(r, ".3f") for r in table[middle, LAGS]]
+        diagonal = number(table[LAGS + 1, LAGS + 1], ".3f")
+        shape.append((f"{one.name} right", *right, diagonal, number(one.energy_left, ".3f")))
+        shape.append((f"{one.name} down", *down, "", ""))
+        tails = one.tails
+        moments = number(tails.skewness, ".3f"), number(tails.excess_kurtosis, ".3f")
+        far.append((one.name, *moments, *(number(p, ".2g") for p in tails.beyond)))
+    far.append(("Gaussian", "0", "0", *(f"{gaussian_beyond(k):.2g}" for k in SIGMAS)))
+    sigmas = [dict(zip(one.curve.bins, one.curve.sigma, strict=True)) for one in report.channels]
+    curve: Rows = [("intensity", *names)]
+    for i in sorted(set().union(*sigmas)):
+        middle_of_bin = (report.edges[i] + report.edges[i + 1]) / 2
+        values = (f"{s[i]:.4g}" if i in s else "" for s in sigmas)
+        curve.append((f"{middle_of_bin:.3f}", *values))
+    pairs = [f"{a}-{b}" for a, b in report.correlations]
+    across: Rows = [tuple(pairs), tuple(number(r, ".3f") for r in report.correlations.values())]
+    return [
+        ("noise" + ("; variance = a * intensity + b" if laws else ""), size),
+        ("autocorrelation (independent noise: 0; left after 2x2: 0.25)", shape),
+        ("correlation between channels", across),
+        ("tails of standardised noise", far),
+        ("sigma by intensity", curve),
+    ]

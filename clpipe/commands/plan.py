@@ -1,23 +1,59 @@
-"""TODO."""
+"""``clpipe plan``: the launches and buffers of a chain, as a table or JSON."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import click
 
 from clpipe.base.errors import RequestError
 from clpipe.chain.files import toml_text
-from clpipe.chain.request import request_from_options
-from clpipe.commands.options import chain_options, format_option, json_option, keep_option
+from clpipe.chain.request import Request
+from clpipe.commands.chain_options import chain_options, format_option, keep_option
+from clpipe.commands.options import json_option
 from clpipe.commands.printing import show, show_json
-from clpipe.engine.plan import AnyLaunch, Launch, Lines, Plan, launch_bytes, reads_of
-from clpipe.outputs.renditions import Rendition
-from clpipe.outputs.writer import OutputWriter
+from clpipe.engine.plan import AnyLaunch, Launch, Lines, Plan, launch_bytes, make_plan, reads_of
+from clpipe.outputs.results import results_of
+
+
+@click.command("plan")
+@chain_options
+@keep_option
+@format_option
+@json_option
+@click.option("--toml", "as_toml", is_flag=True, help="Print the chain as a configuration.")
+def plan(as_json: bool, as_toml: bool, **options: Any) -> None:
+    """Show the launches and buffer slots of a chain, without running it.
+
+    A launch is one kernel call over the image. Stages that read only the pixel itself join the
+    launch before them; a stencil, a reduction and a kept image open a new one. A slot is a buffer
+    of one plane.
+    """
+    request = Request.from_options(**options)
+    if as_toml:
+        if request.start_at or request.until or as_json:
+            raise RequestError(
+                "plan: --toml prints a whole chain as a configuration; leave out --start-at, "
+                "--until and --json"
+            )
+        click.echo(toml_text(request.chain()), nl=False)
+        return
+    chain = request.chain()
+    request = request.with_outputs(chain)
+    keep, encode, final = results_of(chain, request.formats, request.keep)
+    plan = make_plan(chain, half=True, keep=keep, encode=encode, final=final)
+    if as_json:
+        show_json(plan_record(plan))
+        return
+    headings = ("launch", "opened by", "stages", "reads", "writes", "bytes/px")
+    show(headings, plan_rows(plan))
+    click.echo(
+        f"\n{len(plan.launches)} launches, {plan.slot_count} slots, "
+        f"{plan.bytes_per_pixel(8):.1f} bytes a pixel on the device"
+    )
 
 
 def plan_rows(plan: Plan) -> list[tuple[str, ...]]:
-    """A row a launch: name, what opened it, stages, images read and written, bytes a pixel."""
+    """A row for each launch: name, cause, stages, images read and written, bytes a pixel."""
     kept = {image.number: name for name, image in plan.kept}
     return [
         (
@@ -33,7 +69,7 @@ def plan_rows(plan: Plan) -> list[tuple[str, ...]]:
 
 
 def opener(launch: AnyLaunch, kept: Mapping[int, str]) -> str:
-    """Why a launch is one of its own, and which stage is the cause."""
+    """Why a launch does not join the one before it: the stage and its reason."""
     if isinstance(launch, Lines):
         return "tables of rows and columns"
     if not isinstance(launch, Launch):
@@ -48,7 +84,7 @@ def opener(launch: AnyLaunch, kept: Mapping[int, str]) -> str:
 
 
 def stages_of(launch: AnyLaunch) -> list[str]:
-    """The steps in a launch, in order, each once; those redone at each tap are in brackets."""
+    """The steps in a launch, in order, each once; those repeated at each tap are in brackets."""
     if isinstance(launch, Lines):
         return [op.step for op in launch.ops]
     if not isinstance(launch, Launch):
@@ -97,40 +133,3 @@ def plan_record(plan: Plan) -> dict[str, Any]:
         "bytes_per_pixel": plan.bytes_per_pixel(8),
         "kept": [name for name, _ in plan.kept],
     }
-
-
-@click.command("plan")
-@chain_options
-@keep_option
-@format_option
-@json_option
-@click.option("--toml", "as_toml", is_flag=True, help="Print the chain as a configuration.")
-def plan(
-    keep: tuple[str, ...], formats: tuple[str, ...], as_json: bool, as_toml: bool, **request: Any
-) -> None:
-    """Show the launches and buffer slots of a chain, without running it.
-
-    A launch is one kernel call over the image. Stages that look at a pixel alone join the launch
-    before them; a stencil, a reduction and a kept image open one. A slot is a buffer of one plane.
-    """
-    asked = request_from_options(**request)
-    if as_toml:
-        if asked.start_at or asked.until or as_json:
-            raise RequestError(
-                "plan: --toml prints a whole chain, which neither --start-at nor --until is part "
-                "of, and --json prints the plan"
-            )
-        click.echo(toml_text(asked.chain()), nl=False)
-        return
-    chain = asked.chain()
-    target = OutputWriter(Path(), formats or ("jpg",), keep=chain.kept(keep))
-    made = target.runner(Rendition("", chain, ""), None).plan()
-    if as_json:
-        show_json(plan_record(made))
-        return
-    headings = ("launch", "opened by", "stages", "reads", "writes", "bytes/px")
-    show(headings, plan_rows(made))
-    click.echo(
-        f"\n{len(made.launches)} launches, {made.slot_count} slots, "
-        f"{made.bytes_per_pixel(8):.1f} bytes a pixel on the device"
-    )

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Tables, numbers and JSON on stdout."""
 
 import json
 import math
@@ -7,16 +7,14 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import click
-from rich.console import Console
-from rich.table import Table
 
-from clpipe.chain.files import value_text
+from clpipe.chain.toml import value_text
 
 Rows = list[tuple[str, ...]]
 
 
 def short_text(value: Any) -> str:
-    """A number, or numbers, with four digits.
+    """A value, with numbers to four digits.
 
     >>> short_text(((1.0, 0.123456), (0.0, 2.0)))
     '[[1, 0.1235], [0, 2]]'
@@ -30,7 +28,7 @@ def short_text(value: Any) -> str:
 
 
 def number(value: float, form: str = ".3g") -> str:
-    """A measured number; a dash where it could not be told.
+    """A measured number; a dash where it is NaN.
 
     >>> number(0.01234), number(math.nan)
     ('0.0123', '-')
@@ -38,19 +36,25 @@ def number(value: float, form: str = ".3g") -> str:
     return "-" if math.isnan(value) else f"{value:{form}}"
 
 
-def console() -> Console:
-    """Where tables go. A pipe gets room for whole lines."""
-    return Console(width=None if sys.stdout.isatty() else 140, highlight=False)
-
-
 def show(headings: Sequence[str], rows: Iterable[Sequence[str]], left: int | None = None) -> None:
-    """Print a table whose first ``left`` columns stand left and the others right; None is all."""
+    """Print a table.
+
+    Args:
+        headings: of the columns.
+        rows: with a text for each column.
+        left: how many columns are aligned left, the others right; None is all.
+    """
+    # Imported here, because --json needs none of it.
+    from rich.console import Console
+    from rich.table import Table
+
     table = Table(box=None, pad_edge=False)
     for number, heading in enumerate(headings):
         table.add_column(heading, justify="left" if left is None or number < left else "right")
     for row in rows:
         table.add_row(*row)
-    console().print(table)
+    # A pipe gets room for whole lines.
+    Console(width=None if sys.stdout.isatty() else 140, highlight=False).print(table)
 
 
 def show_json(values: Any) -> None:

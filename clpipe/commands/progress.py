@@ -1,31 +1,33 @@
-"""What a run says while it goes on: a bar on a terminal, lines in a log. All of it on stderr."""
+"""What a run prints on stderr: a bar on a terminal, otherwise a line for each image."""
+
+from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
 from clpipe.batch.run_log import Summary
-from clpipe.outputs.formats import ending_of
+from clpipe.chain.formats import ending_of
 from clpipe.outputs.writer import OutputWriter
 
-NAMED = 20  # failures that are named again at the end
+REPEATED = 20  # failures that are printed again at the end
 
 
 class Reporter:
-    """Tells of outcomes as they come, and of all of them when it is told to end.
+    """Prints outcomes as they come, and a summary when it is left as a context.
 
     Args:
-        summary: what became of the images so far; kept up by who calls.
-        target: where the pictures go.
-        console: where to tell; a terminal gets a bar where there are several images.
-        quiet: tell of failures alone.
+        summary: what became of the images so far; the caller adds to it.
+        writer: where the pictures go.
+        console: where to print; a terminal gets a bar where there are several images.
+        quiet: print failures only.
     """
 
     def __init__(
-        self, summary: Summary, target: OutputWriter, console: Console, quiet: bool = False
+        self, summary: Summary, writer: OutputWriter, console: Console, quiet: bool = False
     ) -> None:
         self._summary = summary
-        self._target = target
+        self._writer = writer
         self._console = console
         self._quiet = quiet
         self._several = summary.total > 1
@@ -40,35 +42,42 @@ class Reporter:
                 transient=True,
             )
             self._task = self._bar.add_task("", total=summary.total)
-            self._bar.start()
 
-    def say(self, text: str) -> None:
-        """A line of its own."""
+    def __enter__(self) -> Self:
+        if self._bar:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.end()
+
+    def print(self, text: str) -> None:
+        """Print a line."""
         self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
-    def tell(self, outcome: Outcome) -> None:
-        """Tell what became of one image, which the summary has counted."""
+    def report(self, outcome: Outcome) -> None:
+        """Print what became of one image, after it was added to the summary."""
         if outcome.error:
-            self.say(f"clpipe: {outcome.error}")
+            self.print(f"clpipe: {outcome.error}")
         if self._quiet:
             return
         for warning in outcome.warnings:
             if outcome.status == DONE:
-                self.say(f"clpipe: {outcome.job.path}: warning: {warning}")
+                self.print(f"clpipe: {outcome.job.path}: warning: {warning}")
         if self._bar:
             self._bar.update(
                 self._task, completed=self._summary.finished, description=self._state()
             )
         elif outcome.status == DONE:
-            self.say(f"{outcome.job.path} -> {self._made(outcome)}")
+            self.print(f"{outcome.job.path} -> {self._files(outcome)}")
 
-    def _made(self, outcome: Outcome) -> str:
-        first, *others = self._target.pictures_of(outcome.job)
-        made = str(self._target.path(outcome.job, ending_of(self._target.formats[0]), first))
+    def _files(self, outcome: Outcome) -> str:
+        first, *others = self._writer.names_of(outcome.job)
+        text = str(self._writer.path(outcome.job, ending_of(self._writer.formats[0]), first))
         if others:
-            made += f" and {len(others)} more"
+            text += f" and {len(others)} more"
         seconds = sum(outcome.seconds(step) for step in self._summary.seconds)
-        return f"{made}  {outcome.megapixels:.2g} MP  {seconds:.2f} s"
+        return f"{text}  {outcome.megapixels:.2g} MP  {seconds:.2f} s"
 
     def _state(self) -> str:
         summary = self._summary
@@ -77,19 +86,21 @@ class Reporter:
         return f"{speed:.0f} MP/s  {summary.shares()}" + f"  {failed} failed" * bool(failed)
 
     def end(self) -> None:
-        """Tell of the whole; the bar is over."""
+        """Remove the bar and print the summary."""
         if self._bar:
             self._bar.stop()
         summary, counts = self._summary, self._summary.counts
         if counts[LEFT_OUT] and not self._quiet:
-            self.say(f"{counts[LEFT_OUT]} images in folders were kept elsewhere and left out")
+            self.print(
+                f"{counts[LEFT_OUT]} images in folders were kept after other stages and left out"
+            )
         failed = summary.failures
         if self._several and failed and (self._bar or not self._quiet):
-            self.say("failed:")
-            for error in failed[:NAMED]:
-                self.say(f"  {error.splitlines()[0]}")
-            if len(failed) > NAMED:
-                self.say(f"  and {len(failed) - NAMED} more, which the run log names")
+            self.print("failed:")
+            for error in failed[:REPEATED]:
+                self.print(f"  {error.splitlines()[0]}")
+            if len(failed) > REPEATED:
+                self.print(f"  and {len(failed) - REPEATED} more, which the run log names")
         if self._quiet or not (self._several or failed or counts[SKIPPED]):
             return
         there = f" ({counts[SKIPPED]} of them were there already)" if counts[SKIPPED] else ""
@@ -100,4 +111,4 @@ class Reporter:
         if counts[DONE]:
             speed = summary.megapixels / summary.elapsed
             text += f"; {summary.elapsed:.1f} s, {speed:.3g} MP/s; {summary.shares()}"
-        self.say(text)
+        self.print(text)

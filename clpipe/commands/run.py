@@ -1,10 +1,11 @@
-"""TODO."""
+"""``clpipe run``: images through the chain, on this machine or on a cluster."""
 
+import logging
 import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
@@ -12,27 +13,31 @@ from rich.console import Console
 
 from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
-from clpipe.batch.dask_client import Cluster, connected
 from clpipe.batch.dask_worker import RunSpec
 from clpipe.batch.interrupt import interruptible
 from clpipe.batch.replay import replay_of
 from clpipe.batch.run_log import RunLog, Summary, log_name
-from clpipe.batch.tars import Tar, TarBatch, cut
+from clpipe.batch.tar_batch import TarBatch
+from clpipe.batch.tars import Tar, cut
 from clpipe.batch.threads import Batch
 from clpipe.batch.trace import Trace, check_trace
+from clpipe.batch.work import ImageWorker
 from clpipe.chain.chain import Chain
-from clpipe.chain.request import request_from_options
-from clpipe.commands.options import chain_options, format_option, keep_option
+from clpipe.chain.request import Request
+from clpipe.chain.truth import TRUTHS
+from clpipe.commands.chain_options import chain_options, format_option, keep_option
 from clpipe.commands.progress import Reporter
 from clpipe.engine.device import Device, open_devices
 from clpipe.images.dump import TYPES
-from clpipe.images.read import MAX_PIXELS, TRANSFERS, USUAL_MAX_PIXELS, ReadOptions
-from clpipe.inputs.find import Shard, find_jobs, parse_shard
+from clpipe.images.read import MAX_PIXELS, TRANSFERS, USUAL_MAX_PIXELS
+from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.folder import output_folder, remove_unfinished
-from clpipe.outputs.renditions import TRUTHS, RenditionPlan
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
+
+if TYPE_CHECKING:
+    from clpipe.batch.dask_client import Cluster
 
 
 @click.command("run")
@@ -43,31 +48,31 @@ from clpipe.stage import Kind
     required=True,
     callback=lambda _context, _option, text: folder_named(text),
     metavar="OUT",
-    help="The folder for what comes out; made if need be.",
+    help="The output folder; it is made where it is missing.",
 )
 @chain_options
 @click.option(
     "--frames",
     type=click.IntRange(1),
     metavar="N",
-    help="Make a burst of N frames of each image, each with noise of its own, and the truth.",
+    help="Make a burst of N frames of each image, each with its own noise, and their truth.",
 )
 @click.option(
     "--truth",
     "truths",
     multiple=True,
     type=click.Choice(TRUTHS),
-    help="Make beside each picture what is known of it: its development or its mosaic without "
-    "noise, or the variance of the noise in the mosaic; may be repeated.",
+    help="Write beside each picture its truth: its development or its mosaic without noise, or the "
+    "variance of the noise in the mosaic; may be repeated.",
 )
-@click.option("--raw-size", metavar="WxH", help="Of headerless dumps (.raw): width and height.")
+@click.option("--raw-size", metavar="WxH", help="Width and height of headerless dumps (.raw).")
 @click.option(
-    "--raw-type", type=click.Choice(list(TYPES)), help="And how their samples are stored."
+    "--raw-type", type=click.Choice(list(TYPES)), help="How headerless dumps store a sample."
 )
 @click.option(
     "--transfer",
     type=click.Choice(list(TRANSFERS)),
-    help="Of renders in whole numbers (PNG, TIFF of 8 or 16 bits), which do not say it.",
+    help="The transfer curve of renders in whole numbers (PNG, TIFF of 8 or 16 bits).",
 )
 @click.option("--layer", metavar="NAME", help="The layer or part of an EXR that is the picture.")
 @click.option(
@@ -76,7 +81,7 @@ from clpipe.stage import Kind
     show_default=True,
     type=click.IntRange(1, MAX_PIXELS),
     metavar="N",
-    help="Refuse files that claim more, before memory is taken.",
+    help="Refuse larger images, before memory is taken.",
 )
 @keep_option
 @format_option
@@ -91,58 +96,52 @@ from clpipe.stage import Kind
 @click.option(
     "--memory",
     metavar="SIZE",
-    help="Of a device, such as 2G; larger images go in tiles. [default: what is free]",
+    help="Memory of a device, such as 2G; larger images are done in tiles. [default: what is free]",
 )
 @click.option(
     "--jobs",
     "threads",
     type=click.IntRange(1, 1024),
     metavar="N",
-    help="Images that are decoded at a time, and as many encoded. [default: one a processor]",
+    help="Threads that decode, and as many that encode. [default: one for each processor]",
 )
 @click.option(
     "--shard",
     default="1/1",
     metavar="I/N",
     callback=lambda _context, _option, text: parse_shard(text),
-    help="Do the I-th of N parts of the images, for job arrays.",
+    help="Do only part I of N of the images, for job arrays.",
 )
 @click.option(
     "--replay",
     type=click.Path(path_type=Path),
     metavar="SIDECAR",
-    help="Make the picture of a sidecar again, the same bytes; an INPUT is where its input is now.",
+    help="Make a sidecar's picture again, byte for byte; INPUT is its input, where that moved.",
 )
 @click.option(
     "--webdataset",
     "per_tar",
     type=click.IntRange(1),
     metavar="N",
-    help="Pack N images at a time into OUT/000000.tar and so on, as WebDataset reads them.",
+    help="Pack N images at a time into OUT/000000.tar and so on, for WebDataset.",
 )
 @click.option(
     "--dask",
     metavar="ADDRESS",
-    help="Of a Dask scheduler (tcp://HOST:8786), whose workers see the same files: use them.",
+    help="Run on the workers of a Dask scheduler (tcp://HOST:8786); they must see the same files.",
 )
-@click.option("--overwrite", is_flag=True, help="Make what is there already and up to date, too.")
-@click.option("--quiet", is_flag=True, help="Tell of failures alone.")
+@click.option("--overwrite", is_flag=True, help="Make pictures again that are up to date.")
+@click.option("--quiet", is_flag=True, help="Print failures only.")
 @click.option(
     "--trace",
     type=click.Path(path_type=Path),
     metavar="FILE.json",
-    help="Write what was done when, for Perfetto or chrome://tracing.",
+    help="Write a timeline of the run, for Perfetto or chrome://tracing.",
 )
 def run(
     inputs: tuple[str, ...],
     output: Path,
-    frames: int | None,
-    truths: tuple[str, ...],
-    transfer: str | None,
-    layer: str | None,
     max_pixels: int,
-    keep: tuple[str, ...],
-    formats: tuple[str, ...],
     selectors: tuple[str, ...],
     memory: str | None,
     threads: int | None,
@@ -153,82 +152,68 @@ def run(
     overwrite: bool,
     quiet: bool,
     trace: Path | None,
-    **request: Any,
+    **options: Any,
 ) -> None:
-    """Run images through the chain: files, folders, globs or manifests (.csv, .jsonl) of linear
-    float images (EXR), and of camera raws, which are developed as they are: they enter at
-    normalize, where noise is past.
+    """Run images through the chain: files, folders, globs or manifests (.csv, .jsonl).
 
-    Each makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used. A second
-    run makes only what is missing or has changed. OUT/run.jsonl is the log. With
-    --frames: OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise.
-    With --webdataset these are in tars, and dots in NAME become "_": a key of WebDataset has none.
+    Renders are linear float images (EXR). Camera raws are developed as they are: they enter at
+    normalize, behind the stages that add noise.
 
-    --truth development is that, without a burst. --truth mosaic is OUT/NAME.truth_mosaic.exr, the
-    truth of --keep normalize. --truth variance is OUT/NAME.truth_variance.exr: for each pixel of
-    that mosaic the variance of the noise that the chain adds, in signal squared, with what is fixed
-    to a sensor (PRNU, DSNU, columns) and rounding, without clipping and defect pixels.
+    Each image makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used. A
+    second run makes only what is missing or has changed. OUT/run.jsonl is the log. With --frames:
+    OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise. With --webdataset
+    these are in tars, and dots in NAME become "_", because a key of WebDataset has none.
+
+    --truth development is OUT/NAME.truth.jpg, also without --frames. --truth mosaic is
+    OUT/NAME.truth_mosaic.exr, the truth of --keep normalize. --truth variance is
+    OUT/NAME.truth_variance.exr: for each pixel of that mosaic the variance of the noise that the
+    chain adds, in signal squared. It includes what is fixed to a sensor (PRNU, DSNU, columns) and
+    rounding, but neither clipping nor defect pixels.
     """
+    tars: list[Tar] = []
     if replay:
-        refuse_beside_replay()
+        check_beside_replay()
         again = replay_of(replay, [Path(path) for path in inputs], max_pixels)
-        if again.doubt:
-            click.echo(f"clpipe: {replay}: warning: {again.doubt}", err=True)
-        entrance, jobs, tars = again.entrance, [again.job], []
-        chain = entrance.first_chain(jobs)
-        target = OutputWriter(output, again.formats, again.burst, again.keep)
+        if again.warning:
+            click.echo(f"clpipe: {replay}: warning: {again.warning}", err=True)
+        request, jobs = again.request, [again.job]
+        loader = ImageLoader(request)
+        chain = loader.first_chain(jobs)
     else:
-        entrance = ImageLoader(
-            request_from_options(**request), ReadOptions(layer, max_pixels, transfer)
-        )
-        jobs = find_jobs(inputs, output, entrance.endings())
-        tars = shard.take(cut(jobs, per_tar, output)) if per_tar else []
-        jobs = [job for tar in tars for job in tar.jobs] if per_tar else shard.take(jobs)
+        request = Request.from_options(max_pixels=max_pixels, **options)
+        loader = ImageLoader(request)
+        jobs = find_jobs(inputs, output, loader.endings())
+        if per_tar:
+            tars = shard.take(cut(jobs, per_tar, output))
+            jobs = [job for tar in tars for job in tar.jobs]
+        else:
+            jobs = shard.take(jobs)
         if not jobs:
             click.echo(f"shard {shard.number} of {shard.of} has no images", err=True)
             return
-        entrance.check(jobs)
-        chain = entrance.first_chain(jobs)
-        for option, value in (("--layer", layer), ("--transfer", transfer)):
-            if value is not None and chain.source is not Kind.RGB:
-                raise RequestError(
-                    f"{option}: it is one of a render, but the chain reads {chain.source.label}"
-                )
-        whole = entrance.asked.until is None or chain.result is Kind.DISPLAY
-        formats = tuple(dict.fromkeys(formats)) or (("jpg",) if whole else ("exr",))
-        target = OutputWriter(output, formats, RenditionPlan(frames, truths), chain.kept(keep))
-    target.check(chain, jobs)
+        loader.check(jobs)
+        chain = loader.first_chain(jobs)
+        check_read_options(request, chain)
+        request = request.with_outputs(chain)
+    writer = OutputWriter(output, request)
+    writer.check(chain, jobs)
     if trace:
         check_trace(trace)
     budget = parse_size(memory) if memory else None
-    engine = engine_for(
-        RunSpec(entrance, target, selectors, budget, threads, overwrite, trace is not None),
-        chain,
-        tars,
-        dask,
+    spec = RunSpec(
+        request, output, selectors, budget, threads, overwrite, trace is not None, first=jobs[0]
     )
-    summary = Summary(len(jobs))
-    with engine as batch, output_folder(output, shard):
+    opened = batch_of(spec, loader, chain, tars, dask)
+    summary = Summary(len(jobs))  # counts seconds from here on
+    if quiet:
+        logging.getLogger("clpipe").setLevel(logging.WARNING)
+    reporter = Reporter(summary, writer, Console(stderr=True), quiet)
+    events = Trace() if trace else None
+    with opened as batch, output_folder(output, shard):
         remove_unfinished(output, jobs)
-        events = Trace() if trace else None
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
-        with (
-            closing(batch.run(jobs)) as outcomes,
-            closing(RunLog(output / log_name(shard), start)) as log,
-            interruptible(batch.stop),
-        ):
-            reporter = Reporter(summary, target, Console(stderr=True), quiet)
-            try:
-                for outcome in outcomes:
-                    summary.add(outcome)
-                    log.add(outcome)
-                    reporter.tell(outcome)
-                    if events:
-                        events.add(outcome)
-            finally:
-                summary.interrupted = summary.finished < summary.total
-                log.end(summary)
-                reporter.end()
+        with closing(RunLog(output / log_name(shard), start)) as log:
+            follow(batch, jobs, summary, reporter, log, events)
     if events and trace:
         events.write(trace)
     if summary.interrupted:
@@ -236,29 +221,78 @@ def run(
     sys.exit(1 if summary.failures else 0)
 
 
-def engine_for(
-    spec: RunSpec, chain: Chain, tars: Sequence[Tar], dask: str | None
-) -> AbstractContextManager[Batch | TarBatch | Cluster]:
-    """What puts the images through: this machine, with or without tars, or a cluster.
+def follow(
+    batch: "Batch | Cluster",
+    jobs: Sequence[Job],
+    summary: Summary,
+    reporter: Reporter,
+    log: RunLog,
+    events: Trace | None,
+) -> None:
+    """Run jobs, and note and print the outcome of each as it comes.
 
     Raises:
-        RequestError: both are asked for.
+        ClpipeError: the run cannot go on; what is finished is noted.
+    """
+    with closing(batch.run(jobs)) as outcomes, interruptible(batch.stop), reporter:
+        try:
+            for outcome in outcomes:
+                summary.add(outcome)
+                log.add(outcome)
+                reporter.report(outcome)
+                if events:
+                    events.add(outcome)
+        finally:
+            summary.interrupted = summary.finished < summary.total
+            log.end(summary)
+
+
+def check_read_options(request: Request, chain: Chain) -> None:
+    """See that options about renders are not set for other images.
+
+    Raises:
+        RequestError: one is.
+    """
+    for option, value in (("--layer", request.layer), ("--transfer", request.transfer)):
+        if value is not None and chain.source is not Kind.RGB:
+            raise RequestError(
+                f"{option}: it is for renders, but the chain reads {chain.source.label}"
+            )
+
+
+def batch_of(
+    spec: RunSpec, loader: ImageLoader, chain: Chain, tars: Sequence[Tar], dask: str | None
+) -> "AbstractContextManager[Batch | Cluster]":
+    """What does the jobs: this machine, with or without tars, or a cluster.
+
+    Args:
+        spec: the run.
+        loader: of its request.
+        chain: of the first image.
+        tars: what is made, or none.
+        dask: the address of a scheduler, or None.
+
+    Raises:
+        RequestError: both tars and a cluster are asked for, or the cluster cannot be used.
+        DeviceError: there is no usable device.
     """
     if dask is not None:
         if tars:
             raise RequestError("--dask: it makes no tars; use --webdataset with --shard")
+        from clpipe.batch.dask_client import connected
+
         return connected(dask, spec)
-    devices: list[Device | None] = [*open_devices(spec.selectors, spec.memory)]
-    how = (spec.threads, spec.overwrite, spec.trace)
+    devices: list[Device | None] = [*open_devices(spec.selectors, spec.memory)] or [None]
+    writer = OutputWriter(spec.output, spec.request)
     if tars:
-        return nullcontext(
-            TarBatch(tars, spec.entrance, spec.target, devices or [None], chain, *how)
-        )
-    return nullcontext(Batch(spec.entrance, spec.target, devices or [None], chain, *how))
+        options = (spec.threads, spec.overwrite, spec.trace)
+        return nullcontext(TarBatch(tars, loader, writer, chain, devices, *options))
+    worker = ImageWorker(loader, writer, chain, spec.overwrite, spec.trace)
+    return nullcontext(Batch(worker, devices, spec.threads))
 
 
 def folder_named(text: str) -> Path:
-    """The folder for what comes out.
+    """The output folder.
 
     Raises:
         RequestError: the name is empty.
@@ -268,21 +302,22 @@ def folder_named(text: str) -> Path:
     return Path(text)
 
 
+# Options that a sidecar does not store.
 BESIDE_REPLAY = (
     *("inputs", "output", "replay", "max_pixels", "selectors", "memory"),
     *("overwrite", "quiet", "trace"),
 )
 
 
-def refuse_beside_replay() -> None:
-    """See that nothing is asked for that a sidecar says.
+def check_beside_replay() -> None:
+    """See that no option is set whose value comes from the sidecar.
 
     Raises:
-        RequestError: something is.
+        RequestError: one is.
     """
     context = click.get_current_context()
     for parameter in context.command.params:
         name = str(parameter.name)
-        given = context.get_parameter_source(name) is not ParameterSource.DEFAULT
-        if given and name not in BESIDE_REPLAY:
+        is_set = context.get_parameter_source(name) is not ParameterSource.DEFAULT
+        if is_set and name not in BESIDE_REPLAY:
             raise RequestError(f"{parameter.opts[0]}: the sidecar says it; --replay repeats that")

@@ -1,4 +1,4 @@
-"""TODO."""
+"""``clpipe stages``: the stages, or the methods and parameters of one."""
 
 import types
 from pathlib import Path
@@ -10,19 +10,55 @@ from pydantic import ValidationError
 from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.base.text import one_of
 from clpipe.chain.chain import make_chain
-from clpipe.chain.files import value_text
 from clpipe.chain.registry import all_stages, load_stage_file
 from clpipe.chain.request import DEFAULTS
 from clpipe.chain.settings import Settings, overlay
-from clpipe.commands.options import camera_option, iso_option, json_option, stage_file_option
+from clpipe.chain.toml import value_text
+from clpipe.commands.chain_options import camera_option, iso_option
+from clpipe.commands.completion import steps
+from clpipe.commands.options import json_option, stage_file_option
 from clpipe.commands.printing import short_text, show, show_json
 from clpipe.stage import Context, Method, Stage
 
 LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 
+@click.command("stages")
+@click.argument("name", required=False, shell_complete=steps)
+@camera_option
+@iso_option
+@stage_file_option
+@json_option
+def stages(
+    name: str | None,
+    camera: str | None,
+    iso: float | None,
+    stage_files: tuple[Path, ...],
+    as_json: bool,
+) -> None:
+    """List the stages, or explain the methods and parameters of one.
+
+    Automatic parameters are shown with the values that they have for a camera and an ISO.
+    """
+    for file in stage_files:
+        load_stage_file(file)
+    if name is not None and name not in all_stages():
+        raise RequestError(one_of("stage", name, all_stages()))
+    values = {"camera": camera, "iso": iso}
+    settings = overlay(DEFAULTS, {k: v for k, v in values.items() if v is not None})
+    chosen = [all_stages()[name]] if name else list(all_stages().values())
+    if as_json:
+        records = [stage_record(s, context_for(s, settings)) for s in chosen]
+        show_json(records)
+    elif name is None:
+        headings = ("stage", "reads", "writes", "what it does", "methods (first is default)")
+        show(headings, map(stage_row, chosen))
+    else:
+        explain_stage(chosen[0], settings)
+
+
 def type_text(annotation: Any) -> str:
-    """A parameter's type, in a word."""
+    """The type of a parameter, in words."""
     if get_origin(annotation) is Literal:
         return " | ".join(map(str, get_args(annotation)))
     if get_origin(annotation) is Annotated:
@@ -38,11 +74,11 @@ def type_text(annotation: Any) -> str:
 
 
 def resolved(method: type[Method], context: Context) -> dict[str, str]:
-    """The values that automatic parameters of a method take in a context, as text."""
+    """The values that automatic parameters of a method have in a context, as text."""
     automatic = [name for name, field in method.model_fields.items() if field.default is None]
     try:
         values = method().resolve(context)
-    except ValidationError:  # it must be given something
+    except ValidationError:  # a parameter has no default
         values = method.model_validate(method.example).resolve(context)
         automatic = [name for name in automatic if name not in method.example]
     except ClpipeError as error:
@@ -51,7 +87,7 @@ def resolved(method: type[Method], context: Context) -> dict[str, str]:
 
 
 def context_for(stage: Stage, settings: Settings) -> Context:
-    """What is known where a stage stands in the default chain, or could stand."""
+    """The context of a stage where it stands in the default chain, or could stand."""
     steps = make_chain(settings).steps
     own = [step.context for step in steps if step.stage is stage]
     alike = [step.context for step in steps if step.stage.reads is stage.reads]
@@ -59,7 +95,7 @@ def context_for(stage: Stage, settings: Settings) -> Context:
 
 
 def parameter_rows(method: type[Method]) -> list[tuple[str, ...]]:
-    """A row a parameter: name, default, unit, what is allowed, one sentence."""
+    """A row for each parameter: name, default, unit, what is allowed, one sentence."""
     rows: list[tuple[str, ...]] = []
     for name, field in method.model_fields.items():
         extra: Any = field.json_schema_extra
@@ -74,7 +110,7 @@ def parameter_rows(method: type[Method]) -> list[tuple[str, ...]]:
 
 
 def stage_record(stage: Stage, context: Context) -> dict[str, Any]:
-    """A stage as JSON values, with what automatic parameters come to in a context."""
+    """A stage as JSON values, with the values of automatic parameters in a context."""
     keys = ("name", "default", "unit", "allowed", "text")
     return {
         "name": stage.name,
@@ -94,44 +130,13 @@ def stage_record(stage: Stage, context: Context) -> dict[str, Any]:
 
 
 def stage_row(stage: Stage) -> tuple[str, ...]:
-    """A stage in a line: name, what it reads and writes, what it does, its methods."""
+    """The row of a stage: name, what it reads and writes, what it does, its methods."""
     methods = ", ".join(stage.by_name)
     return stage.name, stage.reads.label, stage.writes.label, stage.summary, methods
 
 
-@click.command("stages")
-@click.argument("name", required=False)
-@camera_option
-@iso_option
-@stage_file_option
-@json_option
-def stages(
-    name: str | None,
-    camera: str | None,
-    iso: float | None,
-    stage_files: tuple[Path, ...],
-    as_json: bool,
-) -> None:
-    """List the stages, or explain one: its methods and parameters, for a camera and an ISO."""
-    for file in stage_files:
-        load_stage_file(file)
-    if name is not None and name not in all_stages():
-        raise RequestError(one_of("stage", name, all_stages()))
-    values = {"camera": camera, "iso": iso}
-    settings = overlay(DEFAULTS, {k: v for k, v in values.items() if v is not None})
-    chosen = [all_stages()[name]] if name else list(all_stages().values())
-    if as_json:
-        records = [stage_record(s, context_for(s, settings)) for s in chosen]
-        show_json(records)
-    elif name is None:
-        headings = ("stage", "reads", "writes", "what it does", "methods (first is default)")
-        show(headings, map(stage_row, chosen))
-    else:
-        explain_stage(chosen[0], settings)
-
-
 def explain_stage(stage: Stage, settings: Settings) -> None:
-    """One stage: its methods and parameters, and what a camera and an ISO make of them."""
+    """Print the methods and parameters of a stage, with their values for a camera and an ISO."""
     context = context_for(stage, settings)
     reads, writes = stage.reads.label, stage.writes.label
     click.echo(f"{stage.name}: {stage.summary} Reads {reads}, writes {writes}.")

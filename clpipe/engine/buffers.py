@@ -1,4 +1,4 @@
-"""TODO."""
+"""Memory of a run: buffers on the device, and arrays on the host for what comes back."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,16 +13,30 @@ from clpipe.stage import Kind
 
 
 @dataclass
-class Output:
-    """What a run brings back: planes by image number, eight-bit pixels, and numbers found."""
+class HostImages:
+    """The results of a run on the host.
+
+    ``images`` are float images by their number in the plan, (height, width[, channel]);
+    ``encoded`` are eight-bit pixels of the same shape; ``estimates`` are four floats a step.
+    """
 
     images: dict[int, Array]
     encoded: Array | None
-    found: dict[str, Array]
+    estimates: dict[str, Array]
 
 
-def room_for(plan: Plan, width: int, height: int, into: Array | None) -> Output:
-    """Whole images on the host for all that a plan gives; ``into`` is for the encoded one."""
+def room_for(plan: Plan, width: int, height: int, into: Array | None) -> HostImages:
+    """Empty arrays for all results of a plan.
+
+    Args:
+        plan: the plan.
+        width: of the image in pixels, and its height.
+        height: see above.
+        into: an array to use for the eight-bit pixels.
+
+    Raises:
+        ValueError: ``into`` has another shape or type.
+    """
 
     def shape(kind: Kind) -> tuple[int, ...]:
         channels = len(kind.channels)
@@ -36,10 +50,10 @@ def room_for(plan: Plan, width: int, height: int, into: Array | None) -> Output:
             raise ValueError(
                 f"into is {encoded.shape} {encoded.dtype}; {shape(plan.encoded)} uint8"
             )
-    return Output(
+    return HostImages(
         images={image.number: np.empty(shape(image.kind), np.float32) for image in images},
         encoded=encoded,
-        found={
+        estimates={
             x.op.step: np.empty(4, np.float32) for x in plan.launches if isinstance(x, Finalize)
         },
     )
@@ -51,12 +65,12 @@ class Pool:
     def __init__(self, make: Callable[[int], Any]) -> None:
         self._make = make
         self.held: dict[str, Any] = {}
-        self.generation = 0  # another one when other buffers are held
+        self.generation = 0  # counts up when a buffer is replaced
 
     def reserve(self, sizes: Mapping[str, int], memory: int) -> None:
-        """See that there is a buffer of at least these sizes (bytes by name).
+        """Make sure that there are buffers of at least these sizes (bytes by name).
 
-        Those that an earlier image needed stay, as long as all together take no more than
+        Buffers that only earlier images needed are kept while all together take no more than
         ``memory`` bytes.
         """
         enough = {name: b for name, b in self.held.items() if b.size >= sizes.get(name, 0)}
@@ -77,11 +91,11 @@ class Pool:
 
     @property
     def bytes(self) -> int:
-        """What all of them take."""
+        """The size of all buffers together."""
         return sum(buffer.size for buffer in self.held.values())
 
     def release(self) -> None:
-        """Give all of them back."""
+        """Give all buffers back to the device."""
         self.generation += 1
         held, self.held = self.held, {}
         for buffer in held.values():
@@ -97,8 +111,8 @@ def buffer_name(parameter: Parameter) -> str | None:
             return "dst"
         case "slot":
             return f"slot{parameter.number}"
-        case "lines" | "found":
+        case "lines" | "estimates":
             return f"{parameter.role}.{parameter.step}"
-        case "sums" | "shares" | "counts" | "histogram":
+        case "sums" | "partials" | "counts" | "histogram":
             return parameter.role
     return None

@@ -1,4 +1,4 @@
-"""TODO."""
+"""A compiled kernel with its arguments, and how many work items it is launched over."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.engine.buffers import Pool, buffer_name
-from clpipe.engine.codegen import LOCAL_SIZE, SHARES, Kernel, Parameter, round_up
+from clpipe.engine.codegen import LOCAL_SIZE, PARTIALS, Kernel, Parameter, round_up
 from clpipe.engine.plan import Finalize, Histogram, Launch, Lines, Reduce
 from clpipe.engine.tiles import Extent
 
@@ -14,7 +14,7 @@ Bind = Callable[[Parameter], Any]
 
 
 def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """How many work items a kernel has, and in which groups."""
+    """The global and the local size of a kernel, in work items."""
     match kernel.launch:
         case Launch(rows=rows, columns=columns):
             across = round_up(extent.padded_width, extent.lanes * columns)
@@ -24,15 +24,15 @@ def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[
             longest = round_up(max(extent.width, extent.height), extent.lanes)
             return (round_up(longest // extent.lanes, LOCAL_SIZE),), (LOCAL_SIZE,)
         case Histogram() | Reduce():
-            return (SHARES,), (LOCAL_SIZE,)
+            return (PARTIALS,), (LOCAL_SIZE,)
         case Finalize():
             return (1,), (1,)
 
 
 class Call:
-    """A compiled kernel and the arguments that it was given last.
+    """A compiled kernel that remembers its arguments.
 
-    Most arguments stay the same from image to image, and to set one takes time.
+    Setting an argument takes time, and most stay the same from image to image.
     """
 
     def __init__(self, kernel: Kernel, compiled: Any) -> None:
@@ -47,14 +47,14 @@ class Call:
         self._place: tuple[Any, ...] = ()
 
     def set_arguments(self, pool: "Pool", extent: Extent, tile: int, bind: Bind) -> None:
-        """Set what is different from the last time: buffers, a tile's numbers, and values."""
+        """Set the arguments that differ from the last launch: buffers, a tile's numbers, values."""
         place = pool.generation, extent, tile
         if place != self._place:
-            told = {**extent.numbers, "tile": np.uint32(tile)}
+            numbers = {**extent.numbers, "tile": np.uint32(tile)}
             for i, name in self._buffers:
                 self.compiled.set_arg(i, pool.held[name])
             for i, name in self._numbers:
-                self.compiled.set_arg(i, told[name])
+                self.compiled.set_arg(i, numbers[name])
             self._place = place
         for i, parameter in self._values:
             value, last = bind(parameter), self._last[i]
@@ -64,6 +64,6 @@ class Call:
 
 
 def same_bits(one: Any, two: Any) -> bool:
-    """Whether two NumPy scalars are the same; 0 and -0 are not."""
+    """Whether two NumPy scalars have the same bits, which 0 and -0 do not."""
     scalars = isinstance(one, np.generic) and isinstance(two, np.generic)
     return scalars and one.tobytes() == two.tobytes()

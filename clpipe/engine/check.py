@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.types import Array
-from clpipe.chain.chain import make_chain
+from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
@@ -17,28 +17,50 @@ from clpipe.stage import Kind, Method, Stage, variant_label, variants
 
 # Odd sizes, one pixel wide and high, smaller than the widest border, more than one work-group.
 SIZES = ((1, 1), (1, 9), (11, 1), (2, 3), (6, 5), (37, 53), (9, 530))
+ISO = 3200  # at which every stage has something to do
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Two results compared: how many samples, how many differ at all, and by how much at most."""
+
+    samples: int = 0
+    differing: int = 0
+    largest: float = 0.0
+
+    def __add__(self, other: "Difference") -> "Difference":
+        return Difference(
+            self.samples + other.samples,
+            self.differing + other.differing,
+            max(self.largest, other.largest),
+        )
 
 
 @dataclass(frozen=True)
 class Check:
-    """How one method of a stage did: the largest difference, and how many pixels differ at all."""
+    """How one method of a stage did, over so many cases (images)."""
 
     stage: str
     method: str
     cases: int
-    samples: int
-    differing: int
-    largest: float
+    difference: Difference
     tolerance: float
 
     @property
     def passed(self) -> bool:
         """Whether the largest difference is within the declared tolerance."""
-        return self.largest <= self.tolerance
+        return self.difference.largest <= self.tolerance
 
     def record(self) -> dict[str, Any]:
         """The check as JSON values."""
-        return asdict(self) | {"passed": self.passed}
+        return {
+            "stage": self.stage,
+            "method": self.method,
+            "cases": self.cases,
+            **asdict(self.difference),
+            "tolerance": self.tolerance,
+            "passed": self.passed,
+        }
 
 
 def example(kind: Kind, size: tuple[int, int], half: bool = False, seed: int = 0) -> Array:
@@ -51,38 +73,52 @@ def example(kind: Kind, size: tuple[int, int], half: bool = False, seed: int = 0
     return values.astype(np.float16 if half else np.float32)
 
 
-def compare(
-    device: Device, settings: Settings, source: Kind, sizes: Sequence[tuple[int, int]]
-) -> tuple[int, int, float]:
-    """One chain on the device and in NumPy: samples, how many differ, the largest difference.
+def difference(one: Array | None, two: Array | None) -> Difference:
+    """Two images compared. NaN is infinitely far from anything.
 
-    Eight-bit results count too, where a difference of one level is taken for none: an ulp before
-    rounding can make it.
+    Raises:
+        ValueError: one is missing, or they differ in shape.
     """
-    chain = make_chain(settings, source)
-    encode = chain.result is not Kind.RAW
-    on_device = Runner(chain, device, encode=encode, final=True)
-    alone = Runner(chain, device, encode=encode)
-    in_numpy = Runner(chain, None, encode=encode, final=True)
-    samples, differing, largest = 0, 0, 0.0
-    for number, size in enumerate(sizes):
-        half = number % 2 == 1 and source is not Kind.RAW
-        image = example(source, size, half, seed=number)
-        one, two = on_device.run(image, "check"), in_numpy.run(image, "check")
-        assert one.final is not None and two.final is not None
-        if one.final.shape != two.final.shape:
-            raise AssertionError(f"{one.final.shape} is not {two.final.shape}")
-        difference = np.abs(one.final.astype(np.float64) - two.final)
-        samples += difference.size
-        differing += int(np.count_nonzero(difference))
-        largest = max(largest, float(np.nan_to_num(difference, nan=np.inf).max()))
-        if encode:
-            encoded = alone.run(image, "check").encoded
-            assert encoded is not None and two.encoded is not None and one.encoded is not None
-            levels = np.abs(encoded.astype(int) - two.encoded).max()
-            if levels > 1 or not np.array_equal(encoded, one.encoded):
-                largest = max(largest, float(levels))
-    return samples, differing, largest
+    if one is None or two is None or one.shape != two.shape:
+        shapes = [None if image is None else image.shape for image in (one, two)]
+        raise ValueError(f"found images of shapes {shapes}; expected two of one shape")
+    apart = np.nan_to_num(np.abs(one.astype(np.float64) - two), nan=np.inf)
+    return Difference(apart.size, int(np.count_nonzero(apart)), float(apart.max()))
+
+
+def compare(
+    device: Device, chain: Chain, sizes: Sequence[tuple[int, int]] = SIZES, half: bool = False
+) -> Difference:
+    """A chain on the device and in NumPy, in float, over images of these sizes (height, width)."""
+    on_device, in_numpy = (Runner(chain, d, encode=False, final=True) for d in (device, None))
+    total = Difference()
+    for seed, size in enumerate(sizes):
+        image = example(chain.source, size, half, seed)
+        one, two = (runner.run(image, "check").final for runner in (on_device, in_numpy))
+        total += difference(one, two)
+    return total
+
+
+def chain_for(
+    stage: Stage, method: type[Method], values: Mapping[str, Any], pattern: Pattern
+) -> Chain:
+    """One method of a stage as a chain that starts on what it reads, in that pattern."""
+    before = {Kind.MOSAIC: ("mosaic",), Kind.RAW: ("mosaic", "quantize")}.get(stage.reads, ())
+    parameters: dict[str, dict[str, Any]] = {"mosaic": {"pattern": pattern}}
+    own = {"method": method.method, **method.example, **values}
+    parameters[stage.name] = parameters.get(stage.name, {}) | own
+    settings = Settings(iso=ISO, stages=(*before, stage.name), parameters=parameters)
+    return make_chain(settings, start_at=stage.name)
+
+
+def depends_on_pattern(stage: Stage, method: type[Method], values: Mapping[str, Any]) -> bool:
+    """Whether the kernels of a method are compiled for a CFA pattern."""
+    step = chain_for(stage, method, values, PATTERNS[0]).steps[0]
+    return "pattern" in {
+        name
+        for pass_ in step.method.passes()
+        for name in (*pass_.arguments, *pass_.finish_arguments)
+    }
 
 
 def check_method(
@@ -93,35 +129,20 @@ def check_method(
     patterns: Sequence[Pattern] = PATTERNS,
     values: Mapping[str, Any] | None = None,
 ) -> Check:
-    """One method of a stage, behind a mosaic where it reads one so that all patterns are seen.
+    """One method of a stage, in all these patterns if it depends on the pattern.
 
-    ``values`` are parameters of the method that are not left at their defaults.
+    ``values`` are parameters that choose a variant of the method; a variant is checked in the first
+    of the patterns.
     """
     values = values or {}
-    samples, differing, largest, cases = 0, 0, 0.0, 0
+    # A variant reads the pattern through the same functions as the method's default.
+    if values or not depends_on_pattern(stage, method, values):
+        patterns = patterns[:1]
+    total = Difference()
     for pattern in patterns:
-        chain: tuple[str, ...] = (stage.name,)
-        source = stage.reads
-        if source is Kind.MOSAIC and stage.name != "mosaic":
-            chain, source = ("mosaic", stage.name), Kind.RGB
-        parameters: dict[str, dict[str, Any]] = {"mosaic": {"pattern": pattern}}
-        own = {"method": method.method, **method.example, **values}
-        parameters[stage.name] = parameters.get(stage.name, {}) | own
-        settings = Settings(iso=3200, stages=chain, parameters=parameters)
-        more = compare(device, settings, source, sizes)
-        samples, differing = samples + more[0], differing + more[1]
-        largest, cases = max(largest, more[2]), cases + len(sizes)
-        if not {"mosaic"} & set(chain):
-            break  # no pattern in it
-    return Check(
-        stage.name,
-        variant_label(method, values),
-        cases,
-        samples,
-        differing,
-        largest,
-        method.tolerance,
-    )
+        total += compare(device, chain_for(stage, method, values, pattern), sizes)
+    label = variant_label(method, values)
+    return Check(stage.name, label, len(patterns) * len(sizes), total, method.tolerance)
 
 
 # Every source of noise at work.
@@ -134,35 +155,65 @@ NOISE: Mapping[str, Mapping[str, Any]] = {
 }
 
 
-def check_raw(device: Device, noise: str, sizes: Sequence[tuple[int, int]] = SIZES) -> Check:
-    """The whole way to the raw, all patterns: after quantize, device and NumPy must be equal.
+def check_raw(
+    device: Device,
+    noise: str,
+    sizes: Sequence[tuple[int, int]] = SIZES,
+    patterns: Sequence[Pattern] = PATTERNS,
+) -> Check:
+    """The whole way from half RGB to the raw: after quantize, device and NumPy must be equal.
 
     ``noise`` is the method of sensor_noise.
     """
     names = list(all_stages())
-    chain = tuple(names[: names.index("quantize") + 1])
-    samples, differing, largest = 0, 0, 0.0
-    for pattern in PATTERNS:
+    stages = tuple(names[: names.index("quantize") + 1])
+    total = Difference()
+    for pattern in patterns:
         own: dict[str, dict[str, Any]] = {"mosaic": {"pattern": pattern}}
         own["sensor_noise"] = {"method": noise}
-        settings = Settings(iso=3200, stages=chain, parameters={**NOISE, **own})
-        more = compare(device, settings, Kind.RGB, sizes)
-        samples, differing, largest = samples + more[0], differing + more[1], max(largest, more[2])
-    return Check(
-        "exposure..quantize",
-        f"the raw, {noise}",
-        len(PATTERNS) * len(sizes),
-        samples,
-        differing,
-        largest,
-        0.0,
-    )
+        settings = Settings(iso=ISO, stages=stages, parameters={**NOISE, **own})
+        total += compare(device, make_chain(settings), sizes, half=True)
+    cases = len(patterns) * len(sizes)
+    return Check("exposure..quantize", f"the raw, {noise}", cases, total, 0.0)
+
+
+def check_ends(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Check:
+    """How images enter and leave: as half and float, RGB and mosaic; as eight bits.
+
+    Eight bits come by conversion, or by a table where the chain ends in curves. A difference of
+    one level is allowed, since an ulp before rounding can make it. No difference is allowed between
+    eight bits that are the only result and those that are made beside the float image.
+    """
+    total, cases = Difference(), 0
+    mosaic = Settings(stages=("mosaic", "inverse_white_balance"))
+    for chain in (
+        make_chain(Settings(stages=("exposure",))),
+        make_chain(Settings(stages=("exposure", "tone_curve", "gamma"))),
+        make_chain(mosaic, start_at="inverse_white_balance"),
+    ):
+        for half in (False, True):
+            both = Runner(chain, device, final=True)
+            alone, in_numpy = Runner(chain, device), Runner(chain, None, final=True)
+            for seed, size in enumerate(sizes):
+                image = example(chain.source, size, half, seed)
+                one, two = both.run(image, "check"), in_numpy.run(image, "check")
+                levels = difference(one.encoded, two.encoded)
+                same = difference(one.encoded, alone.run(image, "check").encoded)
+                wrong = max(same.largest, levels.largest if levels.largest > 1 else 0.0)
+                total += difference(one.final, two.final) + Difference(
+                    levels.samples, same.differing, wrong
+                )
+                cases += 1
+    return Check("source..8 bit", "half, float", cases, total, 0.0)
 
 
 def check_all(
     device: Device, stages: Sequence[Stage] = (), sizes: Sequence[tuple[int, int]] = SIZES
 ) -> Iterator[Check]:
-    """Every method of these stages, in all its variants; if none are named, of all, and the raw."""
+    """Every method of these stages, in all its variants.
+
+    If no stages are named: of all stages, then the raw, and how images enter and leave.
+    """
     for stage in stages or all_stages().values():
         for method in stage.methods:
             for values in variants(method):
@@ -170,3 +221,4 @@ def check_all(
     if not stages:
         for noise in all_stages()["sensor_noise"].by_name:
             yield check_raw(device, noise, sizes)
+        yield check_ends(device, sizes)

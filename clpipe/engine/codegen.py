@@ -2,25 +2,27 @@
 
 A kernel is the library, the stage files it needs (with ``#line``, so that the compiler's messages
 name the right file and line) and one short function that loads, calls the stages and stores.
+
+The text depends on what a launch does and on nothing else: not on its place in the plan, the slots
+it reads and writes, the names of its steps or the width of the border. Steps, planes and line
+tables are numbered in the order in which the text uses them, and the kernel is named by a digest of
+its text. So two plans that share a launch share its program, however else they differ.
 """
 
-import re
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from clpipe.engine.plan import AnyLaunch, Finalize, Histogram, Launch, Lines, Op, Plan, Read, Reduce
 from clpipe.engine.sources import LIBRARY, files_text
-from clpipe.stage import Access, Kind
+from clpipe.stage import Access, Kind, NoiseScope
 
 # What is known of the origin when compiling: it is in whole blocks, so the rows that share a
 # Philox call and the phase of a Bayer pattern are too.
-EXTENT = "{width, height, pitch, left * LANES, top * 4, columns, rows}"
-
-
+EXTENT = "{width, height, pitch, left * LANES, top * 4, columns, rows, border}"
 LOCAL_SIZE = 64
-
-
-SHARES = 256  # work items of a reduction's first half
+PARTIALS = 256  # work items of a reduction's first half, each with a partial sum or histogram
+UNNAMED = "kernel_without_a_name_yet"
 
 
 @dataclass(frozen=True)
@@ -28,8 +30,9 @@ class Parameter:
     """One kernel parameter: its OpenCL declaration, and what is bound to it.
 
     ``role`` is one of tile (a number of :class:`clpipe.engine.tiles.Extent`, or the tile's own
-    number), source, slot, encoded, table8 (the composed curve), value, key, lines, found, sums,
-    shares, counts, histogram; ``step``, ``item`` and ``number`` tell which.
+    number), source, slot, encoded, table8 (the composed curve), value, key, lines, estimates, sums,
+    partials, counts, histogram. ``step``, ``item`` and ``number`` say which one of that role; they
+    are not part of the text.
     """
 
     declaration: str
@@ -41,7 +44,10 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Kernel:
-    """A launch as OpenCL: its name, whole source, parameters in order and kind of index space."""
+    """A launch as OpenCL: the kernel's name, its whole source and its parameters in order.
+
+    ``files`` are the kernel files that the source includes.
+    """
 
     name: str
     source: str
@@ -56,18 +62,26 @@ def round_up(value: int, step: int) -> int:
 
 
 def border_left(border: int, lanes: int) -> int:
-    """Columns before the first pixel of a plane's row: the border, in whole blocks."""
+    """Columns before the first pixel of a plane's row: the border, in whole blocks of lanes."""
     return round_up(border, lanes)
 
 
 class _Writer:
-    """Collects the parameters and the body of one kernel."""
+    """Collects the parameters and the body of one kernel, and gives canonical names to both."""
 
     def __init__(self, plan: Plan, lanes: int) -> None:
         self.plan = plan
         self.lanes = lanes
         self.parameters: dict[str, Parameter] = {}
         self.setup: list[str] = []
+        self._steps: list[str] = []
+        self._slots: list[int] = []
+
+    def name(self, step: str, item: str) -> str:
+        """The name in the text of something that belongs to a step, such as ``step0_gain``."""
+        if step not in self._steps:
+            self._steps.append(step)
+        return f"step{self._steps.index(step)}_{item}"
 
     def parameter(self, name: str, type_: str, role: str, **which: str | int) -> str:
         space = "" if type_.endswith("*") else " "
@@ -83,56 +97,65 @@ class _Writer:
         return "c"
 
     def slot(self, number: int, written: bool) -> str:
+        if number not in self._slots:
+            self._slots.append(number)
         const = "" if written else "const "
         type_ = f"__global {const}float *restrict"
-        return self.parameter(f"slot{number}", type_, "slot", number=number)
+        name = f"plane{self._slots.index(number)}"
+        return self.parameter(name, type_, "slot", number=number)
 
     def planes(self, read: Read) -> list[str]:
         """Three plane parameters of an image that is read, the last repeated where it has less."""
         slots = [self.slot(n, False) for n in self.plan.slots[read.image.number]]
         return (slots + [slots[-1]] * 2)[:3]
 
-    def arguments(
-        self, op: Op, found: dict[str, tuple[str, int]], names: Sequence[str] | None = None
-    ) -> list[str]:
+    def lines(self, step: str, item: str, written: bool) -> str:
+        """The parameter of a step's line table."""
+        type_ = "__global float *" if written else "__global const float *"
+        return self.parameter(self.name(step, item), type_, "lines", step=step, item=item)
+
+    def estimates(self, step: str, written: bool) -> str:
+        """The parameter of the buffer with the numbers that a step estimates from the image."""
+        type_ = "__global float *" if written else "__global const float *"
+        return self.parameter(self.name(step, "estimates"), type_, "estimates", step=step)
+
+    def stream(self, op: Op, scope: NoiseScope) -> str:
+        """The random stream of a pass, from three parameters."""
+
+        def word(item: str, name: str) -> str:
+            return self.parameter(self.name(op.step, name), "uint", "key", step=op.step, item=item)
+
+        keys = [word(f"{scope.value}{half}", f"{scope.value}_key{half}") for half in "01"]
+        return f"(stream){{{', '.join([*keys, word('stage', 'stage')])}}}"
+
+    def arguments(self, op: Op, names: Sequence[str] | None = None) -> list[str]:
         """The actual arguments of a pass, or those ``names``, after the pixel and its site."""
         pass_, types, literals = op.pass_, dict(op.types), dict(op.literals)
-        texts = []
-        if pass_.random:
-            key = f"{op.step}_{pass_.random.value}_key"
-            for half in "01":
-                self.parameter(
-                    key + half, "uint", "key", step=op.step, item=pass_.random.value + half
-                )
-            stage = self.parameter(f"{op.step}_stage", "uint", "key", step=op.step, item="stage")
-            texts.append(f"(stream){{{key}0, {key}1, {stage}}}")
-        for name in pass_.arguments if names is None else names:
-            full = f"{op.step}_{name}"
-            if name in literals:
-                texts.append(literals[name])
-            elif name in types:
-                texts.append(self.parameter(full, types[name], "value", step=op.step, item=name))
-            elif name in found:
-                step, index = found[name]
-                buffer = self.parameter(
-                    f"{step}_found", "__global const float *", "found", step=step
-                )
-                line = f"const float {full} = {buffer}[{index}];"
+        estimates = estimates_of(self.plan, op.step)
+        texts = [self.stream(op, pass_.random)] if pass_.random else []
+        for item in pass_.arguments if names is None else names:
+            if item in literals:
+                texts.append(literals[item])
+            elif item in types:
+                name = self.name(op.step, item)
+                texts.append(self.parameter(name, types[item], "value", step=op.step, item=item))
+            elif item in estimates:
+                name, buffer = self.name(op.step, item), self.estimates(op.step, written=False)
+                line = f"const float {name} = {buffer}[{estimates.index(item)}];"
                 if line not in self.setup:
                     self.setup.append(line)
-                texts.append(full)
+                texts.append(name)
             else:
-                self.parameter(full, "__global const float *", "lines", step=op.step, item=name)
-                texts.append(full)
+                texts.append(self.lines(op.step, item, written=False))
         return texts
 
 
-def found_by(plan: Plan, step: str) -> dict[str, tuple[str, int]]:
-    """Names of the numbers that a step finds, with the step and the place in its buffer."""
+def estimates_of(plan: Plan, step: str) -> tuple[str, ...]:
+    """The names of the numbers that a step estimates from the image, in their buffer's order."""
     for launch in plan.launches:
         if isinstance(launch, Finalize) and launch.op.step == step:
-            return {name: (step, i) for i, name in enumerate(launch.op.pass_.found)}
-    return {}
+            return launch.op.pass_.estimates
+    return ()
 
 
 def call(op: Op, arguments: Sequence[str]) -> str:
@@ -140,17 +163,14 @@ def call(op: Op, arguments: Sequence[str]) -> str:
     return f"{op.pass_.function}({', '.join(arguments)})"
 
 
-def write_kernel(plan: Plan, launch: AnyLaunch, index: int, lanes: int) -> Kernel:
+def write_kernel(plan: Plan, launch: AnyLaunch, lanes: int) -> Kernel:
     """The OpenCL source of one launch of a plan, for a device with that many lanes."""
     writer = _Writer(plan, lanes)
-    name = f"launch_{index}_" + re.sub(r"\W+", "_", launch.name)
-    for number in ("width", "height", "pitch", "left", "top", "columns", "rows"):
+    for number in ("width", "height", "pitch", "left", "top", "columns", "rows", "border"):
         writer.tile(number)
     seen: set[str] = set()
-    left = border_left(plan.border, lanes)
     columns = launch.columns if isinstance(launch, Launch) else 1
-    text = f"#define LANES {lanes}\n#define BORDER {plan.border}\n#define BORDER_LEFT {left}\n"
-    text += f"#define COLUMNS {columns}\n"
+    text = f"#define LANES {lanes}\n#define COLUMNS {columns}\n"
     text += files_text([f"lib/{part}.h" for part in LIBRARY], seen)
     match launch:
         case Launch():
@@ -175,12 +195,14 @@ def write_kernel(plan: Plan, launch: AnyLaunch, index: int, lanes: int) -> Kerne
     setup = "".join(f"    {line}\n" for line in writer.setup)
     # The hint keeps Intel's compiler from making vectors of our vectors, up to nine times slower.
     text += (
-        f'#line 1 "{launch.name}"\n'
+        '#line 1 "launch"\n'
         f"__kernel __attribute__((vec_type_hint(vf), reqd_work_group_size({size}, 1, 1)))\n"
-        f"void {name}(\n    {signature})\n{{\n"
+        f"void {UNNAMED}(\n    {signature})\n{{\n"
         f"    const extent e = {EXTENT};\n{setup}{body}}}\n"
     )
-    return Kernel(name, text, tuple(writer.parameters.values()), launch, tuple(sorted(seen)))
+    name = f"launch_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+    source = text.replace(UNNAMED, name)
+    return Kernel(name, source, tuple(writer.parameters.values()), launch, tuple(sorted(seen)))
 
 
 def kernels_of(ops: Sequence[Op | None]) -> list[str]:
@@ -192,7 +214,7 @@ def _prologue(writer: _Writer, read: Read) -> list[tuple[Op, list[str], list[str
     """Each pass redone at a tap, its arguments, and which of them are run-time values."""
     calls = []
     for op in read.prologue:
-        arguments = writer.arguments(op, found_by(writer.plan, op.step))
+        arguments = writer.arguments(op)
         literals = dict(op.literals).values()
         calls.append((op, arguments, [a for a in arguments if a not in literals]))
     return calls
@@ -249,7 +271,7 @@ def _load(writer: _Writer, launch: Launch) -> tuple[list[str], list[str], Kind]:
         type_ = "src_image" if name == "src" else "image"
         made = f"{{{', '.join([stored, *values])}}}" if values else stored
         lines.append(f"const {type_} {name} = {made};")
-    arguments = writer.arguments(stencil, found_by(plan, stencil.step))
+    arguments = writer.arguments(stencil)
     kind, given = stencil.kind, [*stencil.pass_.reads, *arguments]
     if not block:
         return [], [*lines, f"const {kind.c_type} v0 = {call(stencil, ['at', *given])};"], kind
@@ -278,12 +300,12 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
         curves.insert(0, ops.pop())
     for i, op in enumerate(ops):
         kind = op.kind
-        made = call(op, [f"v{i}", "at", *writer.arguments(op, found_by(plan, op.step))])
+        made = call(op, [f"v{i}", "at", *writer.arguments(op)])
         lines.append(f"const {kind.c_type} v{i + 1} = {made};")
     value, after = f"v{len(ops)}", ""
     if launch.sums:
         writer.parameter("sums", "__global int4 *restrict ", "sums")
-        sample = call(launch.sums, [value, *writer.arguments(launch.sums, {})])
+        sample = call(launch.sums, [value, *writer.arguments(launch.sums)])
         lines.append(f"const vi sample = only_inside({sample}, at, {writer.core()});")
         lines.append("if (row & 1) odd_rows += sample; else even_rows += sample;")
         once.append("vi even_rows = (vi)(0), odd_rows = (vi)(0);")
@@ -300,15 +322,18 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
         once.append(f"{kind.c_type} values[{launch.rows}];")
         lines.append(f"values[row] = {value};")
         value = "values[row]"
-    stores = []
+    writes, encodes = [], []
     if launch.writes:
         slots = [writer.slot(n, True) for n in plan.slots[launch.writes.number]]
-        stores.append(f"store_{kind.c_name}({', '.join([value, *slots])}, at, e);")
+        writes.append(f"store_{kind.c_name}({', '.join([value, *slots])}, at, e);")
     if launch.encodes:
-        stores.append(_encode(writer, value, kind, curves))
-    loops = _over_block([*lines, *stores], launch) if block else [lines, stores]
+        encodes.append(_encode(writer, value, kind, curves))
     start = "".join(f"    {line}\n" for line in once)
-    body = "".join(_over_rows(part, launch.rows, unroll=not block) for part in loops)
+    if block:
+        body = _over_rows(_over_columns([*lines, *writes, *encodes], launch), launch.rows, False)
+    else:
+        body = _over_rows(lines, launch.rows) + _store(writes, launch.rows)
+        body += _over_rows(encodes, launch.rows) if encodes else ""
     return (
         f"    const uint x = left * LANES + (uint)get_global_id(0) * {max(block, 1)} * LANES;\n"
         f"    const uint y = top * 4 + (uint)get_global_id(1) * {launch.rows};\n"
@@ -317,15 +342,15 @@ def _pixels(writer: _Writer, launch: Launch) -> str:
     )
 
 
-def _over_block(lines: Sequence[str], launch: Launch) -> list[list[str]]:
+def _over_columns(lines: Sequence[str], launch: Launch) -> list[str]:
     """Lines for each vector of a row of a stencil's block."""
     head = f"for (uint column = 0; column < {launch.columns}; ++column) {{"
     beyond = "    if (x - e.left + column * LANES >= columns) break;"
     place = "    const site at = site_at(x + column * LANES, y + row);"
-    return [[head, beyond, place, *(f"    {line}" for line in lines), "}"]]
+    return [head, beyond, place, *(f"    {line}" for line in lines), "}"]
 
 
-def _over_rows(lines: Sequence[str], rows: int, unroll: bool) -> str:
+def _over_rows(lines: Sequence[str], rows: int, unroll: bool = True) -> str:
     """A loop over the rows of a work item. What is in an array already need not be unrolled."""
     place = ["const site at = site_at(x, y + row);"] if unroll else []
     body = "".join(f"        {line}\n" for line in [*place, *lines])
@@ -333,19 +358,27 @@ def _over_rows(lines: Sequence[str], rows: int, unroll: bool) -> str:
     return f"{pragma}\n    for (uint row = 0; row < {rows}; ++row) {{\n{body}    }}\n"
 
 
+def _store(writes: Sequence[str], rows: int) -> str:
+    """The stores of all rows of a work item: at edges in a loop of its own, which is slow code."""
+    if not writes:
+        return ""
+    place = "        const site at = site_at(x, y + row);\n"
+    loop = f"    for (uint row = 0; row < {rows}; ++row) {{\n{place}"
+    at_edge = "".join(f"        {line}\n" for line in writes)
+    inside = at_edge.replace("(", "_inside(", 1)
+    return (
+        f"    if (near_edge(first, {rows}, e)) {{\n#pragma unroll 1\n{loop}{at_edge}    }}\n"
+        f"    }} else {{\n#pragma unroll\n{loop}{inside}    }}\n    }}\n"
+    )
+
+
 def _lines(writer: _Writer, launch: Lines) -> str:
     body = "    const uint i = (uint)get_global_id(0) * LANES;\n"
     body += "    const vu line = lane_indices(i);\n"
     for op in launch.ops:
-        table = writer.parameter(
-            f"{op.step}_{op.pass_.writes}",
-            "__global float *",
-            "lines",
-            step=op.step,
-            item=op.pass_.writes,
-        )
+        table = writer.lines(op.step, op.pass_.writes, written=True)
         count = "height" if op.pass_.lines == "rows" else "width"
-        value = call(op, ["line", *writer.arguments(op, {})])
+        value = call(op, ["line", *writer.arguments(op)])
         body += f"    if (i < {count}) store({value}, {table} + i);\n"
     return body
 
@@ -354,13 +387,13 @@ def _count(writer: _Writer, launch: Histogram) -> str:
     op, bins = launch.op, launch.op.pass_.bins
     plane = writer.planes(launch.reads[0])[0]
     counts = writer.parameter("counts", "__global uint *", "counts", number=bins)
-    arguments = ["origin", "x", "y", "e", *writer.arguments(op, {})]
+    arguments = ["origin", "x", "y", "e", *writer.arguments(op)]
     core = writer.core()
     return (
         f"    __global const float *origin = image_origin({plane}, e);\n"
         f"    __global uint *own = {counts} + (size_t)get_global_id(0) * {bins};\n"
         f"    for (uint k = 0; k < {bins}; ++k) own[k] = 0;\n"
-        f"    for (uint y = {core}.top + get_global_id(0); y < {core}.bottom; y += {SHARES}) {{\n"
+        f"    for (uint y = {core}.top + get_global_id(0); y < {core}.bottom; y += {PARTIALS}) {{\n"
         f"        for (uint x = {core}.left; x < {core}.right; ++x) {{\n"
         f"            const int bin = {call(op, arguments)};\n"
         "            if (bin >= 0) own[bin] += 1;\n"
@@ -373,10 +406,10 @@ def _add_up(writer: _Writer, launch: Reduce) -> str:
     if bins := launch.op.pass_.bins:
         writer.parameter("counts", "__global const uint *", "counts", number=bins)
         writer.parameter("histogram", "__global uint *", "histogram", number=bins)
-        return f"    add_up_counts(counts, histogram, {bins}, {SHARES}, {tile});\n"
+        return f"    add_up_counts(counts, histogram, {bins}, {PARTIALS}, {tile});\n"
     writer.parameter("sums", "__global const int4 *", "sums")
-    writer.parameter("shares", "__global long4 *", "shares")
-    return f"    add_up_blocks(sums, shares, {writer.tile('blocks')}, {tile});\n"
+    writer.parameter("partials", "__global long4 *", "partials")
+    return f"    add_up_blocks(sums, partials, {writer.tile('blocks')}, {tile});\n"
 
 
 def _find(writer: _Writer, launch: Finalize) -> str:
@@ -386,11 +419,9 @@ def _find(writer: _Writer, launch: Finalize) -> str:
             "histogram", "__global const uint *", "histogram", number=pass_.bins
         )
     else:
-        writer.parameter("shares", "__global const long4 *", "shares")
-        whole = f"add_up_shares(shares, {SHARES})"
-    found = writer.parameter(
-        f"{launch.op.step}_found", "__global float *", "found", step=launch.op.step
-    )
-    arguments = writer.arguments(launch.op, {}, pass_.finish_arguments)
-    texts = [whole, *arguments, "e", found]
+        writer.parameter("partials", "__global const long4 *", "partials")
+        whole = f"add_up_partials(partials, {PARTIALS})"
+    estimates = writer.estimates(launch.op.step, written=True)
+    arguments = writer.arguments(launch.op, pass_.finish_arguments)
+    texts = [whole, *arguments, "e", estimates]
     return f"    {pass_.finish}({', '.join(texts)});\n"

@@ -1,29 +1,27 @@
-"""OpenCL devices: which there are, and running a plan on one. The only importer of pyopencl."""
+"""An open OpenCL device: it puts images through plans, whole or in tiles."""
 
-import re
 import time
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from clpipe.base.errors import DeviceError, ImageError, RequestError
+from clpipe.base.errors import DeviceError, ImageError
 from clpipe.base.types import Array
-from clpipe.engine.buffers import Output, Pool, room_for
+from clpipe.engine.buffers import HostImages, Pool, room_for
 from clpipe.engine.calls import Bind, Call, index_space
-from clpipe.engine.codegen import Kernel, Parameter, border_left, write_kernel
+from clpipe.engine.codegen import Parameter, border_left, write_kernel
 from clpipe.engine.discovery import DeviceInfo, choose, choose_all, find_devices, usable_memory
 from clpipe.engine.plan import Plan
+from clpipe.engine.programs import programs_of
 from clpipe.engine.tiles import Extent, Tiling, tiling_of
 
 
 @dataclass(frozen=True)
 class Timing:
-    """What one launch or transfer took, in seconds on the device.
+    """How long one launch or transfer took, in seconds on the device.
 
     ``start`` is on the clock of :func:`time.perf_counter`. Transfers are called "upload" and
     "download".
@@ -35,19 +33,8 @@ class Timing:
     transfer: bool
 
 
-def build_log(text: str) -> str:
-    """What the compiler said, out of pyopencl's error message.
-
-    >>> build_log("failed\\n\\nBuild on <x>:\\n\\nerror: a.cl:2:7: no\\n\\n(options: -a)")
-    'error: a.cl:2:7: no'
-    """
-    log = re.sub(r"\n*\(options: .*", "", text.partition(">:\n")[2], flags=re.DOTALL)
-    lines = [line for line in log.splitlines() if "failed to build the program" not in line]
-    return "\n".join(lines).strip() or text
-
-
 def timed(events: Sequence[tuple[str, Any]]) -> list[Timing]:
-    """How long each took. The queue has just been finished, so the last of them ends now."""
+    """The timings of events. The queue has just been finished, so the last one ends now."""
     if not events:
         return []
     offset = time.perf_counter() - events[-1][1].profile.end * 1e-9
@@ -64,9 +51,9 @@ def timed(events: Sequence[tuple[str, Any]]) -> list[Timing]:
 
 
 class Device:
-    """A device with its queue, compiled kernels and buffers, kept from image to image.
+    """An open device with its queue, compiled kernels and buffers, kept from image to image.
 
-    It is for one thread at a time; several devices can run at once, each in its own.
+    One thread may use it at a time; several devices can run at once, each in a thread of its own.
 
     Args:
         chosen: which device.
@@ -83,15 +70,12 @@ class Device:
         self.info = chosen
         self.memory = memory or usable_memory(chosen)
         self._cl = cl
-        try:
-            self._context = cl.Context([chosen.handle])
-            self._queue = cl.CommandQueue(
-                self._context, properties=cl.command_queue_properties.PROFILING_ENABLE
-            )
-        except cl.Error as error:
-            raise DeviceError(f"{chosen.label} cannot be opened: {error}") from None
+        self._programs = programs_of(chosen)
+        self._context = self._programs.context
+        self._queue = cl.CommandQueue(
+            self._context, properties=cl.command_queue_properties.PROFILING_ENABLE
+        )
         self._calls: dict[Plan, list[Call]] = {}
-        self._programs: dict[str, Any] = {}
         self._pool = Pool(self._new_buffer)
         self._tables: dict[int, tuple[Array, Any]] = {}
 
@@ -100,6 +84,10 @@ class Device:
         """Device memory of the buffers that are kept from image to image."""
         return self._pool.bytes
 
+    def is_ready(self, plan: Plan) -> bool:
+        """Whether the kernels of a plan are compiled."""
+        return plan in self._calls
+
     def prepare(self, plan: Plan) -> list[Call]:
         """The compiled kernels of a plan, from the first call on without compiling.
 
@@ -107,37 +95,9 @@ class Device:
             DeviceError: a kernel does not compile; the message is the compiler's.
         """
         if plan not in self._calls:
-            lanes = self.info.lanes
-            kernels = [write_kernel(plan, x, i, lanes) for i, x in enumerate(plan.launches)]
-            self._calls[plan] = [Call(k, self._compile(k)) for k in kernels]
+            kernels = [write_kernel(plan, launch, self.info.lanes) for launch in plan.launches]
+            self._calls[plan] = [Call(k, self._programs.kernel(k)) for k in kernels]
         return self._calls[plan]
-
-    def _compile(self, kernel: Kernel) -> Any:
-        cl = self._cl
-        program = self._programs.get(kernel.source)
-        if program is None:
-            options = ["-cl-std=CL1.2"]
-            exact = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
-            if self.info.handle.single_fp_config & exact:
-                options.append("-cl-fp32-correctly-rounded-divide-sqrt")
-            # PoCL keeps a cache of its own; a second copy only costs time.
-            own_cache = "Portable Computing" in self.info.platform
-            # Not within catch_warnings, which is no matter of one thread.
-            warnings.filterwarnings("ignore", category=cl.CompilerWarning)
-            try:
-                program = cl.Program(self._context, kernel.source).build(
-                    options, cache_dir=False if own_cache else None
-                )
-            except cl.MemoryError:
-                raise
-            except cl.Error as error:
-                log = build_log(str(error))
-                for file in kernel.files:
-                    if Path(file).is_absolute():
-                        raise RequestError(f"{file}: does not compile:\n{log}") from None
-                raise DeviceError(f"{kernel.launch.name}: does not compile:\n{log}") from None
-            self._programs[kernel.source] = program
-        return cl.Kernel(program, kernel.name)
 
     def run(
         self,
@@ -147,21 +107,21 @@ class Device:
         timings: list[Timing] | None = None,
         download: bool = True,
         into: Array | None = None,
-    ) -> Output:
-        """Put one image through a plan; in tiles where it does not fit into the memory.
+    ) -> HostImages:
+        """Put one image through a plan, in tiles if it does not fit into the memory.
 
-        Where the memory that is allowed is not there, buffers of earlier images are given back,
-        then tiles become smaller.
+        If the device runs out of memory before the limit is reached, buffers of earlier images are
+        given back, then tiles become smaller.
 
         Args:
-            plan: what to do.
-            source: the image, (height, width[, channel]), of a type that becomes half floats or
-                floats, as the plan says, without loss.
+            plan: the plan.
+            source: the image, (height, width[, channel]), of a type that converts without loss to
+                what the plan reads, half or float.
             bind: the value of a "value", "key" or "table8" parameter: a NumPy scalar or array.
-            timings: is given one entry a launch and transfer, in order.
-            download: bring results back; False leaves them on the device (for measuring).
-            into: where the eight-bit pixels are put, (height, width[, channel]) uint8,
-                C-contiguous; memory that is new to the process costs time.
+            timings: one entry a launch and transfer is appended, in order.
+            download: bring results back; False leaves them on the device, for measuring.
+            into: an array to use for the eight-bit pixels, (height, width[, channel]) uint8,
+                C-contiguous; a used one saves the time that new memory takes.
 
         Raises:
             ImageError: the image does not fit into the device's memory, not even in tiles, or the
@@ -171,7 +131,7 @@ class Device:
         cl = self._cl
         height, width = source.shape[:2]
         memory = self.memory
-        full: Exception | None = None  # what the device said when there was no more
+        full: Exception | None = None  # the device's error when its memory ran out
         while True:
             try:
                 tiling = tiling_of(
@@ -203,7 +163,7 @@ class Device:
         timings: list[Timing] | None,
         download: bool,
         into: Array | None,
-    ) -> Output:
+    ) -> HostImages:
         calls = self.prepare(plan)
         if len(self._tables) > 32:
             self._tables.clear()
@@ -234,17 +194,17 @@ class Device:
                     events += [("download", e) for e in self._download(plan, extent, output)]
             launch(phase.last, tiling.tiles[0], 0)
         if download:
-            events += [("download", e) for e in self._find(output)]
+            events += [("download", e) for e in self._download_estimates(output)]
         self._queue.finish()
         if timings is not None:
             timings += timed(events)
-        return output if download else Output({}, None, {})
+        return output if download else HostImages({}, None, {})
 
     def _new_buffer(self, size: int) -> Any:
         return self._cl.Buffer(self._context, self._cl.mem_flags.READ_WRITE, size)
 
     def _abandon(self) -> None:
-        """Wait for what is still to be done of an image that failed, and give all memory back."""
+        """After a failure: wait for the rest of that image, and give all memory back."""
         with suppress(self._cl.Error):
             self._queue.finish()
         with suppress(self._cl.Error):
@@ -269,8 +229,8 @@ class Device:
             event.wait()  # or the event would hold the copy until the image is done
         return event
 
-    def _download(self, plan: Plan, extent: Extent, output: Output) -> Iterator[Any]:
-        """Bring the core of a tile into the whole images."""
+    def _download(self, plan: Plan, extent: Extent, output: HostImages) -> Iterator[Any]:
+        """Copy the core of a tile into the whole images."""
         core, stored, held = extent.core, extent.stored, self._pool.held
         if output.encoded is not None:
             channels = output.encoded.size // (extent.width * extent.height)
@@ -308,10 +268,10 @@ class Device:
                 rows = plane[: height * extent.pitch].reshape(height, extent.pitch)
                 part[..., channel] = rows[top : top + core.height, left : left + core.width]
 
-    def _find(self, output: Output) -> Iterator[Any]:
-        """Bring what was found in the image."""
-        for step, values in output.found.items():
-            yield self._cl.enqueue_copy(self._queue, values, self._pool.held[f"found.{step}"])
+    def _download_estimates(self, output: HostImages) -> Iterator[Any]:
+        """Copy the numbers that stages estimated from the image."""
+        for step, values in output.estimates.items():
+            yield self._cl.enqueue_copy(self._queue, values, self._pool.held[f"estimates.{step}"])
 
     def copy_speed(self, size: int = 96 * 2**20) -> float:
         """Bytes a second, read plus written, of the device's own buffer copy; the best of five."""
@@ -328,12 +288,12 @@ class Device:
 
 
 def open_device(selector: str | None, memory: int | None = None) -> Device | None:
-    """The device that a selector names, as :func:`choose` has it; None for "numpy".
+    """Open the device that a selector names, see :func:`choose`; None stands for "numpy".
 
-    ``memory`` is how many bytes of it may be used.
+    ``memory`` is how many bytes its buffers may take.
 
     Raises:
-        DeviceError: there is none, none matches, or the one that was asked for cannot be used.
+        DeviceError: there is no device, none matches, or the one that matches cannot be used.
     """
     if selector is not None and selector.lower() == "numpy":
         return None
@@ -341,9 +301,9 @@ def open_device(selector: str | None, memory: int | None = None) -> Device | Non
 
 
 def open_devices(selectors: Sequence[str] = (), memory: int | None = None) -> list[Device]:
-    """The devices that selectors name, as :func:`choose_all` has them; none for "numpy".
+    """Open the devices that selectors name, see :func:`choose_all`; an empty list for "numpy".
 
-    ``memory`` is how many bytes may be used of each; without it, CPUs share what there is.
+    ``memory`` is how many bytes the buffers of each may take; without it, CPUs share what is free.
 
     Raises:
         DeviceError: as :func:`open_device`, or "numpy" stands beside others.
@@ -353,8 +313,8 @@ def open_devices(selectors: Sequence[str] = (), memory: int | None = None) -> li
             raise DeviceError(f"found devices {', '.join(selectors)}; numpy is used alone")
         return []
     chosen = choose_all(selectors, find_devices())
-    sharing = sum(found.type != "GPU" for found in chosen)
+    sharing = sum(info.type != "GPU" for info in chosen)
     return [
-        Device(found, memory or usable_memory(found) // (1 if found.type == "GPU" else sharing))
-        for found in chosen
+        Device(info, memory or usable_memory(info) // (1 if info.type == "GPU" else sharing))
+        for info in chosen
     ]

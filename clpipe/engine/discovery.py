@@ -1,4 +1,4 @@
-"""TODO."""
+"""The OpenCL devices of this machine, and which of them to use."""
 
 import os
 import shutil
@@ -9,13 +9,17 @@ from typing import Any
 from clpipe.base.errors import DeviceError
 from clpipe.base.memory import available_memory
 from clpipe.base.text import one_of
+from clpipe.engine.cache_folder import prepare_environment
 
-_process: int | None = None  # the one that has used OpenCL, of this and those before it
+_process: int | None = None  # the process id that first used OpenCL, here or before a fork
 
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """A device that an OpenCL platform offers. ``problem`` says why it cannot be used, if so."""
+    """A device that an OpenCL platform offers.
+
+    ``problem`` says why it cannot be used; it is empty where it can.
+    """
 
     index: int
     platform: str
@@ -49,6 +53,7 @@ def find_devices() -> list[DeviceInfo]:
             'be spawned (multiprocessing\'s "spawn" or "forkserver"), or fork before'
         )
     _process = os.getpid()
+    prepare_environment()
     try:
         import pyopencl as cl
     except (ImportError, OSError) as error:
@@ -117,13 +122,13 @@ def problem_with(type_: str, platform: str, device: Any) -> str:
 
 
 def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
-    """The device to use: the first usable GPU, else the first usable CPU, or what was asked for.
+    """The device to use: the one that a selector names, else the first usable GPU, else CPU.
 
     Args:
         selector: an index from ``clpipe devices``, or a part of a device's or platform's name.
 
     Raises:
-        DeviceError: there is none, none matches, or the one that was asked for cannot be used.
+        DeviceError: there is no device, none matches, or the one that matches cannot be used.
     """
     if not devices:
         raise DeviceError(
@@ -131,17 +136,17 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
             "GPU's driver), or use --device numpy, which is slow but needs none"
         )
     if selector is not None:
-        wanted = [
+        matching = [
             d
             for d in devices
             if (selector == str(d.index) if selector.isdecimal() else matches(selector, d))
         ]
-        if not wanted:
+        if not matching:
             names = [f"{d.index}: {d.label}" for d in devices]
             raise DeviceError(one_of("device", selector, [*names, "numpy"]))
-        usable = [d for d in wanted if not d.problem]
+        usable = [d for d in matching if not d.problem]
         if not usable:
-            raise DeviceError(f"device {wanted[0].label}: {wanted[0].problem}")
+            raise DeviceError(f"device {matching[0].label}: {matching[0].problem}")
         return usable[0]
     usable = [d for kind in ("GPU", "CPU") for d in devices if d.type == kind and not d.problem]
     if not usable:
@@ -151,10 +156,10 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
 
 
 def choose_all(selectors: Sequence[str], devices: list[DeviceInfo]) -> list[DeviceInfo]:
-    """The devices that selectors name, each as :func:`choose` has it, each device once.
+    """The devices that selectors name, each device once; each selector as in :func:`choose`.
 
-    Without selectors these are the one that is chosen by default and, if it is a GPU, all others of
-    the same name, which give the same bits.
+    Without selectors: the default device and, if it is a GPU, all other GPUs of the same name,
+    because these give the same bits.
 
     Raises:
         DeviceError: as :func:`choose`.
@@ -179,10 +184,10 @@ def matches(selector: str, device: DeviceInfo) -> bool:
 
 
 def usable_memory(chosen: DeviceInfo) -> int:
-    """Bytes that buffers on a device may take by default.
+    """How many bytes of buffers a device may hold by default.
 
-    Of a GPU's, a tenth is left to others. A CPU shares its memory with everybody: half of what is
-    available now.
+    That is nine tenths of a GPU's memory. A CPU shares its memory with all other programs, so
+    there it is half of what is available now.
     """
     if chosen.type == "GPU":
         return chosen.memory * 9 // 10

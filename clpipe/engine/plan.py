@@ -1,9 +1,9 @@
 """From a chain of stages to launches and buffer slots. Pure: it needs no device.
 
-Passes go into groups, and a group becomes one launch. A stencil opens a group, because its
-neighbours must be there first; pointwise passes join the group before them; sums and a kept
-intermediate close it. What crosses from one launch to the next is an image of one to three planes;
-a plane lives in a slot from the launch that writes it to the last one that reads it.
+Passes go into groups, and a group becomes one launch. A stencil opens a group, because the pixels
+around it must be stored first; pointwise passes join the group before them; sums and a kept image
+close it. Launches pass images of one to three planes to each other. A plane occupies a slot, a
+buffer on the device, from the launch that writes it to the last one that reads it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,9 +21,9 @@ class Op:
     """One pass of one step, with the types of its run-time arguments and its literals."""
 
     step: str
-    kernel: str  # file, in clpipe's own folder of kernels unless it is a whole path
+    kernel: str  # file, relative to the kernel folder; a plug-in's is an absolute path
     pass_: Pass
-    kind: Kind  # of what it gives
+    kind: Kind  # of the image that it writes
     types: tuple[tuple[str, str], ...]  # argument -> OpenCL type
     literals: tuple[tuple[str, str], ...]  # argument -> OpenCL text
 
@@ -38,7 +38,7 @@ class Image:
 
 @dataclass(frozen=True)
 class Read:
-    """An image as a launch reads it: passes in ``prologue`` are redone at each tap."""
+    """An image as a launch reads it: the passes of ``prologue`` are redone at each tap."""
 
     image: Image
     prologue: tuple[Op, ...] = ()
@@ -48,9 +48,9 @@ class Read:
 class Launch:
     """One kernel call over the image.
 
-    ``reads`` is empty where the launch reads the source; if the first op is a stencil they are
-    its images in order, else the one image that is loaded. ``writes`` is stored as planes,
-    ``encodes`` says that eight-bit pixels are written, ``sums`` is a SUMS pass fed on the way.
+    ``reads`` has the images of the stencil if the first op is one, else the one image that is
+    loaded; it is empty if the launch reads the source. ``writes`` is the image that is stored,
+    ``encodes`` whether eight-bit pixels are written, ``sums`` a SUMS pass over the result.
     """
 
     name: str
@@ -78,7 +78,7 @@ class Lines:
 
 @dataclass(frozen=True)
 class Histogram:
-    """A histogram's start: each work item counts its share of a stored image's rows."""
+    """The first part of a histogram: each work item counts some of a stored image's rows."""
 
     op: Op
     reads: tuple[Read]
@@ -87,7 +87,7 @@ class Histogram:
 
 @dataclass(frozen=True)
 class Reduce:
-    """A reduction goes on: sums of blocks to sums of work items, or counts to one histogram."""
+    """The second part of a reduction: block sums to partial sums, or counts to one histogram."""
 
     op: Op
     name: str
@@ -95,7 +95,7 @@ class Reduce:
 
 @dataclass(frozen=True)
 class Finalize:
-    """The end of a reduction: one work item makes the numbers out of the sums or the histogram."""
+    """The end of a reduction: one work item makes estimates from the sums or the histogram."""
 
     op: Op
     name: str
@@ -111,7 +111,7 @@ def reads_of(launch: AnyLaunch) -> tuple[Read, ...]:
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything that is to be done to one image, in order."""
+    """The launches that develop one image, in order, and the slots of its planes."""
 
     source: Kind
     half: bool
@@ -132,7 +132,7 @@ class Plan:
         return hash((self.source, self.half, self.launches, self.kept, self.final, self.encoded))
 
     def bytes_per_pixel(self, lanes: int) -> float:
-        """Device memory a pixel takes: source, slots, partial sums and eight-bit result."""
+        """Bytes of device memory per pixel: source, slots, block sums and eight-bit result."""
         source = len(self.source.channels) * (2 if self.half else 4)
         sums = [x for x in self.launches if isinstance(x, Launch) and x.sums]
         encoded = len(self.encoded.channels) if self.encoded else 0
@@ -148,9 +148,13 @@ class _Planner:
         self.images: list[Image] = []
         self.group: Launch | None = Launch("load", ())  # open, still to be stored
         self.stored: Image | None = None  # the current image, when no group is open
+        # Where the current image was kept, how a stencil reads it all the same; and the image that
+        # only keeping has stored, in the midst of a group.
+        self.folded: Read | None = None
+        self.split: Image | None = None
 
     def close(self, sums: Op | None = None) -> Image:
-        """End the open group and store its result; the stored current image if none is open."""
+        """End the open group and store its result. Without an open group the image is stored."""
         if self.group is None:
             assert self.stored is not None
             if not sums:
@@ -181,14 +185,35 @@ class _Planner:
         rows = 4 if shared else 2
         self.launches.append(replace(group, name=name, rows=rows, columns=max(block, 1)))
 
+    def keep(self) -> Image:
+        """Store the current image because it is wanted.
+
+        Stencils after it read what they would read otherwise, so they are the same kernels.
+        """
+        folded, is_open = self.foldable(), self.group is not None
+        image = self.close()
+        self.folded = folded
+        if is_open and not folded:
+            self.split = image
+        return image
+
+    def foldable(self) -> Read | None:
+        """The current image as cheap pointwise passes on a stored one, if it is that."""
+        group = self.group
+        if not (self.fold and group and group.reads) or group.stencil:
+            return self.folded
+        cheap = all(op.pass_.cheap for op in group.ops)
+        read = Read(group.reads[0].image, group.ops)
+        return read if cheap and read.image is not self.split else None
+
     def input_of_stencil(self) -> Read:
         """The current image for a stencil: cheap pointwise passes on a stored one are redone."""
-        group = self.group
-        loaded = group and group.reads and not group.stencil
-        if group and loaded and self.fold and all(op.pass_.cheap for op in group.ops):
-            self.group, self.stored = None, group.reads[0].image
-            return Read(group.reads[0].image, group.ops)
-        return Read(self.close())
+        read = self.foldable()
+        if read is None:
+            return Read(self.close())
+        if self.group:
+            self.group, self.stored = None, read.image
+        return read
 
     def add_step(self, ops: Sequence[Op]) -> None:
         local: dict[str, Read] = {}
@@ -203,11 +228,13 @@ class _Planner:
                     continue
                 case Access.SUMS:
                     self.close(sums=op)
+                    self.split = None
                     self.launches.append(Reduce(op, f"{op.step}.add_up"))
                     self.launches.append(Finalize(op, f"{op.step}.{pass_.finish}"))
                     continue
                 case Access.HISTOGRAM:
                     stored = Read(self.close())
+                    self.split = None
                     self.launches.append(Histogram(op, (stored,), f"{op.step}.count"))
                     self.launches.append(Reduce(op, f"{op.step}.add_up"))
                     self.launches.append(Finalize(op, f"{op.step}.{pass_.finish}"))
@@ -221,13 +248,14 @@ class _Planner:
                         assert self.stored is not None
                         self.group = Launch("", (), (Read(self.stored),))
                     self.group = replace(self.group, ops=(*self.group.ops, op))
+            self.folded = None
             self.kind, written = op.kind, pass_.writes
 
 
 def ops_of(step: Step, arguments: Mapping[str, Argument]) -> tuple[Op, ...]:
     """The passes of a step with the types of its arguments, which decide the kernels' signatures.
 
-    Two chains whose steps have the same names and the same of these have the same plan.
+    Chains whose steps have the same names and the same ops have the same plan.
     """
     passes = step.method.passes()
     if not passes:
@@ -258,16 +286,16 @@ def make_plan(
     """The plan of a chain.
 
     Args:
-        half: the source holds half floats, not floats.
-        keep: steps whose image is wanted.
-        encode: the last image is wanted in eight bits.
-        final: the last image is wanted in float. If it is not wanted at all, the plan ends with
-            the last step to keep.
-        fold: let a stencil redo cheap passes at its taps. It must be off for images one pixel
-            wide or high: mirroring cannot keep the Bayer phase there.
+        half: whether the source holds half floats, not floats.
+        keep: steps whose image is returned.
+        encode: whether the last image is returned in eight bits.
+        final: whether the last image is returned in float. Without either, the plan ends with the
+            last step to keep.
+        fold: whether a stencil redoes cheap passes at its taps. It must not for images one pixel
+            wide or high, where mirroring changes the Bayer phase.
 
     Raises:
-        RequestError: a step to keep that the chain has not.
+        RequestError: the chain has no such step to keep.
     """
     for name in keep:
         chain.step_named(name)
@@ -280,7 +308,7 @@ def make_plan(
     for step in chain.steps:
         planner.add_step(ops_of(step, step.method.arguments(step.context)))
         if step.name in keep and step.name != last:
-            kept[step.name] = planner.close()
+            kept[step.name] = planner.keep()
     group = planner.group or Launch("encode", (), (Read(planner.close()),))
     final_image = None
     if final:
@@ -313,9 +341,15 @@ def make_plan(
 def assign_slots(
     launches: Sequence[AnyLaunch], images: Sequence[Image], pinned: set[int]
 ) -> tuple[dict[int, tuple[int, ...]], int]:
-    """Slots for the planes of every image, by last use; those of ``pinned`` are never reused.
+    """Slots for the planes of every image, by liveness.
 
-    Returns the slots of each image number, and how many slots there are.
+    Args:
+        launches: in order.
+        images: that they write.
+        pinned: numbers of images whose slots are never reused, since they are results.
+
+    Returns:
+        The slots of each image, by its number, and how many slots there are.
     """
     last_use = {
         read.image.number: i for i, launch in enumerate(launches) for read in reads_of(launch)
@@ -338,7 +372,7 @@ def assign_slots(
 
 
 def launch_bytes(plan: Plan, launch: AnyLaunch, lanes: int) -> float:
-    """Bytes a pixel that a launch reads and writes in device memory, each sample once."""
+    """Bytes per pixel that a launch reads and writes in device memory, each sample once."""
     if isinstance(launch, Reduce) and launch.op.pass_.access is Access.SUMS:
         return 16 / (lanes * 4)
     total = float(sum(4 * len(read.image.kind.channels) for read in reads_of(launch)))

@@ -1,6 +1,7 @@
 """One image through a chain, on a device or in NumPy."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,7 @@ from clpipe.chain.registry import user_code_errors
 from clpipe.engine.codegen import Parameter
 from clpipe.engine.device import Device, Timing
 from clpipe.engine.plan import Finalize, Plan, make_plan, ops_of
+from clpipe.engine.programs import announced
 from clpipe.reference.curve import compose, to_8_bit
 from clpipe.reference.random import Stream, stream_of
 from clpipe.stage import Frame, NoiseScope
@@ -20,23 +22,36 @@ from clpipe.stage import Frame, NoiseScope
 
 @dataclass(frozen=True)
 class Result:
-    """What came out of a chain.
+    """The images that one image became in a chain.
 
-    ``final`` is the last image in float32, ``encoded`` the same in eight bits, ``kept`` the images
-    of the steps that were asked for, ``found`` what stages found in the image.
+    ``final`` is the last image in float32, ``encoded`` the same in eight bits; both are (height,
+    width[, channel]), and None where not requested. ``kept`` has the images of the steps to keep,
+    float32, by step. ``estimates`` has the numbers that stages estimated from the image, such as
+    gains, by step and name.
     """
 
     final: Floats | None
     encoded: Array | None
     kept: dict[str, Floats]
-    found: dict[str, dict[str, float]]
+    estimates: dict[str, dict[str, float]]
 
     @property
     def image(self) -> Array:
-        """The last image: in eight bits where these were asked for, else in float."""
+        """The last image: in eight bits if the chain ends in display values, else in float."""
         image = self.final if self.encoded is None else self.encoded
         assert image is not None
         return image
+
+    def __repr__(self) -> str:
+        shapes = {"final": self.final, "encoded": self.encoded, **self.kept}
+        parts = [f"{k}: {v.shape} {v.dtype}" for k, v in shapes.items() if v is not None]
+        return f"Result({', '.join(parts)})"
+
+    def _repr_png_(self) -> bytes | None:
+        """The last image as notebooks show it."""
+        from clpipe.images.preview import png_bytes
+
+        return None if self.final is None and self.encoded is None else png_bytes(self.image)
 
 
 def streams(chain: Chain, step: Step, image_key: str) -> dict[NoiseScope, Stream]:
@@ -51,14 +66,14 @@ def streams(chain: Chain, step: Step, image_key: str) -> dict[NoiseScope, Stream
 
 
 class Runner:
-    """Runs one chain over images, on a device, or in NumPy where there is none.
+    """Runs one chain over images, on a device or in NumPy.
 
     Args:
         chain: the chain.
         device: where to run; None is NumPy.
-        keep: steps whose image is wanted.
-        encode: whether the last image is wanted in eight bits.
-        final: whether the last image is wanted in float.
+        keep: steps whose image is returned.
+        encode: whether the last image is returned in eight bits.
+        final: whether the last image is returned in float.
     """
 
     def __init__(
@@ -76,14 +91,14 @@ class Runner:
         self.final = final
         self._arguments = {s.name: s.method.arguments(s.context) for s in chain.steps}
         self._own_plans: dict[tuple[bool, bool], Plan] = {}
-        # Those that runners of other chains have made too, by the structure of a chain.
+        # Shared with the runners of other chains, by a chain's structure.
         self._plans: dict[Any, Plan] = {}
         self._tables: dict[Any, tuple[Sequence[Array], Array]] = {}
 
     def of(self, chain: Chain) -> "Runner":
-        """The same for another chain.
+        """A runner for another chain that shares plans and tables with this one.
 
-        Where only values are different, nothing is planned or compiled again.
+        A chain that differs in run-time values alone is neither planned nor compiled again.
         """
         other = Runner(chain, self.device, self.keep, self.encode, self.final)
         other._plans, other._tables = self._plans, self._tables
@@ -105,8 +120,19 @@ class Runner:
     def warm_up(self, half: bool = True) -> None:
         """Compile everything, so that the first image does not wait for it."""
         if self.device:
+            self._make_ready(self.plan(half))
+
+    def _make_ready(self, plan: Plan) -> None:
+        """Compile the kernels of a plan, by running it on a tiny image.
+
+        PoCL compiles a kernel again when it is first launched.
+        """
+        assert self.device
+        if not self.device.is_ready(plan):
             shape = (8, 8, 3)[: 2 if len(self.chain.source.channels) == 1 else 3]
-            self.run(np.zeros(shape, np.float16 if half else np.float32), "")
+            tiny = np.zeros(shape, np.float16 if plan.half else np.float32)
+            with announced(self.device.info):
+                self._run_plan(plan, tiny, "")
 
     def run(
         self,
@@ -121,11 +147,11 @@ class Runner:
         Args:
             image: (height, width, 3) linear RGB, or (height, width) for a chain that starts on a
                 mosaic; finite, of float16 or any type that fits into float32.
-            image_key: what the image's noise is keyed on.
-            timings: is given one entry a launch (devices only).
-            download: False leaves the results on the device (for measuring).
-            into: where the eight-bit pixels are put (devices only), of their shape; a batch that
-                uses its arrays again spares the time that new memory takes.
+            image_key: the key of the image's noise.
+            timings: one entry a launch and transfer is appended (devices only).
+            download: False leaves the results on the device, for measuring.
+            into: an array to use for the eight-bit pixels (devices only), of their shape; a used
+                one saves the time that new memory takes.
 
         Raises:
             ImageError: an image of the wrong shape, or one that does not fit the device.
@@ -142,6 +168,21 @@ class Runner:
         if not self.device:
             return self._run_numpy(np.asarray(image, np.float32), image_key)
         plan = self.plan(image.dtype == np.float16, fold=min(image.shape[:2]) > 1)
+        with suppress(ImageError):  # of the tiny image; the one below says it of this image
+            self._make_ready(plan)
+        return self._run_plan(plan, image, image_key, timings, download, into)
+
+    def _run_plan(
+        self,
+        plan: Plan,
+        image: Array,
+        image_key: str,
+        timings: list[Timing] | None = None,
+        download: bool = True,
+        into: Array | None = None,
+    ) -> Result:
+        """Put an image through a plan on the device; arguments as for :meth:`run`."""
+        assert self.device
         keys: dict[str, dict[NoiseScope, Stream]] = {}
 
         def bind(parameter: Parameter) -> Any:
@@ -159,14 +200,14 @@ class Runner:
             return np.uint32(stream.key1 if parameter.item.endswith("1") else stream.key0)
 
         output = self.device.run(plan, image, bind, timings, download, into)
-        names = {x.op.step: x.op.pass_.found for x in plan.launches if isinstance(x, Finalize)}
+        names = {x.op.step: x.op.pass_.estimates for x in plan.launches if isinstance(x, Finalize)}
         return Result(
             final=output.images.get(plan.final.number) if plan.final else None,
             encoded=output.encoded,
             kept={name: output.images[i.number] for name, i in plan.kept if output.images},
-            found={
+            estimates={
                 step: dict(zip(names[step], map(float, values), strict=False))
-                for step, values in output.found.items()
+                for step, values in output.estimates.items()
             },
         )
 
@@ -191,7 +232,7 @@ class Runner:
 
     def _run_numpy(self, image: Floats, image_key: str) -> Result:
         kept: dict[str, Floats] = {}
-        found: dict[str, dict[str, float]] = {}
+        estimates: dict[str, dict[str, float]] = {}
         whole = self.encode or self.final
         steps = (self.chain if whole else self.chain.through(self.keep)).steps
         for step in steps:
@@ -200,11 +241,11 @@ class Runner:
                 image = step.method.reference(image, frame)
             if step.name in self.keep:
                 kept[step.name] = image
-            if frame.found:
-                found[step.name] = frame.found
+            if frame.estimates:
+                estimates[step.name] = frame.estimates
         return Result(
             final=image if self.final or steps[-1].name in self.keep else None,
             encoded=to_8_bit(image) if self.encode else None,
             kept=kept,
-            found=found,
+            estimates=estimates,
         )

@@ -1,4 +1,4 @@
-"""TODO."""
+"""The kernel files: where they are, and their text with includes in place."""
 
 import re
 from collections.abc import Sequence
@@ -24,21 +24,23 @@ LIBRARY = (
 
 @cache
 def kernel_folder() -> Path:
-    """Where the kernel files are: in the package, or beside it in a checkout."""
+    """The folder of the kernel files: inside the package, or beside it in a checkout."""
     packaged = Path(str(resources.files("clpipe") / "kernels"))
     return packaged if packaged.is_dir() else Path(__file__).resolve().parents[2] / "kernels"
 
 
 def file_text(name: str, seen: set[str]) -> str:
-    """A kernel file with its includes in place, each file once.
+    """The text of a kernel file with its includes in place.
 
-    A stage of somebody else's has its kernels by whole paths; what they include is looked for
-    beside them, then among clpipe's own.
+    Args:
+        name: the file, relative to the kernel folder; a plug-in's file by its absolute path. A
+            plug-in's includes are looked up beside its file, then in the kernel folder.
+        seen: the files that the source has already, which are left out; this one is added.
     """
     if name in seen:
         return ""
     seen.add(name)
-    path = kernel_folder() / name  # a whole path stays what it is
+    path = kernel_folder() / name  # an absolute path stays as it is
     text = path.read_text()
     label = name if Path(name).is_absolute() else f"kernels/{name}"
 
@@ -53,5 +55,5 @@ def file_text(name: str, seen: set[str]) -> str:
 
 
 def files_text(names: Sequence[str], seen: set[str]) -> str:
-    """These kernel files, each once, one after the other."""
+    """The text of several kernel files; arguments as for :func:`file_text`."""
     return "".join(file_text(name, seen) for name in names)

@@ -1,7 +1,7 @@
 """An image on a device, whole or in tiles: where its planes begin, and what memory they take. Pure.
 
-A tile is a core, which it is there for, and a halo around it, from which stencils read. Cores
-begin with whole blocks of lanes and of four rows, so a pixel stands at the same place of a work
+A tile is a core, the part of the result that it makes, with a halo around it for stencils to read.
+Cores begin with whole blocks of lanes and of four rows, so a pixel has the same place in its work
 item as in the whole image: its noise, its CFA phase and its arithmetic are the same, bit for bit.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError
 from clpipe.base.memory import in_words
-from clpipe.engine.codegen import SHARES, border_left, round_up
+from clpipe.engine.codegen import PARTIALS, border_left, round_up
 from clpipe.engine.plan import (
     AnyLaunch,
     Finalize,
@@ -79,27 +79,27 @@ class Extent:
 
     @property
     def padded_width(self) -> int:
-        """That of the planes, in whole blocks."""
+        """The width of the planes, in whole blocks."""
         return round_up(self.stored.width, self.lanes)
 
     @property
     def padded_height(self) -> int:
-        """That of the planes, in whole blocks of four rows."""
+        """The height of the planes, in whole blocks of four rows."""
         return round_up(self.stored.height, 4)
 
     @property
     def blocks(self) -> int:
-        """How many blocks of lanes and four rows there are, each with sums of its own."""
+        """The number of blocks of lanes and four rows, each of which has sums of its own."""
         return self.padded_width // self.lanes * (self.padded_height // 4)
 
     @property
     def plane_bytes(self) -> int:
-        """The size of a plane with its border; the last block's loads may run over by its width."""
+        """The bytes of a plane with its border, and a margin that the last block's loads need."""
         return ((self.padded_height + 2 * self.border) * self.pitch + 5 * self.lanes) * 4
 
     @cached_property
     def numbers(self) -> dict[str, np.uint32]:
-        """What kernels are told of it, by the names of their parameters."""
+        """The values of the kernel parameters that describe it, by name."""
         core = {f"core_{side}": value for side, value in vars(self.core).items()}
         numbers = {
             "width": self.width,
@@ -109,6 +109,7 @@ class Extent:
             "top": self.stored.top // 4,
             "columns": self.stored.width,
             "rows": self.stored.height,
+            "border": self.border,
             "blocks": self.blocks,
             **core,
         }
@@ -130,13 +131,13 @@ def buffer_sizes(plan: Plan, extent: Extent) -> dict[str, int]:
             case Lines(ops=ops):
                 sizes |= {f"lines.{op.step}": longest * 4 for op in ops}
             case Launch(sums=sums) if sums:
-                sizes |= {"sums": extent.blocks * 16, "shares": SHARES * 32}
+                sizes |= {"sums": extent.blocks * 16, "partials": PARTIALS * 32}
             case Histogram(op=op):
                 bins = op.pass_.bins
-                sizes["counts"] = max(sizes.get("counts", 0), SHARES * bins * 4)
+                sizes["counts"] = max(sizes.get("counts", 0), PARTIALS * bins * 4)
                 sizes["histogram"] = max(sizes.get("histogram", 0), bins * 4)
             case Finalize(op=op):
-                sizes[f"found.{op.step}"] = 16
+                sizes[f"estimates.{op.step}"] = 16
     return sizes
 
 
@@ -164,10 +165,10 @@ class Tiling:
 
 
 def phases_of(plan: Plan) -> tuple[Phase, ...]:
-    """The phases in which tiles go through a plan.
+    """The phases in which tiles go through a plan, one for each pass over all tiles.
 
-    What is found in the whole image stands between two phases: each but the last goes, over all
-    tiles, as far as one reduction, and the next begins again at the source.
+    A number that is estimated from the whole image ends a phase: each phase but the last goes, over
+    all tiles, as far as one reduction, and the next begins again at the source.
     """
     numbered = tuple(enumerate(plan.launches))
     lines = tuple(i for i, launch in numbered if isinstance(launch, Lines))
@@ -189,14 +190,14 @@ def phases_of(plan: Plan) -> tuple[Phase, ...]:
 
 
 def reduction_of(launch: AnyLaunch) -> Op | None:
-    """The reduction that a launch takes part in, before its end."""
+    """The reduction that a launch is a part of, but for the reduction's end."""
     if isinstance(launch, Launch):
         return launch.sums
     return launch.op if isinstance(launch, Histogram | Reduce) else None
 
 
 def leading_to(plan: Plan, ends: set[int]) -> tuple[int, ...]:
-    """These launches, and those that write what they read."""
+    """These launches, and all that they depend on."""
     images: set[int] = set()
     chosen = []
     for number, launch in reversed(tuple(enumerate(plan.launches))):
@@ -208,7 +209,7 @@ def leading_to(plan: Plan, ends: set[int]) -> tuple[int, ...]:
 
 
 def halo_of(plan: Plan) -> int:
-    """How far around a pixel the source is read, through all stencils after one another."""
+    """How many pixels around each the source is read, through all stencils in a row."""
     reach: dict[int, int] = {}  # around each image that is stored
     source = 0
     for launch in reversed(plan.launches):
@@ -225,17 +226,17 @@ def halo_of(plan: Plan) -> int:
 
 @lru_cache(maxsize=64)
 def tiling_of(plan: Plan, width: int, height: int, lanes: int, memory: int, largest: int) -> Tiling:
-    """How an image goes through a plan in that much memory: whole where it fits, else in tiles.
+    """How an image goes through a plan in limited memory: whole if it fits, else in tiles.
 
-    Of the divisions that fit, it is the one in which the halos are the smallest share, and of those
-    that differ by less than 2 % the one into the fewest columns of tiles: full rows are
-    transferred in one piece.
+    Of the divisions that fit, the one with the smallest share of halos is chosen. Among those that
+    differ by less than 2 %, it is the one into the fewest columns, since full rows are transferred
+    in one piece.
 
     Args:
         width: of the image, and its height, in pixels.
         lanes: of the device.
-        memory: bytes that all buffers may take.
-        largest: bytes that one buffer may take.
+        memory: bytes that all buffers together may take.
+        largest: bytes that a single buffer may take.
 
     Raises:
         ImageError: not even the smallest tile fits; the message says what it needs.

@@ -1,4 +1,4 @@
-"""Which images a run is about: files, folders, globs and manifests, and their names."""
+"""Finds the images of a run in files, folders, globs and manifests, and names their outputs."""
 
 import glob
 import os
@@ -19,16 +19,21 @@ T = TypeVar("T")
 class Job:
     """One image to make pictures of.
 
-    ``key`` is its image key, ``name`` that of its outputs, without an ending. ``values`` are what
-    is said of it alone, nested as in a configuration; ``frames`` how many frames are made of it,
-    where that is said; ``place`` where all this is said. ``pictures`` are those of them to make, by
-    what stands behind the name; None is all.
+    Args:
+        path: the file.
+        key: its image key.
+        name: the path of its outputs in the output folder, without an ending; "" follows the key.
+        listed: whether it was named, matched or in a manifest, and not found in a folder.
+        values: settings that hold for it alone, nested as in a configuration.
+        frames: how many frames are made of it; None is what the request says.
+        place: the manifest and the row that it stands in; "" where it is in none.
+        pictures: names of the renditions to make; None is all.
     """
 
     path: Path
     key: str
     name: str = ""
-    listed: bool = True  # by name, glob or manifest; otherwise found in a folder
+    listed: bool = True
     values: Mapping[str, Any] = field(default_factory=dict)
     frames: int | None = None
     place: str = ""
@@ -39,17 +44,25 @@ class Job:
         """The path of its outputs in the output folder, without an ending."""
         return self.name or str(Path(self.key).with_suffix(""))
 
+    @property
+    def label(self) -> str:
+        """The job as an error names it."""
+        return f"{self.path} ({self.place})" if self.place else str(self.path)
+
 
 def find_jobs(
     inputs: Sequence[str], output: Path, endings: Sequence[str] = (*RENDER_SUFFIXES, *RAW_SUFFIXES)
 ) -> list[Job]:
-    """The images that inputs name: files, folders (all images in them, at any depth), globs and
-    manifests.
+    """The jobs of a run, in the order of its inputs.
 
-    The image key of a file in a folder is its path relative to that folder, that of a file given
-    by name or found by a glob is its name; a manifest's rows have their own. A file that does not
-    exist is a job too: it fails later, alone. Where the output folder lies inside an input folder,
-    what is in it is no input.
+    The image key of a file in a folder is its path relative to that folder; that of a file which is
+    named or matches a glob is its name; a manifest's rows have their own. A missing file is a job,
+    too: it fails later, alone.
+
+    Args:
+        inputs: files, folders (all images in them, at any depth), globs and manifests.
+        output: the output folder; where it lies inside an input folder, its files are no inputs.
+        endings: of the files that are taken from folders.
 
     Raises:
         RequestError: no input, an empty name, a folder without images, a glob that no file matches,
@@ -85,35 +98,36 @@ def find_jobs(
 
 
 def images_in(folder: Path, output: Path, endings: Sequence[str]) -> list[Path]:
-    """The files in a folder at any depth that end so, sorted; hidden ones and a folder in it that
-    is the output aside, links followed. A link that leads nowhere is one too: it fails later.
+    """The images in a folder at any depth, sorted; links are followed.
+
+    Hidden files and the output folder are left out. A link that leads nowhere is an image, too: it
+    fails later.
     """
-    found: list[Path] = []
-    seen: set[str] = set()
+    images: list[Path] = []
+    visited: set[str] = set()
     for place, folders, names in os.walk(folder, followlinks=True):
         real = os.path.realpath(place)
-        led_back = real in seen
-        if led_back or (seen and real == os.path.realpath(output)):
+        if real in visited or (visited and real == os.path.realpath(output)):
             folders.clear()
             continue
-        seen.add(real)
-        found += [
+        visited.add(real)
+        images += [
             Path(place, n)
             for n in names
             if not n.startswith(".") and os.path.splitext(n)[1].lower() in endings
         ]
-    return sorted(p for p in found if p.is_file() or p.is_symlink())
+    return sorted(p for p in images if p.is_file() or p.is_symlink())
 
 
 @dataclass(frozen=True)
 class Shard:
-    """One part of several of a run: every ``of``-th job or tar, from the ``number``-th (from 1)."""
+    """One part of a run: every ``of``-th job or tar, from the ``number``-th on, counted from 1."""
 
     number: int = 1
     of: int = 1
 
     def take(self, jobs: Sequence[T]) -> list[T]:
-        """Those that are its own.
+        """The items of this part.
 
         >>> [job.key for job in Shard(2, 3).take([Job(Path(k), k) for k in "abcde"])]
         ['b', 'e']

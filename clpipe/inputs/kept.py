@@ -1,7 +1,10 @@
-"""Going on from a kept image, or from a mosaic of somebody else's."""
+"""Kept images: the attributes that they carry, and how one enters the chain again.
+
+A mosaic from elsewhere enters in the same way, without attributes.
+"""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,41 +12,32 @@ from clpipe.base.errors import ImageError, KindError, RequestError
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
+from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings, settings_from
 from clpipe.images.attributes import read_attributes
 from clpipe.images.read import SourceImage
-from clpipe.stage import Kind
+from clpipe.inputs.plausibility import input_warnings
 
-NOISE = "sensor_noise"  # the attribute of an image that says "none", where others have some
+NOISE = "sensor_noise"  # the attribute of an image without sensor noise; its value is "none"
 
 
 def attributes_of(step: Step, chain: Chain, image_key: str) -> dict[str, str]:
-    """What a kept image says of itself, so that a chain can go on with it."""
-    noisy = step.method.after(step.context).noise is not None
+    """The attributes of the kept image of a step, with which a chain can go on from it."""
+    is_noisy = step.method.after(step.context).noise is not None
     return {
         "stage": step.name,
         "kind": step.stage.writes.label,
         "image_key": image_key,
         "settings": json.dumps(chain.settings.record()),
-        **({} if noisy else {NOISE: "none"}),
+        **({} if is_noisy else {NOISE: "none"}),
     }
 
 
-def without_noise(chain: Chain) -> Chain:
-    """The chain for an image without sensor noise: it has what the chain's own steps add."""
-    steps: list[Step] = []
-    noise = None
-    for step in chain.steps:
-        steps.append(replace(step, context=replace(step.context, noise=noise)))
-        noise = step.method.after(steps[-1].context).noise
-    return replace(chain, steps=tuple(steps))
-
-
 def carried_settings(attributes: Mapping[str, str]) -> Settings | None:
-    """The settings that a kept image was made with; None where it says nothing of them.
+    """The settings that a kept image was made with; None where it has no such attribute.
 
     Raises:
-        RequestError: they are damaged, or name what there is not.
+        RequestError: they are damaged, or hold a name or value that is not allowed.
     """
     if "settings" not in attributes:
         return None
@@ -62,104 +56,99 @@ def carried_settings(attributes: Mapping[str, str]) -> Settings | None:
 
 @dataclass(frozen=True)
 class KeptLoader:
-    """Going on with kept images: how to make the chain, given the settings that one carries."""
+    """How a kept image enters the chain of a request that has ``start_at``."""
 
-    start_at: str
-    make: Callable[[Settings | None], Chain]
+    request: Request
+
+    @property
+    def start_at(self) -> str:
+        """The step that it enters at."""
+        assert self.request.start_at is not None
+        return self.request.start_at
 
     def first_chain(self, path: Path) -> Chain:
-        """The chain for the first image, from which it is seen early whether the request is right.
+        """The chain of the first image, read early so that a wrong request is refused early.
 
         Raises:
-            RequestError: it is not.
+            RequestError: it cannot be made.
         """
         try:
-            return self.make(carried_settings(read_attributes(path)))
+            return self._chain(self.request, carried_settings(read_attributes(path)))
         except RequestError:
-            return self.make(None)
+            return self._chain(self.request, None)
 
-    def chain_for(self, path: Path, attributes: Mapping[str, str]) -> Chain:
-        """The chain for one image, by what it says of itself.
+    def enter(
+        self, path: Path, source: SourceImage, key: str, is_listed: bool
+    ) -> tuple[Chain, SourceImage, str] | None:
+        """The chain for an image, the image with its warnings, and its image key.
+
+        None where the image was found in a folder, and was kept after another step than the one
+        before ``start_at``.
+
+        Args:
+            path: of the image, for messages.
+            source: the image.
+            key: the image key, where the image does not carry one.
+            is_listed: whether the image was named, and not found in a folder.
 
         Raises:
-            ImageError: what it says is of no use.
+            ImageError: the settings that it carries cannot be used.
+            KindError: it is of another kind than the step reads.
         """
+        key = source.attributes.get("image_key", key)
+        request = self.request.for_image(key, self.request.image)  # the same is drawn for it
+        chain = self._chain_for(request, path, source.attributes)
+        warnings = list(source.warnings)
+        if not self._is_next(chain, source.attributes):
+            if not is_listed:
+                return None
+            warnings.append(
+                f"was kept after {source.attributes.get('stage')}; "
+                f"entering at {self.start_at} repeats stages or leaves some out"
+            )
+        if source.attributes.get("kind", chain.source.label) != chain.source.label:
+            raise KindError(path, source.attributes)
+        warnings += input_warnings(source, chain)
+        return chain, replace(source, warnings=tuple(warnings)), key
+
+    def _chain_for(self, request: Request, path: Path, attributes: Mapping[str, str]) -> Chain:
         try:
-            chain = self.make(carried_settings(attributes))
+            chain = self._chain(request, carried_settings(attributes))
         except RequestError as error:
             raise ImageError(f"{path}: what it was made with cannot be used: {error}") from None
-        return without_noise(chain) if attributes.get(NOISE) == "none" else chain
+        return _without_input_noise(chain) if attributes.get(NOISE) == "none" else chain
 
-    def check_kind(self, path: Path, chain: Chain, attributes: Mapping[str, str]) -> None:
-        """See that an image is of the kind that the first step reads.
+    @staticmethod
+    def _chain(request: Request, carried: Settings | None) -> Chain:
+        """The chain of a request; a configuration that is named replaces what an image carries."""
+        return request.chain(carried if request.config is None else None)
 
-        Raises:
-            KindError: it is not.
-        """
-        kind = attributes.get("kind", chain.source.label)
-        if kind != chain.source.label:
-            raise KindError(path, attributes)
-
-    def is_next(self, chain: Chain, attributes: Mapping[str, str]) -> bool:
-        """Whether an image was kept right before the step to start at, as far as it says."""
+    def _is_next(self, chain: Chain, attributes: Mapping[str, str]) -> bool:
+        """Whether an image was kept right before ``start_at``, as far as it says."""
         before = chain.names.index(self.start_at) - 1
         return attributes.get("stage") in (None, chain.names[before] if before >= 0 else None)
 
 
-def misplaced(error: KindError, chain: Chain, reentry: KeptLoader | None) -> str:
-    """What to say of a kept image that has not the channels that are wanted."""
-    reads = f", but {reentry.start_at} reads {chain.source.label}" if reentry else ""
-    return f"{error}{reads}; {entries_of(error.attributes['kind'], chain)}"
+def _without_input_noise(chain: Chain) -> Chain:
+    """The chain for an image without sensor noise: only its own steps add any."""
+    steps: list[Step] = []
+    noise = None
+    for step in chain.steps:
+        steps.append(replace(step, context=replace(step.context, noise=noise)))
+        noise = step.method.after(steps[-1].context).noise
+    return replace(chain, steps=tuple(steps))
 
 
-def entries_of(kind: str, chain: Chain) -> str:
-    """Where an image of a kind can enter a chain."""
+def kind_message(error: KindError, chain: Chain, start_at: str | None) -> str:
+    """The message for a kept image of the wrong kind: what is read, and where it could enter."""
+    reads = f", but {start_at} reads {chain.source.label}" if start_at else ""
+    return f"{error}{reads}; {_entries_of(error.attributes['kind'], chain)}"
+
+
+def _entries_of(kind: str, chain: Chain) -> str:
+    """Where an image of a kind can enter a chain, in words."""
     stages = {name: all_stages()[base_name(name)] for name in chain.names}
     names = [name for name, stage in stages.items() if stage.reads.label == kind]
     if not names:
         return f"no stage of the chain reads {kind}"
     return f"{kind} can enter with --start-at {' or '.join(names)}"
-
-
-def brightness_warnings(source: SourceImage, chain: Chain) -> list[str]:
-    """What looks wrong with the values of an image that enters."""
-    first = chain.steps[0].method
-    brightest = float(source.pixels.max())
-    found: list[str] = []
-    black = getattr(first, "black_level", None)
-    if chain.source is Kind.RAW and black is not None and brightest <= black:
-        found.append(
-            f"its largest sample is {brightest:g}, not above the black level of {black:g} DN"
-        )
-    if chain.source is Kind.MOSAIC and brightest > 16:
-        found.append(
-            f"its largest sample is {brightest:g}, but 1 is the white level here; "
-            "a raw in DN enters with --start-at normalize"
-        )
-    return found
-
-
-def input_warnings(source: SourceImage, chain: Chain) -> list[str]:
-    """What looks wrong with an image that enters, and what was taken for what it does not say."""
-    found = brightness_warnings(source, chain)
-    if "settings" in source.attributes:
-        return found
-    first = chain.steps[0].method
-    black = getattr(first, "black_level", None)
-    if chain.settings.iso == Settings().iso and any(s.stage.name == "denoise" for s in chain.steps):
-        found.append(f"it does not say its ISO; {chain.settings.iso:g} is taken (--iso)")
-    if chain.source in (Kind.RAW, Kind.MOSAIC):
-        given = {
-            f"{step}.{name}" for step, table in chain.settings.parameters.items() for name in table
-        }
-        if "mosaic.pattern" not in given:
-            pattern = chain.steps[0].context.pattern
-            found.append(f"it does not say its pattern; {pattern} is taken (--set mosaic.pattern)")
-        levels = {"normalize.black_level", "normalize.white_level"}
-        if black is not None and not levels <= given:
-            white = getattr(first, "white_level", 1)
-            found.append(
-                f"it does not say its levels; black {black:g} and white {white:g} are taken "
-                "(--set normalize.black_level, normalize.white_level)"
-            )
-    return found

@@ -1,8 +1,9 @@
-"""How an image enters a chain: a render, a camera's raw, or a kept image of any stage."""
+"""How an image becomes pixels with a chain: a render, a camera raw or dump, or a kept image."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 from clpipe.base.errors import KindError
 from clpipe.chain.chain import Chain, entry
@@ -10,9 +11,16 @@ from clpipe.chain.methods import base_name, stage_named
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
 from clpipe.images.raw import RAW_SUFFIXES
-from clpipe.images.read import PICTURE_SUFFIXES, RENDER_SUFFIXES, ReadOptions, SourceImage
+from clpipe.images.read import (
+    PICTURE_SUFFIXES,
+    RENDER_SUFFIXES,
+    USUAL_MAX_PIXELS,
+    ReadOptions,
+    SourceImage,
+    read_source,
+)
 from clpipe.inputs.find import Job
-from clpipe.inputs.kept import KeptLoader, input_warnings, misplaced
+from clpipe.inputs.kept import KeptLoader, kind_message
 from clpipe.inputs.manifest import check_rows
 from clpipe.inputs.raw import RawImage, RawLoader
 from clpipe.stage import Kind
@@ -29,82 +37,77 @@ class LoadedImage:
 
 @dataclass(frozen=True)
 class ImageLoader:
-    """What is asked for, and how files are read."""
+    """Loads the images of a request."""
 
-    asked: Request
-    reading: ReadOptions = field(default_factory=ReadOptions)
+    request: Request
 
-    def of(self, job: Job) -> "ImageLoader":
-        """The same for one job, with what is said of it alone."""
-        if not job.values and not self.is_drawn:
+    def for_job(self, job: Job) -> "ImageLoader":
+        """The loader for one job; the same one where the job has no values of its own."""
+        if not job.values and not self.has_draws:
             return self
-        return replace(self, asked=self.asked.of(job.key, job.values))
+        return ImageLoader(self.request.for_image(job.key, job.values))
 
     @cached_property
     def settings(self) -> Settings:
-        """The settings that hold where an image brings none."""
-        return self.asked.settings()
+        """The settings of an image that carries none."""
+        return self.request.settings()
 
     @cached_property
-    def is_drawn(self) -> bool:
-        """Whether each image has settings of its own, some of them drawn at random."""
+    def has_draws(self) -> bool:
+        """Whether settings are drawn, so that each image has its own."""
         return bool(self.settings.draws)
 
     @cached_property
     def chain(self) -> Chain:
-        """The chain of an image that brings no settings."""
-        return self.asked.chain()
+        """The chain of an image that carries no settings."""
+        return self.request.chain()
 
     @cached_property
     def reads(self) -> Kind:
-        """The kind of image that is read; raws aside."""
-        start_at = self.asked.start_at
+        """The kind of image that is read, raws apart."""
+        start_at = self.request.start_at
         if start_at is None:
             return entry(self.settings)
         return stage_named("--start-at", base_name(start_at)).reads
 
     @property
-    def reentry(self) -> KeptLoader | None:
-        """How kept images enter, where that was asked for."""
-        asked = self.asked
-        return KeptLoader(asked.start_at, asked.chain) if asked.start_at is not None else None
+    def kept(self) -> KeptLoader | None:
+        """How kept images enter; None where images enter at the first step."""
+        return None if self.request.start_at is None else KeptLoader(self.request)
 
     @property
-    def raws(self) -> RawLoader:
-        """How raws enter."""
-        asked = self.asked
-        return RawLoader(asked.settings, asked.chain_of, asked.start_at, self.settings.dump)
+    def raw(self) -> RawLoader:
+        """How raws and dumps enter."""
+        return RawLoader(self.request, self.settings.dump)
 
     def endings(self) -> tuple[str, ...]:
-        """How the names of the files end that are taken from folders."""
-        if self.asked.start_at is None and self.reads is Kind.DISPLAY:
+        """The endings of the files that are taken from folders."""
+        if self.request.start_at is None and self.reads is Kind.DISPLAY:
             return PICTURE_SUFFIXES
-        return (
-            *RENDER_SUFFIXES,
-            *(PICTURE_SUFFIXES if self.reading.transfer else ()),
-            *RAW_SUFFIXES,
-        )
+        pictures = PICTURE_SUFFIXES if self.request.transfer else ()
+        return (*RENDER_SUFFIXES, *pictures, *RAW_SUFFIXES)
 
     def first_chain(self, jobs: Sequence[Job]) -> Chain:
-        """The chain of the first image, from which it is seen early whether the request is right.
+        """The chain of the first image, made early so that a wrong request is refused early.
 
         Raises:
-            RequestError: it is not.
+            RequestError: it cannot be made.
         """
-        own = self.of(jobs[0])
-        if all(self.raws.takes(job.path) for job in jobs):
-            return own.raws.first_chain(jobs[0].path)
-        return own.reentry.first_chain(jobs[0].path) if own.reentry else own.chain
+        loader, path = self.for_job(jobs[0]), jobs[0].path
+        takes = self.raw.takes
+        if all(takes(job.path) for job in jobs):
+            return loader.raw.first_chain(path)
+        return loader.kept.first_chain(path) if loader.kept else loader.chain
 
     def check(self, jobs: Sequence[Job]) -> None:
-        """See that what is said of single images is allowed.
+        """See that the values of single images are allowed.
 
         Raises:
-            RequestError: it is not; the message says where it stands.
+            RequestError: they are not; the message says in which row.
         """
-        if said := [job for job in jobs if job.values]:
-            brings = self.raws.takes if self.reentry is None else lambda path: True
-            check_rows(said, self.settings, brings)
+        if rows := [job for job in jobs if job.values]:
+            carries = self.raw.takes if self.kept is None else lambda path: True
+            check_rows(rows, self.settings, carries)
 
     def read(self, job: Job) -> SourceImage:
         """The image of a job.
@@ -112,44 +115,45 @@ class ImageLoader:
         Raises:
             ImageError: it cannot be read, or is of another kind.
         """
-        return self.raws.read(job.path, self.reads, self.reading)
+        if self.raw.takes(job.path):
+            return self.raw.read(job.path)
+        request = self.request
+        options = ReadOptions(
+            request.layer, request.max_pixels or USUAL_MAX_PIXELS, request.transfer
+        )
+        return read_source(job.path, self.reads, options)
 
     def enter(self, job: Job, source: SourceImage) -> LoadedImage | None:
-        """How to go on with an image.
+        """An image with the chain for it.
 
         None for one that was found in a folder of kept images and is not the one to go on from.
 
         Raises:
             ImageError: it cannot enter there.
+            RequestError: its chain cannot be made.
         """
         if isinstance(source, RawImage):
-            chain, source = self.raws.enter(job.path, source)
+            chain, source = self.raw.enter(job.path, source)
             return LoadedImage(chain, source, job.key)
-        kept, warnings = source.attributes.get("stage"), list(source.warnings)
-        if reentry := self.reentry:
-            key = source.attributes.get("image_key", job.key)
-            asked = self.asked.of(key, self.asked.row)  # so that the same is drawn for it
-            reentry = replace(reentry, make=asked.chain)
-            chain = reentry.chain_for(job.path, source.attributes)
-            if not reentry.is_next(chain, source.attributes):
-                if not job.listed:
-                    return None
-                again = f"entering at {reentry.start_at} repeats stages or leaves some out"
-                warnings.append(f"was kept after {kept}; {again}")
-            reentry.check_kind(job.path, chain, source.attributes)
-            warnings += input_warnings(source, chain)
-            return LoadedImage(chain, replace(source, warnings=tuple(warnings)), key)
-        if kept:
-            warnings.append(f"was kept after {kept}; is it a render? See --start-at")
-        return LoadedImage(self.chain, replace(source, warnings=tuple(warnings)), job.key)
+        if self.kept:
+            entered = self.kept.enter(job.path, source, job.key, job.listed)
+            return LoadedImage(*entered) if entered else None
+        if stage := source.attributes.get("stage"):
+            warning = f"was kept after {stage}; is it a render? See --start-at"
+            source = replace(source, warnings=(*source.warnings, warning))
+        return LoadedImage(self.chain, source, job.key)
 
     def is_left_out(self, job: Job, error: Exception) -> bool:
         """Whether an image that cannot enter was only found in a folder of kept images."""
-        return isinstance(error, KindError) and self.reentry is not None and not job.listed
+        return isinstance(error, KindError) and self.kept is not None and not job.listed
 
-    def explain(self, job: Job, error: Exception) -> str:
-        """An error as it is told: with the file, and with what can be done."""
+    def error_text(self, job: Job, error: Exception) -> str:
+        """The message of an error, with the file, and with what can be done."""
         if isinstance(error, KindError):
-            return misplaced(error, self.chain, self.reentry)
+            return kind_message(error, self.chain, self.request.start_at)
         message = str(error) or "there is not enough memory for it"
         return message if str(job.path) in message else f"{job.path}: {message}"
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Cached values stay with the process: they may hold classes of stage files.
+        return {each.name: getattr(self, each.name) for each in fields(self)}

@@ -1,10 +1,10 @@
-"""How a camera's raw, or a headerless dump, enters a chain: by what it says of itself.
+"""Camera raws and headerless dumps: read, and given the chain that their own facts ask for.
 
-It enters where DN are read, so nothing is added to it. Configuration and options win over the file.
+A raw enters at the first step that reads DN, so no noise is added to it. Configuration and options
+win over what the file says.
 """
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,151 +15,167 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_cameras, load_camera
 from clpipe.chain.chain import Chain
 from clpipe.chain.registry import all_stages
+from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
 from clpipe.images.dump import Dump, read_dump
 from clpipe.images.raw import RAW_SUFFIXES, RawFacts, read_facts, read_raw
-from clpipe.images.read import RENDER_SUFFIXES, ReadOptions, SourceImage, read_source
+from clpipe.images.read import RENDER_SUFFIXES, SourceImage
 from clpipe.images.tags import Tags, to_attributes
-from clpipe.inputs.kept import brightness_warnings, input_warnings
+from clpipe.inputs.plausibility import brightness_warnings, input_warnings
 from clpipe.stage import Kind
 
-UNKNOWN_COLOURS = "its colour matrix is not known; its colours stay those of the sensor"
+UNKNOWN_COLOURS = "its colour matrix is unknown; its colours stay those of the sensor"
 
 
 @dataclass(frozen=True)
 class RawImage(SourceImage):
-    """A mosaic in DN, (height, width), and what the file says of itself, or is told of a dump."""
+    """A mosaic in DN, (height, width), and what its file says, or what was set for a dump."""
 
-    said: RawFacts | Dump = field(kw_only=True)
+    facts: RawFacts | Dump = field(kw_only=True)
 
 
 @dataclass(frozen=True)
 class RawLoader:
-    """Entering with raws: how to make the chain for one, given the settings that it brings.
+    """Loads raws, and dumps where their geometry is set, and makes the chain for each."""
 
-    ``settings`` lays a configuration and options over settings and draws for the image, ``chain``
-    makes the chain that is entered at a step. ``start_at`` is the step to enter at, where one was
-    asked for; ``dump`` the geometry of dumps, where it is given.
-    """
-
-    settings: Callable[[Settings], Settings]
-    chain: Callable[[Settings, str], Chain]
-    start_at: str | None = None
+    request: Request
     dump: Dump | None = None
 
     def takes(self, path: Path) -> bool:
-        """Whether a file is a raw or a dump, by how its name ends."""
-        return path.suffix.lower() in RAW_SUFFIXES or self.takes_as_dump(path)
+        """Whether a file is a raw or a dump, by the ending of its name."""
+        return path.suffix.lower() in RAW_SUFFIXES or self._is_dump(path)
 
-    def takes_as_dump(self, path: Path) -> bool:
-        """Whether a file is a dump: .raw, or of an ending that nothing else has."""
+    def _is_dump(self, path: Path) -> bool:
+        """Whether a file is a dump: .raw, or an ending that nothing else has."""
         others = (*RENDER_SUFFIXES, *(e for e in RAW_SUFFIXES if e != ".raw"))
         return self.dump is not None and path.suffix.lower() not in others
 
-    def read(self, path: Path, kind: Kind, how: ReadOptions) -> SourceImage:
-        """A raw, a dump, or what else there is of a kind.
+    def _facts(self, path: Path) -> RawFacts | Dump:
+        return self.dump if self.dump and self._is_dump(path) else read_facts(path)
+
+    def read(self, path: Path) -> RawImage:
+        """A raw or a dump.
 
         Raises:
             ImageError: it cannot be read, or holds no Bayer mosaic.
         """
-        if not self.takes(path):
-            return read_source(path, kind, how)
-        said = self.dump if self.dump and self.takes_as_dump(path) else read_facts(path)
+        facts = self._facts(path)
         try:
             data = path.read_bytes()
         except OSError as error:
             raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
-        pixels = read_dump(data, path, said) if isinstance(said, Dump) else read_raw(path, said)
-        return RawImage(pixels, hashlib.sha256(data).hexdigest(), "", (), {}, said=said)
+        pixels = read_dump(data, path, facts) if isinstance(facts, Dump) else read_raw(path, facts)
+        return RawImage(pixels, hashlib.sha256(data).hexdigest(), "", (), {}, facts=facts)
 
     def first_chain(self, path: Path) -> Chain:
-        """The chain for the first raw, from which it is seen early whether the request is right.
+        """The chain of the first raw, made early so that a wrong request is refused early.
 
         Raises:
-            RequestError: it is not.
+            RequestError: it cannot be made.
         """
         try:
-            said = self.dump if self.dump and self.takes_as_dump(path) else read_facts(path)
-            return self._chain(path, said)[0]
+            return self._chain(path, self._facts(path))[0]
         except ImageError:
-            settings = self.settings(Settings())
-            return self.chain(settings, self.start_at or entrance(settings))
+            return self._chain_from(self.request.settings())
 
     def enter(self, path: Path, image: RawImage) -> tuple[Chain, RawImage]:
         """The chain for a raw, and the raw with its warnings and what it carries to the output.
 
         Raises:
-            ImageError: it cannot enter there, or its levels cannot be.
+            ImageError: it cannot enter there, or its levels cannot be right.
             RequestError: the chain cannot be made.
         """
-        chain, found = self._chain(path, image.said)
-        if isinstance(image.said, Dump):
-            found += input_warnings(image, chain)
-            return chain, replace(image, warnings=tuple(found))
-        found += brightness_warnings(image, chain)
+        chain, warnings = self._chain(path, image.facts)
+        if isinstance(image.facts, Dump):
+            warnings += input_warnings(image, chain)
+            return chain, replace(image, warnings=tuple(warnings))
+        warnings += brightness_warnings(image, chain)
         white = getattr(chain.steps[0].method, "white_level", 65535.0)
         if np.count_nonzero(image.pixels >= white) > image.pixels.size / 2:
-            found.append(f"most of its samples are not below the white level of {white:g} DN")
-        attributes = to_attributes(tags_of(image.said, chain), image.said.orientation)
-        return chain, replace(image, warnings=tuple(found), attributes=attributes)
+            warnings.append(f"most of its samples are not below the white level of {white:g} DN")
+        attributes = to_attributes(tags_of(image.facts, chain), image.facts.orientation)
+        return chain, replace(image, warnings=tuple(warnings), attributes=attributes)
 
-    def _chain(self, path: Path, said: RawFacts | Dump) -> tuple[Chain, list[str]]:
-        """The chain for a raw, and what was taken for what it does not say, or says wrongly."""
-        brought, found = brought_by(said)
-        parameters = dict(brought.parameters)
-        own = self.settings(Settings()).drawn("")  # an example, where there is no image yet
-        if "white_balance" in found and own.parameters.get("white_balance"):
-            del parameters["white_balance"]  # the user's own, not what stands in for the file's
-        settings = self.settings(replace(brought, parameters=parameters)).drawn("")
+    def _chain_from(self, settings: Settings) -> Chain:
+        return self.request.chain_from(settings, self.request.start_at or first_raw_step(settings))
+
+    def _chain(self, path: Path, facts: RawFacts | Dump) -> tuple[Chain, list[str]]:
+        """The chain for a raw, and warnings about what its file does not say, or says wrongly."""
+        carried, warnings = settings_of(facts)
+        parameters = dict(carried.parameters)
+        own = self.request.settings().drawn("")  # an example, where there is no image yet
+        if "white_balance" in warnings and own.parameters.get("white_balance"):
+            del parameters["white_balance"]  # the user's own replaces what stands in for the file's
+        settings = self.request.settings(replace(carried, parameters=parameters)).drawn("")
         camera = load_camera(settings.camera)
         low, high = camera.iso_range
         iso = min(max(settings.iso, low), high)
-        of_file = isinstance(said, RawFacts) and settings.iso == said.iso
-        if of_file and iso != settings.iso:
-            found["iso"] = (
+        is_of_file = isinstance(facts, RawFacts) and settings.iso == facts.iso
+        if is_of_file and iso != settings.iso:
+            warnings["iso"] = (
                 f"its ISO of {settings.iso:g} is beyond camera {camera.name}, "
                 f"{low:g} to {high:g}; {iso:g} is taken for denoising"
             )
             settings = replace(settings, iso=iso)
-        chain = self.chain(settings, self.start_at or entrance(settings))
+        chain = self._chain_from(settings)
+        self._check(path, facts, chain)
+        return chain, _remaining(warnings, chain, carried)
+
+    def _check(self, path: Path, facts: RawFacts | Dump, chain: Chain) -> None:
+        """See that a chain can take a raw.
+
+        Raises:
+            ImageError: it does not start on DN, or with another pattern, or the levels of the file
+                cannot be right and none are set.
+        """
+        settings = chain.settings
         if chain.source is not Kind.RAW:
             raise ImageError(
-                f"{path}: a raw enters at {entrance(settings)}; "
-                f"{self.start_at} reads {chain.source.label}"
+                f"{path}: a raw enters at {first_raw_step(settings)}; "
+                f"{self.request.start_at} reads {chain.source.label}"
             )
-        wanted = settings.parameters.get("mosaic", {}).get("pattern", "RGGB")
-        if chain.steps[0].context.pattern != wanted:
+        pattern = settings.parameters.get("mosaic", {}).get("pattern", "RGGB")
+        if chain.steps[0].context.pattern != pattern:
             raise ImageError(
-                f"{path}: its pattern is {wanted}, which the mosaic stage says, but the chain has "
+                f"{path}: its pattern is {pattern}, which the mosaic stage says, but the chain has "
                 "none; list mosaic and quantize first (they are not run on a raw)"
             )
         levels = settings.parameters.get("normalize", {})
-        if isinstance(said, RawFacts) and not {"black_level", "white_level"} <= levels.keys():
+        if isinstance(facts, RawFacts) and not {"black_level", "white_level"} <= levels.keys():
             raise ImageError(
-                f"{path}: its levels cannot be: black {said.black_level}, white {said.white_level} "
-                "(--set normalize.black_level, normalize.white_level)"
+                f"{path}: its levels cannot be right: black {facts.black_level}, white "
+                f"{facts.white_level} (--set normalize.black_level, normalize.white_level)"
             )
-        parts = {step.stage.name for step in chain.steps}
-        # What the user says himself is no doubt.
-        if settings.iso != brought.iso or "denoise" not in parts:
-            found.pop("no_iso", None)
-        if settings.camera != brought.camera or "denoise" not in parts:
-            found.pop("camera", None)
-        for name in ("white_balance", "color_matrix"):
-            same = settings.parameters.get(name) == brought.parameters.get(name)
-            if not same or name not in parts:
-                found.pop(name, None)
-        return chain, list(found.values())
 
 
-def entrance(settings: Settings) -> str:
+def _remaining(warnings: dict[str, str], chain: Chain, carried: Settings) -> list[str]:
+    """The warnings that still hold: not about what the user set, or what no step of the chain uses.
+
+    Args:
+        warnings: by what they are about.
+        chain: the chain for the raw.
+        carried: the settings that the raw carries.
+    """
+    settings, stages = chain.settings, {step.stage.name for step in chain.steps}
+    is_denoised = "denoise" in stages
+    is_current = {
+        "no_iso": is_denoised and settings.iso == carried.iso,
+        "camera": is_denoised and settings.camera == carried.camera,
+    }
+    for name in ("white_balance", "color_matrix"):
+        same = settings.parameters.get(name) == carried.parameters.get(name)
+        is_current[name] = same and name in stages
+    return [text for about, text in warnings.items() if is_current.get(about, True)]
+
+
+def first_raw_step(settings: Settings) -> str:
     """The first step that reads a raw.
 
-    >>> entrance(Settings())
+    >>> first_raw_step(Settings())
     'normalize'
 
     Raises:
-        RequestError: there is none.
+        RequestError: no step does.
     """
     for name in settings.stages:
         if all_stages()[name].reads is Kind.RAW and name not in settings.skip:
@@ -167,50 +183,50 @@ def entrance(settings: Settings) -> str:
     raise RequestError("no stage of the chain reads a raw; normalize does")
 
 
-def brought_by(said: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
-    """The settings that a raw brings with it, and warnings, by what they are about."""
-    if isinstance(said, Dump):
+def settings_of(facts: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
+    """The settings that a raw carries, and warnings by what they are about."""
+    if isinstance(facts, Dump):
         gray_world = {"white_balance": {"method": "gray_world"}}
         return Settings(parameters=gray_world), {
-            "white_balance": "it does not say its white balance; gray_world finds it",
+            "white_balance": "it does not say its white balance; gray_world estimates it",
             "color_matrix": UNKNOWN_COLOURS,
         }
-    found: dict[str, str] = {}
-    known = camera_named(said.make, said.model)
-    camera = known.name if known else DEFAULT_CAMERA
-    if not known:
-        same = said.model.casefold().startswith(said.make.casefold())
-        name = said.model if same else f"{said.make} {said.model}"
-        found["camera"] = (
+    warnings: dict[str, str] = {}
+    profile = camera_named(facts.make, facts.model)
+    camera = profile.name if profile else DEFAULT_CAMERA
+    if not profile:
+        same = facts.model.casefold().startswith(facts.make.casefold())
+        name = facts.model if same else f"{facts.make} {facts.model}"
+        warnings["camera"] = (
             f"there is no profile of {name}; denoising takes the noise of {camera} (--camera)"
         )
-    iso = said.iso or Settings().iso
-    if not said.iso:
-        found["no_iso"] = f"it does not say its ISO; {iso:g} is taken for denoising (--iso)"
-    parameters: dict[str, dict[str, Any]] = {"mosaic": {"pattern": said.pattern}}
-    if 0 <= said.black_level < said.white_level:
-        levels = {"black_level": float(said.black_level), "white_level": float(said.white_level)}
+    iso = facts.iso or Settings().iso
+    if not facts.iso:
+        warnings["no_iso"] = f"it does not say its ISO; {iso:g} is taken for denoising (--iso)"
+    parameters: dict[str, dict[str, Any]] = {"mosaic": {"pattern": facts.pattern}}
+    if 0 <= facts.black_level < facts.white_level:
+        levels = {"black_level": float(facts.black_level), "white_level": float(facts.white_level)}
         parameters["normalize"] = levels
-    gains = said.gains or said.daylight_gains
+    gains = facts.gains or facts.daylight_gains
     if gains:
         red_and_blue = dict(zip(("red_gain", "blue_gain"), gains, strict=True))
         parameters |= {"inverse_white_balance": red_and_blue, "white_balance": {**red_and_blue}}
     else:
         parameters["white_balance"] = {"method": "gray_world"}
-    if not said.gains:
-        multipliers = ", ".join(f"{x:.4g}" for x in said.as_shot)
-        which = "those of daylight are taken" if gains else "gray_world finds others"
-        found["white_balance"] = (
-            f"its white balance as shot cannot be, with multipliers {multipliers}; {which}"
+    if not facts.gains:
+        multipliers = ", ".join(f"{x:.4g}" for x in facts.as_shot)
+        which = "those of daylight are taken" if gains else "gray_world estimates others"
+        warnings["white_balance"] = (
+            f"its white balance as shot cannot be right, with multipliers {multipliers}; {which}"
         )
-    if said.camera_to_srgb:
-        matrix = [list(row) for row in said.camera_to_srgb]
+    if facts.camera_to_srgb:
+        matrix = [list(row) for row in facts.camera_to_srgb]
         parameters["color_matrix"] = {"method": "camera", "matrix": matrix}
-    elif known and known.xyz_to_camera:
+    elif profile and profile.xyz_to_camera:
         parameters["color_matrix"] = {"method": "camera"}
     else:
-        found["color_matrix"] = UNKNOWN_COLOURS
-    return Settings(camera=camera, iso=iso, parameters=parameters), found
+        warnings["color_matrix"] = UNKNOWN_COLOURS
+    return Settings(camera=camera, iso=iso, parameters=parameters), warnings
 
 
 def camera_named(make: str, model: str) -> Camera | None:
@@ -225,13 +241,13 @@ def camera_named(make: str, model: str) -> Camera | None:
 
 
 def tags_of(facts: RawFacts, chain: Chain) -> Tags:
-    """What a picture's EXIF says of a raw; the ISO is the user's, where he gave another."""
+    """The EXIF of a picture that is made of a raw; the ISO is the user's, where one is set."""
     low, high = chain.camera.iso_range
-    own = facts.iso is not None and chain.iso == min(max(facts.iso, low), high)
+    is_of_file = facts.iso is not None and chain.iso == min(max(facts.iso, low), high)
     return Tags(
         facts.make,
         facts.model,
-        facts.iso if own and facts.iso else chain.iso,
+        facts.iso if is_of_file and facts.iso else chain.iso,
         facts.exposure,
         facts.aperture,
         facts.focal_length,

@@ -1,4 +1,4 @@
-"""The folder that a run writes to: made, locked against other runs, and cleared of halves."""
+"""The output folder: made, locked against other runs, and cleared of unfinished files."""
 
 import contextlib
 import errno
@@ -15,47 +15,44 @@ from clpipe.inputs.find import Job, Shard
 RESUMABLE = "what is finished is there, and the same command goes on"
 
 
-ROOM = 8 * 2**20  # bytes; a disk with less is full
+ROOM = 8 * 2**20  # bytes; a disk with less counts as full
+
+LOCK = ".clpipe.lock"
+
+PARTS = 2**40  # bytes of the lock, of which each shard holds its part; none is ever written
+
+UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # as write_beside names them
 
 
-def trouble_with(folder: Path) -> str:
+def write_problem(folder: Path) -> str:
     """Why nothing can be written to a folder, "" where it can."""
     probe = folder / f".clpipe.{os.getpid()}"
     try:
         with open(probe, "wb") as file:
             os.posix_fallocate(file.fileno(), 0, ROOM)
     except OSError as error:
-        wanted = f" ({in_words(ROOM)} are wanted)" if error.errno == errno.ENOSPC else ""
-        return f"cannot write there: {error.strerror}{wanted}"
+        needed = f" ({in_words(ROOM)} are needed)" if error.errno == errno.ENOSPC else ""
+        return f"cannot write there: {error.strerror}{needed}"
     finally:
         with contextlib.suppress(OSError):
             probe.unlink()
     return ""
 
 
-LOCK = ".clpipe.lock"
-
-
-PARTS = 2**40  # bytes of the lock, of which a shard takes its share; none is ever written
-
-
-UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # as image_io.write_beside names them
-
-
 @contextlib.contextmanager
 def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
-    """Make the folder, see that it can be written, and hold it against other runs.
+    """Make the folder, see that it can be written to, and lock it against other runs.
 
-    Shards of one run hold it together. The lock is the system's: it ends with the process.
+    Shards of one run share the lock. It is the system's, so it ends with the process.
 
     Raises:
-        RequestError: it cannot be written to, or another run is at work in it.
+        RequestError: it cannot be written to, or another run is writing there.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RequestError(f"{folder}: cannot write there: {error.strerror}") from None
-    if reason := trouble_with(folder):
+    if reason := write_problem(folder):
         raise RequestError(f"{folder}: {reason}")
     first = PARTS * (shard.number - 1) // shard.of
     share = PARTS * shard.number // shard.of - first
@@ -63,7 +60,7 @@ def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
     try:
         yield
     finally:
-        # Alone in the end: the file has no more use.
+        # Where nobody else holds the lock, its file is of no more use.
         with contextlib.suppress(OSError):
             fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB, PARTS)
             (folder / LOCK).unlink()
@@ -71,7 +68,7 @@ def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
 
 
 def _locked(path: Path, length: int, first: int) -> int:
-    """The lock file, open, a part of it held.
+    """Open the lock file and hold a part of it, ``length`` bytes from ``first`` on.
 
     Raises:
         RequestError: another process holds it.
@@ -91,11 +88,11 @@ def _locked(path: Path, length: int, first: int) -> int:
         with contextlib.suppress(OSError):
             if os.fstat(lock).st_ino == path.stat().st_ino:
                 return lock
-        os.close(lock)  # who held it has taken it away in between
+        os.close(lock)  # its last holder has removed it in between
 
 
 def remove_unfinished(folder: Path, jobs: Iterable[Job]) -> None:
-    """Remove what a run that was killed left half written of these jobs."""
+    """Remove the unfinished files that a killed run left of these jobs."""
     stems = {job.stem for job in jobs}
     for place, _, names in os.walk(folder):
         for match in filter(None, map(UNFINISHED.fullmatch, names)):

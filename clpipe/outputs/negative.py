@@ -1,4 +1,4 @@
-"""TODO."""
+"""The raw of a chain as a negative: what a DNG stores beside the samples."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,46 +18,51 @@ def negative_of(chain: Chain) -> Negative:
     """
     makers = [step for step in chain.steps if step.stage.writes is Kind.RAW]
     first, last = chain.steps[0], chain.steps[-1]
-    entered = not makers
-    if entered and chain.source is not Kind.RAW:
+    is_input = not makers
+    if is_input and chain.source is not Kind.RAW:
         raise RequestError(
             "--format dng writes the raw in DN that quantize makes, but this chain starts on "
             f"{chain.source.label} and has no quantize; put it in, or use another format"
         )
-    known = first.context if entered else makers[-1].method.after(makers[-1].context)
+    context = first.context if is_input else makers[-1].method.after(makers[-1].context)
     end = last.method.after(last.context)
-    balanced = any(step.stage.name == "white_balance" for step in chain.steps)
-    gains = end.applied_gains if entered and balanced else known.gains
-    levels = first.method if entered else known  # those of an image that enters, normalize is told
-    black = _given(levels, "black_level", chain.camera.black_level)
-    white = _given(levels, "white_level", chain.camera.white_level)
+    is_balanced = any(step.stage.name == "white_balance" for step in chain.steps)
+    gains = end.applied_gains if is_input and is_balanced else context.gains
+    levels = first.method if is_input else context  # normalize has the levels of a raw that enters
+    black = _level(levels, "black_level", chain.camera.black_level)
+    white = _level(levels, "white_level", chain.camera.white_level)
     if white != int(white):
         raise RequestError(
             f"--format dng: found a white level of {white:g}, but DNG wants whole DN; "
             f"--set quantize.white_level={white:.0f}"
         )
     return Negative(
-        step=None if entered else makers[-1].name,
-        pattern=known.pattern,
+        step=None if is_input else makers[-1].name,
+        pattern=context.pattern,
         black_level=black,
         white_level=int(white),
         gains=gains,
-        xyz_to_camera=xyz_to_camera(_colours(known, end, entered), gains),
-        noise=known.noise,
+        xyz_to_camera=xyz_to_camera(_colours(context, end, is_input), gains),
+        noise=context.noise,
     )
 
 
-def _given(of: object, name: str, otherwise: float) -> float:
-    value = getattr(of, name, None)
-    return otherwise if value is None else float(value)
+def _level(owner: object, name: str, default: float) -> float:
+    value = getattr(owner, name, None)
+    return default if value is None else float(value)
 
 
-def _colours(known: Context, end: Context, entered: bool) -> NDArray[np.float64]:
-    """From linear sRGB to the mosaic's own colours, white-balanced.
+def _colours(context: Context, end: Context, is_input: bool) -> NDArray[np.float64]:
+    """The matrix from linear sRGB to the mosaic's own colours, white-balanced.
 
-    A render is in linear sRGB, and what color_matrix made of it before the mosaic is known. Of a
-    camera's raw it is not known, but which matrix leads back to sRGB.
+    For a render it is what color_matrix did before the mosaic. For a camera's raw it is the inverse
+    of what color_matrix does behind it.
+
+    Args:
+        context: at the raw.
+        end: at the end of the chain.
+        is_input: whether the raw is the image that enters.
     """
-    if entered and known.colours == IDENTITY:
+    if is_input and context.colours == IDENTITY:
         return np.asarray(np.linalg.inv(end.colours), np.float64)
-    return np.array(known.colours)
+    return np.array(context.colours)

@@ -1,26 +1,35 @@
-"""Which pictures are made of an image: one or a burst, and the truth beside them."""
+"""Renditions: the pictures that are made of one image, a burst of frames and truths beside it."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from clpipe.chain.chain import Chain, Step
-from clpipe.chain.truth import noisy_mosaic, signal_and_noise
+from clpipe.chain.truth import (
+    DEVELOPMENT,
+    MOSAIC,
+    TRUTHS,
+    VARIANCE,
+    noisy_mosaic,
+    signal_and_noise,
+)
 
-DEVELOPMENT, MOSAIC, VARIANCE = TRUTHS = ("development", "mosaic", "variance")
+# What is put behind the image's name for each truth.
+SUFFIXES = {DEVELOPMENT: ".truth", MOSAIC: ".truth_mosaic", VARIANCE: ".truth_variance"}
 
-
-NAMES = {DEVELOPMENT: ".truth", MOSAIC: ".truth_mosaic", VARIANCE: ".truth_variance"}
-
-
-MAPS = (NAMES[MOSAIC], NAMES[VARIANCE])  # are mosaics in float, whatever the format of pictures
+# Mosaics in float, whatever the format of pictures is.
+FLOAT_MOSAICS = (SUFFIXES[MOSAIC], SUFFIXES[VARIANCE])
 
 
 @dataclass(frozen=True)
 class Rendition:
-    """One picture of an image: what stands behind the image's name, how it is made, its key.
+    """One picture of an image.
 
-    Where ``noise`` is given, it is the variance that these steps make of the chain's last image,
-    see :func:`clpipe.chain.truth.variance_of`.
+    Args:
+        name: what is put behind the image's name.
+        chain: how it is made.
+        key: its image key, of which its noise is made.
+        noise: for a variance map, the steps whose noise has this variance in the chain's last
+            image, see :func:`clpipe.chain.truth.variance_of`; else ().
     """
 
     name: str
@@ -38,63 +47,69 @@ class Rendition:
 
 @dataclass(frozen=True)
 class RenditionPlan:
-    """How many frames are made of each image, and what of their truth, as :data:`TRUTHS` has it.
+    """Which renditions are made of each image.
 
-    None is one frame; a number is a burst, which has the truth's development in any case.
+    Args:
+        frames: how many frames; None is one picture. A burst has the truth of its development, too.
+        truths: which of :data:`clpipe.chain.truth.TRUTHS`.
     """
 
     frames: int | None = None
     truths: tuple[str, ...] = ()
 
     def names(self) -> tuple[str, ...]:
-        """What stands behind the image's name for each picture that is made of it.
+        """The name of each rendition.
 
         >>> RenditionPlan(2).names(), RenditionPlan(truths=("mosaic",)).names()
         (('.frame0', '.frame1', '.truth'), ('', '.truth_mosaic'))
         """
-        return (*self._frames(), *(NAMES[truth] for truth in self._truths()))
+        return (*self._frame_names(), *(SUFFIXES[truth] for truth in self._all_truths()))
 
-    def _frames(self) -> tuple[str, ...]:
+    def _frame_names(self) -> tuple[str, ...]:
         if self.frames is None:
             return ("",)
         digits = len(str(self.frames - 1))
         return tuple(f".frame{i:0{digits}}" for i in range(self.frames))
 
-    def _truths(self) -> list[str]:
-        wanted = (*self.truths, *([DEVELOPMENT] if self.frames else []))
-        return [truth for truth in TRUTHS if truth in wanted]
+    def _all_truths(self) -> list[str]:
+        truths = (*self.truths, *([DEVELOPMENT] if self.frames else []))
+        return [truth for truth in TRUTHS if truth in truths]
 
-    def shots(self, chain: Chain, key: str) -> list[Rendition]:
-        """The pictures of an image, as :meth:`names` has them.
+    def renditions(self, chain: Chain, key: str) -> list[Rendition]:
+        """The renditions of an image, in the order of :meth:`names`.
 
-        The first frame is the picture that there is without a burst.
+        The first frame is the same picture as that without a burst.
 
         Raises:
-            RequestError: the truth of this chain cannot be known.
+            RequestError: the chain has no such truth.
         """
-        names = enumerate(self._frames())
+        names = enumerate(self._frame_names())
         frames = [Rendition(name, chain, f"{key}#{i}" if i else key) for i, name in names]
-        return [*frames, *(replace(truth_of(t, chain), key=key) for t in self._truths())]
+        return [*frames, *(replace(truth_of(t, chain), key=key) for t in self._all_truths())]
 
 
 def truth_named(name: str) -> str | None:
-    """Which of :data:`TRUTHS` a picture is, by what stands behind the image's name.
+    """Which truth a rendition is, by its name; None for a frame.
 
     >>> truth_named(".truth_mosaic"), truth_named(".frame3")
     ('mosaic', None)
     """
-    return next((truth for truth, its in NAMES.items() if its == name), None)
+    return next((truth for truth, suffix in SUFFIXES.items() if suffix == name), None)
 
 
-@lru_cache(maxsize=16)  # most images of a run have one chain, and what it is planned as is kept too
+@lru_cache(maxsize=16)  # most images of a run share one chain, and plans are cached per chain
 def truth_of(truth: str, chain: Chain) -> Rendition:
-    """What is to be known of the truth of a chain's images, one of :data:`TRUTHS`; without a key.
+    """The rendition of a truth, without a key.
+
+    Args:
+        truth: one of :data:`clpipe.chain.truth.TRUTHS`.
+        chain: of the noisy picture.
 
     Raises:
-        RequestError: it cannot be known.
+        RequestError: the chain has no such truth.
     """
     if truth == VARIANCE:
         signal, noise = signal_and_noise(chain)
-        return Rendition(NAMES[truth], signal, "", noise)
+        return Rendition(SUFFIXES[truth], signal, "", noise)
     noisy = noisy_mosaic(chain) if truth == MOSAIC else chain
-    return Rendition(NAMES[truth], noisy.without_noise(), "")
+    return Rendition(SUFFIXES[truth], noisy.without_noise(), "")

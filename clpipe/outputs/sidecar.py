@@ -1,122 +1,79 @@
-"""The sidecar: everything that is needed to make a picture again, and whether it must be."""
+"""The sidecar: everything that is needed to make a picture again, and to see that it is done."""
 
 import json
 import os
 import platform
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from functools import cache, lru_cache
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from clpipe.base.about import __version__
+from clpipe.base.digests import digests, stamp_of
 from clpipe.base.errors import ImageError
-from clpipe.base.files import sha256_of, write_beside
-from clpipe.chain.paths import files_of
-from clpipe.chain.request import Request
+from clpipe.base.files import write_beside
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
-from clpipe.images.read import ReadOptions, SourceImage
+from clpipe.images.read import SourceImage
 from clpipe.images.write import versions
 from clpipe.inputs.find import Job
 from clpipe.inputs.raw import RawImage
 from clpipe.outputs.renditions import Rendition
-from clpipe.outputs.writer import OutputWriter
 
-OWN = "clpipe"  # the key that every sidecar has, its first one
+SIDECAR = "json"  # the ending of its name
 
+OWN = "clpipe"  # the first key of every sidecar
 
-NEAR = 1 << 16  # bytes in which a file says who wrote it
-
+MARKED = 1 << 16  # bytes at either end of a file, in which a format of clpipe names clpipe
 
 BEGINNING = f'{{\n  "{OWN}": '.encode()
 
 
-def wanted(asked: Request, reading: ReadOptions, target: OutputWriter) -> dict[str, Any]:
-    """What is to be made, as far as it is known before the image is read.
-
-    What is equal here makes the same bytes of the same image under the same image key.
-    """
-    record = {
-        **asked.record(),
-        "layer": reading.layer,
-        "transfer": reading.transfer,
-        "formats": target.formats,
-        "keep": target.keep,
-        "files": digests([*files_of(asked.settings()), *asked.stage_files]),
-    }
-    found: dict[str, Any] = json.loads(json.dumps(record))  # as a sidecar will have it
-    return found
-
-
-def stamp_of(path: Path) -> tuple[int, int]:
-    """The size of a file and its time of change (ns); zeros where it cannot be seen."""
-    try:
-        info = path.stat()
-    except OSError:
-        return (0, 0)
-    return info.st_size, info.st_mtime_ns
-
-
-def digests(files: Iterable[str]) -> dict[str, str]:
-    """The SHA-256 of each of these files that can be read."""
-    found = {}
-    for file in files:
-        with suppress(OSError):
-            found[file] = _digest(file, *stamp_of(Path(file)))
-    return found
-
-
-@lru_cache(maxsize=1024)
-def _digest(file: str, size: int, modified: int) -> str:
-    return sha256_of(Path(file))[0]
-
-
-def is_done(path: Path, job: Job, wanted: Mapping[str, Any], outputs: Sequence[Path]) -> bool:
-    """Whether a picture is there already, made of the same input, in the same way, by this version.
+def is_done(path: Path, job: Job, request: Mapping[str, Any], outputs: Sequence[Path]) -> bool:
+    """Whether a picture is there, made of the same input by the same request and this version.
 
     Args:
         path: of the sidecar.
         job: the image.
-        wanted: what is to be made, as :func:`wanted` says it, and the image key.
+        request: the record of the request for the image.
         outputs: the files that must be there.
 
     Raises:
         ImageError: the sidecar is somebody else's file.
     """
     try:
-        found = read_sidecar(path)
+        values = read_sidecar(path)
     except FileNotFoundError:
         return False
-    return all(map(os.path.exists, outputs)) and is_as_wanted(found, job, wanted)
+    return all(map(os.path.exists, outputs)) and is_current(values, job, request)
 
 
-def is_as_wanted(found: Mapping[str, Any], job: Job, wanted: Mapping[str, Any]) -> bool:
-    """Whether a sidecar's values are of the same input, the same wishes and this version.
+def is_current(values: Mapping[str, Any], job: Job, request: Mapping[str, Any]) -> bool:
+    """Whether a sidecar's values are of the same input, the same request and this version.
 
     An input of the same size and time of change is taken for the same; else its SHA-256 decides.
-    ``wanted`` as for :func:`is_done`.
+    Arguments as for :func:`is_done`.
     """
-    if found.get(OWN) != __version__ or not _same(found.get("asked"), wanted):
+    if values.get(OWN) != __version__ or not _same_request(values.get("request"), request):
         return False
     size, modified = stamp_of(job.path)
-    if found.get("input_size") != size:
+    if values.get("input_size") != size:
         return False
-    if found.get("input_modified") == modified:
+    if values.get("input_modified") == modified:
         return True
-    return found.get("sha256") in digests([str(job.path)]).values()
+    return values.get("sha256") in digests([str(job.path)]).values()
 
 
-def _same(asked: Any, wanted: Mapping[str, Any]) -> bool:
-    """Whether the same was asked for; files that are named by their contents, wherever they lie."""
-    if asked == wanted:
+def _same_request(one: Any, other: Mapping[str, Any]) -> bool:
+    """Whether records of requests are equal, with files compared by content and not by name."""
+    if one == other:
         return True
-    if not isinstance(asked, dict) or not (wanted["files"] and asked.get("files")):
+    if not isinstance(one, dict) or not (other["files"] and one.get("files")):
         return False
     texts = []
-    for values in (asked, wanted):
+    for values in (one, other):
         text = json.dumps({k: v for k, v in values.items() if k != "files"}, sort_keys=True)
         for file, digest in values["files"].items():
             text = text.replace(json.dumps(file), json.dumps(digest))
@@ -128,7 +85,7 @@ def read_sidecar(path: Path) -> dict[str, Any]:
     """A sidecar's values.
 
     Raises:
-        FileNotFoundError: it is not there, or is empty or cut off, as a loss of power may leave it.
+        FileNotFoundError: it is missing, or is empty or cut off, as a loss of power may leave it.
         ImageError: it cannot be read, or clpipe did not write it.
     """
     try:
@@ -138,35 +95,35 @@ def read_sidecar(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
     try:
-        found = json.loads(data)
+        values = json.loads(data)
     except (ValueError, RecursionError):
-        found = None
+        values = None
         if not data.strip(b"\0") or data.startswith(BEGINNING):
             raise FileNotFoundError(path) from None
-    if not isinstance(found, dict) or OWN not in found:
+    if not isinstance(values, dict) or OWN not in values:
         raise ImageError(
             f"{path}: clpipe did not write this file, and would overwrite it with its sidecar; "
             "move it, choose another output folder, or say --overwrite"
         )
-    return found
+    return values
 
 
 def check_own(path: Path) -> None:
-    """See that a picture that would be written over, and has no sidecar, is one of clpipe's.
+    """See that a picture without a sidecar, which would be overwritten, is one of clpipe's.
 
-    All its formats say so, before their pixels or behind them; a run that was killed may have left
-    one without a sidecar.
+    Each format names clpipe before or behind its pixels. A run that was killed may have left a
+    picture without a sidecar.
 
     Raises:
         ImageError: it is somebody else's.
     """
     try:
         with open(path, "rb") as file:
-            ends = file.read(NEAR)
-            file.seek(max(os.fstat(file.fileno()).st_size - NEAR, 0))
-            ends += file.read(NEAR)
+            ends = file.read(MARKED)
+            file.seek(max(os.fstat(file.fileno()).st_size - MARKED, 0))
+            ends += file.read(MARKED)
     except OSError:
-        return  # it is not there, or the writing of it says why
+        return  # it is missing, or writing to it will say why
     if ends and OWN.encode() not in ends:
         raise ImageError(
             f"{path}: clpipe did not write this picture, and would overwrite it; "
@@ -208,18 +165,31 @@ def json_text(record: Mapping[str, Any]) -> str:
 
 def sidecar(
     job: Job,
+    request: Mapping[str, Any],
     stamp: tuple[int, int],
-    shot: Rendition,
+    rendition: Rendition,
     frames: int | None,
     device: Device | None,
     source: SourceImage,
     result: Result,
     outputs: Sequence[str],
 ) -> dict[str, Any]:
-    """Everything that is needed to make the same files again."""
-    chain = shot.whole
-    raw = source.said if isinstance(source, RawImage) else None
-    noise = chain.noise if not raw or chain.is_noisy else None
+    """Everything that is needed to make the files of a rendition again, as JSON values.
+
+    Args:
+        job: the image.
+        request: the record of the request for the image.
+        stamp: the input's size and time of change, before it was read.
+        rendition: the picture.
+        frames: how many frames its burst has; None without a burst.
+        device: where it was made; None is NumPy.
+        source: the image, as it was loaded.
+        result: what was made of it.
+        outputs: the names of the files.
+    """
+    chain = rendition.whole
+    facts = source.facts if isinstance(source, RawImage) else None
+    noise = chain.noise if not facts or chain.is_noisy else None
     size, modified = stamp
     return {
         OWN: __version__,
@@ -229,9 +199,9 @@ def sidecar(
         "sha256": source.sha256,
         "layer": source.layer,
         "name": job.stem,
-        "picture": shot.name,
+        "picture": rendition.name,
         "frames": frames,
-        "image_key": shot.key,
+        "image_key": rendition.key,
         "seed": chain.seed,
         "width": source.pixels.shape[1],
         "height": source.pixels.shape[0],
@@ -240,14 +210,18 @@ def sidecar(
         "output": chain.settings.output.filled(source.shot).model_dump(),
         "noise": noise.record() if noise else None,
         "starts_on": chain.source.label,
-        **({"raw": asdict(raw)} if raw else {}),
+        **({"raw": asdict(facts)} if facts else {}),
         "stages": [
             {
                 "name": step.name,
                 "stage": step.stage.name,
                 "method": step.method.method,
                 "parameters": step.method.model_dump(),
-                **({"found": result.found[step.name]} if step.name in result.found else {}),
+                **(
+                    {"estimates": result.estimates[step.name]}
+                    if step.name in result.estimates
+                    else {}
+                ),
             }
             for step in chain.steps
         ],
@@ -261,12 +235,13 @@ def sidecar(
             "lanes": device.info.lanes if device else 0,
         },
         "versions": all_versions(),
+        "request": request,
     }
 
 
 @cache
 def all_versions() -> dict[str, str]:
-    """The versions of what a picture's bytes may depend on."""
+    """The versions of all that a picture's bytes may depend on, by name."""
     return {
         "python": platform.python_version(),
         "numpy": version("numpy"),

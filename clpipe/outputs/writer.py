@@ -1,12 +1,15 @@
-"""Where the pictures of a run go: names and formats."""
+"""Writes the pictures of a run: which files, under which names, in which formats."""
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from clpipe.base.errors import ImageError, OutputError, RequestError
+from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
+from clpipe.chain.formats import DNG, FORMATS, Format, ending_of
+from clpipe.chain.request import Request
 from clpipe.chain.truth import variance_of
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
@@ -16,72 +19,77 @@ from clpipe.images.tags import TAG_ATTRIBUTES, Tags, from_attributes, upright
 from clpipe.images.write import JPEG_MAX_SIDE, write_display, write_exr
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import attributes_of
-from clpipe.outputs.folder import RESUMABLE, trouble_with
-from clpipe.outputs.formats import DNG, FORMATS, SIDECAR, ending_of, samples
+from clpipe.outputs.folder import RESUMABLE, write_problem
 from clpipe.outputs.negative import negative_of
-from clpipe.outputs.renditions import MAPS, Rendition, RenditionPlan
+from clpipe.outputs.renditions import FLOAT_MOSAICS, Rendition, RenditionPlan
+from clpipe.outputs.results import results_of
+from clpipe.outputs.sidecar import SIDECAR
+from clpipe.reference.curve import to_16_bit
 from clpipe.stage import Kind
 
 
 @dataclass(frozen=True)
 class OutputWriter:
-    """Where results go, in which formats, how many of each image, and which stages' images too."""
+    """Writes the pictures of a request to a folder.
+
+    Args:
+        folder: where they go.
+        request: with every output named, see :meth:`Request.with_outputs`.
+    """
 
     folder: Path
-    formats: tuple[str, ...]
-    burst: RenditionPlan = field(default_factory=RenditionPlan)
-    keep: tuple[str, ...] = ()
+    request: Request
 
-    def burst_of(self, job: Job) -> RenditionPlan:
-        """How many frames are made of a job's image."""
-        return self.burst if job.frames is None else replace(self.burst, frames=job.frames)
+    @property
+    def formats(self) -> tuple[str, ...]:
+        """The formats of the last image, and of the raw."""
+        return self.request.formats
 
-    def pictures_of(self, job: Job) -> tuple[str, ...]:
-        """What stands behind the name of each picture that is made of a job's image."""
-        names = self.burst_of(job).names()
+    def plan_of(self, job: Job) -> RenditionPlan:
+        """Which renditions are made of a job's image."""
+        frames = self.request.frames if job.frames is None else job.frames
+        return RenditionPlan(frames, self.request.truths)
+
+    def names_of(self, job: Job) -> tuple[str, ...]:
+        """The name of each rendition that is made of a job's image."""
+        names = self.plan_of(job).names()
         return tuple(name for name in names if job.pictures is None or name in job.pictures)
 
-    def runner(self, shot: Rendition, device: Device | None) -> Runner:
-        """What makes all of a picture that is to be written, and nothing else."""
-        formats = self.formats_of(shot.name)
-        made = [FORMATS[f] for f in formats if f != DNG]
-        raw = negative_of(shot.chain).step if DNG in formats else None
-        return Runner(
-            shot.chain,
-            device,
-            tuple(dict.fromkeys([*self.kept_of(shot), *([raw] if raw else [])])),
-            encode=any(f.bits == 8 for f in made),
-            final=any(f.bits > 8 for f in made),
-        )
+    def runner(self, rendition: Rendition, device: Device | None) -> Runner:
+        """A runner that makes all of a rendition that is written, and nothing else."""
+        formats, keep = self.formats_of(rendition.name), self.keep_of(rendition.name)
+        results = results_of(rendition.chain, formats, keep)
+        return Runner(rendition.chain, device, *results)
 
     def formats_of(self, name: str) -> tuple[str, ...]:
-        """The formats of the picture of that name, see :meth:`RenditionPlan.names`."""
-        return ("exr",) if name in MAPS else self.formats
+        """The formats of a rendition, by its name."""
+        return ("exr",) if name in FLOAT_MOSAICS else self.formats
 
     def keep_of(self, name: str) -> tuple[str, ...]:
-        """The steps whose image is written beside the picture of that name, if it has them."""
-        return () if name in MAPS else self.keep
+        """The steps whose image is written beside a rendition, by its name, where it has them."""
+        return () if name in FLOAT_MOSAICS else self.request.keep
 
-    def kept_of(self, shot: Rendition) -> list[str]:
-        """The steps of a picture's chain whose image is written too."""
-        return [s.name for s in shot.chain.steps if s.name in self.keep_of(shot.name)]
+    def _kept_steps(self, rendition: Rendition) -> list[str]:
+        """The steps of a rendition's chain whose image is written, too."""
+        keep = self.keep_of(rendition.name)
+        return [step.name for step in rendition.chain.steps if step.name in keep]
 
     def check(self, chain: Chain, jobs: Sequence[Job]) -> None:
-        """See that the results can be written in these formats, over no input and no other result.
+        """See that the formats can hold the results, and that no file is written twice.
 
         Raises:
-            RequestError: they cannot.
+            RequestError: they cannot, or a result would overwrite an input or another result.
         """
-        few = [f for f in self.formats if f != DNG and FORMATS[f].bits < 32]
-        if few and chain.result is Kind.RAW:
+        too_small = [f for f in self.formats if f != DNG and FORMATS[f].bits < 32]
+        if too_small and chain.result is Kind.RAW:
             raise RequestError(
-                f"the chain ends in DN, which {few[0]} cannot hold; "
+                f"the chain ends in DN, which {too_small[0]} cannot hold; "
                 "end it with normalize or a later stage, or use --format dng or exr"
             )
         if DNG in self.formats:
             negative_of(chain)  # refuses a chain without a raw
-        for burst in {self.burst_of(job) for job in jobs}:
-            burst.shots(chain, "")  # refuses a chain of which there is no truth
+        for plan in {self.plan_of(job) for job in jobs}:
+            plan.renditions(chain, "")  # refuses a chain that has no such truth
         endings: dict[str, str] = {}
         for format_ in self.formats:
             other = endings.setdefault(ending_of(format_), format_)
@@ -90,12 +98,20 @@ class OutputWriter:
                     f"--format {other} and {format_} would both write NAME.{ending_of(format_)}; "
                     "run them into different folders"
                 )
+        self._check_paths(jobs)
+
+    def _check_paths(self, jobs: Sequence[Job]) -> None:
+        """See that no file that may be written is an input or the file of another job.
+
+        Raises:
+            RequestError: one is.
+        """
         real_folder = os.path.realpath(self.folder)
         inputs = {os.path.realpath(job.path) for job in jobs}
         inside = {path for path in inputs if path.startswith(real_folder + os.sep)}
         makers: dict[str, Job] = {}
         for job in jobs:
-            for name in self.pictures_of(job):
+            for name in self.names_of(job):
                 whole = [ending_of(format_) for format_ in self.formats_of(name)]
                 for ending in (SIDECAR, *whole, *(f"{step}.exr" for step in self.keep_of(name))):
                     path = f"{job.stem}{name}.{ending}"
@@ -106,13 +122,13 @@ class OutputWriter:
                         )
                     if path in makers:
                         raise RequestError(
-                            f"{named(makers[path])} and {named(job)} would both write "
+                            f"{makers[path].label} and {job.label} would both write "
                             f"{self.folder / path}; run them into different folders"
                         )
                     makers[path] = job
 
     def path(self, job: Job, ending: str, name: str = "") -> Path:
-        """The output of a job with that ending; ``name`` is one of the burst's."""
+        """The file of a job with an ending; ``name`` is that of the rendition."""
         return self.folder / f"{job.stem}{name}.{ending}"
 
     def check_size(self, source: SourceImage) -> None:
@@ -124,24 +140,9 @@ class OutputWriter:
         if "jpg" in self.formats and max(source.pixels.shape[:2]) > JPEG_MAX_SIDE:
             raise ImageError(f"JPEG holds at most {JPEG_MAX_SIDE} pixels a side; use --format png")
 
-    def _make_folder_of(self, job: Job) -> None:
-        """Make the folders between the output folder, which must be there, and a job's files.
-
-        Raises:
-            OutputError: the output folder is not there any more.
-            ImageError: they cannot be made.
-        """
-        if not self.folder.is_dir():
-            raise OutputError(f"{self.folder}: the folder has gone; {RESUMABLE}")
-        place = self.path(job, "").parent
-        try:
-            place.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ImageError(f"{place}: cannot be made: {error.strerror}") from None
-
     def outputs(self, job: Job, name: str) -> list[Path]:
-        """The images of one picture that are there in any case; an image that enters behind a kept
-        step has not that one.
+        """The pictures of a rendition, by its name. Kept images are not among them: one of a step
+        before ``start_at`` is never written.
         """
         return [self.path(job, ending_of(format_), name) for format_ in self.formats_of(name)]
 
@@ -151,45 +152,58 @@ class OutputWriter:
         Raises:
             OutputError: it cannot.
         """
-        if reason := trouble_with(self.folder):
+        if reason := write_problem(self.folder):
             raise OutputError(f"{self.folder}: {reason}; {RESUMABLE}")
 
-    def write(self, job: Job, shot: Rendition, source: SourceImage, result: Result) -> list[Path]:
-        """Write the images of one picture; the files.
+    def write(
+        self, job: Job, rendition: Rendition, source: SourceImage, result: Result
+    ) -> list[Path]:
+        """Write the images of one rendition.
+
+        Args:
+            job: the image.
+            rendition: the picture of it.
+            source: the image, as it was loaded.
+            result: what the rendition's :meth:`runner` made of it.
+
+        Returns:
+            The files.
 
         Raises:
             ImageError: a file cannot be written.
-            OutputError: the output folder is not there any more.
+            OutputError: the output folder has gone.
         """
         self._make_folder_of(job)
-        chain, camera = shot.chain, shot.chain.camera
-        own = Tags(camera.make, camera.model, chain.iso)
-        tags, orientation = from_attributes(source.attributes, own)
-        how = chain.settings.output.filled({**source.shot, **tags.shot})
-        tags = replace(tags, output=how)
-        brought = {
+        chain, camera = rendition.chain, rendition.chain.camera
+        tags, orientation = from_attributes(
+            source.attributes, Tags(camera.make, camera.model, chain.iso)
+        )
+        output = chain.settings.output.filled({**source.shot, **tags.shot})
+        tags = replace(tags, output=output)
+        tag_attributes = {
             name: source.attributes[name] for name in TAG_ATTRIBUTES if name in source.attributes
         }
-        mosaic = chain.result in (Kind.RAW, Kind.MOSAIC)
-        turn = 1 if mosaic else orientation  # to turn a mosaic would be to change its pattern
+        is_mosaic = chain.result in (Kind.RAW, Kind.MOSAIC)
+        turn = 1 if is_mosaic else orientation  # turning a mosaic would change its pattern
         outputs: list[Path] = []
-        for step in (chain.step_named(name) for name in self.kept_of(shot)):
-            path = self.path(job, f"{step.name}.exr", shot.name)
-            attributes = attributes_of(step, chain, shot.key) | brought
+        for step in (chain.step_named(name) for name in self._kept_steps(rendition)):
+            path = self.path(job, f"{step.name}.exr", rendition.name)
+            attributes = attributes_of(step, chain, rendition.key) | tag_attributes
             write_exr(path, result.kept[step.name], step.stage.writes.channels, attributes)
             outputs.append(path)
-        for format_ in self.formats_of(shot.name):
-            path = self.path(job, ending_of(format_), shot.name)
-            if shot.noise:
+        for format_ in self.formats_of(rendition.name):
+            path = self.path(job, ending_of(format_), rendition.name)
+            if rendition.noise:
                 assert result.final is not None
-                write_exr(path, variance_of(shot.noise, result.final), ("Y",), says_variance(shot))
+                variance = variance_of(rendition.noise, result.final)
+                write_exr(path, variance, ("Y",), variance_attributes(rendition))
             elif format_ == DNG:
                 negative = negative_of(chain)
                 raw = result.kept[negative.step] if negative.step else source.pixels
                 write_dng(path, raw, negative, tags, orientation)
             elif FORMATS[format_].ending == "exr":
                 assert result.final is not None
-                attributes = attributes_of(chain.steps[-1], chain, shot.key) | brought
+                attributes = attributes_of(chain.steps[-1], chain, rendition.key) | tag_attributes
                 if turn != 1:
                     attributes |= {"orientation": "1"}
                 half = FORMATS[format_].bits == 16
@@ -200,13 +214,32 @@ class OutputWriter:
             outputs.append(path)
         return outputs
 
+    def _make_folder_of(self, job: Job) -> None:
+        """Make the folders between the output folder, which must be there, and a job's files.
 
-def says_variance(shot: Rendition) -> dict[str, str]:
-    """What a variance map says of itself: what it is, so that it enters nowhere, and how made."""
-    own = attributes_of(shot.noise[-1], shot.whole, shot.key)
+        Raises:
+            OutputError: the output folder has gone.
+            ImageError: they cannot be made.
+        """
+        if not self.folder.is_dir():
+            raise OutputError(f"{self.folder}: the folder has gone; {RESUMABLE}")
+        folder = self.path(job, "").parent
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ImageError(f"{folder}: cannot be made: {error.strerror}") from None
+
+
+def samples(result: Result, format_: Format) -> Array:
+    """The last image as a format for display holds it: uint8, uint16 or float32."""
+    if format_.bits == 8:
+        assert result.encoded is not None
+        return result.encoded
+    assert result.final is not None
+    return result.final if format_.floats else to_16_bit(result.final)
+
+
+def variance_attributes(rendition: Rendition) -> dict[str, str]:
+    """The attributes of a variance map; by their kind it can enter no chain."""
+    own = attributes_of(rendition.noise[-1], rendition.whole, rendition.key)
     return {**own, "stage": "variance", "kind": "variance"}
-
-
-def named(job: Job) -> str:
-    """A job as an error names it."""
-    return f"{job.path} ({job.place})" if job.place else str(job.path)

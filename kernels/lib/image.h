@@ -1,7 +1,7 @@
 // Where a block of lanes stands, and how lanes are read from and written to images.
 //
 // A stored image is one to three planes of float32. Its rows are `pitch` apart, and it is surrounded
-// by a border of BORDER pixels that mirrors the image (reflect-101: the edge pixel is not repeated,
+// by a border of `border` pixels that mirrors the image (reflect-101: the edge pixel is not repeated,
 // so the Bayer pattern continues in the border). Whatever writes a pixel also writes its mirror
 // images in the border, so a stencil never has to check where it is.
 #ifndef CLPIPE_IMAGE_H
@@ -20,6 +20,7 @@ typedef struct {
     uint pitch;
     uint left, top;      // of the planes, in the image; in whole blocks
     uint columns, rows;  // of the planes
+    uint border;         // around the planes, in pixels: as wide as the plan's widest stencil
 } extent;
 
 // The pixels of a tile without its halo.
@@ -55,13 +56,17 @@ INLINE size_t pixel_number(site at, extent e) {
     return (size_t)(at.y - e.top) * e.columns + (at.x - e.left);
 }
 
+// Columns before the first pixel of a row: the border, in whole blocks.
+INLINE uint border_left(extent e) { return (e.border + LANES - 1) / LANES * LANES; }
+
 INLINE size_t plane_offset(site at, extent e) {
-    return (size_t)(at.y - e.top + BORDER) * e.pitch + BORDER_LEFT + (at.x - e.left);
+    return (size_t)(at.y - e.top + e.border) * e.pitch + border_left(e) + (at.x - e.left);
 }
 
 // The address that the image's first pixel would have, from which places in the image are counted.
 INLINE __global const float *image_origin(__global const float *plane, extent e) {
-    return plane + ((long)BORDER - (long)e.top) * (long)e.pitch + BORDER_LEFT - (long)e.left;
+    return plane + ((long)e.border - (long)e.top) * (long)e.pitch + (long)border_left(e) -
+           (long)e.left;
 }
 
 INLINE image image_at(__global const float *p0, __global const float *p1, __global const float *p2,
@@ -91,75 +96,90 @@ INLINE ycbcr tap_ycbcr(image i, int dx, int dy) {
 }
 #undef TAP
 
-// The pixel (0..n-1) that reflect-101 puts at index i.
-INLINE int mirror(int i, int n) {
-    if (n == 1) return 0;
-    const int period = 2 * (n - 1);
-    i %= period;
-    if (i < 0) i += period;
-    return i < n ? i : period - i;
+// Reflect-101 shows the pixel at place i of n at i and -i, and at both again a period further. Stores
+// at edges go over these places from the lowest one in the border on. Their loops are not unrolled,
+// since few blocks come there, and they would be most of a kernel's code.
+INLINE int mirror_period(int n) { return n > 1 ? 2 * (n - 1) : 1; }
+
+// The lowest place not below `lowest` that is a whole number of periods from `place`.
+INLINE int lowest_place(int place, int period, int lowest) {
+    const int above = (place - lowest) % period;
+    return lowest + (above < 0 ? above + period : above);
 }
 
-// Stores one lane's value in its column and in that column's mirror images, all in one row.
-INLINE void store_lane(float v, __global float *row, int x, int width) {
-    row[x] = v;
-    for (int a = 1; a <= BORDER; ++a) {
-        if (mirror(-a, width) == x) row[-a] = v;
-        if (mirror(width - 1 + a, width) == x) row[width - 1 + a] = v;
-    }
-}
-
-static void store_row(vf v, __global float *row, int x, int width) {
-    if (x > BORDER && x + LANES + BORDER < width) {
+static void store_row(vf v, __global float *row, int x, extent e) {
+    const int border = (int)e.border, width = (int)e.columns, period = mirror_period(width);
+    if (x > border && x + LANES + border < width) {
         store(v, row + x);
         return;
     }
     float lanes[LANES];
     spill(v, lanes);
-    for (int k = 0; k < LANES && x + k < width; ++k) store_lane(lanes[k], row, x + k, width);
+#pragma unroll 1
+    for (int k = 0; k < 2 * LANES; ++k) {
+        const int column = x + k / 2, place = k & 1 ? -column : column;
+        if (column >= width) break;
+#pragma unroll 1
+        for (int i = lowest_place(place, period, -border); i < width + border; i += period)
+            row[i] = lanes[k / 2];
+    }
 }
 
 // `x` and `y` are counted from where the planes begin.
 static void store_at_edge(vf v, __global float *dst, int x, int y, extent e) {
-    const int columns = (int)e.columns, rows = (int)e.rows;
-    __global float *origin = dst + (size_t)BORDER * e.pitch + BORDER_LEFT;
-    store_row(v, origin + (long)y * e.pitch, x, columns);
-    for (int a = 1; a <= BORDER; ++a) {
-        if (mirror(-a, rows) == y) store_row(v, origin - (long)a * e.pitch, x, columns);
-        if (mirror(rows - 1 + a, rows) == y)
-            store_row(v, origin + (long)(rows - 1 + a) * e.pitch, x, columns);
+    const int border = (int)e.border, rows = (int)e.rows, period = mirror_period(rows);
+    __global float *origin = dst + (size_t)border * e.pitch + border_left(e);
+#pragma unroll 1
+    for (int k = 0; k < 2; ++k) {
+#pragma unroll 1
+        for (int i = lowest_place(k ? -y : y, period, -border); i < rows + border; i += period)
+            store_row(v, origin + (long)i * (long)e.pitch, x, e);
     }
 }
 
-INLINE bool near_edge(uint x, uint y, extent e) {
-    return x <= BORDER || x + LANES + BORDER >= e.columns || y <= BORDER || y + 1 + BORDER >= e.rows;
+// Whether a block of rows has pixels that the border mirrors, or that are none of the image's.
+INLINE bool near_edge(site at, uint rows, extent e) {
+    const uint x = at.x - e.left, y = at.y - e.top;
+    return x <= e.border || x + LANES + e.border >= e.columns || y <= e.border ||
+           y + rows + e.border >= e.rows;
 }
 
+// A pixel of a block that is not near an edge.
+INLINE void store_plane_inside(vf v, __global float *dst, site at, extent e) {
+    store(v, dst + plane_offset(at, e));
+}
+
+// Any pixel, with its mirror images.
 INLINE void store_plane(vf v, __global float *dst, site at, extent e) {
     const uint x = at.x - e.left, y = at.y - e.top;
-    if (near_edge(x, y, e)) {
-        if (y < e.rows) store_at_edge(v, dst, (int)x, (int)y, e);
-    } else {
-        store(v, dst + plane_offset(at, e));
-    }
+    if (!near_edge(at, 1, e)) store_plane_inside(v, dst, at, e);
+    else if (y < e.rows) store_at_edge(v, dst, (int)x, (int)y, e);
 }
 
-INLINE void store_mosaic(vf v, __global float *p0, site at, extent e) { store_plane(v, p0, at, e); }
-INLINE void store_pair(pair v, __global float *p0, __global float *p1, site at, extent e) {
-    store_plane(v.first, p0, at, e);
-    store_plane(v.second, p1, at, e);
-}
-INLINE void store_rgb(rgb v, __global float *p0, __global float *p1, __global float *p2, site at,
-                      extent e) {
-    store_plane(v.r, p0, at, e);
-    store_plane(v.g, p1, at, e);
-    store_plane(v.b, p2, at, e);
-}
-INLINE void store_ycbcr(ycbcr v, __global float *p0, __global float *p1, __global float *p2,
-                        site at, extent e) {
-    store_plane(v.y, p0, at, e);
-    store_plane(v.cb, p1, at, e);
-    store_plane(v.cr, p2, at, e);
-}
+// store_rgb(v, plane0, plane1, plane2, at, e), store_rgb_inside(...) and so on for each kind.
+#define STORES(STORE, suffix)                                                                     \
+    INLINE void store_mosaic##suffix(vf v, __global float *p0, site at, extent e) {               \
+        STORE(v, p0, at, e);                                                                      \
+    }                                                                                             \
+    INLINE void store_pair##suffix(pair v, __global float *p0, __global float *p1, site at,       \
+                                   extent e) {                                                    \
+        STORE(v.first, p0, at, e);                                                                \
+        STORE(v.second, p1, at, e);                                                               \
+    }                                                                                             \
+    INLINE void store_rgb##suffix(rgb v, __global float *p0, __global float *p1,                  \
+                                  __global float *p2, site at, extent e) {                        \
+        STORE(v.r, p0, at, e);                                                                    \
+        STORE(v.g, p1, at, e);                                                                    \
+        STORE(v.b, p2, at, e);                                                                    \
+    }                                                                                             \
+    INLINE void store_ycbcr##suffix(ycbcr v, __global float *p0, __global float *p1,              \
+                                    __global float *p2, site at, extent e) {                      \
+        STORE(v.y, p0, at, e);                                                                    \
+        STORE(v.cb, p1, at, e);                                                                   \
+        STORE(v.cr, p2, at, e);                                                                   \
+    }
+STORES(store_plane, )
+STORES(store_plane_inside, _inside)
+#undef STORES
 
 #endif

@@ -64,8 +64,8 @@ INLINE vf load_half(__global const half *p) { return LANES_OF(vload_half)(0, p);
 
 INLINE vf vmin(vf a, vf b) { return a < b ? a : b; }
 INLINE vf vmax(vf a, vf b) { return a > b ? a : b; }
-INLINE vi least_int(vi a, vi b) { return a < b ? a : b; }
-INLINE vi most_int(vi a, vi b) { return a > b ? a : b; }
+INLINE vi vmin_int(vi a, vi b) { return a < b ? a : b; }
+INLINE vi vmax_int(vi a, vi b) { return a > b ? a : b; }
 
 // To the nearest whole number, ties to even, for |v| < 2^22.
 INLINE vf nearest(vf v) { return (v + 12582912.0f) - 12582912.0f; }

@@ -24,26 +24,26 @@ INLINE int2 fold_columns(vi v, site at) {
 }
 
 // Work item i of n adds up its share of the blocks, on top of those of the tiles before.
-INLINE void add_up_blocks(__global const int4 *blocks, __global long4 *shares, uint count,
+INLINE void add_up_blocks(__global const int4 *blocks, __global long4 *partials, uint count,
                           uint tile) {
     const uint n = get_global_size(0), i = get_global_id(0);
-    long4 sum = tile ? shares[i] : (long4)(0);
+    long4 sum = tile ? partials[i] : (long4)(0);
     for (uint k = i; k < count; k += n) sum += convert_long4(blocks[k]);
-    shares[i] = sum;
+    partials[i] = sum;
 }
 
-INLINE long4 add_up_shares(__global const long4 *shares, uint count) {
+INLINE long4 add_up_partials(__global const long4 *partials, uint count) {
     long4 sum = (long4)(0);
-    for (uint k = 0; k < count; ++k) sum += shares[k];
+    for (uint k = 0; k < count; ++k) sum += partials[k];
     return sum;
 }
 
-// Each work item adds up some of the bins, over all shares, on top of those of the tiles before.
+// Each work item adds up some of the bins, over all partials, on top of those of the tiles before.
 INLINE void add_up_counts(__global const uint *counts, __global uint *histogram, uint bins,
-                          uint shares, uint tile) {
+                          uint partials, uint tile) {
     for (uint bin = get_global_id(0); bin < bins; bin += get_global_size(0)) {
         uint sum = tile ? histogram[bin] : 0;
-        for (uint share = 0; share < shares; ++share) sum += counts[(size_t)share * bins + bin];
+        for (uint k = 0; k < partials; ++k) sum += counts[(size_t)k * bins + bin];
         histogram[bin] = sum;
     }
 }

@@ -36,12 +36,12 @@ class EstimatedGains(Method):
 
     def passes(self) -> tuple[Pass, ...]:
         search = self.search()
-        apply = Pass("white_balance", arguments=("pattern", *search.found), cheap=True)
+        apply = Pass("white_balance", arguments=("pattern", *search.estimates), cheap=True)
         return search, apply
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
         red, blue = self.gains(image, frame.context.pattern)
-        frame.found["red_gain"], frame.found["blue_gain"] = float(red), float(blue)
+        frame.estimates["red_gain"], frame.estimates["blue_gain"] = float(red), float(blue)
         return apply_gains(image, frame.context, red, blue)
 
 

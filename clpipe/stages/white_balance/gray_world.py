@@ -28,7 +28,7 @@ class GrayWorld(EstimatedGains):
             Access.SUMS,
             finish="gray_world",
             finish_arguments=("pattern",),
-            found=("red_gain", "blue_gain"),
+            estimates=("red_gain", "blue_gain"),
         )
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:

@@ -76,7 +76,7 @@ class WhitePatch(EstimatedGains):
             ("pattern", "clip"),
             finish="white_patch",
             finish_arguments=("millionths",),
-            found=("red_gain", "blue_gain"),
+            estimates=("red_gain", "blue_gain"),
             bins=3 * STEPS,
         )
 

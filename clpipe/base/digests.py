@@ -1,0 +1,31 @@
+"""SHA-256 of files, computed again only where a file has changed."""
+
+from collections.abc import Iterable
+from contextlib import suppress
+from functools import lru_cache
+from pathlib import Path
+
+from clpipe.base.files import sha256_of
+
+
+def stamp_of(path: Path) -> tuple[int, int]:
+    """The size of a file in bytes and its time of change in ns; zeros where it cannot be seen."""
+    try:
+        info = path.stat()
+    except OSError:
+        return (0, 0)
+    return info.st_size, info.st_mtime_ns
+
+
+def digests(files: Iterable[str]) -> dict[str, str]:
+    """The SHA-256 of each of these files, by its name; those that cannot be read are left out."""
+    by_name = {}
+    for file in files:
+        with suppress(OSError):
+            by_name[file] = _digest(file, *stamp_of(Path(file)))
+    return by_name
+
+
+@lru_cache(maxsize=1024)
+def _digest(file: str, size: int, modified: int) -> str:
+    return sha256_of(Path(file))[0]

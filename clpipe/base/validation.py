@@ -1,0 +1,60 @@
+"""What pydantic refuses, as one line for a user: where the value stands, what it is, why."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from pydantic import ValidationError
+
+
+@dataclass(frozen=True)
+class Fault:
+    """The first thing wrong with a table of values.
+
+    ``path`` leads to the value, through tables by name and through lists by number; it is empty
+    where values are wrong only together. ``text`` says what was found and why it is refused.
+    """
+
+    path: tuple[str | int, ...]
+    problem: Literal["unknown", "missing", "invalid"]
+    text: str
+
+    @property
+    def name(self) -> str:
+        """The last part of the path, "" where there is none."""
+        return str(self.path[-1]) if self.path else ""
+
+    @property
+    def key(self) -> str:
+        """The path as a text.
+
+        >>> Fault(("gain_stages", 1, "iso"), "missing", "").key
+        'gain_stages[1].iso'
+        """
+        parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in self.path)
+        return "".join(parts).lstrip(".")
+
+
+def first_fault(error: ValidationError) -> Fault:
+    """The first of the faults that pydantic found.
+
+    >>> from pydantic import BaseModel, Field
+    >>> class Lens(BaseModel):
+    ...     stops: float = Field(ge=1)
+    >>> try:
+    ...     Lens(stops=0.5)
+    ... except ValidationError as error:
+    ...     fault = first_fault(error)
+    >>> fault.key, fault.text
+    ('stops', 'found 0.5: should be greater than or equal to 1')
+    """
+    first = error.errors()[0]
+    path = first["loc"]
+    if first["type"] == "extra_forbidden":
+        return Fault(path, "unknown", "there is no such key")
+    if first["type"] == "missing":
+        return Fault(path, "missing", "it is missing")
+    reason = first["msg"].removeprefix("Value error, ").removeprefix("Input ")
+    # A whole table is too long to repeat, and its path says which one it is.
+    shown = bool(path) and not isinstance(first["input"], Mapping)
+    return Fault(path, "invalid", f"found {first['input']!r}: {reason}" if shown else reason)

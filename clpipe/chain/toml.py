@@ -1,0 +1,72 @@
+"""TOML as text: single values in and out, and the line on which a key stands."""
+
+import json
+import re
+import tomllib
+from collections.abc import Mapping
+from typing import Any
+
+from clpipe.base.errors import RequestError
+
+
+def line_of(text: str, key: str) -> int | None:
+    """The line of a TOML text (from 1) on which a key such as ``stage.parameter`` is set."""
+    table = ""
+    within = None
+    for number, line in enumerate(text.splitlines(), 1):
+        if match := re.match(r"\s*\[\s*([\w.-]+)\s*\]", line):
+            name, table = match[1], match[1] + "."
+        elif match := re.match(r"\s*([\w.-]+)\s*=", line):
+            name = table + match[1]
+            if name == key:
+                return number
+        else:
+            continue
+        if within is None and f"{name}.".startswith(f"{key}."):
+            within = number
+    return within
+
+
+def parse_assignment(text: str) -> tuple[str, str, Any]:
+    """The three parts of ``stage.parameter=value``; the value as :func:`toml_value` has it.
+
+    >>> parse_assignment("sensor_noise.a=1e-4")
+    ('sensor_noise', 'a', 0.0001)
+
+    Raises:
+        RequestError: the text does not have that form.
+    """
+    match = re.fullmatch(r"(\w+)\.(\w+)=(.*)", text)
+    if not match:
+        raise RequestError(f"--set {text}: expected stage.parameter=value")
+    return match[1], match[2], toml_value(match[3])
+
+
+def toml_value(text: str) -> Any:
+    """The value of a text that is valid TOML, such as a number or a list; else the text itself.
+
+    >>> toml_value("1e-4"), toml_value("{choice = [100, 400]}"), toml_value("bilinear")
+    (0.0001, {'choice': [100, 400]}, 'bilinear')
+    """
+    try:
+        table = tomllib.loads(f"value = {text}")
+    except (ValueError, RecursionError):
+        return text
+    return table["value"] if len(table) == 1 else text
+
+
+def value_text(value: Any) -> str:
+    """A parameter's value, as TOML has it.
+
+    >>> value_text((1.0, 2.5)), value_text("bayer"), value_text(False)
+    ('[1, 2.5]', '"bayer"', 'false')
+    >>> value_text({"uniform": [1, 2]})
+    '{ uniform = [1, 2] }'
+    """
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(f'{key} = {value_text(v)}' for key, v in value.items())} }}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(value_text, value))}]"
+    if isinstance(value, float):
+        return repr(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
+    return json.dumps(value, ensure_ascii=False)

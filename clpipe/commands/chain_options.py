@@ -1,0 +1,100 @@
+"""Options that say which chain to run, and what of it to write."""
+
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+from clpipe.chain.files import built_in_configs
+from clpipe.chain.formats import EVERY_FORMAT
+from clpipe.chain.request import DEFAULTS
+from clpipe.commands.completion import (
+    cameras,
+    configs,
+    parameters,
+    stage_lists,
+    steps,
+    steps_or_all,
+)
+from clpipe.commands.options import stage_file_option
+
+camera_option = click.option(
+    "--camera",
+    metavar="NAME|FILE",
+    shell_complete=cameras,
+    help=f"A built-in camera or a profile (.toml). [default: {DEFAULTS.camera}]",
+)
+
+iso_option = click.option(
+    "--iso",
+    type=float,
+    help=f"The ISO; noise and denoising follow from it. [default: {DEFAULTS.iso:g}]",
+)
+
+_CHAIN_OPTIONS = (
+    click.option(
+        "-c",
+        "--config",
+        metavar="NAME|FILE",
+        shell_complete=configs,
+        help=f"A configuration: {', '.join(built_in_configs())}, or a TOML file.",
+    ),
+    camera_option,
+    iso_option,
+    click.option("--seed", type=int, help=f"The seed of the noise. [default: {DEFAULTS.seed}]"),
+    click.option(
+        "--set",
+        "assignments",
+        multiple=True,
+        metavar="STAGE.PARAM=VALUE",
+        shell_complete=parameters,
+        help="Set a parameter; may be repeated. STAGE.method=NAME chooses a method; "
+        "'{uniform=[1, 2]}' as the value draws one for each image.",
+    ),
+    click.option(
+        "--stages",
+        metavar="A,B,C",
+        shell_complete=stage_lists,
+        help="The stages to run, in order, in place of the default chain.",
+    ),
+    click.option(
+        "--skip",
+        multiple=True,
+        metavar="STAGE",
+        shell_complete=steps,
+        help="Leave a stage out; may be repeated.",
+    ),
+    click.option(
+        "--start-at",
+        metavar="STAGE",
+        shell_complete=steps,
+        help="The first stage to run, on kept images or mosaics.",
+    ),
+    click.option("--until", metavar="STAGE", shell_complete=steps, help="The last stage to run."),
+    stage_file_option,
+)
+
+
+def chain_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The options that say which chain to run."""
+    for option in reversed(_CHAIN_OPTIONS):
+        function = option(function)
+    return function
+
+
+keep_option = click.option(
+    "--keep",
+    multiple=True,
+    metavar="STAGE|all",
+    shell_complete=steps_or_all,
+    help="Write the image of a stage, too, as float EXR; may be repeated.",
+)
+
+format_option = click.option(
+    "--format",
+    "formats",
+    multiple=True,
+    type=click.Choice(EVERY_FORMAT),
+    help="The format of the last image, or dng for the raw that quantize makes; may be repeated. "
+    "[default: jpg; exr where --until ends the chain earlier]",
+)

@@ -1,0 +1,92 @@
+"""Names that the shell completes: cameras, configurations, stages and their parameters.
+
+Each function has the signature of click's ``shell_complete``. Rooms are imported where they are
+needed, because these functions are named by options of commands that do not use them.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import click
+from click.shell_completion import CompletionItem
+
+from clpipe.base.errors import ClpipeError
+
+
+def cameras(context: click.Context, option: click.Parameter, text: str) -> list[CompletionItem]:
+    """Built-in cameras, and files."""
+    from clpipe.camera.profile import built_in_cameras
+
+    return _names(built_in_cameras(), text) or _file(text)
+
+
+def configs(context: click.Context, option: click.Parameter, text: str) -> list[CompletionItem]:
+    """Built-in configurations, and files."""
+    from clpipe.chain.files import built_in_configs
+
+    return _names(built_in_configs(), text) or _file(text)
+
+
+def steps(context: click.Context, option: click.Parameter, text: str) -> list[CompletionItem]:
+    """Stages, in the order of the default chain."""
+    return _names(_stages(context), text)
+
+
+def steps_or_all(
+    context: click.Context, option: click.Parameter, text: str
+) -> list[CompletionItem]:
+    """Stages, and "all"."""
+    return _names(["all", *_stages(context)], text)
+
+
+def stage_lists(context: click.Context, option: click.Parameter, text: str) -> list[CompletionItem]:
+    """Stages behind the last comma."""
+    before, comma, last = text.rpartition(",")
+    return [CompletionItem(before + comma + item.value) for item in _names(_stages(context), last)]
+
+
+def methods_of(context: click.Context, option: click.Parameter, text: str) -> list[CompletionItem]:
+    """Stages that have more than one method."""
+    from clpipe.chain.registry import all_stages
+
+    names = _stages(context)
+    return _names([name for name in names if len(all_stages()[name].methods) > 1], text)
+
+
+def parameters(context: click.Context, option: click.Parameter, text: str) -> list[CompletionItem]:
+    """``stage.``, then ``stage.parameter=``, then the methods of ``stage.method=``."""
+    from clpipe.chain.methods import base_name
+    from clpipe.chain.registry import all_stages
+
+    names = _stages(context)
+    step, dot, rest = text.partition(".")
+    if not dot:
+        return _names([f"{name}." for name in names], text)
+    stage = all_stages().get(base_name(step))
+    if stage is None:
+        return []
+    if rest.startswith("method="):
+        return _names([f"{step}.method={method}" for method in stage.by_name], text)
+    of_methods = [name for method in stage.methods for name in method.model_fields]
+    return _names([f"{step}.{name}=" for name in dict.fromkeys(["method", *of_methods])], text)
+
+
+def _stages(context: click.Context) -> list[str]:
+    """The names of all stages, with those of ``--stage-file`` where they can be loaded."""
+    from clpipe.chain.registry import all_stages, load_stage_file
+
+    try:
+        for file in context.params.get("stage_files") or ():
+            load_stage_file(Path(file))
+        return list(all_stages())
+    except ClpipeError:
+        return []
+
+
+def _names(names: Iterable[str], text: str) -> list[CompletionItem]:
+    return [CompletionItem(name) for name in names if name.startswith(text)]
+
+
+def _file(text: str) -> list[CompletionItem]:
+    """The item that lets the shell complete names of files."""
+    return [CompletionItem(text, type="file")]

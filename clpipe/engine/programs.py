@@ -1,0 +1,131 @@
+"""Compiled programs: one for each text and device of a process, on disk between processes.
+
+The text of a kernel depends only on what it does (see :mod:`clpipe.engine.codegen`), so plans
+share programs, and so do all :class:`~clpipe.engine.device.Device` objects on one device.
+"""
+
+import logging
+import re
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from clpipe.base.errors import DeviceError, RequestError
+from clpipe.engine.cache_folder import cache_folder
+from clpipe.engine.codegen import Kernel
+from clpipe.engine.discovery import DeviceInfo
+
+LONG = 2.0  # s of compiling after which a user is told what is going on
+log = logging.getLogger(__name__)
+_by_device: dict[int, "Programs"] = {}
+_lock = threading.Lock()
+_announced = threading.Event()
+
+
+class Programs:
+    """The OpenCL context of a device, and the programs that this process compiled in it.
+
+    Raises:
+        DeviceError: the device cannot be opened.
+    """
+
+    def __init__(self, info: DeviceInfo) -> None:
+        import pyopencl as cl
+
+        self._cl = cl
+        try:
+            self.context = cl.Context([info.handle])
+        except cl.Error as error:
+            raise DeviceError(f"{info.label} cannot be opened: {error}") from None
+        self._programs: dict[str, Any] = {}
+        self._lock = threading.Lock()
+        self._options = ["-cl-std=CL1.2"]
+        if info.handle.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
+            self._options.append("-cl-fp32-correctly-rounded-divide-sqrt")
+        # PoCL keeps programs in the same folder by itself, with what it makes of them at the first
+        # launch. For other platforms pyopencl keeps binaries under a key of text, options, device
+        # and driver.
+        own_cache = "Portable Computing" in info.platform
+        self._cache_dir = False if own_cache else str(cache_folder() / "programs")
+
+    def __len__(self) -> int:
+        """How many programs there are."""
+        return len(self._programs)
+
+    def kernel(self, kernel: Kernel) -> Any:
+        """A compiled kernel, with arguments of its own.
+
+        Raises:
+            RequestError: a user's stage file does not compile; the message is the compiler's.
+            DeviceError: another kernel does not compile.
+        """
+        with self._lock:
+            if kernel.source not in self._programs:
+                self._programs[kernel.source] = self._compile(kernel)
+            return self._cl.Kernel(self._programs[kernel.source], kernel.name)
+
+    def _compile(self, kernel: Kernel) -> Any:
+        cl = self._cl
+        # Not within catch_warnings, which changes the filters of all threads.
+        warnings.filterwarnings("ignore", category=cl.CompilerWarning)
+        program = cl.Program(self.context, kernel.source)
+        try:
+            return program.build(self._options, cache_dir=self._cache_dir)
+        except cl.MemoryError:
+            raise
+        except cl.Error as error:
+            text = build_log(str(error))
+            for file in kernel.files:
+                if Path(file).is_absolute():
+                    raise RequestError(f"{file}: does not compile:\n{text}") from None
+            raise DeviceError(f"{kernel.launch.name}: does not compile:\n{text}") from None
+
+
+def programs_of(info: DeviceInfo) -> Programs:
+    """The context and programs of a device, one for all who use it in this process.
+
+    Raises:
+        DeviceError: the device cannot be opened.
+    """
+    with _lock:
+        key = info.handle.int_ptr
+        if key not in _by_device:
+            _by_device[key] = Programs(info)
+        return _by_device[key]
+
+
+@contextmanager
+def announced(info: DeviceInfo) -> Iterator[None]:
+    """Log that kernels are being compiled if that takes longer than :data:`LONG`; once a process.
+
+    The logger is ``clpipe.engine.programs``, the level INFO.
+    """
+
+    def announce() -> None:
+        if not _announced.is_set():
+            _announced.set()
+            log.info(
+                "compiling kernels for %s; later runs find them in %s", info.label, cache_folder()
+            )
+
+    timer = threading.Timer(LONG, announce)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def build_log(text: str) -> str:
+    """What the compiler said, out of pyopencl's error message.
+
+    >>> build_log("failed\\n\\nBuild on <x>:\\n\\nerror: a.cl:2:7: no\\n\\n(options: -a)")
+    'error: a.cl:2:7: no'
+    """
+    found = re.sub(r"\n*\(options: .*", "", text.partition(">:\n")[2], flags=re.DOTALL)
+    lines = [line for line in found.splitlines() if "failed to build the program" not in line]
+    return "\n".join(lines).strip() or text

@@ -1,0 +1,145 @@
+"""Tables of a manifest: CSV and JSONL, as values by column.
+
+A row is parsed only when its record is called, so that one wrong row does not hide the others.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from clpipe.base.errors import RequestError
+from clpipe.base.text import one_of
+from clpipe.chain.toml import toml_value
+
+Record = Callable[[], dict[str, Any]]  # the values of a row by column, or a RequestError
+
+TEXTS = ("path", "name")  # columns that are text, whatever they look like
+
+OWN = (*TEXTS, "frames")  # columns that are no settings
+
+PLAIN = ("iso", "camera", "seed")  # columns of settings that stand in no table
+
+
+def csv_records(
+    path: Path, text: str, check_column: Callable[[str], None]
+) -> Iterator[tuple[int, Record]]:
+    """The rows of a CSV, each with the line on which it begins.
+
+    Args:
+        path: the file, for messages.
+        text: its text.
+        check_column: raises a RequestError for a column that does not exist.
+
+    Raises:
+        RequestError: the CSV is not valid or empty, or its header is wrong.
+    """
+    reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True, strict=True)
+    columns: list[str] | None = None
+    line = 1
+    try:
+        for cells in reader:
+            if cells and columns is None:
+                columns = [cell.strip() for cell in cells]
+                _check_header(f"{path}, row {line}", columns, check_column)
+            elif cells and columns:
+                yield line, partial(_by_column, columns, cells)
+            line = reader.line_num + 1
+    except csv.Error as error:
+        raise RequestError(f"{path}, row {line}: not valid CSV: {error}") from None
+    if columns is None:
+        raise RequestError(f"{path}: it is empty; its first row names columns, such as path")
+
+
+def _check_header(place: str, columns: Sequence[str], check_column: Callable[[str], None]) -> None:
+    """See that a header names each column once, and only columns that exist.
+
+    Raises:
+        RequestError: it does not.
+    """
+    for number, column in enumerate(columns, 1):
+        if not column:
+            raise RequestError(f"{place}: column {number} has no name")
+        if column in columns[: number - 1]:
+            raise RequestError(f"{place}: there are two columns '{column}'")
+    if "path" not in columns:
+        commas = "" if len(columns) > 1 else "; columns are separated by commas"
+        message = one_of("column", "path", columns).replace("unknown", "there is no")
+        raise RequestError(f"{place}: {message.replace('; allowed:', '; found:')}{commas}")
+    for column in columns:
+        try:
+            check_column(column)
+        except RequestError as error:
+            raise RequestError(f"{place}: {error}") from None
+
+
+def _by_column(columns: Sequence[str], cells: Sequence[str]) -> dict[str, Any]:
+    """The cells of a row by their columns, without empty ones.
+
+    Raises:
+        RequestError: there are more or fewer cells than columns.
+    """
+    if len(cells) != len(columns):
+        listed = ", ".join(columns)
+        raise RequestError(
+            f"found {len(cells)} cells, but there are {len(columns)} columns ({listed}); "
+            "a cell with commas stands in quotes"
+        )
+    pairs = zip(columns, cells, strict=True)
+    filled = {column: cell for column, cell in pairs if cell.strip()}
+    return {k: v if k in TEXTS else toml_value(v.strip()) for k, v in filled.items()}
+
+
+def json_records(
+    path: Path, text: str, check_column: Callable[[str], None]
+) -> Iterator[tuple[int, Record]]:
+    """The lines of a JSONL that are not empty, with their numbers; arguments as for a CSV."""
+    for number, line in enumerate(text.split("\n"), 1):
+        if line.strip():
+            yield number, partial(_from_json, line, check_column)
+
+
+def _from_json(line: str, check_column: Callable[[str], None]) -> dict[str, Any]:
+    """The values of a JSON object by dotted columns, without null.
+
+    Raises:
+        RequestError: it is no object, has a key twice, or a column that does not exist.
+    """
+    try:
+        row = json.loads(line, parse_constant=_refuse_constant, object_pairs_hook=_unique)
+    except json.JSONDecodeError as error:
+        message = f"not valid JSON: {error.msg} at character {error.colno}"
+        raise RequestError(message) from None
+    except (ValueError, RecursionError) as error:
+        raise RequestError(f"not valid JSON: {error}") from None
+    if not isinstance(row, dict):
+        raise RequestError(f"found {line.strip()[:40]}, but a row is an object: {{...}}")
+    pairs: list[tuple[str, Any]] = []
+    for key, value in row.items():
+        if isinstance(value, dict) and "." not in key and key not in (*OWN, *PLAIN):
+            pairs += [(f"{key}.{name}", item) for name, item in value.items()]
+        else:
+            pairs.append((key, value))
+    for column, _ in pairs:
+        check_column(column)
+    return {k: v for k, v in _unique(pairs).items() if v is not None}
+
+
+def _refuse_constant(constant: str) -> None:
+    raise ValueError(f"found {constant}, which is no number")
+
+
+def _unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    """Pairs as a dict.
+
+    Raises:
+        RequestError: a key is there twice.
+    """
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise RequestError(f"'{next(n for n in names if names.count(n) > 1)}' is there twice")
+    return values

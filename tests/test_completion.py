@@ -1,0 +1,110 @@
+"""What the shell completes, and that listing and completing commands stays light."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.shell_completion import ShellComplete
+
+from clpipe.commands.main import COMMANDS, main, summary
+from clpipe.stages import DEFAULT_CHAIN
+from tests.conftest import ROOT
+
+
+def completed(*words):
+    """The completions of the last word, with those before it on the command line."""
+    *before, last = words
+    shell = ShellComplete(main, {}, "clpipe", "_CLPIPE_COMPLETE")
+    return [(item.type, item.value) for item in shell.get_completions(before, last)]
+
+
+def values(*words):
+    assert all(kind == "plain" for kind, _ in completed(*words))
+    return [value for _, value in completed(*words)]
+
+
+def test_commands():
+    assert values("c") == ["cameras", "calibrate", "check"]
+
+
+@pytest.mark.parametrize("words", [("run", "--camera"), ("cameras",), ("stages", "--camera")])
+def test_cameras(words):
+    assert values(*words, "sony") == ["sony-a7r2", "sony-a7s2"]
+
+
+def test_configurations_and_files():
+    assert values("run", "-c", "brooks") == ["brooks2019"]
+    assert completed("run", "-c", "mine") == [("file", "mine")]
+    assert completed("run", "--camera", "./") == [("file", "./")]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("run", "--skip"),
+        ("run", "--start-at"),
+        ("plan", "--until"),
+        ("run", "--keep"),
+        ("stages",),
+        ("check", "mosaic"),
+    ],
+)
+def test_stages(words):
+    assert values(*words, "demo") == ["demosaic"]
+    assert set(DEFAULT_CHAIN) <= set(values(*words, ""))
+
+
+def test_lists_of_stages():
+    assert values("run", "--stages", "exposure,mosaic,dem") == ["exposure,mosaic,demosaic"]
+
+
+def test_keep_takes_all():
+    assert values("plan", "--keep", "a") == ["all"]
+
+
+def test_only_stages_with_several_methods_have_methods_to_time():
+    assert "exposure" not in values("bench", "--methods", "")
+    assert values("bench", "--methods", "den") == ["denoise"]
+
+
+def test_parameters():
+    assert values("run", "--set", "expo") == ["exposure."]
+    assert values("run", "--set", "exposure.") == ["exposure.method=", "exposure.ev="]
+    assert values("run", "--set", "gamma.method=s") == ["gamma.method=srgb"]
+    assert values("run", "--set", "nothing.") == []
+
+
+def test_a_stage_of_the_users_own(tmp_path):
+    file = tmp_path / "gone.py"
+    assert values("run", "--stage-file", str(file), "--skip", "dem") == []  # and no traceback
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_command_has_one_sentence_in_the_list(name):
+    text = summary(name)
+    assert 10 < len(text) < 100
+    assert text[0].isupper() and not text.endswith(".")
+
+
+# What takes long to import, and which commands do without it.
+HEAVY = ("numpy", "pydantic", "pyopencl", "OpenImageIO", "rich", "scipy", "matplotlib")
+
+
+@pytest.mark.parametrize(
+    ("code", "allowed"),
+    [
+        ("import clpipe", ()),
+        ("from clpipe.commands.main import main; main(['--help'], standalone_mode=False)", ()),
+        ("import clpipe.commands.cameras", ("numpy", "pydantic")),
+        ("import clpipe.commands.stages", ("numpy", "pydantic")),
+        ("import clpipe.commands.plan", ("numpy", "pydantic")),
+        ("import clpipe.commands.devices", ("numpy", "pydantic", "pyopencl")),
+        ("import clpipe.pipeline", ("numpy", "pydantic", "pyopencl")),
+    ],
+)
+def test_what_is_not_needed_is_not_imported(code, allowed):
+    program = f"import sys; {code}; print([m for m in {HEAVY} if m in sys.modules])"
+    command = [sys.executable, "-c", program]
+    run = subprocess.run(command, cwd=Path(ROOT), capture_output=True, text=True, check=True)
+    assert set(eval(run.stdout.splitlines()[-1])) <= set(allowed)

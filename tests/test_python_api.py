@@ -1,0 +1,79 @@
+"""What a Python user sees of the package: exported names, short reprs, attributes that refuse."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import clpipe
+from tests.conftest import ROOT, STILL_LIFE
+
+
+def test_every_exported_name_is_there_and_documented():
+    page = (ROOT / "docs" / "api.md").read_text()
+    for name in clpipe.__all__:
+        exported = getattr(clpipe, name)
+        assert name in dir(clpipe)
+        if name != "__version__":
+            assert exported.__doc__
+            assert f"::: clpipe.{name}\n" in page
+    with pytest.raises(AttributeError, match="no attribute 'Pipelin'"):
+        _ = clpipe.Pipelin
+
+
+def test_the_type_checkers_names_are_the_lazy_ones():
+    text = (ROOT / "clpipe" / "__init__.py").read_text()
+    block = text[text.index("if TYPE_CHECKING") : text.index("_MODULES")]
+    for name, module in clpipe._MODULES.items():
+        (line,) = (x for x in block.splitlines() if f"from {module} import " in x)
+        assert name in line.partition(" import ")[2].split(", ")
+
+
+@pytest.mark.parametrize(
+    ("code", "heavy"),
+    [
+        ("import clpipe", ("numpy", "pydantic", "pyopencl", "OpenImageIO", "click")),
+        ("from clpipe.__main__ import main; main()", ("numpy", "pydantic", "pyopencl", "rich")),
+    ],
+)
+def test_what_is_not_used_is_not_imported(code, heavy):
+    program = f"""import sys
+sys.argv[1:] = ["--help"]
+try:
+    {code}
+except SystemExit:
+    pass
+print([name for name in {heavy!r} if name in sys.modules])"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1] == "[]", done.stderr
+
+
+def test_reprs_are_short():
+    camera = clpipe.Pipeline(iso=3200, device="numpy", until="quantize")
+    assert repr(camera) == "Pipeline(sony-a7r2, ISO 3200, exposure..quantize, on numpy)"
+    shot = camera.process(np.zeros((4, 6, 3), np.float32), "a")
+    assert repr(shot) == "Result(final: (4, 6) float32)"
+    assert repr(camera.chain) == "Chain(sony-a7r2, ISO 3200, exposure..quantize)"
+    assert repr(camera.chain.steps[0]) == "Step(exposure, gain)"
+    samples = clpipe.Dataset(STILL_LIFE, iso={"choice": [100, 800]}, epochs=3)
+    assert repr(samples) == "Dataset(1 images, 3 epochs, sony-a7r2, drawn ISO)"
+    assert len(repr(clpipe.load_camera("sony-a7r2"))) < 80
+
+
+def test_what_cannot_be_assigned_refuses():
+    camera = clpipe.Pipeline(device="numpy")
+    with pytest.raises(AttributeError, match=r"cannot set iso: .* make another one with iso="):
+        camera.iso = 800
+    with pytest.raises(AttributeError, match="cannot set truth"):
+        clpipe.Dataset(STILL_LIFE).truth = True
+    shot = camera.process(np.zeros((4, 6, 3), np.float32), "a")
+    with pytest.raises(AttributeError):
+        shot.encoded = None
+
+
+@pytest.mark.parametrize("until", [None, "normalize"])
+def test_a_notebook_shows_a_result(until):
+    camera = clpipe.Pipeline(device="numpy", until=until)
+    shot = camera.process(np.full((4, 6, 3), 0.5, np.float32), "a")
+    assert shot._repr_png_().startswith(b"\x89PNG")

@@ -1,0 +1,162 @@
+"""The request: one set of plain values from options, configurations, rows and sidecars."""
+
+import json
+import pickle
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clpipe.base.errors import RequestError
+from clpipe.chain.request import RECORDED, Request
+from clpipe.chain.settings import settings_from
+from clpipe.inputs.find import Job
+from clpipe.inputs.loader import ImageLoader
+from clpipe.stage import Method
+
+OPTIONS = {
+    "config": "paper",
+    "iso": 800.0,
+    "assignments": ["exposure.ev=0.5"],
+    "until": "demosaic",
+    "keep": ("mosaic",),
+    "formats": ("exr",),
+    "transfer": "srgb",
+    "frames": 2,
+}
+
+STAGE_FILE = """
+from pathlib import Path
+Path({mark!r}).touch()
+from clpipe.stage import Kind, Stage, Unchanged
+
+
+class Nothing(Unchanged):
+    method = "nothing"
+    summary = "stay"
+
+
+STAGE = Stage({name!r}, "Do nothing.", Kind.RGB, Kind.RGB, (Nothing,))
+"""
+
+
+def test_a_record_makes_the_same_request_but_for_which_pictures_are_made():
+    request = Request.from_options(**OPTIONS).for_image("a.exr", {"seed": 3})
+    again = Request.from_record(json.loads(json.dumps(request.record())))
+    assert again.record() == request.record()
+    assert {name: getattr(again, name) for name in RECORDED} == {
+        name: getattr(request, name) for name in RECORDED
+    }
+    assert again.frames is None and request.frames == 2
+    assert again.settings() == request.settings()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"config": None}, {"iso": 100.0}, {"keep": ()}, {"formats": ("png",)}, {"transfer": None}],
+)
+def test_records_differ_where_bytes_do(change):
+    records = [Request.from_options(**{**OPTIONS, **c}).record() for c in ({}, change)]
+    assert records[0] != records[1]
+
+
+@pytest.mark.parametrize("change", [{"frames": None}, {"truths": ("mosaic",)}, {"max_pixels": 9}])
+def test_records_are_equal_where_the_bytes_of_a_picture_are(change):
+    records = [Request.from_options(**{**OPTIONS, **c}).record() for c in ({}, change)]
+    assert records[0] == records[1]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"formats": ["gif"]},
+        {"keep": None},
+        {"stage_files": 3},
+        {"image_key": 3},
+        {"until": ["demosaic"]},
+        {"options": [1]},
+    ],
+)
+def test_a_damaged_record(damage):
+    with pytest.raises(RequestError, match=r"formats|damaged"):
+        Request.from_record({**Request().record(), **damage})
+    with pytest.raises(RequestError, match="damaged: 'config'"):
+        Request.from_record({})
+
+
+def test_outputs_that_are_left_open_follow_from_the_chain():
+    request = Request.from_options(until="demosaic", keep=("all", "mosaic"))
+    completed = request.with_outputs(request.chain())
+    assert completed.formats == ("exr",)
+    assert completed.keep == tuple(step.name for step in request.chain().steps)
+    whole = Request.from_options(formats=("png", "png"))
+    assert whole.with_outputs(whole.chain()).formats == ("png",)
+    with pytest.raises(RequestError, match="unknown stage in this chain 'no'"):
+        request = Request.from_options(keep=("no",))
+        request.with_outputs(request.chain())
+
+
+def test_what_an_image_carries_stands_below_configuration_and_options():
+    carried = settings_from({"iso": 400, "exposure": {"ev": 3}, "gamma": {"method": "srgb"}})
+    request = Request.from_options(iso=800.0, values={"exposure": {"ev": 1}})
+    settings = request.for_image("a", {"seed": 9}).settings(carried)
+    assert (settings.iso, settings.seed) == (800, 9)
+    assert settings.parameters == {"exposure": {"ev": 1}, "gamma": {"method": "srgb"}}
+
+
+def test_a_request_and_its_loader_can_be_sent_with_a_stage_file(tmp_path, monkeypatch):
+    monkeypatch.setattr("clpipe.chain.registry._from_files", {})
+    file = tmp_path / "sent.py"
+    file.write_text(STAGE_FILE.format(mark=str(tmp_path / "ran"), name="sent"))
+    request = Request.from_options(
+        stage_files=[file], stages="exposure,sent", assignments=["sent.method=nothing"]
+    )
+    loader = ImageLoader(request)
+    assert [s.name for s in loader.chain.steps] == ["exposure", "sent"]
+    sent = pickle.loads(pickle.dumps(loader))
+    assert sent == loader and set(vars(sent)) == {"request"}
+    assert sent.chain.names == loader.chain.names
+
+
+def test_a_run_validates_the_parameters_of_a_step_once(monkeypatch):
+    counts = Counter()
+    validate = Method.model_validate.__func__
+
+    def counted(cls, values, **options):
+        counts[cls.__name__, json.dumps(values)] += 1
+        return validate(cls, values, **options)
+
+    monkeypatch.setattr(Method, "model_validate", classmethod(counted))
+    options = {"assignments": ["exposure.ev=0.5", "denoise.luma_size=3"], "config": "paper"}
+    request = Request.from_options(**options)
+    loader = ImageLoader(request)
+    jobs = [Job(Path("a.exr"), "a"), Job(Path("b.exr"), "b", values={"iso": 800})]
+    loader.check(jobs)
+    request = request.with_outputs(loader.first_chain(jobs))
+    for job in jobs:
+        assert loader.for_job(job).chain.steps
+        request.for_image(job.key, job.values).record()
+    own = {k: n for k, n in counts.items() if k[0] not in ("Linear", "Levels")}
+    assert len(own) >= 4 and set(own.values()) == {1}, counts
+
+
+def test_a_replay_does_not_run_a_stage_file_that_has_changed(clpipe, write_exr, monkeypatch):
+    monkeypatch.setattr("clpipe.chain.registry._from_files", {})
+    Path("mine.py").write_text(STAGE_FILE.format(mark="ran", name="mine"))
+    write_exr("a.exr", np.full((8, 8, 3), 0.5, np.float32))
+    options = ("--stage-file", "mine.py", "--stages", "exposure,mine", "--format", "exr")
+    clpipe("run", "a.exr", "-o", "out", *options)
+    monkeypatch.setattr("clpipe.chain.registry._from_files", {})
+    Path("ran").unlink()
+    Path("mine.py").write_text(Path("mine.py").read_text() + "\n")
+    stderr = clpipe("run", "--replay", "out/a.json", "-o", "again", status=2).stderr
+    assert "mine.py: has changed since" in stderr
+    assert not Path("ran").exists()
+
+    record = json.loads(Path("out/a.json").read_text())
+    record["request"]["files"] = {}
+    Path("edited.json").write_text(json.dumps(record))
+    stderr = clpipe("run", "--replay", "edited.json", "-o", "again", status=2).stderr
+    assert "names a stage file without its SHA-256" in stderr
+    assert not Path("ran").exists()
