@@ -1,5 +1,5 @@
-"""Helpers that every other room may use: errors, array types, text, memory, whole-file writes.
+"""Helpers that every other room may use: errors, array types, text, memory, files, validation.
 
 Nothing here knows what an image, a stage or a device is. This room imports only the standard
-library and NumPy.
+library, NumPy and pydantic's errors.
 """
