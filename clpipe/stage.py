@@ -1,8 +1,8 @@
 """What a stage is: the image kinds it reads and writes, how it touches pixels, its parameters.
 
 A stage is declared once, in ``clpipe/stages/<name>.py``, as a :class:`Stage` with one or more
-:class:`Method` classes. The fields of a method are its parameters; everything that is said of them
-anywhere (validation, help, ``--set``, kernel arguments, the sidecar) is derived from there.
+:class:`Method` classes. The fields of a method are its parameters; their validation, help,
+``--set``, kernel arguments and sidecar entries are all derived from that declaration.
 """
 
 import typing
@@ -50,7 +50,7 @@ __all__ = [
 
 
 class Kind(Enum):
-    """A kind of image: what its samples mean, how it is called in OpenCL, its planes."""
+    """A kind of image: what its samples mean, its OpenCL type, its planes."""
 
     RGB = ("rgb", "rgb", ("R", "G", "B"))  # linear, 1 = sensor full scale at EV 0
     MOSAIC = ("mosaic", "vf", ("Y",))  # signal: 0 = black level, 1 = white level
@@ -66,7 +66,7 @@ class Kind(Enum):
 
     @property
     def c_name(self) -> str:
-        """What the kernel library calls it in ``tap_*`` and ``store_*``."""
+        """Its name in the kernel library's functions, such as ``tap_mosaic``."""
         return "mosaic" if self.c_type == "vf" else self.c_type
 
 
@@ -82,10 +82,10 @@ class Access(Enum):
 
 
 class NoiseScope(Enum):
-    """What noise belongs to, and so what its random key is made of."""
+    """What a draw of noise belongs to; the random key is made of it."""
 
-    IMAGE = "image"  # new in each image
-    CAMERA = "camera"  # fixed: the same across images, views and ISOs
+    IMAGE = "image"  # each image has its own
+    CAMERA = "camera"  # fixed pattern: the same in all images of a camera
 
 
 @dataclass(frozen=True)
@@ -93,10 +93,12 @@ class Pass:
     """One function of a method's kernel file, and how the planner may place it.
 
     ``reads`` and ``writes`` name images of the stage: ``src`` is its input, ``dst`` its output, any
-    other name is scratch. A STENCIL with a ``block`` gets an array for it, row by row, as its last
-    argument, where others return a pixel. ``arguments`` are, in order, names from
-    :meth:`Method.arguments`, from ``estimates`` of an earlier SUMS pass, or the line table that an
-    earlier LINES pass writes.
+    other name an image between its passes. ``arguments`` are the function's arguments after the
+    pixel, in order: names from :meth:`Method.arguments`, from the ``estimates`` of an earlier SUMS
+    or HISTOGRAM pass, or of the table that an earlier LINES pass writes.
+
+    A function returns its pixel. A STENCIL with a ``block`` instead fills an array, its last
+    argument, with 4 rows of that many vectors.
     """
 
     function: str
@@ -106,11 +108,11 @@ class Pass:
     writes: str = "dst"
     kind: Kind | None = None  # of what it writes; None: what the stage writes
     radius: int = 0
-    random: NoiseScope | None = None  # gets a random stream as its first argument
-    block: int = 0  # STENCIL: one call gives 4 rows of that many vectors, which share work
-    cheap: bool = False  # so cheap that a stencil after it may redo it at each tap
+    random: NoiseScope | None = None  # takes a random stream as its first argument
+    block: int = 0  # STENCIL: vectors in a row of the block; 0 returns a pixel
+    cheap: bool = False  # a stencil after it may redo it at each tap
     lines: str = ""  # LINES: "rows" or "columns"
-    finish: str = ""  # SUMS, HISTOGRAM: the function that turns these into the estimates
+    finish: str = ""  # SUMS, HISTOGRAM: the function that computes the estimates
     finish_arguments: tuple[str, ...] = ()  # of that function
     estimates: tuple[str, ...] = ()  # SUMS, HISTOGRAM: names of the numbers, at most four
     bins: int = 0  # HISTOGRAM: how many
@@ -128,7 +130,7 @@ Argument = np.float32 | np.uint32 | np.int32 | Array | Literal
 
 @dataclass(frozen=True)
 class Context:
-    """What is known of the image where a stage stands in the chain."""
+    """What the steps before a stage say of the image that it reads."""
 
     camera: Camera
     iso: float
@@ -140,8 +142,8 @@ class Context:
     black_level: float | None = None  # DN, as quantize used them
     white_level: float | None = None
 
-    def known_noise(self) -> tuple[float, float]:
-        """The a and b of the sensor noise: as they were used, else as the camera has them."""
+    def noise_parameters(self) -> tuple[float, float]:
+        """The a and b of the sensor noise: of the noise that was added, else the camera's."""
         model = self.noise or self.camera.noise(self.iso)
         return model.a, model.b
 
@@ -163,9 +165,15 @@ def parameter(
 ) -> Any:
     """Declare a parameter: default, one sentence, unit, limits (ge, gt, le, lt).
 
-    ``auto`` says where the value comes from when it is left at None. ``structural`` values are
-    compiled into the kernel; all others may change from image to image at no cost. ``file`` is the
-    name of a file, which a configuration gives relative to itself.
+    Args:
+        default: the default; None for a value that the camera or the chain decides.
+        text: one sentence about it.
+        unit: its unit, if it has one.
+        auto: where a value comes from that is left at None.
+        structural: whether it is compiled into the kernel; any other parameter may change from
+            image to image at no cost.
+        file: whether it is the name of a file, which a configuration gives relative to itself.
+        **limits: ge, gt, le, lt.
     """
     if unknown := limits.keys() - {"ge", "gt", "le", "lt"}:
         raise TypeError(f"parameter() got {', '.join(sorted(unknown))}; limits are ge, gt, le, lt")
@@ -179,46 +187,50 @@ def parameter(
 
 
 class Method(BaseModel):
-    """One way to do a stage. Subclasses declare parameters as fields and override what follows."""
+    """One way to do a stage. A subclass declares its parameters as fields.
+
+    It overrides :meth:`passes`, :meth:`arguments` and :meth:`reference`, and of the other methods
+    those that do not hold for it as they are.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     method: ClassVar[str]
     kernel: ClassVar[str]  # file name in kernels/, without .cl
     summary: ClassVar[str]
-    tolerance: ClassVar[float] = 0.0  # of the kernel against the reference; 0: bit for bit
-    example: ClassVar[Mapping[str, Any]] = {}  # to be checked with, where defaults do nothing
-    other_examples: ClassVar[tuple[Mapping[str, Any], ...]] = ()  # that take another way
+    tolerance: ClassVar[float] = 0.0  # kernel against reference; 0 is bit for bit
+    example: ClassVar[Mapping[str, Any]] = {}  # parameters for checks, where defaults do nothing
+    other_examples: ClassVar[tuple[Mapping[str, Any], ...]] = ()  # that take other paths
 
     def resolve(self, context: Context) -> Self:
-        """The same method with every parameter that was left to the camera or the chain filled."""
+        """The method with a value for every parameter that was left to the camera or the chain."""
         return self
 
     def after(self, context: Context) -> Context:
-        """What is known after this (resolved) stage."""
+        """The context of the next step, from this (resolved) method's."""
         return context
 
     def passes(self) -> tuple[Pass, ...]:
-        """The kernel functions, in order; none where the image stays as it is."""
+        """The kernel functions, in order; none if the image stays as it is."""
         raise NotImplementedError(type(self).__name__)
 
     def without_noise(self) -> "Method | None":
-        """What is left of this (resolved) method without noise; None where that is nothing."""
+        """This (resolved) method without its noise; None if nothing is left of it."""
         return None if any(each.random for each in self.passes()) else self
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
-        """The variance of the noise behind this (resolved) method, from that of the noise before.
+        """The variance of the noise after this (resolved) method, from the variance before it.
 
-        A method that draws random numbers of mean 0 adds theirs; one that scales scales it.
+        A method that adds independent noise adds its variance; one that scales the image scales it.
 
         Args:
-            before: the variance in the image that enters, in its unit squared; float32 of the
-                image's shape, or of shape () where it is the same everywhere. It is not changed.
-            signal: the image that enters, without noise, (height, width[, channel]).
-            context: what is known there.
+            before: the variance in the image that the method reads, in its unit squared; float32 of
+                the image's shape, or of shape () if it is the same everywhere. It is not modified.
+            signal: that image without noise, (height, width[, channel]).
+            context: the context of the step.
 
         Returns:
-            The same of the image that comes out; None where that cannot be said.
+            The variance in the image that the method writes; None if it cannot be computed.
         """
         return None if self.passes() else before
 
@@ -231,13 +243,13 @@ class Method(BaseModel):
         raise NotImplementedError(type(self).__name__)
 
     def filled(self, **values: Any) -> Self:
-        """A copy in which those of ``values`` replace parameters that are None."""
+        """A copy in which ``values`` replace the parameters that are None."""
         missing = {k: v for k, v in values.items() if getattr(self, k) is None}
         return self.model_copy(update=missing) if missing else self
 
 
 class Unchanged(Method):
-    """The image stays as it is, at no cost. Subclasses say how that is called."""
+    """Leaves the image as it is, at no cost. A subclass gives the method's name."""
 
     kernel: ClassVar = ""
 
@@ -249,14 +261,14 @@ class Unchanged(Method):
 
 
 class Noiseless(Unchanged):
-    """What is left of a stage that does nothing but add noise, without it."""
+    """A stage that only adds noise, without its noise."""
 
     method: ClassVar = "none"
     summary: ClassVar = "no noise"
 
 
 class Curve(Method):
-    """A curve on each channel. Subclasses give its table, see :mod:`clpipe.reference.curve`."""
+    """A curve on each channel. A subclass gives its table, see :mod:`clpipe.reference.curve`."""
 
     kernel: ClassVar = "curve"
 
@@ -275,10 +287,10 @@ class Curve(Method):
 
 
 class GaussianNoise(Method):
-    """Gaussian noise of one sigma; where that is 0, the image stays as it is, at no cost.
+    """Gaussian noise of one sigma; at sigma 0 the image stays as it is, at no cost.
 
-    Subclasses say where the sigma comes from, how it is drawn, and what it is in NumPy; and where
-    it is not that of an offset, its variance.
+    A subclass gives the default of sigma, the passes and the reference; and the variance, if the
+    noise is not an offset.
     """
 
     method: ClassVar = "gaussian"
@@ -294,7 +306,7 @@ class GaussianNoise(Method):
     )
 
     def draw(self) -> tuple[Pass, ...]:
-        """The kernel functions, where there is noise."""
+        """The kernel functions for a sigma above 0."""
         raise NotImplementedError(type(self).__name__)
 
     def passes(self) -> tuple[Pass, ...]:
@@ -322,10 +334,10 @@ def odd_size(size: int, largest: int) -> int:
 
 
 def variants(method: type[Method]) -> Iterator[dict[str, Any]]:
-    """What is compiled differently: the defaults, then each other choice of a structural parameter,
-    then the method's other examples.
+    """Parameters for each variant of a method that is compiled differently.
 
-    The CFA pattern is not among them: whoever goes through variants goes through patterns anyway.
+    The first is the defaults; then each other choice of a structural parameter; then the method's
+    other examples. CFA patterns are no variants here, since they go with every variant.
     """
     yield {}
     for name, field in method.model_fields.items():
@@ -338,15 +350,16 @@ def variants(method: type[Method]) -> Iterator[dict[str, Any]]:
 
 
 def variant_label(method: type[Method], values: Mapping[str, Any]) -> str:
-    """A method and what is not at its default."""
+    """The name of a method with the parameters that are not at their defaults."""
     return " ".join([method.method, *(f"{name}={value}" for name, value in values.items())])
 
 
 @dataclass
 class Frame:
-    """What a reference needs besides the image and its parameters.
+    """What a reference gets besides the image and its parameters.
 
-    ``estimates`` is where a stage puts numbers that it estimates from the image, such as gains.
+    ``stream`` has the random streams by scope. A reference stores the numbers that it estimates
+    from the image, such as gains, in ``estimates``.
     """
 
     context: Context
@@ -357,9 +370,9 @@ class Frame:
 def run_reference(
     method: Method, image: Floats, iso: float = 100, pattern: Pattern = "RGGB"
 ) -> Floats:
-    """A method's reference on an image, as the first stage after a mosaic of the default camera.
+    """The reference of a method on an image of the default camera, for examples and experiments.
 
-    For examples and for trying things out; noise is that of the image key "".
+    The noise is that of the image key "".
     """
     context = Context(load_camera(DEFAULT_CAMERA), iso, pattern)
     resolved = method.resolve(context)
@@ -369,9 +382,9 @@ def run_reference(
 
 @dataclass(frozen=True)
 class Stage:
-    """A named step of the chain. The first method is the default.
+    """A stage by name, with its methods; the first one is the default.
 
-    ``explain`` says in a few lines how the automatic parameters follow from what is known.
+    ``explain`` describes in a few lines how automatic parameters follow from the context.
     """
 
     name: str
@@ -379,8 +392,8 @@ class Stage:
     reads: Kind
     writes: Kind
     methods: tuple[type[Method], ...]
-    explain: Callable[[Context], str] | None = None  # more about it, with numbers
-    folder: Path | None = None  # of the kernel files, where they are not clpipe's own
+    explain: Callable[[Context], str] | None = None
+    folder: Path | None = None  # of a plug-in's kernel files
 
     @cached_property
     def by_name(self) -> dict[str, type[Method]]:

@@ -5,7 +5,6 @@ import json
 import os
 import signal
 import socket
-import sys
 import time
 from contextlib import nullcontext
 from dataclasses import replace
@@ -270,9 +269,3 @@ def test_a_scheduler_that_cannot_be_reached(clpipe, renders, monkeypatch):
         told = clpipe("run", "in", "-o", "out", "--dask", address, status=2).stderr
         assert f"the scheduler at {address} has no workers" in told
     assert not Path("out").exists()
-
-
-def test_distributed_is_an_extra(clpipe, renders, monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    told = clpipe("run", "in", "-o", "out", "--dask", "tcp://127.0.0.1:1", status=2).stderr
-    assert "pip install distributed" in told

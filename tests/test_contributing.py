@@ -1,5 +1,6 @@
 """The example stage in CONTRIBUTING.md, as it stands there."""
 
+import pkgutil
 import re
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ from tests.conftest import ROOT, STILL_LIFE
 from tests.markdown import blocks
 
 PAGE = ROOT / "CONTRIBUTING.md"
+TEXT = PAGE.read_text()
 
 
 def block(language: str) -> str:
@@ -48,3 +50,20 @@ def test_every_file_it_names_is_there():
     for name in re.findall(r"`((?:clpipe|kernels|tests|tools|docs)/[\w./]+)`", PAGE.read_text()):
         if "vignette" not in name and "<" not in name:
             assert (ROOT / name).exists(), name
+
+
+def test_the_walks_are_true_to_the_code():
+    walks = TEXT[TEXT.index("## Two walks") : TEXT.index("## A stage of your own")]
+    names = re.findall(r"`([a-z_]+(?:\.[A-Za-z_]+)+)`", walks)
+    assert len(names) > 20
+    for name in names:
+        if name != "denoise.luma_strength":
+            assert pkgutil.resolve_name(f"clpipe.{name}") is not None
+
+
+def test_the_map_names_every_room():
+    package = ROOT / "clpipe"
+    rooms = {p.name for p in package.iterdir() if p.is_dir() and p.name != "__pycache__"}
+    modules = {p.name for p in package.glob("[a-z]*.py")}
+    for name in (*(f"  {room}/" for room in rooms), *modules):
+        assert name in TEXT, name

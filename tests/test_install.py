@@ -4,6 +4,9 @@ import os
 import subprocess
 import sys
 
+import pytest
+
+from clpipe.base import extras
 from tests.conftest import ROOT, STILL_LIFE
 
 
@@ -31,3 +34,20 @@ def test_the_installed_package_works_from_anywhere(tmp_path):
     )
     assert done.stdout.startswith(str(target))
     assert (tmp_path / "out" / "still_life.jpg").is_file()
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (("calibrate", "a.dng", "-o", "c.toml"), "clpipe calibrate needs scipy and matplotlib"),
+        (("measure", "a.exr", "--plot", "a.png"), "--plot needs matplotlib"),
+        (("run", STILL_LIFE, "-o", "out", "--dask", "tcp://x:1"), "--dask needs distributed"),
+    ],
+)
+def test_what_an_extra_installs_is_named_where_it_is_missing(clpipe, monkeypatch, command, message):
+    found = extras.find_spec
+    absent = ("scipy", "matplotlib", "distributed")
+    monkeypatch.setattr(extras, "find_spec", lambda name: None if name in absent else found(name))
+    error = clpipe(*command, status=2).stderr
+    extra = "dask" if "--dask" in command else "calibrate"
+    assert f"{message}; pip install 'clpipe[{extra}]'" in error

@@ -28,7 +28,7 @@ LOOPS = [
 
 
 @pytest.mark.parametrize(("camera", "iso", "pattern", "method"), LOOPS)
-def test_known_noise_comes_back(camera, iso, pattern, method):
+def test_noise_that_goes_in_comes_back(camera, iso, pattern, method):
     # The Canon's row noise is a thirtieth of its read noise: only long rows tell it to 3 %.
     width = 3072 if camera == "canon-5d2" else 1024
     loop = validate.close_loop(camera, iso, pattern, 800, width, method)

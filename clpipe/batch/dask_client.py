@@ -17,6 +17,7 @@ from typing import Any
 
 from clpipe.base.about import __version__
 from clpipe.base.errors import ClpipeError, ClusterError, RequestError
+from clpipe.base.extras import require
 from clpipe.batch.dask_worker import (
     ChunkReport,
     RunSpec,
@@ -53,10 +54,9 @@ def connected(address: str, spec: RunSpec) -> Iterator["Cluster"]:
         RequestError: distributed is not installed, the scheduler does not answer, it has no
             workers, or they have different versions of clpipe.
     """
-    try:
-        from distributed import Client
-    except ImportError:
-        raise RequestError("--dask: needs distributed; pip install distributed") from None
+    require("--dask", "dask", "distributed")
+    from distributed import Client
+
     try:
         asyncio.run(_reach(address))
         client = Client(address, timeout=TIMEOUT, name="clpipe", set_as_default=False)

@@ -11,6 +11,7 @@ from clpipe.analysis.report import UNITS, NoiseReport
 from clpipe.analysis.spatial import LAGS, LineNoise
 from clpipe.analysis.statistics import SIGMAS, gaussian_beyond
 from clpipe.base.errors import RequestError
+from clpipe.base.extras import require
 from clpipe.commands.options import json_option
 from clpipe.commands.printing import Rows, number, show, show_json
 from clpipe.reference.cfa import PATTERNS, Pattern
@@ -53,6 +54,8 @@ def measure(
     """
     if plot is not None and plot.suffix != ".png":
         raise RequestError(f"--plot: found {plot}; expected a name that ends in .png")
+    if plot is not None:
+        require("--plot", "calibrate", "matplotlib")
     report = measure_images(
         [load_picture(path, pattern) for path in images],
         load_picture(truth, pattern) if truth else None,

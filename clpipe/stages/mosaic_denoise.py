@@ -81,7 +81,7 @@ class NonLocalMeans(Method):
     def resolve(self, context: Context) -> "NonLocalMeans":
         if self.a is not None and self.b is not None:
             return self
-        a, b = context.known_noise()
+        a, b = context.noise_parameters()
         return self.filled(a=a, b=b)
 
     @property

@@ -14,6 +14,7 @@ from clpipe.analysis.calibration.plot import plot_calibration
 from clpipe.analysis.calibration.profile import profile_text
 from clpipe.analysis.calibration.result import Calibration
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.extras import require
 from clpipe.base.files import write_new
 from clpipe.camera.profile import load_camera
 
@@ -33,9 +34,11 @@ def calibrate_files(
         ISO.
 
     Raises:
-        RequestError: the frames do not belong together, or needed metadata is missing.
+        RequestError: the frames do not belong together, needed metadata is missing, or the extra
+            "calibrate" is not installed.
         ImageError: a file cannot be read, or the frames do not allow an estimate.
     """
+    require("clpipe calibrate", "calibrate", "scipy", "matplotlib")
     overrides.check()
     dark_paths = find_frames(dark)
     without_light = {path.resolve() for path in dark_paths}

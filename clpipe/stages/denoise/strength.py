@@ -44,7 +44,7 @@ def noise_of_colours(context: Context) -> tuple[Variance, Variance, Variance]:
     In a colour with gain k, a grey of level v has the signal v/k and the variance a*v/k + b before
     the gain, so a*v*k + b*k^2 after it. Noise that demosaicing averages out is not deducted.
     """
-    a, b = context.known_noise()
+    a, b = context.noise_parameters()
     red, blue = context.applied_gains
     one, two, three = (Variance(a * k, b * k * k) for k in (red, 1.0, blue))
     return one, two, three
@@ -72,7 +72,7 @@ def predicted_noise(context: Context) -> tuple[float, float]:
 
 def explain(context: Context) -> str:
     """The steps from a and b to luma and chroma noise, in a few lines, with a context's numbers."""
-    a, b = context.known_noise()
+    a, b = context.noise_parameters()
     red, blue = context.applied_gains
     sigmas = [sqrt(colour.at(MID_GREY)) for colour in noise_of_colours(context)]
     luma, chroma = predicted_noise(context)
