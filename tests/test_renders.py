@@ -354,7 +354,11 @@ def test_mutated_files_make_no_traceback_hang_or_crash(tmp_path):
     chroma = {"Y": (np.ones((8, 6)), 1), "RY": (half, 2), "BY": (half, 2)}
     primaries = [("chromaticities", "chromaticities", struct.pack("<8f", *ACES))]
     (tmp_path / "yc.exr").write_bytes(exr(chroma, 6, 8, attributes=primaries))
-    files = [*tmp_path.iterdir(), STILL_LIFE, *(ROOT / "clpipe" / "cameras").glob("*.toml")]
+    files = [
+        *tmp_path.iterdir(),
+        STILL_LIFE,
+        *(ROOT / "clpipe" / "camera" / "profiles").glob("*.toml"),
+    ]
     command = [sys.executable, ROOT / "tools" / "fuzz", "--cases", "300", *files]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -92,9 +92,9 @@ def test_outputs_that_are_left_open_follow_from_the_chain():
     assert completed.keep == tuple(step.name for step in request.chain().steps)
     whole = Request.from_options(formats=("png", "png"))
     assert whole.with_outputs(whole.chain()).formats == ("png",)
+    misspelt = Request.from_options(keep=("no",))
     with pytest.raises(RequestError, match="unknown stage in this chain 'no'"):
-        request = Request.from_options(keep=("no",))
-        request.with_outputs(request.chain())
+        misspelt.with_outputs(misspelt.chain())
 
 
 def test_what_an_image_carries_stands_below_configuration_and_options():

@@ -9,7 +9,7 @@ from clpipe.base.files import sha256_of
 
 
 def stamp_of(path: Path) -> tuple[int, int]:
-    """The size of a file in bytes and its time of change in ns; zeros where it cannot be seen."""
+    """The size of a file in bytes and its time of change in ns; zeros where it has no status."""
     try:
         info = path.stat()
     except OSError:
@@ -18,7 +18,7 @@ def stamp_of(path: Path) -> tuple[int, int]:
 
 
 def digests(files: Iterable[str]) -> dict[str, str]:
-    """The SHA-256 of each of these files, by its name; those that cannot be read are left out."""
+    """The SHA-256 of each file, by its name; files that cannot be read are left out."""
     by_name = {}
     for file in files:
         with suppress(OSError):

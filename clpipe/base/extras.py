@@ -9,12 +9,12 @@ def require(purpose: str, extra: str, *modules: str) -> None:
     """See that the libraries of an extra are installed.
 
     Args:
-        purpose: what needs them, as an error names it, such as "clpipe calibrate".
+        purpose: what needs them, for the message, such as "clpipe calibrate".
         extra: the extra of the package that installs them.
-        modules: the modules to be imported.
+        modules: the modules.
 
     Raises:
-        RequestError: one is not there; the message says how to install it.
+        RequestError: a module is missing; the message says how to install it.
 
     >>> require("this example", "docs", "no_such_module")
     Traceback (most recent call last):

@@ -4,7 +4,7 @@ from typing import Any
 
 
 class ReadOnly:
-    """Refuses to set public attributes: what looks like a setting must not be ignored silently.
+    """Refuses to set public attributes, since nothing would read the new value.
 
     >>> class Camera(ReadOnly):
     ...     pass

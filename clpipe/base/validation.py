@@ -1,4 +1,4 @@
-"""What pydantic refuses, as one line for a user: where the value stands, what it is, why."""
+"""Errors of pydantic as one line for a user: the place of the value, the value, the reason."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,10 +9,10 @@ from pydantic import ValidationError
 
 @dataclass(frozen=True)
 class Fault:
-    """The first thing wrong with a table of values.
+    """The first fault in a table of values.
 
     ``path`` leads to the value, through tables by name and through lists by number; it is empty
-    where values are wrong only together. ``text`` says what was found and why it is refused.
+    where values only contradict each other. ``text`` names the value found and the reason.
     """
 
     path: tuple[str | int, ...]
@@ -36,7 +36,7 @@ class Fault:
 
 
 def first_fault(error: ValidationError) -> Fault:
-    """The first of the faults that pydantic found.
+    """The first fault in an error of pydantic.
 
     >>> from pydantic import BaseModel, Field
     >>> class Lens(BaseModel):
@@ -55,6 +55,6 @@ def first_fault(error: ValidationError) -> Fault:
     if first["type"] == "missing":
         return Fault(path, "missing", "it is missing")
     reason = first["msg"].removeprefix("Value error, ").removeprefix("Input ")
-    # A whole table is too long to repeat, and its path says which one it is.
+    # A whole table is too long to repeat; its path identifies it.
     shown = bool(path) and not isinstance(first["input"], Mapping)
     return Fault(path, "invalid", f"found {first['input']!r}: {reason}" if shown else reason)

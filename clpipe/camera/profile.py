@@ -263,11 +263,11 @@ def _parse(text: str) -> Camera:
 
 
 def _reason(error: ValidationError) -> str:
-    """What is wrong with a profile first, with the key, what was found and what is allowed."""
+    """The first problem of a profile: its key, the value found and what is allowed."""
     fault = first_fault(error)
     if fault.problem == "unknown":
         model = GainStage if "." in fault.key else Camera
         return fault.key.removesuffix(fault.name) + one_of("key", fault.name, model.model_fields)
     if fault.problem == "missing":
-        return f"{fault.key}: it is missing, and a profile needs it"
+        return f"{fault.key}: missing; every profile needs this key"
     return f"{fault.key}: {fault.text}" if fault.path else fault.text

@@ -51,9 +51,9 @@ class Linear(Method):
         return self
 
     def resolve(self, context: Context) -> "Linear":
-        camera, known = context.camera, context
-        black = camera.black_level if known.black_level is None else known.black_level
-        white = camera.white_level if known.white_level is None else known.white_level
+        camera = context.camera
+        black = camera.black_level if context.black_level is None else context.black_level
+        white = camera.white_level if context.white_level is None else context.white_level
         filled = self.filled(black_level=black, white_level=white)
         return type(self).model_validate(filled.model_dump())
 

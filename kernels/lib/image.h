@@ -137,7 +137,7 @@ static void store_at_edge(vf v, __global float *dst, int x, int y, extent e) {
     }
 }
 
-// Whether a block of rows has pixels that the border mirrors, or that are none of the image's.
+// Whether a block of rows has pixels that the border mirrors, or that are outside the image.
 INLINE bool near_edge(site at, uint rows, extent e) {
     const uint x = at.x - e.left, y = at.y - e.top;
     return x <= e.border || x + LANES + e.border >= e.columns || y <= e.border ||

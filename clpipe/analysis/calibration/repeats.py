@@ -186,8 +186,8 @@ def without_flicker(stack: Stack) -> tuple[Stack, Array]:
     if not (np.abs(brighter) > 4 * errors).any():
         return stack, unchanged
     for frame, by in zip(stack.rest, brighter, strict=True):
-        frame -= np.float32(by) * stack.light
-        frame /= np.float32(1 + by)
+        np.subtract(frame, np.float32(by) * stack.light, out=frame)
+        np.divide(frame, np.float32(1 + by), out=frame)
     return stack, brighter
 
 

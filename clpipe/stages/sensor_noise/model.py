@@ -64,30 +64,30 @@ class SensorNoise(Method):
     )
     chi: float | None = parameter(
         None,
-        "Instead of a and b, with theta: electrons at y = 1 and theta = 1 (the paper).",
+        "Instead of a and b, with theta: electrons at y = 1 and theta = 1 (Bielova et al. 2019).",
         "e-",
         "not used",
         gt=0,
     )
     theta: float | None = parameter(
-        None, "With chi: the analogue gain (the paper).", "", "not used", gt=0
+        None, "With chi: the analogue gain (Bielova et al. 2019).", "", "not used", gt=0
     )
     b_before: float | None = parameter(
         None,
-        "With chi: b', the variance of the noise before the gain (the paper).",
+        "With chi: b', the variance of the noise before the gain (Bielova et al. 2019).",
         "signal^2",
         "not used",
         ge=0,
     )
     b_after: float | None = parameter(
         None,
-        "With chi: b'', the variance of the noise after the gain (the paper).",
+        "With chi: b'', the variance of the noise after the gain (Bielova et al. 2019).",
         "signal^2",
         "not used",
         ge=0,
     )
     p0: float | None = parameter(
-        None, "With chi: the pedestal (the paper).", "signal", "not used", ge=0
+        None, "With chi: the pedestal (Bielova et al. 2019).", "signal", "not used", ge=0
     )
     full_well: float | None = parameter(
         None,
@@ -110,12 +110,13 @@ class SensorNoise(Method):
         emva, paper = self._set_names(EMVA), self._set_names(PAPER)
         if emva and paper:
             raise ValueError(
-                f"set the noise in one parametrisation, EMVA 1288's or the paper's; "
+                "set the noise in one parametrisation, EMVA 1288's or that of Bielova et al. 2019; "
                 f"found {', '.join(emva)} and {', '.join(paper)}"
             )
         if paper and (self.chi is None or self.theta is None):
             raise ValueError(
-                f"the paper's parameters need both chi and theta; found {', '.join(paper)} only"
+                "the parameters of Bielova et al. 2019 need both chi and theta; "
+                f"found {', '.join(paper)} only"
             )
         return self
 
