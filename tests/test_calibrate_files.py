@@ -235,7 +235,7 @@ def test_a_real_raw(shared_data, tmp_path):
     [
         ("exiftool_DNG.dng", "holds no pixels"),
         ("magicknet_DSC8695.dng", "holds every colour at every pixel"),
-        ("bep_truncated.cr2", "damaged, or no raw"),
+        ("bep_truncated.cr2", "damaged, or not a raw"),
         ("mei_issue247-1.nef", "it is a JPEG, not a camera's raw"),
         ("mushfiq_DSC_1339_768x512_rggb.raw", "a dump of samples"),
     ],
