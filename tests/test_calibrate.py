@@ -299,7 +299,7 @@ def test_frames_that_cannot_tell_are_refused():
         calibrate(100, flat, None, SENSOR)
 
 
-@pytest.mark.parametrize(("gain", "read"), [(0.5, 3.0), (5.0, 5.3), (40.0, 41.0)])
+@pytest.mark.parametrize(("gain", "read"), [(0.5, 3.0), (40.0, 41.0)])
 def test_a_single_image(gain, read):
     found = calibrate(100, frames(scene(384, 512), 1, gain, read), None, SENSOR)
     assert off(found.pooled.gain, gain)[0] < 0.06
