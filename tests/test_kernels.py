@@ -8,7 +8,15 @@ import pytest
 from clpipe.chain.chain import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
-from clpipe.engine.check import SIZES, check_ends, check_method, check_raw, compare, example
+from clpipe.engine.check import (
+    SIZES,
+    chain_for,
+    check_ends,
+    check_method,
+    check_raw,
+    compare,
+    example,
+)
 from clpipe.engine.runner import Runner
 from clpipe.engine.sources import kernel_folder
 from clpipe.reference.cfa import PATTERNS
@@ -20,17 +28,25 @@ VARIANTS = [
     for stage, method in METHODS
     for values in variants(method)
 ]
+# Other choices of a structural parameter differ in arithmetic alone, which lanes do not change.
+ON_ONE_LANE = [each for each in VARIANTS if not set(each.values[2]) & {"classifier", "size"}]
 SMALL_SIZES = SIZES[:6]
+
+
+def passes_of(stage, method):
+    return chain_for(stage, method, {}, "GRBG").steps[0].method.passes()
 
 
 @pytest.mark.parametrize(("stage", "method", "values"), VARIANTS)
 def test_kernel_agrees_with_its_reference(device, stage, method, values):
-    result = check_method(device, stage, method, values=values)
+    # In several launches, patterns in which red stands in either row and in either column.
+    patterns = PATTERNS if len(passes_of(stage, method)) == 1 else ("GRBG", "GBRG")
+    result = check_method(device, stage, method, patterns=patterns, values=values)
     assert result.difference.samples > 1000
     assert result.passed, result
 
 
-@pytest.mark.parametrize(("stage", "method", "values"), VARIANTS)
+@pytest.mark.parametrize(("stage", "method", "values"), ON_ONE_LANE)
 def test_kernel_agrees_with_its_reference_on_one_lane(scalar_device, stage, method, values):
     result = check_method(scalar_device, stage, method, SMALL_SIZES, ("GRBG",), values)
     assert result.passed, result
@@ -63,7 +79,8 @@ def test_median_of_zeros_and_ones(device, size):
 
 @pytest.mark.parametrize("noise", ["gaussian", "poisson"])
 def test_raw_is_bit_for_bit_the_references(device, scalar_device, noise):
-    for any_device, patterns in ((device, PATTERNS), (scalar_device, ("BGGR",))):
+    several = PATTERNS if noise == "gaussian" else ("GRBG",)
+    for any_device, patterns in ((device, several), (scalar_device, ("GRBG",))):
         result = check_raw(any_device, noise, patterns=patterns)
         assert result.difference.differing == 0, result
 
@@ -146,8 +163,9 @@ def test_every_kernel_file_belongs_to_a_method():
     assert {method.kernel for _, method in METHODS if method.kernel} == files
 
 
-def test_the_command_checks_every_stage(clpipe):
-    # Here, where all kernels are compiled.
+def test_the_command_checks_every_stage(clpipe, monkeypatch):
+    # Here, where the kernels of this pattern are compiled.
+    monkeypatch.setattr("clpipe.engine.check.PATTERNS", ("GRBG",))
     record = json.loads(clpipe("check", "--small", "--json").stdout)
     assert record["failed"] == 0
     checked = {(check["stage"], check["method"].split()[0]) for check in record["checks"]}
