@@ -337,11 +337,12 @@ def test_bench_of_methods(clpipe):
     options = ("--size", "320x200", "--repeat", 1, *sizes)
     text = clpipe("bench", "--methods", "denoise", *options).stdout
     assert "bilateral luma_size=5 chroma_size=3" in text
-    records = json.loads(clpipe("bench", "--methods", "demosaic", *options, "--json").stdout)
+    white = clpipe("bench", "--methods", "white_balance", "--size", "320x200", "--json").stdout
+    records = json.loads(white)
     launches = {record["method"]: record["launches"] for record in records}
-    assert launches["bilinear"] == 1
-    assert launches["edge_directed_median size=5"] == 3
-    assert all(record["mp_per_s"] > 0 for record in records)
+    assert launches["as_shot"] == 1
+    assert launches["gray_world"] > 2
+    assert all(record["mp_per_s"] > 0 for record in records if record["launches"])
     one = ("--set", "denoise.method=mean", "--json")
     records = json.loads(clpipe("bench", "--methods", "denoise", *options, *one).stdout)
     assert [record["method"] for record in records] == ["mean luma_size=5 chroma_size=3"]
