@@ -65,6 +65,16 @@ def test_keeping_a_stage_at_the_end_of_a_group_costs_no_launch_but_a_slot():
     assert len(plan_of(keep=("white_balance",)).launches) == len(plan_of().launches)
 
 
+@pytest.mark.parametrize(
+    ("method", "launches"),
+    [({"method": "bilinear"}, 1), ({"method": "edge_directed_median", "size": 5}, 3)],
+)
+def test_demosaicing_takes_so_many_launches(method, launches):
+    plan = plan_of(stages=["mosaic", "demosaic"], demosaic=method)
+    own = [x for x in plan.launches if isinstance(x, Launch) and x.stencil]
+    assert len(own) == launches
+
+
 def test_keeping_all():
     chain = make_chain(settings_from(GRAY_WORLD))
     steps = tuple(step.name for step in chain.steps)

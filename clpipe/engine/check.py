@@ -64,12 +64,15 @@ class Check:
 
 
 def example(kind: Kind, size: tuple[int, int], half: bool = False, seed: int = 0) -> Array:
-    """A random image of a kind, (height, width[, channel]): shadows, highlights, below black."""
+    """A random image of a kind, (height, width[, channel]): shadows, highlights, below black.
+
+    Signals go from -0.05, which a 14-bit ADC clips at 0 DN, to 1.35.
+    """
     random = np.random.default_rng(seed)
     if kind is Kind.RAW:
         return random.integers(0, 16384, size).astype(np.float32)
     shape = size if len(kind.channels) == 1 else (*size, len(kind.channels))
-    values = random.random(shape) ** 2 * 1.4 - 0.02
+    values = random.random(shape) ** 2 * 1.4 - 0.05
     return values.astype(np.float16 if half else np.float32)
 
 
