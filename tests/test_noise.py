@@ -37,7 +37,7 @@ def test_normals_invert_the_normal_distribution():
     p = (steps + 0.5) / 2**32
     z = normal_of(steps).astype(np.float64)
     assert np.all(np.abs(z - norm.isf(p)) < np.maximum(8e-5 * z, 1e-7))
-    # A relative error e of z moves the tail probability by about z^2 * e: within 5 sigma it is less.
+    # A relative error e of z moves the tail probability by about z^2 * e.
     near = z < 5
     allowed = (4e-5 * np.maximum(z[near], 1) ** 2 + 3e-7) * 1.5
     assert np.all(np.abs(norm.sf(z[near]) / p[near] - 1) < np.maximum(allowed, 3e-4))
