@@ -24,8 +24,8 @@ from clpipe.chain.request import Request
 from clpipe.images import write
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
+from clpipe.outputs import existing, sidecar
 from clpipe.outputs import folder as output_folders
-from clpipe.outputs import sidecar
 from clpipe.outputs.folder import LOCK, output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
 from tests.conftest import ROOT, written
@@ -128,7 +128,7 @@ def test_the_content_of_a_file_that_is_named_is_a_part_of_the_request(clpipe, re
 
 def test_another_version_makes_everything_again(clpipe, renders, monkeypatch):
     clpipe("run", renders(2), *RUN)
-    for module in (sidecar, replay):
+    for module in (sidecar, existing, replay):
         monkeypatch.setattr(module, "__version__", "9.9.9")
     clpipe("run", "in", *RUN)
     assert set(statuses("out").values()) == {"done"}
@@ -367,7 +367,7 @@ def test_the_disk_is_full(clpipe, renders, monkeypatch):
         if len(count) > 2:
             monkeypatch.setattr(output_folders, "ROOM", 2**62)  # more than any disk has
             raise ImageError(f"{path}: cannot be written: the disk is full")
-        real(path, spec, pixels)
+        return real(path, spec, pixels)
 
     monkeypatch.setattr(write, "_write", fail_to_write)
     result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)
@@ -382,9 +382,10 @@ def test_the_folder_has_gone(clpipe, renders, monkeypatch):
     real = write._write
 
     def fail_to_write(path, spec, pixels):
-        real(path, spec, pixels)
+        stored = real(path, spec, pixels)
         if path.name == "r002.jpg":
             Path("out").rename("elsewhere")
+        return stored
 
     monkeypatch.setattr(write, "_write", fail_to_write)
     result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)
@@ -556,7 +557,7 @@ def test_a_sidecar_whose_picture_cannot_be_the_same(clpipe, renders, monkeypatch
     assert Path("b/r000.jpg").read_bytes() == Path("out/r000.jpg").read_bytes()
     Path("mine.toml").write_text(Path("mine.toml").read_text() + "\n")
     assert "mine.toml: has changed since" in refused("moved.exr")
-    for module in (sidecar, replay):
+    for module in (sidecar, existing, replay):
         monkeypatch.setattr(module, "__version__", "9.9.9")
     assert "it is of clpipe 0" in refused("moved.exr")
     assert (
@@ -585,7 +586,7 @@ def test_a_picture_of_another_hand_is_not_written_over(clpipe, renders, format_)
     Path("out/r000.json").unlink()
     picture = Path(f"out/r000.{ending_of(format_)}")
     picture.write_bytes(b"somebody else's" * 20_000)
-    assert f"{picture}: clpipe did not write this picture" in clpipe(*run, status=1).stderr
+    assert f"{picture}: clpipe did not write this file" in clpipe(*run, status=1).stderr
     assert picture.read_bytes().startswith(b"somebody")
     clpipe(*run, "--overwrite")
 

@@ -1,6 +1,5 @@
 """Image files: the right picture or the right refusal."""
 
-import errno
 import io
 
 import numpy as np
@@ -9,13 +8,12 @@ import pytest
 from PIL import Image, ImageCms
 
 from clpipe.base.errors import ImageError
-from clpipe.images import write as image_write
 from clpipe.images.layers import picture_channels
 from clpipe.images.pixels import display_window
 from clpipe.images.read import holds_mosaic, read_finished, read_image
 from clpipe.images.tags import Tags
-from clpipe.images.write import write_display
-from tests.conftest import STILL_LIFE
+from clpipe.images.write import write_display, write_exr
+from tests.conftest import STILL_LIFE, file_limit
 
 
 def ramp(height=6, width=9, channels=3):
@@ -172,12 +170,16 @@ def test_jpeg_is_as_a_camera_writes_it(tmp_path):
     assert "sRGB" in ImageCms.getProfileDescription(profile)
 
 
-def test_a_jpeg_that_does_not_fit_on_the_disk_does_not_end_the_process(tmp_path, monkeypatch):
-    def copy(source, target, size):
-        target.write(source.read(100))
-        raise OSError(errno.ENOSPC, "No space left on device")
+@pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif", "a.exr"])
+def test_a_picture_that_may_not_be_written_does_not_end_the_process(tmp_path, name):
+    def write():
+        if name == "a.exr":
+            return write_exr(tmp_path / name, np.zeros((32, 32, 3), np.float32), "RGB", {})
+        return write_display(tmp_path / name, np.zeros((32, 32, 3), np.uint8), Tags("", "", 100))
 
-    monkeypatch.setattr(image_write.shutil, "copyfileobj", copy)
-    with pytest.raises(ImageError, match=r"a\.jpg: cannot be written: No space left on device"):
-        write_display(tmp_path / "a.jpg", np.zeros((32, 32, 3), np.uint8), Tags("", "", 100))
-    assert not list(tmp_path.iterdir())
+    for size in (1, 600):
+        with file_limit(size), pytest.raises(ImageError, match=rf"{name}: cannot be written: File"):
+            write()
+        assert not list(tmp_path.iterdir())
+    size = write().size
+    assert [path.stat().st_size for path in tmp_path.iterdir()] == [size]

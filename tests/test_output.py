@@ -1,5 +1,6 @@
 """The formats that results are written in, and what [output] says of them."""
 
+import hashlib
 import json
 import re
 
@@ -67,7 +68,15 @@ def test_several_at_once_are_the_same_as_one_by_one(scene, tmp_path):
         file = f"scene.{name.removesuffix('16')}"
         assert (tmp_path / "all" / file).read_bytes() == (tmp_path / name / file).read_bytes()
     outputs = json.loads((tmp_path / "all" / "scene.json").read_text())["outputs"]
-    assert outputs == ["scene.jpg", "scene.png", "scene.tif", "scene.exr"]
+    assert [each["name"] for each in outputs] == [
+        "scene.jpg",
+        "scene.png",
+        "scene.tif",
+        "scene.exr",
+    ]
+    for each in outputs:
+        data = (tmp_path / "all" / each["name"]).read_bytes()
+        assert (each["size"], each["sha256"]) == (len(data), hashlib.sha256(data).hexdigest())
 
 
 def test_light_beyond_half_is_clipped_in_half(write_exr, tmp_path):

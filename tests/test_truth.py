@@ -162,9 +162,10 @@ def test_what_lies_beside_a_picture(clpipe, write_exr):
     assert variance.attributes["kind"] == "variance"
     records = {name: json.loads(Path(f"o/{name}.json").read_text()) for name in names}
     for name, record in records.items():
-        assert all(Path("o", output).is_file() for output in record["outputs"])
+        assert all(Path("o", output["name"]).is_file() for output in record["outputs"])
         assert record["picture"] == name.removeprefix("a") and record["image_key"] == "a.exr"
-    assert records["a.truth_variance"]["outputs"] == ["a.truth_variance.exr"]
+    (variance,) = records["a.truth_variance"]["outputs"]
+    assert variance["name"] == "a.truth_variance.exr"
     assert records["a.truth_variance"]["noise"] == records["a"]["noise"]
     assert records["a.truth_variance"]["stages"] == records["a"]["stages"][:11]
     assert records["a.truth"]["noise"] is records["a.truth_mosaic"]["noise"] is None

@@ -280,18 +280,18 @@ def test_the_disk_is_full(clpipe, renders, when):
 
     with pytest.MonkeyPatch.context() as patch:
 
-        def full(path, _write):
+        def full(path):
             raise ImageError(f"{path}: cannot be written: No space left on device")
 
         def write(path, pixels, tags):
             count.append(path)
             if len(count) > 5:
                 patch.setattr(output_folders, "ROOM", 2**62)  # more than any disk has
-                full(path, None)
-            real(path, pixels, tags)
+                full(path)
+            return real(path, pixels, tags)
 
         if when == "tar":
-            patch.setattr(tar_batch, "write_beside", full)
+            patch.setattr(tar_batch, "whole_file", full)
         else:
             patch.setattr(writer, "write_display", write)
         result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)

@@ -1,5 +1,6 @@
 """The picture of a noise report: noise by intensity, tails, autocorrelation."""
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +58,9 @@ def draw(report: NoiseReport, path: Path) -> None:
     title = f"Noise of {subject} against {against} ({report.kind}, {report.share:.0%} used)"
     figure.suptitle(title, fontsize=15)
     FigureCanvasAgg(figure)
-    write_new(path, figure.savefig)
+    png = BytesIO()
+    figure.savefig(png)
+    write_new(path, png.getvalue())
 
 
 def short_name(path: str) -> str:

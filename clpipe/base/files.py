@@ -1,10 +1,15 @@
 """Whole files: their digest, and writing them so that none is ever left half-written."""
 
 import contextlib
+import errno
 import hashlib
+import os
 import secrets
-from collections.abc import Callable
+import stat
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from clpipe.base.errors import ImageError
 
@@ -22,23 +27,64 @@ def sha256_of(path: Path) -> tuple[str, int]:
         return digest.hexdigest(), file.tell()
 
 
-_unfinished: set[Path] = set()  # temporary files of this process, for `remove_temporary_files`
+@dataclass(frozen=True)
+class Stored:
+    """A file as it was written: its size in bytes, and its SHA-256."""
+
+    size: int
+    sha256: str
 
 
-def write_beside(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file under a temporary name beside ``path``, then rename it to ``path``.
+def read_regular(path: Path, largest: int) -> bytes:
+    """The content of a regular file; neither a device nor a pipe is waited for.
 
     Args:
-        path: the file; an existing one is replaced.
-        write: writes the whole content to the path that it is called with.
+        path: the file.
+        largest: more bytes are refused before they are read.
+
+    Raises:
+        OSError: it cannot be read, is no regular file, or is larger.
+    """
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, "not a regular file", str(path))
+        if status.st_size > largest:
+            raise OSError(errno.EFBIG, f"{status.st_size} bytes; at most {largest}", str(path))
+        return file.read()
+
+
+_unfinished: set[Path] = set()  # temporary files of this process, for `remove_temporary_files`
+
+LONGEST = 200  # bytes of a name that its temporary name repeats; file systems hold 255
+
+
+def shortened(name: str) -> str:
+    """A name as far as a temporary name repeats it.
+
+    >>> shortened("render"), len(shortened("x" * 255))
+    ('render', 200)
+    """
+    return os.fsencode(name)[:LONGEST].decode("utf-8", "ignore")
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[BinaryIO]:
+    """A file to write to, which takes the place of ``path`` when all of it is on the disk.
+
+    It is new, so it follows no link. Where it cannot be written, or the body raises, ``path`` stays
+    as it was.
 
     Raises:
         ImageError: the file cannot be written.
     """
-    beside = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
+    beside = path.with_name(f".{shortened(path.stem)}.{secrets.token_hex(4)}.part{path.suffix}")
     _unfinished.add(beside)
     try:
-        write(beside)
+        with open(beside, "xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())  # else a loss of power leaves an empty file under its name
         beside.replace(path)
     except OSError as error:
         raise ImageError(f"{path}: cannot be written: {error.strerror or error}") from None
@@ -48,8 +94,27 @@ def write_beside(path: Path, write: Callable[[Path], object]) -> None:
         _unfinished.discard(beside)
 
 
-def write_new(path: Path, write: Callable[[Path], object]) -> None:
-    """Make the folders above ``path`` where they are missing, then :func:`write_beside`.
+def write_whole(path: Path, *parts: bytes | memoryview) -> Stored:
+    """Write a file, all of it or nothing; an existing one is replaced.
+
+    Args:
+        path: the file.
+        *parts: its bytes, one behind the other; views are of bytes.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    digest, size = hashlib.sha256(), 0
+    with whole_file(path) as file:
+        for part in parts:
+            file.write(part)
+            digest.update(part)
+            size += len(part)
+    return Stored(size, digest.hexdigest())
+
+
+def write_new(path: Path, data: bytes) -> Stored:
+    """Make the folders above ``path`` where they are missing, then :func:`write_whole`.
 
     Raises:
         ImageError: the file cannot be written.
@@ -58,7 +123,17 @@ def write_new(path: Path, write: Callable[[Path], object]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ImageError(f"{path}: cannot be written: {error.strerror}") from None
-    write_beside(path, write)
+    return write_whole(path, data)
+
+
+def keep_names(folder: Path) -> None:
+    """Have the names of a folder outlive a loss of power, as far as its file system can."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def remove_temporary_files() -> None:

@@ -41,7 +41,7 @@ class RunSpec:
         selectors: of the devices, as ``--device`` has them.
         memory: of a device, in bytes; None is what is free.
         threads: as for :class:`clpipe.batch.threads.Batch`.
-        overwrite, trace: as for :class:`clpipe.batch.work.ImageWorker`.
+        overwrite, verify, trace: as for :class:`clpipe.batch.work.ImageWorker`.
         run: a name that no other run has.
         folder: where relative paths start.
         environment: what every worker must be.
@@ -54,6 +54,7 @@ class RunSpec:
     memory: int | None
     threads: int | None
     overwrite: bool
+    verify: bool
     trace: bool
     run: str = field(default_factory=lambda: secrets.token_hex(8))
     folder: str = field(default_factory=os.getcwd)
@@ -180,7 +181,7 @@ def _batch(spec: RunSpec, threads: int) -> Batch:
     assert spec.first
     loader, writer = ImageLoader(spec.request), OutputWriter(spec.output, spec.request)
     chain = loader.first_chain([spec.first])
-    worker = ImageWorker(loader, writer, chain, spec.overwrite, spec.trace)
+    worker = ImageWorker(loader, writer, chain, spec.overwrite, spec.verify, spec.trace)
     return Batch(worker, _devices(spec.selectors, spec.memory), spec.threads or threads)
 
 

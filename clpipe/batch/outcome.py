@@ -41,6 +41,7 @@ class Outcome:
         outputs: the files that were written, relative to the output folder.
         began: in s since 1970.
         spans: what was done when.
+        clipped: the share of clipped pixels, 0 to 1; of several renditions, the largest.
     """
 
     job: Job
@@ -51,6 +52,7 @@ class Outcome:
     outputs: tuple[str, ...] = ()
     began: float = 0.0
     spans: tuple[Span, ...] = ()
+    clipped: float = 0.0
 
     def seconds(self, step: str) -> float:
         """How many seconds a step took, over all renditions of the image."""

@@ -1,16 +1,21 @@
 """The log of a run: a line of JSON for its start, each image and its end."""
 
+import contextlib
+import errno
 import json
+import os
+import stat
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from clpipe.base.about import __version__
 from clpipe.base.errors import OutputError
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS, Outcome
+from clpipe.engine.clipping import MUCH
 from clpipe.inputs.find import Shard
 
 
@@ -38,12 +43,17 @@ class Summary:
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STEPS, 0.0))
     began: float = field(default_factory=time.perf_counter)
     interrupted: bool = False
+    much_clipped: int = 0  # images of which a share of MUCH or more is clipped
+    most_clipped: tuple[float, str] = (0.0, "")  # the largest share, and its image
 
     def add(self, outcome: Outcome) -> None:
         """Count one more image."""
         self.counts[outcome.status] += 1
         if outcome.status == DONE:
             self.megapixels += outcome.megapixels
+            self.much_clipped += outcome.clipped >= MUCH
+            if outcome.clipped > self.most_clipped[0]:
+                self.most_clipped = outcome.clipped, str(outcome.job.path)
         if outcome.error:
             self.failures.append(outcome.error)
         for step in STEPS:
@@ -90,22 +100,32 @@ class RunLog:
 
     def __init__(self, path: Path, start: Mapping[str, Any]) -> None:
         self._path = path
-        self._file: BinaryIO | None = None
+        self._file: int | None = None
         self._start = _line("start", time.time(), {"clpipe": __version__, **start})
 
     def _write(self, line: bytes) -> None:
         try:
             if self._file is None:
-                self._file = open(self._path, "a+b")  # noqa: SIM115  closed at exit
-                if self._file.seek(0, 2):
-                    self._file.seek(-1, 2)
-                    if self._file.read(1) != b"\n":
-                        self._file.write(b"\n")  # after a line that was cut off
-                self._file.write(self._start)
-            self._file.write(line)
-            self._file.flush()
+                self._file = self._opened()
+                line = self._start + line
+            _append(self._file, line)
         except OSError as error:
             raise OutputError(f"{self._path}: cannot be written: {error.strerror}") from None
+
+    def _opened(self) -> int:
+        """The file, open behind its last whole line.
+
+        Raises:
+            OSError: it cannot be opened, or is no regular file.
+        """
+        file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+        status = os.fstat(file)
+        if not stat.S_ISREG(status.st_mode):
+            os.close(file)
+            raise OSError(errno.EINVAL, "not a regular file")
+        if status.st_size and os.pread(file, 1, status.st_size - 1) != b"\n":
+            _append(file, b"\n")  # after a line that was cut off
+        return file
 
     def add(self, outcome: Outcome) -> None:
         """Write the line of one image.
@@ -125,6 +145,7 @@ class RunLog:
                 **{f"{step}_seconds": round(outcome.seconds(step), 6) for step in STEPS},
                 "outputs": list(outcome.outputs),
                 "warnings": list(outcome.warnings),
+                "clipped": round(outcome.clipped, 4),
                 "error": outcome.error or None,
             },
         )
@@ -136,13 +157,32 @@ class RunLog:
         Raises:
             OutputError: it cannot be written.
         """
-        if self._file:
+        if self._file is not None:
             self._write(_line("end", time.time(), summary.record()))
 
     def close(self) -> None:
         """Close the file."""
-        if self._file:
-            self._file.close()
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                os.fsync(self._file)
+            os.close(self._file)
+            self._file = None
+
+
+def _append(file: int, data: bytes) -> None:
+    """Write all of the data at the end of a file, or nothing.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    end = os.lseek(file, 0, os.SEEK_END)
+    written = 0
+    try:
+        while written < len(data):
+            written += os.write(file, data[written:])
+    except OSError:
+        os.ftruncate(file, end)
+        raise
 
 
 def read_log(path: Path) -> Sequence[dict[str, Any]]:

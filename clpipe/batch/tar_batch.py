@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.base.errors import ImageError, OutputError
-from clpipe.base.files import write_beside
+from clpipe.base.files import keep_names, whole_file
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, Outcome
 from clpipe.batch.tars import STAGING, Members, Tar, prepare
 from clpipe.batch.threads import Batch
@@ -24,8 +24,9 @@ from clpipe.chain.chain import Chain
 from clpipe.engine.device import Device
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
+from clpipe.outputs.existing import is_current
 from clpipe.outputs.folder import RESUMABLE
-from clpipe.outputs.sidecar import SIDECAR, is_current, read_sidecar
+from clpipe.outputs.sidecar import SIDECAR, outputs_in, read_sidecar
 from clpipe.outputs.writer import OutputWriter
 
 
@@ -58,20 +59,23 @@ class Packer:
         path = self._writer.path(job, SIDECAR, name)
         return path.relative_to(self._tar.staging).as_posix()
 
-    def has(self, job: Job, name: str, request: Mapping[str, Any]) -> bool:
+    def has(self, job: Job, name: str, request: Mapping[str, Any], verify: bool) -> bool:
         """Whether the tar holds a rendition that was made by the same request; it is then reused.
 
-        Arguments as for :meth:`clpipe.batch.work.ImageWorker.is_done`.
+        A tar does not say when its files were touched, so their SHA-256 is always compared.
+        Arguments as for :meth:`clpipe.outputs.existing.Existing.is_done`.
         """
         member = self._member(job, name)
         with self._lock:
             values = self._old.sidecar(member)
-        if not values or not is_current(values, job, request):
+        listed = outputs_in(values)
+        pictures = {path.name for path in self._writer.existing(job, name).pictures}
+        if not pictures <= listed.keys() or not is_current(values, job, request, verify):
             return False
-        files = [str(PurePosixPath(member).with_name(n)) for n in values["outputs"]]
-        if not all(file in self._old.places for file in files):
+        files = {str(PurePosixPath(member).with_name(n)): was for n, was in listed.items()}
+        if any(self._old.sha256(file) != was["sha256"] for file, was in files.items()):
             return False
-        self._reused[member] = files
+        self._reused[member] = list(files)
         return True
 
     def packed(self, outcome: Outcome) -> Outcome:
@@ -98,7 +102,7 @@ class Packer:
             new = any(isinstance(source, Path) for _, source in members)
             same = [name for name, _ in members] == list(self._old.places)
             if members and (new or not (same or FAILED in self._statuses.values())):
-                write_beside(self._tar.path, lambda to: self._write(to, members))
+                self._write(members)
         except ImageError as error:
             raise OutputError(f"{error}; {RESUMABLE}") from None
         except FileNotFoundError as error:
@@ -119,27 +123,27 @@ class Packer:
                         yield file, self._old.places[file]
                     continue
                 sidecar = self._writer.path(job, SIDECAR, name)
-                paths = [sidecar.with_name(n) for n in read_sidecar(sidecar)["outputs"]]
+                paths = [sidecar.with_name(n) for n in outputs_in(read_sidecar(sidecar))]
                 for path in (*paths, sidecar):
                     yield path.relative_to(self._tar.staging).as_posix(), path
 
-    def _write(self, to: Path, members: Sequence[tuple[str, Path | tuple[int, int]]]) -> None:
-        with open(to, "wb") as file:
-            with tarfile.TarFile(
+    def _write(self, members: Sequence[tuple[str, Path | tuple[int, int]]]) -> None:
+        with (
+            whole_file(self._tar.path) as file,
+            tarfile.TarFile(
                 fileobj=file, mode="w", format=tarfile.GNU_FORMAT, encoding="utf-8"
-            ) as tar:
-                for name, source in members:
-                    info = tarfile.TarInfo(name)  # mtime, uid and gid are 0, the mode is 0644
-                    with open(source if isinstance(source, Path) else self._tar.path, "rb") as data:
-                        if isinstance(source, Path):
-                            info.size = os.fstat(data.fileno()).st_size
-                        else:
-                            start, info.size = source
-                            data.seek(start)
-                        tar.addfile(info, data)
-            # Its pictures are removed next: it must outlive a loss of power.
-            file.flush()
-            os.fsync(file.fileno())
+            ) as tar,
+        ):
+            for name, source in members:
+                info = tarfile.TarInfo(name)  # mtime, uid and gid are 0, the mode is 0644
+                with open(source if isinstance(source, Path) else self._tar.path, "rb") as data:
+                    if isinstance(source, Path):
+                        info.size = os.fstat(data.fileno()).st_size
+                    else:
+                        start, info.size = source
+                        data.seek(start)
+                    tar.addfile(info, data)
+        keep_names(self._tar.folder)  # its pictures are removed next
 
 
 class TarWorker(ImageWorker):
@@ -151,7 +155,8 @@ class TarWorker(ImageWorker):
 
     def is_done(self, job: Job, name: str, request: Mapping[str, Any]) -> bool:
         """Whether a rendition is done, in its tar or in the folder that will be packed."""
-        return self._packers.of(job).has(job, name, request) or super().is_done(job, name, request)
+        packed = self._packers.of(job).has(job, name, request, self._verify)
+        return packed or super().is_done(job, name, request)
 
 
 class Packers:
@@ -175,7 +180,8 @@ class TarBatch(Batch):
 
     Args:
         tars: what is made.
-        loader, writer, chain, overwrite, trace: as for :class:`clpipe.batch.work.ImageWorker`.
+        loader, writer, chain, overwrite, verify, trace: as for
+            :class:`clpipe.batch.work.ImageWorker`.
         devices, threads: as for the base.
     """
 
@@ -188,6 +194,7 @@ class TarBatch(Batch):
         devices: Sequence[Device | None],
         threads: int | None = None,
         overwrite: bool = False,
+        verify: bool = False,
         trace: bool = False,
     ) -> None:
         folders = {job.stem: tar.staging.name for tar in tars for job in tar.jobs}
@@ -195,7 +202,7 @@ class TarBatch(Batch):
         self._tars = tars
         self._overwrite = overwrite
         self._packers = Packers(tars, staged)
-        worker = TarWorker(self._packers, loader, staged, chain, overwrite, trace)
+        worker = TarWorker(self._packers, loader, staged, chain, overwrite, verify, trace)
         super().__init__(worker, devices, threads)
 
     def run(self, jobs: Sequence[Job]) -> Generator[Outcome, None, None]:

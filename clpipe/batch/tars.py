@@ -1,5 +1,6 @@
 """WebDataset tars: each holds the pictures of a number of images, with their sidecars."""
 
+import hashlib
 import json
 import os
 import re
@@ -147,3 +148,19 @@ class Members:
         except (OSError, ValueError):
             return {}
         return values if isinstance(values, dict) else {}
+
+    def sha256(self, name: str) -> str:
+        """The SHA-256 of a file; "" where it is missing or cannot be read."""
+        if name not in self.places:
+            return ""
+        start, left = self.places[name]
+        digest = hashlib.sha256()
+        try:
+            with open(self._path, "rb") as file:
+                file.seek(start)
+                while left > 0 and (part := file.read(min(left, 4 << 20))):
+                    digest.update(part)
+                    left -= len(part)
+        except OSError:
+            return ""
+        return digest.hexdigest()

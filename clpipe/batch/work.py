@@ -17,13 +17,14 @@ from clpipe.base.types import Array
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome, Span
 from clpipe.chain.chain import Chain
 from clpipe.chain.formats import DNG
+from clpipe.engine.clipping import clipped_share
 from clpipe.engine.device import Device, Timing
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.read import SourceImage
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.renditions import Rendition
-from clpipe.outputs.sidecar import SIDECAR, check_own, is_done, sidecar, write_sidecar
+from clpipe.outputs.sidecar import SIDECAR, sidecar, write_sidecar
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
@@ -44,6 +45,7 @@ class Task:
     status: str = DONE
     error: str = ""
     outputs: list[str] = field(default_factory=list)
+    clipped: float = 0.0  # the share of clipped pixels, of the rendition that has most
 
     @contextmanager
     def timed(self, step: str) -> Iterator[None]:
@@ -67,6 +69,7 @@ class Task:
             tuple(self.outputs),
             self.began,
             tuple(self.spans),
+            self.clipped,
         )
 
 
@@ -78,6 +81,7 @@ class ImageWorker:
         writer: how pictures are written.
         chain: that of the first image, for which kernels are compiled early.
         overwrite: make pictures that are done already, too.
+        verify: read pictures that are done already, to see that they are whole.
         trace: note each launch and transfer.
     """
 
@@ -87,12 +91,14 @@ class ImageWorker:
         writer: OutputWriter,
         chain: Chain,
         overwrite: bool = False,
+        verify: bool = False,
         trace: bool = False,
     ) -> None:
         self.writer = writer
         self._loader = loader
         self._chain = chain
         self._overwrite = overwrite
+        self._verify = verify
         self._trace = trace
         self._spare = SpareArrays(0)
 
@@ -164,13 +170,7 @@ class ImageWorker:
         Raises:
             ImageError: a file of its name is somebody else's.
         """
-        path, outputs = self.writer.path(job, SIDECAR, name), self.writer.outputs(job, name)
-        if is_done(path, job, request, outputs):
-            return True
-        if not path.exists():
-            for output in outputs:
-                check_own(output)
-        return False
+        return self.writer.existing(job, name).is_done(job, request, self._verify)
 
     def _load(self, task: Task, names: Sequence[str]) -> None:
         """Load a task's image, and decide which renditions are made of it.
@@ -224,6 +224,8 @@ class ImageWorker:
         with task.timed("encode"):
             try:
                 files = writer.write(job, rendition, task.source, result)
+                clipped = None if rendition.noise else clipped_share(result, rendition.chain)
+                task.clipped = max(task.clipped, clipped or 0.0)
                 path = writer.path(job, SIDECAR, rendition.name)
                 record = sidecar(
                     job,
@@ -234,7 +236,8 @@ class ImageWorker:
                     device,
                     task.source,
                     result,
-                    [file.name for file in files],
+                    files,
+                    clipped,
                 )
                 write_sidecar(path, record)
                 task.outputs += [str(f.relative_to(writer.folder)) for f in (*files, path)]

@@ -1,5 +1,6 @@
 """What a run prints on stderr: a bar on a terminal, otherwise a line for each image."""
 
+import contextlib
 from typing import Self
 
 from rich.console import Console
@@ -8,6 +9,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
 from clpipe.batch.run_log import Summary
 from clpipe.chain.formats import ending_of
+from clpipe.engine.clipping import clipping_text
 from clpipe.outputs.writer import OutputWriter
 
 REPEATED = 20  # failures that are printed again at the end
@@ -52,8 +54,9 @@ class Reporter:
         self.end()
 
     def print(self, text: str) -> None:
-        """Print a line."""
-        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+        """Print a line. One that cannot be printed, on a full disk, ends no run."""
+        with contextlib.suppress(OSError):
+            self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def report(self, outcome: Outcome) -> None:
         """Print what became of one image, after it was added to the summary."""
@@ -85,11 +88,21 @@ class Reporter:
         speed = summary.megapixels / max(summary.elapsed, 1e-9)
         return f"{speed:.0f} MP/s  {summary.shares()}" + f"  {failed} failed" * bool(failed)
 
+    def _clipping(self) -> str:
+        """What is said of images that are clipped much."""
+        share, path = self._summary.most_clipped
+        text = clipping_text(share)
+        if not self._several:
+            return f"clpipe: {path}: warning: {text}"
+        return f"{self._summary.much_clipped} images are clipped much; in {path} {text}"
+
     def end(self) -> None:
         """Remove the bar and print the summary."""
         if self._bar:
             self._bar.stop()
         summary, counts = self._summary, self._summary.counts
+        if summary.much_clipped and not self._quiet:
+            self.print(self._clipping())
         if counts[LEFT_OUT] and not self._quiet:
             self.print(
                 f"{counts[LEFT_OUT]} images in folders were kept after other stages and left out"

@@ -131,6 +131,11 @@ if TYPE_CHECKING:
     help="Run on the workers of a Dask scheduler (tcp://HOST:8786); they must see the same files.",
 )
 @click.option("--overwrite", is_flag=True, help="Make pictures again that are up to date.")
+@click.option(
+    "--verify",
+    is_flag=True,
+    help="Read all pictures that are up to date, and make those again that are damaged.",
+)
 @click.option("--quiet", is_flag=True, help="Print failures only.")
 @click.option(
     "--trace",
@@ -150,6 +155,7 @@ def run(
     per_tar: int | None,
     dask: str | None,
     overwrite: bool,
+    verify: bool,
     quiet: bool,
     trace: Path | None,
     **options: Any,
@@ -201,7 +207,15 @@ def run(
         check_trace(trace)
     budget = parse_size(memory) if memory else None
     spec = RunSpec(
-        request, output, selectors, budget, threads, overwrite, trace is not None, first=jobs[0]
+        request,
+        output,
+        selectors,
+        budget,
+        threads,
+        overwrite,
+        verify,
+        trace is not None,
+        first=jobs[0],
     )
     opened = batch_of(spec, loader, chain, tars, dask)
     summary = Summary(len(jobs))  # counts seconds from here on
@@ -285,9 +299,9 @@ def batch_of(
     devices: list[Device | None] = [*open_devices(spec.selectors, spec.memory)] or [None]
     writer = OutputWriter(spec.output, spec.request)
     if tars:
-        options = (spec.threads, spec.overwrite, spec.trace)
+        options = (spec.threads, spec.overwrite, spec.verify, spec.trace)
         return nullcontext(TarBatch(tars, loader, writer, chain, devices, *options))
-    worker = ImageWorker(loader, writer, chain, spec.overwrite, spec.trace)
+    worker = ImageWorker(loader, writer, chain, spec.overwrite, spec.verify, spec.trace)
     return nullcontext(Batch(worker, devices, spec.threads))
 
 
@@ -305,7 +319,7 @@ def folder_named(text: str) -> Path:
 # Options that a sidecar does not store.
 BESIDE_REPLAY = (
     *("inputs", "output", "replay", "max_pixels", "selectors", "memory"),
-    *("overwrite", "quiet", "trace"),
+    *("overwrite", "verify", "quiet", "trace"),
 )
 
 

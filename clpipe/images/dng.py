@@ -12,7 +12,7 @@ import numpy as np
 
 from clpipe.base.about import __version__
 from clpipe.base.errors import ImageError
-from clpipe.base.files import write_beside
+from clpipe.base.files import Stored, write_whole
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.profile import SRGB_TO_XYZ
@@ -156,7 +156,7 @@ def noise_fields(negative: Negative) -> tiff.Directory:
 
 def write_dng(
     path: Path, mosaic: Floats, negative: Negative, tags: Tags, orientation: int = 1
-) -> None:
+) -> Stored:
     """Write a raw as a DNG 1.4: every DN unchanged, in 16 bits, uncompressed.
 
     Args:
@@ -193,9 +193,4 @@ def write_dng(
         head += tiff.directory_bytes(directory, offset)
     head += small.tobytes().ljust(dn_offset - small_offset, b"\0")
 
-    def write(to: Path) -> None:
-        with to.open("wb") as file:
-            file.write(head)
-            file.write(np.ascontiguousarray(dn).data)
-
-    write_beside(path, write)
+    return write_whole(path, head, np.ascontiguousarray(dn).data.cast("B"))

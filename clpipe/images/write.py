@@ -1,7 +1,9 @@
 """Writing pictures: JPEG, PNG and TIFF with EXIF and an ICC profile, and float OpenEXR."""
 
+import errno
+import mmap
 import os
-import shutil
+import resource
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -12,7 +14,8 @@ import OpenImageIO as oiio
 from PIL import Image, ImageCms
 
 from clpipe.base.about import __version__
-from clpipe.base.files import write_beside
+from clpipe.base.errors import ImageError
+from clpipe.base.files import Stored, write_whole
 from clpipe.base.types import Array, Floats
 from clpipe.images.attributes import PREFIX
 from clpipe.images.encoding import exif
@@ -34,7 +37,7 @@ def srgb_profile() -> bytes:
     return bytes(profile)
 
 
-def write_display(path: Path, pixels: Array, tags: Tags) -> None:
+def write_display(path: Path, pixels: Array, tags: Tags) -> Stored:
     """Write a picture, (height, width[, 3]), as JPEG, PNG or TIFF, with EXIF.
 
     Whole numbers of 8 or 16 bits get an sRGB profile; float samples (TIFF) do not. ``tags.output``
@@ -73,7 +76,7 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> None:
         spec.attribute("Exif:DateTimeOriginal", tags.taken)
     if tags.taken or path.suffix == ".tif":
         spec.attribute("DateTime", tags.taken or NO_TIME)
-    _write(path, spec, pixels.reshape(height, width, channels))
+    return _write(path, spec, pixels.reshape(height, width, channels))
 
 
 def write_exr(
@@ -82,7 +85,7 @@ def write_exr(
     channels: Sequence[str],
     attributes: Mapping[str, str],
     half: bool = False,
-) -> None:
+) -> Stored:
     """Write a float image, (height, width[, channel]), as OpenEXR with ZIP compression.
 
     Args:
@@ -103,35 +106,45 @@ def write_exr(
     for name, value in attributes.items():
         spec.attribute(PREFIX + name, value)
     data = np.clip(pixels, -HALF_MAX, HALF_MAX) if half else pixels
-    _write(path, spec, data.reshape(height, width, len(channels)))
+    return _write(path, spec, data.reshape(height, width, len(channels)))
 
 
-def _write(path: Path, spec: Any, pixels: Array) -> None:
+def _write(path: Path, spec: Any, pixels: Array) -> Stored:
     """Write (height, width, channel) with OpenImageIO, which releases the GIL while it encodes.
 
     Raises:
         ImageError: the file cannot be written.
     """
 
-    def write(to: Path) -> None:
-        if to.suffix != ".jpg":
-            _encode(str(to), str(to), spec, pixels)
-            return
-        # libjpeg ends the process where it cannot write, so it writes to memory.
-        memory = os.memfd_create("jpeg")
-        with open(memory, "rb", buffering=0) as encoded:
-            _encode("jpeg", f"/proc/self/fd/{memory}", spec, pixels)
-            with open(to, "wb", buffering=0) as file:
-                shutil.copyfileobj(encoded, file, 8 << 20)
+    # The encoders do not notice all that a full disk refuses, and libjpeg then ends the process; so
+    # they write to memory.
+    with open(os.memfd_create("picture"), "rb", buffering=0) as memory:
+        try:
+            _check_file_limit(2 * pixels.nbytes)
+            _encode(path.suffix[1:], f"/proc/self/fd/{memory.fileno()}", spec, pixels)
+            encoded = mmap.mmap(memory.fileno(), 0, prot=mmap.PROT_READ)
+        except OSError as error:
+            raise ImageError(f"{path}: cannot be written: {error.strerror or error}") from None
+        with encoded, memoryview(encoded) as data:
+            return write_whole(path, data)
 
-    write_beside(path, write)
+
+def _check_file_limit(size: int) -> None:
+    """See that the process may write files of a size (``ulimit -f``), which holds in memory, too.
+
+    Raises:
+        OSError: it may not.
+    """
+    limit, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
+    if limit != resource.RLIM_INFINITY and size > limit:
+        raise OSError(errno.EFBIG, f"{os.strerror(errno.EFBIG)} (ulimit -f)")
 
 
 def _encode(format_: str, to: str, spec: Any, pixels: Array) -> None:
     """Encode pixels to a file.
 
     Args:
-        format_: an ending such as "jpeg", or a file name that has one.
+        format_: its ending.
         to: the path to write to.
         spec: the ``oiio.ImageSpec``.
         pixels: (height, width, channel).

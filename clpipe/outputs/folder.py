@@ -5,10 +5,12 @@ import errno
 import fcntl
 import os
 import re
+import secrets
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from clpipe.base.errors import RequestError
+from clpipe.base.files import shortened
 from clpipe.base.memory import in_words
 from clpipe.inputs.find import Job, Shard
 
@@ -21,14 +23,14 @@ LOCK = ".clpipe.lock"
 
 PARTS = 2**40  # bytes of the lock, of which each shard holds its part; none is ever written
 
-UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # as write_beside names them
+UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # as whole_file names them
 
 
 def write_problem(folder: Path) -> str:
     """Why nothing can be written to a folder, "" where it can."""
-    probe = folder / f".clpipe.{os.getpid()}"
+    probe = folder / f".clpipe.{secrets.token_hex(8)}"
     try:
-        with open(probe, "wb") as file:
+        with open(probe, "xb") as file:
             os.posix_fallocate(file.fileno(), 0, ROOM)
     except OSError as error:
         needed = f" ({in_words(ROOM)} are needed)" if error.errno == errno.ENOSPC else ""
@@ -74,7 +76,10 @@ def _locked(path: Path, length: int, first: int) -> int:
         RequestError: another process holds it.
     """
     while True:
-        lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+        except OSError as error:
+            raise RequestError(f"{path}: cannot be locked: {error.strerror}") from None
         try:
             fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB, length, first)
         except OSError as error:
@@ -93,7 +98,7 @@ def _locked(path: Path, length: int, first: int) -> int:
 
 def remove_unfinished(folder: Path, jobs: Iterable[Job]) -> None:
     """Remove the unfinished files that a killed run left of these jobs."""
-    stems = {job.stem for job in jobs}
+    stems = {str(Path(job.stem).with_name(shortened(Path(job.stem).name))) for job in jobs}
     for place, _, names in os.walk(folder):
         for match in filter(None, map(UNFINISHED.fullmatch, names)):
             stem = os.path.relpath(os.path.join(place, match[1]), folder)

@@ -3,7 +3,7 @@
 import json
 import os
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import cache
 from importlib.metadata import version
@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.about import __version__
-from clpipe.base.digests import digests, stamp_of
 from clpipe.base.errors import ImageError
-from clpipe.base.files import write_beside
+from clpipe.base.files import Stored, keep_names, read_regular, write_whole
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.images.read import SourceImage
@@ -26,70 +25,20 @@ SIDECAR = "json"  # the ending of its name
 
 OWN = "clpipe"  # the first key of every sidecar
 
-MARKED = 1 << 16  # bytes at either end of a file, in which a format of clpipe names clpipe
+LARGEST = 64 << 20  # bytes
 
 BEGINNING = f'{{\n  "{OWN}": '.encode()
 
 
-def is_done(path: Path, job: Job, request: Mapping[str, Any], outputs: Sequence[Path]) -> bool:
-    """Whether a picture is there, made of the same input by the same request and this version.
-
-    Args:
-        path: of the sidecar.
-        job: the image.
-        request: the record of the request for the image.
-        outputs: the files that must be there.
-
-    Raises:
-        ImageError: the sidecar is somebody else's file.
-    """
-    try:
-        values = read_sidecar(path)
-    except FileNotFoundError:
-        return False
-    return all(map(os.path.exists, outputs)) and is_current(values, job, request)
-
-
-def is_current(values: Mapping[str, Any], job: Job, request: Mapping[str, Any]) -> bool:
-    """Whether a sidecar's values are of the same input, the same request and this version.
-
-    An input of the same size and time of change is taken for the same; else its SHA-256 decides.
-    Arguments as for :func:`is_done`.
-    """
-    if values.get(OWN) != __version__ or not _same_request(values.get("request"), request):
-        return False
-    size, modified = stamp_of(job.path)
-    if values.get("input_size") != size:
-        return False
-    if values.get("input_modified") == modified:
-        return True
-    return values.get("sha256") in digests([str(job.path)]).values()
-
-
-def _same_request(one: Any, other: Mapping[str, Any]) -> bool:
-    """Whether records of requests are equal, with files compared by content and not by name."""
-    if one == other:
-        return True
-    if not isinstance(one, dict) or not (other["files"] and one.get("files")):
-        return False
-    texts = []
-    for values in (one, other):
-        text = json.dumps({k: v for k, v in values.items() if k != "files"}, sort_keys=True)
-        for file, digest in values["files"].items():
-            text = text.replace(json.dumps(file), json.dumps(digest))
-        texts.append(text)
-    return texts[0] == texts[1]
-
-
 def read_sidecar(path: Path) -> dict[str, Any]:
-    """A sidecar's values.
+    """A sidecar's values, of which only the key :data:`OWN` is sure to be there.
 
     Raises:
         FileNotFoundError: it is missing, or is empty or cut off, as a loss of power may leave it.
         ImageError: it cannot be read, or clpipe did not write it.
     """
     try:
-        data = path.read_bytes()
+        data = read_regular(path, LARGEST)
     except FileNotFoundError:
         raise
     except OSError as error:
@@ -108,27 +57,18 @@ def read_sidecar(path: Path) -> dict[str, Any]:
     return values
 
 
-def check_own(path: Path) -> None:
-    """See that a picture without a sidecar, which would be overwritten, is one of clpipe's.
+def outputs_in(values: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """The files that a sidecar's values list: the size and the SHA-256 of each, by its name.
 
-    Each format names clpipe before or behind its pixels. A run that was killed may have left a
-    picture without a sidecar.
-
-    Raises:
-        ImageError: it is somebody else's.
+    What is no name beside the sidecar, or says no size and SHA-256, is left out.
     """
-    try:
-        with open(path, "rb") as file:
-            ends = file.read(MARKED)
-            file.seek(max(os.fstat(file.fileno()).st_size - MARKED, 0))
-            ends += file.read(MARKED)
-    except OSError:
-        return  # it is missing, or writing to it will say why
-    if ends and OWN.encode() not in ends:
-        raise ImageError(
-            f"{path}: clpipe did not write this picture, and would overwrite it; "
-            "move it, choose another output folder, or say --overwrite"
-        )
+    listed = values.get("outputs")
+    return {
+        each["name"]: each
+        for each in (listed if isinstance(listed, list) else ())
+        if isinstance(each, dict) and {"name", "size", "sha256"} <= each.keys()
+        if isinstance(each["name"], str) and os.path.basename(each["name"]) == each["name"] != ""
+    }
 
 
 def write_sidecar(path: Path, record: Mapping[str, Any]) -> None:
@@ -137,8 +77,8 @@ def write_sidecar(path: Path, record: Mapping[str, Any]) -> None:
     Raises:
         ImageError: it cannot be written.
     """
-    data = json_text(record).encode()
-    write_beside(path, lambda to: to.write_bytes(data))
+    write_whole(path, json_text(record).encode())
+    keep_names(path.parent)
 
 
 def json_text(record: Mapping[str, Any]) -> str:
@@ -172,7 +112,8 @@ def sidecar(
     device: Device | None,
     source: SourceImage,
     result: Result,
-    outputs: Sequence[str],
+    outputs: Mapping[Path, Stored],
+    clipped: float | None,
 ) -> dict[str, Any]:
     """Everything that is needed to make the files of a rendition again, as JSON values.
 
@@ -185,7 +126,8 @@ def sidecar(
         device: where it was made; None is NumPy.
         source: the image, as it was loaded.
         result: what was made of it.
-        outputs: the names of the files.
+        outputs: the files.
+        clipped: the share of clipped pixels, 0 to 1; None where the image has no upper end.
     """
     chain = rendition.whole
     facts = source.facts if isinstance(source, RawImage) else None
@@ -225,7 +167,11 @@ def sidecar(
             }
             for step in chain.steps
         ],
-        "outputs": list(outputs),
+        "clipped": clipped if clipped is None else round(clipped, 4),
+        "outputs": [
+            {"name": path.name, "size": file.size, "sha256": file.sha256}
+            for path, file in outputs.items()
+        ],
         "warnings": list(source.warnings),
         "device": {
             "name": device.info.name if device else "numpy",

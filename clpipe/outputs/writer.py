@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from clpipe.base.errors import ImageError, OutputError, RequestError
+from clpipe.base.files import Stored
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
 from clpipe.chain.formats import DNG, FORMATS, Format, ending_of
@@ -19,6 +20,7 @@ from clpipe.images.tags import TAG_ATTRIBUTES, Tags, from_attributes, upright
 from clpipe.images.write import JPEG_MAX_SIDE, write_display, write_exr
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import attributes_of
+from clpipe.outputs.existing import Existing
 from clpipe.outputs.folder import RESUMABLE, write_problem
 from clpipe.outputs.negative import negative_of
 from clpipe.outputs.renditions import FLOAT_MOSAICS, Rendition, RenditionPlan
@@ -112,18 +114,17 @@ class OutputWriter:
         makers: dict[str, Job] = {}
         for job in jobs:
             for name in self.names_of(job):
-                whole = [ending_of(format_) for format_ in self.formats_of(name)]
-                for ending in (SIDECAR, *whole, *(f"{step}.exr" for step in self.keep_of(name))):
-                    path = f"{job.stem}{name}.{ending}"
-                    if inside and os.path.realpath(self.folder / path) in inside:
+                files = self.existing(job, name)
+                for path in map(str, (files.sidecar, *files.pictures, *files.others)):
+                    if inside and os.path.realpath(path) in inside:
                         raise RequestError(
-                            f"{self.folder / path} is an input and would be overwritten; "
+                            f"{path} is an input and would be overwritten; "
                             "choose another output folder"
                         )
                     if path in makers:
                         raise RequestError(
-                            f"{makers[path].label} and {job.label} would both write "
-                            f"{self.folder / path}; run them into different folders"
+                            f"{makers[path].label} and {job.label} would both write {path}; "
+                            "run them into different folders"
                         )
                     makers[path] = job
 
@@ -140,11 +141,13 @@ class OutputWriter:
         if "jpg" in self.formats and max(source.pixels.shape[:2]) > JPEG_MAX_SIDE:
             raise ImageError(f"JPEG holds at most {JPEG_MAX_SIDE} pixels a side; use --format png")
 
-    def outputs(self, job: Job, name: str) -> list[Path]:
-        """The pictures of a rendition, by its name. Kept images are not among them: one of a step
-        before ``start_at`` is never written.
+    def existing(self, job: Job, name: str) -> Existing:
+        """The files of a rendition, by its name. A kept image of a step before ``start_at`` is
+        never written, so kept images need not be there.
         """
-        return [self.path(job, ending_of(format_), name) for format_ in self.formats_of(name)]
+        pictures = [self.path(job, ending_of(format_), name) for format_ in self.formats_of(name)]
+        kept = [self.path(job, f"{step}.exr", name) for step in self.keep_of(name)]
+        return Existing(self.path(job, SIDECAR, name), pictures, kept)
 
     def check_folder(self) -> None:
         """See that the output folder can still be written to.
@@ -157,7 +160,7 @@ class OutputWriter:
 
     def write(
         self, job: Job, rendition: Rendition, source: SourceImage, result: Result
-    ) -> list[Path]:
+    ) -> dict[Path, Stored]:
         """Write the images of one rendition.
 
         Args:
@@ -185,22 +188,23 @@ class OutputWriter:
         }
         is_mosaic = chain.result in (Kind.RAW, Kind.MOSAIC)
         turn = 1 if is_mosaic else orientation  # turning a mosaic would change its pattern
-        outputs: list[Path] = []
+        outputs: dict[Path, Stored] = {}
         for step in (chain.step_named(name) for name in self._kept_steps(rendition)):
             path = self.path(job, f"{step.name}.exr", rendition.name)
             attributes = attributes_of(step, chain, rendition.key) | tag_attributes
-            write_exr(path, result.kept[step.name], step.stage.writes.channels, attributes)
-            outputs.append(path)
+            channels = step.stage.writes.channels
+            outputs[path] = write_exr(path, result.kept[step.name], channels, attributes)
         for format_ in self.formats_of(rendition.name):
             path = self.path(job, ending_of(format_), rendition.name)
             if rendition.noise:
                 assert result.final is not None
                 variance = variance_of(rendition.noise, result.final)
-                write_exr(path, variance, ("Y",), variance_attributes(rendition))
+                attributes = variance_attributes(rendition)
+                outputs[path] = write_exr(path, variance, ("Y",), attributes)
             elif format_ == DNG:
                 negative = negative_of(chain)
                 raw = result.kept[negative.step] if negative.step else source.pixels
-                write_dng(path, raw, negative, tags, orientation)
+                outputs[path] = write_dng(path, raw, negative, tags, orientation)
             elif FORMATS[format_].ending == "exr":
                 assert result.final is not None
                 attributes = attributes_of(chain.steps[-1], chain, rendition.key) | tag_attributes
@@ -208,10 +212,10 @@ class OutputWriter:
                     attributes |= {"orientation": "1"}
                 half = FORMATS[format_].bits == 16
                 image = upright(result.final, turn)
-                write_exr(path, image, chain.result.channels, attributes, half)
+                outputs[path] = write_exr(path, image, chain.result.channels, attributes, half)
             else:
-                write_display(path, upright(samples(result, FORMATS[format_]), turn), tags)
-            outputs.append(path)
+                pixels = upright(samples(result, FORMATS[format_]), turn)
+                outputs[path] = write_display(path, pixels, tags)
         return outputs
 
     def _make_folder_of(self, job: Job) -> None:

@@ -10,12 +10,12 @@ from clpipe.analysis.calibration.frames import (
     read_frame,
 )
 from clpipe.analysis.calibration.groups import calibrate_group, group_frames
-from clpipe.analysis.calibration.plot import plot_calibration
+from clpipe.analysis.calibration.plot import calibration_png
 from clpipe.analysis.calibration.profile import profile_text
 from clpipe.analysis.calibration.result import Calibration
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.extras import require
-from clpipe.base.files import write_new
+from clpipe.base.files import whole_file, write_new
 from clpipe.camera.profile import load_camera
 
 
@@ -80,15 +80,13 @@ def write_profile(path: Path, frame: CalibrationFrame, calibrations: Sequence[Ca
         path.stem, frame.make, frame.model, calibrations, frame.gains, frame.xyz_to_camera
     )
 
-    def write(to: Path) -> None:
-        to.write_text(text, "utf-8")
-        load_camera(str(to))  # raises RequestError for a profile that no run could use
-
     picture = path.with_suffix(".png")
-    title = f"{frame.make} {frame.model}"
-    write_new(picture, lambda to: plot_calibration(to, calibrations, title))
+    write_new(picture, calibration_png(calibrations, f"{frame.make} {frame.model}"))
     try:
-        write_new(path, write)
+        with whole_file(path) as file:
+            file.write(text.encode())
+            file.flush()
+            load_camera(file.name)  # raises RequestError for a profile that no run could use
     except RequestError as error:
         raise ImageError(f"the estimates make no valid profile: {error}") from None
     return picture

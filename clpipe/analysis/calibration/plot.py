@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
+from io import BytesIO
 
 import numpy as np
 
@@ -13,14 +13,13 @@ WIDTH = 1600  # px
 COLUMNS = 3  # of panels, one for each ISO
 
 
-def plot_calibration(path: Path, calibrations: Sequence[Calibration], title: str) -> None:
-    """Draw a calibration as a PNG, 1600 px wide.
+def calibration_png(calibrations: Sequence[Calibration], title: str) -> bytes:
+    """A calibration as a PNG, 1600 px wide.
 
     For each ISO it shows variance over mean with the fitted lines, and below the photon-transfer
     curves of all ISOs (log noise over log light), all in DN.
 
     Args:
-        path: of the PNG.
         calibrations: one calibration for each ISO.
         title: the name of the camera.
     """
@@ -39,7 +38,9 @@ def plot_calibration(path: Path, calibrations: Sequence[Calibration], title: str
         panel.axis("off")
     _photon_transfer(lower.subplots(), calibrations)
     canvas = FigureCanvasAgg(figure)
-    canvas.print_png(str(path))
+    picture = BytesIO()
+    canvas.print_png(picture)
+    return picture.getvalue()
 
 
 def _variance_over_mean(panel: object, one: Calibration) -> None:

@@ -1,0 +1,51 @@
+"""How much of a picture is clipped: a render in other units than the sensor's comes out white."""
+
+import math
+
+import numpy as np
+
+from clpipe.chain.chain import Chain
+from clpipe.engine.runner import Result
+from clpipe.stage import Kind
+
+MUCH = 0.25  # the share of clipped pixels from which on it is said
+
+COUNTED = 1 << 18  # pixels, at least, where an image has as many; all would take too long
+
+
+def clipped_share(result: Result, chain: Chain) -> float | None:
+    """The share of clipped pixels in the last image of a chain, 0 to 1.
+
+    A pixel is clipped where any of its channels is at the upper end: that of display values, or the
+    white level of a raw. Of large images, pixels on a grid are counted.
+
+    Args:
+        result: what was made of an image.
+        chain: by which it was made.
+
+    Returns:
+        None where the last image has no upper end, or was not asked for.
+    """
+    image = result.final if result.encoded is None else result.encoded
+    last = chain.steps[-1]
+    top: float | None = None
+    if chain.result is Kind.DISPLAY:
+        top = 255 if result.encoded is not None else 1
+    elif chain.result is Kind.RAW:
+        top = last.method.after(last.context).white_level
+    if image is None or top is None:
+        return None
+    step = max(math.isqrt(image.shape[0] * image.shape[1] // COUNTED), 1)
+    counted = image[::step, ::step]
+    brightest = counted.max(axis=-1) if counted.ndim == 3 else counted
+    return float(np.mean(brightest >= top))
+
+
+def clipping_text(share: float) -> str:
+    """What is said of a share of clipped pixels.
+
+    >>> clipping_text(0.997)
+    '99.7 % of its pixels are clipped; 1 is the white level at EV 0, see exposure.ev'
+    """
+    text = f"{100 * share:.3g} % of its pixels are clipped"
+    return f"{text}; 1 is the white level at EV 0, see exposure.ev"

@@ -1,0 +1,153 @@
+"""What lies in the output folder already: pictures that are done, ours to replace, or others'."""
+
+import json
+import os
+import re
+import stat
+import time
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from clpipe.base.about import __version__
+from clpipe.base.digests import digests, stamp_of
+from clpipe.base.errors import ImageError
+from clpipe.base.files import sha256_of
+from clpipe.inputs.find import Job
+from clpipe.outputs.sidecar import OWN, outputs_in, read_sidecar
+
+MARKED = 1 << 16  # bytes at either end of a file, in which a format of clpipe names clpipe
+
+# The tag Software of clpipe, or an attribute of its own. The camera of a DNG is called clpipe, too,
+# and converters repeat it in what they make.
+MARK = re.compile(rb"clpipe \d+\.\d|clpipe:\w")
+
+
+@dataclass(frozen=True)
+class Existing:
+    """The files of one rendition that may be there.
+
+    Args:
+        sidecar: the path of its sidecar.
+        pictures: those that every such rendition has.
+        others: further files that may be written.
+    """
+
+    sidecar: Path
+    pictures: Sequence[Path]
+    others: Sequence[Path] = ()
+
+    def is_done(self, job: Job, request: Mapping[str, Any], verify: bool = False) -> bool:
+        """Whether all is there, unchanged, made of the same input by the same request.
+
+        A file counts as unchanged where it has its size and was last touched before its sidecar was
+        written; else its SHA-256 decides.
+
+        Args:
+            job: the image.
+            request: the record of the request for the image.
+            verify: let the SHA-256 of each file, and of the input, decide.
+
+        Raises:
+            ImageError: a file that would be written is somebody else's.
+        """
+        try:
+            values = read_sidecar(self.sidecar)
+        except FileNotFoundError:
+            values = {}
+        listed = outputs_in(values)
+        written = 0 if verify else _written(self.sidecar)
+        intact = {name for name, was in listed.items() if self._is_intact(name, was, written)}
+        pictures = {path.name for path in self.pictures}
+        if pictures <= intact == listed.keys() and is_current(values, job, request, verify):
+            return True
+        self._check_own(intact)
+        return False
+
+    def _is_intact(self, name: str, was: Mapping[str, Any], written: int) -> bool:
+        """Whether a file is what a sidecar says of it.
+
+        Args:
+            name: of the file.
+            was: its size and SHA-256.
+            written: when the sidecar was written, in ns since 1970; 0 compares the SHA-256.
+        """
+        path = self.sidecar.with_name(name)
+        try:
+            status = os.lstat(path)
+            if not stat.S_ISREG(status.st_mode) or status.st_size != was["size"]:
+                return False
+            return 0 <= status.st_ctime_ns <= written or sha256_of(path)[0] == was["sha256"]
+        except OSError:
+            return False
+
+    def _check_own(self, intact: Collection[str]) -> None:
+        """See that what would be overwritten is clpipe's.
+
+        Raises:
+            ImageError: a file is somebody else's.
+        """
+        for path in (*self.pictures, *self.others):
+            if path.name not in intact and os.path.lexists(path) and not is_marked(path):
+                raise ImageError(
+                    f"{path}: clpipe did not write this file, or it was changed since, and would "
+                    "be overwritten; move it, choose another output folder, or say --overwrite"
+                )
+
+
+def _written(path: Path) -> int:
+    """When a sidecar was written, in ns since 1970; 0 where that lies in the future."""
+    try:
+        modified = path.stat().st_mtime_ns
+    except OSError:
+        return 0
+    return modified if modified <= time.time_ns() else 0
+
+
+def is_current(
+    values: Mapping[str, Any], job: Job, request: Mapping[str, Any], verify: bool = False
+) -> bool:
+    """Whether a sidecar's values are of the same input, the same request and this version.
+
+    An input of the same size and time of change is taken for the same; else, and with ``verify``,
+    its SHA-256 decides. Arguments as for :meth:`Existing.is_done`.
+    """
+    if values.get(OWN) != __version__ or not _same_request(values.get("request"), request):
+        return False
+    size, modified = stamp_of(job.path)
+    if values.get("input_size") != size:
+        return False
+    if values.get("input_modified") == modified and not verify:
+        return True
+    return values.get("sha256") in digests([str(job.path)]).values()
+
+
+def _same_request(one: Any, other: Mapping[str, Any]) -> bool:
+    """Whether records of requests are equal, with files compared by content and not by name."""
+    if one == other:
+        return True
+    if not isinstance(one, dict) or not (other["files"] and one.get("files")):
+        return False
+    texts = []
+    for values in (one, other):
+        text = json.dumps({k: v for k, v in values.items() if k != "files"}, sort_keys=True)
+        for file, digest in values["files"].items():
+            text = text.replace(json.dumps(file), json.dumps(digest))
+        texts.append(text)
+    return texts[0] == texts[1]
+
+
+def is_marked(path: Path) -> bool:
+    """Whether a file is clpipe's work by its tags, or is what a loss of power may leave of one."""
+    try:
+        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                return False
+            ends = file.read(MARKED)
+            file.seek(max(status.st_size - MARKED, 0))
+            ends += file.read(MARKED)
+    except OSError:
+        return False
+    return MARK.search(ends) is not None or not ends.strip(b"\0")

@@ -1,0 +1,139 @@
+"""What lies in the output folder: done, to be made again, or not ours to touch."""
+
+import json
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clpipe.batch.run_log import read_log
+from clpipe.outputs.sidecar import outputs_in
+from tests.conftest import STILL_LIFE
+
+RUN = ("-o", "out", "--device", "numpy", "--keep", "normalize", "--truth", "mosaic")
+MADE = ("a.jpg", "a.normalize.exr", "a.truth_mosaic.exr")
+
+
+@pytest.fixture
+def again(clpipe, write_exr):
+    """Run an image; the files that the run wrote."""
+    write_exr("in/a.exr", np.full((8, 8, 3), 0.25, np.float32))
+
+    def run(*options, status=0):
+        clpipe("run", "in", *RUN, *options, status=status)
+        image = [line for line in read_log(Path("out/run.jsonl")) if line["event"] == "image"][-1]
+        return {"done": image["outputs"], "skipped": []}[image["status"]]
+
+    assert set(MADE) < set(run())
+    return run
+
+
+def damaged(path: Path, how: str) -> None:
+    data = path.read_bytes()
+    flipped = bytes([data[500] ^ 1])
+    path.write_bytes(
+        {
+            "empty": b"",
+            "zeros": bytes(len(data)),
+            "cut": data[: len(data) // 2],
+            "long": data + b"x",
+            "flipped": data[:500] + flipped + data[501:],
+        }[how]
+    )
+
+
+@pytest.mark.parametrize("name", MADE)
+@pytest.mark.parametrize("how", ["gone", "empty", "zeros", "cut", "long", "flipped"])
+def test_what_is_missing_or_damaged_is_made_again(again, name, how):
+    path = Path("out", name)
+    before, status = path.read_bytes(), path.stat()
+    assert again() == []
+    if how == "gone":
+        path.unlink()
+    else:
+        damaged(path, how)
+        os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))  # it looks as old as before
+    assert name in again()
+    assert path.read_bytes() == before
+    assert again() == []
+
+
+def test_verify_reads_everything(again):
+    path = Path("out/a.jpg")
+    before = path.read_bytes()
+    damaged(path, "flipped")
+    os.utime("out/a.json")  # as if the sidecar had been written after that
+    assert again() == []
+    assert again("--verify") != []
+    assert path.read_bytes() == before
+    assert again("--verify") == []
+
+
+def test_an_input_that_only_looks_the_same(again, write_exr):
+    status = Path("in/a.exr").stat()
+    write_exr("in/a.exr", np.full((8, 8, 3), 0.5, np.float32))
+    assert Path("in/a.exr").stat().st_size == status.st_size
+    os.utime("in/a.exr", ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert again() == []
+    assert again("--verify") != []
+
+
+def test_copied_moved_and_dated_elsewhere_it_is_done_still(again, tmp_path):
+    os.utime("out/a.json", (0, 0))  # long before its pictures
+    assert again() == []
+    os.utime("out/a.json", (time.time() + 1e6,) * 2)  # by a clock that was wrong
+    assert again() == []
+
+
+@pytest.mark.parametrize("value", [None, {}, ["a.jpg"], [{"name": "../a.jpg"}], [{"name": 1}]])
+def test_a_sidecar_with_a_list_that_is_none_counts_for_nothing(again, value):
+    values = json.loads(Path("out/a.json").read_text())
+    assert set(outputs_in(values)) == {"a.jpg", "a.normalize.exr"}
+    Path("out/a.json").write_text(json.dumps({**values, "outputs": value}))
+    assert "a.jpg" in again()
+
+
+def test_a_picture_beside_our_negative_is_somebody_elses(clpipe, write_exr, tmp_path):
+    write_exr("in/a.exr", np.full((8, 8, 3), 0.3, np.float32))
+    run = ("run", "in", "-o", "out", "--device", "numpy")
+    clpipe(*run, "--format", "dng")
+    # A converter's: it repeats the camera of our DNG, and names itself.
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110], exif[0x0131] = "Sony", "clpipe ILCE-7RM2", "darktable 5.0"
+    Image.new("RGB", (8, 8)).save("out/a.jpg", exif=exif)
+    before = Path("out/a.jpg").read_bytes()
+    result = clpipe(*run, "--format", "jpg", status=1)
+    assert "out/a.jpg: clpipe did not write this file" in result.stderr
+    assert Path("out/a.jpg").read_bytes() == before
+    clpipe(*run, "--format", "jpg", "--overwrite")
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a.normalize.exr", "a.json"])
+@pytest.mark.parametrize("kind", ["link", "pipe", "folder"])
+def test_what_is_no_file_is_not_ours(clpipe, write_exr, tmp_path, name, kind):
+    write_exr("in/a.exr", np.full((8, 8, 3), 0.3, np.float32))
+    path = Path("out", name)
+    path.parent.mkdir()
+    Path("victim").write_text("keep")
+    if kind == "link":
+        path.symlink_to("../victim")
+    elif kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.mkdir()
+    result = clpipe("run", "in", *RUN, status=1)
+    assert f"out/{name}: " in result.stderr
+    assert Path("victim").read_text() == "keep"
+    assert not list(Path("out").glob("*.truth*"))
+
+
+def test_every_format_marks_its_files(clpipe, tmp_path):
+    formats = ("jpg", "png", "tif", "exr", "dng")
+    options = [o for name in formats for o in ("--format", name)]
+    run = ("run", STILL_LIFE, "-o", "out", "--device", "numpy", "--until", "gamma", *options)
+    clpipe(*run)
+    Path("out/still_life.json").unlink()
+    clpipe(*run)  # a killed run may have left pictures without a sidecar: they are ours

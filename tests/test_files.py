@@ -1,0 +1,110 @@
+"""Files are written whole or not at all, and what is read is a regular file."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clpipe.base import files
+from clpipe.base.errors import ImageError, OutputError
+from clpipe.base.files import read_regular, whole_file, write_whole
+from clpipe.batch.outcome import DONE, Outcome
+from clpipe.batch.run_log import RunLog, read_log
+from clpipe.inputs.find import Job
+from tests.conftest import file_limit
+
+PARTS = (b"head" * 20, bytes(50_000), memoryview(np.arange(900, dtype=np.uint8)))
+WHOLE = b"".join(PARTS)
+
+
+@pytest.mark.parametrize("size", [0, 1, 79, 80, 4096, 50_080, len(WHOLE) - 1])
+@pytest.mark.parametrize("before", [None, b"what was there"])
+def test_a_file_that_the_disk_does_not_hold_stays_as_it_was(tmp_path, size, before):
+    path = tmp_path / "a.bin"
+    if before:
+        path.write_bytes(before)
+    with file_limit(size), pytest.raises(ImageError, match=r"a\.bin: cannot be written: File too"):
+        write_whole(path, *PARTS)
+    assert [p.read_bytes() for p in tmp_path.iterdir()] == ([before] if before else [])
+    with file_limit(len(WHOLE)):
+        assert write_whole(path, *PARTS).size == len(WHOLE)
+    assert path.read_bytes() == WHOLE
+
+
+def test_an_error_in_between_leaves_the_file_as_it_was(tmp_path):
+    write_whole(tmp_path / "a", b"before")
+    with pytest.raises(TypeError), whole_file(tmp_path / "a") as file:
+        file.write(b"after")
+        file.write("no bytes")
+    assert [p.read_bytes() for p in tmp_path.iterdir()] == [b"before"]
+
+
+def test_no_link_is_followed(tmp_path, monkeypatch):
+    (tmp_path / "victim").write_text("keep")
+    monkeypatch.setattr(files.secrets, "token_hex", lambda count: "00000000")
+    (tmp_path / ".a.00000000.part.bin").symlink_to("victim")
+    with pytest.raises(ImageError, match="File exists"):
+        write_whole(tmp_path / "a.bin", b"new")
+    monkeypatch.undo()
+    (tmp_path / "a.bin").symlink_to("victim")
+    write_whole(tmp_path / "a.bin", b"new")  # the link is replaced, and not what it leads to
+    assert (tmp_path / "victim").read_text() == "keep"
+    assert (tmp_path / "a.bin").read_bytes() == b"new"
+
+
+def test_the_longest_name_that_a_disk_takes(tmp_path):
+    name = "é" * 125 + ".json"
+    write_whole(tmp_path / name, b"x")
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    with pytest.raises(ImageError, match="File name too long"):
+        write_whole(tmp_path / f"x{name}", b"x")
+
+
+def test_pipes_devices_folders_and_giants_are_not_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/zero"), tmp_path):
+        with pytest.raises(OSError, match=r"not a regular file|Is a directory"):
+            read_regular(path, 1000)
+    (tmp_path / "a").write_bytes(bytes(1001))
+    with pytest.raises(OSError, match="1001 bytes; at most 1000"):
+        read_regular(tmp_path / "a", 1000)
+    assert read_regular(tmp_path / "a", 1001) == bytes(1001)
+
+
+def outcome(number):
+    return Outcome(Job(Path(f"{number}.exr"), f"{number}.exr"), DONE, 0.1)
+
+
+def test_the_log_has_whole_lines_only(tmp_path):
+    path = tmp_path / "run.jsonl"
+    log = RunLog(path, {})
+    log.add(outcome(0))
+    before = path.read_bytes()
+    for room in (0, 1, 100):
+        with (
+            file_limit(len(before) + room),
+            pytest.raises(OutputError, match=r"run\.jsonl: cannot"),
+        ):
+            log.add(outcome(1))
+        assert path.read_bytes() == before
+    log.add(outcome(2))
+    log.close()
+    with open(path, "ab") as file:
+        file.write(b'{"event": "ima')  # cut off by an earlier version
+    log = RunLog(path, {})
+    log.add(outcome(3))
+    log.close()
+    assert [line.get("input") for line in read_log(path)] == [None, "0.exr", "2.exr", None, "3.exr"]
+    assert len([json.loads(line) for line in before.splitlines()]) == 2
+
+
+@pytest.mark.parametrize("kind", ["link", "pipe"])
+def test_a_log_that_is_something_else_is_not_written_to(tmp_path, kind):
+    (tmp_path / "victim").write_text("keep")
+    path = tmp_path / "run.jsonl"
+    path.symlink_to("victim") if kind == "link" else os.mkfifo(path)
+    with pytest.raises(OutputError, match=r"run\.jsonl: cannot be written"):
+        RunLog(path, {}).add(outcome(0))
+    assert (tmp_path / "victim").read_text() == "keep"
