@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -459,3 +460,30 @@ def test_a_missing_linker_is_said_before_it_aborts_the_process(tmp_path):
     )
     assert done.returncode == 3
     assert "PoCL needs a linker" in done.stderr
+
+
+@pytest.mark.parametrize("arguments", ["--help", "--version", "stages", "cameras --json", "plan"])
+def test_what_cannot_be_printed_is_said_so(arguments):
+    command = [sys.executable, "-m", "clpipe", *arguments.split()]
+    with open("/dev/full", "w") as full:
+        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    assert result.stderr == "clpipe: cannot print: No space left on device\n"
+    assert result.returncode == 2
+
+
+def test_a_log_that_cannot_be_written_is_named_and_the_summary_is_printed(clpipe, small, tmp_path):
+    (tmp_path / "out/run.jsonl").mkdir(parents=True)
+    (tmp_path / "in/b.exr").write_bytes(small.read_bytes())
+    result = clpipe("run", "in", "-o", "out", "--device", "numpy", status=1)
+    assert "clpipe: out/run.jsonl: cannot be written: Is a directory" in result.stderr
+    assert re.search(r"\d of 2 images done, 0 failed", result.stderr)
+
+
+def test_a_screen_that_takes_no_more_ends_no_run(clpipe, small, tmp_path):
+    run = [sys.executable, "-m", "clpipe", "run", small, "-o", tmp_path / "out"]
+    with open("/dev/full", "w") as full:
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        command = [*map(str, run), "--device", "numpy"]
+        result = subprocess.run(command, stderr=full, env=environment, cwd=tmp_path)
+    assert result.returncode == 0
+    assert len(written(tmp_path / "out")) == 2

@@ -9,7 +9,7 @@ import pytest
 
 from clpipe.base import files
 from clpipe.base.errors import ImageError, OutputError
-from clpipe.base.files import read_regular, whole_file, write_whole
+from clpipe.base.files import read_regular, write_whole
 from clpipe.batch.outcome import DONE, Outcome
 from clpipe.batch.run_log import RunLog, read_log
 from clpipe.inputs.find import Job
@@ -35,9 +35,8 @@ def test_a_file_that_the_disk_does_not_hold_stays_as_it_was(tmp_path, size, befo
 
 def test_an_error_in_between_leaves_the_file_as_it_was(tmp_path):
     write_whole(tmp_path / "a", b"before")
-    with pytest.raises(TypeError), whole_file(tmp_path / "a") as file:
-        file.write(b"after")
-        file.write("no bytes")
+    with pytest.raises(TypeError):
+        write_whole(tmp_path / "a", b"after", "no bytes")
     assert [p.read_bytes() for p in tmp_path.iterdir()] == [b"before"]
 
 

@@ -35,7 +35,8 @@ def interruptible(stop: Callable[[], None]) -> Iterator[None]:
         is_stopping = True
         stop()
         # Not print(): the signal may have interrupted one.
-        os.write(sys.stderr.fileno(), b"\nfinishing what is begun; again to stop now\n")
+        with contextlib.suppress(OSError):
+            os.write(sys.stderr.fileno(), b"\nfinishing what is begun; again to stop now\n")
 
     before = {number: signal.signal(number, handle) for number in SIGNALS}
     try:

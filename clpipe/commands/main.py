@@ -4,6 +4,7 @@ import ast
 import logging
 import re
 import sys
+import traceback
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
@@ -12,7 +13,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from clpipe.base.about import __version__
-from clpipe.base.errors import ClpipeError, RequestError
+from clpipe.base.errors import ClpipeError, OutputError, RequestError
 
 # In the order of the help. Each is a module of this folder that defines a function of its name.
 COMMANDS = (
@@ -69,10 +70,25 @@ class LazyGroup(click.Group):
         except KeyboardInterrupt:
             click.echo("interrupted", err=True)
             sys.exit(130)
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return super().main(*args, **kwargs)
         except BrokenPipeError:
             sys.exit(0)
         except OSError as error:
-            fail(RequestError(f"cannot print: {error.strerror}"))
+            fail(refused(error))
+
+
+def refused(error: OSError) -> ClpipeError:
+    """What the system refused: a file, to print, or something that it does not name."""
+    if error.filename is not None:
+        return OutputError(f"{error.filename}: {error.strerror or error}")
+    *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
+    room, _, _ = innermost.f_globals["__name__"].partition(".")
+    if room in ("click", "rich"):
+        return RequestError(f"cannot print: {error.strerror}")
+    return OutputError(f"the system refused something: {error.strerror or error}")
 
 
 def summary(name: str) -> str:
