@@ -15,6 +15,7 @@ from typing import Any, Self
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
 from clpipe.chain.chain import Chain
+from clpipe.chain.identity import noise_key, of_frame
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_device
 from clpipe.engine.runner import Runner
@@ -29,15 +30,6 @@ Sample = dict[str, Any]
 NOWHERE = Path(os.devnull)  # nothing is written
 
 
-def key_in(epoch: int, key: str) -> str:
-    """The image key of an image in an epoch; epochs are keyed as the frames of a burst are.
-
-    >>> key_in(0, "a.exr"), key_in(2, "a.exr")
-    ('a.exr', 'a.exr#2')
-    """
-    return f"{key}#{epoch}" if epoch else key
-
-
 class Dataset(ReadOnly):
     """Renders as a camera sees them, sample by sample, with new noise in each epoch.
 
@@ -47,14 +39,14 @@ class Dataset(ReadOnly):
     - "image": (height, width, 3) uint8 where the chain ends in display values, else float32,
     - "truth", with ``truth=True``: the same without noise; images of ``keep`` by the names of their
       steps, and "truth.NAME" for each of them without noise; float32,
-    - "key": the image key of the render, and "epoch",
+    - "key": the name of the render, its path below the folder that was given, and "epoch",
     - "iso", "a" and "b": the sensor noise that was added, Var[y] = a*y + b in signal units (1 is
       the white level), zeros where none was.
 
     All arrays are in the sensor's orientation. The noise of an image in epoch E is that of frame E
-    of ``clpipe run --frames``: its image key is the render's, with "#E" behind it from epoch 1 on.
-    So a sample depends on its render, the settings and the epoch alone, and not on order, sharding,
-    workers or restarts. Draws are made again in each epoch; kept images keep theirs.
+    of ``clpipe run --frames``. So a sample depends on its render, the settings and the epoch alone,
+    and not on order, sharding, workers or restarts. Draws are made again in each epoch; kept images
+    keep theirs.
 
     The device is opened by the process that first makes a sample. OpenCL does not survive a fork:
     workers of a process that has used it must be spawned (``multiprocessing_context="spawn"``).
@@ -76,8 +68,8 @@ class Dataset(ReadOnly):
         **settings: what a configuration file may hold, over ``config``.
 
     Raises:
-        RequestError: a name or value that is not allowed, a folder without images, two images with
-            the same key, a truth of a chain without noise.
+        RequestError: a name or value that is not allowed, a folder without images, two images of
+            one name, a truth of a chain without noise.
     """
 
     def __init__(
@@ -213,7 +205,7 @@ class Dataset(ReadOnly):
     def _read(self, job: Job, epoch: int) -> LoadedImage:
         loader = self._loader
         try:
-            loader = loader.for_job(replace(job, key=key_in(epoch, job.key)))
+            loader = loader.for_job(replace(job, key=of_frame(job.key, epoch)))
             loaded = loader.enter(job, loader.read(job))
         except (ImageError, RequestError, MemoryError) as error:
             raise ImageError(loader.error_text(job, error)) from None
@@ -232,7 +224,7 @@ class Dataset(ReadOnly):
     def _develop(self, job: Job, epoch: int, loaded: LoadedImage) -> Sample:
         chain = loaded.chain
         try:
-            arrays = self._developer().develop(loaded, key_in(epoch, loaded.key))
+            arrays = self._developer().develop(loaded, noise_key(chain.settings, loaded.key, epoch))
         except (ImageError, RequestError, MemoryError) as error:
             raise ImageError(self._loader.error_text(job, error)) from None
         adds_noise = chain.is_noisy or not isinstance(loaded.source, RawImage)
@@ -271,7 +263,7 @@ class _Developer:
         self._chain: Chain | None = None
         self._runners: dict[str, Runner] = {}
 
-    def develop(self, loaded: LoadedImage, key: str) -> Sample:
+    def develop(self, loaded: LoadedImage, noise_key: str) -> Sample:
         """The arrays of a sample: "image", "truth" and kept images.
 
         Raises:
@@ -281,7 +273,7 @@ class _Developer:
         with self._lock:
             self._prepare(loaded.chain)
             for name, runner in self._runners.items():
-                result = runner.run(loaded.source.pixels, key)
+                result = runner.run(loaded.source.pixels, noise_key)
                 prefix = "" if name == "image" else f"{name}."
                 arrays |= {prefix + step: image for step, image in result.kept.items()}
                 arrays[name] = result.image
@@ -304,7 +296,7 @@ class _Developer:
 
 
 def _check_keys(jobs: Sequence[Job]) -> None:
-    """See that no two images have the same key, and so the same noise.
+    """See that no two images have the same name, and so the same draws.
 
     Raises:
         RequestError: two have.
@@ -314,6 +306,6 @@ def _check_keys(jobs: Sequence[Job]) -> None:
         other = owners.setdefault(job.key, job)
         if other is not job:
             raise RequestError(
-                f"{other.label} and {job.label} have the same image key, {job.key}, and would "
-                "have the same noise; give the folder that both are in"
+                f"{other.label} and {job.label} are both called {job.key}, and what is drawn for "
+                "them would be the same; give the folder that both are in"
             )

@@ -1,17 +1,23 @@
 """The Python API: a chain as an object that takes NumPy images."""
 
+import itertools
+import threading
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from xxhash import xxh3_64_hexdigest
 
 from clpipe.base.errors import ImageError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.files import load_settings
+from clpipe.chain.identity import image_key, noise_key
 from clpipe.chain.settings import Settings, overlay
+from clpipe.engine.clipping import MUCH, clipped_share, clipping_text
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Result, Runner
 from clpipe.stage import Kind
@@ -47,6 +53,8 @@ class Pipeline(ReadOnly):
     ) -> None:
         self._settings = overlay(load_settings(str(config)), plain(settings))
         self._ends = start_at, until
+        self._numbers = itertools.count()
+        self._lock = threading.Lock()  # a device is for one thread
         chain = self._chain(self._settings)
         kept = chain.select([keep] if isinstance(keep, str) else keep)
         encode = chain.result is Kind.DISPLAY
@@ -74,7 +82,10 @@ class Pipeline(ReadOnly):
             image: (height, width, 3) linear RGB, 1 = full scale of the sensor, of float16, float32
                 or float64; or (height, width) where the chain starts on a mosaic, also of uint16;
                 or a finished picture, also of uint8, where it starts on one.
-            key: the image key; noise and draws depend on it and on the seed alone.
+            key: the image's name. Draws depend on it and on the seed alone; noise on both, on what
+                the image holds, and on the ISO. Who wants the same noise in several images, or in
+                one at several ISOs, gives them one ``noise_key``, which replaces these; that of a
+                picture of ``clpipe run`` stands in its sidecar, and repeats its noise.
             **settings: values for this image alone, as for the class. Another ISO, gain or noise
                 parameter costs nothing; for another method or size, kernels are compiled.
 
@@ -90,7 +101,14 @@ class Pipeline(ReadOnly):
         own = overlay(self._settings, plain(settings)) if settings else self._settings
         if settings or own.draws:
             runner = runner.of(self._chain(own.drawn(key)))
-        return runner.run(_checked(image, runner.chain.source), key)
+        checked, chain = _checked(image, runner.chain.source), runner.chain
+        own_key = image_key(key, "" if chain.settings.noise_key else digest_of(checked))
+        with self._lock:
+            result = runner.run(checked, noise_key(chain.settings, own_key))
+        share = clipped_share(result, chain) or 0.0
+        if share >= MUCH:
+            warnings.warn(f"{key}: {clipping_text(share)}", stacklevel=2)
+        return result
 
     def process_many(
         self, images: Iterable[Array | tuple[Array, str | Mapping[str, Any]]]
@@ -98,14 +116,19 @@ class Pipeline(ReadOnly):
         """Run the chain on images, each when its result is taken from the iterator.
 
         Args:
-            images: each is an image, whose key is then its number ("0", "1", ...), or an image with
-                its key, or an image with a dict of further arguments of :meth:`process`, such as
-                ``{"key": "a", "iso": 800}``.
+            images: each is an image, whose key is then its number ("0", "1", ..., counted on from
+                call to call), or an image with its key, or an image with a dict of further
+                arguments of :meth:`process`, such as ``{"key": "a", "iso": 800}``.
         """
-        for number, item in enumerate(images):
+        for item in images:
             image, arguments = item if isinstance(item, tuple) else (item, {})
             named = {"key": arguments} if isinstance(arguments, str) else arguments
-            yield self.process(image, **{"key": str(number), **named})
+            yield self.process(image, **{"key": str(next(self._numbers)), **named})
+
+
+def digest_of(image: Array) -> str:
+    """A digest of an image's samples that takes little time."""
+    return xxh3_64_hexdigest(np.ascontiguousarray(image).data.cast("B"))
 
 
 def plain(values: Any) -> Any:

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO
 import pytest
 
 from clpipe.base.errors import ImageError, RequestError
@@ -65,7 +66,7 @@ def statuses(folder):
     """What the last run in a folder made of each image, by its log."""
     lines = read_log(Path(folder) / "run.jsonl")
     last = max(i for i, line in enumerate(lines) if line["event"] == "start")
-    return {x["image_key"]: x["status"] for x in lines[last:] if x["event"] == "image"}
+    return {x["name"]: x["status"] for x in lines[last:] if x["event"] == "image"}
 
 
 def stamps(folder):
@@ -410,13 +411,8 @@ def test_a_manifest_and_draws(clpipe, renders):
         json.loads(Path(f"out/{n}.json").read_text())
         for n in ("a/low.0001", "a/high", "r001.frame0", "r001.frame1")
     )
-    assert (low["iso"], low["image_key"], high["iso"], high["seed"]) == (
-        400,
-        "a/low.0001",
-        12800,
-        3,
-    )
-    assert one["iso"] == 3200 and one["image_key"] == "r001.exr"
+    assert (low["iso"], high["iso"], high["seed"], one["iso"]) == (400, 12800, 3, 3200)
+    assert low["image_key"].startswith("a/low.0001@") and one["image_key"].startswith("r001.exr@")
     assert 1e-4 < one["noise"]["signal"]["a"] == two["noise"]["signal"]["a"] < 1e-3
     whole = contents("out")
     lines = Path("in/list.csv").read_text().splitlines()
@@ -638,7 +634,7 @@ def test_a_sidecar_that_somebody_edited(clpipe, renders, key, value):
     assert not Path("b").exists()
 
 
-@pytest.mark.parametrize(("key", "value"), [("formats", []), ("options", 3), ("image_key", None)])
+@pytest.mark.parametrize(("key", "value"), [("formats", []), ("options", 3), ("image_name", None)])
 def test_a_sidecar_whose_request_somebody_edited(clpipe, renders, key, value):
     clpipe("run", renders(1), *RUN)
     record = json.loads(Path("out/r000.json").read_text())
@@ -657,7 +653,14 @@ def test_a_sidecar_made_with_other_libraries(clpipe, renders):
     record["versions"]["OpenImageIO"] = "1.2.3"
     sidecar_.write_text(json.dumps(record))
     stderr = clpipe("run", "--replay", sidecar_, "-o", "c").stderr
-    assert "warning: was made with OpenImageIO 1.2.3; the bytes may be others" in stderr
+    now = OpenImageIO.__version__
+    assert f"warning: was made with OpenImageIO 1.2.3 (now {now}); the bytes may be" in stderr
+    record["versions"]["OpenImageIO"] = now
+    for key, value in (("driver", "9.9"), ("name", "GPU"), ("lanes", 3)):
+        changed = {**record, "device": {**record["device"], key: value}}
+        sidecar_.write_text(json.dumps(changed))
+        stderr = clpipe("run", "--replay", sidecar_, "-o", "d", "--overwrite").stderr
+        assert f"warning: was made with device {key} {value} (now " in stderr
 
 
 def test_what_nobody_expected_ends_the_run_and_does_not_hang(renders, tmp_path, monkeypatch):

@@ -39,7 +39,8 @@ def test_the_main_job(clpipe, tmp_path):
         assert image.size == (960, 640)
     sidecar = json.loads((tmp_path / "out" / "still_life.json").read_text())
     assert len(sidecar["sha256"]) == 64
-    assert sidecar["image_key"] == "still_life.exr"
+    assert sidecar["image_key"] == f"still_life.exr@{sidecar['sha256'][:16]}"
+    assert sidecar["noise_key"] == f"{sidecar['image_key']}@ISO1600"
     assert sidecar["iso"] == 1600
     stages = {s["name"]: s for s in sidecar["stages"]}
     assert stages["sensor_noise"]["parameters"]["a"] == pytest.approx(5.0419 / 15871)
@@ -166,9 +167,8 @@ def test_a_folder_keeps_its_structure_and_a_bad_file_stops_nobody(clpipe, write_
     assert "3 of 5 images done, 2 failed" in result.stderr
     made = ["a.jpg", "a.json", "sub/b.jpg", "sub/b.json", "sub/deep/a.jpg", "sub/deep/a.json"]
     assert written(tmp_path / "out") == made
-    keys = [
-        json.loads((tmp_path / "out" / m).read_text())["image_key"] for m in made if "json" in m
-    ]
+    records = [json.loads((tmp_path / "out" / m).read_text()) for m in made if "json" in m]
+    keys = [record["image_key"].partition("@")[0] for record in records]
     assert keys == ["a.exr", "sub/b.exr", "sub/deep/a.exr"]
 
 
@@ -399,8 +399,9 @@ def test_a_burst_is_frames_and_one_truth(clpipe, write_exr, tmp_path):
     for i, one in enumerate(frames):
         assert 0.5 < (one - truth).std() / np.sqrt(6.35e-4 * 0.13) < 1.5
         assert not any(np.array_equal(one, other) for other in frames[:i])
-    keys = [json.loads((out / f"{name}.json").read_text())["image_key"] for name in names]
-    assert keys == ["scene.exr", "scene.exr", "scene.exr#1", "scene.exr#2"]
+    records = [json.loads((out / f"{name}.json").read_text()) for name in names]
+    keys = [record["noise_key"].removeprefix(record["image_key"]) for record in records]
+    assert keys == ["@ISO3200", "@ISO3200", "#1@ISO3200", "#2@ISO3200"]
     assert json.loads((out / "scene.truth.json").read_text())["noise"] is None
     clpipe("run", render, "-o", tmp_path / "one", "--iso", 3200)
     assert (tmp_path / "one" / "scene.jpg").read_bytes() == (out / "scene.frame0.jpg").read_bytes()

@@ -109,7 +109,7 @@ def test_one_machine_three_shards_and_a_cluster_that_loses_a_worker(
     assert before - set(workers.nthreads())
     start, *images, end = log("dask")
     assert (start["event"], end["event"]) == ("start", "end")
-    assert sorted(i["image_key"] for i in images) == sorted(p.name for p in backwards)
+    assert sorted(i["name"] for i in images) == sorted(p.name for p in backwards)
     assert {i["status"] for i in images} <= {"done", "skipped"}
     assert end["done"] + end["skipped"] == IMAGES and end["skipped"] <= 2 * 4
 
@@ -134,7 +134,7 @@ def test_an_image_that_kills_workers_fails_alone(clpipe, renders, workers, addre
     finally:
         workers.unregister_worker_plugin("die")
         allow(3)
-    failed = {i["image_key"]: i["error"] for i in log("out")[1:-1] if i["status"] == "failed"}
+    failed = {i["name"]: i["error"] for i in log("out")[1:-1] if i["status"] == "failed"}
     assert sorted(failed) == ["damaged.exr", "deadly.exr"]
     assert "killed the worker that took it, 1 in all, the last one tcp" in failed["deadly.exr"]
     assert f"{IMAGES - 1} of {IMAGES + 1} images done" in told.stderr

@@ -178,7 +178,7 @@ def test_rows_lie_over_settings(manifest):
         ("path\n..\n", "row 2: path: found '..', which names no image"),
         ("path\na\0b\n", "row 2: path: found .*no NUL"),
         (b"path\na.exr\n\xff.exr\n", "frames.csv, line 3: not a text in UTF-8"),
-        ("path,frames\na.exr,0\n", "row 2: frames: found 0, but it is a whole number from 1 on"),
+        ("path,frames\na.exr,0\n", "row 2: frames: found 0, but it is a whole number from 1 to 1"),
         ("path,frames\na.exr,2.5\n", "row 2: frames: found 2.5"),
         ("path,frames\na.exr,true\n", "row 2: frames: found True"),
         ("path\nx/a.exr\nb.exr\nx/a.exr\n", "row 4: .*same outputs as row 2, x/a; .*called name"),

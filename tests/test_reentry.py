@@ -173,9 +173,9 @@ def test_a_kept_mosaic_is_no_render(kept, tmp_path):
     ("level", "start_at", "options", "messages"),
     [
         (0.4, "normalize", (), ("not above the black level of 512", "RGGB", "levels", "ISO")),
-        (900, "white_balance", (), ("1 is the white level here", "its pattern", "its ISO")),
-        (0.4, "white_balance", ("--set", "mosaic.pattern=RGGB", "--iso", 800), ()),
-        (0.4, "white_balance", ("--set", "mosaic.pattern=RGGB"), ("say its ISO; 100 is taken",)),
+        (900, "white_balance", (), ("level here", "its pattern", "its ISO", "are clipped")),
+        (0.2, "white_balance", ("--set", "mosaic.pattern=RGGB", "--iso", 800), ()),
+        (0.2, "white_balance", ("--set", "mosaic.pattern=RGGB"), ("say its ISO; 100 is taken",)),
     ],
 )
 def test_what_looks_wrong_with_a_mosaic_is_told(tmp_path, level, start_at, options, messages):

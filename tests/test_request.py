@@ -73,7 +73,7 @@ def test_records_are_equal_where_the_bytes_of_a_picture_are(change):
         {"formats": ["gif"]},
         {"keep": None},
         {"stage_files": 3},
-        {"image_key": 3},
+        {"image_name": 3},
         {"until": ["demosaic"]},
         {"options": [1]},
     ],
@@ -141,22 +141,43 @@ def test_a_run_validates_the_parameters_of_a_step_once(monkeypatch):
     assert len(own) >= 4 and set(own.values()) == {1}, counts
 
 
-def test_a_replay_does_not_run_a_stage_file_that_has_changed(clpipe, write_exr, monkeypatch):
-    monkeypatch.setattr("clpipe.chain.registry._from_files", {})
+def test_no_code_comes_from_a_sidecar(clpipe, write_exr, monkeypatch):
+    def forget():
+        monkeypatch.setattr("clpipe.chain.registry._from_files", {})
+        Path("ran").unlink(missing_ok=True)
+
+    forget()
     Path("mine.py").write_text(STAGE_FILE.format(mark="ran", name="mine"))
     write_exr("a.exr", np.full((8, 8, 3), 0.5, np.float32))
-    options = ("--stage-file", "mine.py", "--stages", "exposure,mine", "--format", "exr")
-    clpipe("run", "a.exr", "-o", "out", *options)
-    monkeypatch.setattr("clpipe.chain.registry._from_files", {})
-    Path("ran").unlink()
-    Path("mine.py").write_text(Path("mine.py").read_text() + "\n")
-    stderr = clpipe("run", "--replay", "out/a.json", "-o", "again", status=2).stderr
-    assert "mine.py: has changed since" in stderr
-    assert not Path("ran").exists()
-
+    options = ("--stages", "exposure,mine", "--format", "exr", "--device", "numpy")
+    clpipe("run", "a.exr", "-o", "out", *options, "--stage-file", "mine.py")
+    replay = ("run", "--device", "numpy", "-o", "again", "--replay")
     record = json.loads(Path("out/a.json").read_text())
-    record["request"]["files"] = {}
-    Path("edited.json").write_text(json.dumps(record))
-    stderr = clpipe("run", "--replay", "edited.json", "-o", "again", status=2).stderr
-    assert "names a stage file without its SHA-256" in stderr
-    assert not Path("ran").exists()
+    request = record["request"]
+    named = {"stage_files": ["mine.py"]}
+    for changes in (
+        {},
+        {"files": {}},
+        {"stage_files": []},
+        {"files": {}, "config": named},
+        {"files": {}, "options": {**request["options"], **named}},
+        {"files": {}, "image": named},
+    ):
+        forget()
+        edited = {**record, "request": {**request, **changes}}
+        Path("edited.json").write_text(json.dumps(edited))
+        stderr = clpipe(*replay, "edited.json", status=2).stderr
+        assert "--stage-file" in stderr or "unknown stage" in stderr
+        assert not Path("ran").exists()
+
+    forget()
+    Path("there").mkdir()
+    Path("mine.py").rename("there/mine.py")
+    clpipe(*replay, "out/a.json", "--stage-file", "there/mine.py")
+    assert Path("again/a.exr").read_bytes() == Path("out/a.exr").read_bytes()
+    assert Path("ran").exists()
+
+    forget()
+    Path("there/mine.py").write_text(Path("there/mine.py").read_text() + "\n")
+    stderr = clpipe(*replay, "out/a.json", "--stage-file", "there/mine.py", status=2).stderr
+    assert "a sidecar runs no code; where you trust that file, name it: --stage-file" in stderr

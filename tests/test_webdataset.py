@@ -71,7 +71,7 @@ def stamps(folder):
 def statuses(folder):
     lines = read_log(Path(folder) / "run.jsonl")
     last = max(i for i, line in enumerate(lines) if line["event"] == "start")
-    return {x["image_key"]: x["status"] for x in lines[last:] if x["event"] == "image"}
+    return {x["name"]: x["status"] for x in lines[last:] if x["event"] == "image"}
 
 
 def test_what_readers_see(clpipe, renders):
@@ -86,7 +86,7 @@ def test_what_readers_see(clpipe, renders):
         said = json.loads(sample["json"])
         image = Image.open(io.BytesIO(sample["jpg"]))
         assert image.size == (said["width"], said["height"])
-        stem = Path("plain", said["image_key"])
+        stem = Path("plain", said["name"])
         for ending in ("jpg", "quantize.exr"):
             assert sample[ending] == stem.with_suffix(f".{ending}").read_bytes()
 
@@ -322,7 +322,7 @@ def test_killed_and_resumed_again_and_again(clpipe, renders, tmp_path):
     assert not [n for n in os.listdir("out") if n.startswith(".")]
     for line in read_log(OUT / "run.jsonl"):
         if line.get("status") == "done":
-            done.append(line["image_key"])
+            done.append(line["name"])
     assert len(done) == len(set(done)), "an image was made twice"
 
 

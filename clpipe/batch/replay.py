@@ -8,11 +8,16 @@ from typing import Any
 from clpipe.base.about import __version__
 from clpipe.base.digests import digests
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.chain.identity import MAX_FRAMES
+from clpipe.chain.registry import code_files
 from clpipe.chain.request import Request
+from clpipe.engine.device import Device
 from clpipe.inputs.find import Job
 from clpipe.inputs.manifest import check_output_name
 from clpipe.outputs.renditions import RenditionPlan, truth_named
-from clpipe.outputs.sidecar import all_versions, read_sidecar
+from clpipe.outputs.sidecar import all_versions, device_record, read_sidecar
+
+CODE = (".py", ".cl")  # the endings of files that are run
 
 
 @dataclass(frozen=True)
@@ -22,25 +27,56 @@ class Replay:
     Args:
         request: what the sidecar says was asked for.
         job: the image, and the rendition of it.
-        warning: why the bytes may differ after all; "" where nothing is known.
+        made: what the sidecar says of the device and the versions of libraries.
     """
 
     request: Request
     job: Job
-    warning: str
+    made: Mapping[str, str]
+
+    def warning(self, device: Device | None) -> str:
+        """Why the bytes may differ after all on a device; "" where nothing is known."""
+        now = surroundings(device)
+        changed = [
+            f"{what} {was or 'unknown'} (now {now[what] or 'unknown'})"
+            for what, was in self.made.items()
+            if was != now[what]
+        ]
+        return f"was made with {', '.join(changed)}; the bytes may be others" if changed else ""
 
 
-def replay_of(path: Path, inputs: Sequence[Path], max_pixels: int | None) -> Replay:
+def surroundings(device: Device | None) -> dict[str, str]:
+    """What the bytes of a picture depend on beside the request, by name, as a sidecar has it."""
+    return {**flat(device_record(device)), **all_versions()}
+
+
+def flat(device: Mapping[str, Any]) -> dict[str, str]:
+    """The values of a sidecar's device, by names that a reader understands.
+
+    >>> flat({"name": "RTX 5090", "lanes": 1})
+    {'device name': 'RTX 5090', 'device lanes': '1'}
+    """
+    return {f"device {key}": str(value) for key, value in device.items()}
+
+
+def replay_of(
+    path: Path,
+    inputs: Sequence[Path],
+    max_pixels: int | None,
+    stage_files: Sequence[Path] = (),
+) -> Replay:
     """What is to be made again, by its sidecar.
 
     Args:
         path: of the sidecar.
         inputs: where its input is now; none means, where it was.
         max_pixels: as for :class:`~clpipe.chain.request.Request`.
+        stage_files: code that may be run. What a sidecar names is data, and is not.
 
     Raises:
-        RequestError: it is no sidecar, or one of another version, or the input or a file that was
-            used (a camera profile, a curve, a stage) is missing or has changed.
+        RequestError: it is no sidecar, or one of another version, the input or a file that was used
+            (a camera profile, a curve) is missing or has changed, or it was made with stage files
+            that are not among these.
     """
     if len(inputs) > 1:
         raise RequestError(f"{path}: it has one input; found {len(inputs)}")
@@ -49,13 +85,15 @@ def replay_of(path: Path, inputs: Sequence[Path], max_pixels: int | None) -> Rep
         replay = _replay(values, inputs, max_pixels)
         files = {str(name): str(digest) for name, digest in values["request"]["files"].items()}
         files[str(replay.job.path)] = str(values["sha256"])
-        if not set(replay.request.stage_files) <= files.keys():
-            raise RequestError("it names a stage file without its SHA-256")
     except (KeyError, TypeError, ValueError, AttributeError, RequestError) as error:
         raise RequestError(f"{path}: it is damaged: {error}") from None
-    _check_files(path, files)  # before settings() runs stage files, which are among them
+    code = {name: files.pop(name) for name in list(files) if Path(name).suffix in CODE}
+    _check_files(path, files)
+    _check_code(path, code, stage_files)
+    request = replace(replay.request, stage_files=tuple(str(f.resolve()) for f in stage_files))
+    replay = replace(replay, request=request)
     try:
-        replay.request.settings()
+        request.settings()
     except (TypeError, ValueError, AttributeError, RequestError) as error:
         raise RequestError(f"{path}: it is damaged: {error}") from None
     return replay
@@ -91,7 +129,7 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
     """
     name, picture, frames = str(values["name"]), str(values["picture"]), values["frames"]
     check_output_name(name)
-    if not (frames is None or frames > 0):
+    if not (frames is None or (type(frames) is int and 0 < frames <= MAX_FRAMES)):
         raise RequestError(f"found frames {frames}")
     truths = tuple(filter(None, [truth_named(picture)]))
     if picture not in RenditionPlan(frames, truths).names():
@@ -101,15 +139,29 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
         raise RequestError("found no formats")
     request = replace(request, max_pixels=max_pixels, frames=frames, truths=truths)
     path = inputs[0] if inputs else Path(values["input"])
-    job = Job(path, request.image_key, name, values=request.image, pictures=(picture,))
-    were = values["versions"]
-    changed = [
-        f"{library} {were[library]}"
-        for library, now in all_versions().items()
-        if were[library] != now
-    ]
-    text = f"was made with {', '.join(changed)}; the bytes may be others" if changed else ""
-    return Replay(request, job, text)
+    job = Job(path, request.image_name, name, values=request.image, pictures=(picture,))
+    were = {**flat(values["device"]), **values["versions"]}
+    return Replay(request, job, {what: str(were[what]) for what in surroundings(None)})
+
+
+def _check_code(path: Path, code: Mapping[str, str], stage_files: Sequence[Path]) -> None:
+    """See that the code of a sidecar is that of stage files which the user named.
+
+    Args:
+        path: of the sidecar, for messages.
+        code: the SHA-256 of each file of code, by its name.
+        stage_files: those that the user named; only they are loaded.
+
+    Raises:
+        RequestError: a file is not among them.
+    """
+    trusted = digests(map(str, code_files(stage_files))).values()
+    for name, was in code.items():
+        if was not in trusted:
+            raise RequestError(
+                f"{path}: was made with {name} (SHA-256 {was[:12]}...), and a sidecar runs no "
+                "code; where you trust that file, name it: --stage-file FILE.py"
+            )
 
 
 def _check_files(path: Path, files: Mapping[str, str]) -> None:

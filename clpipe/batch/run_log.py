@@ -139,7 +139,7 @@ class RunLog:
             outcome.began,
             {
                 "input": str(job.path),
-                "image_key": job.key,
+                "name": job.key,
                 "status": outcome.status,
                 "megapixels": round(outcome.megapixels, 3),
                 **{f"{step}_seconds": round(outcome.seconds(step), 6) for step in STEPS},

@@ -145,7 +145,7 @@ class ImageWorker:
         """The record of the request for a task's image."""
         job = task.job
         if task.loader is self._loader:
-            return {**self._general_request, "image_key": job.key}
+            return {**self._general_request, "image_name": job.key}
         return self.writer.request.for_image(job.key, job.values).record()
 
     @cached_property
@@ -199,7 +199,7 @@ class ImageWorker:
             try:
                 pixels = task.source.pixels
                 into = self._spare.take(pixels.shape) if runner.encode and runner.device else None
-                result = runner.run(pixels, rendition.key, timings, into=into)
+                result = runner.run(pixels, rendition.noise_key, timings, into=into)
             except (ImageError, RequestError, MemoryError) as error:
                 task.error = task.loader.error_text(task.job, error)
                 return None

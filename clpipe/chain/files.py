@@ -10,7 +10,8 @@ from typing import Any
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
 from clpipe.chain.chain import Chain, Step
-from clpipe.chain.keys import OUTPUT
+from clpipe.chain.keys import CODE, OUTPUT, names_in
+from clpipe.chain.registry import load_stage_file
 from clpipe.chain.settings import Settings, settings_from
 from clpipe.chain.toml import line_of, value_text
 
@@ -25,11 +26,13 @@ def built_in_configs() -> dict[str, Path]:
 class Config:
     """A configuration: its values, nested as in its file, and the settings that they come to.
 
-    Names of files in it are absolute, or relative to the working directory.
+    Names of files in it are absolute, or relative to the working directory. Its stage files stand
+    apart: whoever names a configuration trusts them, and no other values load code.
     """
 
     values: Mapping[str, Any]
     settings: Settings
+    stage_files: tuple[Path, ...]
 
 
 def load_settings(name: str) -> Settings:
@@ -55,6 +58,10 @@ def load_config(name: str) -> Config:
     try:
         text = path.read_text("utf-8-sig")
         values = tomllib.loads(text)
+        stage_files = [path.parent / file for file in names_in(values, CODE, "files")]
+        for file in stage_files:
+            load_stage_file(file)
+        values.pop(CODE, None)
         settings = settings_from(values, path.parent)
     except OSError as error:
         raise RequestError(f"{path}: cannot read this configuration: {error.strerror}") from None
@@ -68,9 +75,7 @@ def load_config(name: str) -> Config:
         raise RequestError(f"{place}: {error}") from None
     record = settings.record()
     own = {key: record[key] for key in values if key in record}
-    if files := values.get("stage_files"):
-        own["stage_files"] = [str((path.parent / file).resolve()) for file in files]
-    return Config(own, settings)
+    return Config(own, settings, tuple(file.resolve() for file in stage_files))
 
 
 def toml_text(chain: Chain) -> str:

@@ -5,7 +5,9 @@ from typing import Any
 
 from clpipe.base.errors import KeyedError
 
-KEYS = ("camera", "iso", "seed", "raw_size", "raw_type", "stages", "skip", "stage_files")
+CODE = "stage_files"  # the key that only a configuration file may have
+
+KEYS = ("camera", "iso", "seed", "noise_key", "raw_size", "raw_type", "stages", "skip", CODE)
 
 OUTPUT = "output"  # the one table that belongs to no stage
 
@@ -16,7 +18,7 @@ MAX_ISO = 10**9
 TYPES: dict[str, tuple[str, Any]] = {
     "iso": ("a number", int | float),
     "seed": ("a whole number", int),
-    **dict.fromkeys(("camera", "raw_size", "raw_type"), ("text", str)),
+    **dict.fromkeys(("camera", "noise_key", "raw_size", "raw_type"), ("text", str)),
 }
 
 

@@ -2,7 +2,7 @@
 
 import re
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, lru_cache
@@ -64,6 +64,20 @@ def load_stage_file(path: Path) -> Stage:
     """
     with _loading:
         return _loaded_file(path, path.resolve())
+
+
+def code_files(stage_files: Iterable[Path]) -> list[Path]:
+    """Stage files with the kernels of their stages: all of the code that they bring.
+
+    Raises:
+        RequestError: as :func:`load_stage_file`.
+    """
+    files: list[Path] = []
+    for file in stage_files:
+        stage = load_stage_file(file)
+        kernels = dict.fromkeys(m.kernel for m in stage.methods if m.kernel)
+        files += [file, *(file.parent / f"{kernel}.cl" for kernel in kernels)]
+    return files
 
 
 def _loaded_file(path: Path, where: Path) -> Stage:

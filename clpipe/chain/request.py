@@ -14,7 +14,7 @@ from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.files import load_config
 from clpipe.chain.formats import EVERY_FORMAT
 from clpipe.chain.keys import KEYS, OUTPUT
-from clpipe.chain.registry import load_stage_file
+from clpipe.chain.registry import code_files, load_stage_file
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import parse_assignment
 from clpipe.stage import Kind
@@ -23,7 +23,7 @@ DEFAULTS = Settings()
 
 # What decides about the bytes of a picture. The rest decides which pictures are made, or whether.
 RECORDED = (
-    *("config", "options", "image", "start_at", "until", "stage_files", "image_key"),
+    *("config", "options", "image", "start_at", "until", "stage_files", "image_name"),
     *("layer", "transfer", "formats", "keep"),
 )
 
@@ -38,8 +38,8 @@ class Request:
         image: values of one image over both, from its row in a manifest.
         start_at: the first step to run; None is the first of the chain.
         until: the last step to run; None is the last of the chain.
-        stage_files: Python files that define further stages.
-        image_key: the image that noise and draws belong to; "" is none in particular.
+        stage_files: Python files that define further stages; settings load them.
+        image_name: the image that draws belong to; "" is none in particular.
         layer: of an EXR, which is the picture; None chooses.
         transfer: the transfer curve of renders in whole numbers; None refuses these.
         max_pixels: larger files are refused; None is the reader's own limit.
@@ -55,7 +55,7 @@ class Request:
     start_at: str | None = None
     until: str | None = None
     stage_files: tuple[str, ...] = ()
-    image_key: str = ""
+    image_name: str = ""
     layer: str | None = None
     transfer: str | None = None
     max_pixels: int | None = None
@@ -72,6 +72,7 @@ class Request:
         camera: str | None = None,
         iso: float | None = None,
         seed: int | None = None,
+        noise_key: str | None = None,
         assignments: Sequence[str] = (),
         stages: str | None = None,
         skip: Sequence[str] = (),
@@ -85,7 +86,7 @@ class Request:
 
         Args:
             config: the name of a built-in configuration, or of a TOML file.
-            camera, iso, seed, skip, raw_size, raw_type: settings.
+            camera, iso, seed, noise_key, skip, raw_size, raw_type: settings.
             assignments: texts of the form ``stage.parameter=value``.
             stages: names, separated by commas.
             stage_files: as for the class.
@@ -97,7 +98,7 @@ class Request:
         """
         for file in stage_files:
             load_stage_file(file)
-        plain = {"camera": camera, "iso": iso, "seed": seed}
+        plain = {"camera": camera, "iso": iso, "seed": seed, "noise_key": noise_key}
         plain |= {"raw_size": raw_size, "raw_type": raw_type}
         options: dict[str, Any] = {k: v for k, v in plain.items() if v is not None}
         if stages is not None:
@@ -108,10 +109,11 @@ class Request:
             stage, parameter, value = parse_assignment(text)
             options.setdefault(stage, {})[parameter] = value
         configuration = load_config(config) if config is not None else None
+        code = (*(configuration.stage_files if configuration else ()), *stage_files)
         request = cls(
             configuration.values if configuration else None,
             {**options, **(values or {})},
-            stage_files=tuple(str(file.resolve()) for file in stage_files),
+            stage_files=tuple(dict.fromkeys(str(file.resolve()) for file in code)),
             **fields_,
         )
         if configuration:
@@ -136,14 +138,16 @@ class Request:
         request = cls(**{**values, **lists})
         tables = (request.config or {}, request.options, request.image)
         texts = (request.start_at, request.until, request.layer, request.transfer)
-        are_texts = all(isinstance(text, str) for text in (request.image_key, *filter(None, texts)))
+        are_texts = all(
+            isinstance(text, str) for text in (request.image_name, *filter(None, texts))
+        )
         if not are_texts or not all(isinstance(table, Mapping) for table in tables):
             raise RequestError("the request in it is damaged: a value is of the wrong type")
         return request
 
-    def for_image(self, key: str, values: Mapping[str, Any]) -> "Request":
-        """The request for one image: its key, and values that hold for it alone."""
-        return self._changed(image_key=key, image=values)
+    def for_image(self, name: str, values: Mapping[str, Any]) -> "Request":
+        """The request for one image: its name, and values that hold for it alone."""
+        return self._changed(image_name=name, image=values)
 
     def with_outputs(self, chain: Chain) -> "Request":
         """The request with every output named, as a chain has them.
@@ -176,7 +180,7 @@ class Request:
             settings = carried
         if self.image:
             settings = overlay(settings, self.image)
-        return settings.drawn(self.image_key) if self.image_key else settings
+        return settings.drawn(self.image_name) if self.image_name else settings
 
     def chain(self, carried: Settings | None = None) -> Chain:
         """The chain that is asked for; ``carried`` as for :meth:`settings`.
@@ -209,7 +213,8 @@ class Request:
             RequestError: as :meth:`settings`.
         """
         values = {name: getattr(self, name) for name in RECORDED}
-        values["files"] = digests([*self.settings().files(), *self.stage_files])
+        code = code_files([Path(file) for file in self.stage_files])
+        values["files"] = digests([*self.settings().files(), *map(str, code)])
         record: dict[str, Any] = json.loads(json.dumps(values))  # as it is read back
         return record
 

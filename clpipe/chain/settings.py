@@ -18,7 +18,7 @@ from clpipe.base.text import one_of
 from clpipe.camera.profile import DEFAULT_CAMERA, load_camera
 from clpipe.chain.drawing import draw_of, extremes_of, values_of
 from clpipe.chain.draws import TINY, Choice, Draw, Limits, limits_of
-from clpipe.chain.keys import KEYS, OUTPUT, check_type, names_in
+from clpipe.chain.keys import CODE, KEYS, OUTPUT, check_type, names_in
 from clpipe.chain.methods import (
     base_name,
     chosen_method,
@@ -29,7 +29,7 @@ from clpipe.chain.methods import (
     unknown_parameter,
 )
 from clpipe.chain.paths import file_parameters, from_folder
-from clpipe.chain.registry import all_stages, load_stage_file
+from clpipe.chain.registry import all_stages
 from clpipe.images.dump import Dump, dump_of
 from clpipe.images.encoding import Output
 from clpipe.stage import Method
@@ -47,6 +47,7 @@ class Settings:
     camera: str = DEFAULT_CAMERA
     iso: float = 100.0
     seed: int = 0
+    noise_key: str = ""  # "" follows from the image and the ISO
     raw_size: str = ""  # of headerless dumps: WIDTHxHEIGHT
     raw_type: str = ""  # and how their samples are stored
     stages: tuple[str, ...] = DEFAULT_CHAIN
@@ -68,6 +69,8 @@ class Settings:
     def record(self) -> dict[str, Any]:
         """The settings as nested JSON values, which :func:`settings_from` reads back."""
         plain: dict[str, Any] = {"camera": self.camera, "iso": self.iso, "seed": self.seed}
+        if self.noise_key:
+            plain["noise_key"] = self.noise_key
         if self.dump:
             plain |= {"raw_size": self.raw_size, "raw_type": self.raw_type}
         lists = {"stages": list(self.stages), "skip": list(self.skip)}
@@ -79,11 +82,11 @@ class Settings:
             (record.setdefault(table, {}) if table else record)[name] = draw.record()
         return record
 
-    def drawn(self, image_key: str) -> "Settings":
+    def drawn(self, name: str) -> "Settings":
         """The settings with a value for each draw; the same object where there are none.
 
-        The values depend on the seed and the image key alone (see :mod:`clpipe.chain.draws`).
-        Frames of a burst share the key, and so the values, of their image.
+        The values depend on the seed and the image's name alone (see :mod:`clpipe.chain.draws`).
+        Frames of a burst share the name, and so the values, of their image.
 
         Raises:
             RequestError: the values are not allowed together, or a camera cannot be loaded.
@@ -91,7 +94,7 @@ class Settings:
         if not self.draws:
             return self
         limits = partial(self.limits, isos=self.isos() if "iso" in self.draws else Limits())
-        owner = f"draw:{self.seed}:{image_key}"
+        owner = f"draw:{self.seed}:{name}"
         values: dict[str, Any] = {}
         for key, value in values_of(self.draws, self.constants(), limits, owner).items():
             step, _, name = key.rpartition(".")
@@ -226,12 +229,10 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
     Raises:
         KeyedError: as :func:`settings_from`.
     """
-    for path in names_in(values, "stage_files", "files"):
-        load_stage_file((folder or Path()) / path)
     if folder is not None:
         values = from_folder(folder, values)
     tables = {key: value for key, value in values.items() if isinstance(value, Mapping)}
-    plain = {k: v for k, v in values.items() if k not in tables and k != "stage_files"}
+    plain = {k: v for k, v in values.items() if k not in tables}
     plain = _checked_plain(settings, plain)
     draws = {k: draw for k, draw in settings.draws.items() if k.partition(".")[0] not in values}
     draws |= {key: draw_of(key, tables.pop(key)) for key in KEYS if key in tables}
@@ -269,6 +270,8 @@ def _checked_plain(settings: Settings, plain: Mapping[str, Any]) -> dict[str, An
             raise KeyedError(key, f"{key}: found {value!r}, but a stage is a table: [{key}]")
         if key == OUTPUT:
             raise KeyedError(key, f"{key}: found {value!r}, but it is a table: [{key}]")
+        if key == CODE:
+            raise KeyedError(key, f"{key}: code comes from --stage-file or a configuration file")
         if key not in KEYS:
             raise KeyedError(key, one_of("key", key, (*KEYS, OUTPUT, *all_stages())))
         check_type(key, value)

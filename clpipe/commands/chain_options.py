@@ -43,6 +43,12 @@ _CHAIN_OPTIONS = (
     iso_option,
     click.option("--seed", type=int, help=f"The seed of the noise. [default: {DEFAULTS.seed}]"),
     click.option(
+        "--noise-key",
+        metavar="TEXT",
+        help="Share the noise with all images that have this key, whatever their ISO. "
+        "[default: each image and ISO has noise of its own]",
+    ),
+    click.option(
         "--set",
         "assignments",
         multiple=True,

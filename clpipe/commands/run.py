@@ -15,7 +15,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
 from clpipe.batch.dask_worker import RunSpec
 from clpipe.batch.interrupt import interruptible
-from clpipe.batch.replay import replay_of
+from clpipe.batch.replay import Replay, replay_of
 from clpipe.batch.run_log import RunLog, Summary, log_name
 from clpipe.batch.tar_batch import TarBatch
 from clpipe.batch.tars import Tar, cut
@@ -23,6 +23,7 @@ from clpipe.batch.threads import Batch
 from clpipe.batch.trace import Trace, check_trace
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.chain import Chain
+from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.request import Request
 from clpipe.chain.truth import TRUTHS
 from clpipe.commands.chain_options import chain_options, format_option, keep_option
@@ -53,7 +54,7 @@ if TYPE_CHECKING:
 @chain_options
 @click.option(
     "--frames",
-    type=click.IntRange(1),
+    type=click.IntRange(1, MAX_FRAMES),
     metavar="N",
     help="Make a burst of N frames of each image, each with its own noise, and their truth.",
 )
@@ -179,9 +180,8 @@ def run(
     tars: list[Tar] = []
     if replay:
         check_beside_replay()
-        again = replay_of(replay, [Path(path) for path in inputs], max_pixels)
-        if again.warning:
-            click.echo(f"clpipe: {replay}: warning: {again.warning}", err=True)
+        paths = [Path(path) for path in inputs]
+        again = replay_of(replay, paths, max_pixels, options["stage_files"])
         request, jobs = again.request, [again.job]
         loader = ImageLoader(request)
         chain = loader.first_chain(jobs)
@@ -224,6 +224,8 @@ def run(
     reporter = Reporter(summary, writer, Console(stderr=True), quiet)
     events = Trace() if trace else None
     with opened as batch, output_folder(output, shard):
+        if replay and isinstance(batch, Batch):
+            warn_of_changes(replay, again, batch.devices[0])
         remove_unfinished(output, jobs)
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
         with closing(RunLog(output / log_name(shard), start)) as log:
@@ -305,6 +307,12 @@ def batch_of(
     return nullcontext(Batch(worker, devices, spec.threads))
 
 
+def warn_of_changes(sidecar: Path, replay: Replay, device: Device | None) -> None:
+    """Say why a replay may make other bytes, where something is known."""
+    if warning := replay.warning(device):
+        click.echo(f"clpipe: {sidecar}: warning: {warning}", err=True)
+
+
 def folder_named(text: str) -> Path:
     """The output folder.
 
@@ -318,7 +326,7 @@ def folder_named(text: str) -> Path:
 
 # Options that a sidecar does not store.
 BESIDE_REPLAY = (
-    *("inputs", "output", "replay", "max_pixels", "selectors", "memory"),
+    *("inputs", "output", "replay", "stage_files", "max_pixels", "selectors", "memory"),
     *("overwrite", "verify", "quiet", "trace"),
 )
 

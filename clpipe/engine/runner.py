@@ -54,13 +54,13 @@ class Result:
         return None if self.final is None and self.encoded is None else png_bytes(self.image)
 
 
-def streams(chain: Chain, step: Step, image_key: str) -> dict[NoiseScope, Stream]:
+def streams(chain: Chain, step: Step, noise_key: str) -> dict[NoiseScope, Stream]:
     """The random streams of a step for one image.
 
-    Image noise is keyed on the seed and the image key, fixed pattern noise on the camera.
+    Image noise is keyed on the seed and the noise key, fixed pattern noise on the camera.
     """
     return {
-        NoiseScope.IMAGE: stream_of(f"image:{chain.seed}:{image_key}", step.name),
+        NoiseScope.IMAGE: stream_of(f"image:{chain.seed}:{noise_key}", step.name),
         NoiseScope.CAMERA: stream_of(f"camera:{chain.camera.name}", step.name),
     }
 
@@ -137,7 +137,7 @@ class Runner:
     def run(
         self,
         image: Array,
-        image_key: str,
+        noise_key: str,
         timings: list[Timing] | None = None,
         download: bool = True,
         into: Array | None = None,
@@ -147,7 +147,7 @@ class Runner:
         Args:
             image: (height, width, 3) linear RGB, or (height, width) for a chain that starts on a
                 mosaic; finite, of float16 or any type that fits into float32.
-            image_key: the key of the image's noise.
+            noise_key: what the noise is made of, see :func:`clpipe.chain.identity.noise_key`.
             timings: one entry a launch and transfer is appended (devices only).
             download: False leaves the results on the device, for measuring.
             into: an array to use for the eight-bit pixels (devices only), of their shape; a used
@@ -166,17 +166,17 @@ class Runner:
         if not (self.encode or self.final or self.keep):
             return Result(None, None, {}, {})
         if not self.device:
-            return self._run_numpy(np.asarray(image, np.float32), image_key)
+            return self._run_numpy(np.asarray(image, np.float32), noise_key)
         plan = self.plan(image.dtype == np.float16, fold=min(image.shape[:2]) > 1)
         with suppress(ImageError):  # of the tiny image; the one below says it of this image
             self._make_ready(plan)
-        return self._run_plan(plan, image, image_key, timings, download, into)
+        return self._run_plan(plan, image, noise_key, timings, download, into)
 
     def _run_plan(
         self,
         plan: Plan,
         image: Array,
-        image_key: str,
+        noise_key: str,
         timings: list[Timing] | None = None,
         download: bool = True,
         into: Array | None = None,
@@ -192,7 +192,7 @@ class Runner:
                 return self._arguments[parameter.step][parameter.item]
             if parameter.step not in keys:
                 step = self.chain.step_named(parameter.step)
-                keys[parameter.step] = streams(self.chain, step, image_key)
+                keys[parameter.step] = streams(self.chain, step, noise_key)
             of = keys[parameter.step]
             if parameter.item == "stage":
                 return np.uint32(of[NoiseScope.IMAGE].stage)
@@ -230,13 +230,13 @@ class Runner:
             self._tables[key] = curves, composed
         return self._tables[key][1]
 
-    def _run_numpy(self, image: Floats, image_key: str) -> Result:
+    def _run_numpy(self, image: Floats, noise_key: str) -> Result:
         kept: dict[str, Floats] = {}
         estimates: dict[str, dict[str, float]] = {}
         whole = self.encode or self.final
         steps = (self.chain if whole else self.chain.through(self.keep)).steps
         for step in steps:
-            frame = Frame(step.context, streams(self.chain, step, image_key), {})
+            frame = Frame(step.context, streams(self.chain, step, noise_key), {})
             with user_code_errors(f"stage {step.name}", step.stage.folder):
                 image = step.method.reference(image, frame)
             if step.name in self.keep:

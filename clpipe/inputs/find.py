@@ -21,7 +21,7 @@ class Job:
 
     Args:
         path: the file.
-        key: its image key.
+        key: its name among the inputs, from which draws and the names of outputs follow.
         name: the path of its outputs in the output folder, without an ending; "" follows the key.
         listed: whether it was named, matched or in a manifest, and not found in a folder.
         values: settings that hold for it alone, nested as in a configuration.
@@ -55,7 +55,7 @@ def find_jobs(
 ) -> list[Job]:
     """The jobs of a run, in the order of its inputs.
 
-    The image key of a file in a folder is its path relative to that folder; that of a file which is
+    The key of a file in a folder is its path relative to that folder; that of a file which is
     named or matches a glob is its name; a manifest's rows have their own. A missing file is a job,
     too: it fails later, alone.
 

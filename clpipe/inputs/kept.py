@@ -10,6 +10,7 @@ from pathlib import Path
 
 from clpipe.base.errors import ImageError, KindError, RequestError
 from clpipe.chain.chain import Chain, Step
+from clpipe.chain.identity import name_in, of_frame
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.request import Request
@@ -21,14 +22,24 @@ from clpipe.inputs.plausibility import input_warnings
 NOISE = "sensor_noise"  # the attribute of an image without sensor noise; its value is "none"
 
 
-def attributes_of(step: Step, chain: Chain, image_key: str) -> dict[str, str]:
-    """The attributes of the kept image of a step, with which a chain can go on from it."""
+def attributes_of(step: Step, chain: Chain, key: str, frame: int = 0) -> dict[str, str]:
+    """The attributes of the kept image of a step, with which a chain can go on from it.
+
+    Args:
+        step: the step.
+        chain: its chain.
+        key: the image key.
+        frame: the number of the frame in a burst.
+    """
     is_noisy = step.method.after(step.context).noise is not None
+    settings = chain.settings
+    if settings.noise_key:
+        settings = replace(settings, noise_key=of_frame(settings.noise_key, frame))
     return {
         "stage": step.name,
         "kind": step.stage.writes.label,
-        "image_key": image_key,
-        "settings": json.dumps(chain.settings.record()),
+        "image_key": of_frame(key, frame),
+        "settings": json.dumps(settings.record()),
         **({} if is_noisy else {NOISE: "none"}),
     }
 
@@ -47,10 +58,6 @@ def carried_settings(attributes: Mapping[str, str]) -> Settings | None:
         raise RequestError(str(error)) from None
     if not isinstance(values, dict):
         raise RequestError(f"found {values!r}")
-    if "stage_files" in values:
-        raise RequestError(
-            "it names stage files; code comes from --stage-file, never from an image"
-        )
     return settings_from(values)
 
 
@@ -96,7 +103,7 @@ class KeptLoader:
             KindError: it is of another kind than the step reads.
         """
         key = source.attributes.get("image_key", key)
-        request = self.request.for_image(key, self.request.image)  # the same is drawn for it
+        request = self.request.for_image(name_in(key), self.request.image)  # draws the same
         chain = self._chain_for(request, path, source.attributes)
         warnings = list(source.warnings)
         if not self._is_next(chain, source.attributes):

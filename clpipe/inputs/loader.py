@@ -7,6 +7,7 @@ from typing import Any
 
 from clpipe.base.errors import KindError
 from clpipe.chain.chain import Chain, entry
+from clpipe.chain.identity import image_key
 from clpipe.chain.methods import base_name, stage_named
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
@@ -132,16 +133,17 @@ class ImageLoader:
             ImageError: it cannot enter there.
             RequestError: its chain cannot be made.
         """
+        key = image_key(job.key, source.sha256)
         if isinstance(source, RawImage):
             chain, source = self.raw.enter(job.path, source)
-            return LoadedImage(chain, source, job.key)
+            return LoadedImage(chain, source, key)
         if self.kept:
-            entered = self.kept.enter(job.path, source, job.key, job.listed)
+            entered = self.kept.enter(job.path, source, key, job.listed)
             return LoadedImage(*entered) if entered else None
         if stage := source.attributes.get("stage"):
             warning = f"was kept after {stage}; is it a render? See --start-at"
             source = replace(source, warnings=(*source.warnings, warning))
-        return LoadedImage(self.chain, source, job.key)
+        return LoadedImage(self.chain, source, key)
 
     def is_left_out(self, job: Job, error: Exception) -> bool:
         """Whether an image that cannot enter was only found in a folder of kept images."""

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
 from clpipe.chain.chain import step_names
+from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.keys import OUTPUT
 from clpipe.chain.methods import base_name
 from clpipe.chain.paths import from_folder
@@ -26,7 +27,7 @@ class Row:
 
     Args:
         path: the file.
-        key: its image key.
+        key: its name among the inputs.
         name: the path of its outputs in the output folder, without an ending; "" follows the key.
         values: its settings, nested as in a configuration.
         frames: how many frames are made of it; None is what the request says.
@@ -52,10 +53,10 @@ def read_manifest(path: Path) -> list[Row]:
     A .csv has a header, commas and UTF-8; its cells are TOML values, else text, and an empty cell
     sets nothing. A .jsonl has an object in each line, nested as a configuration or with dotted
     keys, and null sets nothing. Columns are ``path``, ``name``, ``frames``, ``iso``, ``camera``,
-    ``seed`` and any ``stage.parameter``, also of stage files that are loaded. Names of files are
-    relative to the manifest.
+    ``seed``, ``noise_key`` and any ``stage.parameter``, also of stage files that are loaded. Names
+    of files are relative to the manifest.
 
-    The image key is the name where there is one; else the path relative to the manifest's folder
+    The key is the name where there is one; else the path relative to the manifest's folder
     where it lies below that; else the file's name.
 
     Raises:
@@ -187,8 +188,10 @@ def _row(folder: Path, place: str, record: Mapping[str, Any]) -> Row:
     if os.path.basename(path) in ("", ".", ".."):
         raise RequestError(f"path: found {path!r}, which names no image")
     check_output_name(name)
-    if frames is not None and (type(frames) is not int or frames < 1):
-        raise RequestError(f"frames: found {frames!r}, but it is a whole number from 1 on")
+    if frames is not None and (type(frames) is not int or not 0 < frames <= MAX_FRAMES):
+        raise RequestError(
+            f"frames: found {frames!r}, but it is a whole number from 1 to {MAX_FRAMES}"
+        )
     values: dict[str, Any] = {}
     for column, value in record.items():
         step, _, parameter = column.partition(".")

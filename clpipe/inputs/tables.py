@@ -21,7 +21,7 @@ TEXTS = ("path", "name")  # columns that are text, whatever they look like
 
 OWN = (*TEXTS, "frames")  # columns that are no settings
 
-PLAIN = ("iso", "camera", "seed")  # columns of settings that stand in no table
+PLAIN = ("iso", "camera", "seed", "noise_key")  # columns of settings that stand in no table
 
 
 def csv_records(

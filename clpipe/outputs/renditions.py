@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from clpipe.chain.chain import Chain, Step
+from clpipe.chain.identity import noise_key
 from clpipe.chain.truth import (
     DEVELOPMENT,
     MOSAIC,
@@ -27,7 +28,8 @@ class Rendition:
     Args:
         name: what is put behind the image's name.
         chain: how it is made.
-        key: its image key, of which its noise is made.
+        key: the key of the image.
+        frame: its number in a burst.
         noise: for a variance map, the steps whose noise has this variance in the chain's last
             image, see :func:`clpipe.chain.truth.variance_of`; else ().
     """
@@ -35,7 +37,13 @@ class Rendition:
     name: str
     chain: Chain
     key: str
+    frame: int = 0
     noise: tuple[Step, ...] = ()
+
+    @property
+    def noise_key(self) -> str:
+        """What its noise is made of."""
+        return noise_key(self.chain.settings, self.key, self.frame)
 
     @property
     def whole(self) -> Chain:
@@ -84,7 +92,7 @@ class RenditionPlan:
             RequestError: the chain has no such truth.
         """
         names = enumerate(self._frame_names())
-        frames = [Rendition(name, chain, f"{key}#{i}" if i else key) for i, name in names]
+        frames = [Rendition(name, chain, key, frame) for frame, name in names]
         return [*frames, *(replace(truth_of(t, chain), key=key) for t in self._all_truths())]
 
 
@@ -110,6 +118,6 @@ def truth_of(truth: str, chain: Chain) -> Rendition:
     """
     if truth == VARIANCE:
         signal, noise = signal_and_noise(chain)
-        return Rendition(SUFFIXES[truth], signal, "", noise)
+        return Rendition(SUFFIXES[truth], signal, "", noise=noise)
     noisy = noisy_mosaic(chain) if truth == MOSAIC else chain
     return Rendition(SUFFIXES[truth], noisy.without_noise(), "")

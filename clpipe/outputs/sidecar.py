@@ -144,6 +144,7 @@ def sidecar(
         "picture": rendition.name,
         "frames": frames,
         "image_key": rendition.key,
+        "noise_key": rendition.noise_key,
         "seed": chain.seed,
         "width": source.pixels.shape[1],
         "height": source.pixels.shape[0],
@@ -173,15 +174,20 @@ def sidecar(
             for path, file in outputs.items()
         ],
         "warnings": list(source.warnings),
-        "device": {
-            "name": device.info.name if device else "numpy",
-            "platform": device.info.platform if device else "numpy",
-            "version": device.info.version if device else all_versions()["numpy"],
-            "driver": device.info.driver if device else "",
-            "lanes": device.info.lanes if device else 0,
-        },
+        "device": device_record(device),
         "versions": all_versions(),
         "request": request,
+    }
+
+
+def device_record(device: Device | None) -> dict[str, Any]:
+    """What a sidecar says of a device, as JSON values; None is NumPy."""
+    return {
+        "name": device.info.name if device else "numpy",
+        "platform": device.info.platform if device else "numpy",
+        "version": device.info.version if device else all_versions()["numpy"],
+        "driver": device.info.driver if device else "",
+        "lanes": device.info.lanes if device else 0,
     }
 
 

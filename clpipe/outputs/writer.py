@@ -189,9 +189,10 @@ class OutputWriter:
         is_mosaic = chain.result in (Kind.RAW, Kind.MOSAIC)
         turn = 1 if is_mosaic else orientation  # turning a mosaic would change its pattern
         outputs: dict[Path, Stored] = {}
+        whose = rendition.key, rendition.frame
         for step in (chain.step_named(name) for name in self._kept_steps(rendition)):
             path = self.path(job, f"{step.name}.exr", rendition.name)
-            attributes = attributes_of(step, chain, rendition.key) | tag_attributes
+            attributes = attributes_of(step, chain, *whose) | tag_attributes
             channels = step.stage.writes.channels
             outputs[path] = write_exr(path, result.kept[step.name], channels, attributes)
         for format_ in self.formats_of(rendition.name):
@@ -207,7 +208,7 @@ class OutputWriter:
                 outputs[path] = write_dng(path, raw, negative, tags, orientation)
             elif FORMATS[format_].ending == "exr":
                 assert result.final is not None
-                attributes = attributes_of(chain.steps[-1], chain, rendition.key) | tag_attributes
+                attributes = attributes_of(chain.steps[-1], chain, *whose) | tag_attributes
                 if turn != 1:
                     attributes |= {"orientation": "1"}
                 half = FORMATS[format_].bits == 16
@@ -245,5 +246,5 @@ def samples(result: Result, format_: Format) -> Array:
 
 def variance_attributes(rendition: Rendition) -> dict[str, str]:
     """The attributes of a variance map; by their kind it can enter no chain."""
-    own = attributes_of(rendition.noise[-1], rendition.whole, rendition.key)
+    own = attributes_of(rendition.noise[-1], rendition.whole, rendition.key, rendition.frame)
     return {**own, "stage": "variance", "kind": "variance"}

@@ -1,0 +1,57 @@
+"""What the noise of an image belongs to, so that no two images share it by accident."""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from clpipe.chain.settings import Settings
+
+MAX_FRAMES = 100_000  # of one image
+
+DIGITS = 16  # of the digest of an image's content, four bits each
+
+
+def image_key(name: str, digest: str) -> str:
+    """The key of an image: its name among the inputs, and what it holds.
+
+    The name is its path below the folder that was given, else the file's name.
+
+    >>> image_key("left/0001.exr", "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f0")
+    'left/0001.exr@9f86d081884c7d65'
+    """
+    return f"{name}@{digest[:DIGITS]}"
+
+
+def name_in(key: str) -> str:
+    """The name in an image key, of which values are drawn; frames of a burst have one.
+
+    >>> name_in("left/0001.exr@9f86d081884c7d65#3"), name_in("0001.exr")
+    ('left/0001.exr', '0001.exr')
+    """
+    name, at, _ = key.rpartition("@")
+    return name if at else key
+
+
+def of_frame(key: str, frame: int) -> str:
+    """The key of a frame of a burst, or of an image in an epoch, counted from 0.
+
+    >>> of_frame("a.exr@9f86d081884c7d65", 0), of_frame("a.exr@9f86d081884c7d65", 2)
+    ('a.exr@9f86d081884c7d65', 'a.exr@9f86d081884c7d65#2')
+    """
+    return f"{key}#{frame}" if frame else key
+
+
+def noise_key(settings: "Settings", key: str, frame: int = 0) -> str:
+    """What noise is made of, beside the seed and the stage: the image and the ISO.
+
+    Settings that have a ``noise_key`` of their own share the noise with all others that have it,
+    whatever the image and the ISO: common random numbers.
+
+    >>> from clpipe.chain.settings import Settings
+    >>> noise_key(Settings(iso=3200.0), "a.exr@9f86d081884c7d65", 1)
+    'a.exr@9f86d081884c7d65#1@ISO3200'
+    >>> noise_key(Settings(noise_key="pair 7"), "a.exr@9f86d081884c7d65", 1)
+    'pair 7#1'
+    """
+    if settings.noise_key:
+        return of_frame(settings.noise_key, frame)
+    return f"{of_frame(key, frame)}@ISO{settings.iso:.9g}"
