@@ -18,9 +18,11 @@ from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.commands.main import main
 from clpipe.images.dng import write_dng
+from clpipe.images.encoding import Output
 from clpipe.images.raw import read_facts, read_raw
 from clpipe.images.read import read_image
 from clpipe.images.tags import Tags
+from clpipe.images.write import write_display
 from clpipe.outputs.negative import negative_of
 from clpipe.reference.cfa import PATTERNS
 from tests.conftest import STILL_LIFE, written
@@ -125,6 +127,30 @@ def test_what_it_says_of_itself(clpipe, tmp_path):
     assert exif["EXIF ISOSpeedRatings"].values == [1600]
     assert float(exif["EXIF FocalPlaneXResolution"].values[0]) == pytest.approx(960 / 1.8)
     assert str(exif["Image Software"]).startswith("clpipe ")
+
+
+def test_it_has_every_tag_of_a_jpeg(tmp_path):
+    mosaic = np.arange(4096, dtype=np.float32).reshape(64, 64)
+    shot = Output(exposure_time=0.01, focal_length=24.0, sensor_width=18.0)
+    tags = Tags("Sony", "A", 100, aperture=2.8, taken="2024:05:06 07:08:09", output=shot)
+    write_dng(tmp_path / "a.dng", mosaic, negative_of(make_chain(settings_from({}))), tags)
+    write_display(tmp_path / "a.jpg", np.zeros((64, 64, 3), np.uint8), tags)
+
+    def read(name):
+        with (tmp_path / name).open("rb") as file:
+            return exifread.process_file(file, details=False)
+
+    of_pictures = {"ColorSpace", "ComponentsConfiguration", "FlashPixVersion"}
+    jpeg, dng = read("a.jpg"), read("a.dng")
+    names = {k for k in jpeg if k.split()[-1] not in of_pictures | {"JPEGThumbnail"}}
+    differing = {"Image Model", "Image ExifOffset"}
+    for name in names - differing:
+        one, other = jpeg[name].values, dng[name].values
+        assert one == other or float(one[0]) == pytest.approx(float(other[0])), name
+    assert names >= {"EXIF FNumber", "EXIF DateTimeOriginal", "Image DateTime"}
+    assert differing <= names
+    facts = read_facts(tmp_path / "a.dng")
+    assert (facts.aperture, facts.taken) == (2.8, tags.taken)
 
 
 @pytest.mark.parametrize(

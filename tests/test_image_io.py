@@ -10,10 +10,11 @@ from PIL import Image, ImageCms
 
 from clpipe.base.errors import ImageError
 from clpipe.images import write as image_write
+from clpipe.images.encoding import Output
 from clpipe.images.layers import picture_channels
 from clpipe.images.pixels import display_window
 from clpipe.images.read import holds_mosaic, read_finished, read_image
-from clpipe.images.tags import Tags
+from clpipe.images.tags import Tags, exif
 from clpipe.images.write import write_display
 from tests.conftest import STILL_LIFE
 
@@ -170,6 +171,18 @@ def test_jpeg_is_as_a_camera_writes_it(tmp_path):
     assert (exif[0x010F], exif[0x0110]) == ("Sony", "ILCE-7RM2")
     assert exif.get_ifd(0x8769)[0x8827] == 3200
     assert "sRGB" in ImageCms.getProfileDescription(profile)
+
+
+@pytest.mark.parametrize(
+    "size", [(400, 400), (300, 400), (800, 1200), (1080, 1920), (400, 300), (1200, 800)]
+)
+def test_the_equivalent_focal_length_is_by_diagonals(size):
+    shot = Output(focal_length=50.0, sensor_width=23.0)
+    values = exif(Tags("", "", 100, output=shot), *size)
+    pixels = 50 / 23 * max(size)  # the focal length
+    equivalent = pixels / np.hypot(*size) * 43.27  # 43.27 mm: the diagonal of 36 mm by 24 mm
+    assert values["FocalLengthIn35mmFilm"] == pytest.approx(equivalent, abs=0.501)
+    assert values["FocalPlaneXResolution"] / 10 * 50 == pytest.approx(pixels)
 
 
 def test_a_jpeg_that_does_not_fit_on_the_disk_does_not_end_the_process(tmp_path, monkeypatch):
