@@ -95,7 +95,9 @@ def test_libraw_reads_the_very_dn(clpipe, scene, tmp_path, pattern, size):
     assert facts.white_level == 16383
     assert facts.gains == pytest.approx((2.77, 1.36), rel=1e-6)
     assert (facts.make, facts.model, facts.iso) == ("Sony", "ILCE-7RM2", 3200)
-    assert facts.xyz_to_camera is None  # the real camera's is not the render's
+    # The real camera's matrix is not the render's, which has the primaries of sRGB.
+    to_camera = np.array(facts.xyz_to_camera) @ SRGB_TO_XYZ
+    assert to_camera / to_camera[1, 1] == pytest.approx(np.diag([1 / 2.77, 1, 1 / 1.36]), abs=1e-4)
     assert np.array_equal(read_raw(path, facts), kept)
     with rawpy.imread(str(path)) as raw:
         assert raw.color_desc == b"RGBG"
@@ -151,6 +153,20 @@ def test_it_has_every_tag_of_a_jpeg(tmp_path):
     assert differing <= names
     facts = read_facts(tmp_path / "a.dng")
     assert (facts.aperture, facts.taken) == (2.8, tags.taken)
+
+
+@pytest.mark.parametrize("stages", [{}, {"color_matrix": {"method": "inverse_camera"}}])
+def test_its_matrix_is_read_as_that_of_a_camera(tmp_path, stages):
+    order = ["color_matrix", "mosaic", "inverse_white_balance", "quantize"] if stages else []
+    values = {**stages, **({"stages": order} if order else {})}
+    negative = negative_of(make_chain(settings_from(values)))
+    mosaic = np.arange(4096, dtype=np.float32).reshape(64, 64)
+    write_dng(tmp_path / "a.dng", mosaic, negative, Tags("Sony", "A", 100))
+    matrix = read_facts(tmp_path / "a.dng").xyz_to_camera
+    assert np.array(matrix) == pytest.approx(negative.xyz_to_camera, abs=1e-6)
+    if stages:
+        camera = load_camera("sony-a7r2")
+        assert np.array(matrix) == pytest.approx(np.array(camera.xyz_to_camera), abs=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import click
 
+from clpipe.images.dump import TYPES
+
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 device_option = click.option(
@@ -20,4 +22,12 @@ stage_file_option = click.option(
     type=click.Path(path_type=Path),
     metavar="FILE.py",
     help="Load a stage of your own; may be repeated.",
+)
+
+raw_size_option = click.option(
+    "--raw-size", metavar="WxH", help="Width and height of headerless dumps (.raw)."
+)
+
+raw_type_option = click.option(
+    "--raw-type", type=click.Choice(list(TYPES)), help="How headerless dumps store a sample."
 )

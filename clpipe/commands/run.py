@@ -26,9 +26,9 @@ from clpipe.chain.chain import Chain
 from clpipe.chain.request import Request
 from clpipe.chain.truth import TRUTHS
 from clpipe.commands.chain_options import chain_options, format_option, keep_option
+from clpipe.commands.options import raw_size_option, raw_type_option
 from clpipe.commands.progress import Reporter
 from clpipe.engine.device import Device, open_devices
-from clpipe.images.dump import TYPES
 from clpipe.images.read import MAX_PIXELS, TRANSFERS, USUAL_MAX_PIXELS
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
@@ -65,10 +65,8 @@ if TYPE_CHECKING:
     help="Write beside each picture its truth: its development or its mosaic without noise, or the "
     "variance of the noise in the mosaic; may be repeated.",
 )
-@click.option("--raw-size", metavar="WxH", help="Width and height of headerless dumps (.raw).")
-@click.option(
-    "--raw-type", type=click.Choice(list(TYPES)), help="How headerless dumps store a sample."
-)
+@raw_size_option
+@raw_type_option
 @click.option(
     "--transfer",
     type=click.Choice(list(TRANSFERS)),
