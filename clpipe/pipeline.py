@@ -9,6 +9,7 @@ import numpy as np
 from clpipe.base.errors import ImageError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.types import Array
+from clpipe.base.validation import typed
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.files import load_settings
 from clpipe.chain.settings import Settings, overlay
@@ -35,6 +36,7 @@ class Pipeline(ReadOnly):
         DeviceError: there is no usable device.
     """
 
+    @typed
     def __init__(
         self,
         config: str | Path = "default",

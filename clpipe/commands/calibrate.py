@@ -8,7 +8,7 @@ from clpipe.analysis.calibration.files import calibrate_files, check_profile_nam
 from clpipe.analysis.calibration.frames import FrameOverrides
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.result import Calibration
-from clpipe.commands.options import json_option, raw_size_option, raw_type_option
+from clpipe.commands.options import Command, json_option, raw_size_option, raw_type_option
 from clpipe.commands.printing import show, show_json
 from clpipe.images.dump import dump_of
 from clpipe.reference.cfa import PATTERNS, Pattern
@@ -19,7 +19,7 @@ CALIBRATION = (
 )
 
 
-@click.command("calibrate")
+@click.command("calibrate", cls=Command)
 @click.argument("inputs", nargs=-1, required=True, metavar="FRAMES...")
 @click.option(
     "-o",
@@ -61,9 +61,9 @@ def calibrate(
     """Measure a sensor's noise from raw frames, and write it as a camera profile.
 
     FRAMES are camera raws, mosaics that clpipe kept, or mosaics from elsewhere (EXR, 16-bit TIFF or
-    PNG, headerless dumps, with options for what they do not say). For each ISO, take two or more of one static scene
-    that has dark and bright places; a single frame gives less exact figures. Dark frames (lens cap
-    on) add column noise, DSNU, hot pixels and a better b.
+    PNG, headerless dumps, with options for what they do not say). For each ISO, take two or more of
+    one static scene that has dark and bright places; a single frame gives less exact figures. Dark
+    frames (lens cap on) add column noise, DSNU, hot pixels and a better b.
 
     \b
     clpipe calibrate scene/*.CR2 --dark 'dark/*.CR2' -o my_camera.toml

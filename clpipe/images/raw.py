@@ -87,9 +87,7 @@ def read_facts(path: Path) -> RawFacts:
         iso = speed or exif.number("ISOSpeedRatings", 0)
         exposure = exif.number("ExposureTime", shutter)
         if not (exif.tags or iso or exposure):
-            raise ImageError(
-                f"{path}: names no camera, ISO or exposure; {DUMP_HINT}"
-            )
+            raise ImageError(f"{path}: names no camera, ISO or exposure; {DUMP_HINT}")
         size = raw.sizes
         by_colour = raw.black_level_per_channel
         cell = raw.raw_colors_visible[:2, :2].ravel()
