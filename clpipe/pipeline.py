@@ -1,5 +1,6 @@
 """The Python API: a chain as an object that takes NumPy images."""
 
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -92,7 +93,14 @@ class Pipeline(ReadOnly):
         own = overlay(self._settings, plain(settings)) if settings else self._settings
         if settings or own.draws:
             runner = runner.of(self._chain(own.drawn(key)))
-        return runner.run(_checked(image, runner.chain.source), key)
+        pixels = _checked(image, runner.chain.source)
+        if _clips_mostly(pixels, runner.chain):
+            warnings.warn(
+                "most of the image is above 1, the full scale of the sensor, and becomes white; "
+                "are its values 0 to 255, or is exposure.ev too high?",
+                stacklevel=2,
+            )
+        return runner.run(pixels, key)
 
     def process_many(
         self, images: Iterable[Array | tuple[Array, str | Mapping[str, Any]]]
@@ -108,6 +116,15 @@ class Pipeline(ReadOnly):
             image, arguments = item if isinstance(item, tuple) else (item, {})
             named = {"key": arguments} if isinstance(arguments, str) else arguments
             yield self.process(image, **{"key": str(number), **named})
+
+
+def _clips_mostly(image: Array, chain: Chain) -> bool:
+    """Whether most samples of linear RGB are above full scale, judged by a part of them."""
+    if chain.source is not Kind.RGB:
+        return False
+    sample = image.flat[::61]
+    white = 2.0 ** -getattr(chain.steps[0].method, "ev", 0.0)
+    return bool(np.count_nonzero(sample > white) > sample.size / 2)
 
 
 def plain(values: Any) -> Any:

@@ -1,5 +1,7 @@
 """The Python API, as somebody who imports clpipe sees it."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -130,3 +132,12 @@ def test_an_image_that_is_none(camera, image, message):
 def test_a_request_that_is_wrong(settings, message):
     with pytest.raises(clpipe.RequestError, match=message):
         clpipe.Pipeline(**settings)
+
+
+def test_an_image_of_0_to_255_is_warned_of(render):
+    camera = clpipe.Pipeline(device="numpy", exposure={"ev": -1}, skip=["denoise"])
+    with pytest.warns(UserWarning, match="most of the image is above 1, .* values 0 to 255"):
+        camera.process(render * 255, "a")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        camera.process(render * 3, "a")  # its mean is 0.45 after the exposure
