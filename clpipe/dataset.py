@@ -14,12 +14,15 @@ from typing import Any, Self
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
+from clpipe.base.text import one_of
+from clpipe.base.validation import typed
 from clpipe.chain.chain import Chain
 from clpipe.chain.identity import noise_key, of_frame
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_device
 from clpipe.engine.runner import Runner
 from clpipe.images.openimageio import set_codec_threads
+from clpipe.images.read import TRANSFERS
 from clpipe.inputs.find import Job, find_jobs
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.inputs.raw import RawImage
@@ -68,10 +71,11 @@ class Dataset(ReadOnly):
         **settings: what a configuration file may hold, over ``config``.
 
     Raises:
-        RequestError: a name or value that is not allowed, a folder without images, two images of
-            one name, a truth of a chain without noise.
+        RequestError: a name or value that is not allowed, a missing input, a folder without images,
+            two images of one name, a truth of a chain without noise.
     """
 
+    @typed
     def __init__(
         self,
         inputs: str | Path | Sequence[str | Path],
@@ -89,6 +93,11 @@ class Dataset(ReadOnly):
         threads: int | None = None,
         **settings: Any,
     ) -> None:
+        if transfer is not None and transfer not in TRANSFERS:
+            raise RequestError(one_of("transfer", transfer, TRANSFERS))
+        for name, number in (("epochs", epochs), ("threads", threads)):
+            if number is not None and number < 1:
+                raise RequestError(f"found {name} {number}; expected 1 or more, or None")
         request = Request.from_options(
             config=None if config is None else str(config),
             values=plain(settings),
@@ -101,6 +110,7 @@ class Dataset(ReadOnly):
         several = [inputs] if isinstance(inputs, str | Path) else inputs
         self._jobs = find_jobs([str(i) for i in several], NOWHERE, self._loader.endings())
         self._loader.check(self._jobs)
+        _check_files(self._jobs)
         _check_keys(self._jobs)
         chain = self._loader.first_chain(self._jobs)
         if truth:
@@ -109,10 +119,6 @@ class Dataset(ReadOnly):
         self._encode = chain.result is Kind.DISPLAY
         self._truth = truth
         self._selector = None if device is None else str(device)
-        if epochs is not None and (type(epochs) is not int or epochs < 1):
-            raise RequestError(
-                f"found epochs {epochs!r}; expected a whole number from 1 on, or None"
-            )
         self._epochs = epochs
         self._threads = threads or len(os.sched_getaffinity(0))
         self._opened: _Developer | None = None
@@ -293,6 +299,17 @@ class _Developer:
         if latest and latest.keep == kept:
             return latest.of(chain)  # shares its plans
         return Runner(chain, self._device, kept, self._encode, final=not self._encode)
+
+
+def _check_files(jobs: Sequence[Job]) -> None:
+    """See that the files that are named exist; those of a folder were found there.
+
+    Raises:
+        RequestError: one does not.
+    """
+    for job in jobs:
+        if job.listed and not job.path.exists():
+            raise RequestError(f"{job.label}: no such file or folder")
 
 
 def _check_keys(jobs: Sequence[Job]) -> None:

@@ -13,6 +13,7 @@ from xxhash import xxh3_64_hexdigest
 from clpipe.base.errors import ImageError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.types import Array
+from clpipe.base.validation import typed
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.files import load_settings
 from clpipe.chain.identity import image_key, noise_key
@@ -41,6 +42,7 @@ class Pipeline(ReadOnly):
         DeviceError: there is no usable device.
     """
 
+    @typed
     def __init__(
         self,
         config: str | Path = "default",
@@ -128,7 +130,7 @@ class Pipeline(ReadOnly):
 
 def digest_of(image: Array) -> str:
     """A digest of an image's samples that takes little time."""
-    return xxh3_64_hexdigest(np.ascontiguousarray(image).data.cast("B"))
+    return xxh3_64_hexdigest(np.ascontiguousarray(image).data)
 
 
 def plain(values: Any) -> Any:

@@ -201,6 +201,9 @@ class Method(BaseModel):
     tolerance: ClassVar[float] = 0.0  # kernel against reference; 0 is bit for bit
     example: ClassVar[Mapping[str, Any]] = {}  # parameters for checks, where defaults do nothing
     other_examples: ClassVar[tuple[Mapping[str, Any], ...]] = ()  # that take other paths
+    # Parameters of which one may be set: a configuration's gives way to an option's, and that to a
+    # manifest's.
+    alternatives: ClassVar[frozenset[str]] = frozenset()
 
     def resolve(self, context: Context) -> Self:
         """The method with a value for every parameter that was left to the camera or the chain."""

@@ -6,11 +6,13 @@ import re
 import subprocess
 import sys
 
+import click
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
+from clpipe.commands.main import COMMANDS, main
 from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import ROOT, STILL_LIFE, written
 
@@ -488,3 +490,24 @@ def test_a_screen_that_takes_no_more_ends_no_run(clpipe, small, tmp_path):
         result = subprocess.run(command, stderr=full, env=environment, cwd=tmp_path)
     assert result.returncode == 0
     assert len(written(tmp_path / "out")) == 2
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_an_option_that_holds_one_value_is_given_once(clpipe, name):
+    command = main.get_command(click.Context(main), name)
+    options = [p for p in command.params if isinstance(p, click.Option)]
+    for option in (o for o in options if not (o.multiple or o.is_flag)):
+        long = option.opts[-1]
+        for first in option.opts:
+            message = clpipe(name, first, "1", f"{long}=2", status=2).stderr
+            assert message.startswith(f"clpipe: {long}: it is given 2 times")
+
+
+def test_an_output_folder_is_not_named_like_a_picture(clpipe, small, tmp_path):
+    for name in ("out.jpg", "out.EXR", "out.dng"):
+        message = clpipe("run", small, "-o", name, "--device", "numpy", status=2).stderr
+        assert f"--output: found {name}, the name of a picture" in message
+        assert not (tmp_path / name).exists()
+    (tmp_path / "shots.exr").mkdir()
+    clpipe("run", small, "-o", "shots.exr", "--device", "numpy")
+    assert written(tmp_path / "shots.exr") == ["small.jpg", "small.json"]

@@ -147,9 +147,23 @@ def test_what_is_refused(renders):
         ({"keep": "demosiac"}, "demosaic"),
         ({"truth": True, "skip": ["sensor_noise", "row_noise", "column_noise"]}, "adds noise"),
         ({"epoch": -1}, "found epoch -1"),
+        ({"truth": "mosaic"}, "found truth 'mosaic'; expected bool"),
+        ({"keep": 5}, r"found keep 5; expected str | Sequence\[str\]"),
+        ({"start_at": 5}, "found start_at 5; expected str"),
+        ({"threads": 0}, "found threads 0; expected 1 or more"),
+        ({"threads": "all"}, "found threads 'all'; expected int"),
+        ({"transfer": "gamma"}, "unknown transfer 'gamma'; allowed: linear, srgb"),
+        ({"config": "none.toml"}, "none.toml: cannot read this configuration"),
+        ({"config": 5}, "found config 5"),
     ):
         with pytest.raises(RequestError, match=message):
             api.Dataset(renders, **wrong)
+    Path("m.csv").write_text("path\nin/none.exr\n")
+    for missing in ("none/", ["in/r0.exr", "in/none.exr"], "m.csv"):
+        with pytest.raises(RequestError, match=r"none.*: no such file or folder"):
+            api.Dataset(missing)
+    with pytest.raises(RequestError, match="found inputs 5; expected str"):
+        api.Dataset(5)
     with pytest.raises(RequestError, match="no file matches"):
         api.Dataset("in/*.png")
     with pytest.raises(RequestError, match=r"are both called r0\.exr"):

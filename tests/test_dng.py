@@ -18,9 +18,11 @@ from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.commands.main import main
 from clpipe.images.dng import write_dng
+from clpipe.images.encoding import Output
 from clpipe.images.raw import read_facts, read_raw
 from clpipe.images.read import read_image
 from clpipe.images.tags import Tags
+from clpipe.images.write import write_display
 from clpipe.outputs.negative import negative_of
 from clpipe.reference.cfa import PATTERNS
 from tests.conftest import STILL_LIFE, written
@@ -93,7 +95,9 @@ def test_libraw_reads_the_very_dn(clpipe, scene, tmp_path, pattern, size):
     assert facts.white_level == 16383
     assert facts.gains == pytest.approx((2.77, 1.36), rel=1e-6)
     assert (facts.make, facts.model, facts.iso) == ("Sony", "ILCE-7RM2", 3200)
-    assert facts.xyz_to_camera is None  # the real camera's is not the render's
+    # The real camera's matrix is not the render's, which has the primaries of sRGB.
+    to_camera = np.array(facts.xyz_to_camera) @ SRGB_TO_XYZ
+    assert to_camera / to_camera[1, 1] == pytest.approx(np.diag([1 / 2.77, 1, 1 / 1.36]), abs=1e-4)
     assert np.array_equal(read_raw(path, facts), kept)
     with rawpy.imread(str(path)) as raw:
         assert raw.color_desc == b"RGBG"
@@ -125,6 +129,44 @@ def test_what_it_says_of_itself(clpipe, tmp_path):
     assert exif["EXIF ISOSpeedRatings"].values == [1600]
     assert float(exif["EXIF FocalPlaneXResolution"].values[0]) == pytest.approx(960 / 1.8)
     assert str(exif["Image Software"]).startswith("clpipe ")
+
+
+def test_it_has_every_tag_of_a_jpeg(tmp_path):
+    mosaic = np.arange(4096, dtype=np.float32).reshape(64, 64)
+    shot = Output(exposure_time=0.01, focal_length=24.0, sensor_width=18.0)
+    tags = Tags("Sony", "A", 100, aperture=2.8, taken="2024:05:06 07:08:09", output=shot)
+    write_dng(tmp_path / "a.dng", mosaic, negative_of(make_chain(settings_from({}))), tags)
+    write_display(tmp_path / "a.jpg", np.zeros((64, 64, 3), np.uint8), tags)
+
+    def read(name):
+        with (tmp_path / name).open("rb") as file:
+            return exifread.process_file(file, details=False)
+
+    of_pictures = {"ColorSpace", "ComponentsConfiguration", "FlashPixVersion"}
+    jpeg, dng = read("a.jpg"), read("a.dng")
+    names = {k for k in jpeg if k.split()[-1] not in of_pictures | {"JPEGThumbnail"}}
+    differing = {"Image Model", "Image ExifOffset"}
+    for name in names - differing:
+        one, other = jpeg[name].values, dng[name].values
+        assert one == other or float(one[0]) == pytest.approx(float(other[0])), name
+    assert names >= {"EXIF FNumber", "EXIF DateTimeOriginal", "Image DateTime"}
+    assert differing <= names
+    facts = read_facts(tmp_path / "a.dng")
+    assert (facts.aperture, facts.taken) == (2.8, tags.taken)
+
+
+@pytest.mark.parametrize("stages", [{}, {"color_matrix": {"method": "inverse_camera"}}])
+def test_its_matrix_is_read_as_that_of_a_camera(tmp_path, stages):
+    order = ["color_matrix", "mosaic", "inverse_white_balance", "quantize"] if stages else []
+    values = {**stages, **({"stages": order} if order else {})}
+    negative = negative_of(make_chain(settings_from(values)))
+    mosaic = np.arange(4096, dtype=np.float32).reshape(64, 64)
+    write_dng(tmp_path / "a.dng", mosaic, negative, Tags("Sony", "A", 100))
+    matrix = read_facts(tmp_path / "a.dng").xyz_to_camera
+    assert np.array(matrix) == pytest.approx(negative.xyz_to_camera, abs=1e-6)
+    if stages:
+        camera = load_camera("sony-a7r2")
+        assert np.array(matrix) == pytest.approx(np.array(camera.xyz_to_camera), abs=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from clpipe.base.errors import RequestError
 from clpipe.camera.profile import built_in_cameras
 from clpipe.chain.chain import make_chain
 from clpipe.chain.files import load_settings
+from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
 from clpipe.inputs.manifest import Row, check_rows, read_manifest
 
@@ -388,3 +389,31 @@ def test_draws_under_dotted_keys_of_jsonl(tmp_path):
         "demosaic": {"method": {"choice": ["bilinear", "median"]}},
     }
     check_rows([row], settings_from({}))
+
+
+def test_a_row_completes_and_replaces_what_options_set(tmp_path, monkeypatch):
+    curve = {"sigma": 0.02, "intensity": {"mean": [0.5], "sigma": [0.02]}}
+    (tmp_path / "noise.json").write_text(
+        json.dumps({"kind": "display", "channels": dict.fromkeys("RGB", curve)})
+    )
+    monkeypatch.chdir(tmp_path)  # what a row names is found beside the manifest, not here
+    (tmp_path / "rows").mkdir()
+    (tmp_path / "noise.json").rename(tmp_path / "rows" / "noise.json")
+    method = "picture_noise.method=iid_gaussian"
+
+    def sigma(cells, *assignments):
+        header, cell = cells
+        (tmp_path / "rows" / "a.csv").write_text(f"path,{header}\na.exr,{cell}\n")
+        [row] = read_manifest(tmp_path / "rows" / "a.csv")
+        request = Request.from_options(assignments=[method, *assignments])
+        check_rows([row], request.settings())
+        chain = request.for_image(row.key, row.values).chain()
+        return chain.step_named("picture_noise").method.sigma
+
+    measured = ("picture_noise.measured", "noise.json")
+    assert sigma(measured) == (0.02, 0.02, 0.02)
+    assert sigma(measured, "picture_noise.sigma=0.1") == (0.02, 0.02, 0.02)
+    own = ("picture_noise.sigma", "0.3")
+    assert sigma(own, "picture_noise.measured=rows/noise.json") == (0.3, 0.3, 0.3)
+    with pytest.raises(RequestError, match="picture_noise: needs sigma, or measured"):
+        sigma(("iso", "400"))

@@ -11,6 +11,7 @@ from PIL import Image
 
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import Picture, load_picture
+from clpipe.base.errors import RequestError
 from clpipe.camera.profile import load_camera
 from clpipe.commands.measure import measure_tables
 from tests.conftest import STILL_LIFE
@@ -24,8 +25,8 @@ def measured(clpipe):
     return lambda *arguments: json.loads(clpipe("measure", *arguments, "--json").stdout)
 
 
-def run(clpipe, folder, *options):
-    clpipe("run", STILL_LIFE, "-o", folder, "--iso", 3200, *options)
+def run(clpipe, folder, *options, iso=3200):
+    clpipe("run", STILL_LIFE, "-o", folder, "--iso", iso, *options)
     return f"{folder}/still_life"
 
 
@@ -270,8 +271,8 @@ def test_load_says_what_it_read(clpipe, tmp_path):
 
 
 def test_wrong_partners_are_refused(clpipe):
-    noisy = run(clpipe, "noisy", "--until", "quantize", "--iso", 800)
-    other = run(clpipe, "other", "--until", "quantize", "--iso", 1600, "--seed", 1)
+    noisy = run(clpipe, "noisy", "--until", "quantize", iso=800)
+    other = run(clpipe, "other", "--until", "quantize", "--seed", 1, iso=1600)
     before = run(clpipe, "before", "--until", "mosaic")
     found = clpipe("measure", f"{noisy}.exr", f"{other}.exr", status=2)
     assert "repeats must have one ISO" in found.stderr
@@ -285,3 +286,24 @@ def test_a_truth_among_the_repeats_is_refused(clpipe, tmp_path):
     assert len(images) == 4
     found = clpipe("measure", *images, status=2)
     assert "truth.exr has 0." in found.stderr and "give it as --truth" in found.stderr
+
+
+def test_another_scene_among_the_repeats_is_refused():
+    random, height, width = np.random.default_rng(2), 256, 384
+    y, x = np.mgrid[:height, :width] / 64
+    scene = (0.3 + 0.15 * np.sin(x) * np.cos(y + x * x / 9)).astype(np.float32)
+    fixed = random.normal(0, 0.1, scene.shape)
+
+    def frame(name, light, sigma):
+        rows = random.normal(0, sigma, (height, 1))  # stronger than any camera's
+        noise = random.normal(0, sigma, scene.shape) + rows + fixed
+        return Picture(Path(name), "mosaic", (light + noise).astype(np.float32))
+
+    for sigma in (0.001, 0.03):
+        repeats = [frame(f"{k}.exr", scene, sigma) for k in range(3)]
+        assert len(measure(repeats).images) == 3
+        for other in (frame("other.exr", scene[:, ::-1], sigma), frame("other.exr", 0.3, sigma)):
+            with pytest.raises(RequestError, match=r"^other\.exr does not show .* as the others"):
+                measure([*repeats, other])
+            with pytest.raises(RequestError, match=r"does not show the same scene as"):
+                measure([repeats[0], other])

@@ -161,7 +161,7 @@ def test_exif_and_profile(scene, tmp_path, name):
     assert exif[0x0131].startswith("clpipe ")
     assert inner[0x829A] == pytest.approx(0.01)
     assert inner[0xA001] == 1
-    assert (inner[0x920A], inner[0xA405]) == (50, 75)
+    assert (inner[0x920A], inner[0xA405]) == (50, 76)
     assert (inner[0xA20E], inner[0xA210]) == (pytest.approx(33 / 2.4), 3)
     if name != "tif":  # OpenImageIO has no way to put it there
         assert inner[0x8827] == 25600

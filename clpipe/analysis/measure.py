@@ -21,6 +21,12 @@ from clpipe.stage import Kind
 # Among n frames and against their mean, a truth has (n - 1) / (n^2 - n - 1), at most 0.4.
 TRUTH_SHARE = 0.6
 
+# A repeat shows another scene, where averaging BLOCK x BLOCK pixels leaves more than this share of
+# the energy of its difference from the mean. Noise leaves 1 / BLOCK^2, and up to 0.01 where
+# processing has smeared it; another view leaves 0.2.
+SCENE_SHARE = 0.05
+BLOCK = 64  # px
+
 # The share of pixels that count, the channels, and the correlations of pairs of channels.
 Parts = tuple[float, tuple[Channel, ...], dict[tuple[str, str], float]]
 
@@ -38,7 +44,8 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
         truth: the same without noise, of that kind and size.
 
     Raises:
-        RequestError: there is a single image without a truth, or the images do not match.
+        RequestError: there is a single image without a truth, or the images do not match, or they
+            are no repeats of one scene.
         ImageError: no pixel counts.
     """
     check_partners(images, truth)
@@ -51,6 +58,7 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
         freedom = (len(images) - 1) / len(images)
         clean = frames.mean(0, dtype=np.float64).astype(np.float32)
         noise = (frames - clean) / np.float32(freedom**0.5)
+        refuse_other_scenes(images, noise)
         refuse_truth_among_repeats(images, noise)
     start = ~truth.clipped() if truth else np.ones(clean.shape, bool)
     if not start.any():
@@ -113,6 +121,35 @@ def clipped_samples(images: Sequence[Picture], frames: Floats) -> Mask:
     # The levels are unknown; samples that clip can only be the smallest and the largest.
     low, high = frames.min(), frames.max()
     return ((frames <= low) | (frames >= high)) & (low < high)
+
+
+def refuse_other_scenes(images: Sequence[Picture], noise: Floats) -> None:
+    """See that no repeat differs from the others over wide areas, as another scene would.
+
+    Images of less than 2x2 blocks are not judged.
+
+    Raises:
+        RequestError: one does.
+    """
+    frames, rows, columns = len(noise), noise.shape[1] // BLOCK, noise.shape[2] // BLOCK
+    if min(rows, columns) < 2:
+        return
+    whole = noise[:, : rows * BLOCK, : columns * BLOCK].reshape(
+        frames, rows, BLOCK, columns, BLOCK, -1
+    )
+    means = whole.mean((2, 4), dtype=np.float64)
+    for axis in (1, 2):  # rows, columns and the brightness of a frame may have noise of their own
+        means -= means.mean(axis, keepdims=True)
+    remaining = np.square(means).mean((1, 2, 3))
+    worst = int(remaining.argmax())
+    energy = np.square(whole[worst]).mean(dtype=np.float64)
+    if remaining[worst] > SCENE_SHARE * energy:
+        others = "the others" if frames > 2 else images[1 - worst].path
+        raise RequestError(
+            f"{images[worst].path} does not show the same scene as {others}: averaged over "
+            f"{BLOCK}x{BLOCK} pixels, {remaining[worst] / energy:.0%} of the difference remains, "
+            f"of noise less than {SCENE_SHARE:.0%} would; give repeats of one scene, or a --truth"
+        )
 
 
 def refuse_truth_among_repeats(images: Sequence[Picture], noise: Floats) -> None:

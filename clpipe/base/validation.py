@@ -1,10 +1,18 @@
 """Errors of pydantic as one line for a user: the place of the value, the value, the reason."""
 
-from collections.abc import Mapping
+import inspect
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from functools import wraps
+from typing import Literal, ParamSpec, TypeVar
 
-from pydantic import ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from clpipe.base.errors import RequestError
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -58,3 +66,39 @@ def first_fault(error: ValidationError) -> Fault:
     # A whole table is too long to repeat; its path identifies it.
     shown = bool(path) and not isinstance(first["input"], Mapping)
     return Fault(path, "invalid", f"found {first['input']!r}: {reason}" if shown else reason)
+
+
+def typed(function: Callable[P, R]) -> Callable[P, R]:
+    """A function that refuses arguments which are not of their annotated types; none is converted.
+
+    >>> @typed
+    ... def keep(names: str, truth: bool = False) -> None: ...
+    >>> keep("normalize", truth="mosaic")
+    Traceback (most recent call last):
+    clpipe.base.errors.RequestError: found truth 'mosaic'; expected bool
+
+    Raises:
+        RequestError: an argument is of another type.
+    """
+    signature = inspect.signature(function)
+    annotations = {
+        name: parameter.annotation
+        for name, parameter in signature.parameters.items()
+        if parameter.annotation is not parameter.empty and parameter.kind != parameter.VAR_KEYWORD
+    }
+    strict = ConfigDict(strict=True)
+
+    @wraps(function)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        for name, value in signature.bind(*args, **kwargs).arguments.items():
+            if name not in annotations:
+                continue
+            try:
+                TypeAdapter(annotations[name], config=strict).validate_python(value)
+            except ValidationError:
+                text = inspect.formatannotation(annotations[name])
+                expected = re.sub(r"\b[a-z_.]+\.(?=[A-Z])", "", text)  # without their modules
+                raise RequestError(f"found {name} {value!r}; expected {expected}") from None
+        return function(*args, **kwargs)
+
+    return checked

@@ -302,6 +302,10 @@ def _merged(settings: Settings, step: str, table: Mapping[str, Any]) -> dict[str
     before = settings.table(step)
     if "method" in own and own["method"] != chosen_method(step, before):
         return own
+    stage = all_stages().get(base_name(step))
+    for method in stage.methods if stage else ():
+        if own.keys() & method.alternatives:
+            before = {k: v for k, v in before.items() if k not in method.alternatives}
     return {**before, **own}
 
 

@@ -12,7 +12,7 @@ from clpipe.chain.methods import stage_named
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import chain_options
 from clpipe.commands.completion import methods_of
-from clpipe.commands.options import device_option, json_option
+from clpipe.commands.options import Command, device_option, json_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.bench import bench as run_bench
 from clpipe.engine.bench import bench_methods
@@ -33,7 +33,7 @@ BATCH_HEADINGS = (
 )
 
 
-@click.command("bench")
+@click.command("bench", cls=Command)
 @chain_options
 @device_option
 @click.option(

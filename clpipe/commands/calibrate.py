@@ -8,8 +8,9 @@ from clpipe.analysis.calibration.files import calibrate_files, check_profile_nam
 from clpipe.analysis.calibration.frames import FrameOverrides
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.result import Calibration
-from clpipe.commands.options import json_option
+from clpipe.commands.options import Command, json_option, raw_size_option, raw_type_option
 from clpipe.commands.printing import show, show_json
+from clpipe.images.dump import dump_of
 from clpipe.reference.cfa import PATTERNS, Pattern
 
 CALIBRATION = (
@@ -18,7 +19,7 @@ CALIBRATION = (
 )
 
 
-@click.command("calibrate")
+@click.command("calibrate", cls=Command)
 @click.argument("inputs", nargs=-1, required=True, metavar="FRAMES...")
 @click.option(
     "-o",
@@ -42,6 +43,8 @@ CALIBRATION = (
     type=click.FloatRange(0, min_open=True),
     help="The ISO of all frames, in place of what the files say.",
 )
+@raw_size_option
+@raw_type_option
 @json_option
 def calibrate(
     inputs: tuple[str, ...],
@@ -51,21 +54,24 @@ def calibrate(
     white_level: float | None,
     pattern: Pattern | None,
     iso: float | None,
+    raw_size: str | None,
+    raw_type: str | None,
     as_json: bool,
 ) -> None:
     """Measure a sensor's noise from raw frames, and write it as a camera profile.
 
     FRAMES are camera raws, mosaics that clpipe kept, or mosaics from elsewhere (EXR, 16-bit TIFF or
-    PNG, with options for what they do not say). For each ISO, take two or more of one static scene
-    that has dark and bright places; a single frame gives less exact figures. Dark frames (lens cap
-    on) add column noise, DSNU, hot pixels and a better b.
+    PNG, headerless dumps, with options for what they do not say). For each ISO, take two or more of
+    one static scene that has dark and bright places; a single frame gives less exact figures. Dark
+    frames (lens cap on) add column noise, DSNU, hot pixels and a better b.
 
     \b
     clpipe calibrate scene/*.CR2 --dark 'dark/*.CR2' -o my_camera.toml
     clpipe run render.exr -o out --camera my_camera.toml --iso 800
     """
     check_profile_name(output)
-    overrides = FrameOverrides(black_level, white_level, pattern, iso)
+    dump = dump_of(raw_size or "", raw_type or "") if raw_size or raw_type else None
+    overrides = FrameOverrides(black_level, white_level, pattern, iso, dump)
     frames, calibrations = calibrate_files(inputs, dark, overrides)
     picture = write_profile(output, frames, calibrations)
     if as_json:

@@ -7,7 +7,7 @@ import click
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import Camera, built_in_cameras, load_camera
 from clpipe.commands.completion import cameras as camera_names
-from clpipe.commands.options import json_option
+from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import Rows, short_text, show, show_json
 
 # What a camera has at every ISO, with units.
@@ -26,7 +26,7 @@ FIXED = {
 }
 
 
-@click.command("cameras")
+@click.command("cameras", cls=Command)
 @click.argument("name", required=False, metavar="[NAME|FILE]", shell_complete=camera_names)
 @click.option("--iso", type=float, help="The ISO. [default: all that were measured]")
 @json_option

@@ -9,13 +9,13 @@ from clpipe.base.errors import RequestError
 from clpipe.chain.methods import stage_named
 from clpipe.chain.registry import load_stage_file
 from clpipe.commands.completion import steps
-from clpipe.commands.options import device_option, json_option, stage_file_option
+from clpipe.commands.options import Command, device_option, json_option, stage_file_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.check import SIZES, Check, check_all
 from clpipe.engine.device import open_device
 
 
-@click.command("check")
+@click.command("check", cls=Command)
 @click.argument("names", nargs=-1, metavar="[STAGE]...", shell_complete=steps)
 @device_option
 @click.option("--small", is_flag=True, help="Compare tiny images only, for slow devices.")

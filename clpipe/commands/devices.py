@@ -6,12 +6,12 @@ from typing import Any
 import click
 
 from clpipe.base.errors import DeviceError
-from clpipe.commands.options import json_option
+from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.discovery import DeviceInfo, choose, find_devices
 
 
-@click.command("devices")
+@click.command("devices", cls=Command)
 @json_option
 def devices(as_json: bool) -> None:
     """List the OpenCL devices, and say which one is used and why others are not."""

@@ -12,12 +12,12 @@ from clpipe.analysis.spatial import LAGS, LineNoise
 from clpipe.analysis.statistics import SIGMAS, gaussian_beyond
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
-from clpipe.commands.options import json_option
+from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import Rows, number, show, show_json
 from clpipe.reference.cfa import PATTERNS, Pattern
 
 
-@click.command("measure")
+@click.command("measure", cls=Command)
 @click.argument(
     "images", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE..."
 )

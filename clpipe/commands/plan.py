@@ -9,13 +9,13 @@ from clpipe.base.errors import RequestError
 from clpipe.chain.files import toml_text
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import chain_options, format_option, keep_option
-from clpipe.commands.options import json_option
+from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.plan import AnyLaunch, Launch, Lines, Plan, launch_bytes, make_plan, reads_of
 from clpipe.outputs.results import results_of
 
 
-@click.command("plan")
+@click.command("plan", cls=Command)
 @chain_options
 @keep_option
 @format_option

@@ -27,10 +27,10 @@ from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.request import Request
 from clpipe.chain.truth import TRUTHS
 from clpipe.commands.chain_options import chain_options, format_option, keep_option
+from clpipe.commands.options import Command, raw_size_option, raw_type_option
 from clpipe.commands.progress import Reporter
 from clpipe.engine.device import Device, open_devices
-from clpipe.images.dump import TYPES
-from clpipe.images.read import MAX_PIXELS, TRANSFERS, USUAL_MAX_PIXELS
+from clpipe.images.read import MAX_PIXELS, PICTURE_SUFFIXES, TRANSFERS, USUAL_MAX_PIXELS
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.folder import output_folder, remove_unfinished
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from clpipe.batch.dask_client import Cluster
 
 
-@click.command("run")
+@click.command("run", cls=Command)
 @click.argument("inputs", nargs=-1, metavar="INPUT...")
 @click.option(
     "-o",
@@ -66,10 +66,8 @@ if TYPE_CHECKING:
     help="Write beside each picture its truth: its development or its mosaic without noise, or the "
     "variance of the noise in the mosaic; may be repeated.",
 )
-@click.option("--raw-size", metavar="WxH", help="Width and height of headerless dumps (.raw).")
-@click.option(
-    "--raw-type", type=click.Choice(list(TYPES)), help="How headerless dumps store a sample."
-)
+@raw_size_option
+@raw_type_option
 @click.option(
     "--transfer",
     type=click.Choice(list(TRANSFERS)),
@@ -317,11 +315,16 @@ def folder_named(text: str) -> Path:
     """The output folder.
 
     Raises:
-        RequestError: the name is empty.
+        RequestError: the name is empty, or that of a picture.
     """
     if not text:
         raise RequestError("--output: it is empty; name a folder")
-    return Path(text)
+    folder = Path(text)
+    if folder.suffix.lower() in (*PICTURE_SUFFIXES, ".dng") and not folder.is_dir():
+        raise RequestError(
+            f"--output: found {text}, the name of a picture; name the folder to write to: -o FOLDER"
+        )
+    return folder
 
 
 # Options that a sidecar does not store.

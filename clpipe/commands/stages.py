@@ -16,14 +16,14 @@ from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import value_text
 from clpipe.commands.chain_options import camera_option, iso_option
 from clpipe.commands.completion import steps
-from clpipe.commands.options import json_option, stage_file_option
+from clpipe.commands.options import Command, json_option, stage_file_option
 from clpipe.commands.printing import short_text, show, show_json
 from clpipe.stage import Context, Method, Stage
 
 LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 
-@click.command("stages")
+@click.command("stages", cls=Command)
 @click.argument("name", required=False, shell_complete=steps)
 @camera_option
 @iso_option

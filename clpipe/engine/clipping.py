@@ -45,7 +45,7 @@ def clipping_text(share: float) -> str:
     """What is said of a share of clipped pixels.
 
     >>> clipping_text(0.997)
-    '99.7 % of its pixels are clipped; 1 is the white level at EV 0, see exposure.ev'
+    '99.7 % of its pixels are clipped; are its values 0 to 255, or is exposure.ev too high?'
     """
     text = f"{100 * share:.3g} % of its pixels are clipped"
-    return f"{text}; 1 is the white level at EV 0, see exposure.ev"
+    return f"{text}; are its values 0 to 255, or is exposure.ev too high?"

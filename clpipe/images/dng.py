@@ -17,8 +17,8 @@ from clpipe.base.types import Array, Doubles, Floats
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.profile import SRGB_TO_XYZ
 from clpipe.images import tiff
-from clpipe.images.encoding import SIMULATED, exif
-from clpipe.images.tags import Tags
+from clpipe.images.encoding import SIMULATED
+from clpipe.images.tags import Tags, exif
 from clpipe.reference.cfa import Pattern, red_site
 from clpipe.reference.curve import to_8_bit
 from clpipe.reference.transfer import srgb_curve
@@ -109,6 +109,7 @@ def main_directory(
     return {
         **tiff.image_fields(small, subfile_type=1, photometric=2),  # RGB
         **noise_fields(negative),
+        **({306: tiff.text(tags.taken)} if tags.taken else {}),  # DateTime
         271: tiff.text(tags.make),  # Make
         # Model. It is not the real camera's name: for that one RawTherapee cuts off optically black
         # columns and sets its own white level, and LibRaw uses its own matrix, even for a name that
@@ -177,7 +178,7 @@ def write_dng(
         )
     small = preview(dn, negative)
     main, raw = main_directory(small, negative, tags, orientation), raw_directory(dn, negative)
-    shot = tiff.exif_fields(exif(tags.iso, tags.output, max(dn.shape)))
+    shot = tiff.exif_fields(exif(tags, *dn.shape))
 
     # The file: header, the three directories, the preview, the mosaic.
     raw_offset = 8 + tiff.directory_size(main)

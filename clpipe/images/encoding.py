@@ -1,4 +1,4 @@
-"""How pictures are encoded and tagged: the ``[output]`` table of a configuration, and EXIF."""
+"""How pictures are encoded and tagged: the ``[output]`` table of a configuration."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal
@@ -6,7 +6,6 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 SIMULATED = "clpipe "  # prefix of the camera's model in a DNG that clpipe writes
-FULL_FRAME = 36.0  # mm, the longer side of a frame of 35 mm film
 Length = Annotated[float, Field(gt=0, le=10000, allow_inf_nan=False)]
 
 
@@ -37,36 +36,3 @@ class Output(BaseModel):
 
 
 SHOT = {"exposure_time", "focal_length", "sensor_width"}
-
-
-def exif(iso: float, shot: Output, longer_side: int) -> dict[str, float]:
-    """EXIF tags (EXIF 2.3, 2010) by their names.
-
-    Args:
-        iso: the ISO; EXIF holds at most 65535.
-        shot: the exposure data.
-        longer_side: of the image, px.
-
-    >>> shot = Output(focal_length=24.0, sensor_width=24.0)
-    >>> for name, value in exif(800, shot, 6000).items():
-    ...     print(name, value)
-    PhotographicSensitivity 800
-    FocalLength 24.0
-    FocalLengthIn35mmFilm 36
-    FocalPlaneXResolution 2500.0
-    FocalPlaneYResolution 2500.0
-    FocalPlaneResolutionUnit 3
-    """
-    tags: dict[str, float] = {"PhotographicSensitivity": min(round(iso), 65535)}
-    if shot.exposure_time:
-        tags["ExposureTime"] = shot.exposure_time
-    if shot.focal_length:
-        tags["FocalLength"] = shot.focal_length
-    if shot.focal_length and shot.sensor_width:
-        equivalent = round(shot.focal_length * FULL_FRAME / shot.sensor_width)
-        tags["FocalLengthIn35mmFilm"] = min(max(equivalent, 1), 65535)
-    if shot.sensor_width:
-        per_cm = longer_side / shot.sensor_width * 10
-        tags |= {"FocalPlaneXResolution": per_cm, "FocalPlaneYResolution": per_cm}
-        tags["FocalPlaneResolutionUnit"] = 3  # cm
-    return tags

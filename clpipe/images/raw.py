@@ -8,7 +8,7 @@ import logging
 import math
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import numpy as np
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Floats
 from clpipe.camera.profile import SRGB_TO_XYZ, Matrix
+from clpipe.images.dng import D65
 from clpipe.images.encoding import SIMULATED
 from clpipe.reference.cfa import PATTERNS, Pattern
 
@@ -28,7 +29,7 @@ RAW_SUFFIXES = (
 )
 
 LEAST_BITS = 0.25  # of a pixel; assumed to be less than any compressed raw has
-MOST_GAIN = 20.0  # of white balance; assumed to be more than any camera needs
+MOST_GAIN = 8.0  # of white balance, and the inverse of the least; no light asks a camera for more
 
 # EXIF's orientation by LibRaw's flip (1: left to right, 2: upside down, 4: then transposed).
 ORIENTATIONS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
@@ -38,6 +39,8 @@ EXIF_MARKS = (b"CMT1", b"CMT2", b"Exif\0\0")
 PARTS = ("EXIF", "Image")  # exifread's prefixes of tags, in order of preference
 DATE_TAGS = ("DateTimeOriginal", "DateTime")
 DATE = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")
+COLOR_MATRICES = {"0xC622": "0xC65B", "0xC621": "0xC65A"}  # a DNG's, and their illuminants
+DUMP_HINT = "a dump of samples, not a camera's raw, give --raw-size and --raw-type"
 OTHERS = {b"\xff\xd8\xff": "a JPEG", b"\x89PNG": "a PNG", b"v/1\x01": "an OpenEXR image"}
 
 
@@ -45,7 +48,7 @@ OTHERS = {b"\xff\xd8\xff": "a JPEG", b"\x89PNG": "a PNG", b"v/1\x01": "an OpenEX
 class RawFacts:
     """The metadata of a raw file. Levels are in DN, gains relative to green = 1; None is unknown.
 
-    Implausible gains (not above 0, or above 20) are None; ``as_shot`` holds what the file says.
+    Implausible gains (outside 1/8 to 8) are None; ``as_shot`` holds what the file says.
     """
 
     make: str
@@ -58,7 +61,6 @@ class RawFacts:
     white_level: int
     as_shot: tuple[float, float, float]  # white balance multipliers of red, green, blue
     gains: tuple[float, float] | None  # red, blue, as shot
-    daylight_gains: tuple[float, float] | None  # red, blue
     xyz_to_camera: Matrix | None
     camera_to_srgb: Matrix | None  # of white-balanced RGB, linear
     orientation: int  # as EXIF has it: 1 is upright
@@ -85,10 +87,7 @@ def read_facts(path: Path) -> RawFacts:
         iso = speed or exif.number("ISOSpeedRatings", 0)
         exposure = exif.number("ExposureTime", shutter)
         if not (exif.tags or iso or exposure):
-            raise ImageError(
-                f"{path}: names no camera, ISO or exposure; a dump of samples, not a camera's raw "
-                "(clpipe run takes it with --raw-size and --raw-type)"
-            )
+            raise ImageError(f"{path}: names no camera, ISO or exposure; {DUMP_HINT}")
         size = raw.sizes
         by_colour = raw.black_level_per_channel
         cell = raw.raw_colors_visible[:2, :2].ravel()
@@ -111,8 +110,7 @@ def read_facts(path: Path) -> RawFacts:
             white_level=int(raw.white_level),
             as_shot=(red, green, blue),
             gains=_gains(red, green, blue),
-            daylight_gains=_gains(*raw.daylight_whitebalance[:3]) if to_srgb else None,
-            xyz_to_camera=matrix,
+            xyz_to_camera=exif.color_matrix() if matrix is None else matrix,
             camera_to_srgb=to_srgb,
             orientation=ORIENTATIONS.get(size.flip, 1),
             aperture=exif.number("FNumber", aperture),
@@ -127,7 +125,7 @@ def _gains(red: float, green: float, blue: float) -> tuple[float, float] | None:
     >>> _gains(1024.0, 512.0, 768.0), _gains(-2.0, 1.0, 1.5), _gains(2.0, 1.0, 100.0)
     ((2.0, 1.5), None, None)
     """
-    if green <= 0 or not all(0 < c / green <= MOST_GAIN for c in (red, blue)):
+    if not (green > 0 and all(1 / MOST_GAIN <= c / green <= MOST_GAIN for c in (red, blue))):
         return None
     return red / green, blue / green
 
@@ -181,7 +179,11 @@ def _opened(path: Path) -> Iterator[Any]:
             yield raw
     except rawpy.LibRawError as error:
         reason = error.args[0].decode() if isinstance(error.args[0], bytes) else str(error)
-        raise ImageError(f"{path}: damaged, or not a raw that LibRaw knows: {reason}") from None
+        is_dump = path.suffix.lower() == ".raw"
+        hint = f"; if it is {DUMP_HINT}" if is_dump else ""
+        raise ImageError(
+            f"{path}: damaged, or not a raw that LibRaw knows: {reason}{hint}"
+        ) from None
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror or error}") from None
 
@@ -242,6 +244,15 @@ class Exif:
                     value = 0
                 break
         return value if 0 < value < math.inf else None
+
+    def color_matrix(self) -> Matrix | None:
+        """The ColorMatrix of a DNG for D65, from CIE XYZ; None where there is none."""
+        for name, illuminant in COLOR_MATRICES.items():
+            if self.number(f"Tag {illuminant}", 0) == D65 and f"Image Tag {name}" in self.tags:
+                with suppress(TypeError, ValueError, ZeroDivisionError):
+                    values = [float(value) for value in self.tags[f"Image Tag {name}"].values]
+                    return _matrix(np.reshape(values, (3, 3)))
+        return None
 
 
 def read_exif(path: Path) -> Exif:

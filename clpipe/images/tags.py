@@ -1,6 +1,7 @@
 """Tags: what goes into a picture's EXIF, and how an image carries it from stage to stage."""
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 
@@ -12,6 +13,7 @@ from clpipe.base.types import Array
 from clpipe.camera.profile import Positive
 from clpipe.images.encoding import Output
 
+FILM_DIAGONAL = math.hypot(36, 24)  # mm, of a frame of 35 mm film
 TAG_ATTRIBUTES = ("exif", "orientation")  # the attributes by which an image carries its tags
 
 
@@ -33,6 +35,48 @@ class Tags:
         """Exposure time and focal length where known, by the names of ``Output``'s fields."""
         values = {"exposure_time": self.exposure, "focal_length": self.focal_length}
         return {name: value for name, value in values.items() if value}
+
+
+def exif(tags: Tags, height: int, width: int) -> dict[str, float | str]:
+    """EXIF tags (EXIF 2.3, 2010) by their names; the shot is that of ``tags.output``.
+
+    The equivalent focal length is by the ratio of diagonals (CIPA DCG-001, 2018), as
+    structure-from-motion tools take it; EXIF holds whole mm.
+
+    Args:
+        tags: what is known; EXIF holds an ISO of at most 65535.
+        height: of the image, px.
+        width: of the image, px.
+
+    >>> shot = Output(focal_length=24.0, sensor_width=24.0)
+    >>> for name, value in exif(Tags("", "", 800, output=shot), 4000, 6000).items():
+    ...     print(name, value)
+    PhotographicSensitivity 800
+    FocalLength 24.0
+    FocalLengthIn35mmFilm 36
+    FocalPlaneXResolution 2500.0
+    FocalPlaneYResolution 2500.0
+    FocalPlaneResolutionUnit 3
+    """
+    shot = tags.output
+    values: dict[str, float | str] = {"PhotographicSensitivity": min(round(tags.iso), 65535)}
+    if shot.exposure_time:
+        values["ExposureTime"] = shot.exposure_time
+    if tags.aperture:
+        values["FNumber"] = tags.aperture
+    if tags.taken:
+        values["DateTimeOriginal"] = tags.taken
+    if shot.focal_length:
+        values["FocalLength"] = shot.focal_length
+    if shot.sensor_width:
+        per_mm = max(height, width) / shot.sensor_width
+        if shot.focal_length:
+            diagonal = math.hypot(height, width) / per_mm
+            equivalent = round(shot.focal_length * FILM_DIAGONAL / diagonal)
+            values["FocalLengthIn35mmFilm"] = min(max(equivalent, 1), 65535)
+        values |= {"FocalPlaneXResolution": per_mm * 10, "FocalPlaneYResolution": per_mm * 10}
+        values["FocalPlaneResolutionUnit"] = 3  # cm
+    return values
 
 
 def to_attributes(tags: Tags, orientation: int) -> dict[str, str]:

@@ -4,7 +4,7 @@ Each function named after a TIFF type makes a field of that type from its values
 """
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -120,11 +120,13 @@ def image_fields(pixels: Array, subfile_type: int, photometric: int) -> Director
     }
 
 
-def exif_fields(tags: dict[str, float]) -> Directory:
-    """The EXIF directory; ``tags`` are those of :func:`clpipe.images.encoding.exif`."""
+def exif_fields(tags: Mapping[str, float | str]) -> Directory:
+    """The EXIF directory; ``tags`` are those of :func:`clpipe.images.tags.exif`."""
     types: dict[str, tuple[int, Callable[..., Field]]] = {
         "ExposureTime": (33434, rational),
+        "FNumber": (33437, rational),
         "PhotographicSensitivity": (34855, short),
+        "DateTimeOriginal": (36867, text),
         "FocalLength": (37386, rational),
         "FocalPlaneXResolution": (41486, rational),
         "FocalPlaneYResolution": (41487, rational),

@@ -18,10 +18,9 @@ from clpipe.base.errors import ImageError
 from clpipe.base.files import Stored, write_whole
 from clpipe.base.types import Array, Floats
 from clpipe.images.attributes import PREFIX
-from clpipe.images.encoding import exif
 from clpipe.images.openimageio import error_text
 from clpipe.images.pixels import HALF_MAX
-from clpipe.images.tags import Tags
+from clpipe.images.tags import Tags, exif
 
 JPEG_MAX_SIDE = 65500
 
@@ -63,17 +62,13 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> Stored:
     spec.attribute("Make", tags.make)
     spec.attribute("Model", tags.model)
     spec.attribute("Software", f"clpipe {__version__}")
-    for name, value in exif(tags.iso, output, max(height, width)).items():
+    for name, value in exif(tags, height, width).items():
         if name == "ExposureTime":
             # OpenImageIO cuts off after the sixth digit, and 0.01 is 0.0099999998 as float32.
             above = float(np.nextafter(np.float32(value), np.float32(np.inf)))
             spec.attribute(name, above)
         else:
-            spec.attribute(f"Exif:{name}", value)
-    if tags.aperture:
-        spec.attribute("FNumber", tags.aperture)
-    if tags.taken:
-        spec.attribute("Exif:DateTimeOriginal", tags.taken)
+            spec.attribute(name if name == "FNumber" else f"Exif:{name}", value)
     if tags.taken or path.suffix == ".tif":
         spec.attribute("DateTime", tags.taken or NO_TIME)
     return _write(path, spec, pixels.reshape(height, width, channels))

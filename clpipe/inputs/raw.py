@@ -34,6 +34,15 @@ class RawImage(SourceImage):
     facts: RawFacts | Dump = field(kw_only=True)
 
 
+def may_be_dump(path: Path) -> bool:
+    """Whether a file is a dump, where the geometry of dumps is set, by the ending of its name.
+
+    It is for .raw, and for any ending that no other image has.
+    """
+    others = (*RENDER_SUFFIXES, *(ending for ending in RAW_SUFFIXES if ending != ".raw"))
+    return path.suffix.lower() not in others
+
+
 @dataclass(frozen=True)
 class RawLoader:
     """Loads raws, and dumps where their geometry is set, and makes the chain for each."""
@@ -43,15 +52,11 @@ class RawLoader:
 
     def takes(self, path: Path) -> bool:
         """Whether a file is a raw or a dump, by the ending of its name."""
-        return path.suffix.lower() in RAW_SUFFIXES or self._is_dump(path)
-
-    def _is_dump(self, path: Path) -> bool:
-        """Whether a file is a dump: .raw, or an ending that nothing else has."""
-        others = (*RENDER_SUFFIXES, *(e for e in RAW_SUFFIXES if e != ".raw"))
-        return self.dump is not None and path.suffix.lower() not in others
+        is_dump = self.dump is not None and may_be_dump(path)
+        return path.suffix.lower() in RAW_SUFFIXES or is_dump
 
     def _facts(self, path: Path) -> RawFacts | Dump:
-        return self.dump if self.dump and self._is_dump(path) else read_facts(path)
+        return self.dump if self.dump and may_be_dump(path) else read_facts(path)
 
     def read(self, path: Path) -> RawImage:
         """A raw or a dump.
@@ -207,17 +212,15 @@ def settings_of(facts: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
     if 0 <= facts.black_level < facts.white_level:
         levels = {"black_level": float(facts.black_level), "white_level": float(facts.white_level)}
         parameters["normalize"] = levels
-    gains = facts.gains or facts.daylight_gains
-    if gains:
-        red_and_blue = dict(zip(("red_gain", "blue_gain"), gains, strict=True))
+    if facts.gains:
+        red_and_blue = dict(zip(("red_gain", "blue_gain"), facts.gains, strict=True))
         parameters |= {"inverse_white_balance": red_and_blue, "white_balance": {**red_and_blue}}
     else:
         parameters["white_balance"] = {"method": "gray_world"}
-    if not facts.gains:
         multipliers = ", ".join(f"{x:.4g}" for x in facts.as_shot)
-        which = "those of daylight are taken" if gains else "gray_world estimates others"
         warnings["white_balance"] = (
-            f"its white balance as shot cannot be right, with multipliers {multipliers}; {which}"
+            f"its white balance as shot cannot be right, with multipliers {multipliers}; "
+            "gray_world estimates it"
         )
     if facts.camera_to_srgb:
         matrix = [list(row) for row in facts.camera_to_srgb]

@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
+from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.reference.curve import to_8_bit
 from clpipe.reference.random import normal_at
@@ -59,6 +60,8 @@ def _as_tuples(value: Any) -> Any:
 class IndependentNoise(Method):
     """Gaussian noise, independent in each pixel, channel and image; sigma is set or measured."""
 
+    alternatives: ClassVar = frozenset({"sigma", "measured"})
+
     measured: str = parameter(
         "",
         "A report of clpipe measure --json on finished pictures; the noise gets its sigma.",
@@ -73,13 +76,23 @@ class IndependentNoise(Method):
         return path
 
     @model_validator(mode="after")
-    def _one_of_two(self) -> Self:
-        has_sigma = getattr(self, "sigma", None) is not None
-        if has_sigma and self.measured:
+    def _at_most_one(self) -> Self:
+        if getattr(self, "sigma", None) is not None and self.measured:
             raise ValueError("found both sigma and measured; set one of them")
-        if not has_sigma and not self.measured:
-            raise ValueError("needs sigma, or measured, a report of clpipe measure --json")
         return self
+
+    def noise(self) -> tuple["ChannelNoise", ...]:
+        """The measured noise of red, green and blue.
+
+        Raises:
+            RequestError: neither sigma nor a report is set. It is refused as late as here because
+                options may choose the method, and each row of a manifest its report.
+        """
+        if not self.measured:
+            raise RequestError(
+                "picture_noise: needs sigma, or measured, a report of clpipe measure --json"
+            )
+        return measured_noise(self.measured)
 
 
 class IidGaussian(IndependentNoise):
@@ -108,7 +121,7 @@ class IidGaussian(IndependentNoise):
     def resolve(self, context: Context) -> "IidGaussian":
         if self.sigma is not None:
             return self
-        return self.filled(sigma=tuple(noise.sigma for noise in measured_noise(self.measured)))
+        return self.filled(sigma=tuple(noise.sigma for noise in self.noise()))
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("picture_noise", arguments=("red", "green", "blue"), random=NoiseScope.IMAGE),)
@@ -155,7 +168,7 @@ class IntensityDependent(IndependentNoise):
         if self.sigma is not None:
             return self
         places = np.linspace(0, 1, RESOLVED)
-        curves = (np.interp(places, c.intensity, c.sigmas) for c in measured_noise(self.measured))
+        curves = (np.interp(places, c.intensity, c.sigmas) for c in self.noise())
         return self.filled(sigma=tuple(tuple(curve.round(6).tolist()) for curve in curves))
 
     def table(self) -> Floats:

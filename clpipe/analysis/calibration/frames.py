@@ -13,9 +13,11 @@ from clpipe.base.types import Floats
 from clpipe.camera.profile import Matrix
 from clpipe.chain.chain import make_chain
 from clpipe.images.attributes import read_attributes
+from clpipe.images.dump import Dump, read_dump
 from clpipe.images.raw import RAW_SUFFIXES, RawFacts, read_facts, read_raw
 from clpipe.images.read import RENDER_SUFFIXES, read_image
 from clpipe.inputs.kept import carried_settings
+from clpipe.inputs.raw import may_be_dump
 from clpipe.reference.cfa import Pattern
 from clpipe.stage import Kind
 
@@ -26,13 +28,14 @@ MOSAICS = (*RENDER_SUFFIXES, ".png")  # endings of files with a mosaic that are 
 class FrameOverrides:
     """What the user states about all frames, instead of what their files say; None is not stated.
 
-    Levels are in DN.
+    Levels are in DN. ``dump`` is the format of headerless dumps.
     """
 
     black_level: float | None = None
     white_level: float | None = None
     pattern: Pattern | None = None
     iso: float | None = None
+    dump: Dump | None = None
 
     def check(self) -> None:
         """See that the numbers are possible.
@@ -61,7 +64,7 @@ class CalibrationFrame:
     exposure: str  # as text, "" if unknown
     sensor: Sensor
     signal: bool = False  # the file holds signal, not DN
-    facts: RawFacts | None = None  # of a camera raw
+    facts: RawFacts | Dump | None = None  # of a camera raw, or of a dump
     gains: tuple[float, float] | None = None  # white balance, red and blue (green = 1)
     xyz_to_camera: Matrix | None = None
 
@@ -71,7 +74,13 @@ class CalibrationFrame:
         Raises:
             ImageError: the file cannot be read, or is smaller than 16x16.
         """
-        if self.facts:
+        if isinstance(self.facts, Dump):
+            try:
+                data = self.path.read_bytes()
+            except OSError as error:
+                raise ImageError(f"{self.path}: cannot be read: {error.strerror}") from None
+            mosaic = read_dump(data, self.path, self.facts)
+        elif self.facts:
             mosaic = read_raw(self.path, self.facts)
         else:
             mosaic = read_image(self.path, mosaic=True).pixels.astype(np.float32)
@@ -121,13 +130,17 @@ def _frames_among(paths: Iterable[Path]) -> list[Path]:
 def read_frame(path: Path, overrides: FrameOverrides) -> CalibrationFrame:
     """Read the metadata of a frame: a camera raw, a mosaic that clpipe kept, or another mosaic.
 
+    A headerless dump is another mosaic, where the user states its format.
+
     Raises:
         ImageError: the file cannot be read, or holds no mosaic.
         RequestError: neither the file nor the user states what is needed.
     """
-    if path.suffix.lower() not in MOSAICS:
+    has_header = path.suffix.lower() in MOSAICS
+    dump = overrides.dump if may_be_dump(path) and not has_header else None
+    if not (has_header or dump):
         return _from_raw(path, overrides)
-    attributes = read_attributes(path)
+    attributes = read_attributes(path) if has_header else {}
     if "settings" in attributes:
         return _from_kept(path, attributes, overrides)
     missing = [
@@ -142,7 +155,7 @@ def read_frame(path: Path, overrides: FrameOverrides) -> CalibrationFrame:
     assert overrides.pattern and overrides.iso is not None
     assert overrides.black_level is not None and overrides.white_level is not None
     sensor = Sensor(overrides.pattern, overrides.black_level, overrides.white_level)
-    return CalibrationFrame(path, "unknown", "unknown", overrides.iso, "", sensor)
+    return CalibrationFrame(path, "unknown", "unknown", overrides.iso, "", sensor, facts=dump)
 
 
 def _from_raw(path: Path, overrides: FrameOverrides) -> CalibrationFrame:
