@@ -10,6 +10,7 @@ from clpipe.base.errors import DeviceError
 from clpipe.base.memory import available_memory
 from clpipe.base.text import one_of
 from clpipe.engine.cache_folder import prepare_environment
+from clpipe.engine.hardware import Hardware, hardware_of
 
 _process: int | None = None  # the process id that first used OpenCL, here or before a fork
 
@@ -33,6 +34,7 @@ class DeviceInfo:
     lanes: int
     problem: str
     handle: Any
+    hardware: Hardware
 
     @property
     def label(self) -> str:
@@ -89,6 +91,7 @@ def find_devices() -> list[DeviceInfo]:
                     lanes=lanes_for(type_, platform.name, device),
                     problem=problem_with(type_, platform.name, device),
                     handle=device,
+                    hardware=hardware_of(device),
                 )
             )
     return found
@@ -156,24 +159,30 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
 
 
 def choose_all(selectors: Sequence[str], devices: list[DeviceInfo]) -> list[DeviceInfo]:
-    """The devices that selectors name, each device once; each selector as in :func:`choose`.
+    """The devices that selectors name; each selector as in :func:`choose`.
 
     Without selectors: the default device and, if it is a GPU, all other GPUs of the same name,
-    because these give the same bits.
+    because these give the same bits. Each device is there once, also where two drivers offer it.
 
     Raises:
         DeviceError: as :func:`choose`.
     """
     if not selectors:
         first = choose(None, devices)
-        return [first] + [
+        chosen = [first] + [
             d
             for d in devices
             if d.type == first.type == "GPU" and d.name == first.name and not d.problem
-            if d.index != first.index
         ]
-    chosen = [choose(selector, devices) for selector in selectors]
-    return list({d.index: d for d in chosen}.values())
+    else:
+        chosen = [choose(selector, devices) for selector in selectors]
+    distinct: list[DeviceInfo] = []
+    for device in chosen:
+        if not any(
+            device.index == d.index or device.hardware.is_same(d.hardware) for d in distinct
+        ):
+            distinct.append(device)
+    return distinct
 
 
 def matches(selector: str, device: DeviceInfo) -> bool:
