@@ -97,6 +97,13 @@ def programs_of(info: DeviceInfo) -> Programs:
         return _by_device[key]
 
 
+def forget_programs(info: DeviceInfo, dead: Programs) -> None:
+    """See that nobody gets a context that is of no more use; who asks next makes a new one."""
+    with _lock:
+        if _by_device.get(info.handle.int_ptr) is dead:
+            del _by_device[info.handle.int_ptr]
+
+
 @contextmanager
 def announced(info: DeviceInfo) -> Iterator[None]:
     """Log that kernels are being compiled if that takes longer than :data:`LONG`; once a process.
