@@ -1,6 +1,8 @@
 """Many images: resuming, failing alone, being stopped, being looked at."""
 
+import itertools
 import json
+import logging
 import os
 import random
 import re
@@ -14,13 +16,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clpipe.base.errors import ImageError, RequestError
-from clpipe.batch import replay
+from clpipe.base.errors import DeviceError, ImageError, RequestError
+from clpipe.batch import replay, work
+from clpipe.batch.room import host_bytes
 from clpipe.batch.run_log import read_log
 from clpipe.batch.threads import Batch
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.formats import EVERY_FORMAT, ending_of
 from clpipe.chain.request import Request
+from clpipe.engine.runner import Runner
 from clpipe.images import write
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
@@ -659,27 +663,145 @@ def test_a_sidecar_made_with_other_libraries(clpipe, renders):
     assert "warning: was made with OpenImageIO 1.2.3; the bytes may be others" in stderr
 
 
-def test_what_nobody_expected_ends_the_run_and_does_not_hang(renders, tmp_path, monkeypatch):
+class Panic(BaseException):
+    """As extensions written in Rust raise it."""
+
+
+# Where an image is decoded, developed and encoded.
+INSIDE = {
+    "decode": (ImageLoader, "read"),
+    "device": (Runner, "run"),
+    "encode": (OutputWriter, "write"),
+}
+
+
+@pytest.mark.parametrize("step", INSIDE)
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (ValueError("a mistake of ours"), "unexpected ValueError: a mistake of ours"),
+        (Panic("of a library"), "unexpected Panic: of a library"),
+        (SystemExit(0), "unexpected SystemExit: 0"),
+        (MemoryError(), "there is not enough memory for it"),
+    ],
+)
+def test_what_nobody_expected_fails_its_image_alone(
+    clpipe, renders, monkeypatch, caplog, step, error, text
+):
+    owner, name = INSIDE[step]
+    right, calls = getattr(owner, name), itertools.count()
+
+    def planted(*arguments, **options):
+        if next(calls) == 2:
+            raise error
+        return right(*arguments, **options)
+
+    renders(6)
+    run = ("run", "in", "-o", "out", "--device", "numpy", "--stages", "exposure,gamma")
+    with monkeypatch.context() as patch, caplog.at_level(logging.DEBUG, "clpipe.batch.threads"):
+        patch.setattr(owner, name, planted)
+        told = clpipe(*run, status=1).stderr
+    (failed,) = [key for key, status in statuses("out").items() if status == "failed"]
+    assert f"clpipe: in/{failed}: {text}" in told
+    assert "5 of 6 images done, 1 failed" in told
+    assert not [name for name in written(Path("out")) if name.startswith(failed[:4])]
+    records = [r for r in caplog.records if r.name == "clpipe.batch.threads"]
+    assert [r.levelname for r in records] == ["DEBUG"] * (not isinstance(error, MemoryError))
+    assert all(r.exc_info[1] is error for r in records)
+    clpipe(*run)
+    assert "failed" not in statuses("out").values()
+
+
+def test_a_thread_that_dies_ends_the_run(renders, tmp_path, monkeypatch):
     renders(30)
     (tmp_path / "out").mkdir()
     worker, jobs = worker_of(tmp_path)
-    for step in ("decode", "develop", "encode"):
+    for dies in (Panic, ValueError):
         caught = []
 
-        def fail(*_):
-            raise ValueError("a mistake of ours")
+        def die(*_, dies=dies):
+            raise dies("a mistake of ours")
 
         def run(batch, caught=caught):
             try:
                 list(batch.run(jobs))
-            except ValueError as error:
+            except Exception as error:
                 caught.append(str(error))
 
         with monkeypatch.context() as patch:
-            patch.setattr(ImageWorker, step, fail)
-            batch = Batch(worker, [None], threads=1)
-            thread = threading.Thread(target=run, args=(batch,), daemon=True)
+            patch.setattr(work.Task, "outcome", die)  # of what is done behind an image's back
+            thread = threading.Thread(target=run, args=(Batch(worker, [None], 1),), daemon=True)
             thread.start()
             thread.join(20)
-            assert not thread.is_alive(), step
-        assert caught == ["a mistake of ours"]
+            assert not thread.is_alive()
+        assert len(caught) == 1 and "a mistake of ours" in caught[0]
+
+
+def test_what_a_device_leaves_another_does(renders, tmp_path, monkeypatch, caplog):
+    renders(8)
+    (tmp_path / "out").mkdir()
+    worker, jobs = worker_of(tmp_path)
+    broken = []
+
+    def develop(self, task, rendition, runner):
+        if threading.current_thread().name == "device 0":
+            broken.append(task.job)
+            raise DeviceError("it is given up")
+        while not broken:
+            time.sleep(0.01)
+        return right(self, task, rendition, runner)
+
+    right = ImageWorker.develop
+    monkeypatch.setattr(ImageWorker, "develop", develop)
+    outcomes = list(Batch(worker, [None, None]).run(jobs))
+    assert [o.status for o in outcomes] == ["done"] * 8
+    assert len(broken) == 1
+    assert "it is given up; the other devices go on" in caplog.text
+    for path in (tmp_path / "out").iterdir():
+        path.unlink()
+    with pytest.raises(DeviceError, match="it is given up"):
+        list(Batch(worker_of(tmp_path)[0], [None]).run(jobs))
+
+
+def test_images_wait_for_room(renders, tmp_path, monkeypatch):
+    renders(12)
+    (tmp_path / "out").mkdir()
+    worker, jobs = worker_of(tmp_path)
+    inside, seen, lock = set(), [], threading.Lock()
+    read, encode = ImageLoader.read, ImageWorker.encode
+
+    def reading(self, job):
+        with lock:
+            inside.add(job.key)
+            seen.append(len(inside))
+        return read(self, job)
+
+    def encoding(self, task, *arguments):
+        time.sleep(0.02)
+        encode(self, task, *arguments)
+        with lock:
+            inside.remove(task.job.key)
+
+    monkeypatch.setattr(ImageLoader, "read", reading)
+    monkeypatch.setattr(ImageWorker, "encode", encoding)
+    large = host_bytes(jobs[1], 1, ("png",), ())
+    assert large == 24 * 32 * (12 + 3)
+    for room, most in ((1, 1), (2 * large, 2), (100 * large, 4)):
+        seen.clear()
+        outcomes = list(Batch(worker, [None], threads=4, room=room).run(jobs))
+        assert [o.status for o in outcomes] == ["done"] * 12
+        assert 1 <= max(seen) <= most if most < 4 else max(seen) > 2
+        worker = worker_of(tmp_path)[0]
+        for path in (tmp_path / "out").iterdir():
+            path.unlink()
+
+
+def test_what_images_take(tmp_path, write_exr):
+    exr = Job(write_exr("a.exr", np.zeros((10, 20, 3), np.float32)), "a")
+    assert host_bytes(exr, 1, ("jpg",), ()) == 200 * (12 + 3)
+    assert host_bytes(exr, 3, ("jpg", "exr"), ("mosaic",)) == 200 * (12 + 3 * 27)
+    raw = tmp_path / "a.nef"
+    raw.write_bytes(bytes(1000))
+    other = raw.rename(tmp_path / "b.nef")
+    assert host_bytes(Job(other, "b"), 1, ("dng",), ()) == 1000 * 27
+    assert host_bytes(Job(tmp_path / "missing.exr", "c"), 1, ("jpg",), ()) == 0

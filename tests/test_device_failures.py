@@ -7,12 +7,18 @@ import pyopencl as cl
 import pytest
 
 from clpipe.base.errors import DeviceError, DeviceFailedError
+from clpipe.batch.threads import Batch
+from clpipe.batch.work import ImageWorker
 from clpipe.chain.chain import make_chain
+from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
 from clpipe.engine import device as devices
 from clpipe.engine.device import Device
 from clpipe.engine.programs import programs_of
 from clpipe.engine.runner import Runner
+from clpipe.inputs.find import find_jobs
+from clpipe.inputs.loader import ImageLoader
+from clpipe.outputs.writer import OutputWriter
 
 IMAGE = np.full((20, 30, 3), 0.5, np.float16)
 
@@ -108,3 +114,26 @@ def test_a_lack_of_memory_needs_no_new_context(device, monkeypatch):
     monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
     assert np.array_equal(runner.run(IMAGE, "k").encoded, expected)
     assert programs_of(device.info) is before
+
+
+def test_kernels_that_fail_in_a_batch_change_no_byte(device, write_exr, tmp_path, monkeypatch):
+    for i in range(12):
+        pixels = np.random.default_rng(i).random((20, 30, 3)).astype(np.float32)
+        write_exr(f"in/{i:02}.exr", pixels)
+    loader = ImageLoader(Request.from_options(stages="exposure,gamma", formats=("png",)))
+    jobs = find_jobs([str(tmp_path / "in")], tmp_path)
+
+    def made(name):
+        (tmp_path / name).mkdir()
+        writer = OutputWriter(tmp_path / name, loader.request)
+        worker = ImageWorker(loader, writer, loader.first_chain(jobs))
+        # Both have one context, as two on one device have: what breaks it for one does for both.
+        batch = Batch(worker, [Device(device.info), Device(device.info)])
+        statuses = [outcome.status for outcome in batch.run(jobs)]
+        return statuses, {p.name: p.read_bytes() for p in (tmp_path / name).iterdir()}
+
+    expected = made("whole")
+    fault = Fault(monkeypatch, {4})  # the first two launches are of tiny images, to compile
+    assert made("failing") == expected
+    assert expected[0] == ["done"] * 12
+    assert len(fault.dead) == 1

@@ -16,7 +16,7 @@ from clpipe.engine.calls import Bind, Call, index_space
 from clpipe.engine.codegen import Parameter, border_left, write_kernel
 from clpipe.engine.discovery import DeviceInfo, choose, choose_all, find_devices, usable_memory
 from clpipe.engine.plan import Plan
-from clpipe.engine.programs import programs_of, forget_programs
+from clpipe.engine.programs import forget_programs, programs_of
 from clpipe.engine.tiles import Extent, Tiling, tiling_of
 
 log = logging.getLogger(__name__)
