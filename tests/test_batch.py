@@ -1,5 +1,6 @@
 """Many images: resuming, failing alone, being stopped, being looked at."""
 
+import errno
 import itertools
 import json
 import logging
@@ -11,19 +12,23 @@ import subprocess
 import sys
 import threading
 import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from clpipe.base.errors import DeviceError, ImageError, RequestError
+from clpipe.base.errors import DeviceError, ImageError, OutputError, RequestError
 from clpipe.batch import replay, work
+from clpipe.batch.outcome import DONE, Outcome, Span
 from clpipe.batch.room import host_bytes
 from clpipe.batch.run_log import read_log
 from clpipe.batch.threads import Batch
+from clpipe.batch.trace import Trace
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.formats import EVERY_FORMAT, ending_of
 from clpipe.chain.request import Request
+from clpipe.commands.progress import Reporter
 from clpipe.engine.runner import Runner
 from clpipe.images import write
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
@@ -323,6 +328,53 @@ def test_a_trace_for_perfetto(clpipe, renders):
         )
 
 
+def test_the_trace_of_a_run_that_ends_early(clpipe, renders, monkeypatch):
+    run = ("run", renders(6), "-o", "out", "--device", "numpy", "--stages", "exposure,gamma")
+
+    def stop(self, outcome):
+        raise OutputError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Reporter, "report", stop)
+        clpipe(*run, "--jobs", 1, "--trace", "folder/t.json", status=1)
+    assert json.loads(Path("folder/t.json").read_text())["traceEvents"] == []
+    assert written(Path("folder")) == ["t.json"]
+    clpipe(*run, "--overwrite", "--trace", "folder/t.json")  # one of its own
+    assert len(json.loads(Path("folder/t.json").read_text())["traceEvents"]) > 3 * 6
+
+
+def test_a_trace_is_not_held_in_memory(tmp_path):
+    spans = tuple(Span(step, "device 0", 1.0, 0.5) for step in ("decode", "device", "encode"))
+    outcome = Outcome(Job(tmp_path / "a.exr", "a"), DONE, spans=spans)
+    tracemalloc.start()
+    with Trace(tmp_path / "t.json") as trace:
+        for _ in range(100):
+            trace.add(outcome)
+        before = tracemalloc.get_traced_memory()[0]
+        for _ in range(600):
+            trace.add(outcome)
+        assert tracemalloc.get_traced_memory()[0] < before + 20_000
+        tracemalloc.stop()
+        (beside,) = tmp_path.iterdir()
+        # What a killed process leaves can be read: the array needs no end.
+        text = beside.read_text().rpartition(",\n")[0] + "]}"
+        assert len(json.loads(text)["traceEvents"]) > 100
+    events = json.loads((tmp_path / "t.json").read_text())["traceEvents"]
+    assert len(events) == 1 + 3 * 700
+
+
+def test_a_trace_that_cannot_be_written_stops_no_image(clpipe, renders, monkeypatch):
+    def full(self, outcome):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Trace, "_events", full)
+    run = ("run", renders(3), "-o", "out", "--device", "numpy", "--stages", "exposure,gamma")
+    told = clpipe(*run, "--trace", "t.json", status=1).stderr
+    assert "t.json: cannot be written: No space left on device" in told
+    assert len(written(Path("out"))) == 6
+    assert not list(Path().glob("*t.json"))
+
+
 def test_two_runs_in_one_folder(tmp_path):
     holder = (
         "import sys; from pathlib import Path; from clpipe.outputs.folder import output_folder\n"
@@ -477,7 +529,7 @@ def start(folder, *arguments, environment=None):
 
 def wait_for(folder, count):
     """Wait until so many pictures are there."""
-    for _ in range(3000):
+    for _ in range(600):
         if len(list(folder.glob("*.json"))) >= count:
             return
         time.sleep(0.01)

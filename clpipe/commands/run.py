@@ -208,14 +208,12 @@ def run(
     if quiet:
         logging.getLogger("clpipe").setLevel(logging.WARNING)
     reporter = Reporter(summary, writer, Console(stderr=True), quiet)
-    events = Trace() if trace else None
-    with opened as batch, output_folder(output, shard):
+    events = Trace(trace) if trace else nullcontext()
+    with opened as batch, output_folder(output, shard), events as timeline:
         remove_unfinished(output, jobs)
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
         with closing(RunLog(output / log_name(shard), start)) as log:
-            follow(batch, jobs, summary, reporter, log, events)
-    if events and trace:
-        events.write(trace)
+            follow(batch, jobs, summary, reporter, log, timeline)
     if summary.interrupted:
         sys.exit(130)
     sys.exit(1 if summary.failures else 0)
