@@ -14,7 +14,14 @@ from clpipe.base.types import Array
 from clpipe.engine.buffers import HostImages, Pool, room_for
 from clpipe.engine.calls import Bind, Call, index_space
 from clpipe.engine.codegen import Parameter, border_left, write_kernel
-from clpipe.engine.discovery import DeviceInfo, choose, choose_all, find_devices, usable_memory
+from clpipe.engine.discovery import (
+    DeviceInfo,
+    choose,
+    choose_all,
+    find_devices,
+    shared_out,
+    usable_memory,
+)
 from clpipe.engine.plan import Plan
 from clpipe.engine.programs import forget_programs, programs_of
 from clpipe.engine.tiles import Extent, Tiling, tiling_of
@@ -368,10 +375,17 @@ def open_device(selector: str | None, memory: int | None = None) -> Device | Non
     return Device(choose(selector, find_devices()), memory)
 
 
-def open_devices(selectors: Sequence[str] = (), memory: int | None = None) -> list[Device]:
+def open_devices(
+    selectors: Sequence[str] = (), memory: int | None = None, share: tuple[int, int] = (0, 1)
+) -> list[Device]:
     """Open the devices that selectors name, see :func:`choose_all`; an empty list for "numpy".
 
-    ``memory`` is how many bytes the buffers of each may take; without it, CPUs share what is free.
+    Args:
+        selectors: of the devices.
+        memory: bytes that the buffers of each may take; without it, CPUs share what is free, and
+            processes share a GPU's.
+        share: the number of this process and of how many, where several of this machine share the
+            devices, see :func:`~clpipe.engine.discovery.shared_out`.
 
     Raises:
         DeviceError: as :func:`open_device`, or "numpy" stands beside others.
@@ -381,8 +395,12 @@ def open_devices(selectors: Sequence[str] = (), memory: int | None = None) -> li
             raise DeviceError(f"found devices {', '.join(selectors)}; numpy is used alone")
         return []
     chosen = choose_all(selectors, find_devices())
-    sharing = sum(info.type != "GPU" for info in chosen)
+    processes = share[1]
+    on_each_gpu = -(-processes // len(chosen))
+    on_cpus = max(sum(info.type != "GPU" for info in chosen), processes)
     return [
-        Device(info, memory or usable_memory(info) // (1 if info.type == "GPU" else sharing))
-        for info in chosen
+        Device(
+            info, memory or usable_memory(info) // (on_each_gpu if info.type == "GPU" else on_cpus)
+        )
+        for info in shared_out(chosen, *share)
     ]

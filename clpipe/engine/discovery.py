@@ -185,6 +185,23 @@ def choose_all(selectors: Sequence[str], devices: list[DeviceInfo]) -> list[Devi
     return distinct
 
 
+def shared_out(devices: list[DeviceInfo], number: int, of: int) -> list[DeviceInfo]:
+    """The devices of one of several processes of a machine, which take them in turn.
+
+    Where there are more processes than devices, several have the same one. All see the same order,
+    also where each was given the devices in another one.
+
+    Args:
+        devices: of all of the processes together.
+        number: of the process, from 0 on.
+        of: how many processes there are.
+    """
+    if of == 1:
+        return devices
+    ordered = sorted(devices, key=lambda d: (d.hardware.pci or (), d.index))
+    return ordered[number::of] or [ordered[number % len(ordered)]]
+
+
 def matches(selector: str, device: DeviceInfo) -> bool:
     """Whether a selector is a part of a device's name, type or platform ('pocl' counts)."""
     alias = " pocl" if "Portable Computing" in device.platform else ""
