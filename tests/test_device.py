@@ -56,7 +56,7 @@ def test_a_device_is_chosen_by_index_or_name(devices, selector, name):
     assert choose(selector, devices).name == name
 
 
-def test_devices_that_cannot_be_used(devices):
+def test_devices_that_cannot_be_used(devices, monkeypatch):
     with pytest.raises(DeviceError, match=r"broken .A.: it has no compiler"):
         choose("broken", devices)
     with pytest.raises(DeviceError, match=r"no usable OpenCL device .*an emulator.*no compiler"):
@@ -64,6 +64,9 @@ def test_devices_that_cannot_be_used(devices):
     with pytest.raises(DeviceError, match=r"unknown device 'x'.*0: slow.*numpy"):
         choose("x", devices)
     with pytest.raises(DeviceError, match="no OpenCL platform"):
+        choose(None, [])
+    monkeypatch.setenv("OCL_ICD_VENDORS", "/nowhere")
+    with pytest.raises(DeviceError, match=r"was found .OCL_ICD_VENDORS is '/nowhere'.; install"):
         choose(None, [])
 
 

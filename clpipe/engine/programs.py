@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError, RequestError
-from clpipe.engine.cache_folder import cache_folder
+from clpipe.engine.cache_folder import cache_folder, later_runs
 from clpipe.engine.codegen import Kernel
-from clpipe.engine.discovery import DeviceInfo
+from clpipe.engine.discovery import DeviceInfo, is_pocl
 
 LONG = 2.0  # s of compiling after which a user is told what is going on
 log = logging.getLogger(__name__)
@@ -48,8 +48,8 @@ class Programs:
         # PoCL keeps programs in the same folder by itself, with what it makes of them at the first
         # launch. For other platforms pyopencl keeps binaries under a key of text, options, device
         # and driver.
-        own_cache = "Portable Computing" in info.platform
-        self._cache_dir = False if own_cache else str(cache_folder() / "programs")
+        folder = None if is_pocl(info.platform) else cache_folder()
+        self._cache_dir = str(folder / "programs") if folder else False
 
     def __len__(self) -> int:
         """How many programs there are."""
@@ -114,9 +114,7 @@ def announced(info: DeviceInfo) -> Iterator[None]:
     def announce() -> None:
         if not _announced.is_set():
             _announced.set()
-            log.info(
-                "compiling kernels for %s; later runs find them in %s", info.label, cache_folder()
-            )
+            log.info("compiling kernels for %s; %s", info.label, later_runs(is_pocl(info.platform)))
 
     timer = threading.Timer(LONG, announce)
     timer.daemon = True
