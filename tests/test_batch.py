@@ -829,7 +829,7 @@ def test_images_wait_for_room(renders, tmp_path, monkeypatch):
         return read(self, job)
 
     def encoding(self, task, *arguments):
-        time.sleep(0.02)
+        time.sleep(0.05)
         encode(self, task, *arguments)
         with lock:
             inside.remove(task.job.key)
@@ -843,6 +843,8 @@ def test_images_wait_for_room(renders, tmp_path, monkeypatch):
         outcomes = list(Batch(worker, [None], threads=4, room=room).run(jobs))
         assert [o.status for o in outcomes] == ["done"] * 12
         assert 1 <= max(seen) <= most if most < 4 else max(seen) > 2
+        waited = 12 * 3 * 0.05  # s in all, where one at a time is inside
+        assert sum(o.seconds("decode") for o in outcomes) < waited / 2  # waiting is none of it
         worker = worker_of(tmp_path)[0]
         for path in (tmp_path / "out").iterdir():
             path.unlink()

@@ -245,6 +245,24 @@ def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
     assert len(fresh._pool.held) > 4
 
 
+@pytest.mark.parametrize("byte", [0xFF, 0x7F])  # NaN, and numbers near the largest
+def test_what_memory_held_before_does_not_matter(device, monkeypatch, byte):
+    chain = make_chain(settings_from({}))
+    image = np.random.default_rng(0).random((37, 53, 3)).astype(np.float16)
+    expected = Runner(chain, device).run(image, "k").encoded
+    make = Device._new_buffer
+
+    def used(self, size):
+        buffer = make(self, size)
+        cl.enqueue_copy(self._queue, buffer, np.full(size, byte, np.uint8))
+        return buffer
+
+    monkeypatch.setattr(Device, "_new_buffer", used)
+    for memory in (None, 60_000):  # whole, and in tiles
+        result = Runner(chain, Device(device.info, memory)).run(image, "k")
+        assert np.array_equal(result.encoded, expected)
+
+
 def test_pixels_into_an_array_that_is_there(device):
     runner = Runner(make_chain(settings_from({})), device)
     image = np.full((20, 30, 3), 0.5, np.float16)

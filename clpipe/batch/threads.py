@@ -8,8 +8,10 @@ it fits into the memory beside the others, so memory does not grow with the numb
 import logging
 import queue
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -185,11 +187,16 @@ class Batch:
 
     def _decode_all(self) -> None:
         while job := self._next():
+            waits: list[float] = []
             try:
-                task = self._worker.decode(job, partial(self._begin, job))
+                task = self._worker.decode(job, partial(self._begin, job, waits))
             except BaseException as error:  # nothing that one image does may end the thread
                 self._outcomes.put(Outcome(job, FAILED, error=failure_text(job, error)))
                 continue
+            for seconds in waits:  # for room, which is no decoding
+                (span,) = task.spans
+                start = span.start + seconds
+                task.spans = [replace(span, start=start, seconds=span.seconds - seconds)]
             if task.renditions:
                 self._decoded.put((task, deque(task.renditions)))
             else:
@@ -198,13 +205,15 @@ class Batch:
         self._places.release()  # for the next thread, which has no job to wait for either
         self._outcomes.put(None)
 
-    def _begin(self, job: Job) -> None:
-        """Wait until there is room for a job's image, which is decoded next."""
+    def _begin(self, job: Job, waits: list[float]) -> None:
+        """Wait until there is room for a job's image, and note how long: it is decoded next."""
         self._begun.set()
         writer = self._worker.writer
         results = min(len(writer.names_of(job)), self.threads + len(self.devices))
         size = host_bytes(job, results, writer.formats, writer.request.keep)
+        start = time.perf_counter()
         self._room.enter(job.stem, size)
+        waits.append(time.perf_counter() - start)
 
     def _develop_all(self, device: Device | None) -> None:
         self._begun.wait()  # a run that makes nothing compiles nothing
