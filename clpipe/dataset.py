@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.processors import available_processors
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import one_of
 from clpipe.base.validation import typed
@@ -120,7 +121,7 @@ class Dataset(ReadOnly):
         self._truth = truth
         self._selector = None if device is None else str(device)
         self._epochs = epochs
-        self._threads = threads or len(os.sched_getaffinity(0))
+        self._threads = threads or available_processors()
         self._opened: _Developer | None = None
         self.set_epoch(epoch)
 
@@ -185,7 +186,7 @@ class Dataset(ReadOnly):
             ImageError: an image cannot be read or processed.
             DeviceError: there is no usable device.
         """
-        set_codec_threads(max(len(os.sched_getaffinity(0)) // self._threads, 1))
+        set_codec_threads(max(available_processors() // self._threads, 1))
         ahead: deque[Future[Sample]] = deque()
         decoders = ThreadPoolExecutor(self._threads, "decode")
         developer = ThreadPoolExecutor(1, "device")

@@ -1,6 +1,9 @@
 """Many images: resuming, failing alone, being stopped, being looked at."""
 
+import errno
+import itertools
 import json
+import logging
 import os
 import random
 import re
@@ -9,19 +12,25 @@ import subprocess
 import sys
 import threading
 import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO
 import pytest
 
-from clpipe.base.errors import ImageError, RequestError
-from clpipe.batch import replay
+from clpipe.base.errors import DeviceError, ImageError, OutputError, RequestError
+from clpipe.batch import replay, work
+from clpipe.batch.outcome import DONE, Outcome, Span
+from clpipe.batch.room import host_bytes
 from clpipe.batch.run_log import read_log
 from clpipe.batch.threads import Batch
+from clpipe.batch.trace import Trace
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.formats import EVERY_FORMAT, ending_of
 from clpipe.chain.request import Request
+from clpipe.commands.progress import Reporter
+from clpipe.engine.runner import Runner
 from clpipe.images import write
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
@@ -105,7 +114,7 @@ def test_what_is_missing_or_changed_is_made_again(clpipe, renders, write_exr):
         ("--format", "png"),
         ("--keep", "normalize"),
         ("--set", "output.jpeg_quality=50"),
-        ("--iso", 100),
+        ("--noise-key", "ours"),
     ],
 )
 def test_another_request_is_a_change(clpipe, renders, more):
@@ -320,6 +329,53 @@ def test_a_trace_for_perfetto(clpipe, renders):
         )
 
 
+def test_the_trace_of_a_run_that_ends_early(clpipe, renders, monkeypatch):
+    run = ("run", renders(6), "-o", "out", "--device", "numpy", "--stages", "exposure,gamma")
+
+    def stop(self, outcome):
+        raise OutputError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Reporter, "report", stop)
+        clpipe(*run, "--jobs", 1, "--trace", "folder/t.json", status=1)
+    assert json.loads(Path("folder/t.json").read_text())["traceEvents"] == []
+    assert written(Path("folder")) == ["t.json"]
+    clpipe(*run, "--overwrite", "--trace", "folder/t.json")  # one of its own
+    assert len(json.loads(Path("folder/t.json").read_text())["traceEvents"]) > 3 * 6
+
+
+def test_a_trace_is_not_held_in_memory(tmp_path):
+    spans = tuple(Span(step, "device 0", 1.0, 0.5) for step in ("decode", "device", "encode"))
+    outcome = Outcome(Job(tmp_path / "a.exr", "a"), DONE, spans=spans)
+    tracemalloc.start()
+    with Trace(tmp_path / "t.json") as trace:
+        for _ in range(100):
+            trace.add(outcome)
+        before = tracemalloc.get_traced_memory()[0]
+        for _ in range(600):
+            trace.add(outcome)
+        assert tracemalloc.get_traced_memory()[0] < before + 20_000
+        tracemalloc.stop()
+        (beside,) = tmp_path.iterdir()
+        # What a killed process leaves can be read: the array needs no end.
+        text = beside.read_text().rpartition(",\n")[0] + "]}"
+        assert len(json.loads(text)["traceEvents"]) > 100
+    events = json.loads((tmp_path / "t.json").read_text())["traceEvents"]
+    assert len(events) == 1 + 3 * 700
+
+
+def test_a_trace_that_cannot_be_written_stops_no_image(clpipe, renders, monkeypatch):
+    def full(self, outcome):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Trace, "_events", full)
+    run = ("run", renders(3), "-o", "out", "--device", "numpy", "--stages", "exposure,gamma")
+    told = clpipe(*run, "--trace", "t.json", status=1).stderr
+    assert "t.json: cannot be written: No space left on device" in told
+    assert len(written(Path("out"))) == 6
+    assert not list(Path().glob("*t.json"))
+
+
 def test_two_runs_in_one_folder(tmp_path):
     holder = (
         "import sys; from pathlib import Path; from clpipe.outputs.folder import output_folder\n"
@@ -470,7 +526,7 @@ def start(folder, *arguments, environment=None):
 
 def wait_for(folder, count):
     """Wait until so many pictures are there."""
-    for _ in range(3000):
+    for _ in range(600):
         if len(list(folder.glob("*.json"))) >= count:
             return
         time.sleep(0.01)
@@ -663,27 +719,147 @@ def test_a_sidecar_made_with_other_libraries(clpipe, renders):
         assert f"warning: was made with device {key} {value} (now " in stderr
 
 
-def test_what_nobody_expected_ends_the_run_and_does_not_hang(renders, tmp_path, monkeypatch):
+class Panic(BaseException):
+    """As extensions written in Rust raise it."""
+
+
+# Where an image is decoded, developed and encoded.
+INSIDE = {
+    "decode": (ImageLoader, "read"),
+    "device": (Runner, "run"),
+    "encode": (OutputWriter, "write"),
+}
+
+
+@pytest.mark.parametrize("step", INSIDE)
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (ValueError("a mistake of ours"), "unexpected ValueError: a mistake of ours"),
+        (Panic("of a library"), "unexpected Panic: of a library"),
+        (SystemExit(0), "unexpected SystemExit: 0"),
+        (MemoryError(), "there is not enough memory for it"),
+    ],
+)
+def test_what_nobody_expected_fails_its_image_alone(
+    clpipe, renders, monkeypatch, caplog, step, error, text
+):
+    owner, name = INSIDE[step]
+    right, calls = getattr(owner, name), itertools.count()
+
+    def planted(*arguments, **options):
+        if next(calls) == 2:
+            raise error
+        return right(*arguments, **options)
+
+    renders(6)
+    run = ("run", "in", "-o", "out", "--device", "numpy", "--stages", "exposure,gamma")
+    with monkeypatch.context() as patch, caplog.at_level(logging.DEBUG, "clpipe.batch.threads"):
+        patch.setattr(owner, name, planted)
+        told = clpipe(*run, status=1).stderr
+    (failed,) = [key for key, status in statuses("out").items() if status == "failed"]
+    assert f"clpipe: in/{failed}: {text}" in told
+    assert "5 of 6 images done, 1 failed" in told
+    assert not [name for name in written(Path("out")) if name.startswith(failed[:4])]
+    records = [r for r in caplog.records if r.name == "clpipe.batch.threads"]
+    assert [r.levelname for r in records] == ["DEBUG"] * (not isinstance(error, MemoryError))
+    assert all(r.exc_info[1] is error for r in records)
+    clpipe(*run)
+    assert "failed" not in statuses("out").values()
+
+
+def test_a_thread_that_dies_ends_the_run(renders, tmp_path, monkeypatch):
     renders(30)
     (tmp_path / "out").mkdir()
     worker, jobs = worker_of(tmp_path)
-    for step in ("decode", "develop", "encode"):
+    for dies in (Panic, ValueError):
         caught = []
 
-        def fail(*_):
-            raise ValueError("a mistake of ours")
+        def die(*_, dies=dies):
+            raise dies("a mistake of ours")
 
         def run(batch, caught=caught):
             try:
                 list(batch.run(jobs))
-            except ValueError as error:
+            except Exception as error:
                 caught.append(str(error))
 
         with monkeypatch.context() as patch:
-            patch.setattr(ImageWorker, step, fail)
-            batch = Batch(worker, [None], threads=1)
-            thread = threading.Thread(target=run, args=(batch,), daemon=True)
+            patch.setattr(work.Task, "outcome", die)  # of what is done behind an image's back
+            thread = threading.Thread(target=run, args=(Batch(worker, [None], 1),), daemon=True)
             thread.start()
             thread.join(20)
-            assert not thread.is_alive(), step
-        assert caught == ["a mistake of ours"]
+            assert not thread.is_alive()
+        assert len(caught) == 1 and "a mistake of ours" in caught[0]
+
+
+def test_what_a_device_leaves_another_does(renders, tmp_path, monkeypatch, caplog):
+    renders(8)
+    (tmp_path / "out").mkdir()
+    worker, jobs = worker_of(tmp_path)
+    broken = []
+
+    def develop(self, task, rendition, runner):
+        if threading.current_thread().name == "device 0":
+            broken.append(task.job)
+            raise DeviceError("it is given up")
+        while not broken:
+            time.sleep(0.01)
+        return right(self, task, rendition, runner)
+
+    right = ImageWorker.develop
+    monkeypatch.setattr(ImageWorker, "develop", develop)
+    outcomes = list(Batch(worker, [None, None]).run(jobs))
+    assert [o.status for o in outcomes] == ["done"] * 8
+    assert len(broken) == 1
+    assert "it is given up; the other devices go on" in caplog.text
+    for path in (tmp_path / "out").iterdir():
+        path.unlink()
+    with pytest.raises(DeviceError, match="it is given up"):
+        list(Batch(worker_of(tmp_path)[0], [None]).run(jobs))
+
+
+def test_images_wait_for_room(renders, tmp_path, monkeypatch):
+    renders(12)
+    (tmp_path / "out").mkdir()
+    worker, jobs = worker_of(tmp_path)
+    inside, seen, lock = set(), [], threading.Lock()
+    read, encode = ImageLoader.read, ImageWorker.encode
+
+    def reading(self, job):
+        with lock:
+            inside.add(job.key)
+            seen.append(len(inside))
+        return read(self, job)
+
+    def encoding(self, task, *arguments):
+        time.sleep(0.05)
+        encode(self, task, *arguments)
+        with lock:
+            inside.remove(task.job.key)
+
+    monkeypatch.setattr(ImageLoader, "read", reading)
+    monkeypatch.setattr(ImageWorker, "encode", encoding)
+    large = host_bytes(jobs[1], 1, ("png",), ())
+    assert large == 24 * 32 * (12 + 3)
+    for room, most in ((1, 1), (2 * large, 2), (100 * large, 4)):
+        seen.clear()
+        outcomes = list(Batch(worker, [None], threads=4, room=room).run(jobs))
+        assert [o.status for o in outcomes] == ["done"] * 12
+        assert 1 <= max(seen) <= most if most < 4 else max(seen) > 2
+        waited = 12 * 3 * 0.05  # s in all, where one at a time is inside
+        assert sum(o.seconds("decode") for o in outcomes) < waited / 2  # waiting is none of it
+        worker = worker_of(tmp_path)[0]
+        for path in (tmp_path / "out").iterdir():
+            path.unlink()
+
+
+def test_what_images_take(tmp_path, write_exr):
+    exr = Job(write_exr("a.exr", np.zeros((10, 20, 3), np.float32)), "a")
+    assert host_bytes(exr, 1, ("jpg",), ()) == 200 * (12 + 3)
+    assert host_bytes(exr, 3, ("jpg", "exr"), ("mosaic",)) == 200 * (12 + 3 * 27)
+    raw = tmp_path / "a.nef"
+    raw.write_bytes(bytes(1000))
+    other = raw.rename(tmp_path / "b.nef")
+    assert host_bytes(Job(other, "b"), 1, ("dng",), ()) == 1000 * 27
+    assert host_bytes(Job(tmp_path / "missing.exr", "c"), 1, ("jpg",), ()) == 0

@@ -18,11 +18,21 @@ import clpipe as package
 from clpipe.base.errors import OutputError
 from clpipe.batch import dask_client as cluster
 from clpipe.batch import dask_worker, work
-from clpipe.batch.dask_worker import RunSpec, WorkerEnvironment, probe_worker, worker_environment
+from clpipe.batch.dask_worker import (
+    RunSpec,
+    WorkerEnvironment,
+    probe_worker,
+    share_of,
+    worker_environment,
+)
 from clpipe.batch.run_log import RunLog
 from clpipe.chain.request import Request
 from clpipe.commands.progress import Reporter
+from clpipe.engine.device import open_devices
+from clpipe.engine.discovery import shared_out
+from clpipe.engine.hardware import Hardware
 from clpipe.inputs.find import Job
+from tests.conftest import ROOT
 
 IMAGES = 40
 
@@ -71,6 +81,17 @@ def die_at_sidecar(number):
         write(path, record)
 
     work.write_sidecar = planted
+
+
+def note_folders():
+    """On a worker: note the working directory at each image from now on."""
+    decode, work.folders = work.ImageWorker.decode, set()
+
+    def noting(this, job, begin):
+        work.folders.add(os.getcwd())
+        return decode(this, job, begin)
+
+    work.ImageWorker.decode = noting
 
 
 class DieOf(WorkerPlugin):
@@ -244,10 +265,9 @@ def test_a_worker_sees_the_same_files(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "probe").touch()
     first = Job(Path("a.exr"), "a.exr")
-    options = (("numpy",), None, None, False, False, "run", str(tmp_path))
-    spec = RunSpec(Request(formats=("jpg",)), Path("out"), *options, first=first)
-    elsewhere = replace(spec, folder=str(tmp_path / "elsewhere"))
-    assert "elsewhere, where the run was started" in probe_worker(elsewhere, "probe", None)
+    options = (("numpy",), None, None, False, False, False, "run", tmp_path)
+    spec = RunSpec(Request(formats=("jpg",)), Path("out"), *options).anchored()
+    spec = replace(spec, first=spec.anchored_job(first))
     assert probe_worker(spec, "probe", None).startswith("does not see the output folder")
     (tmp_path / "probe").rename(tmp_path / "out" / "probe")
     assert probe_worker(spec, "probe", 3) == f"does not see the input {tmp_path / 'a.exr'}"
@@ -255,6 +275,70 @@ def test_a_worker_sees_the_same_files(tmp_path):
     assert probe_worker(spec, "probe", 3) == f"does not see the input {tmp_path / 'a.exr'}"
     assert probe_worker(spec, "probe", 4) == worker_environment(("numpy",))
     assert isinstance(probe_worker(spec, "probe", None), WorkerEnvironment)
+
+
+def test_a_worker_has_a_folder_of_its_own(clpipe, renders, workers, address, tmp_path):
+    profile = (ROOT / "clpipe/camera/profiles/sony-a7r2.toml").read_text()
+    Path("own").mkdir()
+    Path("own/mine.toml").write_text(profile)
+    Path("curve.csv").write_text("0,0\n1,1\n")
+    Path("own/c.toml").write_text('camera = "mine.toml"\n')
+    Path("own/list.csv").write_text("path,name\n../in/f01.exr,a\n../in/no.exr,b\n")
+    workers.run(note_folders)
+    asked = ("--device", "numpy", "--keep", "mosaic", "--format", "png")
+    chosen = (*asked, "-c", "own/c.toml", "--set", "tone_curve.method=file")
+    chosen += ("--set", "tone_curve.path=curve.csv")
+    inputs = ("in/f00.exr", "in/missing.exr", "own/list.csv")
+    told = clpipe("run", *inputs, *chosen, "-o", "out", "--dask", address, status=1)
+    for missing in ("in/missing.exr", "own/../in/no.exr"):
+        assert f"clpipe: {missing}: no such file" in told.stderr
+    seen = workers.run(lambda: work.folders).values()
+    assert set().union(*seen) == set(workers.run(os.getcwd).values()) != {str(tmp_path)}
+    clpipe("run", *inputs, *chosen, "-o", "whole", status=1)
+    for folder in ("out", "whole"):
+        assert json.loads((tmp_path / folder / "f00.json").read_text())["input"] == "in/f00.exr"
+    logged = [{(i["input"], i["error"]) for i in log(o)[1:-1]} for o in ("out", "whole")]
+    assert logged[0] == logged[1]
+    dask, whole = contents("out"), contents("whole")
+    assert dask.keys() == whole.keys()
+    pictures = [path for path in dask if path.suffix == ".png"]
+    assert len(pictures) == 2 and all(dask[path] == whole[path] for path in pictures)
+    again = clpipe("run", *inputs, *chosen, "-o", "out", status=1)  # the request is the same
+    assert "(2 of them were there already)" in again.stderr
+    # What a kept image carries names files, too.
+    go_on = ("--start-at", "inverse_white_balance", "--device", "numpy", "--format", "png")
+    clpipe("run", "out/f00.mosaic.exr", *go_on, "-o", "next", "--dask", address)
+    clpipe("run", "whole/f00.mosaic.exr", *go_on, "-o", "after")
+    png = Path("f00.mosaic.png")
+    assert contents("next")[png] == contents("after")[png]
+
+
+def test_workers_of_a_machine_share_its_devices(device):
+    at = [Hardware(1, pci=(0, bus, 0, 0)) for bus in (3, 1, 2)]
+    gpus = [replace(device.info, index=i, type="GPU", hardware=h) for i, h in enumerate(at)]
+
+    def shared(of, devices=gpus):
+        return [[d.hardware.pci[1] for d in shared_out(devices, i, of)] for i in range(of)]
+
+    assert shared(1) == [[3, 1, 2]]
+    assert shared(2) == [[1, 3], [2]]
+    assert shared(3, gpus[::-1]) == [[1], [2], [3]]  # as dask-cuda turns them round
+    assert shared(5) == [[1], [2], [3], [1], [2]]
+    assert share_of("inproc://10.0.0.1/7/1", ["inproc://10.0.0.1/7/2"]) == (0, 1)
+    assert share_of("tcp://[::1]:9", ["tcp://[::1]:8"]) == (1, 2)
+
+
+def test_what_processes_share_is_for_all_of_them(monkeypatch):
+    opened = [open_devices(["0"], share=(i, of))[0] for i, of in ((0, 1), (1, 4))]
+    assert 0.2 < opened[1].memory / opened[0].memory < 0.3
+
+
+def test_an_environment_names_driver_and_libraries(device):
+    environment = worker_environment(())
+    platform = device.info.handle.platform.version
+    assert f"driver {device.info.driver}, {platform}" in environment.device
+    for library in ("NumPy", "OpenImageIO", "rawpy", "OpenEXR"):
+        assert f"{library} " in environment.libraries
 
 
 def test_a_scheduler_that_cannot_be_reached(clpipe, renders, monkeypatch):

@@ -1,19 +1,24 @@
 """The choice of a device, and what one cannot do."""
 
+import struct
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 from clpipe.base.errors import DeviceError, ImageError
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.commands.devices import device_rows
+from clpipe.engine import hardware
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.discovery import choose, choose_all, find_devices
+from clpipe.engine.hardware import Hardware, hardware_of
 from clpipe.engine.runner import Runner
 from clpipe.engine.tiles import Extent
 
@@ -51,7 +56,7 @@ def test_a_device_is_chosen_by_index_or_name(devices, selector, name):
     assert choose(selector, devices).name == name
 
 
-def test_devices_that_cannot_be_used(devices):
+def test_devices_that_cannot_be_used(devices, monkeypatch):
     with pytest.raises(DeviceError, match=r"broken .A.: it has no compiler"):
         choose("broken", devices)
     with pytest.raises(DeviceError, match=r"no usable OpenCL device .*an emulator.*no compiler"):
@@ -59,6 +64,9 @@ def test_devices_that_cannot_be_used(devices):
     with pytest.raises(DeviceError, match=r"unknown device 'x'.*0: slow.*numpy"):
         choose("x", devices)
     with pytest.raises(DeviceError, match="no OpenCL platform"):
+        choose(None, [])
+    monkeypatch.setenv("OCL_ICD_VENDORS", "/nowhere")
+    with pytest.raises(DeviceError, match=r"was found .OCL_ICD_VENDORS is '/nowhere'.; install"):
         choose(None, [])
 
 
@@ -74,6 +82,51 @@ def test_several_devices_are_chosen(devices):
     assert names() == ["3fast", "4fast"]
     with pytest.raises(DeviceError, match="unknown device 'x'"):
         names("slow", "x")
+
+
+def test_a_gpu_that_two_drivers_offer_is_one(devices):
+    gpu = devices[3]
+    on_board = {"pci": (0, 65, 0, 0), "uuid": b"a" * 16}
+
+    def chosen(*hardware, selectors=()):
+        both = [replace(gpu, index=i, hardware=h) for i, h in enumerate(hardware)]
+        return [d.index for d in choose_all(selectors, both)]
+
+    assert chosen(Hardware(1, **on_board), Hardware(2, pci=(0, 65, 0, 0))) == [0]
+    assert chosen(Hardware(1, **on_board), Hardware(2, uuid=b"a" * 16)) == [0]
+    assert chosen(Hardware(1, **on_board), Hardware(2, **on_board), selectors=("1", "0")) == [1]
+    assert chosen(Hardware(1, **on_board), Hardware(2, pci=(0, 66, 0, 0))) == [0, 1]
+    assert chosen(Hardware(1, **on_board), Hardware(1, **on_board)) == [0, 1]  # parts of a board
+    assert chosen(Hardware(1), Hardware(2)) == [0, 1]  # nobody knows
+
+
+class FakeDevice:
+    """What hardware_of() asks of a pyopencl.Device."""
+
+    def __init__(self, **values):
+        self.platform = SimpleNamespace(int_ptr=7)
+        self.values = values
+
+    def __getattr__(self, name):
+        if name not in self.values:
+            raise cl.LogicError("clGetDeviceInfo failed: INVALID_VALUE")
+        return self.values[name]
+
+
+def test_what_drivers_say_of_hardware(device, monkeypatch):
+    told = {}
+    monkeypatch.setattr(hardware, "queried", lambda _, name: told.get(name))
+    nvidia = FakeDevice(pci_domain_id_nv=1, pci_bus_id_nv=65, pci_slot_id_nv=3 << 3 | 1)
+    assert hardware_of(nvidia) == Hardware(7, (1, 65, 3, 1))
+    amd = FakeDevice(topology_amd=SimpleNamespace(bus=65, device=3, function=1))
+    assert hardware_of(amd) == Hardware(7, (0, 65, 3, 1))
+    assert hardware_of(FakeDevice()) == Hardware(7)
+    told.update({0x410F: struct.pack("4I", 1, 65, 3, 1), 0x106A: b"u" * 16})
+    assert hardware_of(FakeDevice()) == Hardware(7, (1, 65, 3, 1), b"u" * 16)
+    monkeypatch.undo()
+    version = hardware.queried(device.info.handle, cl.device_info.VENDOR_ID, 4)
+    assert version == struct.pack("I", device.info.handle.vendor_id)
+    assert hardware.queried(device.info.handle, 0xFFFF) is None
 
 
 def test_devices_are_opened():
@@ -190,6 +243,24 @@ def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
     runner.run(images[0], "k")
     other.run(images[0], "k")
     assert len(fresh._pool.held) > 4
+
+
+@pytest.mark.parametrize("byte", [0xFF, 0x7F])  # NaN, and numbers near the largest
+def test_what_memory_held_before_does_not_matter(device, monkeypatch, byte):
+    chain = make_chain(settings_from({}))
+    image = np.random.default_rng(0).random((37, 53, 3)).astype(np.float16)
+    expected = Runner(chain, device).run(image, "k").encoded
+    make = Device._new_buffer
+
+    def used(self, size):
+        buffer = make(self, size)
+        cl.enqueue_copy(self._queue, buffer, np.full(size, byte, np.uint8))
+        return buffer
+
+    monkeypatch.setattr(Device, "_new_buffer", used)
+    for memory in (None, 60_000):  # whole, and in tiles
+        result = Runner(chain, Device(device.info, memory)).run(image, "k")
+        assert np.array_equal(result.encoded, expected)
 
 
 def test_pixels_into_an_array_that_is_there(device):

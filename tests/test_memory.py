@@ -1,9 +1,12 @@
-"""Amounts of memory: what people write, and what a machine has left."""
+"""Memory and processors: what people write, and what a machine has left."""
+
+import os
 
 import pytest
 
 from clpipe.base.errors import RequestError
 from clpipe.base.memory import available_memory, parse_size
+from clpipe.base.processors import available_processors
 
 
 @pytest.mark.parametrize(
@@ -59,3 +62,34 @@ def test_memory_left_in_groups_of_the_first_version(tmp_path):
 def test_memory_left_on_this_machine():
     left = available_memory()
     assert left is None or left > 2**20
+
+
+@pytest.fixture
+def _hundred_processors(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(100)))
+
+
+@pytest.mark.usefixtures("_hundred_processors")
+def test_processors_are_the_least_of_what_the_kernel_and_control_groups_say(tmp_path):
+    assert available_processors(tmp_path) == 100
+    write(tmp_path, proc__self__cgroup="0::/job/step\n")
+    group = tmp_path / "sys/fs/cgroup/job"
+    (group / "step").mkdir(parents=True)
+    (group / "step" / "cpu.max").write_text("max 100000\n")
+    assert available_processors(tmp_path) == 100
+    (group / "cpu.max").write_text("250000 100000\n")
+    assert available_processors(tmp_path) == 3
+    (group / "step" / "cpu.max").write_text("10000 100000\n")
+    assert available_processors(tmp_path) == 1
+
+
+@pytest.mark.usefixtures("_hundred_processors")
+def test_processors_in_groups_of_the_first_version(tmp_path):
+    write(tmp_path, proc__self__cgroup="5:memory:/x\n4:cpu,cpuacct:/docker/1\n")
+    group = tmp_path / "sys/fs/cgroup/cpu"
+    group.mkdir(parents=True)
+    (group / "cpu.cfs_period_us").write_text("50000\n")
+    (group / "cpu.cfs_quota_us").write_text("-1\n")
+    assert available_processors(tmp_path) == 100
+    (group / "cpu.cfs_quota_us").write_text("200000\n")
+    assert available_processors(tmp_path) == 4

@@ -6,14 +6,19 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import platformdirs
+import pyopencl as cl
 import pytest
 
+from clpipe.base.errors import DeviceError
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
-from clpipe.engine import programs
+from clpipe.engine import cache_folder, programs
 from clpipe.engine.device import Device
+from clpipe.engine.discovery import choose, find_devices
 from clpipe.engine.runner import Runner
 from tests.conftest import STILL_LIFE
 
@@ -48,6 +53,63 @@ def test_a_home_that_cannot_be_written_to_gets_a_temporary_cache(tmp_path):
     assert Path(folder).name.startswith("clpipe-")
     assert not Path(folder).exists()  # it went with the process
     python(DEVELOP, HOME=tmp_path / "file")
+
+
+def test_a_folder_that_pocl_cannot_use_is_replaced(tmp_path):
+    (tmp_path / "file").touch()
+    python(DEVELOP, CLPIPE_CACHE_DIR=tmp_path, POCL_CACHE_DIR=tmp_path / "file" / "x")
+
+
+def test_a_user_without_a_home(monkeypatch):
+    def fail(_):
+        raise RuntimeError("could not determine the home directory")  # platformdirs from 4.5 on
+
+    with monkeypatch.context() as patch:
+        patch.setattr(platformdirs, "user_cache_path", fail)
+        assert cache_folder.user_folder() is None
+    monkeypatch.setattr(platformdirs, "user_cache_path", lambda _: Path("~/.cache"))
+    assert cache_folder.user_folder() is None
+    assert not cache_folder.is_usable(None)
+
+
+def test_what_a_folder_for_programs_needs(tmp_path, monkeypatch):
+    def mounted(flags=0, room=2**30):
+        status = SimpleNamespace(f_flag=flags, f_bavail=room // 4096, f_frsize=4096)
+        monkeypatch.setattr(os, "statvfs", lambda _: status)
+
+    mounted()
+    assert cache_folder.is_usable(tmp_path / "new", runs_code=True)
+    mounted(os.ST_NOEXEC)
+    assert cache_folder.is_usable(tmp_path)
+    assert not cache_folder.is_usable(tmp_path, runs_code=True)
+    mounted(room=2**20)
+    assert not cache_folder.is_usable(tmp_path)
+
+
+def test_why_pocl_cannot_work_is_said(device, monkeypatch):
+    if "Portable Computing" not in device.info.platform:
+        pytest.skip("needs PoCL")
+    for name in ("POCL_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(name, "/nowhere")
+    monkeypatch.setattr(cache_folder, "is_usable", lambda *_, **__: False)
+    monkeypatch.setattr(cache_folder, "cache_folder", cache_folder.cache_folder.__wrapped__)
+    reason = r"PoCL needs a folder .* 32 MiB of room; /nowhere and .* none; name one with CLPIPE"
+    with pytest.raises(DeviceError, match=reason):
+        choose(None, find_devices())
+    monkeypatch.setattr(cl.Platform, "get_devices", lambda _: [])  # as PoCL has it at first
+    with pytest.raises(DeviceError, match=reason):
+        choose(None, find_devices())
+    monkeypatch.setattr(cache_folder, "is_usable", lambda *_, **__: True)
+    with pytest.raises(DeviceError, match=r"Computing Language.: it offers no device"):
+        choose(None, find_devices())
+
+
+def test_later_runs_find_only_what_lasts(tmp_path):
+    words = "from clpipe.engine.cache_folder import later_runs; print(later_runs(True))"
+    assert python(words, CLPIPE_CACHE_DIR=tmp_path) == f"later runs find them in {tmp_path}"
+    (tmp_path / "file").touch()
+    told = python(words, CLPIPE_CACHE_DIR=tmp_path / "file")
+    assert told == f"later runs do so again, because they cannot be kept in {tmp_path / 'file'}"
 
 
 def test_a_second_process_compiles_nothing(device, tmp_path):

@@ -115,7 +115,7 @@ def test_a_request_and_its_loader_can_be_sent_with_a_stage_file(tmp_path, monkey
     loader = ImageLoader(request)
     assert [s.name for s in loader.chain.steps] == ["exposure", "sent"]
     sent = pickle.loads(pickle.dumps(loader))
-    assert sent == loader and set(vars(sent)) == {"request"}
+    assert sent == loader and set(vars(sent)) == {"request", "folder"}
     assert sent.chain.names == loader.chain.names
 
 

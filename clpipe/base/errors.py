@@ -39,6 +39,10 @@ class KindError(ImageError):
         self.attributes = attributes
 
 
+class DeviceFailedError(ImageError):
+    """A device failed at one image, though it was tried again; it may do for others."""
+
+
 class DeviceError(ClpipeError):
     """There is no usable device, or the requested one cannot be used."""
 

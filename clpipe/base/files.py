@@ -113,16 +113,25 @@ def write_whole(path: Path, *parts: bytes | memoryview) -> Stored:
     return Stored(size, digest.hexdigest())
 
 
-def write_new(path: Path, data: bytes) -> Stored:
-    """Make the folders above ``path`` where they are missing, then :func:`write_whole`.
+def make_folder_of(path: Path) -> None:
+    """Make the folders above a file that is to be written, where they are missing.
 
     Raises:
-        ImageError: the file cannot be written.
+        ImageError: they cannot be made.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ImageError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def write_new(path: Path, data: bytes) -> Stored:
+    """Make the folders above a file where they are missing, then :func:`write_whole`.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    make_folder_of(path)
     return write_whole(path, data)
 
 

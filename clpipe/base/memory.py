@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+from clpipe.base.control_groups import group_folders
 from clpipe.base.errors import RequestError
 
 UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
@@ -55,28 +56,13 @@ def _available(meminfo: Path) -> int | None:
 
 
 def _left_in_groups(root: Path) -> list[int | None]:
-    """Bytes left in each control group of this process and in its parents (version 1 or 2)."""
-    try:
-        lines = (root / "proc/self/cgroup").read_text().splitlines()
-    except OSError:
-        return []
-    left = []
-    for line in lines:
-        _, controllers, path = line.split(":", 2)
-        if controllers not in ("", "memory"):
-            continue
-        mount = root / "sys/fs/cgroup" / controllers
-        names = (
-            ("memory.limit_in_bytes", "memory.usage_in_bytes")
-            if controllers
-            else ("memory.max", "memory.current")
-        )
-        own = mount / path.lstrip("/")
-        for folder in (own, *own.parents):
-            left.append(_left_in_group(folder, *names))
-            if folder == mount:
-                break
-    return left
+    """Bytes left in each control group of this process and in its parents."""
+    first = ("memory.limit_in_bytes", "memory.usage_in_bytes")
+    second = ("memory.max", "memory.current")
+    return [
+        _left_in_group(folder, *(first if is_first_version else second))
+        for folder, is_first_version in group_folders("memory", root)
+    ]
 
 
 def _left_in_group(folder: Path, limit: str, used: str) -> int | None:

@@ -1,6 +1,5 @@
 """Benchmark of whole batches: how near threads come to the limit that their CPU time sets."""
 
-import os
 import re
 import shutil
 import tempfile
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.errors import ImageError
+from clpipe.base.processors import available_processors
 from clpipe.batch.outcome import DONE, STEPS, Outcome
 from clpipe.batch.threads import Batch
 from clpipe.batch.work import ImageWorker
@@ -165,7 +165,7 @@ def bench_batch(device: Device, request: Request, load: Load) -> BatchSpeed:
         load.height,
         serial_s=serial_s,
         batch_s=clock.seconds["batch"],
-        limit_s=sum(clock.cpu[step] for step in STEPS) / len(os.sched_getaffinity(0)),
+        limit_s=sum(clock.cpu[step] for step in STEPS) / available_processors(),
         cpu_ms=cpu,
         alone_ms=alone,
         overhead_ms=serial_s / n * 1e3 - sum(alone.values()),

@@ -22,6 +22,7 @@ from clpipe.batch.dask_worker import (
     ChunkReport,
     RunSpec,
     WorkerEnvironment,
+    as_written,
     check_same,
     check_same_environment,
     close_devices,
@@ -105,7 +106,7 @@ class Cluster:
     def __init__(self, client: Any, address: str, spec: RunSpec) -> None:
         self._client = client
         self._address = address
-        self._spec = spec
+        self._spec = spec.anchored()
         self._stopping = False
         self._finished: queue.SimpleQueue[Any] = queue.SimpleQueue()  # futures; None means stop
         self._running: dict[Any, tuple[list[Job], bool]] = {}  # chunks, and whether each runs alone
@@ -128,8 +129,9 @@ class Cluster:
             OutputError: nothing can be written any more.
             ClusterError: the scheduler or all workers have gone.
         """
-        self._probe(jobs)
-        return self._outcomes(jobs)
+        anchored = list(map(self._spec.anchored_job, jobs))
+        self._probe(anchored)
+        return self._outcomes(anchored)
 
     def _probe(self, jobs: Sequence[Job]) -> None:
         """See that all workers have one environment, and see the same files as this machine."""
@@ -190,10 +192,11 @@ class Cluster:
             ClusterError: there have been no workers for long, or the scheduler has gone.
         """
         try:
-            workers = len(self._client.nthreads())
+            addresses = tuple(sorted(self._client.nthreads()))
         except (OSError, ValueError, RuntimeError):
             raise self._gone() from None
-        if workers:
+        self._spec = replace(self._spec, workers=addresses)
+        if workers := len(addresses):
             self._seen = time.monotonic()
         elif time.monotonic() - self._seen > PATIENCE:
             raise ClusterError(
@@ -292,7 +295,8 @@ class _Chunks:
 
 
 def _failed(chunk: Sequence[Job], reason: str) -> ChunkReport:
-    return ChunkReport([Outcome(job, FAILED, error=f"{job.path}: {reason}") for job in chunk], LONG)
+    failed = (Outcome(job, FAILED, error=f"{job.path}: {reason}") for job in chunk)
+    return ChunkReport(list(map(as_written, failed)), LONG)
 
 
 def _worker_name(error: Any) -> str:

@@ -1,16 +1,16 @@
 """What a Dask worker does of a run: it says what it is, and runs chunks of jobs.
 
-A worker keeps its devices open from chunk to chunk.
+A worker keeps its devices open from chunk to chunk, and shares those of its machine with the
+workers beside it.
 """
 
-import contextlib
-import os
 import secrets
 import threading
 import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import lru_cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,13 @@ import numpy as np
 from clpipe.base.about import __version__
 from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.batch.outcome import Outcome
+from clpipe.batch.room import usual_room
 from clpipe.batch.threads import Batch
 from clpipe.batch.work import ImageWorker
+from clpipe.chain.paths import from_folder
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_devices
-from clpipe.engine.discovery import choose_all, find_devices
+from clpipe.engine.discovery import DeviceInfo, choose_all, find_devices
 from clpipe.images.write import versions
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
@@ -44,6 +46,7 @@ class RunSpec:
         overwrite, verify, trace: as for :class:`clpipe.batch.work.ImageWorker`.
         run: a name that no other run has.
         folder: where relative paths start.
+        workers: the addresses of all workers there are.
         environment: what every worker must be.
         first: the job whose chain is compiled early.
     """
@@ -57,9 +60,36 @@ class RunSpec:
     verify: bool
     trace: bool
     run: str = field(default_factory=lambda: secrets.token_hex(8))
-    folder: str = field(default_factory=os.getcwd)
+    folder: Path = field(default_factory=Path.cwd)
+    workers: tuple[str, ...] = ()
     environment: "WorkerEnvironment | None" = None
     first: Job | None = None
+
+    def anchored(self) -> "RunSpec":
+        """The same run with names of files absolute, for workers in other folders."""
+        folder, asked = self.folder, self.request
+        request = replace(
+            asked,
+            config=None if asked.config is None else from_folder(folder, asked.config),
+            options=from_folder(folder, asked.options),
+            image=from_folder(folder, asked.image),
+        )
+        return replace(self, request=request, output=folder / self.output)
+
+    def anchored_job(self, job: Job) -> Job:
+        """A job of the run with names of files absolute."""
+        values = from_folder(self.folder, job.values)
+        return replace(job, path=self.folder / job.path, values=values, written=job.input)
+
+
+def as_written(outcome: Outcome) -> Outcome:
+    """The outcome of an anchored job, with its path as the user wrote it."""
+    job = outcome.job
+    return replace(
+        outcome,
+        job=replace(job, path=Path(job.input)),
+        error=outcome.error.replace(str(job.path), job.input),
+    )
 
 
 @dataclass(frozen=True)
@@ -80,17 +110,32 @@ class ChunkReport:
     error: ClpipeError | None = None
 
 
-_one_chunk = threading.Lock()  # devices are for one thread, and the current folder is the process's
+_one_chunk = threading.Lock()  # devices are for one thread
 
 _halted: set[str] = set()
 
 _batches: dict[str, Batch] = {}  # by the name of the run
 
 
-@cache
-def _devices(selectors: tuple[str, ...], memory: int | None) -> Sequence[Device | None]:
+@lru_cache(maxsize=1)  # the share changes as workers come and go
+def _devices(
+    selectors: tuple[str, ...], memory: int | None, share: tuple[int, int]
+) -> Sequence[Device | None]:
     """The devices, open from chunk to chunk; [None] is NumPy."""
-    return open_devices(selectors, memory) or [None]
+    return open_devices(selectors, memory, share) or [None]
+
+
+def share_of(worker: str, workers: Collection[str]) -> tuple[int, int]:
+    """Which of the workers of its machine one is, from 0 on, and how many there are, by address.
+
+    >>> share_of("tcp://b:2", ["tcp://b:1", "tcp://a:1", "tcp://b:3", "tcp://b:2"])
+    (1, 3)
+    """
+    scheme_and_host, _, port = worker.rpartition(":")
+    if not port.isdecimal():  # within one process
+        return 0, 1
+    beside = sorted({worker, *(w for w in workers if w.rpartition(":")[0] == scheme_and_host)})
+    return beside.index(worker), len(beside)
 
 
 def close_devices() -> None:
@@ -107,11 +152,18 @@ def worker_environment(selectors: Sequence[str]) -> WorkerEnvironment:
     device = "numpy"
     if [selector.lower() for selector in selectors] != [device]:
         chosen = choose_all(selectors, find_devices())
-        device = " and ".join(sorted({f"{d.label}, {d.lanes} lanes" for d in chosen}))
+        device = " and ".join(sorted({device_text(info) for info in chosen}))
     libraries = {"NumPy": np.__version__, **versions()}
+    libraries |= {name: version(name) for name in ("rawpy", "OpenEXR")}
     return WorkerEnvironment(
         __version__, device, ", ".join(f"{k} {v}" for k, v in libraries.items())
     )
+
+
+def device_text(info: DeviceInfo) -> str:
+    """All of a device that bits may depend on."""
+    platform = info.handle.platform.version.strip()
+    return f"{info.label}, driver {info.driver}, {platform}, {info.lanes} lanes"
 
 
 def probe_worker(spec: RunSpec, probe: str, size: int | None) -> WorkerEnvironment | str:
@@ -126,16 +178,13 @@ def probe_worker(spec: RunSpec, probe: str, size: int | None) -> WorkerEnvironme
         environment = worker_environment(spec.selectors)
     except ClpipeError as error:
         return str(error)
-    folder = os.path.join(spec.folder, spec.output)
     assert spec.first
-    path = os.path.join(spec.folder, spec.first.path)
-    if not os.path.isdir(spec.folder):
-        return f"does not see {spec.folder}, where the run was started"
-    if not os.path.exists(os.path.join(folder, probe)):
-        return f"does not see the output folder {folder}"
-    if reason := write_problem(Path(folder)):
-        return f"{folder}: {reason}"
-    if size is not None and (not os.path.exists(path) or os.path.getsize(path) != size):
+    path = spec.first.path
+    if not (spec.output / probe).exists():
+        return f"does not see the output folder {spec.output}"
+    if reason := write_problem(spec.output):
+        return f"{spec.output}: {reason}"
+    if size is not None and (not path.exists() or path.stat().st_size != size):
         return f"does not see the input {path}"
     return environment
 
@@ -154,19 +203,20 @@ def run_chunk(spec: RunSpec, jobs: Sequence[Job]) -> ChunkReport:
     began = time.perf_counter()
     outcomes: list[Outcome] = []
     error = None
-    with _one_chunk, contextlib.chdir(spec.folder):
+    with _one_chunk:
         try:
             environment = worker_environment(spec.selectors)
             if environment != spec.environment:
                 check_same_environment(
                     {"the others": spec.environment, worker.address: environment}
                 )
-            batch = _batches[spec.run] = _batch(spec, worker.state.nthreads)
+            share = share_of(worker.address, spec.workers)
+            batch = _batches[spec.run] = _batch(spec, worker.state.nthreads, share)
             if spec.run in _halted:
                 batch.stop()
             since = time.time() - time.perf_counter()
             for outcome in batch.run(jobs):
-                outcomes.append(shifted(outcome, since, f"{worker.address} "))
+                outcomes.append(shifted(as_written(outcome), since, f"{worker.address} "))
                 if is_abandoned():  # by the process that started the run
                     batch.stop()
         except ClpipeError as problem:
@@ -176,13 +226,20 @@ def run_chunk(spec: RunSpec, jobs: Sequence[Job]) -> ChunkReport:
     return ChunkReport(outcomes, time.perf_counter() - began, error)
 
 
-def _batch(spec: RunSpec, threads: int) -> Batch:
-    """The batch of one chunk; ``threads`` where the run does not say how many."""
+def _batch(spec: RunSpec, threads: int, share: tuple[int, int]) -> Batch:
+    """The batch of one chunk.
+
+    Args:
+        spec: the run.
+        threads: where the run does not say how many.
+        share: which of the workers of this machine this one is, and of how many.
+    """
     assert spec.first
-    loader, writer = ImageLoader(spec.request), OutputWriter(spec.output, spec.request)
+    loader, writer = ImageLoader(spec.request, spec.folder), OutputWriter(spec.output, spec.request)
     chain = loader.first_chain([spec.first])
     worker = ImageWorker(loader, writer, chain, spec.overwrite, spec.verify, spec.trace)
-    return Batch(worker, _devices(spec.selectors, spec.memory), spec.threads or threads)
+    devices = _devices(spec.selectors, spec.memory, share)
+    return Batch(worker, devices, spec.threads or threads, usual_room(share[1]))
 
 
 def halt(run: str) -> None:

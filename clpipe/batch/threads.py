@@ -1,28 +1,53 @@
 """Many images at once: threads that decode, develop and encode, with a few images in flight.
 
 An image is decoded by one thread, each rendition of it is developed by a device's thread and
-encoded by another one. A job is let in only when one before it has left, so memory does not grow
-with the number of jobs.
+encoded by another one. A job is let in only when one before it has left, and its image only when
+it fits into the memory beside the others, so memory does not grow with the number of jobs.
 """
 
-import os
+import logging
 import queue
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
-from clpipe.base.errors import OutputError
-from clpipe.batch.outcome import Outcome
-from clpipe.batch.work import ImageWorker, Task
+from clpipe.base.errors import ClpipeError, DeviceError, OutputError
+from clpipe.base.processors import available_processors
+from clpipe.batch.outcome import FAILED, Outcome
+from clpipe.batch.room import Room, host_bytes, usual_room
+from clpipe.batch.work import ImageWorker, Runners, Task
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.find import Job
 from clpipe.outputs.renditions import Rendition
 
+# A task and those of its renditions that are not developed yet.
+Decoded = tuple[Task, deque[Rendition]]
+
 # A rendition between a device and its files.
 Developed = tuple[Task, Rendition, Result, Device | None]
+
+log = logging.getLogger(__name__)
+
+
+def failure_text(job: Job, error: BaseException) -> str:
+    """The message of an image that failed of an error that nobody expected.
+
+    Its traceback goes to the log, at the level DEBUG.
+    """
+    if isinstance(error, MemoryError):
+        reason = "there is not enough memory for it"
+    elif isinstance(error, ClpipeError):
+        reason = str(error)
+    else:
+        reason = f"unexpected {type(error).__name__}: {error}".removesuffix(": ")
+    log.debug("%s: %s", job.path, reason, exc_info=error)
+    return f"{job.path}: {reason}"
 
 
 class Batch:
@@ -32,26 +57,33 @@ class Batch:
         worker: what is done to each image.
         devices: where to develop, a thread for each; [None] is NumPy.
         threads: how many decode, and how many encode; None is one for each processor.
+        room: bytes that images in flight may take; None is :func:`~clpipe.batch.room.usual_room`.
     """
 
     def __init__(
-        self, worker: ImageWorker, devices: Sequence[Device | None], threads: int | None = None
+        self,
+        worker: ImageWorker,
+        devices: Sequence[Device | None],
+        threads: int | None = None,
+        room: int | None = None,
     ) -> None:
         self.devices = list(devices)
-        self.threads = threads or len(os.sched_getaffinity(0))
+        self.threads = threads or available_processors()
         self.in_flight = self.threads + len(self.devices) + 1
         self._worker = worker
         worker.reserve(self.threads + len(self.devices))
         self._waiting: deque[Job] = deque()
         self._admitted = 0
+        self._developing = len(self.devices)
         self._failure: Exception | None = None
         self._stopping = threading.Event()
         self._broken = self._closing = False
         self._begun = threading.Event()  # there is something to develop
         self._lock = threading.Lock()
         self._places = threading.Semaphore(self.in_flight)
+        self._room = Room(usual_room() if room is None else room)
         self._results = threading.Semaphore(self.threads + len(self.devices))
-        self._decoded: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
+        self._decoded: queue.SimpleQueue[Decoded | None] = queue.SimpleQueue()
         self._developed: queue.SimpleQueue[Developed | None] = queue.SimpleQueue()
         # None: a thread that decodes has ended, or one of any kind has failed.
         self._outcomes: queue.SimpleQueue[Outcome | None] = queue.SimpleQueue()
@@ -67,10 +99,11 @@ class Batch:
 
         Raises:
             OutputError: nothing can be written any more. What was in flight is reported before.
-            DeviceError: a kernel does not compile.
+            DeviceError: on no device is work possible any more. Where some can still be used, the
+                others' work is theirs.
         """
-        processors = len(os.sched_getaffinity(0))
-        set_codec_threads(max(processors // min(self.threads, max(len(jobs), 1)), 1))
+        at_a_time = min(self.threads, max(len(jobs), 1))
+        set_codec_threads(max(available_processors() // at_a_time, 1))
         self._waiting.extend(jobs)
         numbers = range(self.threads)
         decoders = [self._start(f"decode {i}", self._decode_all) for i in numbers]
@@ -90,8 +123,8 @@ class Batch:
         def guarded() -> None:
             try:
                 work(*arguments)
-            except Exception as error:
-                self._fail(error)
+            except BaseException as error:
+                self._fail(error if isinstance(error, Exception) else RuntimeError(repr(error)))
                 self._broken = True
                 self._outcomes.put(None)
 
@@ -113,6 +146,7 @@ class Batch:
                 ended += 1
                 continue
             finished += 1
+            self._room.leave(outcome.job.stem)
             self._places.release()
             yield outcome
         if self._failure:
@@ -128,6 +162,7 @@ class Batch:
         self.stop()
         self._closing = True
         self._begun.set()
+        self._room.open()
         for _ in decoders:
             self._places.release()
         for _ in developers:
@@ -152,34 +187,81 @@ class Batch:
 
     def _decode_all(self) -> None:
         while job := self._next():
-            task = self._worker.decode(job, self._begun.set)
+            waits: list[float] = []
+            try:
+                task = self._worker.decode(job, partial(self._begin, job, waits))
+            except BaseException as error:  # nothing that one image does may end the thread
+                self._outcomes.put(Outcome(job, FAILED, error=failure_text(job, error)))
+                continue
+            for seconds in waits:  # for room, which is no decoding
+                (span,) = task.spans
+                start = span.start + seconds
+                task.spans = [replace(span, start=start, seconds=span.seconds - seconds)]
             if task.renditions:
-                self._decoded.put(task)
+                self._decoded.put((task, deque(task.renditions)))
             else:
                 self._outcomes.put(task.outcome())
             del task
         self._places.release()  # for the next thread, which has no job to wait for either
         self._outcomes.put(None)
 
+    def _begin(self, job: Job, waits: list[float]) -> None:
+        """Wait until there is room for a job's image, and note how long: it is decoded next."""
+        self._begun.set()
+        writer = self._worker.writer
+        results = min(len(writer.names_of(job)), self.threads + len(self.devices))
+        size = host_bytes(job, results, writer.formats, writer.request.keep)
+        start = time.perf_counter()
+        self._room.enter(job.stem, size)
+        waits.append(time.perf_counter() - start)
+
     def _develop_all(self, device: Device | None) -> None:
         self._begun.wait()  # a run that makes nothing compiles nothing
         if self._closing:
             return
-        runners = self._worker.runners(device)
-        while task := self._decoded.get():
-            for rendition in task.renditions:
-                self._results.acquire()
-                if self._broken:
-                    return
-                result = None
+        decoded: Decoded | None = None
+        try:
+            runners = self._worker.runners(device)
+            while decoded := self._decoded.get():
+                self._develop(*decoded, runners, device)
+                decoded = None  # or its memory would be held until there is another one
+        except DeviceError as error:
+            with self._lock:
+                self._developing -= 1
+                is_last = not self._developing
+            if is_last:
+                raise
+            log.warning("%s; the other devices go on", error)
+            if decoded:
+                self._decoded.put(decoded)
+
+    def _develop(
+        self, task: Task, left: deque[Rendition], runners: Runners, device: Device | None
+    ) -> None:
+        """Develop what is left of a task.
+
+        Raises:
+            DeviceError: the device cannot be used any more; what it did not develop is left.
+        """
+        while left and not self._broken:
+            self._results.acquire()
+            if self._broken:
+                return
+            result = None
+            try:
                 if not task.error:
-                    result = self._worker.develop(task, rendition, runners.of(rendition))
-                if result:
-                    self._developed.put((task, rendition, result, device))
-                else:
-                    self._count_written(task)
-                del result
-            del task, rendition
+                    result = self._worker.develop(task, left[0], runners.of(left[0]))
+            except DeviceError:
+                self._results.release()
+                raise
+            except BaseException as error:
+                task.error = failure_text(task.job, error)
+            rendition = left.popleft()
+            if result:
+                self._developed.put((task, rendition, result, device))
+            else:
+                self._count_written(task)
+            del result
 
     def _encode_all(self) -> None:
         while developed := self._developed.get():
@@ -189,6 +271,8 @@ class Batch:
             except OutputError as error:
                 task.error = f"{task.job.path}: {error}"
                 self._fail(error)
+            except BaseException as error:
+                task.error = failure_text(task.job, error)
             self._count_written(task)
             del developed, task
 

@@ -1,12 +1,15 @@
 """A run as a trace, for Perfetto (ui.perfetto.dev) and chrome://tracing."""
 
+import contextlib
 import json
 import os
+import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from clpipe.base.errors import RequestError
-from clpipe.base.files import write_new
+from clpipe.base.files import make_folder_of, whole_file
 from clpipe.batch.outcome import STEPS, Outcome
 
 BEGINNING = b'{"traceEvents"'
@@ -34,47 +37,74 @@ def check_trace(path: Path) -> None:
 class Trace:
     """What each thread did when: the steps of each image, each launch and each transfer.
 
-    The file is in Chrome's "Trace Event Format" (complete events, in microseconds).
+    The file is in Chrome's "Trace Event Format" (complete events, in microseconds). Events go to a
+    file beside it, which gets its name when the context is left, also by an error. A process that
+    is killed leaves that file; it can be read as it is, because the format needs no end.
+
+    Args:
+        path: the file.
     """
 
-    def __init__(self) -> None:
-        self._events: list[dict[str, Any]] = []
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._stack = contextlib.ExitStack()
         self._threads: dict[str, int] = {}
+        self._began = time.perf_counter()
+        self._separator = b"\n"
+        self._error: OSError | None = None
 
-    def add(self, outcome: Outcome) -> None:
-        """Add the spans of one image."""
-        for span in outcome.spans:
-            is_step = span.step in STEPS
-            number = self._threads.setdefault(span.worker, len(self._threads) + 1)
-            event = {
-                "name": f"{span.step} {outcome.job.stem}" if is_step else span.step,
-                "cat": span.step if is_step else "launch",
-                "ph": "X",
-                "ts": span.start * 1e6,
-                "dur": span.seconds * 1e6,
-                "pid": os.getpid(),
-                "tid": number,
-                "args": {"input": str(outcome.job.path), "megapixels": outcome.megapixels},
-            }
-            self._events.append(event)
-
-    def write(self, path: Path) -> None:
-        """Write the trace.
+    def __enter__(self) -> Self:
+        """Begin the file.
 
         Raises:
             ImageError: it cannot be written.
         """
-        first = min((event["ts"] for event in self._events), default=0.0)
-        events = [{**event, "ts": event["ts"] - first} for event in self._events]
-        names: list[dict[str, Any]] = [
-            {
-                "name": "thread_name",
-                "ph": "M",
+        make_folder_of(self._path)
+        self._file = self._stack.enter_context(whole_file(self._path))
+        self._file.write(BEGINNING + b": [")
+        return self
+
+    def add(self, outcome: Outcome) -> None:
+        """Add the spans of one image. Where that fails, the error comes at the end."""
+        if self._error:
+            return
+        try:
+            for event in self._events(outcome):
+                self._file.write(self._separator + json.dumps(event).encode())
+                self._separator = b",\n"
+        except OSError as error:
+            self._error = error
+
+    def __exit__(self, *error: object) -> None:
+        """End the file.
+
+        Raises:
+            ImageError: it could not be written.
+        """
+        with self._stack:
+            if self._error:
+                raise self._error
+            self._file.write(b'\n], "displayTimeUnit": "ms"}\n')
+
+    def _events(self, outcome: Outcome) -> Iterator[dict[str, Any]]:
+        for span in outcome.spans:
+            is_step = span.step in STEPS
+            if span.worker not in self._threads:
+                self._threads[span.worker] = len(self._threads) + 1
+                yield {
+                    "name": "thread_name",
+                    "ph": "M",
+                    "pid": os.getpid(),
+                    "tid": self._threads[span.worker],
+                    "args": {"name": span.worker},
+                }
+            yield {
+                "name": f"{span.step} {outcome.job.stem}" if is_step else span.step,
+                "cat": span.step if is_step else "launch",
+                "ph": "X",
+                "ts": (span.start - self._began) * 1e6,
+                "dur": span.seconds * 1e6,
                 "pid": os.getpid(),
-                "tid": number,
-                "args": {"name": worker},
+                "tid": self._threads[span.worker],
+                "args": {"input": str(outcome.job.path), "megapixels": outcome.megapixels},
             }
-            for worker, number in self._threads.items()
-        ]
-        text = json.dumps({"traceEvents": [*names, *events], "displayTimeUnit": "ms"})
-        write_new(path, text.encode())

@@ -1,12 +1,12 @@
 """``clpipe bench``: how fast a chain, a stage's methods or whole batches are on a device."""
 
-import os
 from dataclasses import asdict
 from typing import Any
 
 import click
 
 from clpipe.base.errors import RequestError
+from clpipe.base.processors import available_processors
 from clpipe.batch.bench import BatchSpeed, bench_batch, loads
 from clpipe.chain.methods import stage_named
 from clpipe.chain.request import Request
@@ -99,7 +99,7 @@ def bench(
         if as_json:
             show_json({"device": device.info.label, "batches": [b.record() for b in batches]})
             return
-        click.echo(f"{device.info.label}: half EXR to JPEG, {len(os.sched_getaffinity(0))} CPUs")
+        click.echo(f"{device.info.label}: half EXR to JPEG, {available_processors()} CPUs")
         show(BATCH_HEADINGS, map(batch_row, batches), left=1)
         return
     report = run_bench(device, chain, int(width), int(height), repeat)

@@ -220,16 +220,14 @@ def run(
     if quiet:
         logging.getLogger("clpipe").setLevel(logging.WARNING)
     reporter = Reporter(summary, writer, Console(stderr=True), quiet)
-    events = Trace() if trace else None
-    with opened as batch, output_folder(output, shard):
+    events = Trace(trace) if trace else nullcontext()
+    with opened as batch, output_folder(output, shard), events as timeline:
         if replay and isinstance(batch, Batch):
             warn_of_changes(replay, again, batch.devices[0])
         remove_unfinished(output, jobs)
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
         with closing(RunLog(output / log_name(shard), start)) as log:
-            follow(batch, jobs, summary, reporter, log, events)
-    if events and trace:
-        events.write(trace)
+            follow(batch, jobs, summary, reporter, log, timeline)
     if summary.interrupted:
         sys.exit(130)
     sys.exit(1 if summary.failures else 0)

@@ -4,6 +4,8 @@ import atexit
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -11,43 +13,93 @@ import platformdirs
 
 VARIABLE = "CLPIPE_CACHE_DIR"  # names another folder
 
+ROOM = 32 * 2**20  # bytes; with less, PoCL's compiler may end the process
 
-def is_writable(folder: Path) -> bool:
-    """Whether a folder can be written to, after it is made if need be."""
-    if folder.parts[:1] == ("~",):  # the user has no home
+
+def is_usable(folder: Path | None, runs_code: bool = False) -> bool:
+    """Whether compiled programs can be kept in a folder, after it is made if need be.
+
+    ``runs_code`` is whether they are loaded from there, as PoCL does, which needs a file system
+    that is not mounted as "noexec".
+    """
+    if folder is None:
         return False
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
-            return True
+            system = os.statvfs(folder)
     except OSError:
         return False
+    has_room = system.f_bavail * system.f_frsize >= ROOM
+    return has_room and not (runs_code and system.f_flag & os.ST_NOEXEC)
+
+
+def user_folder(name: str | None = None) -> Path | None:
+    """The user's cache folder, or that of a program; None for a user without a home."""
+    with suppress(RuntimeError):  # newer versions of platformdirs
+        folder = platformdirs.user_cache_path(name)
+        return None if folder.parts[:1] == ("~",) else folder  # older ones
+    return None
+
+
+@cache  # before prepare_environment() changes the environment
+def lasting_folder() -> Path | None:
+    """The folder that ``CLPIPE_CACHE_DIR`` names, else the user's cache folder for clpipe."""
+    named = os.environ.get(VARIABLE)
+    return Path(named) if named else user_folder("clpipe")
 
 
 @cache
-def cache_folder() -> Path:
-    """The folder for compiled programs, which is there and can be written to.
+def cache_folder(runs_code: bool = False) -> Path | None:
+    """The folder for compiled programs; None where there is none. Argument as :func:`is_usable`.
 
-    It is the folder that ``CLPIPE_CACHE_DIR`` names, else the user's cache folder for clpipe. Where
-    that cannot be written to, it is a temporary folder that is removed when the process ends.
+    It is the lasting one, else a temporary folder that is removed when the process ends.
     """
-    named = os.environ.get(VARIABLE)
-    folder = Path(named) if named else platformdirs.user_cache_path("clpipe")
-    if is_writable(folder):
+    folder = lasting_folder()
+    if folder and is_usable(folder, runs_code):
         return folder.resolve()
-    temporary = tempfile.mkdtemp(prefix="clpipe-")
-    atexit.register(shutil.rmtree, temporary, ignore_errors=True)
-    return Path(temporary)
+    for place in temporary_places():
+        if is_usable(place, runs_code):
+            temporary = tempfile.mkdtemp(prefix="clpipe-", dir=place)
+            atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+            return Path(temporary)
+    return None
+
+
+def temporary_places() -> Iterator[Path]:
+    """Folders for temporary files, the usual one first."""
+    with suppress(FileNotFoundError):
+        yield Path(tempfile.gettempdir())
+    yield from (Path("/var/tmp"), Path("/dev/shm"))  # noqa: S108
+
+
+def later_runs(runs_code: bool) -> str:
+    """Where later runs find what is compiled now, in words. Argument as :func:`is_usable`."""
+    folder, lasting = cache_folder(runs_code), lasting_folder()
+    if folder and lasting and folder == lasting.resolve():
+        return f"later runs find them in {folder}"
+    return f"later runs do so again, because they cannot be kept in {lasting or 'a home'}"
 
 
 def prepare_environment() -> None:
     """Have the libraries below keep their caches where they can; before OpenCL is first used.
 
     PoCL keeps its programs in our folder too, unless the user named another one. Both it and
-    pyopencl fail to start where the user's cache folder cannot be written to, so there pyopencl
-    gets ours as well.
+    pyopencl fail to start where their cache folder cannot be used, so there they get ours.
     """
-    folder = cache_folder()
-    os.environ.setdefault("POCL_CACHE_DIR", str(folder / "pocl"))
-    if not is_writable(platformdirs.user_cache_path()):
+    if pocl_problem() and (folder := cache_folder(runs_code=True)):
+        os.environ["POCL_CACHE_DIR"] = str(folder / "pocl")
+    if not is_usable(user_folder()) and (folder := cache_folder()):
         os.environ["XDG_CACHE_HOME"] = str(folder)
+
+
+def pocl_problem() -> str:
+    """Why PoCL has no folder to compile in, or nothing."""
+    named = os.environ.get("POCL_CACHE_DIR")
+    if named and is_usable(Path(named), runs_code=True):
+        return ""
+    return (
+        "PoCL needs a folder that can be written to and run from (no 'noexec'), with "
+        f"{ROOM >> 20} MiB of room; {named or lasting_folder() or 'a home'} and the folders for "
+        f"temporary files are none; name one with {VARIABLE}"
+    )

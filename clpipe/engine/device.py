@@ -1,5 +1,6 @@
 """An open OpenCL device: it puts images through plans, whole or in tiles."""
 
+import logging
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -8,15 +9,25 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.base.errors import DeviceError, ImageError
+from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array
 from clpipe.engine.buffers import HostImages, Pool, room_for
 from clpipe.engine.calls import Bind, Call, index_space
 from clpipe.engine.codegen import Parameter, border_left, write_kernel
-from clpipe.engine.discovery import DeviceInfo, choose, choose_all, find_devices, usable_memory
+from clpipe.engine.discovery import (
+    DeviceInfo,
+    choose,
+    choose_all,
+    find_devices,
+    shared_out,
+    usable_memory,
+)
 from clpipe.engine.plan import Plan
-from clpipe.engine.programs import programs_of
+from clpipe.engine.programs import forget_programs, programs_of
 from clpipe.engine.tiles import Extent, Tiling, tiling_of
+
+log = logging.getLogger(__name__)
+FAILURES = 3  # images in a row that a device fails at, before it is given up
 
 
 @dataclass(frozen=True)
@@ -70,14 +81,28 @@ class Device:
         self.info = chosen
         self.memory = memory or usable_memory(chosen)
         self._cl = cl
-        self._programs = programs_of(chosen)
+        self._failures = 0  # images in a row
+        self._open()
+
+    def _open(self) -> None:
+        """Make a queue, and nothing else yet, in the context that all on this device share.
+
+        Raises:
+            DeviceError: the device cannot be opened.
+        """
+        self._programs = programs_of(self.info)
         self._context = self._programs.context
-        self._queue = cl.CommandQueue(
-            self._context, properties=cl.command_queue_properties.PROFILING_ENABLE
-        )
         self._calls: dict[Plan, list[Call]] = {}
         self._pool = Pool(self._new_buffer)
         self._tables: dict[int, tuple[Array, Any]] = {}
+        try:
+            self._queue = self._new_queue()
+        except self._cl.Error as error:
+            raise DeviceError(f"{self.info.label} cannot be opened: {error}") from None
+
+    def _new_queue(self) -> Any:
+        profiling = self._cl.command_queue_properties.PROFILING_ENABLE
+        return self._cl.CommandQueue(self._context, properties=profiling)
 
     @property
     def bytes_held(self) -> int:
@@ -111,7 +136,8 @@ class Device:
         """Put one image through a plan, in tiles if it does not fit into the memory.
 
         If the device runs out of memory before the limit is reached, buffers of earlier images are
-        given back, then tiles become smaller.
+        given back, then tiles become smaller. If a kernel fails, such that its context is of no
+        more use, everything is made anew, and the image is tried once more.
 
         Args:
             plan: the plan.
@@ -124,14 +150,16 @@ class Device:
                 C-contiguous; a used one saves the time that new memory takes.
 
         Raises:
-            ImageError: the image does not fit into the device's memory, not even in tiles, or the
-                device fails.
-            DeviceError: a kernel does not compile.
+            ImageError: the image does not fit into the device's memory, not even in tiles.
+            DeviceFailedError: the device fails, also when it is tried again.
+            DeviceError: a kernel does not compile, or the device has failed at :data:`FAILURES`
+                images in a row.
         """
         cl = self._cl
         height, width = source.shape[:2]
         memory = self.memory
         full: Exception | None = None  # the device's error when its memory ran out
+        failed = False
         while True:
             try:
                 tiling = tiling_of(
@@ -145,14 +173,22 @@ class Device:
                     f"size; others may be using it ({full})"
                 ) from None
             try:
-                return self._run(plan, tiling, source, bind, timings, download, into)
-            except cl.MemoryError as error:
-                self._abandon()
-                memory = memory if full is None else tiling.bytes // 2
-                full = error
+                output = self._run(plan, tiling, source, bind, timings, download, into)
             except cl.Error as error:
                 self._abandon()
-                raise ImageError(f"{self.info.label} failed: {error}") from None
+                if not self._works():
+                    self._renew()
+                    if not failed:
+                        failed = True
+                        continue
+                elif isinstance(error, cl.MemoryError):
+                    memory = memory if full is None else tiling.bytes // 2
+                    full = error
+                    continue
+                self._count_failure(error)
+                raise DeviceFailedError(f"{self.info.label} failed: {error}") from None
+            self._failures = 0
+            return output
 
     def _run(
         self,
@@ -210,6 +246,45 @@ class Device:
         with suppress(self._cl.Error):
             self._tables.clear()
             self._pool.release()
+
+    def _works(self) -> bool:
+        """Whether the context still does what it is told, after an error.
+
+        Codes do not say: NVIDIA reports a kernel that reads astray as CL_OUT_OF_RESOURCES, which is
+        also a lack of memory. But after it everything in that context fails.
+        """
+        cl, sent, back = self._cl, np.arange(4, dtype=np.uint8), np.zeros(4, np.uint8)
+        try:
+            queue = self._new_queue()
+            flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
+            cl.enqueue_copy(queue, back, cl.Buffer(self._context, flags, hostbuf=sent))
+            queue.finish()
+        except cl.Error:
+            return False
+        return np.array_equal(sent, back)
+
+    def _renew(self) -> None:
+        """Leave a context that is of no more use, with all that is in it, for a new one.
+
+        Raises:
+            DeviceError: the device cannot be opened again.
+        """
+        log.warning("%s failed, and is opened again", self.info.label)
+        forget_programs(self.info, self._programs)
+        self._open()
+
+    def _count_failure(self, error: Exception) -> None:
+        """Count an image that the device failed at, though it was tried again.
+
+        Raises:
+            DeviceError: there were too many in a row.
+        """
+        self._failures += 1
+        if self._failures >= FAILURES:
+            raise DeviceError(
+                f"{self.info.label} failed at {self._failures} images in a row and is given up: "
+                f"{error}"
+            ) from None
 
     def _table(self, table: Array) -> Any:
         """A small constant array on the device, uploaded once."""
@@ -300,10 +375,17 @@ def open_device(selector: str | None, memory: int | None = None) -> Device | Non
     return Device(choose(selector, find_devices()), memory)
 
 
-def open_devices(selectors: Sequence[str] = (), memory: int | None = None) -> list[Device]:
+def open_devices(
+    selectors: Sequence[str] = (), memory: int | None = None, share: tuple[int, int] = (0, 1)
+) -> list[Device]:
     """Open the devices that selectors name, see :func:`choose_all`; an empty list for "numpy".
 
-    ``memory`` is how many bytes the buffers of each may take; without it, CPUs share what is free.
+    Args:
+        selectors: of the devices.
+        memory: bytes that the buffers of each may take; without it, CPUs share what is free, and
+            processes share a GPU's.
+        share: the number of this process and of how many, where several of this machine share the
+            devices, see :func:`~clpipe.engine.discovery.shared_out`.
 
     Raises:
         DeviceError: as :func:`open_device`, or "numpy" stands beside others.
@@ -313,8 +395,12 @@ def open_devices(selectors: Sequence[str] = (), memory: int | None = None) -> li
             raise DeviceError(f"found devices {', '.join(selectors)}; numpy is used alone")
         return []
     chosen = choose_all(selectors, find_devices())
-    sharing = sum(info.type != "GPU" for info in chosen)
+    processes = share[1]
+    on_each_gpu = -(-processes // len(chosen))
+    on_cpus = max(sum(info.type != "GPU" for info in chosen), processes)
     return [
-        Device(info, memory or usable_memory(info) // (1 if info.type == "GPU" else sharing))
-        for info in chosen
+        Device(
+            info, memory or usable_memory(info) // (on_each_gpu if info.type == "GPU" else on_cpus)
+        )
+        for info in shared_out(chosen, *share)
     ]

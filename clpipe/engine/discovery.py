@@ -9,7 +9,8 @@ from typing import Any
 from clpipe.base.errors import DeviceError
 from clpipe.base.memory import available_memory
 from clpipe.base.text import one_of
-from clpipe.engine.cache_folder import prepare_environment
+from clpipe.engine.cache_folder import pocl_problem, prepare_environment
+from clpipe.engine.hardware import Hardware, hardware_of
 
 _process: int | None = None  # the process id that first used OpenCL, here or before a fork
 
@@ -33,6 +34,7 @@ class DeviceInfo:
     lanes: int
     problem: str
     handle: Any
+    hardware: Hardware
 
     @property
     def label(self) -> str:
@@ -60,38 +62,72 @@ def find_devices() -> list[DeviceInfo]:
         raise DeviceError(f"pyopencl cannot be loaded: {error}") from None
     try:
         platforms = cl.get_platforms()
-    except cl.Error:
-        return []
+    except cl.Error as error:
+        if "PLATFORM_NOT_FOUND" in str(error):
+            return []
+        raise DeviceError(f"OpenCL cannot be used: {error}") from None
     found: list[DeviceInfo] = []
     for platform in platforms:
         try:
-            devices = platform.get_devices()
-        except cl.Error:
-            continue
-        for device in devices:
-            kind = device.type
-            type_ = "GPU" if kind & cl.device_type.GPU else "CPU"
-            if not kind & (cl.device_type.GPU | cl.device_type.CPU):
-                type_ = "accelerator"
-            if "oclgrind" in platform.name.lower():
-                type_ = "emulator"  # it finds errors in kernels, slowly, and says it is all types
-            found.append(
-                DeviceInfo(
-                    index=len(found),
-                    platform=platform.name.strip(),
-                    name=device.name.strip(),
-                    type=type_,
-                    version=device.version.strip(),
-                    driver=device.driver_version.strip(),
-                    compute_units=device.max_compute_units,
-                    memory=device.global_mem_size,
-                    max_buffer=device.max_mem_alloc_size,
-                    lanes=lanes_for(type_, platform.name, device),
-                    problem=problem_with(type_, platform.name, device),
-                    handle=device,
-                )
-            )
+            devices, reason = platform.get_devices(), "it offers no device"
+        except cl.Error as error:
+            devices, reason = [], f"it offers no device: {error}"
+        found += [describe(len(found) + i, platform, d) for i, d in enumerate(devices)]
+        if not devices:
+            problem = pocl_problem() if is_pocl(platform.name) else ""
+            found.append(without_device(len(found), platform, problem or reason))
     return found
+
+
+def describe(index: int, platform: Any, device: Any) -> DeviceInfo:
+    """What is to be known of a ``pyopencl.Device``."""
+    import pyopencl as cl
+
+    kind = device.type
+    type_ = "GPU" if kind & cl.device_type.GPU else "CPU"
+    if not kind & (cl.device_type.GPU | cl.device_type.CPU):
+        type_ = "accelerator"
+    if "oclgrind" in platform.name.lower():
+        type_ = "emulator"  # it finds errors in kernels, slowly, and says it is all types
+    return DeviceInfo(
+        index=index,
+        platform=platform.name.strip(),
+        name=device.name.strip(),
+        type=type_,
+        version=device.version.strip(),
+        driver=device.driver_version.strip(),
+        compute_units=device.max_compute_units,
+        memory=device.global_mem_size,
+        max_buffer=device.max_mem_alloc_size,
+        lanes=lanes_for(type_, platform.name, device),
+        problem=problem_with(type_, platform.name, device),
+        handle=device,
+        hardware=hardware_of(device),
+    )
+
+
+def without_device(index: int, platform: Any, reason: str) -> DeviceInfo:
+    """A platform that is installed and has nothing to offer; its user wants to know why."""
+    return DeviceInfo(
+        index=index,
+        platform=platform.name.strip(),
+        name="no device",
+        type="none",
+        version=platform.version.strip(),
+        driver="",
+        compute_units=0,
+        memory=0,
+        max_buffer=0,
+        lanes=0,
+        problem=reason,
+        handle=None,
+        hardware=Hardware(platform.int_ptr),
+    )
+
+
+def is_pocl(platform: str) -> bool:
+    """Whether a platform is PoCL, by its name."""
+    return "Portable Computing" in platform
 
 
 def lanes_for(type_: str, platform: str, device: Any) -> int:
@@ -102,7 +138,7 @@ def lanes_for(type_: str, platform: str, device: Any) -> int:
     """
     if type_ != "CPU":
         return 1
-    if "Portable Computing" in platform or device.native_vector_width_float < 16:
+    if is_pocl(platform) or device.native_vector_width_float < 16:
         return 8
     return 16
 
@@ -113,12 +149,12 @@ def problem_with(type_: str, platform: str, device: Any) -> str:
         return "neither a GPU nor a CPU (an emulator or an FPGA)"
     if not device.available or not device.compiler_available:
         return "it is not available or has no compiler"
-    if "Portable Computing" in platform and not shutil.which("ld"):
+    if is_pocl(platform) and not shutil.which("ld"):
         return (
             "PoCL needs a linker and there is no 'ld' on the PATH "
             "(Debian, Ubuntu: apt-get install binutils; conda: binutils)"
         )
-    return ""
+    return pocl_problem() if is_pocl(platform) else ""
 
 
 def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
@@ -131,9 +167,12 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
         DeviceError: there is no device, none matches, or the one that matches cannot be used.
     """
     if not devices:
+        places = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES")  # where the loader looks for platforms
+        limits = "".join(f" ({n} is {os.environ[n]!r})" for n in places if n in os.environ)
         raise DeviceError(
-            "no OpenCL platform was found; install one (pip install 'pyopencl[pocl]', or your "
-            "GPU's driver), or use --device numpy, which is slow but needs none"
+            f"no OpenCL platform was found{limits}; install one "
+            "(pip install 'pyopencl[pocl]', or your GPU's driver), or use --device numpy, which is "
+            "slow but needs none"
         )
     if selector is not None:
         matching = [
@@ -156,29 +195,52 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
 
 
 def choose_all(selectors: Sequence[str], devices: list[DeviceInfo]) -> list[DeviceInfo]:
-    """The devices that selectors name, each device once; each selector as in :func:`choose`.
+    """The devices that selectors name; each selector as in :func:`choose`.
 
     Without selectors: the default device and, if it is a GPU, all other GPUs of the same name,
-    because these give the same bits.
+    because these give the same bits. Each device is there once, also where two drivers offer it.
 
     Raises:
         DeviceError: as :func:`choose`.
     """
     if not selectors:
         first = choose(None, devices)
-        return [first] + [
+        chosen = [first] + [
             d
             for d in devices
             if d.type == first.type == "GPU" and d.name == first.name and not d.problem
-            if d.index != first.index
         ]
-    chosen = [choose(selector, devices) for selector in selectors]
-    return list({d.index: d for d in chosen}.values())
+    else:
+        chosen = [choose(selector, devices) for selector in selectors]
+    distinct: list[DeviceInfo] = []
+    for device in chosen:
+        if not any(
+            device.index == d.index or device.hardware.is_same(d.hardware) for d in distinct
+        ):
+            distinct.append(device)
+    return distinct
+
+
+def shared_out(devices: list[DeviceInfo], number: int, of: int) -> list[DeviceInfo]:
+    """The devices of one of several processes of a machine, which take them in turn.
+
+    Where there are more processes than devices, several have the same one. All see the same order,
+    also where each was given the devices in another one.
+
+    Args:
+        devices: of all of the processes together.
+        number: of the process, from 0 on.
+        of: how many processes there are.
+    """
+    if of == 1:
+        return devices
+    ordered = sorted(devices, key=lambda d: (d.hardware.pci or (), d.index))
+    return ordered[number::of] or [ordered[number % len(ordered)]]
 
 
 def matches(selector: str, device: DeviceInfo) -> bool:
     """Whether a selector is a part of a device's name, type or platform ('pocl' counts)."""
-    alias = " pocl" if "Portable Computing" in device.platform else ""
+    alias = " pocl" if is_pocl(device.platform) else ""
     names = f"{device.name} {device.platform} {device.type}{alias}"
     return bool(selector) and selector.lower() in names.lower()
 

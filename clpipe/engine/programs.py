@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError, RequestError
-from clpipe.engine.cache_folder import cache_folder
+from clpipe.engine.cache_folder import cache_folder, later_runs
 from clpipe.engine.codegen import Kernel
-from clpipe.engine.discovery import DeviceInfo
+from clpipe.engine.discovery import DeviceInfo, is_pocl
 
 LONG = 2.0  # s of compiling after which a user is told what is going on
 log = logging.getLogger(__name__)
@@ -48,8 +48,8 @@ class Programs:
         # PoCL keeps programs in the same folder by itself, with what it makes of them at the first
         # launch. For other platforms pyopencl keeps binaries under a key of text, options, device
         # and driver.
-        own_cache = "Portable Computing" in info.platform
-        self._cache_dir = False if own_cache else str(cache_folder() / "programs")
+        folder = None if is_pocl(info.platform) else cache_folder()
+        self._cache_dir = str(folder / "programs") if folder else False
 
     def __len__(self) -> int:
         """How many programs there are."""
@@ -97,6 +97,13 @@ def programs_of(info: DeviceInfo) -> Programs:
         return _by_device[key]
 
 
+def forget_programs(info: DeviceInfo, dead: Programs) -> None:
+    """See that nobody gets a context that is of no more use; who asks next makes a new one."""
+    with _lock:
+        if _by_device.get(info.handle.int_ptr) is dead:
+            del _by_device[info.handle.int_ptr]
+
+
 @contextmanager
 def announced(info: DeviceInfo) -> Iterator[None]:
     """Log that kernels are being compiled if that takes longer than :data:`LONG`; once a process.
@@ -107,9 +114,7 @@ def announced(info: DeviceInfo) -> Iterator[None]:
     def announce() -> None:
         if not _announced.is_set():
             _announced.set()
-            log.info(
-                "compiling kernels for %s; later runs find them in %s", info.label, cache_folder()
-            )
+            log.info("compiling kernels for %s; %s", info.label, later_runs(is_pocl(info.platform)))
 
     timer = threading.Timer(LONG, announce)
     timer.daemon = True

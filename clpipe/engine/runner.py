@@ -1,13 +1,12 @@
 """One image through a chain, on a device or in NumPy."""
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from clpipe.base.errors import ImageError
+from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.registry import user_code_errors
@@ -118,9 +117,17 @@ class Runner:
         return self._own_plans[key]
 
     def warm_up(self, half: bool = True) -> None:
-        """Compile everything, so that the first image does not wait for it."""
+        """Compile everything, so that the first image does not wait for it.
+
+        Raises:
+            ImageError: not even a tiny image fits into the device's memory.
+            DeviceError: a kernel does not compile, or the device fails.
+        """
         if self.device:
-            self._make_ready(self.plan(half))
+            try:
+                self._make_ready(self.plan(half))
+            except DeviceFailedError as error:
+                raise DeviceError(str(error)) from None
 
     def _make_ready(self, plan: Plan) -> None:
         """Compile the kernels of a plan, by running it on a tiny image.
@@ -155,6 +162,8 @@ class Runner:
 
         Raises:
             ImageError: an image of the wrong shape, or one that does not fit the device.
+            DeviceFailedError: the device fails.
+            DeviceError: a kernel does not compile, or the device is given up.
         """
         channels = len(self.chain.source.channels)
         shape = image.shape[2] if image.ndim == 3 else 1
@@ -168,8 +177,12 @@ class Runner:
         if not self.device:
             return self._run_numpy(np.asarray(image, np.float32), noise_key)
         plan = self.plan(image.dtype == np.float16, fold=min(image.shape[:2]) > 1)
-        with suppress(ImageError):  # of the tiny image; the one below says it of this image
+        try:
             self._make_ready(plan)
+        except DeviceFailedError:
+            raise
+        except ImageError:
+            pass  # the tiny image is too large; the one below says it of this image
         return self._run_plan(plan, image, noise_key, timings, download, into)
 
     def _run_plan(

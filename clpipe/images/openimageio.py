@@ -55,6 +55,20 @@ def open_image(path: Path) -> Iterator[tuple[str, Any]]:
         raise ImageError(f"{path}: damaged: a name or attribute in it is not UTF-8") from None
 
 
+def claimed_pixels(path: Path) -> int | None:
+    """How many pixels a file says that its first part has; None where it cannot be opened."""
+    try:
+        file = oiio.ImageInput.open(str(path))
+        if file is None:
+            oiio.geterror()  # else it would be the next error's
+            return None
+        with contextlib.closing(file):
+            spec = file.spec()
+            return max(spec.width * spec.height, spec.full_width * spec.full_height)
+    except (UnicodeEncodeError, UnicodeDecodeError):
+        return None
+
+
 def error_text(text: str) -> str:
     """An error of OpenImageIO in one line; it gives none for some damaged files."""
     if not text or "could not find a format reader" in text:

@@ -28,6 +28,7 @@ class Job:
         frames: how many frames are made of it; None is what the request says.
         place: the manifest and the row that it stands in; "" where it is in none.
         pictures: names of the renditions to make; None is all.
+        written: the path as the user wrote it, where ``path`` has been made absolute.
     """
 
     path: Path
@@ -38,6 +39,12 @@ class Job:
     frames: int | None = None
     place: str = ""
     pictures: tuple[str, ...] | None = None
+    written: str = ""
+
+    @property
+    def input(self) -> str:
+        """The path as it is stored and printed."""
+        return self.written or str(self.path)
 
     @property
     def stem(self) -> str:

@@ -44,8 +44,12 @@ def attributes_of(step: Step, chain: Chain, key: str, frame: int = 0) -> dict[st
     }
 
 
-def carried_settings(attributes: Mapping[str, str]) -> Settings | None:
+def carried_settings(attributes: Mapping[str, str], folder: Path | None = None) -> Settings | None:
     """The settings that a kept image was made with; None where it has no such attribute.
+
+    Args:
+        attributes: of the image.
+        folder: where names of files in them start; None is the working directory.
 
     Raises:
         RequestError: they are damaged, or hold a name or value that is not allowed.
@@ -58,14 +62,20 @@ def carried_settings(attributes: Mapping[str, str]) -> Settings | None:
         raise RequestError(str(error)) from None
     if not isinstance(values, dict):
         raise RequestError(f"found {values!r}")
-    return settings_from(values)
+    return settings_from(values, folder)
 
 
 @dataclass(frozen=True)
 class KeptLoader:
-    """How a kept image enters the chain of a request that has ``start_at``."""
+    """How a kept image enters the chain of a request that has ``start_at``.
+
+    Args:
+        request: the request.
+        folder: where names of files start that an image carries; None is the working directory.
+    """
 
     request: Request
+    folder: Path | None = None
 
     @property
     def start_at(self) -> str:
@@ -80,7 +90,7 @@ class KeptLoader:
             RequestError: it cannot be made.
         """
         try:
-            return self._chain(self.request, carried_settings(read_attributes(path)))
+            return self._chain(self.request, carried_settings(read_attributes(path), self.folder))
         except RequestError:
             return self._chain(self.request, None)
 
@@ -120,7 +130,7 @@ class KeptLoader:
 
     def _chain_for(self, request: Request, path: Path, attributes: Mapping[str, str]) -> Chain:
         try:
-            chain = self._chain(request, carried_settings(attributes))
+            chain = self._chain(request, carried_settings(attributes, self.folder))
         except RequestError as error:
             raise ImageError(f"{path}: what it was made with cannot be used: {error}") from None
         return _without_input_noise(chain) if attributes.get(NOISE) == "none" else chain

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import KindError
@@ -38,15 +39,21 @@ class LoadedImage:
 
 @dataclass(frozen=True)
 class ImageLoader:
-    """Loads the images of a request."""
+    """Loads the images of a request.
+
+    Args:
+        request: the request.
+        folder: where names of files start that an image carries; None is the working directory.
+    """
 
     request: Request
+    folder: Path | None = None
 
     def for_job(self, job: Job) -> "ImageLoader":
         """The loader for one job; the same one where the job has no values of its own."""
         if not job.values and not self.has_draws:
             return self
-        return ImageLoader(self.request.for_image(job.key, job.values))
+        return ImageLoader(self.request.for_image(job.key, job.values), self.folder)
 
     @cached_property
     def settings(self) -> Settings:
@@ -74,7 +81,7 @@ class ImageLoader:
     @property
     def kept(self) -> KeptLoader | None:
         """How kept images enter; None where images enter at the first step."""
-        return None if self.request.start_at is None else KeptLoader(self.request)
+        return None if self.request.start_at is None else KeptLoader(self.request, self.folder)
 
     @property
     def raw(self) -> RawLoader:

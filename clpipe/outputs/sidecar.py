@@ -135,7 +135,7 @@ def sidecar(
     size, modified = stamp
     return {
         OWN: __version__,
-        "input": str(job.path),
+        "input": job.input,
         "input_size": size,
         "input_modified": modified,
         "sha256": source.sha256,

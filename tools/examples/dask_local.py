@@ -7,15 +7,15 @@ All arguments go to clpipe run. On one machine clpipe alone does the same with l
 what a cluster needs, and a worker that dies (try: kill -9 it) takes nothing with it.
 """
 
-import os
 import sys
 
 from distributed import LocalCluster
 
+from clpipe.base.processors import available_processors
 from clpipe.commands.main import main
 
 if __name__ == "__main__":  # the workers import this file
-    processors = len(os.sched_getaffinity(0))
+    processors = available_processors()
     # Processes, each with its own OpenCL device; their threads are for decoding and encoding.
     with LocalCluster(
         n_workers=max(1, processors // 4),

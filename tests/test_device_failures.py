@@ -1,0 +1,139 @@
+"""Devices that fail: with the errors, and in the state, in which drivers leave them."""
+
+import threading
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from clpipe.base.errors import DeviceError, DeviceFailedError
+from clpipe.batch.threads import Batch
+from clpipe.batch.work import ImageWorker
+from clpipe.chain.chain import make_chain
+from clpipe.chain.request import Request
+from clpipe.chain.settings import settings_from
+from clpipe.engine import device as devices
+from clpipe.engine.device import Device
+from clpipe.engine.programs import programs_of
+from clpipe.engine.runner import Runner
+from clpipe.inputs.find import find_jobs
+from clpipe.inputs.loader import ImageLoader
+from clpipe.outputs.writer import OutputWriter
+
+IMAGE = np.full((20, 30, 3), 0.5, np.float16)
+
+
+class Fault:
+    """Makes launches fail as NVIDIA's driver does where a kernel reads astray.
+
+    The launch, and from then on everything in its context, raises CL_OUT_OF_RESOURCES, which
+    pyopencl raises as a MemoryError. There is no GPU here, so this stands in for one.
+
+    Args:
+        launches: numbers of the launches that fail, counted over all contexts.
+    """
+
+    def __init__(self, monkeypatch, launches):
+        self.launches = launches
+        self.count = 0
+        self.dead = {}  # contexts, held so that no other gets the same handle
+        self.lock = threading.Lock()
+        launch, copy = cl.enqueue_nd_range_kernel, cl.enqueue_copy
+
+        def launched(on, *arguments):
+            with self.lock:
+                number, self.count = self.count, self.count + 1
+                if number in self.launches:
+                    self.dead[on.context.int_ptr] = on.context
+            self.check(on)
+            return launch(on, *arguments)
+
+        def copied(on, *arguments, **options):
+            self.check(on)
+            return copy(on, *arguments, **options)
+
+        monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
+        monkeypatch.setattr(cl, "enqueue_copy", copied)
+
+    def check(self, queue):
+        if queue.context.int_ptr in self.dead:
+            raise cl.MemoryError("clEnqueue failed: OUT_OF_RESOURCES")
+
+
+def runner_on(device):
+    """A chain on a device of its own, ready to run."""
+    chain = make_chain(settings_from({"stages": ["exposure", "gamma"]}))  # a single launch
+    runner = Runner(chain, Device(device.info))
+    runner.warm_up()
+    return runner
+
+
+def test_a_launch_that_fails_is_tried_again_in_a_new_context(device, monkeypatch):
+    runner = runner_on(device)
+    expected = runner.run(IMAGE, "k").encoded
+    before = programs_of(device.info)
+    fault = Fault(monkeypatch, {1})  # at the second image
+    assert np.array_equal(runner.run(IMAGE, "k").encoded, expected)
+    assert np.array_equal(runner.run(IMAGE, "k").encoded, expected)
+    assert len(fault.dead) == 1
+    assert programs_of(device.info) is not before
+
+
+def test_an_image_that_fails_again_fails_alone(device, monkeypatch):
+    runner = runner_on(device)
+    expected = runner.run(IMAGE, "k").encoded
+    Fault(monkeypatch, {0, 1})
+    with pytest.raises(DeviceFailedError, match="failed: clEnqueue failed: OUT_OF_RESOURCES"):
+        runner.run(IMAGE, "k")
+    assert np.array_equal(runner.run(IMAGE, "k").encoded, expected)
+
+
+def test_a_device_that_fails_at_everything_is_given_up(device, monkeypatch):
+    runner = runner_on(device)
+    Fault(monkeypatch, range(1000))
+    for _ in range(devices.FAILURES - 1):
+        with pytest.raises(DeviceFailedError):
+            runner.run(IMAGE, "k")
+    with pytest.raises(DeviceError, match="failed at 3 images in a row and is given up"):
+        runner.run(IMAGE, "k")
+    with pytest.raises(DeviceError, match="OUT_OF_RESOURCES"):
+        Runner(runner.chain, Device(device.info)).warm_up()
+
+
+def test_a_lack_of_memory_needs_no_new_context(device, monkeypatch):
+    runner = runner_on(device)
+    expected = runner.run(IMAGE, "k").encoded
+    before, launch, errors = programs_of(device.info), cl.enqueue_nd_range_kernel, [1]
+
+    def launched(*arguments):
+        if errors:
+            errors.pop()
+            raise cl.MemoryError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES")
+        return launch(*arguments)
+
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
+    assert np.array_equal(runner.run(IMAGE, "k").encoded, expected)
+    assert programs_of(device.info) is before
+
+
+def test_kernels_that_fail_in_a_batch_change_no_byte(device, write_exr, tmp_path, monkeypatch):
+    for i in range(12):
+        pixels = np.random.default_rng(i).random((20, 30, 3)).astype(np.float32)
+        write_exr(f"in/{i:02}.exr", pixels)
+    loader = ImageLoader(Request.from_options(stages="exposure,gamma", formats=("png",)))
+    jobs = find_jobs([str(tmp_path / "in")], tmp_path)
+
+    def made(name):
+        (tmp_path / name).mkdir()
+        writer = OutputWriter(tmp_path / name, loader.request)
+        worker = ImageWorker(loader, writer, loader.first_chain(jobs))
+        # Both have one context, as two on one device have: what breaks it for one does for both.
+        batch = Batch(worker, [Device(device.info), Device(device.info)])
+        statuses = [outcome.status for outcome in batch.run(jobs)]
+        return statuses, {p.name: p.read_bytes() for p in (tmp_path / name).iterdir()}
+
+    expected = made("whole")
+    fault = Fault(monkeypatch, {4})  # the first two launches are of tiny images, to compile
+    assert made("failing") == expected
+    assert expected[0] == ["done"] * 12
+    assert len(fault.dead) == 1
