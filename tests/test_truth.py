@@ -148,9 +148,13 @@ def test_what_lies_beside_a_picture(clpipe, write_exr):
     names = ["a", "a.truth", "a.truth_mosaic", "a.truth_variance"]
     assert set(written(Path("o"))) == {
         *(f"{name}.json" for name in names),
-        *("a.jpg", "a.normalize.exr", "a.truth.jpg", "a.truth.normalize.exr"),
+        *("a.jpg", "a.normalize.exr", "a.truth.jpg"),  # the truth of normalize is truth_mosaic
         *("a.truth_mosaic.exr", "a.truth_variance.exr"),
     }
+    again = ("run", "a.exr", "-o", "o", "--iso", 3200, *ALL, "--keep", "normalize")
+    assert "there already" in clpipe(*again).stderr
+    clpipe("run", "--replay", "o/a.truth.json", "-o", "r")
+    assert set(written(Path("r"))) == {"a.truth.jpg", "a.truth.json"}
     noisy, truth, variance = (
         exr(f"o/a.{x}.exr") for x in ("normalize", "truth_mosaic", "truth_variance")
     )
@@ -160,6 +164,9 @@ def test_what_lies_beside_a_picture(clpipe, write_exr):
     assert np.array_equal(truth.pixels, exr("q/a.exr").pixels)
     assert (truth.attributes["stage"], truth.attributes["kind"]) == ("normalize", "mosaic")
     assert variance.attributes["kind"] == "variance"
+    # Without the truth of the mosaic, that of the kept stage is missing, and is made.
+    clpipe("run", "a.exr", "-o", "o", "--iso", 3200, *ALL[:2], "--keep", "normalize")
+    assert np.array_equal(exr("o/a.truth.normalize.exr").pixels, truth.pixels)
     records = {name: json.loads(Path(f"o/{name}.json").read_text()) for name in names}
     for name, record in records.items():
         assert all(Path("o", output["name"]).is_file() for output in record["outputs"])

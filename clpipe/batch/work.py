@@ -157,7 +157,11 @@ class ImageWorker:
         names = self.writer.names_of(task.job)
         if self._overwrite:
             return list(names)
-        return [name for name in names if not self.is_done(task.job, name, task.request)]
+        return [
+            name
+            for name in names
+            if not self.is_done(task.job, name, self.writer.record_of(task.request, name))
+        ]
 
     def is_done(self, job: Job, name: str, request: Mapping[str, Any]) -> bool:
         """Whether a rendition is there already, made by the same request.
@@ -165,7 +169,7 @@ class ImageWorker:
         Args:
             job: the image.
             name: of the rendition.
-            request: the record of the request for the image.
+            request: its record, see :meth:`OutputWriter.record_of`.
 
         Raises:
             ImageError: a file of its name is somebody else's.
@@ -229,7 +233,7 @@ class ImageWorker:
                 path = writer.path(job, SIDECAR, rendition.name)
                 record = sidecar(
                     job,
-                    task.request,
+                    writer.record_of(task.request, rendition.name),
                     task.stamp,
                     rendition,
                     writer.plan_of(job).frames,

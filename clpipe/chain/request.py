@@ -17,6 +17,7 @@ from clpipe.chain.keys import KEYS, OUTPUT
 from clpipe.chain.registry import code_files, load_stage_file
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import parse_assignment
+from clpipe.chain.truth import MOSAIC, noisy_mosaic
 from clpipe.stage import Kind
 
 DEFAULTS = Settings()
@@ -47,6 +48,8 @@ class Request:
         keep: steps whose image is written too, or "all".
         frames: how many frames of each image; None is one picture instead of a burst.
         truths: which of :data:`clpipe.chain.truth.TRUTHS` are written beside each picture.
+        truth_keep: steps whose image is written beside the truth of the development; None is
+            ``keep``. See :meth:`with_outputs`.
     """
 
     config: Mapping[str, Any] | None = None
@@ -63,6 +66,7 @@ class Request:
     keep: tuple[str, ...] = ()
     frames: int | None = None
     truths: tuple[str, ...] = ()
+    truth_keep: tuple[str, ...] | None = None
 
     @classmethod
     def from_options(
@@ -153,14 +157,18 @@ class Request:
         """The request with every output named, as a chain has them.
 
         The format, where none is chosen, is JPEG; where ``until`` ends the chain before it comes to
-        display values, EXR.
+        display values, EXR. The truth of the mosaic is not kept a second time beside that of the
+        development.
 
         Raises:
-            RequestError: the chain has not a step of ``keep``.
+            RequestError: the chain has not a step of ``keep``, or no mosaic that is asked for.
         """
         is_whole = self.until is None or chain.result is Kind.DISPLAY
         formats = tuple(dict.fromkeys(self.formats)) or (("jpg",) if is_whole else ("exr",))
-        return self._changed(formats=formats, keep=chain.select(self.keep))
+        keep = chain.select(self.keep)
+        own = noisy_mosaic(chain).steps[-1].name if MOSAIC in self.truths else ""
+        truth_keep = tuple(step for step in keep if step != own)
+        return self._changed(formats=formats, keep=keep, truth_keep=truth_keep)
 
     def settings(self, carried: Settings | None = None) -> Settings:
         """The settings that are asked for, drawn for the image where there is one.

@@ -1,9 +1,10 @@
 """Writes the pictures of a run: which files, under which names, in which formats."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from clpipe.base.errors import ImageError, OutputError, RequestError
 from clpipe.base.files import Stored
@@ -11,7 +12,7 @@ from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
 from clpipe.chain.formats import DNG, FORMATS, Format, ending_of
 from clpipe.chain.request import Request
-from clpipe.chain.truth import variance_of
+from clpipe.chain.truth import DEVELOPMENT, variance_of
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.dng import write_dng
@@ -23,7 +24,7 @@ from clpipe.inputs.kept import attributes_of
 from clpipe.outputs.existing import Existing
 from clpipe.outputs.folder import RESUMABLE, write_problem
 from clpipe.outputs.negative import negative_of
-from clpipe.outputs.renditions import FLOAT_MOSAICS, Rendition, RenditionPlan
+from clpipe.outputs.renditions import FLOAT_MOSAICS, SUFFIXES, Rendition, RenditionPlan
 from clpipe.outputs.results import results_of
 from clpipe.outputs.sidecar import SIDECAR
 from clpipe.reference.curve import to_16_bit
@@ -69,7 +70,20 @@ class OutputWriter:
 
     def keep_of(self, name: str) -> tuple[str, ...]:
         """The steps whose image is written beside a rendition, by its name, where it has them."""
-        return () if name in FLOAT_MOSAICS else self.request.keep
+        if name in FLOAT_MOSAICS:
+            return ()
+        if name == SUFFIXES[DEVELOPMENT] and self.request.truth_keep is not None:
+            return self.request.truth_keep
+        return self.request.keep
+
+    def record_of(self, request: Mapping[str, Any], name: str) -> dict[str, Any]:
+        """The record of a request as far as it is about one rendition.
+
+        Args:
+            request: the record for the image.
+            name: of the rendition.
+        """
+        return {**request, "keep": list(self.keep_of(name))}
 
     def _kept_steps(self, rendition: Rendition) -> list[str]:
         """The steps of a rendition's chain whose image is written, too."""
