@@ -94,10 +94,10 @@ class Pipeline(ReadOnly):
         if settings or own.draws:
             runner = runner.of(self._chain(own.drawn(key)))
         pixels = _checked(image, runner.chain.source)
-        if _clips_mostly(pixels, runner.chain):
+        if _is_far_too_bright(pixels, runner.chain):
             warnings.warn(
-                "most of the image is above 1, the full scale of the sensor, and becomes white; "
-                "are its values 0 to 255, or is exposure.ev too high?",
+                "most of the image is beyond four times the full scale of the sensor, and becomes "
+                "white; are its values 0 to 255, or is exposure.ev too high?",
                 stacklevel=2,
             )
         return runner.run(pixels, key)
@@ -118,13 +118,13 @@ class Pipeline(ReadOnly):
             yield self.process(image, **{"key": str(number), **named})
 
 
-def _clips_mostly(image: Array, chain: Chain) -> bool:
-    """Whether most samples of linear RGB are above full scale, judged by a part of them."""
+def _is_far_too_bright(image: Array, chain: Chain) -> bool:
+    """Whether most samples of linear RGB are two stops beyond white, judged by a part of them."""
     if chain.source is not Kind.RGB:
         return False
     sample = image.flat[::61]
     white = 2.0 ** -getattr(chain.steps[0].method, "ev", 0.0)
-    return bool(np.count_nonzero(sample > white) > sample.size / 2)
+    return bool(np.count_nonzero(sample > 4 * white) > sample.size / 2)
 
 
 def plain(values: Any) -> Any:

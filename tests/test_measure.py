@@ -26,7 +26,8 @@ def measured(clpipe):
 
 
 def run(clpipe, folder, *options):
-    clpipe("run", STILL_LIFE, "-o", folder, "--iso", 3200, *options)
+    iso = () if "--iso" in options else ("--iso", 3200)
+    clpipe("run", STILL_LIFE, "-o", folder, *iso, *options)
     return f"{folder}/still_life"
 
 
