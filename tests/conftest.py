@@ -103,6 +103,7 @@ def write_exr(tmp_path: Path) -> Callable[..., Path]:
             pixels.shape[1], pixels.shape[0], pixels.shape[2], oiio.HALF if half else oiio.FLOAT
         )
         spec.channelnames = tuple(channels.split(","))
+        spec.attribute("DateTime", "2026:01:01 00:00:00")  # noise depends on all that a file holds
         for field, value in spec_fields.items():
             setattr(spec, field, value)
         file = oiio.ImageOutput.create(str(path))

@@ -25,8 +25,9 @@ def measured(clpipe):
     return lambda *arguments: json.loads(clpipe("measure", *arguments, "--json").stdout)
 
 
-def run(clpipe, folder, *options, iso=3200):
-    clpipe("run", STILL_LIFE, "-o", folder, "--iso", iso, *options)
+def run(clpipe, folder, *options):
+    iso = () if "--iso" in options else ("--iso", 3200)
+    clpipe("run", STILL_LIFE, "-o", folder, *iso, *options)
     return f"{folder}/still_life"
 
 
@@ -271,8 +272,8 @@ def test_load_says_what_it_read(clpipe, tmp_path):
 
 
 def test_wrong_partners_are_refused(clpipe):
-    noisy = run(clpipe, "noisy", "--until", "quantize", iso=800)
-    other = run(clpipe, "other", "--until", "quantize", "--seed", 1, iso=1600)
+    noisy = run(clpipe, "noisy", "--until", "quantize", "--iso", 800)
+    other = run(clpipe, "other", "--until", "quantize", "--seed", 1, "--iso", 1600)
     before = run(clpipe, "before", "--until", "mosaic")
     found = clpipe("measure", f"{noisy}.exr", f"{other}.exr", status=2)
     assert "repeats must have one ISO" in found.stderr

@@ -26,7 +26,8 @@ from clpipe.outputs import writer
 from tests.conftest import ROOT, written
 
 # A chain that other tests compile too.
-RUN = ("-o", "out", "--iso", 3200, "--webdataset", 4)
+OTHER = ("-o", "out", "--iso", 3200, "--webdataset")
+RUN = (*OTHER, 4)
 OUT = Path("out")
 
 
@@ -86,7 +87,7 @@ def test_what_readers_see(clpipe, renders):
         said = json.loads(sample["json"])
         image = Image.open(io.BytesIO(sample["jpg"]))
         assert image.size == (said["width"], said["height"])
-        stem = Path("plain", said["name"])
+        stem = Path("plain", said["image_key"].partition("@")[0])
         for ending in ("jpg", "quantize.exr"):
             assert sample[ending] == stem.with_suffix(f".{ending}").read_bytes()
 
@@ -251,15 +252,15 @@ def test_a_tar_of_another_hand_is_not_written_over(clpipe, renders, text):
 
 def test_tars_of_a_run_with_more_of_them_are_not_mixed_with(clpipe, renders):
     clpipe("run", renders(), *RUN)
-    result = clpipe("run", "in", *RUN, "--webdataset", 5, status=2)
+    result = clpipe("run", "in", *OTHER, 5, status=2)
     assert "out/000002.tar: is of another run, as this one makes 2 tars" in result.stderr
     Path("out/000002.tar").unlink()
-    clpipe("run", "in", *RUN, "--webdataset", 5)
+    clpipe("run", "in", *OTHER, 5)
     assert [len(samples(OUT / name)) for name in contents("out")] == [5, 5]
 
 
 def test_none_in_a_tar(clpipe, renders):
-    result = clpipe("run", renders(1), *RUN, "--webdataset", 0, status=2)
+    result = clpipe("run", renders(1), *OTHER, 0, status=2)
     assert "--webdataset" in result.stderr
 
 

@@ -40,7 +40,7 @@ PARTS = ("EXIF", "Image")  # exifread's prefixes of tags, in order of preference
 DATE_TAGS = ("DateTimeOriginal", "DateTime")
 DATE = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")
 COLOR_MATRICES = {"0xC622": "0xC65B", "0xC621": "0xC65A"}  # a DNG's, and their illuminants
-DUMP_HINT = "a dump of samples, not a camera's raw, give --raw-size and --raw-type"
+DUMP_HINT = "a dump of samples, not a camera's raw, is read with --raw-size and --raw-type"
 OTHERS = {b"\xff\xd8\xff": "a JPEG", b"\x89PNG": "a PNG", b"v/1\x01": "an OpenEXR image"}
 
 
@@ -179,8 +179,7 @@ def _opened(path: Path) -> Iterator[Any]:
             yield raw
     except rawpy.LibRawError as error:
         reason = error.args[0].decode() if isinstance(error.args[0], bytes) else str(error)
-        is_dump = path.suffix.lower() == ".raw"
-        hint = f"; if it is {DUMP_HINT}" if is_dump else ""
+        hint = f"; {DUMP_HINT}" if path.suffix.lower() == ".raw" else ""
         raise ImageError(
             f"{path}: damaged, or not a raw that LibRaw knows: {reason}{hint}"
         ) from None
