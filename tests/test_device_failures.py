@@ -13,6 +13,7 @@ from clpipe.chain.chain import make_chain
 from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
 from clpipe.engine import device as devices
+from clpipe.engine import programs
 from clpipe.engine.device import Device
 from clpipe.engine.programs import programs_of
 from clpipe.engine.runner import Runner
@@ -58,6 +59,11 @@ class Fault:
     def check(self, queue):
         if queue.context.int_ptr in self.dead:
             raise cl.MemoryError("clEnqueue failed: OUT_OF_RESOURCES")
+
+
+@pytest.fixture(autouse=True)
+def _contexts_of_their_own(monkeypatch):
+    monkeypatch.setattr(programs, "_by_device", {})  # those of other tests stay shared
 
 
 def runner_on(device):
