@@ -7,14 +7,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 from clpipe.base.errors import ImageError
+from clpipe.base.reading import check_regular
 
 
 def sha256_of(path: Path) -> tuple[str, int]:
     """The SHA-256 of a file, and its size in bytes.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: it cannot be read, or is no regular file.
     """
+    check_regular(path)
     digest = hashlib.sha256()
     with open(path, "rb", buffering=0) as file:
         while part := file.read(4 << 20):

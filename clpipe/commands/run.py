@@ -29,7 +29,8 @@ from clpipe.commands.chain_options import chain_options, format_option, keep_opt
 from clpipe.commands.progress import Reporter
 from clpipe.engine.device import Device, open_devices
 from clpipe.images.dump import TYPES
-from clpipe.images.read import MAX_PIXELS, TRANSFERS, USUAL_MAX_PIXELS
+from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS
+from clpipe.images.read import TRANSFERS
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.folder import output_folder, remove_unfinished

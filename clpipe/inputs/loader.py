@@ -3,18 +3,20 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import KindError
+from clpipe.base.reading import unchanged
 from clpipe.chain.chain import Chain, entry
 from clpipe.chain.methods import base_name, stage_named
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
+from clpipe.images.pixels import USUAL_MAX_PIXELS
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import (
     PICTURE_SUFFIXES,
     RENDER_SUFFIXES,
-    USUAL_MAX_PIXELS,
     ReadOptions,
     SourceImage,
     read_source,
@@ -113,15 +115,19 @@ class ImageLoader:
         """The image of a job.
 
         Raises:
-            ImageError: it cannot be read, or is of another kind.
+            ImageError: it cannot be read, is of another kind, or is written to at the same time.
         """
-        if self.raw.takes(job.path):
-            return self.raw.read(job.path)
+        with unchanged(job.path):
+            return self._read(job.path)
+
+    def _read(self, path: Path) -> SourceImage:
+        if self.raw.takes(path):
+            return self.raw.read(path)
         request = self.request
         options = ReadOptions(
             request.layer, request.max_pixels or USUAL_MAX_PIXELS, request.transfer
         )
-        return read_source(job.path, self.reads, options)
+        return read_source(path, self.reads, options)
 
     def enter(self, job: Job, source: SourceImage) -> LoadedImage | None:
         """An image with the chain for it.

@@ -7,6 +7,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
 from clpipe.base.errors import RequestError
+from clpipe.base.reading import read_bytes
 from clpipe.base.text import one_of
 from clpipe.chain.chain import step_names
 from clpipe.chain.keys import OUTPUT
@@ -18,6 +19,7 @@ from clpipe.images.encoding import Output
 from clpipe.inputs.tables import OWN, PLAIN, TEXTS, csv_records, json_records
 
 MANIFEST_SUFFIXES = (".csv", ".jsonl")
+MANIFEST_BYTES = 256 * 2**20  # enough for two million rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,10 +144,9 @@ def _report(faults: Sequence[str]) -> None:
 
 def _text(path: Path) -> str:
     try:
-        data = path.read_bytes()
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise RequestError(f"{path}: cannot read this manifest: {reason}") from None
+        data = read_bytes(path, MANIFEST_BYTES)
+    except OSError as error:
+        raise RequestError(f"{path}: cannot read this manifest: {error.strerror}") from None
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

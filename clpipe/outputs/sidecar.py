@@ -14,6 +14,7 @@ from clpipe.base.about import __version__
 from clpipe.base.digests import digests, stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import write_beside
+from clpipe.base.reading import read_bytes
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.images.read import SourceImage
@@ -89,7 +90,7 @@ def read_sidecar(path: Path) -> dict[str, Any]:
         ImageError: it cannot be read, or clpipe did not write it.
     """
     try:
-        data = path.read_bytes()
+        data = read_bytes(path)
     except FileNotFoundError:
         raise
     except OSError as error:
