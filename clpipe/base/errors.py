@@ -30,6 +30,10 @@ class ImageError(ClpipeError):
     exit_status = 1
 
 
+class NoPictureError(ImageError):
+    """A file is a whole image, but has no channels of the kind that is read, such as only depth."""
+
+
 class KindError(ImageError):
     """A kept image lacks the channels that are needed; ``attributes`` are those of the file."""
 

@@ -64,7 +64,8 @@ def cut(jobs: Sequence[Job], count: int, folder: Path) -> list[Tar]:
         if name in owners:
             raise RequestError(
                 f"{owners[name].label} and {job.label} would both be the sample {name} "
-                "(a key of WebDataset has no dots); give one of them another name"
+                "(a key of WebDataset has no dots); give one of them another name, "
+                "or say --keep-suffix"
             )
         if HIDDEN_BY_READERS.match(name):
             raise RequestError(

@@ -90,10 +90,13 @@ class Reporter:
         if self._bar:
             self._bar.stop()
         summary, counts = self._summary, self._summary.counts
-        if counts[LEFT_OUT] and not self._quiet:
-            self.print(
-                f"{counts[LEFT_OUT]} images in folders were kept after other stages and left out"
-            )
+        without = summary.without_picture
+        if without and not self._quiet:
+            hold = "images in folders hold" if len(without) > 1 else "image in a folder holds"
+            self.print(f"left out: {len(without)} {hold} no picture, such as {without[0]}")
+        if counts[LEFT_OUT] > len(without) and not self._quiet:
+            kept = counts[LEFT_OUT] - len(without)
+            self.print(f"{kept} images in folders were kept after other stages and left out")
         failed = summary.failures
         if self._several and failed and (self._bar or not self._quiet):
             self.print("failed:")
@@ -106,6 +109,8 @@ class Reporter:
         there = f" ({counts[SKIPPED]} of them were there already)" if counts[SKIPPED] else ""
         done = counts[DONE] + counts[SKIPPED]
         text = f"{done} of {summary.total} images done{there}, {counts[FAILED]} failed"
+        if counts[LEFT_OUT]:
+            text += f", {counts[LEFT_OUT]} left out"
         if left := summary.total - summary.finished:
             text += f", {left} not begun"
         if counts[DONE]:

@@ -84,8 +84,21 @@ if TYPE_CHECKING:
     metavar="N",
     help="Refuse larger images, before memory is taken.",
 )
+@click.option(
+    "--exclude",
+    multiple=True,
+    metavar="GLOB",
+    help="Leave out what folders and globs would give: files and folders whose name, or path in "
+    "the input folder, matches; may be repeated.",
+)
 @keep_option
 @format_option
+@click.option(
+    "--keep-suffix",
+    is_flag=True,
+    help="Name outputs by the input's whole name (a.cr2.jpg, not a.jpg), where a folder has a.cr2 "
+    "and a.cr3.",
+)
 @click.option(
     "--device",
     "selectors",
@@ -143,6 +156,8 @@ def run(
     inputs: tuple[str, ...],
     output: Path,
     max_pixels: int,
+    exclude: tuple[str, ...],
+    keep_suffix: bool,
     selectors: tuple[str, ...],
     memory: str | None,
     threads: int | None,
@@ -171,6 +186,8 @@ def run(
     chain adds, in signal squared. It includes what is fixed to a sensor (PRNU, DSNU, columns) and
     rounding, but neither clipping nor defect pixels.
     """
+    if quiet:
+        logging.getLogger("clpipe").setLevel(logging.WARNING)
     tars: list[Tar] = []
     if replay:
         check_beside_replay()
@@ -183,7 +200,7 @@ def run(
     else:
         request = Request.from_options(max_pixels=max_pixels, **options)
         loader = ImageLoader(request)
-        jobs = find_jobs(inputs, output, loader.endings())
+        jobs = find_jobs(inputs, output, loader.endings(), exclude, keep_suffix)
         if per_tar:
             tars = shard.take(cut(jobs, per_tar, output))
             jobs = [job for tar in tars for job in tar.jobs]
@@ -206,8 +223,6 @@ def run(
     )
     opened = batch_of(spec, loader, chain, tars, dask)
     summary = Summary(len(jobs))  # counts seconds from here on
-    if quiet:
-        logging.getLogger("clpipe").setLevel(logging.WARNING)
     reporter = Reporter(summary, writer, Console(stderr=True), quiet)
     events = Trace() if trace else None
     with opened as batch, output_folder(output, shard):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.errors import ImageError, KindError
+from clpipe.base.errors import ImageError, KindError, NoPictureError
 from clpipe.base.text import printable
 from clpipe.images.attributes import own_attributes
 
@@ -43,7 +43,8 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
         layer: the layer that holds the picture; None chooses by :data:`PICTURE_LAYERS`.
 
     Raises:
-        ImageError: there is no such picture, or the file holds another kind of image.
+        NoPictureError: there is no such picture.
+        ImageError: the layer is missing, or the file holds another kind of image.
     """
     pictures: list[PictureLocation] = []
     channel_names: list[str] = []
@@ -78,7 +79,7 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
     if not pictures:
         listed = ", ".join(name for name in channel_names[:20] if name) or "none"
         missing = "no single channel with a mosaic" if mosaic else "no R, G and B channels"
-        raise ImageError(f"{path}: {missing}; found {printable(listed)}")
+        raise NoPictureError(f"{path}: {missing}; found {printable(listed)}")
     best = min(pictures, key=lambda picture: picture.rank)
     file.seek_subimage(best.part, 0)
     file.geterror()  # clears it: the loop asked for parts and levels that do not exist

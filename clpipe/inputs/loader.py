@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.errors import KindError
+from clpipe.base.errors import KindError, NoPictureError
 from clpipe.base.reading import unchanged
 from clpipe.chain.chain import Chain, entry
 from clpipe.chain.methods import base_name, stage_named
@@ -150,8 +150,9 @@ class ImageLoader:
         return LoadedImage(self.chain, source, job.key)
 
     def is_left_out(self, job: Job, error: Exception) -> bool:
-        """Whether an image that cannot enter was only found in a folder of kept images."""
-        return isinstance(error, KindError) and self.kept is not None and not job.listed
+        """Whether an image that cannot enter was only found in a folder, beside others that can."""
+        is_of_other_step = isinstance(error, KindError) and self.kept is not None
+        return not job.listed and (is_of_other_step or isinstance(error, NoPictureError))
 
     def error_text(self, job: Job, error: Exception) -> str:
         """The message of an error, with the file, and with what can be done."""

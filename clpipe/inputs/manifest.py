@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
@@ -48,7 +48,7 @@ class Row:
         return self.name or str(PurePosixPath(self.key).with_suffix(""))
 
 
-def read_manifest(path: Path) -> list[Row]:
+def read_manifest(path: Path, keep_suffix: bool = False) -> list[Row]:
     """The images of a manifest.
 
     A .csv has a header, commas and UTF-8; its cells are TOML values, else text, and an empty cell
@@ -60,6 +60,10 @@ def read_manifest(path: Path) -> list[Row]:
     The image key is the name where there is one; else the path relative to the manifest's folder
     where it lies below that; else the file's name.
 
+    Args:
+        path: the manifest.
+        keep_suffix: a row without a name gets its image key as its name, suffix and all.
+
     Raises:
         RequestError: it cannot be read, has a column that does not exist, or a row is wrong; the
             message is that of the first wrong row, with the number of others.
@@ -68,16 +72,19 @@ def read_manifest(path: Path) -> list[Row]:
     read = json_records if path.suffix.lower() == ".jsonl" else csv_records
     faults: list[str] = []
     rows: list[Row] = []
-    makers: dict[str, str] = {}
+    makers: dict[str, Row] = {}
     for line, record in read(path, text, _check_column):
         place = f"{path}, row {line}"
         try:
             row = _row(path.parent, place, record())
-            other = makers.setdefault(row.stem, place)
-            if other != place:
+            if keep_suffix and not row.name:
+                row = replace(row, name=row.key)
+            other = makers.setdefault(row.stem, row)
+            if other is not row:
+                keep = ", or say --keep-suffix" if other.key != row.key else ""
                 raise RequestError(
-                    f"it would make the same outputs as row {other.rpartition(' ')[2]}, "
-                    f"{row.stem}; tell them apart in a column called name"
+                    f"it would make the same outputs as row {other.place.rpartition(' ')[2]}, "
+                    f"{row.stem}; tell them apart in a column called name{keep}"
                 )
             rows.append(row)
         except RequestError as error:

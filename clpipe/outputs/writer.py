@@ -121,9 +121,10 @@ class OutputWriter:
                             "choose another output folder"
                         )
                     if path in makers:
+                        keep = ", or say --keep-suffix" if makers[path].key != job.key else ""
                         raise RequestError(
                             f"{makers[path].label} and {job.label} would both write "
-                            f"{self.folder / path}; run them into different folders"
+                            f"{self.folder / path}; run them into different folders{keep}"
                         )
                     makers[path] = job
 
