@@ -150,3 +150,29 @@ def test_a_depth_file_in_a_folder_is_left_out(clpipe, write_exr):
     for inputs in ("in/a_depth.exr", "in/*_depth.exr"):
         assert "no R, G and B channels; found Z" in clpipe(*run, inputs, status=1).output
     assert "left out" not in clpipe(*run, "in", "--quiet").output
+
+
+def test_names_that_would_break_a_line_or_the_terminal(clpipe, write_exr):
+    for name in ("new\nline", "esc\x1b[31m", "left\u202e", "[bold]"):
+        write_exr(f"in/{name}.exr", np.full((4, 6, 3), 0.25))
+    Path("in/bad\n\x1b[0m.exr").write_text("no image")
+    Path(os.fsdecode(b"in/no\xff.exr")).write_bytes(b"")
+    done = clpipe("run", "in", "-o", "out", "--device", "numpy", status=1)
+    lines = done.output.splitlines()
+    assert all(line.isprintable() for line in lines)
+    assert sum(" -> out/" in line for line in lines) == 4
+    assert r"in/new\nline.exr -> out/new\nline.jpg" in done.output
+    assert r"in/bad\n\x1b[0m.exr: cannot be read as an image" in done.output
+    assert r"in/no\udcff.exr" in done.output
+    logged = Path("out/run.jsonl").read_text("utf-8").splitlines()
+    assert len([json.loads(line) for line in logged]) == 8
+    refused = clpipe("plan", "-c", "no\nsu\x1bch.toml", status=2).output
+    assert refused.replace("\n", "").isprintable()
+
+
+def test_names_that_are_too_long_fail_alone(clpipe, write_exr):
+    for name in ("a" * 251, "b" * 240, "short"):
+        write_exr(f"in/{name}.exr", np.full((4, 6, 3), 0.25))
+    done = clpipe("run", "in", "-o", "out", "--device", "numpy", status=1)
+    assert "a.json: cannot be read: File name too long" in done.output
+    assert "in/short.exr -> out/short.jpg" in done.output

@@ -5,6 +5,7 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from clpipe.base.text import one_line
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
 from clpipe.batch.run_log import Summary
 from clpipe.chain.formats import ending_of
@@ -53,7 +54,7 @@ class Reporter:
 
     def print(self, text: str) -> None:
         """Print a line."""
-        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self._console.print(one_line(text), markup=False, highlight=False, soft_wrap=True)
 
     def report(self, outcome: Outcome) -> None:
         """Print what became of one image, after it was added to the summary."""
@@ -101,7 +102,7 @@ class Reporter:
         if self._several and failed and (self._bar or not self._quiet):
             self.print("failed:")
             for error in failed[:REPEATED]:
-                self.print(f"  {error.splitlines()[0]}")
+                self.print(f"  {error}")
             if len(failed) > REPEATED:
                 self.print(f"  and {len(failed) - REPEATED} more, which the run log names")
         if self._quiet or not (self._several or failed or counts[SKIPPED]):
