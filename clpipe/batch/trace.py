@@ -77,4 +77,4 @@ class Trace:
             for worker, number in self._threads.items()
         ]
         text = json.dumps({"traceEvents": [*names, *events], "displayTimeUnit": "ms"})
-        write_new(path, lambda to: to.write_text(text))
+        write_new(path, lambda to: to.write_text(text, "utf-8"))
