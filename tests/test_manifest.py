@@ -233,7 +233,7 @@ def test_a_jsonl_that_is_wrong(manifest, line, message):
 def test_a_manifest_that_is_not_there(tmp_path):
     with pytest.raises(RequestError, match=r"no.csv: cannot read this manifest: No such file"):
         read_manifest(tmp_path / "no.csv")
-    with pytest.raises(RequestError, match="cannot read this manifest: Is a directory"):
+    with pytest.raises(RequestError, match="cannot read this manifest: it is a folder, not a file"):
         read_manifest(tmp_path)
 
 
