@@ -31,7 +31,7 @@ from clpipe.inputs.manifest import read_manifest
 from clpipe.stage import Kind
 from tests.conftest import ROOT
 from tests.dng import field, write_dng
-from tests.test_renders import exr
+from tests.exr import exr
 
 # Reads each file in every way, in little memory; each way ends in a refusal that names the file.
 REFUSE_ALL = r"""

@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from pathlib import Path
 
+from clpipe.base.text import one_line
+
 
 class ClpipeError(Exception):
     """Base of all errors that are reported as one clear message, without a traceback."""
@@ -39,7 +41,8 @@ class KindError(ImageError):
 
     def __init__(self, path: Path, attributes: Mapping[str, str]) -> None:
         stage = attributes.get("stage", "a stage that it does not name")
-        super().__init__(f"{path}: holds {attributes['kind']}, kept after {stage}")
+        held = one_line(f"{attributes['kind']}, kept after {stage}")
+        super().__init__(f"{path}: holds {held}")
         self.attributes = attributes
 
 

@@ -13,7 +13,7 @@ def one_of(what: str, found: str, allowed: Iterable[str]) -> str:
     names = list(allowed)
     near = get_close_matches(found, names, n=1, cutoff=0.5)
     hint = f" (did you mean '{near[0]}'?)" if near else ""
-    return f"unknown {what} '{found}'{hint}; allowed: {', '.join(names) or 'none'}"
+    return f"unknown {what} '{one_line(found)}'{hint}; allowed: {', '.join(names) or 'none'}"
 
 
 def one_line(text: str) -> str:

@@ -11,6 +11,7 @@ from clpipe.base.errors import ImageError
 from clpipe.base.text import printable
 from clpipe.base.types import Array, Floats
 from clpipe.images.colour import SRGB, rgb_to_xyz
+from clpipe.images.openimageio import error_text
 from clpipe.images.pixels import check_size
 
 CHANNELS = ("Y", "RY", "BY")
@@ -41,16 +42,18 @@ def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
     """
     import OpenEXR
 
-    def read(header_only: bool) -> Any:
+    def read(header_only: bool) -> tuple[Any, Any]:
+        """The first part, and all."""
         try:
-            return OpenEXR.File(
+            parts = OpenEXR.File(
                 str(path), separate_channels=True, header_only=header_only, num_threads=1
             ).parts
+            return parts[0], parts
         except Exception as error:  # exceptions of the C++ library arrive as many types
-            raise ImageError(f"{path}: damaged: {printable(str(error))}") from None
+            raise ImageError(f"{path}: damaged: {error_text(str(error))}") from None
 
-    parts = read(header_only=True)
-    header = parts[0].header
+    first, parts = read(header_only=True)
+    header = first.header
     names = sorted(channel.name for channel in header["channels"])
     is_flat = all(part.header["type"] == OpenEXR.scanlineimage for part in parts)
     if not set(CHANNELS) <= set(names) or not is_flat:

@@ -11,6 +11,8 @@ from clpipe.base.errors import ImageError
 from clpipe.base.reading import check_regular
 from clpipe.base.text import printable
 
+ERROR_LENGTH = 400  # characters; some repeat what they found, of any length
+
 # How a file of each format begins. OpenImageIO would try its readers for twenty more, which see
 # fewer damaged files than these do.
 BEGINNINGS = (
@@ -71,7 +73,8 @@ def open_image(path: Path) -> Iterator[Any]:
 
 
 def error_text(text: str) -> str:
-    """An error of OpenImageIO in one line; it gives none for some damaged files."""
+    """An error of a library in one short line; it gives none for some damaged files."""
     if not text or "could not find a format reader" in text:
         return "it is damaged, or of no known format"
-    return printable(text)
+    line = printable(text)
+    return line if len(line) <= ERROR_LENGTH else f"{line[:ERROR_LENGTH]}..."

@@ -76,7 +76,10 @@ class CalibrationFrame:
         else:
             mosaic = read_image(self.path, mosaic=True).pixels.astype(np.float32)
         if self.signal:
-            mosaic = mosaic * np.float32(self.sensor.unit) + np.float32(self.sensor.black_level)
+            with np.errstate(over="ignore"):
+                mosaic = mosaic * np.float32(self.sensor.unit) + np.float32(self.sensor.black_level)
+            if not np.isfinite(mosaic).all():
+                raise ImageError(f"{self.path}: damaged: its signal is beyond the range of floats")
             nearest = np.rint(mosaic)
             # Signal that normalize made from whole DN comes back to within float's last bits.
             if np.abs(mosaic - nearest).max() < 0.01:
