@@ -6,8 +6,10 @@ import socket
 import struct
 import subprocess
 import sys
+import tarfile
 import time
 import zlib
+from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
@@ -18,6 +20,7 @@ from clpipe.base.errors import ClpipeError, ImageError, RequestError
 from clpipe.base.files import sha256_of
 from clpipe.base.reading import parse_toml, unchanged
 from clpipe.batch.replay import replay_of
+from clpipe.batch.tars import Members, is_own
 from clpipe.camera.profile import load_camera
 from clpipe.chain.files import load_config
 from clpipe.chain.registry import load_stage_file
@@ -25,7 +28,7 @@ from clpipe.chain.settings import settings_from
 from clpipe.chain.toml import toml_value
 from clpipe.images.dump import dump_of, read_dump
 from clpipe.images.raw import read_exif, read_facts
-from clpipe.images.read import ReadOptions, read_source
+from clpipe.images.read import ReadOptions, holds_mosaic, read_source
 from clpipe.inputs.kept import carried_settings
 from clpipe.inputs.manifest import read_manifest
 from clpipe.stage import Kind
@@ -336,3 +339,66 @@ def test_a_file_that_changes_while_it_is_read_is_refused(tmp_path):
             unchanged(path),
         ):
             change()
+
+
+def tar_header(name: str, size: int, kind: bytes = b"0") -> bytes:
+    info = tarfile.TarInfo(name)
+    info.size, info.type = size, kind
+    return info.tobuf(tarfile.GNU_FORMAT)
+
+
+TARS = {
+    **{
+        f"{kind.decode()} of 2^{power}": tar_header("a", 1 << power, kind) + bytes(2048)
+        for kind in (b"L", b"K", b"x", b"g", b"S")
+        for power in (45, 80)
+    },
+    "large": tar_header("a.json", 1 << 45) + b"{" * 4096,
+    "nested": tar_header("a.json", 200_704) + b"[" * 200_704 + bytes(1024),
+    "a list": tar_header("a.json", 512) + b"[1]".ljust(512) + bytes(1024),
+}
+
+
+@pytest.mark.parametrize("data", TARS.values(), ids=TARS)
+def test_a_damaged_tar_is_nobodys_and_holds_nothing(tmp_path, data):
+    path = tmp_path / "000000.tar"
+    path.write_bytes(data)
+    assert not is_own(path)
+    members = Members(path)
+    assert not any(members.sidecar(name) for name in members.places)
+
+
+def test_a_pipe_in_the_output_folder_does_not_make_a_run_wait(clpipe, write_exr):
+    path = write_exr("a.exr", np.full((4, 6, 3), 0.25))
+    for name in ("out/a.json", "tars/000000.tar", "t.json"):
+        Path(name).parent.mkdir(exist_ok=True)
+        os.mkfifo(name)
+    run = ("run", path, "--device", "numpy")
+    assert (
+        "a.json: cannot be read: it is a named pipe" in clpipe(*run, "-o", "out", status=1).output
+    )
+    os.remove("out/a.json")
+    os.mkfifo("out/a.jpg")
+    clpipe(*run, "-o", "out")
+    assert Path("out/a.jpg").is_file()
+    assert (
+        "did not write this tar" in clpipe(*run, "-o", "tars", "--webdataset", 1, status=2).output
+    )
+    assert "exists and is no trace" in clpipe(*run, "-o", "x", "--trace", "t.json", status=2).output
+
+
+def test_an_image_of_very_many_parts_is_refused(tmp_path):
+    """Each part takes as long to find as there are parts before it."""
+    fields = [(256, 4), (257, 4), (258, 32), (259, 1), (262, 1), (273, 0), (277, 1), (278, 4)]
+    fields += [(279, 64), (339, 3)]
+    body = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in fields)
+    size = 2 + len(body) + 4
+    offsets = [8 + size * i for i in range(1, 20_000)] + [0]
+    parts = [struct.pack("<H", len(fields)) + body + struct.pack("<I", at) for at in offsets]
+    path = tmp_path / "a.tif"
+    path.write_bytes(b"II*\0" + struct.pack("<I", 8) + b"".join(parts))
+    begin = time.perf_counter()
+    with pytest.raises(ImageError, match=r"a\.tif: has more than 1000 parts"):
+        read_source(path, Kind.RGB, ReadOptions())
+    assert holds_mosaic(path)
+    assert time.perf_counter() - begin < 10

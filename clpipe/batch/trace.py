@@ -7,6 +7,7 @@ from typing import Any
 
 from clpipe.base.errors import RequestError
 from clpipe.base.files import write_new
+from clpipe.base.reading import check_regular
 from clpipe.batch.outcome import STEPS, Outcome
 
 BEGINNING = b'{"traceEvents"'
@@ -21,6 +22,7 @@ def check_trace(path: Path) -> None:
     if path.suffix != ".json":
         raise RequestError(f"--trace: found {path}; expected a name that ends in .json")
     try:
+        check_regular(path)
         with open(path, "rb") as file:
             own = file.read(len(BEGINNING)) == BEGINNING
     except FileNotFoundError:

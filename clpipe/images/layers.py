@@ -12,6 +12,8 @@ from clpipe.images.attributes import own_attributes
 # Layers that hold the finished picture, in order of preference: without a name, then common names.
 PICTURE_LAYERS = ("", "combined", "beauty", "rgba", "rgb", "color", "default")
 
+MOST_PARTS = 1000  # each takes as long as there are parts before it
+
 
 @dataclass(frozen=True)
 class PictureLocation:
@@ -54,6 +56,8 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
     while file.seek_subimage(part, 0):
         spec = file.spec()
         part += 1
+        if part > MOST_PARTS:
+            raise ImageError(f"{path}: has more than {MOST_PARTS} parts")
         if refusal := _refusal(spec, has_levels=file.seek_subimage(part - 1, 1)):
             refusals.append(refusal)
             continue

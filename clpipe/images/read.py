@@ -14,7 +14,13 @@ from clpipe.base.files import sha256_of
 from clpipe.base.types import Array, Doubles
 from clpipe.images.attributes import own_attributes, shot_attributes
 from clpipe.images.colour import CIE_XYZ, SRGB, to_linear_srgb
-from clpipe.images.layers import PictureLocation, find_picture, mosaic_channel, picture_channels
+from clpipe.images.layers import (
+    MOST_PARTS,
+    PictureLocation,
+    find_picture,
+    mosaic_channel,
+    picture_channels,
+)
 from clpipe.images.luminance_chroma import read_luminance_chroma
 from clpipe.images.openimageio import SubsampledError, error_text, open_image
 from clpipe.images.pixels import (
@@ -201,7 +207,7 @@ def holds_mosaic(path: Path) -> bool:
     """
     with open_image(path) as file:
         parts: list[list[str]] = []
-        while file.seek_subimage(len(parts), 0):
+        while len(parts) < MOST_PARTS and file.seek_subimage(len(parts), 0):
             parts.append(list(file.spec().channelnames))
     return not any(map(picture_channels, parts)) and any(map(mosaic_channel, parts))
 

@@ -14,7 +14,7 @@ from clpipe.base.about import __version__
 from clpipe.base.digests import digests, stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import write_beside
-from clpipe.base.reading import read_bytes
+from clpipe.base.reading import check_regular, read_bytes
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.images.read import SourceImage
@@ -119,6 +119,7 @@ def check_own(path: Path) -> None:
         ImageError: it is somebody else's.
     """
     try:
+        check_regular(path)
         with open(path, "rb") as file:
             ends = file.read(MARKED)
             file.seek(max(os.fstat(file.fileno()).st_size - MARKED, 0))
