@@ -5,11 +5,18 @@ from pathlib import Path
 
 from clpipe.base.text import one_line
 
+LONGEST = 4000  # characters of a message; what it repeats of a file can have any length
+
 
 class ClpipeError(Exception):
     """Base of all errors that are reported as one clear message, without a traceback."""
 
     exit_status = 2
+
+    def __str__(self) -> str:
+        text = super().__str__()
+        half = LONGEST // 2
+        return text if len(text) <= LONGEST else f"{text[:half]} ... {text[-half:]}"
 
 
 class RequestError(ClpipeError):

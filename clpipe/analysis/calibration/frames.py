@@ -9,6 +9,7 @@ import numpy as np
 
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.text import one_line
 from clpipe.base.types import Floats
 from clpipe.camera.profile import Matrix
 from clpipe.chain.chain import make_chain
@@ -177,9 +178,9 @@ def _from_kept(
     """The frame in a mosaic that clpipe kept."""
     kind = attributes.get("kind", "")
     if kind not in (Kind.RAW.label, Kind.MOSAIC.label):
+        held = one_line(f"{kind}, kept after {attributes.get('stage')}")
         raise ImageError(
-            f"{path}: holds {kind}, kept after {attributes.get('stage')}; a mosaic is needed, such "
-            "as clpipe run --until quantize writes"
+            f"{path}: holds {held}; a mosaic is needed, such as clpipe run --until quantize writes"
         )
     try:
         settings = carried_settings(attributes)
