@@ -414,3 +414,10 @@ def test_a_message_repeats_a_giant_value_in_part(tmp_path):
     with pytest.raises(RequestError, match=r"unknown camera 'xxx.*xxx.*allowed: ") as refused:
         load_config(str(tmp_path / "a.toml")).settings.check_cameras()
     assert len(str(refused.value)) < 5000
+
+
+def test_names_from_a_file_are_escaped_in_messages(tmp_path):
+    (tmp_path / "a.csv").write_text("pa\x1b[31mth,na\x07me\na.exr,b\n")
+    with pytest.raises(RequestError, match="there is no column 'path'") as refused:
+        read_manifest(tmp_path / "a.csv")
+    assert str(refused.value).isprintable()

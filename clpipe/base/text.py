@@ -10,7 +10,7 @@ def one_of(what: str, found: str, allowed: Iterable[str]) -> str:
     >>> one_of("stage", "demosiac", ["mosaic", "demosaic"])
     "unknown stage 'demosiac' (did you mean 'demosaic'?); allowed: mosaic, demosaic"
     """
-    names = list(allowed)
+    names = list(map(one_line, allowed))
     near = get_close_matches(found, names, n=1, cutoff=0.5)
     hint = f" (did you mean '{near[0]}'?)" if near else ""
     return f"unknown {what} '{one_line(found)}'{hint}; allowed: {', '.join(names) or 'none'}"
