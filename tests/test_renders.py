@@ -181,7 +181,13 @@ def test_other_primaries_become_those_of_srgb(tmp_path):
     for primaries in (SRGB, ()):
         source = with_chromaticities(grey, path, *primaries, adoptedNeutral=(0.3457, 0.3585))
         assert source.pixels[0, 0, 2] > source.pixels[0, 0, 0]  # what D50 is becomes neutral
-    for wrong in ((0,) * 8, (np.nan,) * 8, (*SRGB[:6], 0.3, 0), (*SRGB[:2] * 3, 0.3, 0.3)):
+    for wrong in (
+        (0,) * 8,
+        (np.nan,) * 8,
+        (*SRGB[:6], 0.3, 0),
+        (*SRGB[:2] * 3, 0.3, 0.3),
+        (1, -3e38, *SRGB[2:]),
+    ):
         with pytest.raises(
             ImageError, match=r"a\.exr: its chromaticities, .*, are not those of a red"
         ):
