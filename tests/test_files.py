@@ -9,7 +9,7 @@ import pytest
 
 from clpipe.base import files
 from clpipe.base.errors import ImageError, OutputError
-from clpipe.base.files import read_regular, write_whole
+from clpipe.base.files import write_whole
 from clpipe.batch.outcome import DONE, Outcome
 from clpipe.batch.run_log import RunLog, read_log
 from clpipe.inputs.find import Job
@@ -59,17 +59,6 @@ def test_the_longest_name_that_a_disk_takes(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == [name]
     with pytest.raises(ImageError, match="File name too long"):
         write_whole(tmp_path / f"x{name}", b"x")
-
-
-def test_pipes_devices_folders_and_giants_are_not_read(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    for path in (tmp_path / "pipe", Path("/dev/zero"), tmp_path):
-        with pytest.raises(OSError, match=r"not a regular file|Is a directory"):
-            read_regular(path, 1000)
-    (tmp_path / "a").write_bytes(bytes(1001))
-    with pytest.raises(OSError, match="1001 bytes; at most 1000"):
-        read_regular(tmp_path / "a", 1000)
-    assert read_regular(tmp_path / "a", 1001) == bytes(1001)
 
 
 def outcome(number):

@@ -234,7 +234,7 @@ def test_a_jsonl_that_is_wrong(manifest, line, message):
 def test_a_manifest_that_is_not_there(tmp_path):
     with pytest.raises(RequestError, match=r"no.csv: cannot read this manifest: No such file"):
         read_manifest(tmp_path / "no.csv")
-    with pytest.raises(RequestError, match="cannot read this manifest: Is a directory"):
+    with pytest.raises(RequestError, match="cannot read this manifest: it is a folder, not a file"):
         read_manifest(tmp_path)
 
 
@@ -246,7 +246,7 @@ def test_a_manifest_that_is_not_there(tmp_path):
         ("iso\nnan", "row 2: iso: found nan, but camera sony-a7r2"),
         ("iso\n50", "row 2: iso: found 50, but camera sony-a7r2 goes from 100 to 25600"),
         ("iso\n1" + "0" * 400, "row 2: iso: found 10+, but it is at most"),
-        ("iso\n" + "1" * 5000, "row 2: iso: found '1+', but it is a number"),
+        ("iso\n" + "1" * 5000, "row 2: iso: found '1+.*1', but it is a number"),
         ("iso\n" + "[" * 5000, "row 2: iso: found .*but it is a number"),
         ("seed\n1.5", "row 2: seed: found 1.5, but it is a whole number"),
         ('seed\n"{choice=[1, 2]}"', "row 2: seed: found .*cannot be drawn"),

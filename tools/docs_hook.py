@@ -28,8 +28,8 @@ def pages() -> dict[str, str | bytes]:
         "cameras.md": cameras_page(),
         "configurations.md": configurations_page(),
         "cli.md": cli_page(),
-        "changelog.md": (ROOT / "CHANGELOG.md").read_text(),
-        "contributing.md": (ROOT / "CONTRIBUTING.md").read_text(),
+        "changelog.md": (ROOT / "CHANGELOG.md").read_text("utf-8"),
+        "contributing.md": (ROOT / "CONTRIBUTING.md").read_text("utf-8"),
         **notebook_files(ROOT / "docs" / f"{NOTEBOOK}.ipynb"),
     }
 
@@ -222,7 +222,7 @@ def configurations_page() -> str:
         "[Configuration and draws](configuration.md) explains the format.\n"
     ]
     for path in sorted(ROOT.glob("clpipe/**/configs/*.toml")):
-        parts.append(f"## {path.stem}\n\n```toml\n{path.read_text()}```\n")
+        parts.append(f"## {path.stem}\n\n```toml\n{path.read_text('utf-8')}```\n")
     return "\n".join(parts)
 
 
@@ -247,7 +247,7 @@ wrong and nothing is written; 3, there is no usable device; 130, interrupted.
 
 def notebook_files(path: Path) -> dict[str, str | bytes]:
     """A notebook with its outputs as a page, and its pictures."""
-    notebook = json.loads(path.read_text())
+    notebook = json.loads(path.read_text("utf-8"))
     name, parts, files = path.stem, [], {}
     for cell_number, each in enumerate(notebook["cells"]):
         source = "".join(each["source"])

@@ -3,11 +3,20 @@
 from collections.abc import Mapping
 from pathlib import Path
 
+from clpipe.base.text import one_line
+
+LONGEST = 4000  # characters of a message; what it repeats of a file can have any length
+
 
 class ClpipeError(Exception):
     """Base of all errors that are reported as one clear message, without a traceback."""
 
     exit_status = 2
+
+    def __str__(self) -> str:
+        text = super().__str__()
+        half = LONGEST // 2
+        return text if len(text) <= LONGEST else f"{text[:half]} ... {text[-half:]}"
 
 
 class RequestError(ClpipeError):
@@ -30,12 +39,17 @@ class ImageError(ClpipeError):
     exit_status = 1
 
 
+class NoPictureError(ImageError):
+    """A file is a whole image, but has no channels of the kind that is read, such as only depth."""
+
+
 class KindError(ImageError):
     """A kept image lacks the channels that are needed; ``attributes`` are those of the file."""
 
     def __init__(self, path: Path, attributes: Mapping[str, str]) -> None:
         stage = attributes.get("stage", "a stage that it does not name")
-        super().__init__(f"{path}: holds {attributes['kind']}, kept after {stage}")
+        held = one_line(f"{attributes['kind']}, kept after {stage}")
+        super().__init__(f"{path}: holds {held}")
         self.attributes = attributes
 
 

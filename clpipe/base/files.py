@@ -1,25 +1,25 @@
 """Whole files: their digest, and writing them so that none is ever left half-written."""
 
 import contextlib
-import errno
 import hashlib
 import os
 import secrets
-import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 from clpipe.base.errors import ImageError
+from clpipe.base.reading import check_regular
 
 
 def sha256_of(path: Path) -> tuple[str, int]:
     """The SHA-256 of a file, and its size in bytes.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: it cannot be read, or is no regular file.
     """
+    check_regular(path)
     digest = hashlib.sha256()
     with open(path, "rb", buffering=0) as file:
         while part := file.read(4 << 20):
@@ -33,25 +33,6 @@ class Stored:
 
     size: int
     sha256: str
-
-
-def read_regular(path: Path, largest: int) -> bytes:
-    """The content of a regular file; neither a device nor a pipe is waited for.
-
-    Args:
-        path: the file.
-        largest: more bytes are refused before they are read.
-
-    Raises:
-        OSError: it cannot be read, is no regular file, or is larger.
-    """
-    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
-        status = os.fstat(file.fileno())
-        if not stat.S_ISREG(status.st_mode):
-            raise OSError(errno.EINVAL, "not a regular file", str(path))
-        if status.st_size > largest:
-            raise OSError(errno.EFBIG, f"{status.st_size} bytes; at most {largest}", str(path))
-        return file.read()
 
 
 _unfinished: set[Path] = set()  # temporary files of this process, for `remove_temporary_files`

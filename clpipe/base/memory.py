@@ -49,7 +49,7 @@ def available_memory(root: Path = Path("/")) -> int | None:
 
 def _available(meminfo: Path) -> int | None:
     try:
-        match = re.search(r"^MemAvailable:\s+(\d+) kB", meminfo.read_text(), re.MULTILINE)
+        match = re.search(r"^MemAvailable:\s+(\d+) kB", meminfo.read_text("utf-8"), re.MULTILINE)
     except OSError:
         return None
     return int(match[1]) * 1024 if match else None
@@ -68,9 +68,9 @@ def _left_in_groups(root: Path) -> list[int | None]:
 def _left_in_group(folder: Path, limit: str, used: str) -> int | None:
     """Bytes left in one group; None without a limit. Cached files count as free: they can go."""
     try:
-        rest = int((folder / limit).read_text()) - int((folder / used).read_text())
+        rest = int((folder / limit).read_text("utf-8")) - int((folder / used).read_text("utf-8"))
         files = re.search(
-            r"^inactive_file (\d+)", (folder / "memory.stat").read_text(), re.MULTILINE
+            r"^inactive_file (\d+)", (folder / "memory.stat").read_text("utf-8"), re.MULTILINE
         )
     except (OSError, ValueError):  # not there, or "max": no limit
         return None

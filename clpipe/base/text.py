@@ -10,10 +10,21 @@ def one_of(what: str, found: str, allowed: Iterable[str]) -> str:
     >>> one_of("stage", "demosiac", ["mosaic", "demosaic"])
     "unknown stage 'demosiac' (did you mean 'demosaic'?); allowed: mosaic, demosaic"
     """
-    names = list(allowed)
+    names = list(map(one_line, allowed))
     near = get_close_matches(found, names, n=1, cutoff=0.5)
     hint = f" (did you mean '{near[0]}'?)" if near else ""
-    return f"unknown {what} '{found}'{hint}; allowed: {', '.join(names) or 'none'}"
+    return f"unknown {what} '{one_line(found)}'{hint}; allowed: {', '.join(names) or 'none'}"
+
+
+def one_line(text: str) -> str:
+    r"""The text in one line, with an escape for each character that cannot be printed.
+
+    A file's name may hold such characters; they would break a line, or change the terminal.
+
+    >>> one_line("in/a" + chr(10) + chr(27) + "[31m.exr")
+    'in/a\\n\\x1b[31m.exr'
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def printable(text: str) -> str:

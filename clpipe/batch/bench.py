@@ -204,13 +204,13 @@ def one_by_one(
 def forget_peak_memory() -> None:
     """Reset the peak of this process's memory (Linux, proc(5): clear_refs)."""
     with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
+        Path("/proc/self/clear_refs").write_text("5", "utf-8")
 
 
 def peak_memory() -> int:
     """The most memory that this process held, in bytes; 0 where the system has no /proc."""
     try:
-        match = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+        match = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text("utf-8"))
     except OSError:
         match = None
     return int(match[1]) * 1024 if match else 0

@@ -33,11 +33,13 @@ class Outcome:
 
     Args:
         job: the job.
-        status: "done", "skipped" (its pictures were there already), "left out" (kept after another
-            step than the one to go on from) or "failed".
+        status: "done", "skipped" (its pictures were there already), "left out" (found in a folder,
+            but without a picture, or kept after another step than the one to go on from) or
+            "failed".
         megapixels: of the image that was read.
         warnings: about the image.
         error: why it failed; "" otherwise.
+        reason: what an image that was left out holds in place of a picture; "" otherwise.
         outputs: the files that were written, relative to the output folder.
         began: in s since 1970.
         spans: what was done when.
@@ -49,6 +51,7 @@ class Outcome:
     megapixels: float = 0.0
     warnings: tuple[str, ...] = ()
     error: str = ""
+    reason: str = ""
     outputs: tuple[str, ...] = ()
     began: float = 0.0
     spans: tuple[Span, ...] = ()

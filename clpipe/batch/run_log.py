@@ -39,6 +39,7 @@ class Summary:
         default_factory=lambda: dict.fromkeys((DONE, SKIPPED, LEFT_OUT, FAILED), 0)
     )
     failures: list[str] = field(default_factory=list)
+    without_picture: list[str] = field(default_factory=list)
     megapixels: float = 0.0
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STEPS, 0.0))
     began: float = field(default_factory=time.perf_counter)
@@ -56,6 +57,8 @@ class Summary:
                 self.most_clipped = outcome.clipped, str(outcome.job.path)
         if outcome.error:
             self.failures.append(outcome.error)
+        if outcome.reason:
+            self.without_picture.append(outcome.reason)
         for step in STEPS:
             self.seconds[step] += outcome.seconds(step)
 
@@ -147,6 +150,7 @@ class RunLog:
                 "warnings": list(outcome.warnings),
                 "clipped": round(outcome.clipped, 4),
                 "error": outcome.error or None,
+                **({"reason": outcome.reason} if outcome.reason else {}),
             },
         )
         self._write(line)

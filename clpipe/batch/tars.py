@@ -1,7 +1,6 @@
 """WebDataset tars: each holds the pictures of a number of images, with their sidecars."""
 
 import hashlib
-import json
 import os
 import re
 import shutil
@@ -12,6 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.base.errors import RequestError
+from clpipe.base.reading import TEXT_BYTES, check_regular, parse_json
 from clpipe.inputs.find import Job
 from clpipe.outputs.folder import remove_unfinished
 from clpipe.outputs.sidecar import OWN, SIDECAR
@@ -19,6 +19,9 @@ from clpipe.outputs.sidecar import OWN, SIDECAR
 STAGING = ".clpipe."  # begins the name of the folder that holds a tar's pictures until it is packed
 
 NUMBERED = re.compile(rf"({re.escape(STAGING)})?(\d{{6,}})\.tar")
+
+# What tarfile raises for a damaged tar; a header may claim more bytes than a number or memory has.
+DAMAGED = (OSError, tarfile.TarError, ValueError, OverflowError, MemoryError)
 
 HIDDEN_BY_READERS = re.compile("__[^/]*__/")  # the webdataset package skips such folders
 
@@ -65,7 +68,8 @@ def cut(jobs: Sequence[Job], count: int, folder: Path) -> list[Tar]:
         if name in owners:
             raise RequestError(
                 f"{owners[name].label} and {job.label} would both be the sample {name} "
-                "(a key of WebDataset has no dots); give one of them another name"
+                "(a key of WebDataset has no dots); give one of them another name, "
+                "or say --keep-suffix"
             )
         if HIDDEN_BY_READERS.match(name):
             raise RequestError(
@@ -110,13 +114,17 @@ def prepare(tars: Sequence[Tar], overwrite: bool) -> None:
 
 
 def is_own(path: Path) -> bool:
-    """Whether a file is a tar whose first JSON is a sidecar."""
+    """Whether a file is a tar whose first JSON is a sidecar, or what a lost one leaves: nothing."""
     try:
+        check_regular(path)
+        with open(path, "rb") as file:
+            if not file.read(tarfile.RECORDSIZE).strip(b"\0"):
+                return True
         with tarfile.open(path, "r:") as tar:
             for info in tar:
                 if info.name.endswith(f".{SIDECAR}") and (data := tar.extractfile(info)):
-                    return OWN in json.load(data)
-    except (OSError, tarfile.TarError, ValueError, TypeError):
+                    return info.size <= TEXT_BYTES and OWN in parse_json(data.read())
+    except (*DAMAGED, TypeError):
         pass
     return False
 
@@ -128,12 +136,12 @@ class Members:
         self._path = path
         self.places: dict[str, tuple[int, int]] = {}  # offset and size, in bytes
         try:
-            whole = path.stat().st_size
+            whole = check_regular(path).st_size
             with tarfile.open(path, "r:") as tar:
                 for info in tar:
                     if info.offset_data + info.size <= whole:
                         self.places[info.name] = (info.offset_data, info.size)
-        except (OSError, tarfile.TarError):
+        except DAMAGED:
             pass
 
     def sidecar(self, name: str) -> Mapping[str, Any]:
@@ -144,7 +152,7 @@ class Members:
         try:
             with open(self._path, "rb") as file:
                 file.seek(start)
-                values = json.loads(file.read(size))
+                values = parse_json(file.read(min(size, TEXT_BYTES)))
         except (OSError, ValueError):
             return {}
         return values if isinstance(values, dict) else {}

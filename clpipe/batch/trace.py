@@ -10,6 +10,7 @@ from typing import Any, Self
 
 from clpipe.base.errors import RequestError
 from clpipe.base.files import make_folder_of, whole_file
+from clpipe.base.reading import check_regular
 from clpipe.batch.outcome import STEPS, Outcome
 
 BEGINNING = b'{"traceEvents"'
@@ -24,6 +25,7 @@ def check_trace(path: Path) -> None:
     if path.suffix != ".json":
         raise RequestError(f"--trace: found {path}; expected a name that ends in .json")
     try:
+        check_regular(path)
         with open(path, "rb") as file:
             own = file.read(len(BEGINNING)) == BEGINNING
     except FileNotFoundError:

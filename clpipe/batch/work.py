@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.digests import stamp_of
-from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.errors import ImageError, NoPictureError, RequestError
 from clpipe.base.types import Array
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome, Span
 from clpipe.chain.chain import Chain
@@ -44,6 +44,7 @@ class Task:
     unwritten: int = 0  # renditions
     status: str = DONE
     error: str = ""
+    reason: str = ""
     outputs: list[str] = field(default_factory=list)
     clipped: float = 0.0  # the share of clipped pixels, of the rendition that has most
 
@@ -66,6 +67,7 @@ class Task:
             width * height / 1e6,
             self.source.warnings if self.source else (),
             self.error,
+            self.reason,
             tuple(self.outputs),
             self.began,
             tuple(self.spans),
@@ -137,6 +139,7 @@ class ImageWorker:
             except (ImageError, RequestError, MemoryError) as error:
                 if task.loader.is_left_out(job, error):
                     task.status = LEFT_OUT
+                    task.reason = str(error) if isinstance(error, NoPictureError) else ""
                 else:
                     task.error = task.loader.error_text(job, error)
         return task

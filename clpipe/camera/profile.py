@@ -1,6 +1,5 @@
 """Camera profiles: what a sensor does at each ISO, from a TOML file that cites every number."""
 
-import tomllib
 from functools import cache, cached_property, lru_cache
 from importlib import resources
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from clpipe.base.errors import RequestError
+from clpipe.base.reading import parse_toml, read_text
 from clpipe.base.text import one_of
 from clpipe.base.types import Doubles
 from clpipe.base.validation import first_fault
@@ -248,18 +248,18 @@ def load_camera(name: str) -> Camera:
     if path.suffix != ".toml":
         raise RequestError(one_of("camera", name, built_in) + ", or a .toml file")
     try:
-        return _parse(path.read_text("utf-8"))
+        return _parse(read_text(path))
     except OSError as error:
         raise RequestError(f"{path}: cannot read this camera profile: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise RequestError(f"{path}: not valid TOML: {error}") from None
     except ValidationError as error:
         raise RequestError(f"{path}: {_reason(error)}") from None
+    except ValueError as error:
+        raise RequestError(f"{path}: not valid TOML: {error}") from None
 
 
 @lru_cache(maxsize=64)  # a batch loads the camera once for each image
 def _parse(text: str) -> Camera:
-    return Camera.model_validate(tomllib.loads(text))
+    return Camera.model_validate(parse_toml(text))
 
 
 def _reason(error: ValidationError) -> str:

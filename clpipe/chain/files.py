@@ -1,6 +1,5 @@
 """Configurations: TOML files in, and a chain as such a file out."""
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -8,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import KeyedError, RequestError
+from clpipe.base.reading import parse_toml, read_text
 from clpipe.base.text import one_of
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.keys import CODE, OUTPUT, names_in
@@ -56,8 +56,8 @@ def load_config(name: str) -> Config:
     if path.suffix != ".toml" and not path.is_file():
         raise RequestError(one_of("configuration", name, built_in) + ", or a .toml file")
     try:
-        text = path.read_text("utf-8-sig")
-        values = tomllib.loads(text)
+        text = read_text(path)
+        values = parse_toml(text)
         stage_files = [path.parent / file for file in names_in(values, CODE, "files")]
         for file in stage_files:
             load_stage_file(file)
@@ -67,7 +67,7 @@ def load_config(name: str) -> Config:
         raise RequestError(f"{path}: cannot read this configuration: {error.strerror}") from None
     except UnicodeDecodeError:
         raise RequestError(f"{path}: not a text file, so not a TOML configuration") from None
-    except (ValueError, RecursionError) as error:  # tomllib's, also of too long numbers
+    except ValueError as error:
         raise RequestError(f"{path}: not valid TOML: {error}") from None
     except KeyedError as error:
         line = line_of(text, error.key)

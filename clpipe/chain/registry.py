@@ -1,5 +1,6 @@
 """All stages: clpipe's own, those of installed packages, and those of stage files."""
 
+import os
 import re
 import traceback
 from collections.abc import Iterable, Iterator
@@ -17,6 +18,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from clpipe.base.errors import ClpipeError, RequestError
+from clpipe.base.reading import check_regular
 from clpipe.stage import Context, Literal, Method, Stage
 from clpipe.stages import own_stages
 
@@ -63,7 +65,7 @@ def load_stage_file(path: Path) -> Stage:
             another stage.
     """
     with _loading:
-        return _loaded_file(path, path.resolve())
+        return _loaded_file(path, Path(os.path.realpath(path)))
 
 
 def code_files(stage_files: Iterable[Path]) -> list[Path]:
@@ -85,8 +87,12 @@ def _loaded_file(path: Path, where: Path) -> Stage:
         spec = spec_from_file_location(f"clpipe_stage_{path.stem}", where)
         if path.suffix != ".py" or spec is None or spec.loader is None:
             raise RequestError(f"{path}: a stage file is a Python file, ending in .py")
-        if not where.is_file():
-            raise RequestError(f"{path}: no such file")
+        try:
+            check_regular(where)
+        except FileNotFoundError:
+            raise RequestError(f"{path}: no such file") from None
+        except OSError as error:
+            raise RequestError(f"{path}: cannot be read: {error.strerror}") from None
         module = module_from_spec(spec)
         stage, _ = _loaded(str(path), module)
         _check_stage_name(str(path), stage.name, all_stages())
@@ -176,7 +182,7 @@ def check_passes(name: str, stage: Stage, method: Method, context: Context) -> N
                         f"arguments() gives {', '.join(arguments) or 'none'}"
                     )
             for function in filter(None, (pass_.function, pass_.finish)):
-                if not re.search(rf"\b{re.escape(function)}\s*\(", kernel.read_text()):
+                if not re.search(rf"\b{re.escape(function)}\s*\(", kernel.read_text("utf-8")):
                     raise RequestError(
                         f"stage {name}: {kernel} has no function {function}, which a pass names"
                     )

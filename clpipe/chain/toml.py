@@ -2,11 +2,11 @@
 
 import json
 import re
-import tomllib
 from collections.abc import Mapping
 from typing import Any
 
 from clpipe.base.errors import RequestError
+from clpipe.base.reading import parse_toml
 
 
 def line_of(text: str, key: str) -> int | None:
@@ -49,8 +49,8 @@ def toml_value(text: str) -> Any:
     (0.0001, {'choice': [100, 400]}, 'bilinear')
     """
     try:
-        table = tomllib.loads(f"value = {text}")
-    except (ValueError, RecursionError):
+        table = parse_toml(f"value = {text}")
+    except ValueError:
         return text
     return table["value"] if len(table) == 1 else text
 

@@ -17,7 +17,7 @@ from clpipe.commands.printing import show, show_json
 from clpipe.engine.bench import bench as run_bench
 from clpipe.engine.bench import bench_methods
 from clpipe.engine.device import open_device
-from clpipe.images.read import MAX_PIXELS
+from clpipe.images.pixels import MAX_PIXELS
 
 BATCH_HEADINGS = (
     "images",

@@ -14,6 +14,7 @@ from click.shell_completion import CompletionItem
 
 from clpipe.base.about import __version__
 from clpipe.base.errors import ClpipeError, OutputError, RequestError
+from clpipe.base.text import one_line
 
 # In the order of the help. Each is a module of this folder that defines a function of its name.
 COMMANDS = (
@@ -33,7 +34,7 @@ class Notices(logging.Handler):
     """Prints what the package logs, such as that kernels are being compiled."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        click.echo(f"clpipe: {record.getMessage()}", err=True)
+        click.echo(f"clpipe: {one_line(record.getMessage())}", err=True)
 
 
 NOTICES = Notices()
@@ -104,7 +105,8 @@ def summary(name: str) -> str:
 
 def fail(error: ClpipeError) -> NoReturn:
     """Print an error and exit with its status."""
-    click.echo(f"clpipe: {error}", err=True)
+    lines = map(one_line, str(error).split("\n"))  # a compiler's message has several
+    click.echo("clpipe: " + "\n".join(lines), err=True)
     sys.exit(error.exit_status)
 
 

@@ -6,6 +6,7 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from clpipe.base.text import one_line
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
 from clpipe.batch.run_log import Summary
 from clpipe.chain.formats import ending_of
@@ -56,7 +57,7 @@ class Reporter:
     def print(self, text: str) -> None:
         """Print a line. One that cannot be printed, on a full disk, ends no run."""
         with contextlib.suppress(OSError):
-            self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+            self._console.print(one_line(text), markup=False, highlight=False, soft_wrap=True)
 
     def report(self, outcome: Outcome) -> None:
         """Print what became of one image, after it was added to the summary."""
@@ -103,15 +104,18 @@ class Reporter:
         summary, counts = self._summary, self._summary.counts
         if summary.much_clipped and not self._quiet:
             self.print(self._clipping())
-        if counts[LEFT_OUT] and not self._quiet:
-            self.print(
-                f"{counts[LEFT_OUT]} images in folders were kept after other stages and left out"
-            )
+        without = summary.without_picture
+        if without and not self._quiet:
+            hold = "images in folders hold" if len(without) > 1 else "image in a folder holds"
+            self.print(f"left out: {len(without)} {hold} no picture, such as {without[0]}")
+        if counts[LEFT_OUT] > len(without) and not self._quiet:
+            kept = counts[LEFT_OUT] - len(without)
+            self.print(f"{kept} images in folders were kept after other stages and left out")
         failed = summary.failures
         if self._several and failed and (self._bar or not self._quiet):
             self.print("failed:")
             for error in failed[:REPEATED]:
-                self.print(f"  {error.splitlines()[0]}")
+                self.print(f"  {error}")
             if len(failed) > REPEATED:
                 self.print(f"  and {len(failed) - REPEATED} more, which the run log names")
         if self._quiet or not (self._several or failed or counts[SKIPPED]):
@@ -119,6 +123,8 @@ class Reporter:
         there = f" ({counts[SKIPPED]} of them were there already)" if counts[SKIPPED] else ""
         done = counts[DONE] + counts[SKIPPED]
         text = f"{done} of {summary.total} images done{there}, {counts[FAILED]} failed"
+        if counts[LEFT_OUT]:
+            text += f", {counts[LEFT_OUT]} left out"
         if left := summary.total - summary.finished:
             text += f", {left} not begun"
         if counts[DONE]:

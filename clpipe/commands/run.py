@@ -30,7 +30,8 @@ from clpipe.commands.chain_options import chain_options, format_option, keep_opt
 from clpipe.commands.options import Command, raw_size_option, raw_type_option
 from clpipe.commands.progress import Reporter
 from clpipe.engine.device import Device, open_devices
-from clpipe.images.read import MAX_PIXELS, PICTURE_SUFFIXES, TRANSFERS, USUAL_MAX_PIXELS
+from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS
+from clpipe.images.read import PICTURE_SUFFIXES, TRANSFERS
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.folder import output_folder, remove_unfinished
@@ -82,8 +83,21 @@ if TYPE_CHECKING:
     metavar="N",
     help="Refuse larger images, before memory is taken.",
 )
+@click.option(
+    "--exclude",
+    multiple=True,
+    metavar="GLOB",
+    help="Leave out what folders and globs would give: files and folders whose name, or path in "
+    "the input folder, matches; may be repeated.",
+)
 @keep_option
 @format_option
+@click.option(
+    "--keep-suffix",
+    is_flag=True,
+    help="Name outputs by the input's whole name (a.cr2.jpg, not a.jpg), where a folder has a.cr2 "
+    "and a.cr3.",
+)
 @click.option(
     "--device",
     "selectors",
@@ -146,6 +160,8 @@ def run(
     inputs: tuple[str, ...],
     output: Path,
     max_pixels: int,
+    exclude: tuple[str, ...],
+    keep_suffix: bool,
     selectors: tuple[str, ...],
     memory: str | None,
     threads: int | None,
@@ -175,6 +191,8 @@ def run(
     chain adds, in signal squared. It includes what is fixed to a sensor (PRNU, DSNU, columns) and
     rounding, but neither clipping nor defect pixels.
     """
+    if quiet:
+        logging.getLogger("clpipe").setLevel(logging.WARNING)
     tars: list[Tar] = []
     if replay:
         check_beside_replay()
@@ -186,7 +204,7 @@ def run(
     else:
         request = Request.from_options(max_pixels=max_pixels, **options)
         loader = ImageLoader(request)
-        jobs = find_jobs(inputs, output, loader.endings())
+        jobs = find_jobs(inputs, output, loader.endings(), exclude, keep_suffix)
         if per_tar:
             tars = shard.take(cut(jobs, per_tar, output))
             jobs = [job for tar in tars for job in tar.jobs]
@@ -217,8 +235,6 @@ def run(
     )
     opened = batch_of(spec, loader, chain, tars, dask)
     summary = Summary(len(jobs))  # counts seconds from here on
-    if quiet:
-        logging.getLogger("clpipe").setLevel(logging.WARNING)
     reporter = Reporter(summary, writer, Console(stderr=True), quiet)
     events = Trace(trace) if trace else nullcontext()
     with opened as batch, output_folder(output, shard), events as timeline:

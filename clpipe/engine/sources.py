@@ -41,7 +41,7 @@ def file_text(name: str, seen: set[str]) -> str:
         return ""
     seen.add(name)
     path = kernel_folder() / name  # an absolute path stays as it is
-    text = path.read_text()
+    text = path.read_text("utf-8")
     label = name if Path(name).is_absolute() else f"kernels/{name}"
 
     def include(match: re.Match[str]) -> str:

@@ -4,7 +4,8 @@ import contextlib
 from pathlib import Path
 from typing import Any
 
-import OpenImageIO as oiio
+from clpipe.base.errors import ImageError
+from clpipe.images.openimageio import open_image
 
 PREFIX = "clpipe:"  # of the names of clpipe's own attributes
 
@@ -20,13 +21,8 @@ def own_attributes(spec: Any) -> dict[str, str]:
 
 def read_attributes(path: Path) -> dict[str, str]:
     """clpipe's own attributes of a file; none where it is missing, unreadable or not clpipe's."""
-    file = oiio.ImageInput.open(str(path)) if path.is_file() else None
-    with contextlib.suppress(UnicodeDecodeError):
-        if file is None:
-            oiio.geterror()  # clears it; else the next caller is told of this one
-            return {}
-        with contextlib.closing(file):
-            return own_attributes(file.spec())
+    with contextlib.suppress(ImageError), open_image(path) as file:
+        return own_attributes(file.spec())
     return {}
 
 

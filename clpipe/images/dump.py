@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.reading import check_regular
 from clpipe.base.types import Array, Floats
+from clpipe.images.pixels import USUAL_MAX_PIXELS, check_size
 
 # Bytes of a sample. RAW10 and RAW12 are packed as in MIPI CSI-2, without padding after rows.
 TYPES = {
@@ -36,6 +38,18 @@ class Dump:
         """The size of the file in bytes."""
         return int(self.width * self.height * TYPES[self.type])
 
+    def check_size(self, count: int) -> None:
+        """See that a file of ``count`` bytes can be such a dump.
+
+        Raises:
+            ImageError: it cannot; the message says what would fit.
+        """
+        if count != self.byte_count:
+            raise ImageError(
+                f"{count} bytes, but {self.width}x{self.height} {self.type} has "
+                f"{self.byte_count}; {fitting_formats(count, self)}"
+            )
+
     def unpack(self, data: bytes) -> Floats:
         """The mosaic in DN, (height, width).
 
@@ -47,11 +61,7 @@ class Dump:
         Raises:
             ImageError: the data has another size; the message says what would fit.
         """
-        if len(data) != self.byte_count:
-            raise ImageError(
-                f"{len(data)} bytes, but {self.width}x{self.height} {self.type} has "
-                f"{self.byte_count}; {fitting_formats(len(data), self)}"
-            )
+        self.check_size(len(data))
         if self.type in ("uint16le", "uint16be"):
             samples: Array = np.frombuffer(data, "<u2" if self.type == "uint16le" else ">u2")
         else:
@@ -89,14 +99,19 @@ def dump_of(size: str, type_: str) -> Dump:
     return Dump(width, height, type_)
 
 
-def read_dump(data: bytes, path: Path, dump: Dump) -> Floats:
+def read_dump(path: Path, dump: Dump, max_pixels: int = USUAL_MAX_PIXELS) -> Floats:
     """The mosaic of a dump in DN, (height, width).
 
     Raises:
-        ImageError: the data has another size; the message says what would fit.
+        ImageError: the file cannot be read, or is too large, or has another size; the message says
+            what would fit.
     """
+    check_size(path, dump.width, dump.height, max_pixels)
     try:
-        return dump.unpack(data)
+        dump.check_size(check_regular(path).st_size)
+        return dump.unpack(path.read_bytes())
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
     except ImageError as error:
         raise ImageError(f"{path}: {error}") from None
 

@@ -5,12 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.errors import ImageError, KindError
+from clpipe.base.errors import ImageError, KindError, NoPictureError
 from clpipe.base.text import printable
 from clpipe.images.attributes import own_attributes
 
 # Layers that hold the finished picture, in order of preference: without a name, then common names.
 PICTURE_LAYERS = ("", "combined", "beauty", "rgba", "rgb", "color", "default")
+
+MOST_PARTS = 1000  # each takes as long as there are parts before it
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,8 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
         layer: the layer that holds the picture; None chooses by :data:`PICTURE_LAYERS`.
 
     Raises:
-        ImageError: there is no such picture, or the file holds another kind of image.
+        NoPictureError: there is no such picture.
+        ImageError: the layer is missing, or the file holds another kind of image.
     """
     pictures: list[PictureLocation] = []
     channel_names: list[str] = []
@@ -53,6 +56,8 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
     while file.seek_subimage(part, 0):
         spec = file.spec()
         part += 1
+        if part > MOST_PARTS:
+            raise ImageError(f"{path}: has more than {MOST_PARTS} parts")
         if refusal := _refusal(spec, has_levels=file.seek_subimage(part - 1, 1)):
             refusals.append(refusal)
             continue
@@ -78,7 +83,7 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
     if not pictures:
         listed = ", ".join(name for name in channel_names[:20] if name) or "none"
         missing = "no single channel with a mosaic" if mosaic else "no R, G and B channels"
-        raise ImageError(f"{path}: {missing}; found {printable(listed)}")
+        raise NoPictureError(f"{path}: {missing}; found {printable(listed)}")
     best = min(pictures, key=lambda picture: picture.rank)
     file.seek_subimage(best.part, 0)
     file.geterror()  # clears it: the loop asked for parts and levels that do not exist

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -11,8 +11,11 @@ from clpipe.base.errors import ImageError
 from clpipe.base.text import printable
 from clpipe.base.types import Array, Floats
 from clpipe.images.colour import SRGB, rgb_to_xyz
+from clpipe.images.openimageio import error_text
+from clpipe.images.pixels import check_size
 
 CHANNELS = ("Y", "RY", "BY")
+CHANNELS_AT_MOST = 8  # in all parts: these, alpha, depth and a few more
 
 
 @dataclass(frozen=True)
@@ -39,18 +42,21 @@ def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
     """
     import OpenEXR
 
-    def read(part: Literal["header", "channels"]) -> Any:
+    def read(header_only: bool) -> tuple[Any, Any]:
+        """The first part, and all."""
         try:
-            file = OpenEXR.File(
-                str(path), separate_channels=True, header_only=part == "header", num_threads=1
-            )
-            return getattr(file, part)()
+            parts = OpenEXR.File(
+                str(path), separate_channels=True, header_only=header_only, num_threads=1
+            ).parts
+            return parts[0], parts
         except Exception as error:  # exceptions of the C++ library arrive as many types
-            raise ImageError(f"{path}: damaged: {printable(str(error))}") from None
+            raise ImageError(f"{path}: damaged: {error_text(str(error))}") from None
 
-    header = read("header")
+    first, parts = read(header_only=True)
+    header = first.header
     names = sorted(channel.name for channel in header["channels"])
-    if not set(CHANNELS) <= set(names) or header["type"] != OpenEXR.scanlineimage:
+    is_flat = all(part.header["type"] == OpenEXR.scanlineimage for part in parts)
+    if not set(CHANNELS) <= set(names) or not is_flat:
         raise ImageError(
             f"{path}: subsampled channels can be read as {', '.join(CHANNELS)} only; "
             f"found {printable(', '.join(names))}"
@@ -59,9 +65,14 @@ def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
     (x, y), (x_end, y_end) = (corner.tolist() for corner in header["displayWindow"])
     size, picture = (right - left + 1, bottom - top + 1), (x_end - x + 1, y_end - y + 1)
     for width, height in (size, picture):
-        if width < 1 or height < 1 or width * height > max_pixels:
-            raise ImageError(f"{path}: {width}x{height} pixels; at most {max_pixels} are read")
-    channels = read("channels")
+        check_size(path, width, height, max_pixels)
+    # OpenEXR reads all parts and channels.
+    if sum(_samples(part.header) for part in parts) > CHANNELS_AT_MOST * max_pixels:
+        raise ImageError(
+            f"{path}: its parts and channels have more samples than {CHANNELS_AT_MOST} channels of "
+            f"{max_pixels} pixels (--max-pixels)"
+        )
+    channels = read(header_only=False)[0].channels
     luminance, red, blue = (channels[name] for name in CHANNELS)
     planes = luminance.pixels, red.pixels, blue.pixels
     sampling = [(c.xSampling, c.ySampling) for c in (luminance, red, blue)]
@@ -71,6 +82,12 @@ def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
         raise ImageError(f"{path}: its chroma is not subsampled by 2")
     weights = rgb_to_xyz(header.get("chromaticities", SRGB))[1]
     return DataWindow(to_rgb(*planes, weights), left - x, top - y, *picture, header)
+
+
+def _samples(header: Mapping[str, Any]) -> int:
+    """The samples that a part has at most."""
+    (left, top), (right, bottom) = (corner.tolist() for corner in header["dataWindow"])
+    return max(right - left + 1, 0) * max(bottom - top + 1, 0) * len(header["channels"])
 
 
 def to_rgb(luminance: Array, red: Array, blue: Array, weights: Array) -> Floats:

@@ -1,10 +1,27 @@
-"""Arrays of pixels as files hold them: data windows, and values that are not finite."""
+"""Arrays of pixels as files hold them: sizes, data windows, and values that are not finite."""
+
+from pathlib import Path
 
 import numpy as np
 
+from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
 
+MAX_PIXELS = 1_000_000_000  # the largest --max-pixels
+USUAL_MAX_PIXELS = 200_000_000  # its default: what a file may claim
 HALF_MAX = np.float32(65504)  # the largest half
+
+
+def check_size(path: Path, width: int, height: int, max_pixels: int) -> None:
+    """See that an image has pixels, and not more than are read; call it before memory is taken.
+
+    Raises:
+        ImageError: it has none, or more.
+    """
+    if width < 1 or height < 1 or width * height > max_pixels:
+        raise ImageError(
+            f"{path}: {width}x{height} pixels; at most {max_pixels} are read (--max-pixels)"
+        )
 
 
 def display_window(data: Array, x: int, y: int, width: int, height: int) -> Array:

@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.errors import ImageError
+from clpipe.base.reading import check_regular
 from clpipe.base.types import Floats
 from clpipe.camera.profile import SRGB_TO_XYZ, Matrix
 from clpipe.images.dng import D65
 from clpipe.images.encoding import SIMULATED
+from clpipe.images.pixels import USUAL_MAX_PIXELS, check_size
 from clpipe.reference.cfa import PATTERNS, Pattern
 
 RAW_SUFFIXES = (
@@ -37,6 +39,8 @@ ORIENTATIONS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
 # What stands before the EXIF in files that are not TIFF: in a CR3's boxes, in a RAF's JPEG.
 EXIF_MARKS = (b"CMT1", b"CMT2", b"Exif\0\0")
 PARTS = ("EXIF", "Image")  # exifread's prefixes of tags, in order of preference
+EXIF_BYTES = 1 << 20  # the most that a tag has, and where in a file that is no TIFF a mark stands
+MOST_READS = 200_000  # by exifread, which reads each of a tag's values by itself; usual are 1,000
 DATE_TAGS = ("DateTimeOriginal", "DateTime")
 DATE = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")
 COLOR_MATRICES = {"0xC622": "0xC65B", "0xC621": "0xC65A"}  # a DNG's, and their illuminants
@@ -74,14 +78,18 @@ class RawFacts:
         return round(sum(self.black_levels) / 4)
 
 
-def read_facts(path: Path) -> RawFacts:
-    """Read the metadata of a raw file, without decoding its pixels.
+def read_facts(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> RawFacts:
+    """Read the metadata of a raw file.
+
+    Args:
+        path: the file.
+        max_pixels: a file that claims more is refused before memory is taken.
 
     Raises:
-        ImageError: the file is missing, damaged or not a raw, or holds no Bayer mosaic.
+        ImageError: the file is missing, damaged, not a raw or too large, or holds no Bayer mosaic.
     """
     exif = read_exif(path)
-    with _opened(path) as raw:
+    with _opened(path, max_pixels) as raw:
         pattern = _pattern(path, raw)
         speed, shutter, aperture, focal_length = _shot(raw)
         iso = speed or exif.number("ISOSpeedRatings", 0)
@@ -139,7 +147,7 @@ def _matrix(rows: Any) -> Matrix | None:
     return one, two, three
 
 
-def read_raw(path: Path, facts: RawFacts) -> Floats:
+def read_raw(path: Path, facts: RawFacts, max_pixels: int = USUAL_MAX_PIXELS) -> Floats:
     """Read the mosaic of the visible area in DN, (height, width).
 
     The sites of each colour are shifted to the common ``facts.black_level``.
@@ -147,7 +155,7 @@ def read_raw(path: Path, facts: RawFacts) -> Floats:
     Raises:
         ImageError: as :func:`read_facts`; or the file holds no pixels.
     """
-    with _opened(path) as raw:
+    with _opened(path, max_pixels) as raw:
         _pattern(path, raw)
         mosaic = np.array(raw.raw_image_visible, np.float32)
     # For a file whose pixels were removed, LibRaw returns whatever was in memory.
@@ -159,15 +167,16 @@ def read_raw(path: Path, facts: RawFacts) -> Floats:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _opened(path: Path, max_pixels: int) -> Iterator[Any]:
     """The file as rawpy opens it.
 
     Raises:
-        ImageError: it cannot be opened or decoded.
+        ImageError: it cannot be opened or decoded, or is too large.
     """
     import rawpy
 
     try:
+        check_regular(path)
         with path.open("rb") as file:
             start = file.read(8)
         if not start:
@@ -176,6 +185,7 @@ def _opened(path: Path) -> Iterator[Any]:
             if start.startswith(mark):
                 raise ImageError(f"{path}: it is {what}, not a camera's raw, whatever its name")
         with rawpy.imread(str(path)) as raw:
+            check_size(path, raw.sizes.raw_width, raw.sizes.raw_height, max_pixels)
             yield raw
     except rawpy.LibRawError as error:
         reason = error.args[0].decode() if isinstance(error.args[0], bytes) else str(error)
@@ -261,11 +271,12 @@ def read_exif(path: Path) -> Exif:
         ImageError: the file cannot be read.
     """
     try:
+        check_regular(path)
         with path.open("rb") as file:
             tags = _tags(file)
             if not tags:
                 file.seek(0)
-                head = file.read(1 << 20)
+                head = file.read(EXIF_BYTES)
                 for mark in (m for m in EXIF_MARKS if m in head):
                     tags |= _tags(io.BytesIO(head[head.index(mark) + len(mark) :]))
     except FileNotFoundError:
@@ -275,12 +286,29 @@ def read_exif(path: Path) -> Exif:
     return Exif(tags)
 
 
+class _Metered:
+    """A file that ends the reading of one whose tags claim more values than there can be."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self._count = 0
+
+    def read(self, size: int = EXIF_BYTES) -> bytes:
+        self._count += 1
+        if self._count > MOST_READS:
+            raise ValueError
+        return self._file.read(min(size, EXIF_BYTES))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
 def _tags(file: Any) -> dict[str, Any]:
     """The EXIF tags of an open file; none where it is damaged, which LibRaw reports better."""
     import exifread
 
     logging.getLogger("exifread").setLevel(logging.CRITICAL)
     try:
-        return dict(exifread.process_file(file, details=False))
+        return dict(exifread.process_file(_Metered(file), details=False))
     except Exception:  # on damaged files exifread raises exceptions of any type
         return {}

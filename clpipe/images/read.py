@@ -1,7 +1,7 @@
 """Reading images: renders and kept images as linear light, mosaics, finished pictures."""
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,17 +14,28 @@ from clpipe.base.files import sha256_of
 from clpipe.base.types import Array, Doubles
 from clpipe.images.attributes import own_attributes, shot_attributes
 from clpipe.images.colour import CIE_XYZ, SRGB, to_linear_srgb
-from clpipe.images.layers import PictureLocation, find_picture, mosaic_channel, picture_channels
+from clpipe.images.layers import (
+    MOST_PARTS,
+    PictureLocation,
+    find_picture,
+    mosaic_channel,
+    picture_channels,
+)
 from clpipe.images.luminance_chroma import read_luminance_chroma
 from clpipe.images.openimageio import SubsampledError, error_text, open_image
-from clpipe.images.pixels import HALF_MAX, display_window, without_non_finite
+from clpipe.images.pixels import (
+    HALF_MAX,
+    USUAL_MAX_PIXELS,
+    check_size,
+    display_window,
+    without_non_finite,
+)
 from clpipe.reference.transfer import inverse_srgb_curve
 from clpipe.stage import Kind
 
 RENDER_SUFFIXES = (".exr", ".hdr", ".pfm", ".tif", ".tiff")
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
-MAX_PIXELS = 1_000_000_000  # the largest --max-pixels
-USUAL_MAX_PIXELS = 200_000_000  # its default: what a file may claim
+READ_AT_ONCE = 8  # channels; those of a picture may lie hundreds apart
 
 
 @dataclass(frozen=True)
@@ -148,13 +159,17 @@ def read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
     Raises:
         ImageError: the file cannot be read, or holds another kind.
     """
-    if kind is Kind.RGB and options.transfer and (finished := read_finished(path)):
+    if (
+        kind is Kind.RGB
+        and options.transfer
+        and (finished := read_finished(path, options.max_pixels))
+    ):
         linear = TRANSFERS[options.transfer](finished.pixels.astype(np.float64))
         return replace(finished, pixels=linear.astype(np.float32))
     if kind is not Kind.DISPLAY:
         mosaic = len(kind.channels) == 1
         return read_image(path, mosaic, options.layer, options.max_pixels)
-    if finished := read_finished(path):
+    if finished := read_finished(path, options.max_pixels):
         return finished
     image = read_image(path, False, options.layer, options.max_pixels)
     if image.attributes.get("kind") != kind.label:
@@ -165,26 +180,23 @@ def read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
     return image
 
 
-def read_finished(path: Path) -> SourceImage | None:
+def read_finished(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> SourceImage | None:
     """Read a finished picture (JPEG, PNG, TIFF): display values, (height, width, 3), 0..1.
 
     None where the file does not hold red, green and blue in whole numbers of 8 or 16 bits; then it
-    is one for :func:`read_image`. Alpha is not read.
+    is one for :func:`read_image`. Alpha is not read. ``max_pixels`` is that of :func:`read_image`.
 
     Raises:
-        ImageError: the file is missing, empty, damaged or not an image.
+        ImageError: the file is missing, empty, damaged, not an image or too large.
     """
-    with open_image(path) as (digest, file):
+    with open_image(path) as file:
         spec = file.spec()
         picture = picture_channels(list(spec.channelnames))
         if picture is None or spec.format.basetype not in (oiio.UINT8, oiio.UINT16):
             return None
-        pixels = file.read_image(oiio.FLOAT)  # scales whole numbers to 0..1
-        problem = file.geterror()
-        if pixels is None or problem:
-            raise ImageError(f"{path}: damaged: {error_text(problem)}")
-        rgb = np.ascontiguousarray(np.asarray(pixels)[..., list(picture[1])])
-        return SourceImage(rgb, digest, "", (), {})
+        check_size(path, spec.width, spec.height, max_pixels)
+        rgb = _channels(path, file, 0, picture[1], oiio.FLOAT)  # scales whole numbers to 0..1
+        return SourceImage(np.ascontiguousarray(rgb), _digest(path), "", (), {})
 
 
 def holds_mosaic(path: Path) -> bool:
@@ -193,9 +205,9 @@ def holds_mosaic(path: Path) -> bool:
     Raises:
         ImageError: the file is missing, empty, damaged or not an image.
     """
-    with open_image(path) as (_, file):
+    with open_image(path) as file:
         parts: list[list[str]] = []
-        while file.seek_subimage(len(parts), 0):
+        while len(parts) < MOST_PARTS and file.seek_subimage(len(parts), 0):
             parts.append(list(file.spec().channelnames))
     return not any(map(picture_channels, parts)) and any(map(mosaic_channel, parts))
 
@@ -206,12 +218,12 @@ def _decode(path: Path, mosaic: bool, layer: str | None, max_pixels: int) -> _De
     Raises:
         SubsampledError: the channels differ in size.
     """
-    with open_image(path) as (digest, file):
+    with open_image(path) as file:
         location = find_picture(path, file, mosaic, layer)
         spec, pixels = file.spec(), _read_part(path, file, location, mosaic, max_pixels)
         return _Decoded(
             pixels,
-            digest,
+            _digest(path),
             location.layer,
             own_attributes(spec),
             shot_attributes(spec),
@@ -225,9 +237,20 @@ def _decode_luminance_chroma(path: Path, max_pixels: int) -> _Decoded:
     window = read_luminance_chroma(path, max_pixels)
     pixels = display_window(window.pixels, window.x, window.y, window.width, window.height)
     header = window.attributes
-    digest, _ = sha256_of(path)
     chromaticities, neutral = header.get("chromaticities"), header.get("adoptedNeutral")
-    return _Decoded(pixels, digest, "", {}, {}, chromaticities, neutral)
+    return _Decoded(pixels, _digest(path), "", {}, {}, chromaticities, neutral)
+
+
+def _digest(path: Path) -> str:
+    """The SHA-256 of a file.
+
+    Raises:
+        ImageError: it cannot be read any more.
+    """
+    try:
+        return sha256_of(path)[0]
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 def _srgb_matrix(path: Path, decoded: _Decoded) -> Array | None:
@@ -264,23 +287,36 @@ def _read_part(
             "give an OpenEXR file, or say --transfer linear or srgb; a photograph: -c unprocess"
         )
     width, height = spec.full_width, spec.full_height
-    for wide, high in ((width, height), (spec.width, spec.height)):
-        if not 0 < wide * high <= max_pixels:
-            raise ImageError(f"{path}: {wide}x{high} pixels; at most {max_pixels} are read")
-    first, last = min(channels), max(channels) + 1
+    check_size(path, width, height, max_pixels)
+    check_size(path, spec.width, spec.height, max_pixels)
     # Whole numbers are read as they are: as float, OpenImageIO would scale them to 0..1.
     type_ = types.pop() if whole else oiio.HALF if types == {oiio.HALF} else oiio.FLOAT
-    data = file.read_image(location.part, 0, first, last, type_)
-    problem = file.geterror()
-    if data is None or problem:
-        raise ImageError(f"{path}: damaged: {error_text(problem)}")
-    pixels = np.asarray(data).reshape(spec.height, spec.width, last - first)
+    pixels = _channels(path, file, location.part, channels, type_)
     if whole:
         pixels = pixels.astype(np.float32)
-    order = [i - first for i in channels]
-    if order != list(range(last - first)):
-        pixels = pixels[..., order]
     x, y = spec.x - spec.full_x, spec.y - spec.full_y
     if (x, y, spec.width, spec.height) != (0, 0, width, height):
         pixels = display_window(pixels, x, y, width, height)
     return np.ascontiguousarray(pixels if len(channels) > 1 else pixels[..., 0])
+
+
+def _channels(path: Path, file: Any, part: int, channels: Sequence[int], type_: Any) -> Array:
+    """Some channels of a part's data window, (rows, columns, channel), as samples of a type.
+
+    Raises:
+        ImageError: the part is damaged, or a volume.
+    """
+    spec = file.spec()
+    if spec.depth > 1:
+        raise ImageError(f"{path}: a volume of {spec.depth} images, not a picture")
+    first, last = min(channels), max(channels) + 1
+    if last - first > READ_AT_ONCE:
+        planes = [_channels(path, file, part, [i], type_) for i in channels]
+        return np.concatenate(planes, axis=-1)
+    data = file.read_image(part, 0, first, last, type_)
+    problem = file.geterror()
+    if data is None or problem:
+        raise ImageError(f"{path}: damaged: {error_text(problem)}")
+    pixels = np.asarray(data).reshape(spec.height, spec.width, last - first)
+    order = [i - first for i in channels]
+    return pixels if order == list(range(last - first)) else pixels[..., order]

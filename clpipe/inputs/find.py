@@ -1,18 +1,24 @@
 """Finds the images of a run in files, folders, globs and manifests, and names their outputs."""
 
 import glob
+import logging
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, TypeVar
 
 from clpipe.base.errors import RequestError
+from clpipe.base.text import printable
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import RENDER_SUFFIXES
 from clpipe.inputs.manifest import MANIFEST_SUFFIXES, read_manifest
 
 T = TypeVar("T")
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,11 @@ class Job:
 
 
 def find_jobs(
-    inputs: Sequence[str], output: Path, endings: Sequence[str] = (*RENDER_SUFFIXES, *RAW_SUFFIXES)
+    inputs: Sequence[str],
+    output: Path,
+    endings: Sequence[str] = (*RENDER_SUFFIXES, *RAW_SUFFIXES),
+    exclude: Sequence[str] = (),
+    keep_suffix: bool = False,
 ) -> list[Job]:
     """The jobs of a run, in the order of its inputs.
 
@@ -70,60 +80,128 @@ def find_jobs(
         inputs: files, folders (all images in them, at any depth), globs and manifests.
         output: the output folder; where it lies inside an input folder, its files are no inputs.
         endings: of the files that are taken from folders.
+        exclude: patterns of what is not taken from folders and globs, see :class:`Exclusion`.
+        keep_suffix: name outputs by the whole image key, and not without its suffix.
 
     Raises:
-        RequestError: no input, an empty name, a folder without images, a glob that no file matches,
-            or a manifest that is wrong.
+        RequestError: no input, an empty name, a folder without images, or one that cannot be read,
+            a glob that no file matches, or a manifest that is wrong.
     """
     jobs: list[Job] = []
     if not inputs:
         raise RequestError("there is no input; give files, folders, globs or manifests")
+    excluded = Exclusion(exclude)
     for text in inputs:
         if not text:
             raise RequestError("an input is empty; give files, folders, globs or manifests")
         path = Path(text)
         if os.path.isdir(text):
-            files = images_in(path, output, endings)
+            files = images_in(path, output, endings, excluded)
             if not files:
                 listed = ", ".join(e for e in endings if e not in RAW_SUFFIXES)
                 raws = " and camera raws" if set(RAW_SUFFIXES) & set(endings) else ""
-                raise RequestError(f"{path}: a folder without images (looked for {listed}{raws})")
+                left = " that are not excluded" if exclude else ""
+                raise RequestError(
+                    f"{path}: a folder without images{left} (looked for {listed}{raws})"
+                )
             jobs += [Job(p, p.relative_to(path).as_posix(), listed=False) for p in files]
         elif path.suffix.lower() in MANIFEST_SUFFIXES:
             jobs += [
                 Job(row.path, row.key, row.name, True, row.values, row.frames, row.place)
-                for row in read_manifest(path)
+                for row in read_manifest(path, keep_suffix)
             ]
         elif glob.has_magic(text) and not os.path.exists(text):
             matches = sorted(m for m in glob.glob(text, recursive=True) if os.path.isfile(m))
             if not matches:
                 raise RequestError(f"{text}: no file matches")
-            jobs += [Job(Path(m), Path(m).name) for m in matches]
+            jobs += [Job(Path(m), Path(m).name) for m in matches if m not in excluded]
         else:
             jobs.append(Job(path, path.name))
-    return jobs
+    for pattern in excluded.unused:
+        log.warning("--exclude %s: matches nothing", pattern)
+    if not jobs:
+        raise RequestError("every file is excluded")
+    return [replace(job, name=job.name or job.key) for job in jobs] if keep_suffix else jobs
 
 
-def images_in(folder: Path, output: Path, endings: Sequence[str]) -> list[Path]:
-    """The images in a folder at any depth, sorted; links are followed.
+class Exclusion:
+    """Patterns (* ? []) of paths relative to an input folder, or of names of files or folders."""
+
+    def __init__(self, patterns: Sequence[str] = ()) -> None:
+        self._patterns = patterns
+        self.unused = dict.fromkeys(patterns)  # those that have matched nothing yet
+
+    def __contains__(self, path: str) -> bool:
+        name = os.path.basename(path)
+        matching = [p for p in self._patterns if fnmatchcase(path, p) or fnmatchcase(name, p)]
+        for pattern in matching:
+            self.unused.pop(pattern, None)
+        return bool(matching)
+
+
+def images_in(
+    folder: Path, output: Path, endings: Sequence[str], excluded: Exclusion
+) -> list[Path]:
+    """The images in a folder at any depth, sorted; how many other files there are is logged.
 
     Hidden files and the output folder are left out. A link that leads nowhere is an image, too: it
     fails later.
+
+    Raises:
+        RequestError: a folder cannot be read.
     """
     images: list[Path] = []
+    others: Counter[str] = Counter()
+    for place, names in _walk(folder, output, excluded):
+        below = os.path.relpath(place, folder)
+        for name in names:
+            if name.startswith(".") or os.path.normpath(f"{below}/{name}") in excluded:
+                continue
+            path = Path(place, name)
+            suffix = path.suffix.lower()
+            if suffix in endings and (path.is_file() or path.is_symlink()):
+                images.append(path)
+            else:
+                others["pipe or device" if suffix in endings else suffix or "without suffix"] += 1
+    if images and others:
+        are, were = ("file is", "was") if others.total() == 1 else ("files are", "were")
+        ranked = sorted(others.items(), key=lambda item: (-item[1], item[0]))
+        kinds = [f"{count} {suffix}" for suffix, count in ranked[:5]]
+        kinds += ["others"] * (len(others) > len(kinds))
+        listed = printable(", ".join(kinds))
+        log.info("%s: %d %s no image and %s ignored: %s", folder, others.total(), are, were, listed)
+    return sorted(images)
+
+
+def _walk(folder: Path, output: Path, excluded: Exclusion) -> Iterator[tuple[str, list[str]]]:
+    """Each folder below one, with the names of its files. Links are followed after all folders.
+
+    So a file that can be reached by a link, too, has the path without it, whatever the order of
+    the folder is on disk.
+
+    Raises:
+        RequestError: a folder cannot be read.
+    """
     visited: set[str] = set()
-    for place, folders, names in os.walk(folder, followlinks=True):
-        real = os.path.realpath(place)
-        if real in visited or (visited and real == os.path.realpath(output)):
-            folders.clear()
-            continue
-        visited.add(real)
-        images += [
-            Path(place, n)
-            for n in names
-            if not n.startswith(".") and os.path.splitext(n)[1].lower() in endings
-        ]
-    return sorted(p for p in images if p.is_file() or p.is_symlink())
+    starts = [str(folder)]
+    for start in starts:  # which grows
+        for place, folders, names in os.walk(start, onerror=_refuse):
+            real = os.path.realpath(place)
+            if real in visited or (visited and real == os.path.realpath(output)):
+                folders.clear()
+                continue
+            visited.add(real)
+            below = {name: os.path.join(place, name) for name in sorted(folders)}
+            taken = [
+                n for n, path in below.items() if os.path.relpath(path, folder) not in excluded
+            ]
+            starts += [below[name] for name in taken if os.path.islink(below[name])]
+            folders[:] = taken
+            yield place, names
+
+
+def _refuse(error: OSError) -> None:
+    raise RequestError(f"{error.filename}: this folder cannot be read: {error.strerror}") from None
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from clpipe.base.errors import ImageError, KindError, RequestError
+from clpipe.base.reading import parse_json
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.identity import name_in, of_frame
 from clpipe.chain.methods import base_name
@@ -57,7 +58,7 @@ def carried_settings(attributes: Mapping[str, str], folder: Path | None = None) 
     if "settings" not in attributes:
         return None
     try:
-        values = json.loads(attributes["settings"])
+        values = parse_json(attributes["settings"])
     except ValueError as error:
         raise RequestError(str(error)) from None
     if not isinstance(values, dict):

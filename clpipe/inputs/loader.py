@@ -6,17 +6,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.errors import KindError
+from clpipe.base.errors import KindError, NoPictureError
+from clpipe.base.reading import unchanged
 from clpipe.chain.chain import Chain, entry
 from clpipe.chain.identity import image_key
 from clpipe.chain.methods import base_name, stage_named
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
+from clpipe.images.pixels import USUAL_MAX_PIXELS
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import (
     PICTURE_SUFFIXES,
     RENDER_SUFFIXES,
-    USUAL_MAX_PIXELS,
     ReadOptions,
     SourceImage,
     read_source,
@@ -121,15 +122,19 @@ class ImageLoader:
         """The image of a job.
 
         Raises:
-            ImageError: it cannot be read, or is of another kind.
+            ImageError: it cannot be read, is of another kind, or is written to at the same time.
         """
-        if self.raw.takes(job.path):
-            return self.raw.read(job.path)
+        with unchanged(job.path):
+            return self._read(job.path)
+
+    def _read(self, path: Path) -> SourceImage:
+        if self.raw.takes(path):
+            return self.raw.read(path)
         request = self.request
         options = ReadOptions(
             request.layer, request.max_pixels or USUAL_MAX_PIXELS, request.transfer
         )
-        return read_source(job.path, self.reads, options)
+        return read_source(path, self.reads, options)
 
     def enter(self, job: Job, source: SourceImage) -> LoadedImage | None:
         """An image with the chain for it.
@@ -153,8 +158,9 @@ class ImageLoader:
         return LoadedImage(self.chain, source, key)
 
     def is_left_out(self, job: Job, error: Exception) -> bool:
-        """Whether an image that cannot enter was only found in a folder of kept images."""
-        return isinstance(error, KindError) and self.kept is not None and not job.listed
+        """Whether an image that cannot enter was only found in a folder, beside others that can."""
+        is_of_other_step = isinstance(error, KindError) and self.kept is not None
+        return not job.listed and (is_of_other_step or isinstance(error, NoPictureError))
 
     def error_text(self, job: Job, error: Exception) -> str:
         """The message of an error, with the file, and with what can be done."""

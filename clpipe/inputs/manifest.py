@@ -2,11 +2,12 @@
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
 from clpipe.base.errors import RequestError
+from clpipe.base.reading import read_bytes
 from clpipe.base.text import one_of
 from clpipe.chain.chain import step_names
 from clpipe.chain.identity import MAX_FRAMES
@@ -19,6 +20,7 @@ from clpipe.images.encoding import Output
 from clpipe.inputs.tables import OWN, PLAIN, TEXTS, csv_records, json_records
 
 MANIFEST_SUFFIXES = (".csv", ".jsonl")
+MANIFEST_BYTES = 256 * 2**20  # enough for two million rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +49,7 @@ class Row:
         return self.name or str(PurePosixPath(self.key).with_suffix(""))
 
 
-def read_manifest(path: Path) -> list[Row]:
+def read_manifest(path: Path, keep_suffix: bool = False) -> list[Row]:
     """The images of a manifest.
 
     A .csv has a header, commas and UTF-8; its cells are TOML values, else text, and an empty cell
@@ -59,6 +61,10 @@ def read_manifest(path: Path) -> list[Row]:
     The key is the name where there is one; else the path relative to the manifest's folder
     where it lies below that; else the file's name.
 
+    Args:
+        path: the manifest.
+        keep_suffix: a row without a name gets its image key as its name, suffix and all.
+
     Raises:
         RequestError: it cannot be read, has a column that does not exist, or a row is wrong; the
             message is that of the first wrong row, with the number of others.
@@ -67,16 +73,19 @@ def read_manifest(path: Path) -> list[Row]:
     read = json_records if path.suffix.lower() == ".jsonl" else csv_records
     faults: list[str] = []
     rows: list[Row] = []
-    makers: dict[str, str] = {}
+    makers: dict[str, Row] = {}
     for line, record in read(path, text, _check_column):
         place = f"{path}, row {line}"
         try:
             row = _row(path.parent, place, record())
-            other = makers.setdefault(row.stem, place)
-            if other != place:
+            if keep_suffix and not row.name:
+                row = replace(row, name=row.key)
+            other = makers.setdefault(row.stem, row)
+            if other is not row:
+                keep = ", or say --keep-suffix" if other.key != row.key else ""
                 raise RequestError(
-                    f"it would make the same outputs as row {other.rpartition(' ')[2]}, "
-                    f"{row.stem}; tell them apart in a column called name"
+                    f"it would make the same outputs as row {other.place.rpartition(' ')[2]}, "
+                    f"{row.stem}; tell them apart in a column called name{keep}"
                 )
             rows.append(row)
         except RequestError as error:
@@ -143,10 +152,9 @@ def _report(faults: Sequence[str]) -> None:
 
 def _text(path: Path) -> str:
     try:
-        data = path.read_bytes()
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise RequestError(f"{path}: cannot read this manifest: {reason}") from None
+        data = read_bytes(path, MANIFEST_BYTES)
+    except OSError as error:
+        raise RequestError(f"{path}: cannot read this manifest: {error.strerror}") from None
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -4,7 +4,6 @@ A raw enters at the first step that reads DN, so no noise is added to it. Config
 win over what the file says.
 """
 
-import hashlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.files import sha256_of
 from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_cameras, load_camera
 from clpipe.chain.chain import Chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
 from clpipe.images.dump import Dump, read_dump
+from clpipe.images.pixels import USUAL_MAX_PIXELS
 from clpipe.images.raw import RAW_SUFFIXES, RawFacts, read_facts, read_raw
 from clpipe.images.read import RENDER_SUFFIXES, SourceImage
 from clpipe.images.tags import Tags, to_attributes
@@ -56,7 +57,13 @@ class RawLoader:
         return path.suffix.lower() in RAW_SUFFIXES or is_dump
 
     def _facts(self, path: Path) -> RawFacts | Dump:
-        return self.dump if self.dump and may_be_dump(path) else read_facts(path)
+        if self.dump and may_be_dump(path):
+            return self.dump
+        return read_facts(path, self._max_pixels)
+
+    @property
+    def _max_pixels(self) -> int:
+        return self.request.max_pixels or USUAL_MAX_PIXELS
 
     def read(self, path: Path) -> RawImage:
         """A raw or a dump.
@@ -64,13 +71,16 @@ class RawLoader:
         Raises:
             ImageError: it cannot be read, or holds no Bayer mosaic.
         """
-        facts = self._facts(path)
+        facts, most = self._facts(path), self._max_pixels
+        if isinstance(facts, Dump):
+            pixels = read_dump(path, facts, most)
+        else:
+            pixels = read_raw(path, facts, most)
         try:
-            data = path.read_bytes()
+            digest, _ = sha256_of(path)
         except OSError as error:
             raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
-        pixels = read_dump(data, path, facts) if isinstance(facts, Dump) else read_raw(path, facts)
-        return RawImage(pixels, hashlib.sha256(data).hexdigest(), "", (), {}, facts=facts)
+        return RawImage(pixels, digest, "", (), {}, facts=facts)
 
     def first_chain(self, path: Path) -> Chain:
         """The chain of the first raw, made early so that a wrong request is refused early.

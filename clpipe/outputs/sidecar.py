@@ -12,7 +12,8 @@ from typing import Any
 
 from clpipe.base.about import __version__
 from clpipe.base.errors import ImageError
-from clpipe.base.files import Stored, keep_names, read_regular, write_whole
+from clpipe.base.files import Stored, keep_names, write_whole
+from clpipe.base.reading import read_bytes
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.images.read import SourceImage
@@ -25,8 +26,6 @@ SIDECAR = "json"  # the ending of its name
 
 OWN = "clpipe"  # the first key of every sidecar
 
-LARGEST = 64 << 20  # bytes
-
 BEGINNING = f'{{\n  "{OWN}": '.encode()
 
 
@@ -38,7 +37,7 @@ def read_sidecar(path: Path) -> dict[str, Any]:
         ImageError: it cannot be read, or clpipe did not write it.
     """
     try:
-        data = read_regular(path, LARGEST)
+        data = read_bytes(path)
     except FileNotFoundError:
         raise
     except OSError as error:

@@ -136,9 +136,10 @@ class OutputWriter:
                             "choose another output folder"
                         )
                     if path in makers:
+                        keep = ", or say --keep-suffix" if makers[path].key != job.key else ""
                         raise RequestError(
                             f"{makers[path].label} and {job.label} would both write {path}; "
-                            "run them into different folders"
+                            f"run them into different folders{keep}"
                         )
                     makers[path] = job
 

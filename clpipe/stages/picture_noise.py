@@ -4,7 +4,6 @@ Real noise arises before the processing, which shapes it; see ``sensor_noise``. 
 noise is added after the processing, with a sigma of the user's or of ``clpipe measure --json``.
 """
 
-import json
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from clpipe.base.errors import RequestError
+from clpipe.base.reading import check_regular, parse_json, read_bytes
 from clpipe.base.types import Floats
 from clpipe.reference.curve import to_8_bit
 from clpipe.reference.random import normal_at
@@ -222,7 +222,7 @@ def measured_noise(path: str) -> tuple[ChannelNoise, ...]:
             values.
     """
     try:
-        status = Path(path).stat()
+        status = check_regular(Path(path))
         return _measured_noise(path, status.st_mtime_ns, status.st_size)
     except OSError as error:
         raise ValueError(f"cannot be read: {error.strerror}") from None
@@ -231,16 +231,16 @@ def measured_noise(path: str) -> tuple[ChannelNoise, ...]:
 @lru_cache(maxsize=16)
 def _measured_noise(path: str, time: int, size: int) -> tuple[ChannelNoise, ...]:
     try:
-        report = json.loads(Path(path).read_text("utf-8"))
+        report = parse_json(read_bytes(Path(path)))
         kind, channels = report["kind"], report["channels"]
-        if kind != Kind.DISPLAY.label:
-            raise ValueError(
-                f"reports on {kind}, but this noise is in display values; "
-                "measure finished pictures (JPEG, PNG, or EXR kept after gamma)"
-            )
-        return tuple(_channel_of(channels[name]) for name in CHANNELS)
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError):
+        if kind == Kind.DISPLAY.label:
+            return tuple(_channel_of(channels[name]) for name in CHANNELS)
+    except (ValueError, OverflowError, LookupError, TypeError, AttributeError):
         raise ValueError("not a report of clpipe measure --json") from None
+    raise ValueError(
+        f"reports on {kind}, but this noise is in display values; "
+        "measure finished pictures (JPEG, PNG, or EXR kept after gamma)"
+    )
 
 
 def _channel_of(record: Any) -> ChannelNoise:

@@ -1,5 +1,6 @@
 """Calibration of a camera from files: frames in, a profile and a picture of the fit out."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -41,8 +42,8 @@ def calibrate_files(
     require("clpipe calibrate", "calibrate", "scipy", "matplotlib")
     overrides.check()
     dark_paths = find_frames(dark)
-    without_light = {path.resolve() for path in dark_paths}
-    scene_paths = [p for p in find_frames(inputs) if p.resolve() not in without_light]
+    without_light = {os.path.realpath(path) for path in dark_paths}
+    scene_paths = [p for p in find_frames(inputs) if os.path.realpath(p) not in without_light]
     if not scene_paths:
         raise RequestError("all frames are dark frames; give frames of a scene too")
     scene = [read_frame(path, overrides) for path in scene_paths]

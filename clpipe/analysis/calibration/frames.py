@@ -9,6 +9,7 @@ import numpy as np
 
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.text import one_line
 from clpipe.base.types import Floats
 from clpipe.camera.profile import Matrix
 from clpipe.chain.chain import make_chain
@@ -75,17 +76,16 @@ class CalibrationFrame:
             ImageError: the file cannot be read, or is smaller than 16x16.
         """
         if isinstance(self.facts, Dump):
-            try:
-                data = self.path.read_bytes()
-            except OSError as error:
-                raise ImageError(f"{self.path}: cannot be read: {error.strerror}") from None
-            mosaic = read_dump(data, self.path, self.facts)
+            mosaic = read_dump(self.path, self.facts)
         elif self.facts:
             mosaic = read_raw(self.path, self.facts)
         else:
             mosaic = read_image(self.path, mosaic=True).pixels.astype(np.float32)
         if self.signal:
-            mosaic = mosaic * np.float32(self.sensor.unit) + np.float32(self.sensor.black_level)
+            with np.errstate(over="ignore"):
+                mosaic = mosaic * np.float32(self.sensor.unit) + np.float32(self.sensor.black_level)
+            if not np.isfinite(mosaic).all():
+                raise ImageError(f"{self.path}: damaged: its signal is beyond the range of floats")
             nearest = np.rint(mosaic)
             # Signal that normalize made from whole DN comes back to within float's last bits.
             if np.abs(mosaic - nearest).max() < 0.01:
@@ -187,9 +187,9 @@ def _from_kept(
     """The frame in a mosaic that clpipe kept."""
     kind = attributes.get("kind", "")
     if kind not in (Kind.RAW.label, Kind.MOSAIC.label):
+        held = one_line(f"{kind}, kept after {attributes.get('stage')}")
         raise ImageError(
-            f"{path}: holds {kind}, kept after {attributes.get('stage')}; a mosaic is needed, such "
-            "as clpipe run --until quantize writes"
+            f"{path}: holds {held}; a mosaic is needed, such as clpipe run --until quantize writes"
         )
     try:
         settings = carried_settings(attributes)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from clpipe.base.reading import check_regular, read_text
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.curve import tabulate
 
@@ -155,7 +156,7 @@ def table_of(path: str) -> Floats:
         ValueError: the file cannot be read, has an unknown format, or holds no curve.
     """
     try:
-        status = Path(path).stat()
+        status = check_regular(Path(path))
         return _table_of(path, status.st_mtime_ns, status.st_size)
     except OSError as error:
         raise ValueError(f"cannot be read: {error.strerror}") from None
@@ -169,5 +170,5 @@ def _table_of(path: str, time: int, size: int) -> Floats:
     if ending not in FORMATS:
         raise ValueError(f"expected a file that ends in {' or '.join(FORMATS)}")
     parse, interpolate = FORMATS[ending]
-    knots = parse(Path(path).read_text("utf-8-sig"))
+    knots = parse(read_text(Path(path)))
     return tabulate(lambda x: interpolate(knots, x))

@@ -1,0 +1,122 @@
+"""Other people's files: regular ones only, no larger than they can be, and their text as values.
+
+Reading a device or a pipe may never end, and a small file may ask for more memory than there is.
+Errors of files are an OSError with a clear ``strerror``, errors of their content a ValueError.
+"""
+
+import errno
+import json
+import os
+import re
+import stat
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from clpipe.base.errors import ImageError
+from clpipe.base.memory import in_words
+
+TEXT_BYTES = 16 * 2**20  # the largest text but a manifest: a configuration, a curve, a sidecar
+
+KEY_PARTS = 32  # of a dotted key; tomllib takes memory with their square
+
+KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+}
+
+_PART = r"""(?:[\w-]++|"(?:\\.|[^"\\\n])*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+"""
+_LONG_KEY = re.compile(rf"(?<![\w-])(?:{_PART}){{{KEY_PARTS}}}", re.ASCII)
+
+
+def check_regular(path: Path) -> os.stat_result:
+    """The status of a regular file, or of one that a link leads to; nothing is opened.
+
+    Raises:
+        OSError: it is missing, or a folder, a device, a pipe or a socket.
+    """
+    try:
+        status = path.stat()
+    except ValueError:  # a NUL, or characters that are not UTF-8
+        raise OSError(errno.EINVAL, "no file can have this name") from None
+    kind = stat.S_IFMT(status.st_mode)
+    if kind != stat.S_IFREG:
+        raise OSError(errno.EINVAL, f"it is {KINDS.get(kind, 'something else')}, not a file")
+    return status
+
+
+@contextmanager
+def unchanged(path: Path) -> Iterator[None]:
+    """See that a file stays the same while it is read, so that its digest is that of its pixels.
+
+    Raises:
+        ImageError: it was written to, replaced or removed.
+    """
+    before = _state(path)
+    yield
+    if _state(path) != before:
+        raise ImageError(f"{path}: was written to while it was read; run it again")
+
+
+def _state(path: Path) -> tuple[int, ...]:
+    try:
+        status = path.stat()
+    except (OSError, ValueError):
+        return ()
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def read_bytes(path: Path, most: int = TEXT_BYTES) -> bytes:
+    """The content of a regular file of at most ``most`` bytes.
+
+    Raises:
+        OSError: it cannot be read, is no regular file, or is larger.
+    """
+    size = check_regular(path).st_size
+    with path.open("rb") as file:
+        data = b"" if size > most else file.read(most + 1)  # it may grow
+    if max(size, len(data)) > most:
+        found = in_words(max(size, len(data)))
+        raise OSError(errno.EFBIG, f"it has {found}; at most {in_words(most)} are read")
+    return data
+
+
+def read_text(path: Path) -> str:
+    """The text of a small file in UTF-8, with or without a byte order mark.
+
+    Raises:
+        OSError: as :func:`read_bytes`.
+        UnicodeDecodeError: it is not UTF-8.
+    """
+    return read_bytes(path).decode("utf-8-sig")
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The values of a TOML text.
+
+    Raises:
+        ValueError: it is not valid, or is nested too deeply to be read.
+    """
+    if _LONG_KEY.search(text):
+        raise ValueError(f"a key has more than {KEY_PARTS} parts")
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+def parse_json(text: str | bytes) -> Any:
+    """The value of a JSON text.
+
+    Raises:
+        ValueError: it is not valid, or is nested too deeply to be read.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None

@@ -1,0 +1,178 @@
+"""Which files of a folder a run is about, and what its outputs are called."""
+
+import json
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clpipe.base.errors import RequestError
+from clpipe.inputs.find import Job, find_jobs
+from tests.conftest import ROOT, written
+
+NOWHERE = Path("/nowhere")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Make empty files in an empty working directory."""
+    monkeypatch.chdir(tmp_path)
+
+    def make(*names):
+        for name in names:
+            Path(name).parent.mkdir(parents=True, exist_ok=True)
+            Path(name).touch()
+
+    return make
+
+
+def keys(*inputs, **options):
+    return [job.key for job in find_jobs(inputs, NOWHERE, **options)]
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_the_real_path_wins_over_a_link_whatever_the_order_on_disk(folder, monkeypatch, backwards):
+    folder("in/z/sub/one.exr", "in/a/two.exr", "else/three.exr")
+    os.symlink("../z", "in/a/link")
+    os.symlink("z/sub", "in/alink")
+    for name in ("d", "c", "b"):
+        os.symlink("../else", f"in/{name}")
+    scandir = os.scandir
+    monkeypatch.setattr(os, "scandir", lambda place: Listing(scandir, place, backwards))
+    assert keys("in") == ["a/two.exr", "b/three.exr", "z/sub/one.exr"]
+
+
+class Listing:
+    """A folder's entries in an order that a file system may have."""
+
+    def __init__(self, scandir, place, backwards):
+        with scandir(place) as entries:
+            self._entries = iter(sorted(entries, key=lambda e: e.name, reverse=backwards))
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        pass
+
+    def __iter__(self):
+        return self
+
+    def __next__(self):
+        return next(self._entries)
+
+
+def test_what_was_ignored_is_counted(folder, caplog):
+    caplog.set_level(logging.INFO, "clpipe")
+    folder("in/a.exr", "in/b/notes.txt", "in/b/more.TXT", "in/x.json", "in/README", "in/.hidden")
+    os.mkfifo("in/b.exr")
+    assert keys("in") == ["a.exr"]
+    assert caplog.messages == [
+        "in: 5 files are no image and were ignored: 2 .txt, 1 .json, 1 pipe or device, "
+        "1 without suffix"
+    ]
+    caplog.clear()
+    folder("one/a.exr", "one/a\n.b\tc")
+    keys("one")
+    assert caplog.messages == ["one: 1 file is no image and was ignored: 1 .b c"]
+
+
+def test_exclude(folder, caplog):
+    folder("in/a.exr", "in/a_depth.exr", "in/tmp/b.exr", "in/old/tmp/c.exr", "in/old/d.exr")
+    assert keys("in", exclude=["*_depth.exr", "tmp"]) == ["a.exr", "old/d.exr"]
+    assert keys("in", exclude=["old/*.exr"]) == ["a.exr", "a_depth.exr", "tmp/b.exr"]
+    assert keys("in/*.exr", exclude=["*_depth*"]) == ["a.exr"]
+    assert keys("in/a_depth.exr", exclude=["*_depth*"]) == ["a_depth.exr"]  # it was named
+    assert caplog.messages == ["--exclude *_depth*: matches nothing"]
+    for inputs in ("in", "in/*.exr"):
+        with pytest.raises(RequestError, match="excluded"):
+            find_jobs([inputs], NOWHERE, exclude=["*"])
+
+
+def test_a_folder_that_cannot_be_read_is_refused(tmp_path):
+    """Not silently left out; as another user, since root can read everything."""
+    (tmp_path / "in" / "locked").mkdir(parents=True)
+    (tmp_path / "in" / "locked").chmod(0)
+    (tmp_path / "in" / "a.exr").touch()
+    for place in (tmp_path, *tmp_path.parents):
+        if place.owner() != "root" or place.stat().st_mode & 0o077 == 0:
+            place.chmod(place.stat().st_mode | 0o055)
+    code = (
+        "import os, sys; from pathlib import Path; from clpipe.inputs.find import find_jobs\n"
+        "os.getuid() or os.setuid(65534)\n"
+        "find_jobs([sys.argv[1]], Path('/nowhere'))"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "in")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert "in/locked: this folder cannot be read: Permission denied" in done.stderr
+
+
+def test_suffixes_are_kept_on_request(folder, clpipe, write_exr):
+    for name in ("in/a.exr", "in/a.hdr"):
+        write_exr(name, np.full((4, 6, 3), 0.25))
+    Path("list.csv").write_text("path,name\nin/a.exr,\nin/a.hdr,\nin/a.exr,mine\n")
+    run = ("run", "-o", "out", "--device", "numpy")
+    for inputs in (["in"], ["in/a.exr", "in/a.hdr"]):
+        refused = clpipe(*run, *inputs, status=2)
+        assert "run them into different folders, or say --keep-suffix" in refused.output
+    assert "called name, or say --keep-suffix" in clpipe(*run, "list.csv", status=2).output
+    refused = clpipe(*run, "in", "--webdataset", 2, status=2)
+    assert "or say --keep-suffix" in refused.output
+    clpipe(*run, "in", "--keep-suffix")
+    assert written(Path("out")) == ["a.exr.jpg", "a.exr.json", "a.hdr.jpg", "a.hdr.json"]
+    clpipe("run", "in/a.exr", "-o", "alone", "--device", "numpy", "--keep-suffix")
+    for name in ("a.exr.jpg", "a.exr.json"):
+        assert Path("alone", name).exists()
+    assert Path("alone/a.exr.jpg").read_bytes() == Path("out/a.exr.jpg").read_bytes()
+    listed = find_jobs(["list.csv"], NOWHERE, keep_suffix=True)
+    assert [job.stem for job in listed] == ["in/a.exr", "in/a.hdr", "mine"]
+    assert Job(Path("x"), "a.cr2").stem == "a"
+
+
+def test_a_depth_file_in_a_folder_is_left_out(clpipe, write_exr):
+    write_exr("in/a.exr", np.full((4, 6, 3), 0.25))
+    for name in ("a_depth", "b_depth"):
+        write_exr(f"in/{name}.exr", np.ones((4, 6, 1)), "Z")
+    run = ("run", "-o", "out", "--device", "numpy")
+    done = clpipe(*run, "in")
+    assert "left out: 2 images in folders hold no picture, such as in/" in done.output
+    assert "_depth.exr: no R, G and B channels; found Z" in done.output
+    assert "1 of 3 images done, 0 failed, 2 left out" in done.output
+    assert written(Path("out")) == ["a.jpg", "a.json"]
+    lines = map(json.loads, Path("out/run.jsonl").read_text("utf-8").splitlines())
+    left_out = [line for line in lines if line.get("status") == "left out"]
+    assert {line["error"] for line in left_out} == {None}
+    assert all(line["reason"].endswith("found Z") for line in left_out)
+    for inputs in ("in/a_depth.exr", "in/*_depth.exr"):
+        assert "no R, G and B channels; found Z" in clpipe(*run, inputs, status=1).output
+    assert "left out" not in clpipe(*run, "in", "--quiet").output
+
+
+def test_names_that_would_break_a_line_or_the_terminal(clpipe, write_exr):
+    for name in ("new\nline", "esc\x1b[31m", "left\u202e", "[bold]"):
+        write_exr(f"in/{name}.exr", np.full((4, 6, 3), 0.25))
+    Path("in/bad\n\x1b[0m.exr").write_text("no image")
+    Path(os.fsdecode(b"in/no\xff.exr")).write_bytes(b"")
+    done = clpipe("run", "in", "-o", "out", "--device", "numpy", status=1)
+    lines = done.output.splitlines()
+    assert all(line.isprintable() for line in lines)
+    assert sum(" -> out/" in line for line in lines) == 4
+    assert r"in/new\nline.exr -> out/new\nline.jpg" in done.output
+    assert r"in/bad\n\x1b[0m.exr: cannot be read as an image" in done.output
+    assert r"in/no\udcff.exr" in done.output
+    logged = Path("out/run.jsonl").read_text("utf-8").splitlines()
+    assert len([json.loads(line) for line in logged]) == 8
+    refused = clpipe("plan", "-c", "no\nsu\x1bch.toml", status=2).output
+    assert refused.replace("\n", "").isprintable()
+
+
+def test_names_that_are_too_long_fail_alone(clpipe, write_exr):
+    for name in ("a" * 251, "b" * 240, "short"):
+        write_exr(f"in/{name}.exr", np.full((4, 6, 3), 0.25))
+    done = clpipe("run", "in", "-o", "out", "--device", "numpy", status=1)
+    assert "a.json: cannot be read: File name too long" in done.output
+    assert "in/short.exr -> out/short.jpg" in done.output
