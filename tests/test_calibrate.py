@@ -86,7 +86,9 @@ def test_what_clpipe_puts_in_comes_back(pattern, iso):
         )
         with_hot = light.copy()
         with_hot.ravel()[at] += charge.astype(np.float32)
-        shots[name] = np.stack([pipeline.process(with_hot, name, seed=k).image for k in range(8)])
+        shots[name] = np.stack(
+            [pipeline.process(with_hot, name, noise_key=name, seed=k).image for k in range(8)]
+        )
     sensor = Sensor(pattern, camera.black_level, camera.white_level)
     # The realised pattern of the columns, from the stage itself.
     columns = Pipeline(

@@ -384,7 +384,8 @@ def test_a_pipe_in_the_output_folder_does_not_make_a_run_wait(clpipe, write_exr)
     )
     os.remove("out/a.json")
     os.mkfifo("out/a.jpg")
-    clpipe(*run, "-o", "out")
+    assert "did not write this file" in clpipe(*run, "-o", "out", status=1).output
+    clpipe(*run, "-o", "out", "--overwrite")
     assert Path("out/a.jpg").is_file()
     assert (
         "did not write this tar" in clpipe(*run, "-o", "tars", "--webdataset", 1, status=2).output

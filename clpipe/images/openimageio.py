@@ -75,14 +75,10 @@ def open_image(path: Path) -> Iterator[Any]:
 def claimed_pixels(path: Path) -> int | None:
     """How many pixels a file says that its first part has; None where it cannot be opened."""
     try:
-        file = oiio.ImageInput.open(str(path))
-        if file is None:
-            oiio.geterror()  # else it would be the next error's
-            return None
-        with contextlib.closing(file):
+        with open_image(path) as file:
             spec = file.spec()
             return max(spec.width * spec.height, spec.full_width * spec.full_height)
-    except (UnicodeEncodeError, UnicodeDecodeError):
+    except ImageError:
         return None
 
 
