@@ -10,7 +10,6 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -154,7 +153,6 @@ def worker_environment(selectors: Sequence[str]) -> WorkerEnvironment:
         chosen = choose_all(selectors, find_devices())
         device = " and ".join(sorted({device_text(info) for info in chosen}))
     libraries = {"NumPy": np.__version__, **versions()}
-    libraries |= {name: version(name) for name in ("rawpy", "OpenEXR")}
     return WorkerEnvironment(
         __version__, device, ", ".join(f"{k} {v}" for k, v in libraries.items())
     )

@@ -6,12 +6,13 @@ import os
 import resource
 from collections.abc import Mapping, Sequence
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
-from PIL import Image, ImageCms
+from PIL import ImageCms
 
 from clpipe.base.about import __version__
 from clpipe.base.errors import ImageError
@@ -157,4 +158,4 @@ def _encode(format_: str, to: str, spec: Any, pixels: Array) -> None:
 
 def versions() -> dict[str, str]:
     """The versions of the libraries that read and write pictures."""
-    return {"OpenImageIO": oiio.__version__, "Pillow": Image.__version__}  # type: ignore[attr-defined]
+    return {name: version(name) for name in ("OpenImageIO", "OpenEXR", "Pillow", "rawpy")}

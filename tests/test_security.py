@@ -1,0 +1,153 @@
+"""The promises of SECURITY.md, by their numbers; what has tests of its own elsewhere is named."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clpipe.images.write import write_exr
+from tests.conftest import ROOT, written
+
+OWN_TEXT = Path(__file__).read_text("utf-8")
+NUMPY = ("--device", "numpy")
+CURVE = ("--set", "tone_curve.method=file", "--set", "tone_curve.path=curve.csv")
+
+# Where each promise is held besides here.
+ELSEWHERE = {
+    1: ("test_request", "test_no_code_comes_from_a_sidecar"),
+    3: ("test_existing", "test_what_is_no_file_is_not_ours"),
+    4: ("test_hostile_files", "test_what_is_no_file_is_refused_without_waiting"),
+    5: ("test_hostile_files", "test_images_that_claim_too_much_are_refused_in_little_memory"),
+    6: ("test_hostile_files", "test_names_from_a_file_are_escaped_in_messages"),
+    7: ("test_existing", "test_what_is_missing_or_damaged_is_made_again"),
+}
+
+
+def test_each_promise_is_held():
+    text = (ROOT / "SECURITY.md").read_text("utf-8")
+    promises = {int(number) for number in re.findall(r"^(\d+)\. \*\*", text, re.MULTILINE)}
+    held = set(ELSEWHERE) | {int(n) for n in re.findall(r"def test_(\d)_", OWN_TEXT)}
+    assert promises == held
+    for module, name in ELSEWHERE.values():
+        assert f"def {name}" in (ROOT / f"tests/{module}.py").read_text("utf-8")
+
+
+@pytest.fixture
+def render(tmp_path):
+    write_exr(Path("in.exr"), np.full((8, 8, 3), 0.25, np.float32), "RGB", {})
+    return "in.exr"
+
+
+@pytest.fixture(autouse=True)
+def _here(clpipe):
+    """Every test runs in a folder of its own."""
+
+
+def test_1_no_data_runs_code(clpipe, render):
+    Path("evil.py").write_text("open('ran', 'w')\n")
+    Path("evil.toml").write_text('stage_files = ["evil.py"]\n')
+    clpipe("run", render, "-o", "out", *NUMPY, "--keep", "normalize")
+    values = json.loads(Path("out/in.json").read_text())
+
+    def replay(**changes):
+        edited = {**values, "request": {**values["request"], **changes}}
+        Path("edited.json").write_text(json.dumps(edited))
+        clpipe("run", "--replay", "edited.json", "-o", "r", *NUMPY, status=(0, 2))
+
+    named = {"stage_files": ["evil.py"]}
+    replay(stage_files=["evil.py"], files={})
+    for place in ("config", "options", "image"):
+        replay(**{place: named})
+    replay(options={"camera": "evil.toml"})
+    Path("in.jsonl").write_text(json.dumps({"path": "in.exr", **named}))
+    clpipe("run", "in.jsonl", "-o", "m", *NUMPY, status=2)
+    Path("in.jsonl").write_text(json.dumps({"path": "in.exr", "camera": "evil.toml"}))
+    clpipe("run", "in.jsonl", "-o", "m", *NUMPY, status=2)
+    write_exr(
+        *(Path("kept.exr"), np.full((8, 8), 0.25, np.float32), ("Y",)),
+        {"stage": "normalize", "kind": "mosaic", "settings": json.dumps(named)},
+    )
+    clpipe("run", "kept.exr", "-o", "k", "--start-at", "white_balance", *NUMPY, status=1)
+    assert not Path("ran").exists()
+
+
+def test_2_pictures_stay_below_out(clpipe, render):
+    Path("deep").mkdir()
+    clpipe("run", render, "-o", "deep/out", *NUMPY)
+    before = written(Path())
+    values = json.loads(Path("deep/out/in.json").read_text())
+    for name in ("../x", "/tmp/x", "a/../../x", "..", "x\0y"):
+        Path("in.jsonl").write_text(json.dumps({"path": "in.exr", "name": name}))
+        clpipe("run", "in.jsonl", "-o", "deep/out", *NUMPY, status=2)
+        Path("deep/e.json").write_text(json.dumps({**values, "name": name}))
+        clpipe("run", "--replay", "deep/e.json", "-o", "deep/out", *NUMPY, status=2)
+        edited = {**values, "picture": name}
+        Path("deep/e.json").write_text(json.dumps(edited))
+        clpipe("run", "--replay", "deep/e.json", "-o", "deep/out", *NUMPY, status=2)
+    for outputs in (["../../in.exr"], [{"name": "../../in.exr", "size": 1, "sha256": ""}]):
+        Path("deep/out/in.json").write_text(json.dumps({**values, "outputs": outputs}))
+        clpipe("run", render, "-o", "deep/out", *NUMPY)
+    assert written(Path()) == sorted([*before, "deep/e.json", "in.jsonl"])
+
+
+def test_3_no_link_is_written_through(clpipe, render):
+    Path("victim").write_text("keep")
+    for name in ("in.jpg", "in.json", "run.jsonl", ".clpipe.lock", "in.normalize.exr"):
+        out = Path(f"out of {name}")
+        out.mkdir()
+        (out / name).symlink_to("../victim")
+        clpipe("run", render, "-o", out, "--keep", "normalize", *NUMPY, status=(1, 2))
+        assert Path("victim").read_text() == "keep" and (out / name).is_symlink()
+    Path("out").mkdir()
+    Path("out/in.jpg").symlink_to("../victim")
+    clpipe("run", render, "-o", "out", "--overwrite", *NUMPY)
+    assert Path("victim").read_text() == "keep" and not Path("out/in.jpg").is_symlink()
+    Path("trace.json").symlink_to("victim")
+    clpipe("run", render, "-o", "t", "--trace", "trace.json", *NUMPY, status=2)
+    assert Path("victim").read_text() == "keep"
+
+
+@pytest.mark.parametrize("device", ["/dev/zero", "pipe"])
+def test_4_what_never_ends_is_not_read(clpipe, render, device):
+    os.mkfifo("pipe")
+    clpipe("run", render, "-o", "out", *NUMPY)
+    values = json.loads(Path("out/in.json").read_text())
+    values["request"]["files"][str(Path(device).resolve())] = "0" * 64
+    Path("e.json").write_text(json.dumps(values))
+    for name in ("c.toml", "m.jsonl", "s.json", "x.exr", "x.dng", "x.png", "curve.csv"):
+        Path(name).symlink_to(device)
+    for arguments in (
+        ("run", "x.exr", "-o", "o"),
+        ("run", "x.dng", "-o", "o"),
+        ("run", "x.png", "-o", "o", "--transfer", "srgb"),
+        ("run", "m.jsonl", "-o", "o"),
+        ("run", "in.exr", "-o", "o", "-c", "c.toml"),
+        ("run", "in.exr", "-o", "o", "--camera", "c.toml"),
+        ("run", "in.exr", "-o", "o", *CURVE),
+        ("run", "--replay", "s.json", "-o", "o"),
+        ("run", "--replay", "e.json", "-o", "o"),
+    ):
+        clpipe(*arguments, *NUMPY, status=(1, 2))
+
+
+def test_6_a_batch_goes_on_and_the_terminal_is_safe(clpipe, render):
+    Path("in").mkdir()
+    Path("in/good.exr").write_bytes(Path(render).read_bytes())
+    Path("in/\x1b[2Jbad\n.exr").write_bytes(b"v/1\x01")
+    output = clpipe("run", "in", "-o", "out", *NUMPY, status=1).output
+    assert "\x1b" not in output and "bad" in output
+    assert Path("out/good.jpg").exists()
+
+
+def test_faults_of_all_kinds_in_small():
+    """A few of the faults of tools/faults; the whole of it takes an hour."""
+    command = [sys.executable, ROOT / "tools/faults", "--images", "8", "--repeats", "2"]
+    faults = ("full", "power")
+    done = subprocess.run([*map(str, command), "--device", "numpy", *faults], capture_output=True)
+    assert done.returncode == 0, done.stdout.decode()[-2000:] + done.stderr.decode()[-2000:]
+    assert done.stdout.count(b"2 times") == len(faults)
