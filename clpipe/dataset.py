@@ -66,6 +66,7 @@ class Dataset(ReadOnly):
         truth: whether a sample has its image without noise, too.
         layer: the layer of an EXR that is the picture; None chooses.
         transfer: the transfer curve of renders in whole numbers: "srgb" or "linear".
+        exclude: patterns of files that are not taken from folders and globs, such as depth.
         epoch: the number of the first epoch.
         epochs: how many epochs there are; None is no end.
         threads: how many images are decoded at once; None is one for each processor.
@@ -89,6 +90,7 @@ class Dataset(ReadOnly):
         truth: bool = False,
         layer: str | None = None,
         transfer: str | None = None,
+        exclude: str | Sequence[str] = (),
         epoch: int = 0,
         epochs: int | None = 1,
         threads: int | None = None,
@@ -109,7 +111,9 @@ class Dataset(ReadOnly):
         )
         self._loader = ImageLoader(request)
         several = [inputs] if isinstance(inputs, str | Path) else inputs
-        self._jobs = find_jobs([str(i) for i in several], NOWHERE, self._loader.endings())
+        patterns = [exclude] if isinstance(exclude, str) else exclude
+        named = [str(i) for i in several]
+        self._jobs = find_jobs(named, NOWHERE, self._loader.endings(), patterns)
         self._loader.check(self._jobs)
         _check_files(self._jobs)
         _check_keys(self._jobs)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import clpipe as clpipe_api
 from clpipe.base.errors import RequestError
 from clpipe.inputs.find import Job, find_jobs
 from tests.conftest import ROOT, written
@@ -176,3 +177,16 @@ def test_names_that_are_too_long_fail_alone(clpipe, write_exr):
     done = clpipe("run", "in", "-o", "out", "--device", "numpy", status=1)
     assert "a.json: cannot be read: File name too long" in done.output
     assert "in/short.exr -> out/short.jpg" in done.output
+
+
+def test_a_run_that_leaves_everything_out_is_no_success(clpipe, write_exr):
+    write_exr("in/a_depth.exr", np.ones((4, 6, 1)), "Z")
+    done = clpipe("run", "in", "-o", "out", "--device", "numpy", status=1)
+    assert "left out: 1 image in a folder holds no picture, such as in/a_depth.exr" in done.output
+
+
+def test_a_dataset_leaves_out_what_is_excluded(write_exr, tmp_path):
+    write_exr("in/a.exr", np.full((4, 6, 3), 0.25))
+    write_exr("in/a_depth.exr", np.ones((4, 6, 1)), "Z")
+    (sample,) = clpipe_api.Dataset(tmp_path / "in", device="numpy", exclude="*_depth.exr")
+    assert sample["key"] == "a.exr"

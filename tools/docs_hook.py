@@ -29,6 +29,7 @@ def pages() -> dict[str, str | bytes]:
         "configurations.md": configurations_page(),
         "cli.md": cli_page(),
         "changelog.md": (ROOT / "CHANGELOG.md").read_text("utf-8"),
+        "security.md": (ROOT / "SECURITY.md").read_text("utf-8"),
         "contributing.md": (ROOT / "CONTRIBUTING.md").read_text("utf-8"),
         **notebook_files(ROOT / "docs" / f"{NOTEBOOK}.ipynb"),
     }

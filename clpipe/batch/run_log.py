@@ -68,6 +68,11 @@ class Summary:
         return sum(self.counts.values())
 
     @property
+    def is_fruitless(self) -> bool:
+        """Whether images were left out, and there is a picture of none."""
+        return self.counts[LEFT_OUT] > 0 == self.counts[DONE] + self.counts[SKIPPED]
+
+    @property
     def elapsed(self) -> float:
         """Seconds since the start."""
         return time.perf_counter() - self.began

@@ -95,7 +95,8 @@ class Reporter:
         text = clipping_text(share)
         if not self._several:
             return f"clpipe: {path}: warning: {text}"
-        return f"{self._summary.much_clipped} images are clipped much; in {path} {text}"
+        count = self._summary.much_clipped
+        return f"{count} image{'s are' if count > 1 else ' is'} clipped much; in {path} {text}"
 
     def end(self) -> None:
         """Remove the bar and print the summary."""

@@ -246,7 +246,7 @@ def run(
             follow(batch, jobs, summary, reporter, log, timeline)
     if summary.interrupted:
         sys.exit(130)
-    sys.exit(1 if summary.failures else 0)
+    sys.exit(1 if summary.failures or summary.is_fruitless else 0)
 
 
 def follow(
