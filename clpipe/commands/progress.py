@@ -96,7 +96,7 @@ class Reporter:
         if not self._several:
             return f"clpipe: {path}: warning: {text}"
         count = self._summary.much_clipped
-        return f"{count} image{'s are' if count > 1 else ' is'} clipped much; in {path} {text}"
+        return f"{count} image{'s are' if count > 1 else ' is'} clipped much, most {path}: {text}"
 
     def end(self) -> None:
         """Remove the bar and print the summary."""
