@@ -1,5 +1,7 @@
 """The Python API, as somebody who imports clpipe sees it."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -130,3 +132,13 @@ def test_an_image_that_is_none(camera, image, message):
 def test_a_request_that_is_wrong(settings, message):
     with pytest.raises(clpipe.RequestError, match=message):
         clpipe.Pipeline(**settings)
+
+
+def test_several_threads_may_use_one_pipeline():
+    camera = clpipe.Pipeline(iso=3200)
+    random = np.random.default_rng(0)
+    images = [random.random((40 + 8 * (i % 3), 64, 3), np.float32) for i in range(12)]
+    alone = [camera.process(image, str(i), noise_key="k").image for i, image in enumerate(images)]
+    with ThreadPoolExecutor(4) as pool:
+        both = pool.map(lambda i: camera.process(images[i], str(i), noise_key="k").image, range(12))
+        assert all(map(np.array_equal, alone, both))
