@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import ImageError, OutputError, RequestError
-from clpipe.base.files import Stored
+from clpipe.base.files import Stored, keep_names
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
 from clpipe.chain.formats import DNG, FORMATS, Format, ending_of
@@ -245,7 +245,11 @@ class OutputWriter:
             raise OutputError(f"{self.folder}: the folder has gone; {RESUMABLE}")
         folder = self.path(job, "").parent
         try:
+            if folder.is_dir():
+                return
             folder.mkdir(parents=True, exist_ok=True)
+            for place in folder.relative_to(self.folder).parents:
+                keep_names(self.folder / place)
         except OSError as error:
             raise ImageError(f"{folder}: cannot be made: {error.strerror}") from None
 
