@@ -114,9 +114,11 @@ def parse_json(text: str | bytes) -> Any:
     """The value of a JSON text.
 
     Raises:
-        ValueError: it is not valid, or is nested too deeply to be read.
+        ValueError: it is not valid, is nested too deeply to be read, or holds half a character.
     """
     try:
-        return json.loads(text)
+        value = json.loads(text)
+        os.fsencode(json.dumps(value, ensure_ascii=False))  # no file can be named by half of one
+        return value
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
