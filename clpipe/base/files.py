@@ -46,7 +46,9 @@ def shortened(name: str) -> str:
     >>> shortened("render"), len(shortened("x" * 255))
     ('render', 200)
     """
-    return os.fsencode(name)[:LONGEST].decode("utf-8", "ignore")
+    while len(os.fsencode(name)) > LONGEST:
+        name = name[:-1]
+    return name
 
 
 @contextlib.contextmanager

@@ -114,9 +114,13 @@ def parse_json(text: str | bytes) -> Any:
     """The value of a JSON text.
 
     Raises:
-        ValueError: it is not valid, or is nested too deeply to be read.
+        ValueError: it is not valid, is nested too deeply to be read, or holds half a character.
     """
+    text = text.decode("utf-8-sig") if isinstance(text, bytes) else text
     try:
-        return json.loads(text)
+        value = json.loads(text)
+        if "\\ud" in text.lower():  # perhaps half a character, which can name no file
+            os.fsencode(json.dumps(value, ensure_ascii=False))
+        return value
     except RecursionError:
         raise ValueError("it is nested too deeply") from None

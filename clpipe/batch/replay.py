@@ -108,7 +108,8 @@ def _values(path: Path) -> dict[str, Any]:
     try:
         values = read_sidecar(path)
     except FileNotFoundError:
-        raise RequestError(f"{path}: no such file") from None
+        reason = "it is damaged: no whole JSON in UTF-8" if path.exists() else "no such file"
+        raise RequestError(f"{path}: {reason}") from None
     except ImageError:
         raise RequestError(
             f"{path}: clpipe did not write this file; --replay takes a sidecar"

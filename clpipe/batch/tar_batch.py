@@ -100,7 +100,7 @@ class Packer:
         try:
             members = list(self._members())
             new = any(isinstance(source, Path) for _, source in members)
-            same = [name for name, _ in members] == list(self._old.places)
+            same = [name for name, _ in members] == self._old.names
             if members and (new or not (same or FAILED in self._statuses.values())):
                 self._write(members)
         except ImageError as error:

@@ -108,8 +108,8 @@ def prepare(tars: Sequence[Tar], overwrite: bool) -> None:
     for tar in tars:
         if not overwrite and os.path.lexists(tar.path) and not is_own(tar.path):
             raise RequestError(
-                f"{tar.path}: clpipe did not write this tar, and would overwrite it; move it, "
-                "choose another output folder, or say --overwrite"
+                f"{tar.path}: clpipe did not write this tar, or it is damaged, and would be "
+                "overwritten; move it, choose another output folder, or say --overwrite"
             )
 
 
@@ -122,9 +122,11 @@ def is_own(path: Path) -> bool:
                 return True
         with tarfile.open(path, "r:") as tar:
             for info in tar:
-                if info.name.endswith(f".{SIDECAR}") and (data := tar.extractfile(info)):
-                    return info.size <= TEXT_BYTES and OWN in parse_json(data.read())
-    except (*DAMAGED, TypeError):
+                is_sidecar = info.isreg() and info.name.endswith(f".{SIDECAR}")
+                if is_sidecar and (data := tar.extractfile(info)):
+                    values = parse_json(data.read()) if info.size <= TEXT_BYTES else None
+                    return isinstance(values, dict) and OWN in values
+    except DAMAGED:
         pass
     return False
 
@@ -134,12 +136,14 @@ class Members:
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        self.names: list[str] = []  # one may be there twice
         self.places: dict[str, tuple[int, int]] = {}  # offset and size, in bytes
         try:
             whole = check_regular(path).st_size
             with tarfile.open(path, "r:") as tar:
                 for info in tar:
                     if info.offset_data + info.size <= whole:
+                        self.names.append(info.name)
                         self.places[info.name] = (info.offset_data, info.size)
         except DAMAGED:
             pass

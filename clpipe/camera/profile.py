@@ -16,7 +16,8 @@ from clpipe.base.validation import first_fault
 from clpipe.camera.noise import NoiseModel
 
 DEFAULT_CAMERA = "sony-a7r2"
-Row = tuple[float, float, float]
+Coefficient = Annotated[float, Field(ge=-100, le=100)]
+Row = tuple[Coefficient, Coefficient, Coefficient]
 Matrix = tuple[Row, Row, Row]
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -29,8 +30,9 @@ SRGB_TO_XYZ = np.array(
     ]
 )
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+LARGEST = 1e9  # figure of a sensor; its square is a number, too
+Positive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=0.1)]
 
 

@@ -15,6 +15,8 @@ DRAWABLE = ("iso", "camera")  # of the keys; parameters of stages and of the out
 
 MAX_ISO = 10**9
 
+MAX_STAGES = 256  # of a chain; an image can carry one
+
 TYPES: dict[str, tuple[str, Any]] = {
     "iso": ("a number", int | float),
     "seed": ("a whole number", int),

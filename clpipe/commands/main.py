@@ -85,6 +85,8 @@ def refused(error: OSError) -> ClpipeError:
     """What the system refused: a file, to print, or something that it does not name."""
     if error.filename is not None:
         return OutputError(f"{error.filename}: {error.strerror or error}")
+    if isinstance(error, FileNotFoundError):  # only the working directory has no name
+        return RequestError("the working directory has gone; change to one that exists")
     *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
     room, _, _ = innermost.f_globals["__name__"].partition(".")
     if room in ("click", "rich"):

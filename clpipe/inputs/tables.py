@@ -6,6 +6,7 @@ A row is parsed only when its record is called, so that one wrong row does not h
 import csv
 import io
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -60,10 +61,11 @@ def _check_header(place: str, columns: Sequence[str], check_column: Callable[[st
     Raises:
         RequestError: it does not.
     """
+    counts = Counter(columns)
     for number, column in enumerate(columns, 1):
         if not column:
             raise RequestError(f"{place}: column {number} has no name")
-        if column in columns[: number - 1]:
+        if counts[column] > 1:
             raise RequestError(f"{place}: there are two columns '{column}'")
     if "path" not in columns:
         commas = "" if len(columns) > 1 else "; columns are separated by commas"

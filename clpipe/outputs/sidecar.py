@@ -13,7 +13,7 @@ from typing import Any
 from clpipe.base.about import __version__
 from clpipe.base.errors import ImageError
 from clpipe.base.files import Stored, keep_names, write_whole
-from clpipe.base.reading import read_bytes
+from clpipe.base.reading import parse_json, read_bytes
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.images.read import SourceImage
@@ -43,8 +43,8 @@ def read_sidecar(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
     try:
-        values = json.loads(data)
-    except (ValueError, RecursionError):
+        values = parse_json(data)
+    except ValueError:
         values = None
         if not data.strip(b"\0") or data.startswith(BEGINNING):
             raise FileNotFoundError(path) from None

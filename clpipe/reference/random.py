@@ -60,7 +60,7 @@ def stream_of(owner: str, stage: str) -> Stream:
 
 @lru_cache(maxsize=64)
 def _key_of(owner: str) -> tuple[int, int]:
-    digest = blake2b(owner.encode(), digest_size=8).digest()
+    digest = blake2b(owner.encode("utf-8", "surrogatepass"), digest_size=8).digest()
     return int.from_bytes(digest[:4], "little"), int.from_bytes(digest[4:], "little")
 
 
