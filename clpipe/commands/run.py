@@ -200,7 +200,10 @@ def run(
         again = replay_of(replay, paths, max_pixels, options["stage_files"])
         request, jobs = again.request, [again.job]
         loader = ImageLoader(request)
-        chain = loader.first_chain(jobs)
+        try:
+            chain = loader.first_chain(jobs)
+        except RequestError as error:
+            raise RequestError(f"{replay}: {error}") from None
     else:
         request = Request.from_options(max_pixels=max_pixels, **options)
         loader = ImageLoader(request)
