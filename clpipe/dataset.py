@@ -216,7 +216,7 @@ class Dataset(ReadOnly):
     def _read(self, job: Job, epoch: int) -> LoadedImage:
         loader = self._loader
         try:
-            loader = loader.for_job(replace(job, key=of_frame(job.key, epoch)))
+            loader = loader.for_job(replace(job, key=of_frame(job.key, epoch or None)))
             loaded = loader.enter(job, loader.read(job))
         except (ImageError, RequestError, MemoryError) as error:
             raise ImageError(loader.error_text(job, error)) from None

@@ -21,7 +21,7 @@ from clpipe.base.files import sha256_of
 from clpipe.base.reading import parse_toml, unchanged
 from clpipe.batch.replay import replay_of
 from clpipe.batch.tars import Members, is_own
-from clpipe.camera.profile import built_in_cameras, load_camera
+from clpipe.camera.profile import load_camera
 from clpipe.chain.files import load_config
 from clpipe.chain.registry import load_stage_file
 from clpipe.chain.settings import settings_from
@@ -424,75 +424,3 @@ def test_names_from_a_file_are_escaped_in_messages(tmp_path):
     with pytest.raises(RequestError, match="there is no column 'path'") as refused:
         read_manifest(tmp_path / "a.csv")
     assert str(refused.value).isprintable()
-
-
-def test_a_member_that_is_in_a_tar_twice_is_packed_once(clpipe, write_exr):
-    run = ("run", write_exr("a.exr", np.full((4, 6, 3), 0.25)), "-o", "out", "--device", "numpy")
-    clpipe(*run, "--webdataset", 1)
-    whole = Path("out/000000.tar").read_bytes()
-    Path("out/000000.tar").write_bytes(tar_header("a.jpg", 512) + b"another".ljust(512) + whole)
-    clpipe(*run, "--webdataset", 1)
-    assert Path("out/000000.tar").read_bytes() == whole
-
-
-def test_half_a_character_in_a_sidecar(clpipe, write_exr):
-    run = ("run", write_exr("a.exr", np.full((4, 6, 3), 0.25)), "-o", "out", "--device", "numpy")
-    clpipe(*run)
-    sidecar = Path("out/a.json")
-    whole = sidecar.read_text()
-    for key in ('"name": "a', '"input": "', '"image_name": "'):
-        assert key in whole
-        sidecar.write_text(whole.replace(key, key + r"\ud800"))
-        again = clpipe("run", "--replay", sidecar, "-o", "again", "--device", "numpy", status=2)
-        assert f"{sidecar}: it is damaged: no whole JSON" in again.stderr
-        clpipe(*run)
-        assert r"\ud800" not in sidecar.read_text()
-
-
-def test_a_noise_key_and_a_name_that_are_not_utf8(clpipe, write_exr):
-    path = write_exr("in/a.exr", np.full((4, 6, 3), 0.25))
-    os.link(path, os.fsencode(path.parent) + b"/\xff.exr")
-    run = ("run", "in", "-o", "out", "--device", "numpy", "--noise-key", os.fsdecode(b"\xff"))
-    result = clpipe(*run, status=1)
-    assert r"\udcff.exr': its name is not UTF-8; rename it" in result.stderr
-    assert "1 of 2 images done, 1 failed" in result.stderr
-
-
-def test_a_header_of_very_many_columns_is_refused_soon(tmp_path):
-    path = tmp_path / "m.csv"
-    path.write_text("path," + ",".join(f"x{i}" for i in range(40_000)))
-    start = time.monotonic()
-    with pytest.raises(RequestError, match="unknown column 'x0'"):
-        read_manifest(path)
-    assert time.monotonic() - start < 5
-
-
-def test_a_chain_of_very_many_stages_is_refused():
-    with pytest.raises(RequestError, match="stages: found 100000, but at most 256 run"):
-        settings_from({"stages": ["denoise"] * 100_000})
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "key"),
-    [
-        (r"read_noise = \[", "read_noise = [1e300, ", r"gain_stages\[0\].read_noise\[0\]"),
-        (r"xyz_to_camera = \[\[", "xyz_to_camera = [[1e200, ", r"xyz_to_camera\[0\]\[0\]"),
-    ],
-)
-def test_figures_of_a_camera_that_no_sensor_has(tmp_path, old, new, key):
-    text = built_in_cameras()["canon-5d2"].read_text("utf-8")
-    path = tmp_path / "mine.toml"
-    path.write_text(re.sub(old + r"[-\d.]+, ", new, text, count=1))
-    with pytest.raises(RequestError, match=rf"mine\.toml: {key}: found 1e\+\d00: .* less than"):
-        load_camera(str(path))
-
-
-def test_a_working_directory_that_has_gone(tmp_path):
-    gone = tmp_path / "gone"
-    gone.mkdir()
-    code = "import os, sys; os.rmdir(os.getcwd()); from clpipe.commands.main import main; main()"
-    command = [sys.executable, "-c", code, "run", "/a.exr", "-o", "/out", "--device", "numpy"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    result = subprocess.run(command, cwd=gone, env=environment, capture_output=True, text=True)
-    assert result.stderr == ("clpipe: the working directory has gone; change to one that exists\n")
-    assert result.returncode == 2

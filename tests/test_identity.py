@@ -99,6 +99,22 @@ def test_a_frame_that_was_kept_with_a_key_of_its_own_goes_on_as_it_would_have(cl
     assert not alike(correlation("o/a.frame0.exr", "o/a.frame1.exr"))
 
 
+def test_bursts_of_a_kept_burst_do_not_share_noise(clpipe):
+    render("a.exr", 0.3)
+    burst = (*RUN, "--frames", 2)
+    step = "inverse_white_balance"
+    clpipe("run", "a.exr", "-o", "first", *burst, "--keep", step)
+    for i in (0, 1):
+        run = ("run", f"first/a.frame{i}.{step}.exr", "-o", "again", "--start-at", "sensor_noise")
+        clpipe(*run, *burst)
+    names = [f"again/a.frame{i}.{step}.frame{k}.exr" for i in (0, 1) for k in (0, 1)]
+    made = [noise(name) for name in names]
+    for i, one in enumerate(made):
+        assert not any(alike(float((one * other).mean())) for other in made[:i])
+    for i in (0, 1):  # each goes on as it would have
+        assert np.array_equal(made[2 * i], noise(f"first/a.frame{i}.exr"))
+
+
 def test_pipeline(tmp_path, clpipe):
     image = np.full((SIDE, SIDE, 3), 0.3, np.float32)
     pipeline = api.Pipeline(iso=3200, device="numpy", until="sensor_noise")

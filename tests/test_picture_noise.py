@@ -130,9 +130,15 @@ def test_what_is_refused(method, report, tmp_path):
     for records in ({"R": {}}, {"R": {"sigma": None}}, [], dict.fromkeys("RGB", 1)):
         with pytest.raises(RequestError, match="not a report"):
             chain(method=method, measured=report(channels=records))
-    no_numbers = {"sigma": 0.1, "intensity": {"mean": [], "sigma": []}}
-    with pytest.raises(RequestError, match="not a report"):
-        chain(method=method, measured=report(channels=dict.fromkeys("RGB", no_numbers)))
+    for sigma, means, sigmas in (
+        (0.1, [], []),
+        (-0.1, [0, 1], [0, 0]),
+        (1e300, [0, 1], [0, 0]),
+        (0.1, [0, 1], [0, 1e300]),
+    ):
+        record = {"sigma": sigma, "intensity": {"mean": means, "sigma": sigmas}}
+        with pytest.raises(RequestError, match="not a report"):
+            chain(method=method, measured=report(channels=dict.fromkeys("RGB", record)))
 
 
 def test_a_configuration_names_the_report_relative_to_itself(report, tmp_path):

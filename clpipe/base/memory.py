@@ -19,10 +19,10 @@ def parse_size(text: str) -> int:
         RequestError: the text is not a size, or the size is 0 or beyond 63 bits.
     """
     match = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*([kmgt]?)(?:i?b)?", text.strip(), re.IGNORECASE)
-    size = int(float(match[1]) * UNITS[match[2].upper()]) if match else 0
-    if not 0 < size < 2**63:
+    size = float(match[1]) * UNITS[match[2].upper()] if match else 0
+    if not 1 <= size < 2**63:
         raise RequestError(f"--memory: found '{text}'; expected a size such as 512M or 8G")
-    return size
+    return int(size)
 
 
 def in_words(size: float) -> str:

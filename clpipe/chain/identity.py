@@ -31,17 +31,19 @@ def name_in(key: str) -> str:
     return name if at else key
 
 
-def of_frame(key: str, frame: int) -> str:
-    """The key of a frame of a burst, or of an image in an epoch, counted from 0.
+def of_frame(key: str, frame: int | None) -> str:
+    """The key of a frame of a burst, counted from 0, for an image that is kept; None is no burst.
 
-    >>> of_frame("a.exr@9f86d081884c7d65", 0), of_frame("a.exr@9f86d081884c7d65", 2)
-    ('a.exr@9f86d081884c7d65', 'a.exr@9f86d081884c7d65#2')
+    >>> of_frame("a.exr@9f86d081884c7d65", None), of_frame("a.exr@9f86d081884c7d65", 0)
+    ('a.exr@9f86d081884c7d65', 'a.exr@9f86d081884c7d65#0')
     """
-    return f"{key}#{frame}" if frame else key
+    return key if frame is None else f"{key}#{frame}"
 
 
-def noise_key(settings: "Settings", key: str, frame: int = 0) -> str:
+def noise_key(settings: "Settings", key: str, frame: int | None = None) -> str:
     """What noise is made of, beside the seed and the stage: the image and the ISO.
+
+    The first frame of a burst, or epoch, has the noise of the image alone.
 
     Settings that have a ``noise_key`` of their own share the noise with all others that have it,
     whatever the image and the ISO: common random numbers.
@@ -52,6 +54,5 @@ def noise_key(settings: "Settings", key: str, frame: int = 0) -> str:
     >>> noise_key(Settings(noise_key="pair 7"), "a.exr@9f86d081884c7d65", 1)
     'pair 7#1'
     """
-    if settings.noise_key:
-        return of_frame(settings.noise_key, frame)
-    return f"{of_frame(key, frame)}@ISO{settings.iso:.9g}"
+    own = of_frame(settings.noise_key or key, frame or None).removesuffix("#0")
+    return own if settings.noise_key else f"{own}@ISO{settings.iso:.9g}"

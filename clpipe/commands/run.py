@@ -11,7 +11,7 @@ import click
 from click.core import ParameterSource
 from rich.console import Console
 
-from clpipe.base.errors import RequestError
+from clpipe.base.errors import OutputError, RequestError
 from clpipe.base.memory import parse_size
 from clpipe.batch.dask_worker import RunSpec
 from clpipe.batch.interrupt import interruptible
@@ -200,7 +200,10 @@ def run(
         again = replay_of(replay, paths, max_pixels, options["stage_files"])
         request, jobs = again.request, [again.job]
         loader = ImageLoader(request)
-        chain = loader.first_chain(jobs)
+        try:
+            chain = loader.first_chain(jobs)
+        except RequestError as error:
+            raise RequestError(f"{replay}: {error}") from None
     else:
         request = Request.from_options(max_pixels=max_pixels, **options)
         loader = ImageLoader(request)
@@ -262,17 +265,26 @@ def follow(
     Raises:
         ClpipeError: the run cannot go on; what is finished is noted.
     """
+    unlogged: OutputError | None = None
     with closing(batch.run(jobs)) as outcomes, interruptible(batch.stop), reporter:
         try:
             for outcome in outcomes:
                 summary.add(outcome)
-                log.add(outcome)
+                if not unlogged:
+                    try:
+                        log.add(outcome)
+                    except OutputError as error:
+                        unlogged = error  # what is in flight is finished, and counted
+                        batch.stop()
                 reporter.report(outcome)
                 if events:
                     events.add(outcome)
+            if unlogged:
+                raise unlogged
         finally:
             summary.interrupted = summary.finished < summary.total
-            log.end(summary)
+            if not unlogged:
+                log.end(summary)
 
 
 def check_read_options(request: Request, chain: Chain) -> None:

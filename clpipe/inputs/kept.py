@@ -23,14 +23,14 @@ from clpipe.inputs.plausibility import input_warnings
 NOISE = "sensor_noise"  # the attribute of an image without sensor noise; its value is "none"
 
 
-def attributes_of(step: Step, chain: Chain, key: str, frame: int = 0) -> dict[str, str]:
+def attributes_of(step: Step, chain: Chain, key: str, frame: int | None = None) -> dict[str, str]:
     """The attributes of the kept image of a step, with which a chain can go on from it.
 
     Args:
         step: the step.
         chain: its chain.
         key: the image key.
-        frame: the number of the frame in a burst.
+        frame: the number of the frame in a burst; None is no burst.
     """
     is_noisy = step.method.after(step.context).noise is not None
     settings = chain.settings

@@ -29,7 +29,7 @@ class Rendition:
         name: what is put behind the image's name.
         chain: how it is made.
         key: the key of the image.
-        frame: its number in a burst.
+        frame: its number in a burst; None is no frame.
         noise: for a variance map, the steps whose noise has this variance in the chain's last
             image, see :func:`clpipe.chain.truth.variance_of`; else ().
     """
@@ -37,7 +37,7 @@ class Rendition:
     name: str
     chain: Chain
     key: str
-    frame: int = 0
+    frame: int | None = None
     noise: tuple[Step, ...] = ()
 
     @property
@@ -91,8 +91,9 @@ class RenditionPlan:
         Raises:
             RequestError: the chain has no such truth.
         """
-        names = enumerate(self._frame_names())
-        frames = [Rendition(name, chain, key, frame) for frame, name in names]
+        numbers = [None] if self.frames is None else range(self.frames)
+        named = zip(self._frame_names(), numbers, strict=True)
+        frames = [Rendition(name, chain, key, number) for name, number in named]
         return [*frames, *(replace(truth_of(t, chain), key=key) for t in self._all_truths())]
 
 

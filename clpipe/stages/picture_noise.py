@@ -247,8 +247,9 @@ def _channel_of(record: Any) -> ChannelNoise:
     curve = record["intensity"]
     mean, sigma = (tuple(float(x) for x in curve[key]) for key in ("mean", "sigma"))
     noise = ChannelNoise(float(record["sigma"]), mean, sigma)
-    numbers = np.array([noise.sigma, *mean, *sigma])
-    if not mean or len(mean) != len(sigma) or not np.isfinite(numbers).all() or min(sigma) < 0:
+    is_curve = 0 < len(mean) == len(sigma)
+    are_noise = all(0 <= value <= 1 for value in (noise.sigma, *sigma))
+    if not (is_curve and are_noise and np.isfinite(mean).all()):
         raise TypeError
     return noise
 

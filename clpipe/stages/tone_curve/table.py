@@ -80,7 +80,7 @@ def parse_csv(text: str) -> Knots:
             raise ValueError(f"line {number}: found {len(pair)} columns, but expected two: x,y")
         if not all(0 <= value <= 1 for value in pair):
             raise ValueError(f"line {number}: found {line!r}, but x and y go from 0 to 1")
-        if knots and pair[0] <= knots[-1][0]:
+        if knots and pair[0] < knots[-1][0] + 1e-12:  # so that no slope is infinite
             before = knots[-1][0]
             raise ValueError(f"line {number}: x is {pair[0]:g} after {before:g}; x must ascend")
         knots.append((pair[0], pair[1]))
@@ -99,7 +99,8 @@ def parse_cube(text: str) -> Knots:
         ValueError: the table has three dimensions, or red, green and blue differ, or its size is
             not LUT_1D_SIZE, or a line is not in the format, and the message has its number.
     """
-    low, high, size = 0.0, 1.0, None
+    low, high = 0.0, 1.0
+    size: float | None = None
     rows: list[float] = []
     for number, line in enumerate(text.splitlines(), 1):
         fields = line.partition("#")[0].split()
@@ -113,7 +114,7 @@ def parse_cube(text: str) -> Knots:
             case "LUT_3D_SIZE":
                 raise ValueError(f"line {number}: a table of three dimensions; give one of one")
             case "LUT_1D_SIZE":
-                size = int(values[0]) if values else 0
+                size = values[0] if values else 0
             case "LUT_1D_INPUT_RANGE" if len(values) == 2:
                 low, high = values
             case "DOMAIN_MIN" | "DOMAIN_MAX" if len(set(values)) == 1:
@@ -131,13 +132,13 @@ def parse_cube(text: str) -> Knots:
             case _:
                 rows.append(values[0])
     if size is None or size != len(rows) or size < 2:
-        declared = "no LUT_1D_SIZE" if size is None else f"LUT_1D_SIZE {size}"
+        declared = "no LUT_1D_SIZE" if size is None else f"LUT_1D_SIZE {size:g}"
         raise ValueError(f"{declared}, but {len(rows)} rows; they must agree, and be at least 2")
     if not low < high or not np.isfinite([low, high, *rows]).all():
         raise ValueError(
             f"its domain goes from {low:g} to {high:g}; it must ascend, and every number be finite"
         )
-    return np.stack([np.linspace(low, high, size), rows], axis=1)
+    return np.stack([np.linspace(low, high, len(rows)), rows], axis=1)
 
 
 # By a file's ending: how it is parsed, and how its knots are interpolated.
