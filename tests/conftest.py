@@ -25,6 +25,9 @@ STILL_LIFE = ROOT / "tests" / "data" / "still_life.exr"
 SHARED = ROOT.parent / "shared" / "data"
 
 
+WRITTEN = "2026:01:01 00:00:00"  # the time in a file is a part of what its noise belongs to
+
+
 def written(folder: Path) -> list[str]:
     """The files in a folder at any depth, sorted, but for the run's log."""
     files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
@@ -103,7 +106,7 @@ def write_exr(tmp_path: Path) -> Callable[..., Path]:
             pixels.shape[1], pixels.shape[0], pixels.shape[2], oiio.HALF if half else oiio.FLOAT
         )
         spec.channelnames = tuple(channels.split(","))
-        spec.attribute("DateTime", "2026:01:01 00:00:00")  # noise depends on all that a file holds
+        spec.attribute("DateTime", WRITTEN)
         for field, value in spec_fields.items():
             setattr(spec, field, value)
         file = oiio.ImageOutput.create(str(path))

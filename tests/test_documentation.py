@@ -13,7 +13,7 @@ import OpenImageIO as oiio
 import pytest
 
 import clpipe as package
-from tests.conftest import ROOT, STILL_LIFE, written
+from tests.conftest import ROOT, STILL_LIFE, WRITTEN, written
 from tests.dng import write_dng
 from tests.markdown import RUN, PageRunner, blocks
 
@@ -28,6 +28,7 @@ def name_of(page):
 
 def write(path, pixels, type_):
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], type_)
+    spec.attribute("DateTime", WRITTEN)
     file = oiio.ImageOutput.create(str(path))
     assert file.open(str(path), spec)
     assert file.write_image(np.ascontiguousarray(pixels, np.float32))
