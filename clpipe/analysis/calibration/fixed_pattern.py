@@ -81,13 +81,15 @@ def hot_in_scene(stack: Stack, line: Line) -> Pixels:
 def dead_in_scene(stack: Stack, line: Line) -> Pixels:
     """Dead pixels of a scene: without light where all 8 neighbours of the same colour have light.
 
-    Without light is less than 7 standard deviations of the dark; the neighbours must have four
-    times as much, and more than their range.
+    Without light is less than 7 standard deviations of the dark, or than a tenth of the darkest
+    neighbour: the line may put the dark's variance at 0. The neighbours must have four times those
+    deviations, and more than their range.
     """
     low, high = _extremes(stack)
     dark = SURE * float(np.sqrt(line.at(np.zeros(1))[0] / len(stack.rest)))
     lit = low > np.maximum(4 * dark, high - low)
-    return _pixels(lit & (stack.light < dark), stack.light - low, float(lit.mean()))
+    dead = lit & (stack.light < np.maximum(dark, low / 10))
+    return _pixels(dead, stack.light - low, float(lit.mean()))
 
 
 def _extremes(stack: Stack) -> tuple[Floats, Floats]:
