@@ -11,7 +11,6 @@ from PIL import Image
 
 from clpipe.batch.run_log import read_log
 from clpipe.outputs.sidecar import outputs_in
-from tests.conftest import STILL_LIFE
 
 RUN = ("-o", "out", "--device", "numpy", "--keep", "normalize", "--truth", "mosaic")
 MADE = ("a.jpg", "a.normalize.exr", "a.truth_mosaic.exr")
@@ -130,10 +129,11 @@ def test_what_is_no_file_is_not_ours(clpipe, write_exr, tmp_path, name, kind):
     assert not list(Path("out").glob("*.truth*"))
 
 
-def test_every_format_marks_its_files(clpipe, tmp_path):
+def test_every_format_marks_its_files(clpipe, write_exr):
     formats = ("jpg", "png", "tif", "exr", "dng")
     options = [o for name in formats for o in ("--format", name)]
-    run = ("run", STILL_LIFE, "-o", "out", "--device", "numpy", "--until", "gamma", *options)
+    render = write_exr("a.exr", np.full((8, 8, 3), 0.3, np.float32))
+    run = ("run", render, "-o", "out", "--device", "numpy", "--until", "gamma", *options)
     clpipe(*run)
-    Path("out/still_life.json").unlink()
+    Path("out/a.json").unlink()
     clpipe(*run)  # a killed run may have left pictures without a sidecar: they are ours
