@@ -122,6 +122,22 @@ def test_a_lack_of_memory_needs_no_new_context(device, monkeypatch):
     assert programs_of(device.info) is before
 
 
+def test_a_launch_that_fails_once_is_tried_again_in_the_same_context(device, monkeypatch):
+    runner = runner_on(device)
+    expected = runner.run(IMAGE, "k").encoded
+    before, launch = programs_of(device.info), cl.enqueue_nd_range_kernel
+    errors = [cl.RuntimeError("clEnqueueNDRangeKernel failed: INVALID_OPERATION")]
+
+    def launched(*arguments):
+        if errors:
+            raise errors.pop()
+        return launch(*arguments)
+
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
+    assert np.array_equal(runner.run(IMAGE, "k").encoded, expected)
+    assert programs_of(device.info) is before
+
+
 def test_kernels_that_fail_in_a_batch_change_no_byte(device, write_exr, tmp_path, monkeypatch):
     for i in range(12):
         pixels = np.random.default_rng(i).random((20, 30, 3)).astype(np.float32)

@@ -136,8 +136,8 @@ class Device:
         """Put one image through a plan, in tiles if it does not fit into the memory.
 
         If the device runs out of memory before the limit is reached, buffers of earlier images are
-        given back, then tiles become smaller. If a kernel fails, such that its context is of no
-        more use, everything is made anew, and the image is tried once more.
+        given back, then tiles become smaller. If a kernel fails, the image is tried once more; if
+        its context is of no more use then, everything is made anew before.
 
         Args:
             plan: the plan.
@@ -178,12 +178,12 @@ class Device:
                 self._abandon()
                 if not self._works():
                     self._renew()
-                    if not failed:
-                        failed = True
-                        continue
                 elif isinstance(error, cl.MemoryError):
                     memory = memory if full is None else tiling.bytes // 2
                     full = error
+                    continue
+                if not failed:
+                    failed = True
                     continue
                 self._count_failure(error)
                 raise DeviceFailedError(f"{self.info.label} failed: {error}") from None
