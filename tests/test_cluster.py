@@ -49,7 +49,7 @@ def workers():
 
 @pytest.fixture
 def address(workers):
-    workers.wait_for_workers(2, timeout=120)  # they compile what pip did not
+    workers.wait_for_workers(2, timeout=30)
     return workers.scheduler.address
 
 
