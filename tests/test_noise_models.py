@@ -185,6 +185,26 @@ def test_the_noise_of_darktable_is_converted_to_that_of_the_raw(imported, tmp_pa
     )
 
 
+def test_isos_whose_raws_are_scaled_or_denoised_are_left_out(imported, tmp_path):
+    slopes = {800: 2e-5, 1250: 1e-5, 1600: 4e-5, 3200: 8e-5, 51200: 3e-4}
+    camera = imported(darktable(tmp_path / "n.json", ("Canon", {"EOS X": slopes})))
+    assert camera.gain_stages[0].iso == (800, 1600, 3200)
+    assert (
+        "left out, because a/ISO is far from the others': ISO 1250, 51200"
+        in (camera.sources["system_gain"])
+    )
+
+
+@pytest.mark.parametrize(("model", "is_bayer"), [("X-T10", False), ("X-T100", True)])
+def test_x_trans_is_refused(tmp_path, model, is_bayer):
+    path = darktable(tmp_path / "n.json", ("Fujifilm", {model: {800: 2e-5}}))
+    if is_bayer:
+        assert import_camera(path, None, None)[1].model == model
+        return
+    with pytest.raises(RequestError, match="Fujifilm X-T10 has no Bayer pattern but X-Trans"):
+        import_camera(path, None, None)
+
+
 def test_of_a_camera_that_is_built_in_the_levels_and_the_matrix_are_known(imported, tmp_path):
     camera = imported(darktable(tmp_path / "n.json", *MAKERS), "Sony A7 II")
     own = load_camera("sony-a7m2")

@@ -6,9 +6,11 @@ by itself, so a of raw green is 12.8 times its a of green. For six cameras whose
 a is too high. Its b cannot be converted.
 """
 
+import re
 from collections.abc import Iterator
 from difflib import get_close_matches
 from pathlib import Path
+from statistics import median
 from typing import Annotated, Any
 
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
@@ -23,6 +25,12 @@ MARK = "noiseprofiles"
 RAW_OVER_DEMOSAICED = 12.8
 TRUSTED_ISO = 800.0  # the lowest at which the factor holds
 LOWEST_ISO = 100.0  # what is below is often this one with another exposure
+UNCERTAINTY = (
+    0.3  # of the factor; where a/ISO is further from its median, raws are scaled or denoised
+)
+
+# Fujifilm's X-Trans cameras by model, after rawspeed's cameras.xml; X-T100 and X-T200 are Bayer.
+X_TRANS = re.compile(r"X-(?:E|H|M|Pro)\d.*|X-S\d\d|X-T\d\d?(?: II)?|X100[STFV].*|X[237]0|XQ\d")
 
 Slope = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
 
@@ -55,26 +63,51 @@ def parse_darktable(values: Any, path: Path, camera: str | None) -> SensorModel:
     except ValidationError as error:
         fault = first_fault(error)
         raise RequestError(f"{path}: {make} {model}: profiles{fault.key}: {fault.text}") from None
+    if X_TRANS.fullmatch(model):
+        raise RequestError(
+            f"{path}: {make} {model} has no Bayer pattern but X-Trans, for which neither this "
+            "conversion nor the mosaic is"
+        )
     slopes: dict[float, float] = {}
-    for profile in checked:
+    for profile in sorted(checked, key=lambda profile: profile.iso):
         if not profile.skip:
             slopes.setdefault(profile.iso, profile.a[1] * RAW_OVER_DEMOSAICED)
-    usual = {iso: a for iso, a in sorted(slopes.items()) if iso >= LOWEST_ISO}
-    slopes = usual or dict(sorted(slopes.items()))
+    slopes = {iso: a for iso, a in slopes.items() if iso >= LOWEST_ISO} or slopes
     if not slopes:
         raise RequestError(f"{path}: {make} {model}: has no profiles")
-    trusted = next((iso for iso in slopes if iso >= TRUSTED_ISO), None)
-    below = ""
-    if trusted:
-        slopes |= {iso: slopes[trusted] * iso / trusted for iso in slopes if iso < trusted}
-        below = f"; below ISO {trusted:g}, where its a is too high, in proportion to the ISO"
+    slopes, how = _plausible(slopes)
     source = (
-        f"darktable's noiseprofiles.json, {make} {model}, noise after demosaicing: "
-        f"a of raw green = {RAW_OVER_DEMOSAICED} * its green a, +-30 % (9 to 16 for six cameras of "
-        f"known gain){below}; for sensors with a Bayer pattern"
+        f"darktable's noiseprofiles.json, {make} {model}, noise after demosaicing: a of raw green "
+        f"= {RAW_OVER_DEMOSAICED} * its green a, +-{UNCERTAINTY * 100:.0f} % (9 to 16 for six "
+        f"cameras of known gain){how}"
     )
     laws = [Law(iso, a, None) for iso, a in slopes.items()]
     return SensorModel(make, model, laws, source, FOURTEEN_BITS)
+
+
+def _plausible(slopes: dict[float, float]) -> tuple[dict[float, float], str]:
+    """a by ISO, below the trusted ISOs in proportion to the ISO, and in words what was done.
+
+    Trusted ISOs whose a/ISO is far from the median are left out. Without trusted ones, a stays.
+
+    >>> _plausible({100.0: 9.0, 800.0: 8.0, 1250.0: 4.0, 1600.0: 16.0})[0]
+    {100.0: 1.0, 800.0: 8.0, 1600.0: 16.0}
+    """
+    per_iso = {iso: a / iso for iso, a in slopes.items() if iso >= TRUSTED_ISO}
+    if not per_iso:
+        return slopes, ""
+    middle = median(per_iso.values())
+    far = [iso for iso, one in per_iso.items() if abs(one / middle - 1) > UNCERTAINTY]
+    kept = {iso: a for iso, a in slopes.items() if iso not in far}
+    lowest = next((iso for iso in kept if iso >= TRUSTED_ISO), None)
+    if lowest is None:  # two that contradict each other
+        return slopes, ""
+    kept |= {iso: kept[lowest] * iso / lowest for iso in kept if iso < lowest}
+    how = f"; below ISO {lowest:g}, where its a is too high, in proportion to the ISO"
+    if far:
+        numbers = ", ".join(f"{iso:g}" for iso in far)
+        how += f"; left out, because a/ISO is far from the others': ISO {numbers}"
+    return kept, how
 
 
 def _all(values: Any) -> Iterator[tuple[str, str, Any]]:
