@@ -7,7 +7,7 @@ A stage is declared once, in ``clpipe/stages/<name>.py``, as a :class:`Stage` wi
 
 import typing
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
 from pathlib import Path
@@ -22,6 +22,7 @@ from clpipe.camera.profile import DEFAULT_CAMERA, IDENTITY, Camera, Matrix, load
 from clpipe.reference.cfa import PATTERNS, Pattern, red_site
 from clpipe.reference.curve import curve_index
 from clpipe.reference.random import Stream, stream_of
+from clpipe.reference.resample import Resampling
 
 # What a stage file may import from here.
 __all__ = [
@@ -76,6 +77,7 @@ class Access(Enum):
     POINTWISE = "pointwise"  # a pixel from that pixel
     CURVE = "curve"  # pointwise, each channel through the table named "table"
     STENCIL = "stencil"  # a pixel from its neighbours
+    RESAMPLE = "resample"  # rows or columns of a smaller image from those of the image
     LINES = "lines"  # a table with a value a row or column, from no image
     SUMS = "sums"  # sums over the whole image, then a few numbers estimated from them
     HISTOGRAM = "histogram"  # counts over the whole image, then a few numbers estimated from them
@@ -116,6 +118,7 @@ class Pass:
     finish_arguments: tuple[str, ...] = ()  # of that function
     estimates: tuple[str, ...] = ()  # SUMS, HISTOGRAM: names of the numbers, at most four
     bins: int = 0  # HISTOGRAM: how many
+    resampling: Resampling | None = None  # RESAMPLE: how many rows or columns are left, and how
 
 
 @dataclass(frozen=True)
@@ -387,7 +390,8 @@ def run_reference(
 class Stage:
     """A stage by name, with its methods; the first one is the default.
 
-    ``explain`` describes in a few lines how automatic parameters follow from the context.
+    ``explain`` describes in a few lines how automatic parameters follow from the context. ``also``
+    are further kinds that it may read; it then writes the same kind.
     """
 
     name: str
@@ -397,6 +401,11 @@ class Stage:
     methods: tuple[type[Method], ...]
     explain: Callable[[Context], str] | None = None
     folder: Path | None = None  # of a plug-in's kernel files
+    also: tuple[Kind, ...] = ()
+
+    def reading(self, kind: Kind | None) -> "Stage":
+        """The stage where an image of a kind enters it; the stage as it is if it reads no such."""
+        return replace(self, reads=kind, writes=kind) if kind in self.also and kind else self
 
     @cached_property
     def by_name(self) -> dict[str, type[Method]]:

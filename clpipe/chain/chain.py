@@ -11,6 +11,7 @@ from clpipe.chain.draws import Draw
 from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
+from clpipe.reference.resample import sizes
 from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
 
 
@@ -64,6 +65,11 @@ class Chain:
     def result(self) -> Kind:
         """The kind of image that comes out."""
         return self.steps[-1].stage.writes if self.steps else self.source
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """The width and height of what comes out, in px, from those of what enters."""
+        passes = (p for step in self.steps for p in step.method.passes())
+        return sizes((p.resampling for p in passes if p.resampling), width, height)[-1]
 
     @property
     def noise(self) -> NoiseModel | None:
@@ -218,7 +224,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     steps: list[Step] = []
     before = "the input"
     for name in step_names(settings):
-        stage = all_stages()[base_name(name)]
+        stage = all_stages()[base_name(name)].reading(kind)
         method = settings.method(name)
         if stage.reads is not (kind or stage.reads):
             if isinstance(method, Unchanged) and stage.reads is stage.writes:

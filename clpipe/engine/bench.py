@@ -10,8 +10,9 @@ from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device, Timing
-from clpipe.engine.plan import Launch, launch_bytes
+from clpipe.engine.plan import Launch
 from clpipe.engine.runner import Runner
+from clpipe.engine.traffic import launch_bytes
 from clpipe.stage import Stage, variant_label, variants
 
 

@@ -166,7 +166,11 @@ def kind_message(error: KindError, chain: Chain, start_at: str | None) -> str:
 def _entries_of(kind: str, chain: Chain) -> str:
     """Where an image of a kind can enter a chain, in words."""
     stages = {name: all_stages()[base_name(name)] for name in chain.names}
-    names = [name for name, stage in stages.items() if stage.reads.label == kind]
+    names = [
+        name
+        for name, stage in stages.items()
+        if kind in [each.label for each in (stage.reads, *stage.also)]
+    ]
     if not names:
         return f"no stage of the chain reads {kind}"
     return f"{kind} can enter with --start-at {' or '.join(names)}"

@@ -147,13 +147,14 @@ class OutputWriter:
         """The file of a job with an ending; ``name`` is that of the rendition."""
         return self.folder / f"{job.stem}{name}.{ending}"
 
-    def check_size(self, source: SourceImage) -> None:
-        """See that an image fits into the formats.
+    def check_size(self, source: SourceImage, chain: Chain) -> None:
+        """See that what a chain makes of an image fits into the formats.
 
         Raises:
             ImageError: it is too large for one.
         """
-        if "jpg" in self.formats and max(source.pixels.shape[:2]) > JPEG_MAX_SIDE:
+        size = chain.size(*source.pixels.shape[1::-1])
+        if "jpg" in self.formats and max(size) > JPEG_MAX_SIDE:
             raise ImageError(f"JPEG holds at most {JPEG_MAX_SIDE} pixels a side; use --format png")
 
     def existing(self, job: Job, name: str) -> Existing:
