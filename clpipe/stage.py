@@ -142,11 +142,16 @@ class Context:
     applied_gains: tuple[float, float] = (1.0, 1.0)  # red, blue: put back by white_balance
     colours: Matrix = IDENTITY  # linear sRGB to what red, green and blue are, white-balanced
     noise: NoiseModel | None = None  # of the sensor noise that was added
+    clean: bool = False  # the image has no noise, and nothing may follow from what it would have
     black_level: float | None = None  # DN, as quantize used them
     white_level: float | None = None
 
     def noise_parameters(self) -> tuple[float, float]:
-        """The a and b of the sensor noise: of the noise that was added, else the camera's."""
+        """The a and b of the sensor noise: of the noise that was added, else the camera's; zeros in
+        an image that has none.
+        """
+        if self.clean:
+            return 0.0, 0.0
         model = self.noise or self.camera.noise(self.iso)
         return model.a, model.b
 
@@ -224,6 +229,20 @@ class Method(BaseModel):
         """This (resolved) method without its noise; None if nothing is left of it."""
         return None if any(each.random for each in self.passes()) else self
 
+    def where_clean(self, context: Context) -> "Method | None":
+        """What this method, as it was set, becomes in a chain without noise (``--truth clean``).
+
+        It is without its own noise, and what follows from :meth:`Context.noise_parameters` follows
+        from zeros. A method that only takes noise away becomes :class:`Noiseless`.
+
+        Args:
+            context: the context of the step, with ``clean`` set.
+
+        Returns:
+            The resolved method; None if nothing is left of it.
+        """
+        return self.resolve(context).without_noise()
+
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
         """The variance of the noise after this (resolved) method, from the variance before it.
 
@@ -267,7 +286,7 @@ class Unchanged(Method):
 
 
 class Noiseless(Unchanged):
-    """A stage that only adds noise, without its noise."""
+    """A stage that only adds noise, or only takes it away, where there is none."""
 
     method: ClassVar = "none"
     summary: ClassVar = "no noise"

@@ -96,11 +96,28 @@ class Chain:
                 "no stage of this chain adds noise; every frame would be the same, "
                 "and there is no noise to know the truth of"
             )
-        if left[-1][1] is None:
-            left[-1] = left[-1][0], Noiseless()
+        return self._with(left, clean=False)
+
+    def cleaned(self) -> "Chain":
+        """The chain without noise and without all that its strength chose: nothing is denoised.
+
+        Raises:
+            RequestError: a user's stage does not allow it.
+        """
+        left = []
+        for step in self.steps:
+            name, folder = step.name, step.stage.folder
+            method, context = self.settings.method(name), replace(step.context, clean=True)
+            with validation_errors(name, type(method)), user_code_errors(f"stage {name}", folder):
+                left.append((step, method.where_clean(context)))
+        return self._with(left, clean=True)
+
+    def _with(self, methods: Sequence[tuple[Step, Method | None]], clean: bool) -> "Chain":
+        """The chain with other methods in its steps, and no noise; see :meth:`without_noise`."""
+        *others, (last, method) = methods
         steps = tuple(
-            replace(step, method=method, context=replace(step.context, noise=None))
-            for step, method in left
+            replace(step, method=method, context=replace(step.context, noise=None, clean=clean))
+            for step, method in (*others, (last, method or Noiseless()))
             if method
         )
         return replace(self, steps=steps)

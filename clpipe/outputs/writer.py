@@ -12,7 +12,7 @@ from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
 from clpipe.chain.formats import DNG, FORMATS, Format, ending_of
 from clpipe.chain.request import Request
-from clpipe.chain.truth import DEVELOPMENT, variance_of
+from clpipe.chain.truth import PICTURES, variance_of
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.dng import write_dng
@@ -24,7 +24,7 @@ from clpipe.inputs.kept import attributes_of
 from clpipe.outputs.existing import Existing
 from clpipe.outputs.folder import RESUMABLE, write_problem
 from clpipe.outputs.negative import negative_of
-from clpipe.outputs.renditions import FLOAT_MOSAICS, SUFFIXES, Rendition, RenditionPlan
+from clpipe.outputs.renditions import FLOAT_MOSAICS, Rendition, RenditionPlan, truth_named
 from clpipe.outputs.results import results_of
 from clpipe.outputs.sidecar import SIDECAR
 from clpipe.reference.curve import to_16_bit
@@ -72,7 +72,7 @@ class OutputWriter:
         """The steps whose image is written beside a rendition, by its name, where it has them."""
         if name in FLOAT_MOSAICS:
             return ()
-        if name == SUFFIXES[DEVELOPMENT] and self.request.truth_keep is not None:
+        if truth_named(name) in PICTURES and self.request.truth_keep is not None:
             return self.request.truth_keep
         return self.request.keep
 
