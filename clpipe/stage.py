@@ -147,9 +147,7 @@ class Context:
     white_level: float | None = None
 
     def noise_parameters(self) -> tuple[float, float]:
-        """The a and b of the sensor noise: of the noise that was added, else the camera's; zeros in
-        an image that has none.
-        """
+        """The a and b of the noise that was added, else the camera's; of a clean image, zeros."""
         if self.clean:
             return 0.0, 0.0
         model = self.noise or self.camera.noise(self.iso)

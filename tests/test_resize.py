@@ -10,6 +10,7 @@ from PIL import Image
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.check import example
+from clpipe.engine.codegen import write_kernel
 from clpipe.engine.runner import Runner
 from clpipe.engine.tiles import buffer_sizes, halos_of, tiling_of, whole_image
 from clpipe.images.read import read_image
@@ -113,6 +114,18 @@ def test_tiles_cover_each_size_once_and_fit(scale, part):
             image[core.top : core.bottom, core.left : core.right] += 1
             assert extent.is_empty or stored.left % 8 == stored.top % 4 == 0
     assert all((image == 1).all() for image in covered)
+
+
+def test_kernels_do_not_depend_on_the_scale():
+    chains = [
+        make_chain(settings_from({**TWICE, "resize": {"scale": scale, "method": method}}))
+        for scale, method in ((0.5, "area"), (0.7, "lanczos3"))
+    ]
+    one, two = (Runner(chain, None).plan() for chain in chains)
+    assert one != two
+    assert one.unscaled == two.unscaled
+    for mine, other in zip(one.launches, two.launches, strict=True):
+        assert write_kernel(one, mine, 8).source == write_kernel(two, other, 8).source
 
 
 def test_an_image_of_which_one_pixel_is_left(device):

@@ -12,7 +12,7 @@ from clpipe.commands.chain_options import chain_options, format_option, keep_opt
 from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.plan import AnyLaunch, Launch, Lines, Plan, make_plan, reads_of
-from clpipe.engine.traffic import launch_bytes
+from clpipe.engine.traffic import bytes_per_pixel, launch_bytes
 from clpipe.outputs.results import results_of
 
 
@@ -49,7 +49,7 @@ def plan(as_json: bool, as_toml: bool, **options: Any) -> None:
     show(headings, plan_rows(plan))
     click.echo(
         f"\n{len(plan.launches)} launches, {plan.slot_count} slots, "
-        f"{plan.bytes_per_pixel(8):.1f} bytes a pixel on the device"
+        f"{bytes_per_pixel(plan, 8):.1f} bytes a pixel on the device"
     )
 
 
@@ -132,6 +132,6 @@ def plan_record(plan: Plan) -> dict[str, Any]:
     return {
         "launches": [dict(zip(keys, row, strict=True)) for row in plan_rows(plan)],
         "slots": plan.slot_count,
-        "bytes_per_pixel": plan.bytes_per_pixel(8),
+        "bytes_per_pixel": bytes_per_pixel(plan, 8),
         "kept": [name for name, _ in plan.kept],
     }

@@ -28,7 +28,6 @@ from clpipe.engine.tiles import Extent, Extents, Tiling, tiling_of
 from clpipe.engine.writer import Parameter
 
 log = logging.getLogger(__name__)
-PLANS = 64  # whose calls are kept; a scale that is drawn makes a new plan for each image
 FAILURES = 3  # images in a row that a device fails at, before it is given up
 
 
@@ -113,7 +112,7 @@ class Device:
 
     def is_ready(self, plan: Plan) -> bool:
         """Whether the kernels of a plan are compiled."""
-        return plan in self._calls
+        return plan.unscaled in self._calls
 
     def prepare(self, plan: Plan) -> list[Call]:
         """The compiled kernels of a plan, from the first call on without compiling.
@@ -121,12 +120,10 @@ class Device:
         Raises:
             DeviceError: a kernel does not compile; the message is the compiler's.
         """
-        if plan not in self._calls:
-            if len(self._calls) >= PLANS:
-                self._calls.clear()
+        if plan.unscaled not in self._calls:
             kernels = [write_kernel(plan, launch, self.info.lanes) for launch in plan.launches]
-            self._calls[plan] = [Call(k, self._programs.kernel(k)) for k in kernels]
-        return self._calls[plan]
+            self._calls[plan.unscaled] = [Call(k, self._programs.kernel(k)) for k in kernels]
+        return self._calls[plan.unscaled]
 
     def run(
         self,

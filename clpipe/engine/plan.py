@@ -8,7 +8,6 @@ buffer on the device, from the launch that writes it to the last one that reads 
 Images of one size are a level. The source is on level 0; each resampling leads to the next.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -122,6 +121,14 @@ class Finalize:
 AnyLaunch = Launch | Lines | Histogram | Reduce | Finalize
 
 
+def unscaled(launch: AnyLaunch) -> AnyLaunch:
+    """A launch without the scale of the resampling that opens it, if one does."""
+    if not isinstance(launch, Launch) or not launch.opener:
+        return launch
+    op = replace(launch.opener, pass_=replace(launch.opener.pass_, resampling=None))
+    return replace(launch, ops=(op, *launch.ops[1:]))
+
+
 def reads_of(launch: AnyLaunch) -> tuple[Read, ...]:
     """The stored images that a launch reads."""
     return launch.reads if isinstance(launch, Launch | Histogram) else ()
@@ -150,6 +157,14 @@ class Plan:
         # A plan is looked up for each image, and hashing all that is in it takes a while.
         return hash((self.source, self.half, self.launches, self.kept, self.final, self.encoded))
 
+    @cached_property
+    def unscaled(self) -> "Plan":
+        """What plans have in common that differ in the scales of resamplings alone: the kernels."""
+        if not self.resamplings:
+            return self
+        launches = tuple(unscaled(launch) for launch in self.launches)
+        return replace(self, launches=launches, resamplings=())
+
     def sizes(self, width: int, height: int) -> tuple[tuple[int, int], ...]:
         """The width and height of images on each level, from those of the source."""
         return sizes(self.resamplings, width, height)
@@ -167,22 +182,6 @@ class Plan:
             frozenset(image.level for image in images if slot in self.slots[image.number])
             for slot in range(self.slot_count)
         )
-
-    def share(self, level: int) -> float:
-        """About how many pixels an image on a level has for each of the source."""
-        return math.prod(each.scale for each in self.resamplings[:level])
-
-    def bytes_per_pixel(self, lanes: int) -> float:
-        """Bytes of device memory per pixel: source, slots, block sums and eight-bit result."""
-        source = len(self.source.channels) * (2 if self.half else 4)
-        slots = sum(4 * self.share(min(levels)) for levels in self.levels_of_slots)
-        sums = [
-            16 / (lanes * x.rows) * self.share(x.level)
-            for x in self.launches
-            if isinstance(x, Launch) and x.sums
-        ]
-        encoded = len(self.encoded.channels) if self.encoded else 0
-        return source + slots + sum(sums) + encoded * self.share(len(self.resamplings))
 
 
 class _Planner:
