@@ -22,7 +22,7 @@ def filmic(x: Floats) -> Floats:
     [0.0, 0.173, 0.805, 1.0]
     """
     one = np.float32(1)
-    return x * (A * x + B) / (x * (C * x + D) + one)
+    return np.asarray(x * (A * x + B) / (x * (C * x + D) + one))
 
 
 def inverse_filmic(y: Floats) -> Floats:
