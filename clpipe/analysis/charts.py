@@ -96,7 +96,7 @@ def saturated_image() -> Floats:
             if part < 2:  # ramps, across and down
                 light[rows] = ramp if part else ramp[:, None]
             elif part < 5:  # slanted stripes of 2, 3 and 4 px
-                light[rows] = np.where((x + 2 * y)[rows] % (2 * part) < part, *BRIGHT)
+                light[rows] = np.where((x + y)[rows] % (2 * part) < part, *BRIGHT)
             else:
                 grains = generator.uniform(DARK[0], BRIGHT[0], (SIDE // 2, SIDE // 2))
                 light[rows] = grains.repeat(2, 0).repeat(2, 1)
