@@ -9,7 +9,8 @@ import pytest
 import side_by_side
 from PIL import Image
 
-from clpipe.analysis.charts import chart_image, saturated_image
+from clpipe.analysis.charts import chart_image, chart_patches, saturated_image
+from clpipe.analysis.fidelity import colour_errors
 from tests.conftest import ROOT
 
 LOADER = SourceFileLoader("compare_converters", str(ROOT / "tools" / "compare_converters"))
@@ -92,6 +93,21 @@ def test_the_charts_fit_the_sensor():
     for image in (chart_image(), saturated_image()):
         assert 0 <= image.min() < image.max() <= 1
         assert image.shape[0] % 2 == image.shape[1] % 2 == 0
+
+
+def test_errors_of_colour_are_told_apart():
+    true = chart_patches()
+    brighter = colour_errors(true * 1.05, true)
+    assert brighter.grey == pytest.approx(128.1)
+    assert brighter.lightness > 2 > 1 > brighter.hue
+    grey = true.mean(1, keepdims=True)
+    assert colour_errors(grey + (true - grey) / 2, true).chroma == pytest.approx(0.5, abs=0.05)
+    only_red = true.copy()
+    only_red[14] = only_red[14, [0, 2, 1]] + (0, 60, 0)  # red towards orange
+    turned = colour_errors(only_red, true)
+    assert turned.hue == 0
+    assert 20 < turned.largest_hue < 60
+    assert turned.chroma == 1
 
 
 def test_what_is_missing_is_named_and_left_out(monkeypatch, capsys, tmp_path):

@@ -198,8 +198,8 @@ def draw(
             intensity.plot(levels, sigmas, style, color=line.get_color(), label=name)
     _label(spectra, "Power spectrum of luma noise", "cycles per pixel", "power; independent: 1")
     spectra.set_yscale("log")
-    for axis in (spectra.yaxis.set_major_formatter, spectra.yaxis.set_minor_formatter):
-        axis("{x:g}")
+    spectra.yaxis.set_minor_formatter("")
+    spectra.set_yticks(ticks := (0.1, 0.2, 0.5, 1, 2, 5, 10), [f"{tick:g}" for tick in ticks])
     _label(intensity, "Noise by intensity", "luma without noise, levels", "sigma of luma, levels")
     intensity.set_ylim(bottom=0)
     figure.legend(*spectra.get_legend_handles_labels(), loc="outside right center")

@@ -21,8 +21,8 @@ SMOOTH = 16  # the same, of the reference, where a dot can be told
 def cielab(levels: NDArray[np.number]) -> Doubles:
     """CIELAB of sRGB levels under D65, (..., 3): L*, a*, b* (CIE 15:2018, eq. 8.3 to 8.11).
 
-    >>> cielab(np.array([[255, 255, 255], [122, 122, 122]])).round(1).tolist()
-    [[100.0, 0.0, 0.0], [51.2, 0.0, 0.0]]
+    >>> cielab(np.array([[255, 255, 255], [122, 122, 122], [255, 0, 0]])).round(1).tolist()
+    [[100.0, 0.0, 0.0], [51.2, 0.0, 0.0], [53.2, 80.1, 67.2]]
     """
     ratio = linear(levels) @ (SRGB_TO_XYZ / SRGB_TO_XYZ.sum(1, keepdims=True)).T
     x, y, z = np.moveaxis(
