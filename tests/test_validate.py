@@ -68,7 +68,6 @@ def camera_like(seed=0):
     return real_cameras.Pair(*(np.rint(image).astype(np.uint8) for image in (noisy, clean)))
 
 
-@pytest.mark.xfail(reason="the default development leaves lone pixels on saturated colours")
 def test_the_default_chain_is_like_a_camera():
     pair = real_cameras.develop(read_image(validate.RENDER).pixels, 1600)
     record = pair.signature().record()
