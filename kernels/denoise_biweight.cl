@@ -38,7 +38,7 @@ INLINE ycbcr biweight(site at, image planes, float luma_scale, float chroma_scal
                 const ycbcr c = tap_ycbcr(planes, dx, dy);
                 const vf db = c.cb - centre.cb, dr = c.cr - centre.cr;
                 const vf weight = biweight_of((db * db + dr * dr) * chroma_scale) *
-                                  (distance == 2 ? 0.73f : 0.54f);
+                                  (distance == 2 ? 0.6f : 0.45f);
                 sum.cb += weight * c.cb;
                 sum.cr += weight * c.cr;
                 chroma_weight += weight;

@@ -48,7 +48,7 @@ def blur_weights(radius: float) -> Floats:
     """
     away = np.arange(ceil(2 * radius) + 1)
     weights = np.exp(-(away**2) / (2 * radius**2))
-    return np.float32(weights / (2 * weights.sum() - 1))
+    return np.asarray(weights / (2 * weights.sum() - 1), np.float32)
 
 
 class Unsharp(Method):

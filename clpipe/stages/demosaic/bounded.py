@@ -23,8 +23,8 @@ from clpipe.stages.demosaic.common import (
 # of white is less than the noise of most pictures, and no edge.
 EVEN = np.float32(0.01**2)
 
-# Of the roots, in signal units. Chosen: at 0.005 to 0.04 the PSNR of a noise-free picture is the same
-# within 0.2 dB.
+# Of the roots, in signal units. Chosen: at 0.005 to 0.04 the PSNR of a noise-free picture is the
+# same within 0.2 dB.
 OFFSET = np.float32(0.03)
 
 

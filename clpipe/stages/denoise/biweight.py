@@ -13,18 +13,18 @@ from clpipe.reference.roots import from_root, noise_in_roots, root_of
 from clpipe.stage import Access, Argument, Context, Frame, Kind, Pass, parameter
 from clpipe.stages.denoise.strength import MID_GREY, Denoiser, offset_of_roots, offset_parameter
 
-# The difference that weighs nothing, in multiples of strength * noise. Found by trying: at 6 in luma,
-# noise that happens to be large stays alone and makes the tails of the noise longer than a
+# The difference that weighs nothing, in multiples of strength * noise. Found by trying: at 6 in
+# luma, noise that happens to be large stays alone and makes the tails of the noise longer than a
 # camera's; beyond 10 nothing changes but soft edges.
 RANGE_LUMA, RANGE_CHROMA = 10.0, 2.5
 # The least noise that luma is filtered for, in roots, about two levels of 255: in a picture of ISO
 # 100 what is smaller is noise or cannot be told from it.
 LEAST_NOISE = 0.006
 
-# Weights by squared distance, px: a binomial window for luma; for chroma a Gaussian of 1.8 px, of
-# the pixels that demosaicing made of other samples than the centre's.
+# Weights by squared distance, px: for luma a binomial window, for chroma a wider one, of pixels that
+# demosaicing made of other samples than the centre's.
 LUMA_WINDOW = {1: 0.5, 2: 0.25}
-CHROMA_WINDOW = {2: 0.73, 4: 0.54}
+CHROMA_WINDOW = {2: 0.6, 4: 0.45}
 
 
 def window_offsets(window: Mapping[int, float]) -> list[tuple[int, int, np.float32]]:
@@ -97,8 +97,8 @@ class Biweight(Denoiser):
 
     @property
     def effect(self) -> str:
-        luma, chroma = self.ranges
-        return f"differences of roots up to luma {luma:.3g}, chroma {chroma:.3g}; grain {self.grain:.0%}"
+        luma, chroma = (f"{each:.3g}" for each in self.ranges)
+        return f"differences of roots up to: luma {luma}, chroma {chroma}; grain {self.grain:.0%}"
 
     @property
     def ranges(self) -> tuple[float, float]:
@@ -108,6 +108,12 @@ class Biweight(Denoiser):
             RANGE_LUMA * self.luma_strength * hypot(luma, LEAST_NOISE),
             RANGE_CHROMA * self.chroma_strength * chroma,
         )
+
+    @property
+    def scales(self) -> tuple[float, float]:
+        """One over the squares of the ranges, for luma and for chroma."""
+        luma, chroma = (1 / max(each, 1e-6) ** 2 for each in self.ranges)
+        return luma, chroma
 
     def passes(self) -> tuple[Pass, ...]:
         return (
@@ -125,16 +131,17 @@ class Biweight(Denoiser):
         )
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
-        luma, chroma = (np.float32(1 / max(each, 1e-6) ** 2) for each in self.ranges)
+        luma, chroma = self.scales
         return {
-            "luma_scale": luma,
-            "chroma_scale": chroma,
+            "luma_scale": np.float32(luma),
+            "chroma_scale": np.float32(chroma),
             "grain": np.float32(self.grain),
             "offset": np.float32(self.offset),
         }
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        luma_scale, chroma_scale, grain, offset = self.arguments(frame.context).values()
+        luma_scale, chroma_scale = (np.float32(each) for each in self.scales)
+        grain, offset = np.float32(self.grain), np.float32(self.offset)
         planes = rgb_to_ycbcr(root_of(image, offset))
         y, c = planes[..., :1], planes[..., 1:]
         filtered = biweight(y, LUMA_WINDOW, luma_scale)

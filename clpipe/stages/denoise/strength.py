@@ -16,7 +16,18 @@ import numpy as np
 from pydantic import field_validator
 
 from clpipe.reference.colour import LUMA
-from clpipe.stage import Access, Argument, Context, Kind, Literal, Method, Pass, odd_size, parameter
+from clpipe.stage import (
+    Access,
+    Argument,
+    Context,
+    Kind,
+    Literal,
+    Method,
+    Noiseless,
+    Pass,
+    odd_size,
+    parameter,
+)
 
 MID_GREY = 0.18  # signal units
 PREDICTED = "the {} noise at mid grey that a, b and the gains predict"
@@ -151,6 +162,9 @@ class Denoiser(Method):
     def resolve(self, context: Context) -> Self:
         luma, chroma = predicted_noise(context)
         return self.filled(luma_noise=luma, chroma_noise=chroma)
+
+    def where_clean(self, context: Context) -> Method:
+        return Noiseless()
 
     @property
     def amounts(self) -> tuple[float, float]:

@@ -30,7 +30,7 @@ class CameraRaw(Curve):
 
 
 class Linear(Method):
-    """No curve: the contrast of the scene, as bright as it was before ``exposure`` left headroom."""
+    """No curve: the scene's contrast, as bright as it was before ``exposure`` left headroom."""
 
     method: ClassVar = "linear"
     kernel: ClassVar = "exposure"

@@ -8,11 +8,11 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.stage import Argument, Context, Frame, Method, Pass
 
-# y = x (a x + b) / (x (c x + d) + 1); a + b = c + d + 1, so that 1 stays 1. Fitted (in roots of y) to
-# three fifths of Camera Raw's default curve and two fifths of the render's own light, which is 2 x
-# up to 0.25 and rolls off from there: 0.09, which is 18 % grey with a stop of headroom, becomes
-# 0.18, and what was 1.0 becomes 0.8.
-A, B, C, D = np.float32([13.5, 1.27, 11.6, 2.17])
+# y = x (a x + b) / (x (c x + d) + 1); a + b = c + d + 1, so that 1 stays 1. Fitted (in roots of y)
+# to three fifths of Camera Raw's default curve and two fifths of the render's own light, which is
+# 2 x up to 0.25 and rolls off from there. 0.09, which is 18 % grey with a stop of headroom, becomes
+# 0.173, and what was 1.0 becomes 0.8.
+A, B, C, D = (np.float32(value) for value in (13.5, 1.27, 11.6, 2.17))
 
 
 def filmic(x: Floats) -> Floats:
@@ -22,7 +22,7 @@ def filmic(x: Floats) -> Floats:
     [0.0, 0.173, 0.805, 1.0]
     """
     one = np.float32(1)
-    return x * (A * x + B) / (x * (C * x + D) + one)
+    return np.asarray(x * (A * x + B) / (x * (C * x + D) + one))
 
 
 def inverse_filmic(y: Floats) -> Floats:
