@@ -116,6 +116,8 @@ class Biweight(Denoiser):
         return luma, chroma
 
     def passes(self) -> tuple[Pass, ...]:
+        if not any(self.ranges):  # nothing is cut at -offset either
+            return ()
         return (
             Pass("to_root_luma_chroma", arguments=("offset",), writes="planes", kind=Kind.YCBCR),
             Pass(
@@ -140,6 +142,8 @@ class Biweight(Denoiser):
         }
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
+        if not any(self.ranges):
+            return image
         luma_scale, chroma_scale = (np.float32(each) for each in self.scales)
         grain, offset = np.float32(self.grain), np.float32(self.offset)
         planes = rgb_to_ycbcr(root_of(image, offset))
