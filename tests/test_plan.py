@@ -127,7 +127,7 @@ def test_a_plan_depends_on_structure_alone():
 
 
 def test_the_border_is_as_wide_as_the_widest_stencil():
-    assert plan_of().border == 5  # of sharpening, twice its sigma of 2.2
+    assert plan_of().border == 4  # of sharpening, twice its sigma of 2.2
     assert plan_of(skip=["sharpen"]).border == 2
     assert plan_of(denoise={"method": "mean", "chroma_size": 13}).border == 6
     assert plan_of(stages=["exposure", "gamma"]).border == 0

@@ -18,7 +18,7 @@ from tests.conftest import STILL_LIFE, written
 
 OPTIONS = ("--iso", "3200", "--seed", "5", "--set", "mosaic.pattern=GBRG")
 OPTIONS += ("--set", "white_balance.method=gray_world", "--set", "row_noise.sigma=0.01")
-OPTIONS += ("--set", "sharpen.radius=2.4", "--set", "gamma.method=power")
+OPTIONS += ("--set", "sharpen.radius=2.1", "--set", "gamma.method=power")
 
 
 def clpipe(*arguments, status=0):
@@ -71,11 +71,11 @@ def test_going_on_with_some_stages_gives_the_same_images(kept, tmp_path):
 def test_options_given_again_win_over_those_of_the_kept_image(kept, tmp_path):
     entry = (kept / "crop.color_matrix.exr", "--start-at", "sharpen", "--format", "png")
     clpipe("run", *entry, "-o", tmp_path / "a")
-    clpipe("run", *entry, "-o", tmp_path / "b", "--set", "sharpen.radius=2.3")
+    clpipe("run", *entry, "-o", tmp_path / "b", "--set", "sharpen.radius=2.0")
     clpipe("run", *entry, "-o", tmp_path / "c", "-c", "default")
     names = [tmp_path / folder / "crop.color_matrix.json" for folder in "abc"]
     stages = [{s["name"]: s for s in json.loads(n.read_text())["stages"]} for n in names]
-    assert [s["sharpen"]["parameters"]["radius"] for s in stages] == [2.4, 2.3, 2.2]
+    assert [s["sharpen"]["parameters"]["radius"] for s in stages] == [2.1, 2.0, 2.2]
     assert [s["gamma"]["method"] for s in stages] == ["power", "power", "srgb"]
 
 
