@@ -1,5 +1,5 @@
-"""Measurement of noise: statistics of images, and the calibration of a camera from its frames.
+"""Measurement of noise: statistics of images, calibration of a camera, matching of a development.
 
-This room works on arrays and on files that ``images`` reads; it never develops pictures. It imports
-``outputs`` and below, and is the only room that imports SciPy and Matplotlib.
+This room works on arrays and on files that ``images`` reads; only ``matching`` develops pictures.
+It imports ``outputs`` and below, and is the only room that imports SciPy and Matplotlib.
 """

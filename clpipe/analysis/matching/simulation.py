@@ -1,0 +1,86 @@
+"""A scene developed: the picture of the camera, back in linear light, through a chain."""
+
+from collections.abc import Hashable
+from dataclasses import replace
+
+import numpy as np
+
+from clpipe.analysis.matching.columns import Noise, noise_of_frames
+from clpipe.analysis.matching.scenes import Scene
+from clpipe.base.types import Array, Floats
+from clpipe.chain.chain import Chain, make_chain
+from clpipe.chain.registry import all_stages
+from clpipe.chain.settings import Settings
+from clpipe.engine.device import Device
+from clpipe.engine.runner import Runner
+from clpipe.images.jpeg import through_jpeg
+from clpipe.stage import Frame, Method
+
+UNDONE = ("gamma", "tone_curve")  # by the stage of that name with "inverse_" before it
+
+
+class Simulator:
+    """Develops scenes with one setting after another, on one device.
+
+    Args:
+        device: where; None is NumPy.
+    """
+
+    def __init__(self, device: Device | None) -> None:
+        self._device = device
+        self._noisy: Runner | None = None  # shares plans with all runners of noisy chains
+        self._quiet: Runner | None = None
+        self._linear: dict[Hashable, Floats] = {}
+
+    def noise(self, settings: Settings, scene: Scene, key: str, count: int | None = None) -> Noise:
+        """The noise of a scene's development, at the intensities of the camera's pictures.
+
+        A burst is developed as often as it has frames, and compared with its own mean, as the
+        camera's is; other frames are compared with their development without noise.
+
+        Args:
+            settings: of the development.
+            scene: whose mean is developed, and encoded as its frames were.
+            key: what the noise is made of.
+            count: how many frames; None is as many as the scene has.
+        """
+        chain = make_chain(settings)
+        self._noisy = (self._noisy or Runner(chain, self._device)).of(chain)
+        linear = self._linear_light(chain, scene)
+        frames = []
+        for number in range(count or len(scene.frames)):
+            result = self._noisy.run(linear, f"{key}:{scene.name}:{number}")
+            frames.append(finished(result.encoded, scene))
+        mean = None
+        if not scene.own_mean:
+            clean = chain.without_noise()
+            self._quiet = (self._quiet or Runner(clean, self._device)).of(clean)
+            mean = finished(self._quiet.run(linear, "").encoded, scene)
+        return replace(noise_of_frames(frames, mean), level=scene.noise.level)
+
+    def _linear_light(self, chain: Chain, scene: Scene) -> Floats:
+        methods = undoing(chain)
+        key = scene.name, *((type(m), m.model_dump_json()) for m in methods)
+        if key not in self._linear:
+            image = (scene.clean / 255).astype(np.float32)
+            for method in methods:
+                image = method.reference(image, Frame(chain.steps[0].context, {}, {}))
+            self._linear[key] = np.ascontiguousarray(image)
+        return self._linear[key]
+
+
+def finished(pixels: Array | None, scene: Scene) -> Floats:
+    """A developed picture, (height, width, 3), 0 to 255, as the scene's frames were encoded."""
+    assert pixels is not None
+    return (through_jpeg(pixels, scene.jpeg) if scene.jpeg else pixels).astype(np.float32)
+
+
+def undoing(chain: Chain) -> list[Method]:
+    """The methods that take a finished picture back to the light that the chain starts on."""
+    found = []
+    for step in reversed(chain.steps):
+        if step.stage.name in UNDONE:
+            inverse = all_stages()[f"inverse_{step.stage.name}"].by_name[step.method.method]
+            values = step.method.model_dump(include=set(inverse.model_fields))
+            found.append(inverse.model_validate(values))
+    return found
