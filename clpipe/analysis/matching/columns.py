@@ -57,8 +57,8 @@ COLUMNS: Mapping[str, Column] = {
     "chroma_below": Column("chroma, 1 below", 0.03),
     "chroma_two_right": Column("chroma, 2 right", 0.04),
     "red_green": Column("R-G", 0.03),
-    "green_blue": Column("G-B", 0.05),
-    "red_blue": Column("R-B", 0.05),
+    "green_blue": Column("G-B", 0.06),
+    "red_blue": Column("R-B", 0.06),
     **{
         f"band_{k}": Column(f"luma power, {low:g}-{min(high, 0.71):g} cycles/px", 0.03)
         for k, (low, high) in enumerate(itertools.pairwise(BANDS), 1)

@@ -7,6 +7,7 @@ squares is a smooth function of the numbers.
 
 import logging
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -188,7 +189,9 @@ class Search:
 
     def residuals(self, settings: Settings, targets: Sequence[Target]) -> Doubles:
         """The residuals of all columns of some scenes."""
-        found = [target.residuals(self.figures(settings, target)) for target in targets]
+        with ThreadPoolExecutor() as pool:
+            figures = pool.map(lambda target: self.figures(settings, target), targets)
+            found = [t.residuals(f) for t, f in zip(targets, figures, strict=True)]
         return np.concatenate(found) / len(targets) ** 0.5
 
     def figures(self, settings: Settings, target: Target) -> Figures:

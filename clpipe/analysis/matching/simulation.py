@@ -1,5 +1,7 @@
 """A scene developed: the picture of the camera, back in linear light, through a chain."""
 
+import math
+import threading
 from collections.abc import Hashable
 from dataclasses import replace
 
@@ -7,6 +9,7 @@ import numpy as np
 
 from clpipe.analysis.matching.columns import Noise, noise_of_frames
 from clpipe.analysis.matching.scenes import Scene
+from clpipe.analysis.matching.space import RESIZE
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.registry import all_stages
@@ -28,6 +31,7 @@ class Simulator:
 
     def __init__(self, device: Device | None) -> None:
         self._device = device
+        self._lock = threading.Lock()
         self._noisy: Runner | None = None  # shares plans with all runners of noisy chains
         self._quiet: Runner | None = None
         self._linear: dict[Hashable, Floats] = {}
@@ -45,27 +49,28 @@ class Simulator:
             count: how many frames; None is as many as the scene has.
         """
         chain = make_chain(settings)
-        self._noisy = (self._noisy or Runner(chain, self._device)).of(chain)
-        linear = self._linear_light(chain, scene)
-        frames = []
-        for number in range(count or len(scene.frames)):
-            result = self._noisy.run(linear, f"{key}:{scene.name}:{number}")
-            frames.append(finished(result.encoded, scene))
-        mean = None
-        if not scene.own_mean:
-            clean = chain.without_noise()
-            self._quiet = (self._quiet or Runner(clean, self._device)).of(clean)
-            mean = finished(self._quiet.run(linear, "").encoded, scene)
+        keys = [f"{key}:{scene.name}:{number}" for number in range(count or len(scene.frames))]
+        with self._lock:  # a device is for one thread
+            linear = self._linear_light(chain, scene)
+            self._noisy = (self._noisy or Runner(chain, self._device)).of(chain)
+            pictures = [self._noisy.run(linear, name).encoded for name in keys]
+            if not scene.own_mean:
+                clean = chain.without_noise()
+                self._quiet = (self._quiet or Runner(clean, self._device)).of(clean)
+                pictures.append(self._quiet.run(linear, "").encoded)
+        frames = [finished(picture, scene) for picture in pictures]
+        mean = None if scene.own_mean else frames.pop()
         return replace(noise_of_frames(frames, mean), level=scene.noise.level)
 
     def _linear_light(self, chain: Chain, scene: Scene) -> Floats:
-        methods = undoing(chain)
-        key = scene.name, *((type(m), m.model_dump_json()) for m in methods)
+        """The scene in the light, and of the size, that the chain starts on."""
+        methods, scale = undoing(chain), scale_of(chain)
+        key = scene.name, scale, *((type(m), m.model_dump_json()) for m in methods)
         if key not in self._linear:
             image = (scene.clean / 255).astype(np.float32)
             for method in methods:
                 image = method.reference(image, Frame(chain.steps[0].context, {}, {}))
-            self._linear[key] = np.ascontiguousarray(image)
+            self._linear[key] = np.ascontiguousarray(enlarged(image, scale))
         return self._linear[key]
 
 
@@ -73,6 +78,23 @@ def finished(pixels: Array | None, scene: Scene) -> Floats:
     """A developed picture, (height, width, 3), 0 to 255, as the scene's frames were encoded."""
     assert pixels is not None
     return (through_jpeg(pixels, scene.jpeg) if scene.jpeg else pixels).astype(np.float32)
+
+
+def scale_of(chain: Chain) -> float:
+    """How large the picture that a chain makes is, over what it starts on."""
+    scales = (getattr(s.method, "scale", 1.0) for s in chain.steps if s.stage.name == RESIZE)
+    return math.prod(scales)
+
+
+def enlarged(image: Floats, scale: float) -> Floats:
+    """A picture, (height, width, 3), so large that scaled it has its size again; linear between."""
+    if scale == 1:
+        return image
+    from scipy import ndimage
+
+    height, width = image.shape[:2]
+    factors = round(height / scale) / height, round(width / scale) / width, 1
+    return np.asarray(ndimage.zoom(image, factors, order=1, mode="nearest", grid_mode=True))
 
 
 def undoing(chain: Chain) -> list[Method]:

@@ -20,7 +20,10 @@ from clpipe.stage import Method
 # The stages whose methods and numbers are searched, where the registry has them, in the order in
 # which they are tried; and before which stage one goes that the chain lacks.
 DEVELOPMENT = ("denoise", "demosaic", "sharpen")
-BEFORE = {"sharpen": "tone_curve"}
+RESIZE, SCALES = "resize", (0.5, 2 / 3, 0.75)  # of cameras' smaller pictures
+BEFORE = {"sharpen": "tone_curve", RESIZE: "tone_curve"}
+LIGHT = ("red_gain", "blue_gain")  # of inverse_white_balance: the light of a scene decides them
+GAINS = 1.0, 4.0
 SPAN = 8.0  # a parameter without near limits is searched within this factor of its default
 
 
@@ -107,10 +110,17 @@ def dimensions_of(chain: Chain) -> list[Dimension]:
 
     A parameter whose two limits are at most 2 apart is searched between them, any other within a
     factor of 8 of its default, as far as its limits allow. What the camera or the chain decides is
-    not searched, nor what is off by default and has no near limits.
+    not searched, but for the white balance gains; nor what is off by default and has no near
+    limits.
     """
     found = []
     for step in chain.steps:
+        if step.stage.name == "inverse_white_balance":
+            starts = {name: getattr(step.method, name) for name in LIGHT}
+            found += [
+                Dimension(f"{step.name}.{name}", *GAINS, start, logarithmic=True)
+                for name, start in starts.items()
+            ]
         if step.stage.name not in DEVELOPMENT:
             continue
         for name, declared in type(step.method).model_fields.items():
@@ -154,6 +164,18 @@ def space_for(settings: Settings, iso_is_given: bool) -> Space:
         ]
         without = [Choice(f"no {name}")] if added else []
         choices[name] = (*without, *own)
+    if RESIZE in all_stages() and RESIZE not in settings.stages:
+        added = {RESIZE: BEFORE[RESIZE]}
+        smaller = [
+            Choice(
+                f"{RESIZE} {m.method} {scale:.3g}",
+                {RESIZE: {"method": m.method, "scale": scale}},
+                added,
+            )
+            for scale in SCALES
+            for m in all_stages()[RESIZE].methods
+        ]
+        choices[RESIZE] = (Choice("full size"), *smaller)
     if "color_matrix" in settings.stages:
         camera = {
             "color_matrix": {"method": "inverse_camera"},
