@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.processors import available_processors
@@ -20,6 +20,7 @@ from clpipe.base.validation import typed
 from clpipe.chain.chain import Chain
 from clpipe.chain.identity import noise_key, of_frame
 from clpipe.chain.request import Request
+from clpipe.chain.truth import DEVELOPMENT, picture_without_noise
 from clpipe.engine.device import Device, open_device
 from clpipe.engine.runner import Runner
 from clpipe.images.openimageio import set_codec_threads
@@ -41,7 +42,7 @@ class Dataset(ReadOnly):
     dict of
 
     - "image": (height, width, 3) uint8 where the chain ends in display values, else float32,
-    - "truth", with ``truth=True``: the same without noise; images of ``keep`` by the names of their
+    - "truth", with ``truth``: the same without noise; images of ``keep`` by the names of their
       steps, and "truth.NAME" for each of them without noise; float32,
     - "key": the name of the render, its path below the folder that was given, and "epoch",
     - "iso", "a" and "b": the sensor noise that was added, Var[y] = a*y + b in signal units (1 is
@@ -63,7 +64,8 @@ class Dataset(ReadOnly):
         keep: steps whose image a sample has, too, or "all".
         start_at: the first step to run; inputs are then images that were kept before it.
         until: the last step to run.
-        truth: whether a sample has its image without noise, too.
+        truth: whether a sample has its image without noise, too. "clean" is the picture to train
+            on; "development", or True, is denoised as strongly as the noisy one is.
         layer: the layer of an EXR that is the picture; None chooses.
         transfer: the transfer curve of renders in whole numbers: "srgb" or "linear".
         exclude: patterns of files that are not taken from folders and globs, such as depth.
@@ -87,7 +89,7 @@ class Dataset(ReadOnly):
         keep: str | Sequence[str] = (),
         start_at: str | None = None,
         until: str | None = None,
-        truth: bool = False,
+        truth: bool | Literal["development", "clean"] = False,
         layer: str | None = None,
         transfer: str | None = None,
         exclude: str | Sequence[str] = (),
@@ -118,11 +120,12 @@ class Dataset(ReadOnly):
         _check_files(self._jobs)
         _check_keys(self._jobs)
         chain = self._loader.first_chain(self._jobs)
-        if truth:
-            chain.without_noise()  # refuses a chain that adds no noise
+        own_truth = DEVELOPMENT if truth is True else truth or None
+        if own_truth:
+            picture_without_noise(own_truth, chain)  # refuses a chain that adds no noise
         self._keep = chain.select([keep] if isinstance(keep, str) else keep)
         self._encode = chain.result is Kind.DISPLAY
-        self._truth = truth
+        self._truth = own_truth
         self._selector = None if device is None else str(device)
         self._epochs = epochs
         self._threads = threads or available_processors()
@@ -263,7 +266,7 @@ class _Developer:
     """Develops images on a device, one at a time."""
 
     def __init__(
-        self, device: Device | None, keep: Sequence[str], encode: bool, truth: bool
+        self, device: Device | None, keep: Sequence[str], encode: bool, truth: str | None
     ) -> None:
         self.process = os.getpid()
         self._device = device
@@ -294,7 +297,9 @@ class _Developer:
         """Make runners for a chain, unless it is that of the image before."""
         if chain is self._chain:
             return
-        chains = {"image": chain, **({"truth": chain.without_noise()} if self._truth else {})}
+        chains = {"image": chain}
+        if self._truth:
+            chains["truth"] = picture_without_noise(self._truth, chain)
         self._runners = {name: self._runner(name, each) for name, each in chains.items()}
         self._chain = chain
 

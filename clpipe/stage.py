@@ -7,7 +7,7 @@ A stage is declared once, in ``clpipe/stages/<name>.py``, as a :class:`Stage` wi
 
 import typing
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
 from pathlib import Path
@@ -22,6 +22,7 @@ from clpipe.camera.profile import DEFAULT_CAMERA, IDENTITY, Camera, Matrix, load
 from clpipe.reference.cfa import PATTERNS, Pattern, red_site
 from clpipe.reference.curve import curve_index
 from clpipe.reference.random import Stream, stream_of
+from clpipe.reference.resample import Resampling
 
 # What a stage file may import from here.
 __all__ = [
@@ -76,6 +77,7 @@ class Access(Enum):
     POINTWISE = "pointwise"  # a pixel from that pixel
     CURVE = "curve"  # pointwise, each channel through the table named "table"
     STENCIL = "stencil"  # a pixel from its neighbours
+    RESAMPLE = "resample"  # rows or columns of a smaller image from those of the image
     LINES = "lines"  # a table with a value a row or column, from no image
     SUMS = "sums"  # sums over the whole image, then a few numbers estimated from them
     HISTOGRAM = "histogram"  # counts over the whole image, then a few numbers estimated from them
@@ -116,6 +118,7 @@ class Pass:
     finish_arguments: tuple[str, ...] = ()  # of that function
     estimates: tuple[str, ...] = ()  # SUMS, HISTOGRAM: names of the numbers, at most four
     bins: int = 0  # HISTOGRAM: how many
+    resampling: Resampling | None = None  # RESAMPLE: how many rows or columns are left, and how
 
 
 @dataclass(frozen=True)
@@ -137,13 +140,17 @@ class Context:
     pattern: Pattern = "RGGB"
     gains: tuple[float, float] = (1.0, 1.0)  # red, blue: taken out by inverse_white_balance
     applied_gains: tuple[float, float] = (1.0, 1.0)  # red, blue: put back by white_balance
+    headroom: float = 0.0  # stops by which exposure darkened the scene
     colours: Matrix = IDENTITY  # linear sRGB to what red, green and blue are, white-balanced
     noise: NoiseModel | None = None  # of the sensor noise that was added
+    clean: bool = False  # the image has no noise, and nothing may follow from what it would have
     black_level: float | None = None  # DN, as quantize used them
     white_level: float | None = None
 
     def noise_parameters(self) -> tuple[float, float]:
-        """The a and b of the sensor noise: of the noise that was added, else the camera's."""
+        """The a and b of the noise that was added, else the camera's; of a clean image, zeros."""
+        if self.clean:
+            return 0.0, 0.0
         model = self.noise or self.camera.noise(self.iso)
         return model.a, model.b
 
@@ -221,6 +228,20 @@ class Method(BaseModel):
         """This (resolved) method without its noise; None if nothing is left of it."""
         return None if any(each.random for each in self.passes()) else self
 
+    def where_clean(self, context: Context) -> "Method | None":
+        """What this method, as it was set, becomes in a chain without noise (``--truth clean``).
+
+        It is without its own noise, and what follows from :meth:`Context.noise_parameters` follows
+        from zeros. A method that only takes noise away becomes :class:`Noiseless`.
+
+        Args:
+            context: the context of the step, with ``clean`` set.
+
+        Returns:
+            The resolved method; None if nothing is left of it.
+        """
+        return self.resolve(context).without_noise()
+
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
         """The variance of the noise after this (resolved) method, from the variance before it.
 
@@ -264,7 +285,7 @@ class Unchanged(Method):
 
 
 class Noiseless(Unchanged):
-    """A stage that only adds noise, without its noise."""
+    """A stage that only adds noise, or only takes it away, where there is none."""
 
     method: ClassVar = "none"
     summary: ClassVar = "no noise"
@@ -387,7 +408,8 @@ def run_reference(
 class Stage:
     """A stage by name, with its methods; the first one is the default.
 
-    ``explain`` describes in a few lines how automatic parameters follow from the context.
+    ``explain`` describes in a few lines how automatic parameters follow from the context. ``also``
+    are further kinds that it may read; it then writes the same kind.
     """
 
     name: str
@@ -397,6 +419,11 @@ class Stage:
     methods: tuple[type[Method], ...]
     explain: Callable[[Context], str] | None = None
     folder: Path | None = None  # of a plug-in's kernel files
+    also: tuple[Kind, ...] = ()
+
+    def reading(self, kind: Kind | None) -> "Stage":
+        """The stage where an image of a kind enters it; the stage as it is if it reads no such."""
+        return replace(self, reads=kind, writes=kind) if kind in self.also and kind else self
 
     @cached_property
     def by_name(self) -> dict[str, type[Method]]:

@@ -7,7 +7,7 @@ import numpy as np
 
 # A camera's colours at D65, as DNG's ColorMatrix2 has them.
 MATRIX = ((0.4716, 0.0603, -0.0830), (-0.7798, 1.5474, 0.2480), (-0.1496, 0.1937, 0.6651))
-FORMATS = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 10: "ii"}  # of TIFF's field types
+FORMATS = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 10: "ii", 12: "d"}  # of TIFF's field types
 
 
 def field(tag: int, type_: int, *values) -> tuple[int, int, int, bytes]:

@@ -31,7 +31,9 @@ def test_commands():
 
 @pytest.mark.parametrize("words", [("run", "--camera"), ("cameras",), ("stages", "--camera")])
 def test_cameras(words):
-    assert values(*words, "sony") == ["sony-a7r2", "sony-a7s2"]
+    assert values(*words, "nikon-d8") == ["nikon-d800", "nikon-d850"]
+    assert values(*words, "Nikon D8") == ["nikon-d800", "nikon-d850"]
+    assert values(*words, "A7 II") == ["sony-a7m2"]
 
 
 def test_configurations_and_files():

@@ -50,7 +50,7 @@ def build(**settings):
         ({"iso": "high"}, "iso: found 'high', but it is a number"),
         ({"isoo": 3}, "unknown key 'isoo' .*mean 'iso'"),
         ({"iso": 50}, "iso: found 50, but camera sony-a7r2 goes from 100 to 25600"),
-        ({"camera": "sony-a7r3"}, "unknown camera 'sony-a7r3' .*mean 'sony-a7r2'"),
+        ({"camera": "sony-a7r9"}, "unknown camera 'sony-a7r9' .*mean 'sony-a7r'"),
         ({"camera": "nowhere.toml"}, "nowhere.toml: cannot read"),
         (
             {"stages": ["exposure", "demosaic"]},

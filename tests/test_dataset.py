@@ -56,6 +56,16 @@ def test_a_sample_is_what_a_run_makes(clpipe, renders):
         assert sample["iso"] == ISO
 
 
+def test_truths_with_and_without_denoising(renders):
+    truths = [
+        next(iter(api.Dataset(renders, device="numpy", iso=iso, truth=truth)))["truth"]
+        for iso, truth in ((100, "clean"), (ISO, "clean"), (ISO, "development"), (ISO, True))
+    ]
+    assert np.array_equal(truths[0], truths[1])
+    assert np.array_equal(truths[2], truths[3])
+    assert not np.array_equal(truths[1], truths[2])
+
+
 def test_the_noise_is_as_the_sample_says(write_exr, tmp_path):
     write_exr("flat.exr", np.full((256, 256, 3), 0.2, np.float32))
     (sample,) = api.Dataset(
@@ -147,7 +157,7 @@ def test_what_is_refused(renders):
         ({"keep": "demosiac"}, "demosaic"),
         ({"truth": True, "skip": ["sensor_noise", "row_noise", "column_noise"]}, "adds noise"),
         ({"epoch": -1}, "found epoch -1"),
-        ({"truth": "mosaic"}, "found truth 'mosaic'; expected bool"),
+        ({"truth": "mosaic"}, "found truth 'mosaic'; expected bool | Literal"),
         ({"keep": 5}, r"found keep 5; expected str | Sequence\[str\]"),
         ({"start_at": 5}, "found start_at 5; expected str"),
         ({"threads": 0}, "found threads 0; expected 1 or more"),

@@ -312,7 +312,7 @@ def test_a_draw_that_cannot_be(tmp_path, text, message):
             "iso: found 12800, but camera canon-5d2 goes from 100 to 6400",
         ),
         ({"iso": 50, "camera": {"choice": ["sony-a7s2", "canon-5d2"]}}, "found 50, but camera can"),
-        ({"camera": {"choice": ["sony-a7r2", "sony-a7r3"]}}, "unknown camera 'sony-a7r3'"),
+        ({"camera": {"choice": ["sony-a7r2", "sony-a7r9"]}}, "unknown camera 'sony-a7r9'"),
     ],
 )
 def test_an_iso_that_a_camera_has_not(values, message):

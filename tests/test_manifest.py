@@ -250,7 +250,7 @@ def test_a_manifest_that_is_not_there(tmp_path):
         ("iso\n" + "[" * 5000, "row 2: iso: found .*but it is a number"),
         ("seed\n1.5", "row 2: seed: found 1.5, but it is a whole number"),
         ('seed\n"{choice=[1, 2]}"', "row 2: seed: found .*cannot be drawn"),
-        ("camera\nsony-a7r3", "row 2: unknown camera 'sony-a7r3' .*mean 'sony-a7r2'"),
+        ("camera\nsony-a7r9", "row 2: unknown camera 'sony-a7r9' .*mean 'sony-a7r'"),
         ("camera\n7", "row 2: camera: found 7, but it is text"),
         ("camera\nno.toml", "row 2: .*/no.toml: cannot read this camera profile"),
         ("sensor_noise.a\nmuch", "row 2: sensor_noise.a: found 'much': .*number"),

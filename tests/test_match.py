@@ -32,10 +32,11 @@ KNOWN = {
     "iso": 3200.0,
     "demosaic": {"method": "bilinear"},
     "denoise": {"method": "mean", "luma_strength": 4.0, "chroma_strength": 6.0},
+    "sharpen": {"method": "none"},
 }
 # The methods are known here; the search finds them among others in tools and by hand.
 SMALL = Space(
-    {"known": (Choice("known", {k: KNOWN[k] for k in ("demosaic", "denoise")}),)},
+    {"known": (Choice("known", {k: KNOWN[k] for k in ("demosaic", "denoise", "sharpen")}),)},
     Dimension("iso", 100, 25600, 1600, logarithmic=True),
 )
 
@@ -204,8 +205,8 @@ def test_what_is_developed_goes_through_the_same_jpeg(burst, tmp_path):
 
 def test_every_number_of_the_development_is_searched():
     names = {d.name for d in dimensions_of(make_chain(Settings()))}
-    assert "denoise.luma_strength" in names
-    assert not any("noise" in name.partition(".")[2] for name in names)  # automatic
+    assert {"denoise.luma_strength", "denoise.grain", "sharpen.amount"} <= names
+    assert not {"denoise.luma_noise", "sharpen.threshold"} & names  # in units of the signal
     space = space_for(Settings(), iso_is_given=False)
     assert space.strength is not None
     methods = {choice.text for choice in space.choices["demosaic"]}

@@ -8,6 +8,7 @@ from clpipe.chain.files import load_config
 from clpipe.chain.settings import settings_from
 from clpipe.engine.codegen import write_kernel
 from clpipe.engine.plan import Finalize, Launch, Lines, Reduce, make_plan
+from clpipe.engine.traffic import bytes_per_pixel
 from clpipe.stage import Kind
 
 GRAY_WORLD = {"white_balance": {"method": "gray_world"}}
@@ -39,7 +40,7 @@ def test_default_chain_with_gray_world_is_eight_launches_and_at_most_48_bytes():
     assert [type(launch) for launch in plan.launches] == [Lines, Launch, Reduce, Finalize] + [
         Launch
     ] * 4
-    assert plan.bytes_per_pixel(8) <= 48
+    assert bytes_per_pixel(plan, 8) <= 48
 
 
 def test_gains_estimated_from_the_image_are_applied_where_the_stencil_reads():

@@ -13,12 +13,12 @@ from clpipe.engine.plan import Plan
 from clpipe.engine.runner import Result, Runner
 from clpipe.engine.tiles import (
     LARGEST_TILE,
-    Extent,
     buffer_sizes,
     divisions,
-    halo_of,
+    halos_of,
     phases_of,
     tiling_of,
+    whole_image,
 )
 from clpipe.reference.cfa import PATTERNS
 from clpipe.stage import Kind
@@ -39,8 +39,8 @@ def plan_of(**settings) -> Plan:
 
 def memory_for(plan: Plan, columns: int, rows: int, lanes: int) -> int:
     """What a tile takes that has so many pixels beside its halo."""
-    halo = 2 * halo_of(plan) + lanes
-    whole = Extent.whole(columns + halo, rows + halo, lanes, plan.border)
+    halo = 2 * halos_of(plan)[0] + lanes
+    whole = whole_image(plan, columns + halo, rows + halo, lanes)
     return sum(buffer_sizes(plan, whole).values()) + 4 * 1024
 
 
@@ -175,18 +175,18 @@ def test_whole_numbers_become_floats_tile_by_tile(device, monkeypatch):
 @pytest.mark.parametrize("lanes", [1, 8, 16])
 def test_tiles_cover_an_image_once_and_fit(memory, lanes):
     plan = plan_of(**GRAY_WORLD)
-    width, height, halo = 403, 333, halo_of(plan)
+    width, height, halo = 403, 333, halos_of(plan)[0]
     tiling = tiling_of(plan, width, height, lanes, memory, memory // 4)
     covered = np.zeros((height, width), int)
     assert tiling.bytes <= memory
-    for extent in tiling.tiles:
+    for (extent,) in tiling.tiles:
         core, stored = extent.core, extent.stored
         covered[core.top : core.bottom, core.left : core.right] += 1
         assert stored.left % lanes == stored.top % 4 == core.left % 2 == core.left % lanes == 0
         assert stored.left <= max(core.left - halo, 0) and stored.top <= max(core.top - halo, 0)
         assert stored.right == min(core.right + halo, width)
         assert stored.bottom == min(core.bottom + halo, height)
-        sizes = buffer_sizes(plan, extent)
+        sizes = buffer_sizes(plan, (extent,))
         assert all(size <= tiling.sizes[name] for name, size in sizes.items())
         assert max(sizes.values()) <= memory // 4
     assert (covered == 1).all()
@@ -197,15 +197,15 @@ def test_full_rows_come_before_narrow_tiles():
     plan = plan_of()
     for memory, columns in ((2**34, {30000}), (2**26, {2512, 2368})):
         tiling = tiling_of(plan, 30000, 20000, 8, memory, memory)
-        assert {extent.core.width for extent in tiling.tiles} == columns
+        assert {extent.core.width for (extent,) in tiling.tiles} == columns
         assert tiling.bytes < LARGEST_TILE
 
 
 def test_the_halo_is_what_all_stencils_reach_together():
-    assert halo_of(plan_of()) == 2 + 1 + 1 + 2
-    assert halo_of(plan_of(stages=["exposure", "gamma"])) == 0
+    assert halos_of(plan_of()) == (2 + 1 + 1 + 2,)
+    assert halos_of(plan_of(stages=["exposure", "gamma"])) == (0,)
     bilinear = {"stages": ["mosaic", "demosaic"], "demosaic": {"method": "bilinear"}}
-    assert halo_of(plan_of(**bilinear)) == 1
+    assert halos_of(plan_of(**bilinear)) == (1,)
 
 
 def test_phases_end_with_what_is_found():
@@ -252,7 +252,7 @@ def test_memory_that_is_not_there_all_the_same(device, monkeypatch, call):
     other = example(Kind.RGB, (333, 403), half=True)
     runner.run(other, "k")
     # Room for the image alone, but not beside what the larger one has left behind.
-    enough = sum(buffer_sizes(runner.plan(), Extent.whole(203, 150, 8, 2)).values())
+    enough = sum(buffer_sizes(runner.plan(), whole_image(runner.plan(), 203, 150, 8)).values())
     for left, tries in ((enough, 1), (enough // 3, 3), (enough // 9, 5)):
         scarce = Scarce(device, left, call)
         with monkeypatch.context() as patch:

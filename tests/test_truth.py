@@ -12,13 +12,21 @@ from clpipe.camera.profile import DEFAULT_CAMERA, load_camera
 from clpipe.chain.chain import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import settings_from
-from clpipe.chain.truth import MOSAIC, VARIANCE, noisy_mosaic, variance_of
+from clpipe.chain.truth import (
+    CLEAN,
+    DEVELOPMENT,
+    MOSAIC,
+    VARIANCE,
+    noisy_mosaic,
+    variance_of,
+)
 from clpipe.engine.runner import Runner
 from clpipe.images.read import read_image
 from clpipe.outputs.renditions import truth_of
 from clpipe.reference.cfa import PATTERNS
 from clpipe.stage import Context, Kind, Method
 from clpipe.stages import DEFAULT_CHAIN
+from clpipe.stages.exposure import Gain
 from clpipe.stages.row_noise import Gaussian as RowNoise
 from tests.conftest import STILL_LIFE, written
 from tests.dng import write_dng
@@ -198,6 +206,62 @@ def test_a_truth_that_enters_again_claims_no_noise(clpipe, write_exr):
     assert json.loads(Path(again).with_suffix(".json").read_text())["noise"]
 
 
+def picture(chain, image):
+    return Runner(chain, None, encode=False, final=True).run(image, "k").final
+
+
+def test_the_clean_picture_is_the_same_at_every_iso():
+    image = np.random.default_rng(0).random((12, 16, 3)).astype(np.float32)
+    cleans, developments = [], []
+    for iso in (100, 25600):
+        chain = chain_of(iso=iso, denoise={"luma_noise": 0.1 if iso > 100 else None})
+        cleans.append(picture(truth_of(CLEAN, chain).chain, image))
+        developments.append(picture(truth_of(DEVELOPMENT, chain).chain, image))
+    assert np.array_equal(*cleans)
+    assert np.abs(developments[0] - developments[1]).max() > 0.05
+
+
+def test_without_noise_to_take_away_development_and_clean_picture_are_one():
+    image = np.random.default_rng(0).random((12, 16, 3)).astype(np.float32)
+    chain = chain_of(skip=["denoise"], sensor_noise={"full_well": 3e3})
+    clean, development = (picture(truth_of(t, chain).chain, image) for t in (CLEAN, DEVELOPMENT))
+    assert np.array_equal(clean, development)
+
+
+def test_what_follows_from_the_noise_follows_from_none_in_the_clean_picture(monkeypatch):
+    def resolve(method, context):
+        return method.model_copy(update={"ev": 1e3 * context.noise_parameters()[0]})
+
+    monkeypatch.setattr(Gain, "resolve", resolve)
+    chain = chain_of(stages=["mosaic", "sensor_noise", "demosaic", "exposure"])
+    strengths = {t: truth_of(t, chain).chain.steps[-1] for t in (CLEAN, DEVELOPMENT)}
+    assert strengths[CLEAN].method.ev == 0 < strengths[DEVELOPMENT].method.ev
+    assert strengths[CLEAN].context.noise_parameters() == (0, 0)
+
+
+def test_the_clean_picture_is_written_kept_and_entered_again(clpipe, write_exr):
+    write_exr("a.exr", np.random.default_rng(0).random((12, 16, 3)))
+    run = ("--device", "numpy", "--format", "exr")
+    truths = ("--truth", "clean", "--truth", "development")
+    clpipe("run", "a.exr", "-o", "o", "--iso", 3200, *run, *truths, "--keep", "demosaic")
+    clpipe("run", "o/a.truth_clean.demosaic.exr", "-o", "b", "--start-at", "denoise", *run)
+    clpipe("run", "o/a.truth.demosaic.exr", "-o", "b", "--start-at", "denoise", *run)
+    clpipe("run", "--replay", "o/a.truth_clean.json", "-o", "c")
+    (clean, *cleans), (other, again) = (
+        [read_image(Path(name), False).pixels for name in names]
+        for names in (
+            ["o/a.truth_clean.exr", "b/a.truth_clean.demosaic.exr", "c/a.truth_clean.exr"],
+            ["o/a.truth.exr", "b/a.truth.demosaic.exr"],
+        )
+    )
+    assert all(np.array_equal(clean, each) for each in cleans)
+    assert np.array_equal(other, again)
+    assert not np.array_equal(clean, other)
+    said = json.loads(Path("o/a.truth_clean.json").read_text())
+    assert said["noise"] is None
+    assert {s["name"]: s["method"] for s in said["stages"]}["denoise"] == "none"
+
+
 def stamps():
     return {name: Path("o", name).stat().st_mtime_ns for name in written(Path("o"))}
 
@@ -236,7 +300,7 @@ def test_a_burst_has_each_truth_once(clpipe, write_exr):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--truth", "noise"), "'noise' is not one of 'development', 'mosaic', 'variance'"),
+        (("--truth", "noise"), "is not one of 'development', 'clean', 'mosaic', 'variance'"),
         ((*ALL[2:], "--until", "quantize", "--format", "exr"), "ends in DN, at quantize"),
         ((*ALL, "--skip", "sensor_noise", "--skip", "row_noise"), "no noise to know the truth of"),
         ((*ALL, "--start-at", "white_balance"), "no noise to know the truth of"),

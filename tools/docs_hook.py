@@ -185,7 +185,8 @@ def cameras_page() -> str:
         low, high = camera["iso_range"]
         make, model = camera["make"], camera["model"]
         title = model if model.startswith(make) else f"{make} {model}"
-        parts.append(f"## {camera['name']}\n\n{title}, ISO {low:g} to {high:g}.\n")
+        also = f" ({', '.join(camera['aliases'])})" if camera["aliases"] else ""
+        parts.append(f"## {camera['name']}\n\n{title}{also}, ISO {low:g} to {high:g}.\n")
         units = {
             "black_level": "DN",
             "white_level": "DN",
@@ -193,7 +194,7 @@ def cameras_page() -> str:
             "dsnu": "e-",
             "hot_pixel_level": "e-",
         }
-        skip = ("name", "make", "model", "iso_range", "noise", "sources")
+        skip = ("name", "make", "model", "aliases", "iso_range", "noise", "sources")
         rows: list[list[object]] = [
             [code(key), figure(value), units.get(key, "") if value is not None else ""]
             for key, value in camera.items()
@@ -242,6 +243,13 @@ wrong and nothing is written; 3, there is no usable device; 130, interrupted.
     :command: main
     :prog_name: clpipe
     :depth: 1
+    :style: plain
+
+::: mkdocs-click
+    :module: clpipe.commands.cameras
+    :command: import_command
+    :prog_name: clpipe cameras import
+    :depth: 2
     :style: plain
 """
 

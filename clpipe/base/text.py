@@ -4,14 +4,20 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 
 
-def one_of(what: str, found: str, allowed: Iterable[str]) -> str:
-    """A message for an unknown name, with the most similar allowed name as a suggestion.
+def one_of(what: str, found: str, allowed: Iterable[str], nearest: str | None = None) -> str:
+    """A message for an unknown name, with a suggestion.
+
+    Args:
+        what: the name is of.
+        found: the name.
+        allowed: the names that there are.
+        nearest: the name to suggest; None is the most similar of those that are allowed.
 
     >>> one_of("stage", "demosiac", ["mosaic", "demosaic"])
     "unknown stage 'demosiac' (did you mean 'demosaic'?); allowed: mosaic, demosaic"
     """
     names = list(map(one_line, allowed))
-    near = get_close_matches(found, names, n=1, cutoff=0.5)
+    near = [nearest] if nearest else get_close_matches(found, names, n=1, cutoff=0.5)
     hint = f" (did you mean '{near[0]}'?)" if near else ""
     return f"unknown {what} '{one_line(found)}'{hint}; allowed: {', '.join(names) or 'none'}"
 

@@ -188,11 +188,11 @@ class ImageWorker:
         job = task.job
         task.stamp = stamp_of(job.path)
         source = task.loader.read(job)
-        self.writer.check_size(source)
         loaded = task.loader.enter(job, source)
         if loaded is None:
             task.status = LEFT_OUT
             return
+        self.writer.check_size(loaded.source, loaded.chain)
         task.source = loaded.source
         renditions = self.writer.plan_of(job).renditions(loaded.chain, loaded.key)
         task.renditions = [rendition for rendition in renditions if rendition.name in names]
@@ -205,7 +205,9 @@ class ImageWorker:
         with task.timed("device"):
             try:
                 pixels = task.source.pixels
-                into = self._spare.take(pixels.shape) if runner.encode and runner.device else None
+                width, height = runner.chain.size(*pixels.shape[1::-1])
+                shape = (height, width, *pixels.shape[2:])
+                into = self._spare.take(shape) if runner.encode and runner.device else None
                 result = runner.run(pixels, rendition.noise_key, timings, into=into)
             except (ImageError, RequestError, MemoryError) as error:
                 task.error = task.loader.error_text(task.job, error)

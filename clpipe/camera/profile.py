@@ -1,5 +1,7 @@
 """Camera profiles: what a sensor does at each ISO, from a TOML file that cites every number."""
 
+import re
+from difflib import get_close_matches
 from functools import cache, cached_property, lru_cache
 from importlib import resources
 from pathlib import Path
@@ -101,6 +103,7 @@ class Camera(BaseModel):
     name: str
     make: str
     model: str
+    aliases: tuple[str, ...] = ()  # other names of the model
     black_level: Annotated[float, Field(ge=0, le=65535)]
     white_level: Annotated[float, Field(gt=0, le=65535)]
     white_balance_gains: tuple[Positive, Positive]  # red, blue
@@ -239,24 +242,71 @@ def built_in_cameras() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
+def comparable(name: str) -> str:
+    """The name of a camera as names are compared: what makers, people and files write differently.
+
+    >>> comparable("NIKON CORPORATION NIKON D850") == comparable("nikon-d850") == "nikond850"
+    True
+    """
+    words = re.findall(r"[^\W_]+", name.casefold())
+    return "".join(word for word in dict.fromkeys(words) if word != "corporation")
+
+
+@cache
+def camera_names() -> dict[str, str]:
+    """The built-in cameras by all that they are called, as :func:`comparable` has it."""
+    names: dict[str, str] = {}
+    for name, path in built_in_cameras().items():
+        camera = _parse(read_text(path))
+        for model in (camera.model, camera.model.removeprefix(camera.make), *camera.aliases):
+            names |= {comparable(model): name, comparable(f"{camera.make} {model}"): name}
+    return names | {comparable(name): name for name in built_in_cameras()}
+
+
+def built_in_name(name: str) -> str | None:
+    """The name of a built-in camera by its name, its model, or its make and model; else None.
+
+    >>> built_in_name("Canon 5D Mark II"), built_in_name("sony ilce-7rm2"), built_in_name("D1")
+    ('canon-5d2', 'sony-a7r2', None)
+    """
+    if name in built_in_cameras():
+        return name
+    return None if name.endswith(".toml") else camera_names().get(comparable(name))
+
+
 def load_camera(name: str) -> Camera:
-    """Load a built-in camera by its name, or a profile file by its path (ending in .toml).
+    """Load a built-in camera by :func:`built_in_name`, or a file by its path (ending in .toml).
 
     Raises:
         RequestError: there is no such camera or file, or the file is not a valid profile.
     """
     built_in = built_in_cameras()
-    path = built_in.get(name, Path(name))
+    path = built_in.get(built_in_name(name) or "", Path(name))
     if path.suffix != ".toml":
-        raise RequestError(one_of("camera", name, built_in) + ", or a .toml file")
+        near = get_close_matches(comparable(name), camera_names(), n=1, cutoff=0.5)
+        nearest = camera_names()[near[0]] if near else None
+        raise RequestError(one_of("camera", name, built_in, nearest) + ", or a .toml file")
     try:
-        return _parse(read_text(path))
+        text = read_text(path)
     except OSError as error:
         raise RequestError(f"{path}: cannot read this camera profile: {error.strerror}") from None
-    except ValidationError as error:
-        raise RequestError(f"{path}: {_reason(error)}") from None
-    except ValueError as error:
+    except UnicodeDecodeError as error:
         raise RequestError(f"{path}: not valid TOML: {error}") from None
+    return parse_camera(text, str(path))
+
+
+def parse_camera(text: str, source: str) -> Camera:
+    """The camera of a profile's text; ``source`` names it in messages.
+
+    Raises:
+        RequestError: the text is not a valid profile.
+    """
+    try:
+        return _parse(text)
+    except ValidationError as error:
+        raise RequestError(f"{source}: {_reason(error)}") from None
+    except ValueError as error:
+        raise RequestError(f"{source}: not valid TOML: {error}") from None
 
 
 @lru_cache(maxsize=64)  # a batch loads the camera once for each image

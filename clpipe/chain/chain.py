@@ -11,6 +11,7 @@ from clpipe.chain.draws import Draw
 from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
+from clpipe.reference.resample import sizes
 from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
 
 
@@ -65,6 +66,11 @@ class Chain:
         """The kind of image that comes out."""
         return self.steps[-1].stage.writes if self.steps else self.source
 
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """The width and height of what comes out, in px, from those of what enters."""
+        passes = (p for step in self.steps for p in step.method.passes())
+        return sizes((p.resampling for p in passes if p.resampling), width, height)[-1]
+
     @property
     def noise(self) -> NoiseModel | None:
         """The sensor noise in the image that comes out; None where none was added."""
@@ -90,11 +96,28 @@ class Chain:
                 "no stage of this chain adds noise; every frame would be the same, "
                 "and there is no noise to know the truth of"
             )
-        if left[-1][1] is None:
-            left[-1] = left[-1][0], Noiseless()
+        return self._with(left, clean=False)
+
+    def cleaned(self) -> "Chain":
+        """The chain without noise and without all that its strength chose: nothing is denoised.
+
+        Raises:
+            RequestError: a user's stage does not allow it.
+        """
+        left = []
+        for step in self.steps:
+            name, folder = step.name, step.stage.folder
+            method, context = self.settings.method(name), replace(step.context, clean=True)
+            with validation_errors(name, type(method)), user_code_errors(f"stage {name}", folder):
+                left.append((step, method.where_clean(context)))
+        return self._with(left, clean=True)
+
+    def _with(self, methods: Sequence[tuple[Step, Method | None]], clean: bool) -> "Chain":
+        """The chain with other methods in its steps, and no noise; see :meth:`without_noise`."""
+        *others, (last, method) = methods
         steps = tuple(
-            replace(step, method=method, context=replace(step.context, noise=None))
-            for step, method in left
+            replace(step, method=method, context=replace(step.context, noise=None, clean=clean))
+            for step, method in (*others, (last, method or Noiseless()))
             if method
         )
         return replace(self, steps=steps)
@@ -218,7 +241,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     steps: list[Step] = []
     before = "the input"
     for name in step_names(settings):
-        stage = all_stages()[base_name(name)]
+        stage = all_stages()[base_name(name)].reading(kind)
         method = settings.method(name)
         if stage.reads is not (kind or stage.reads):
             if isinstance(method, Unchanged) and stage.reads is stage.writes:

@@ -48,7 +48,7 @@ class Request:
         keep: steps whose image is written too, or "all".
         frames: how many frames of each image; None is one picture instead of a burst.
         truths: which of :data:`clpipe.chain.truth.TRUTHS` are written beside each picture.
-        truth_keep: steps whose image is written beside the truth of the development; None is
+        truth_keep: steps whose image is written beside a truth that is a picture; None is
             ``keep``. See :meth:`with_outputs`.
     """
 

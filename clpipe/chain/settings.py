@@ -4,7 +4,7 @@ Nothing here depends on the camera's data or on a stage's place in the chain; th
 :mod:`clpipe.chain.chain`.
 """
 
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
-from clpipe.camera.profile import DEFAULT_CAMERA, load_camera
+from clpipe.camera.profile import DEFAULT_CAMERA, built_in_name, load_camera
 from clpipe.chain.drawing import draw_of, extremes_of, values_of
 from clpipe.chain.draws import TINY, Choice, Draw, Limits, limits_of
 from clpipe.chain.keys import CODE, KEYS, MAX_STAGES, OUTPUT, check_type, names_in
@@ -258,6 +258,13 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
     return changed
 
 
+# A camera has one name, however it is called, so that requests can be compared.
+CONVERSIONS: dict[str, Callable[[Any], Any]] = {
+    "iso": float,
+    "camera": lambda name: built_in_name(name) or name,
+}
+
+
 def _checked_plain(settings: Settings, plain: Mapping[str, Any]) -> dict[str, Any]:
     """The values that stand in no table, each checked, as the fields of :class:`Settings`.
 
@@ -283,8 +290,7 @@ def _checked_plain(settings: Settings, plain: Mapping[str, Any]) -> dict[str, An
             for name in names:
                 stage_named(key, name if key == "stages" else base_name(name))
             checked[key] = (*settings.skip, *names) if key == "skip" else names
-    if "iso" in plain:
-        checked["iso"] = float(plain["iso"])
+    checked |= {key: convert(plain[key]) for key, convert in CONVERSIONS.items() if key in plain}
     if {"raw_size", "raw_type"} & plain.keys():
         size = plain.get("raw_size", settings.raw_size)
         try:

@@ -12,12 +12,30 @@ from clpipe.chain.chain import Chain, Step
 from clpipe.chain.registry import user_code_errors
 from clpipe.stage import Frame, Kind
 
-DEVELOPMENT, MOSAIC, VARIANCE = TRUTHS = ("development", "mosaic", "variance")
+DEVELOPMENT, CLEAN, MOSAIC, VARIANCE = TRUTHS = ("development", "clean", "mosaic", "variance")
+
+# What is the same picture without noise; the others are of its mosaic.
+PICTURES = (DEVELOPMENT, CLEAN)
 
 
 def adds_noise(step: Step) -> bool:
     """Whether a step adds noise, as its method says."""
     return step.method.without_noise() is not step.method
+
+
+def picture_without_noise(truth: str, chain: Chain) -> Chain:
+    """The chain of a truth that is a picture, one of :data:`PICTURES`.
+
+    "development" is developed exactly as the noisy picture is: denoised as strongly, and sharpened
+    as much. So their difference is the noise that is left. "clean" is the picture that is wanted:
+    its development has nothing to do against noise. Without noise and denoising it is the same
+    picture at every ISO.
+
+    Raises:
+        RequestError: the chain adds no noise.
+    """
+    without = chain.without_noise()
+    return chain.cleaned() if truth == CLEAN else without
 
 
 def noisy_mosaic(chain: Chain) -> Chain:

@@ -4,10 +4,11 @@ from pathlib import Path
 
 import click
 
-from clpipe.analysis.calibration.files import calibrate_files, check_profile_name, write_profile
+from clpipe.analysis.calibration.files import calibrate_files, write_profile
 from clpipe.analysis.calibration.frames import FrameOverrides
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.result import Calibration
+from clpipe.camera.text import check_profile_name
 from clpipe.commands.options import Command, json_option, raw_size_option, raw_type_option
 from clpipe.commands.printing import show, show_json
 from clpipe.images.dump import dump_of

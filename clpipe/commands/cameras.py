@@ -1,12 +1,13 @@
-"""``clpipe cameras``: the built-in cameras, or the noise of one."""
+"""``clpipe cameras``: the built-in cameras, the noise of one, or a profile of a noise model."""
 
+from pathlib import Path
 from typing import Any
 
 import click
 
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import Camera, built_in_cameras, load_camera
-from clpipe.commands.completion import cameras as camera_names
+from clpipe.commands.completion import cameras_or_import
 from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import Rows, short_text, show, show_json
 
@@ -26,14 +27,68 @@ FIXED = {
 }
 
 
-@click.command("cameras", cls=Command)
-@click.argument("name", required=False, metavar="[NAME|FILE]", shell_complete=camera_names)
+@click.command("import", cls=Command)
+@click.argument("path", metavar="FILE", type=click.Path(path_type=Path))
+@click.option(
+    "--camera", metavar="NAME", help="Which camera of a noiseprofiles.json, by make and model."
+)
+@click.option(
+    "-o",
+    "--output",
+    metavar="FILE.toml",
+    type=click.Path(path_type=Path),
+    help="Write the profile there. [default: print it]",
+)
+def import_command(path: Path, camera: str | None, output: Path | None) -> None:
+    """Make a camera profile of a noise model from elsewhere.
+
+    FILE is a DNG with a NoiseProfile, an Android noise model (the text that CameraITS generates and
+    device trees hold), or darktable's noiseprofiles.json. The profile says what of it is the file's
+    and what stands in.
+
+    \b
+    clpipe cameras import photo.dng -o my_camera.toml
+    clpipe cameras import noiseprofiles.json --camera "Nikon D810"
+    """
+    from clpipe.analysis.noise_models.read import import_camera
+
+    text, made = import_camera(path, camera, output)
+    if output is None:
+        click.echo(text, nl=False)
+        return
+    low, high = made.iso_range
+    isos = f"ISO {low:g}" if low == high else f"ISO {low:g} to {high:g}"
+    click.echo(f"wrote {output}: {make_and_model(made)}, {isos}")
+
+
+class CamerasCommand(Command):
+    """Takes the name of a camera, or the word "import" and what that command takes."""
+
+    def make_context(self, info_name: str | None, args: list[str], *rest: Any, **more: Any) -> Any:
+        if args[:1] == [import_command.name]:
+            name = f"{info_name} {import_command.name}"
+            return import_command.make_context(name, args[1:], *rest, **more)
+        return super().make_context(info_name, args, *rest, **more)
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        super().format_options(ctx, formatter)
+        with formatter.section("Commands"):
+            formatter.write_dl([("import FILE", import_command.get_short_help_str(80))])
+
+
+@click.command("cameras", cls=CamerasCommand)
+@click.argument("name", required=False, metavar="[NAME|FILE]", shell_complete=cameras_or_import)
 @click.option("--iso", type=float, help="The ISO. [default: all that were measured]")
 @json_option
 def cameras(name: str | None, iso: float | None, as_json: bool) -> None:
     """List the cameras, or show the noise of one.
 
-    Noise is shown in three forms, with the source of each figure.
+    NAME is that of the list, or a make and model. Noise is shown in three forms, with the source of
+    each figure.
+
+    \b
+    clpipe cameras "Canon 5D Mark III" --iso 3200
+    clpipe cameras import photo.dng -o my_camera.toml
     """
     if name is None:
         if iso is not None:
@@ -43,7 +98,7 @@ def cameras(name: str | None, iso: float | None, as_json: bool) -> None:
             show_json(records)
             return
         every = map(load_camera, built_in_cameras())
-        show(("camera", "make and model", "ISO", "gain stages from"), map(camera_row, every))
+        show(("camera", "make and model", "also called", "ISO"), map(camera_row, every))
         return
     camera = load_camera(name)
     if as_json:
@@ -64,10 +119,10 @@ def make_and_model(camera: Camera) -> str:
 
 
 def camera_row(camera: Camera) -> tuple[str, ...]:
-    """The row of a camera: name, make and model, ISOs, the first ISO of each gain stage."""
-    stages = ", ".join(f"{stage.iso[0]:g}" for stage in camera.gain_stages)
+    """The row of a camera: name, make and model, other names of the model, ISOs."""
     low, high = camera.iso_range
-    return camera.name, make_and_model(camera), f"{low:g} to {high:g}", stages
+    aliases = ", ".join(camera.aliases)
+    return camera.name, make_and_model(camera), aliases, f"{low:g} to {high:g}"
 
 
 def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[str, ...], Rows]]:
@@ -149,6 +204,7 @@ def camera_record(camera: Camera, iso: float | None = None) -> dict[str, Any]:
         "name": camera.name,
         "make": camera.make,
         "model": camera.model,
+        "aliases": camera.aliases,
         "iso_range": camera.iso_range,
         **{key: getattr(camera, key) for key in FIXED},
         "noise": [noise_at(camera, i) for i in isos],

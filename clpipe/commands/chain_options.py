@@ -22,7 +22,7 @@ camera_option = click.option(
     "--camera",
     metavar="NAME|FILE",
     shell_complete=cameras,
-    help=f"A built-in camera or a profile (.toml). [default: {DEFAULTS.camera}]",
+    help=f"A built-in camera, by name or model, or a profile (.toml). [default: {DEFAULTS.camera}]",
 )
 
 iso_option = click.option(

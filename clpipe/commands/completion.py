@@ -14,10 +14,20 @@ from clpipe.base.errors import ClpipeError
 
 
 def cameras(context: click.Context, option: click.Parameter, text: str) -> list[CompletionItem]:
-    """Built-in cameras, and files."""
-    from clpipe.camera.profile import built_in_cameras
+    """Built-in cameras, by their names or by what else they are called, and files."""
+    from clpipe.camera.profile import built_in_cameras, camera_names, comparable
 
-    return _names(built_in_cameras(), text) or _file(text)
+    names = [name for name in built_in_cameras() if name.startswith(text)]
+    if not names and (start := comparable(text)):
+        names = sorted({name for key, name in camera_names().items() if key.startswith(start)})
+    return _names(names, "") or _file(text)
+
+
+def cameras_or_import(
+    context: click.Context, option: click.Parameter, text: str
+) -> list[CompletionItem]:
+    """Built-in cameras, files, and the command that makes a profile."""
+    return [*_names(["import"] if text else [], text), *cameras(context, option, text)]
 
 
 def configs(context: click.Context, option: click.Parameter, text: str) -> list[CompletionItem]:

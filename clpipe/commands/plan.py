@@ -11,7 +11,8 @@ from clpipe.chain.request import Request
 from clpipe.commands.chain_options import chain_options, format_option, keep_option
 from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show, show_json
-from clpipe.engine.plan import AnyLaunch, Launch, Lines, Plan, launch_bytes, make_plan, reads_of
+from clpipe.engine.plan import AnyLaunch, Launch, Lines, Plan, make_plan, reads_of
+from clpipe.engine.traffic import bytes_per_pixel, launch_bytes
 from clpipe.outputs.results import results_of
 
 
@@ -48,7 +49,7 @@ def plan(as_json: bool, as_toml: bool, **options: Any) -> None:
     show(headings, plan_rows(plan))
     click.echo(
         f"\n{len(plan.launches)} launches, {plan.slot_count} slots, "
-        f"{plan.bytes_per_pixel(8):.1f} bytes a pixel on the device"
+        f"{bytes_per_pixel(plan, 8):.1f} bytes a pixel on the device"
     )
 
 
@@ -74,8 +75,9 @@ def opener(launch: AnyLaunch, kept: Mapping[int, str]) -> str:
         return "tables of rows and columns"
     if not isinstance(launch, Launch):
         return f"{launch.op.step}: {launch.op.pass_.access.value}"
-    if launch.stencil:
-        return f"{launch.stencil.step}: stencil, radius {launch.stencil.pass_.radius}"
+    if op := launch.opener:
+        radius = f", radius {op.pass_.radius}" if launch.stencil else ""
+        return f"{op.step}: {op.pass_.access.value}{radius}"
     if not launch.reads:
         return "source"
     if name := kept.get(launch.reads[0].image.number):
@@ -130,6 +132,6 @@ def plan_record(plan: Plan) -> dict[str, Any]:
     return {
         "launches": [dict(zip(keys, row, strict=True)) for row in plan_rows(plan)],
         "slots": plan.slot_count,
-        "bytes_per_pixel": plan.bytes_per_pixel(8),
+        "bytes_per_pixel": bytes_per_pixel(plan, 8),
         "kept": [name for name, _ in plan.kept],
     }

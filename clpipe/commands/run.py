@@ -64,8 +64,9 @@ if TYPE_CHECKING:
     "truths",
     multiple=True,
     type=click.Choice(TRUTHS),
-    help="Write beside each picture its truth: its development or its mosaic without noise, or the "
-    "variance of the noise in the mosaic; may be repeated.",
+    help="Write beside each picture its truth: the same development without noise, the clean "
+    "picture (without noise and denoising), its mosaic without noise, or the variance of the noise "
+    "in the mosaic; may be repeated.",
 )
 @raw_size_option
 @raw_type_option
@@ -185,11 +186,13 @@ def run(
     OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise. With --webdataset
     these are in tars, and dots in NAME become "_", because a key of WebDataset has none.
 
-    --truth development is OUT/NAME.truth.jpg, also without --frames. --truth mosaic is
-    OUT/NAME.truth_mosaic.exr, the truth of --keep normalize. --truth variance is
-    OUT/NAME.truth_variance.exr: for each pixel of that mosaic the variance of the noise that the
-    chain adds, in signal squared. It includes what is fixed to a sensor (PRNU, DSNU, columns) and
-    rounding, but neither clipping nor defect pixels.
+    --truth clean is OUT/NAME.truth_clean.jpg, the picture to train on: without noise, and without
+    denoising and what else follows from the noise. --truth development is OUT/NAME.truth.jpg, also
+    without --frames: denoised as strongly as the noisy picture, so that their difference is the
+    noise that is left. --truth mosaic is OUT/NAME.truth_mosaic.exr, the truth of --keep normalize.
+    --truth variance is OUT/NAME.truth_variance.exr: for each pixel of that mosaic the variance of
+    the noise that the chain adds, in signal squared. It includes what is fixed to a sensor (PRNU,
+    DSNU, columns) and rounding, but neither clipping nor defect pixels.
     """
     if quiet:
         logging.getLogger("clpipe").setLevel(logging.WARNING)

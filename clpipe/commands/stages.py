@@ -18,7 +18,7 @@ from clpipe.commands.chain_options import camera_option, iso_option
 from clpipe.commands.completion import steps
 from clpipe.commands.options import Command, json_option, stage_file_option
 from clpipe.commands.printing import short_text, show, show_json
-from clpipe.stage import Context, Method, Stage
+from clpipe.stage import Context, Kind, Method, Stage
 
 LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
@@ -115,8 +115,8 @@ def stage_record(stage: Stage, context: Context) -> dict[str, Any]:
     return {
         "name": stage.name,
         "summary": stage.summary,
-        "reads": stage.reads.label,
-        "writes": stage.writes.label,
+        "reads": kinds_text(stage.reads, stage),
+        "writes": kinds_text(stage.writes, stage),
         "methods": [
             {
                 "name": method.method,
@@ -132,13 +132,19 @@ def stage_record(stage: Stage, context: Context) -> dict[str, Any]:
 def stage_row(stage: Stage) -> tuple[str, ...]:
     """The row of a stage: name, what it reads and writes, what it does, its methods."""
     methods = ", ".join(stage.by_name)
-    return stage.name, stage.reads.label, stage.writes.label, stage.summary, methods
+    kinds = (kinds_text(kind, stage) for kind in (stage.reads, stage.writes))
+    return stage.name, *kinds, stage.summary, methods
+
+
+def kinds_text(kind: Kind, stage: Stage) -> str:
+    """The kind that a stage reads or writes, and those that it may have in its place."""
+    return " or ".join(each.label for each in (kind, *stage.also))
 
 
 def explain_stage(stage: Stage, settings: Settings) -> None:
     """Print the methods and parameters of a stage, with their values for a camera and an ISO."""
     context = context_for(stage, settings)
-    reads, writes = stage.reads.label, stage.writes.label
+    reads, writes = (kinds_text(kind, stage) for kind in (stage.reads, stage.writes))
     click.echo(f"{stage.name}: {stage.summary} Reads {reads}, writes {writes}.")
     place = f"{context.camera.name}, ISO {context.iso:g}"
     for method in stage.methods:

@@ -10,8 +10,9 @@ from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device, Timing
-from clpipe.engine.plan import Launch, launch_bytes
+from clpipe.engine.plan import Launch
 from clpipe.engine.runner import Runner
+from clpipe.engine.traffic import bytes_per_pixel, launch_bytes
 from clpipe.stage import Stage, variant_label, variants
 
 
@@ -110,7 +111,7 @@ def bench(
         width=width,
         height=height,
         copy_gb_per_s=copy / 1e9,
-        bytes_per_pixel=plan.bytes_per_pixel(lanes),
+        bytes_per_pixel=bytes_per_pixel(plan, lanes),
         first_run_s=first,
         chain=speed("chain", whole, sum(touched)),
         launches=tuple(speed(t.name, t.seconds, b) for t, b in zip(best, touched, strict=True)),

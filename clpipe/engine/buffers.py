@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.types import Array
-from clpipe.engine.codegen import Parameter
 from clpipe.engine.plan import Finalize, Plan
+from clpipe.engine.writer import Parameter
 from clpipe.stage import Kind
 
 
@@ -30,7 +30,7 @@ def room_for(plan: Plan, width: int, height: int, into: Array | None) -> HostIma
 
     Args:
         plan: the plan.
-        width: of the image in pixels, and its height.
+        width: of the source in pixels, and its height.
         height: see above.
         into: an array to use for the eight-bit pixels.
 
@@ -38,20 +38,22 @@ def room_for(plan: Plan, width: int, height: int, into: Array | None) -> HostIma
         ValueError: ``into`` has another shape or type.
     """
 
-    def shape(kind: Kind) -> tuple[int, ...]:
+    sizes = plan.sizes(width, height)
+
+    def shape(kind: Kind, level: int) -> tuple[int, ...]:
+        columns, rows = sizes[level]
         channels = len(kind.channels)
-        return (height, width) if channels == 1 else (height, width, channels)
+        return (rows, columns) if channels == 1 else (rows, columns, channels)
 
     images = [image for _, image in plan.kept] + ([plan.final] if plan.final else [])
     encoded = None
     if plan.encoded:
-        encoded = np.empty(shape(plan.encoded), np.uint8) if into is None else into
-        if encoded.shape != shape(plan.encoded) or encoded.dtype != np.uint8:
-            raise ValueError(
-                f"into is {encoded.shape} {encoded.dtype}; {shape(plan.encoded)} uint8"
-            )
+        own = shape(plan.encoded, len(sizes) - 1)
+        encoded = np.empty(own, np.uint8) if into is None else into
+        if encoded.shape != own or encoded.dtype != np.uint8:
+            raise ValueError(f"into is {encoded.shape} {encoded.dtype}; {own} uint8")
     return HostImages(
-        images={image.number: np.empty(shape(image.kind), np.float32) for image in images},
+        images={i.number: np.empty(shape(i.kind, i.level), np.float32) for i in images},
         encoded=encoded,
         estimates={
             x.op.step: np.empty(4, np.float32) for x in plan.launches if isinstance(x, Finalize)

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 
 from clpipe.engine.buffers import Pool, buffer_name
-from clpipe.engine.codegen import LOCAL_SIZE, PARTIALS, Kernel, Parameter, round_up
+from clpipe.engine.codegen import LOCAL_SIZE, PARTIALS, Kernel, round_up
 from clpipe.engine.plan import Finalize, Histogram, Launch, Lines, Reduce
-from clpipe.engine.tiles import Extent
+from clpipe.engine.tiles import Extent, Extents
+from clpipe.engine.writer import Parameter
 
 Bind = Callable[[Parameter], Any]
 
@@ -42,15 +43,21 @@ class Call:
         names = [(i, buffer_name(p)) for i, p in numbered]
         self._buffers = [(i, name) for i, name in names if name]
         self._numbers = [(i, p.item) for i, p in numbered if p.role == "tile"]
-        self._values = [(i, p) for i, p in numbered if p.role in ("value", "key", "table8")]
+        self._values = [(i, p) for i, p in numbered if p.role in ("value", "key", "table8", "taps")]
         self._last: list[Any] = [None] * len(numbered)
         self._place: tuple[Any, ...] = ()
 
-    def set_arguments(self, pool: "Pool", extent: Extent, tile: int, bind: Bind) -> None:
+    def set_arguments(self, pool: "Pool", extents: Extents, tile: int, bind: Bind) -> None:
         """Set the arguments that differ from the last launch: buffers, a tile's numbers, values."""
-        place = pool.generation, extent, tile
+        place = pool.generation, extents, tile
         if place != self._place:
-            numbers = {**extent.numbers, "tile": np.uint32(tile)}
+            level = self.kernel.launch.level
+            larger = extents[max(level - 1, 0)].numbers
+            numbers = {
+                **extents[level].numbers,
+                **{f"from_{name}": number for name, number in larger.items()},
+                "tile": np.uint32(tile),
+            }
             for i, name in self._buffers:
                 self.compiled.set_arg(i, pool.held[name])
             for i, name in self._numbers:

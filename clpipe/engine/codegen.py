@@ -15,7 +15,8 @@ from dataclasses import dataclass
 
 from clpipe.engine.plan import AnyLaunch, Finalize, Histogram, Launch, Lines, Op, Plan, Read, Reduce
 from clpipe.engine.sources import LIBRARY, files_text
-from clpipe.stage import Access, Kind, NoiseScope
+from clpipe.engine.writer import Parameter, Writer
+from clpipe.stage import Access, Kind
 
 # What is known of the origin when compiling: it is in whole blocks, so the rows that share a
 # Philox call and the phase of a Bayer pattern are too.
@@ -23,23 +24,6 @@ EXTENT = "{width, height, pitch, left * LANES, top * 4, columns, rows, border}"
 LOCAL_SIZE = 64
 PARTIALS = 256  # work items of a reduction's first half, each with a partial sum or histogram
 UNNAMED = "kernel_without_a_name_yet"
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One kernel parameter: its OpenCL declaration, and what is bound to it.
-
-    ``role`` is one of tile (a number of :class:`clpipe.engine.tiles.Extent`, or the tile's own
-    number), source, slot, encoded, table8 (the composed curve), value, key, lines, estimates, sums,
-    partials, counts, histogram. ``step``, ``item`` and ``number`` say which one of that role; they
-    are not part of the text.
-    """
-
-    declaration: str
-    role: str
-    step: str = ""
-    item: str = ""
-    number: int = 0
 
 
 @dataclass(frozen=True)
@@ -66,98 +50,6 @@ def border_left(border: int, lanes: int) -> int:
     return round_up(border, lanes)
 
 
-class _Writer:
-    """Collects the parameters and the body of one kernel, and gives canonical names to both."""
-
-    def __init__(self, plan: Plan, lanes: int) -> None:
-        self.plan = plan
-        self.lanes = lanes
-        self.parameters: dict[str, Parameter] = {}
-        self.setup: list[str] = []
-        self._steps: list[str] = []
-        self._slots: list[int] = []
-
-    def name(self, step: str, item: str) -> str:
-        """The name in the text of something that belongs to a step, such as ``step0_gain``."""
-        if step not in self._steps:
-            self._steps.append(step)
-        return f"step{self._steps.index(step)}_{item}"
-
-    def parameter(self, name: str, type_: str, role: str, **which: str | int) -> str:
-        space = "" if type_.endswith("*") else " "
-        self.parameters[name] = Parameter(f"{type_}{space}{name}", role, **which)  # type: ignore[arg-type]
-        return name
-
-    def tile(self, number: str) -> str:
-        return self.parameter(number, "uint", "tile", item=number)
-
-    def core(self) -> str:
-        sides = [self.tile(f"core_{side}") for side in ("left", "top", "right", "bottom")]
-        self.setup.append(f"const core c = {{{', '.join(sides)}}};")
-        return "c"
-
-    def slot(self, number: int, written: bool) -> str:
-        if number not in self._slots:
-            self._slots.append(number)
-        const = "" if written else "const "
-        type_ = f"__global {const}float *restrict"
-        name = f"plane{self._slots.index(number)}"
-        return self.parameter(name, type_, "slot", number=number)
-
-    def planes(self, read: Read) -> list[str]:
-        """Three plane parameters of an image that is read, the last repeated where it has less."""
-        slots = [self.slot(n, False) for n in self.plan.slots[read.image.number]]
-        return (slots + [slots[-1]] * 2)[:3]
-
-    def lines(self, step: str, item: str, written: bool) -> str:
-        """The parameter of a step's line table."""
-        type_ = "__global float *" if written else "__global const float *"
-        return self.parameter(self.name(step, item), type_, "lines", step=step, item=item)
-
-    def estimates(self, step: str, written: bool) -> str:
-        """The parameter of the buffer with the numbers that a step estimates from the image."""
-        type_ = "__global float *" if written else "__global const float *"
-        return self.parameter(self.name(step, "estimates"), type_, "estimates", step=step)
-
-    def stream(self, op: Op, scope: NoiseScope) -> str:
-        """The random stream of a pass, from three parameters."""
-
-        def word(item: str, name: str) -> str:
-            return self.parameter(self.name(op.step, name), "uint", "key", step=op.step, item=item)
-
-        keys = [word(f"{scope.value}{half}", f"{scope.value}_key{half}") for half in "01"]
-        return f"(stream){{{', '.join([*keys, word('stage', 'stage')])}}}"
-
-    def arguments(self, op: Op, names: Sequence[str] | None = None) -> list[str]:
-        """The actual arguments of a pass, or those ``names``, after the pixel and its site."""
-        pass_, types, literals = op.pass_, dict(op.types), dict(op.literals)
-        estimates = estimates_of(self.plan, op.step)
-        texts = [self.stream(op, pass_.random)] if pass_.random else []
-        for item in pass_.arguments if names is None else names:
-            if item in literals:
-                texts.append(literals[item])
-            elif item in types:
-                name = self.name(op.step, item)
-                texts.append(self.parameter(name, types[item], "value", step=op.step, item=item))
-            elif item in estimates:
-                name, buffer = self.name(op.step, item), self.estimates(op.step, written=False)
-                line = f"const float {name} = {buffer}[{estimates.index(item)}];"
-                if line not in self.setup:
-                    self.setup.append(line)
-                texts.append(name)
-            else:
-                texts.append(self.lines(op.step, item, written=False))
-        return texts
-
-
-def estimates_of(plan: Plan, step: str) -> tuple[str, ...]:
-    """The names of the numbers that a step estimates from the image, in their buffer's order."""
-    for launch in plan.launches:
-        if isinstance(launch, Finalize) and launch.op.step == step:
-            return launch.op.pass_.estimates
-    return ()
-
-
 def call(op: Op, arguments: Sequence[str]) -> str:
     """The call of a pass's function."""
     return f"{op.pass_.function}({', '.join(arguments)})"
@@ -165,7 +57,7 @@ def call(op: Op, arguments: Sequence[str]) -> str:
 
 def write_kernel(plan: Plan, launch: AnyLaunch, lanes: int) -> Kernel:
     """The OpenCL source of one launch of a plan, for a device with that many lanes."""
-    writer = _Writer(plan, lanes)
+    writer = Writer(plan)
     for number in ("width", "height", "pitch", "left", "top", "columns", "rows", "border"):
         writer.tile(number)
     seen: set[str] = set()
@@ -210,7 +102,7 @@ def kernels_of(ops: Sequence[Op | None]) -> list[str]:
     return [op.kernel for op in ops if op]
 
 
-def _prologue(writer: _Writer, read: Read) -> list[tuple[Op, list[str], list[str]]]:
+def _prologue(writer: Writer, read: Read) -> list[tuple[Op, list[str], list[str]]]:
     """Each pass redone at a tap, its arguments, and which of them are run-time values."""
     calls = []
     for op in read.prologue:
@@ -220,7 +112,7 @@ def _prologue(writer: _Writer, read: Read) -> list[tuple[Op, list[str], list[str
     return calls
 
 
-def _source_image(writer: _Writer, launch: Launch) -> str:
+def _source_image(writer: Writer, launch: Launch) -> str:
     """The type and the tap function of a stencil's ``src``, with the passes redone at each tap."""
     if not launch.stencil:
         return ""
@@ -245,7 +137,7 @@ def _source_image(writer: _Writer, launch: Launch) -> str:
     )
 
 
-def _load(writer: _Writer, launch: Launch) -> tuple[list[str], list[str], Kind]:
+def _load(writer: Writer, launch: Launch) -> tuple[list[str], list[str], Kind]:
     """What makes ``v0``, from the source, a stored image or the stencil; and its kind.
 
     The first lines come once a work item (for a stencil that gives its whole block), the others
@@ -262,6 +154,13 @@ def _load(writer: _Writer, launch: Launch) -> tuple[list[str], list[str], Kind]:
         f"image_at({', '.join(writer.planes(read))}, e, first, {'0' if block else 'row'})"
         for read in launch.reads
     ]
+    if launch.opener and not stencil:
+        op, larger = launch.opener, writer.larger()
+        planes = [f"image_origin({p}, {larger})" for p in writer.planes(launch.reads[0])]
+        made = call(
+            op, ["at", *planes, larger, *writer.taps(launch.level - 1), *writer.arguments(op)]
+        )
+        return [], [f"const {op.kind.c_type} v0 = {made};"], op.kind
     if not stencil:
         kind = launch.reads[0].image.kind
         return [], [f"const {kind.c_type} v0 = tap_{kind.c_name}({images[0]}, 0, 0);"], kind
@@ -280,7 +179,7 @@ def _load(writer: _Writer, launch: Launch) -> tuple[list[str], list[str], Kind]:
     return once, [f"const {kind.c_type} v0 = block[row * {block} + column];"], kind
 
 
-def _encode(writer: _Writer, value: str, kind: Kind, curves: Sequence[Op]) -> str:
+def _encode(writer: Writer, value: str, kind: Kind, curves: Sequence[Op]) -> str:
     """The line that writes eight-bit pixels, through one table where curves come last."""
     writer.parameter("dst", "__global uchar *restrict ", "encoded")
     if not curves:
@@ -290,11 +189,11 @@ def _encode(writer: _Writer, value: str, kind: Kind, curves: Sequence[Op]) -> st
     return f"encode_rgb_by_table({value}, table8, dst, at, e);"
 
 
-def _pixels(writer: _Writer, launch: Launch) -> str:
+def _pixels(writer: Writer, launch: Launch) -> str:
     """The body of a kernel over the image: load, the stages, store."""
     plan = writer.plan
     once, lines, kind = _load(writer, launch)
-    ops = list(launch.ops[1:] if launch.stencil else launch.ops)
+    ops = list(launch.ops[1:] if launch.opener else launch.ops)
     curves: list[Op] = []
     while launch.encodes and not launch.writes and ops and ops[-1].pass_.access is Access.CURVE:
         curves.insert(0, ops.pop())
@@ -372,7 +271,7 @@ def _store(writes: Sequence[str], rows: int) -> str:
     )
 
 
-def _lines(writer: _Writer, launch: Lines) -> str:
+def _lines(writer: Writer, launch: Lines) -> str:
     body = "    const uint i = (uint)get_global_id(0) * LANES;\n"
     body += "    const vu line = lane_indices(i);\n"
     for op in launch.ops:
@@ -383,7 +282,7 @@ def _lines(writer: _Writer, launch: Lines) -> str:
     return body
 
 
-def _count(writer: _Writer, launch: Histogram) -> str:
+def _count(writer: Writer, launch: Histogram) -> str:
     op, bins = launch.op, launch.op.pass_.bins
     plane = writer.planes(launch.reads[0])[0]
     counts = writer.parameter("counts", "__global uint *", "counts", number=bins)
@@ -401,7 +300,7 @@ def _count(writer: _Writer, launch: Histogram) -> str:
     )
 
 
-def _add_up(writer: _Writer, launch: Reduce) -> str:
+def _add_up(writer: Writer, launch: Reduce) -> str:
     tile = writer.tile("tile")
     if bins := launch.op.pass_.bins:
         writer.parameter("counts", "__global const uint *", "counts", number=bins)
@@ -412,7 +311,7 @@ def _add_up(writer: _Writer, launch: Reduce) -> str:
     return f"    add_up_blocks(sums, partials, {writer.tile('blocks')}, {tile});\n"
 
 
-def _find(writer: _Writer, launch: Finalize) -> str:
+def _find(writer: Writer, launch: Finalize) -> str:
     pass_ = launch.op.pass_
     if pass_.bins:
         whole = writer.parameter(

@@ -13,7 +13,7 @@ from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array
 from clpipe.engine.buffers import HostImages, Pool, room_for
 from clpipe.engine.calls import Bind, Call, index_space
-from clpipe.engine.codegen import Parameter, border_left, write_kernel
+from clpipe.engine.codegen import border_left, write_kernel
 from clpipe.engine.discovery import (
     DeviceInfo,
     choose,
@@ -24,7 +24,8 @@ from clpipe.engine.discovery import (
 )
 from clpipe.engine.plan import Plan
 from clpipe.engine.programs import forget_programs, programs_of
-from clpipe.engine.tiles import Extent, Tiling, tiling_of
+from clpipe.engine.tiles import Extent, Extents, Tiling, tiling_of
+from clpipe.engine.writer import Parameter
 
 log = logging.getLogger(__name__)
 FAILURES = 3  # images in a row that a device fails at, before it is given up
@@ -111,7 +112,7 @@ class Device:
 
     def is_ready(self, plan: Plan) -> bool:
         """Whether the kernels of a plan are compiled."""
-        return plan in self._calls
+        return plan.unscaled in self._calls
 
     def prepare(self, plan: Plan) -> list[Call]:
         """The compiled kernels of a plan, from the first call on without compiling.
@@ -119,10 +120,10 @@ class Device:
         Raises:
             DeviceError: a kernel does not compile; the message is the compiler's.
         """
-        if plan not in self._calls:
+        if plan.unscaled not in self._calls:
             kernels = [write_kernel(plan, launch, self.info.lanes) for launch in plan.launches]
-            self._calls[plan] = [Call(k, self._programs.kernel(k)) for k in kernels]
-        return self._calls[plan]
+            self._calls[plan.unscaled] = [Call(k, self._programs.kernel(k)) for k in kernels]
+        return self._calls[plan.unscaled]
 
     def run(
         self,
@@ -212,22 +213,25 @@ class Device:
             value = bind(parameter)
             return self._table(value) if isinstance(value, np.ndarray) else value
 
-        def launch(numbers: tuple[int, ...], extent: Extent, tile: int) -> None:
+        def launch(numbers: tuple[int, ...], extents: Extents, tile: int) -> None:
             for number in numbers:
                 call = calls[number]
-                call.set_arguments(self._pool, extent, tile, value_of)
+                extent = extents[call.kernel.launch.level]
+                if extent.is_empty:
+                    continue
+                call.set_arguments(self._pool, extents, tile, value_of)
                 sizes = index_space(call.kernel, extent)
                 event = self._cl.enqueue_nd_range_kernel(self._queue, call.compiled, *sizes)
                 events.append((call.kernel.launch.name, event))
 
         for phase in tiling.phases:
             launch(phase.first, tiling.tiles[0], 0)
-            for tile, extent in enumerate(tiling.tiles):
+            for tile, extents in enumerate(tiling.tiles):
                 if upload:
-                    events.append(("upload", self._upload(plan, extent, source)))
-                launch(phase.each, extent, tile)
+                    events.append(("upload", self._upload(plan, extents[0], source)))
+                launch(phase.each, extents, tile)
                 if download and phase is tiling.phases[-1]:
-                    events += [("download", e) for e in self._download(plan, extent, output)]
+                    events += [("download", e) for e in self._download(plan, extents, output)]
             launch(phase.last, tiling.tiles[0], 0)
         if download:
             events += [("download", e) for e in self._download_estimates(output)]
@@ -304,44 +308,49 @@ class Device:
             event.wait()  # or the event would hold the copy until the image is done
         return event
 
-    def _download(self, plan: Plan, extent: Extent, output: HostImages) -> Iterator[Any]:
+    def _download(self, plan: Plan, extents: Extents, output: HostImages) -> Iterator[Any]:
         """Copy the core of a tile into the whole images."""
-        core, stored, held = extent.core, extent.stored, self._pool.held
-        if output.encoded is not None:
-            channels = output.encoded.size // (extent.width * extent.height)
-            first = core.left - stored.left, core.top - stored.top
-            if core.width == extent.width:
-                rows = output.encoded[core.top : core.bottom]
-                start = first[1] * core.width * channels
-                yield self._cl.enqueue_copy(
-                    self._queue, rows, held["dst"], src_offset=start, is_blocking=False
-                )
-            else:
-                yield self._cl.enqueue_copy(
-                    self._queue,
-                    output.encoded,
-                    held["dst"],
-                    buffer_origin=(first[0] * channels, first[1], 0),
-                    host_origin=(core.left * channels, core.top, 0),
-                    region=(core.width * channels, core.height, 1),
-                    buffer_pitches=(stored.width * channels,),
-                    host_pitches=(extent.width * channels,),
-                )
-        if not output.images:
-            return
-        plane = np.empty(extent.plane_bytes // 4, np.float32)
-        height = extent.padded_height + 2 * plan.border
-        top = plan.border + core.top - stored.top
-        left = border_left(plan.border, extent.lanes) + core.left - stored.left
+        if output.encoded is not None and not extents[-1].core.is_empty:
+            yield self._download_encoded(extents[-1], output.encoded)
         for number, image in output.images.items():
+            extent = extents[plan.level_of(number)]
+            core, stored = extent.core, extent.stored
+            if core.is_empty:
+                continue
+            plane = np.empty(extent.plane_bytes // 4, np.float32)
+            height = extent.padded_height + 2 * plan.border
+            top = plan.border + core.top - stored.top
+            left = border_left(plan.border, extent.lanes) + core.left - stored.left
             whole = image.reshape(extent.height, extent.width, -1)
             part = whole[core.top : core.bottom, core.left : core.right]
             for channel, slot in enumerate(plan.slots[number]):
                 yield self._cl.enqueue_copy(
-                    self._queue, plane, held[f"slot{slot}"], is_blocking=True
+                    self._queue, plane, self._pool.held[f"slot{slot}"], is_blocking=True
                 )
                 rows = plane[: height * extent.pitch].reshape(height, extent.pitch)
                 part[..., channel] = rows[top : top + core.height, left : left + core.width]
+
+    def _download_encoded(self, extent: Extent, whole: Array) -> Any:
+        """Copy the core of a tile into the whole eight-bit image."""
+        core, stored, encoded = extent.core, extent.stored, self._pool.held["dst"]
+        channels = whole.size // (extent.width * extent.height)
+        left, top = core.left - stored.left, core.top - stored.top
+        if core.width == extent.width:
+            rows = whole[core.top : core.bottom]
+            start = top * core.width * channels
+            return self._cl.enqueue_copy(
+                self._queue, rows, encoded, src_offset=start, is_blocking=False
+            )
+        return self._cl.enqueue_copy(
+            self._queue,
+            whole,
+            encoded,
+            buffer_origin=(left * channels, top, 0),
+            host_origin=(core.left * channels, core.top, 0),
+            region=(core.width * channels, core.height, 1),
+            buffer_pitches=(stored.width * channels,),
+            host_pitches=(extent.width * channels,),
+        )
 
     def _download_estimates(self, output: HostImages) -> Iterator[Any]:
         """Copy the numbers that stages estimated from the image."""

@@ -4,6 +4,8 @@ Passes go into groups, and a group becomes one launch. A stencil opens a group, 
 around it must be stored first; pointwise passes join the group before them; sums and a kept image
 close it. Launches pass images of one to three planes to each other. A plane occupies a slot, a
 buffer on the device, from the launch that writes it to the last one that reads it.
+
+Images of one size are a level. The source is on level 0; each resampling leads to the next.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,6 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from clpipe.chain.chain import Chain, Step
+from clpipe.reference.resample import Resampling, sizes
 from clpipe.stage import Access, Argument, Kind, Literal, Pass
 
 
@@ -34,6 +37,7 @@ class Image:
 
     number: int
     kind: Kind
+    level: int = 0
 
 
 @dataclass(frozen=True)
@@ -49,8 +53,9 @@ class Launch:
     """One kernel call over the image.
 
     ``reads`` has the images of the stencil if the first op is one, else the one image that is
-    loaded; it is empty if the launch reads the source. ``writes`` is the image that is stored,
-    ``encodes`` whether eight-bit pixels are written, ``sums`` a SUMS pass over the result.
+    loaded or resampled; it is empty if the launch reads the source. ``writes`` is the image that is
+    stored, ``encodes`` whether eight-bit pixels are written, ``sums`` a SUMS pass over the result.
+    ``level`` is that of the result.
     """
 
     name: str
@@ -61,19 +66,28 @@ class Launch:
     sums: Op | None = None
     rows: int = 2  # of a work item's block
     columns: int = 1  # of it, in vectors
+    level: int = 0
+
+    @property
+    def opener(self) -> Op | None:
+        """The op that opens the group and reads images by itself, if one does."""
+        opens = self.ops and self.ops[0].pass_.access in (Access.STENCIL, Access.RESAMPLE)
+        return self.ops[0] if opens else None
 
     @property
     def stencil(self) -> Op | None:
-        """The stencil that opens the group, if one does."""
-        return self.ops[0] if self.ops and self.ops[0].pass_.access is Access.STENCIL else None
+        """The opener, if it is a stencil."""
+        op = self.opener
+        return op if op and op.pass_.access is Access.STENCIL else None
 
 
 @dataclass(frozen=True)
 class Lines:
-    """One launch that fills the line tables of all steps that have one."""
+    """One launch that fills the line tables of all steps on a level that have one."""
 
     ops: tuple[Op, ...]
     name: str = "lines"
+    level: int = 0
 
 
 @dataclass(frozen=True)
@@ -83,6 +97,7 @@ class Histogram:
     op: Op
     reads: tuple[Read]
     name: str
+    level: int = 0
 
 
 @dataclass(frozen=True)
@@ -91,6 +106,7 @@ class Reduce:
 
     op: Op
     name: str
+    level: int = 0
 
 
 @dataclass(frozen=True)
@@ -99,9 +115,18 @@ class Finalize:
 
     op: Op
     name: str
+    level: int = 0
 
 
 AnyLaunch = Launch | Lines | Histogram | Reduce | Finalize
+
+
+def unscaled(launch: AnyLaunch) -> AnyLaunch:
+    """A launch without the scale of the resampling that opens it, if one does."""
+    if not isinstance(launch, Launch) or not launch.opener:
+        return launch
+    op = replace(launch.opener, pass_=replace(launch.opener.pass_, resampling=None))
+    return replace(launch, ops=(op, *launch.ops[1:]))
 
 
 def reads_of(launch: AnyLaunch) -> tuple[Read, ...]:
@@ -122,6 +147,7 @@ class Plan:
     final: Image | None = None  # the last image as float planes
     encoded: Kind | None = None  # the kind that is encoded to eight bits
     border: int = 0
+    resamplings: tuple[Resampling, ...] = ()  # from each level to the next
 
     def __hash__(self) -> int:
         return self._hash
@@ -131,12 +157,31 @@ class Plan:
         # A plan is looked up for each image, and hashing all that is in it takes a while.
         return hash((self.source, self.half, self.launches, self.kept, self.final, self.encoded))
 
-    def bytes_per_pixel(self, lanes: int) -> float:
-        """Bytes of device memory per pixel: source, slots, block sums and eight-bit result."""
-        source = len(self.source.channels) * (2 if self.half else 4)
-        sums = [x for x in self.launches if isinstance(x, Launch) and x.sums]
-        encoded = len(self.encoded.channels) if self.encoded else 0
-        return source + 4 * self.slot_count + sum(16 / (lanes * x.rows) for x in sums) + encoded
+    @cached_property
+    def unscaled(self) -> "Plan":
+        """What plans have in common that differ in the scales of resamplings alone: the kernels."""
+        if not self.resamplings:
+            return self
+        launches = tuple(unscaled(launch) for launch in self.launches)
+        return replace(self, launches=launches, resamplings=())
+
+    def sizes(self, width: int, height: int) -> tuple[tuple[int, int], ...]:
+        """The width and height of images on each level, from those of the source."""
+        return sizes(self.resamplings, width, height)
+
+    def level_of(self, number: int) -> int:
+        """The level of an image that is a result, by its number."""
+        results = [image for _, image in self.kept] + ([self.final] if self.final else [])
+        return next(image.level for image in results if image.number == number)
+
+    @cached_property
+    def levels_of_slots(self) -> tuple[frozenset[int], ...]:
+        """For each slot, the levels of the images whose planes occupy it."""
+        images = [x.writes for x in self.launches if isinstance(x, Launch) and x.writes]
+        return tuple(
+            frozenset(image.level for image in images if slot in self.slots[image.number])
+            for slot in range(self.slot_count)
+        )
 
 
 class _Planner:
@@ -144,7 +189,8 @@ class _Planner:
         self.kind = source
         self.fold = fold
         self.launches: list[AnyLaunch] = []
-        self.lines: list[Op] = []
+        self.lines: dict[int, list[Op]] = {}  # by level
+        self.resamplings: list[Resampling] = []
         self.images: list[Image] = []
         self.group: Launch | None = Launch("load", ())  # open, still to be stored
         self.stored: Image | None = None  # the current image, when no group is open
@@ -152,6 +198,15 @@ class _Planner:
         # only keeping has stored, in the midst of a group.
         self.folded: Read | None = None
         self.split: Image | None = None
+
+    @property
+    def level(self) -> int:
+        return len(self.resamplings)
+
+    def new_image(self) -> Image:
+        image = Image(len(self.images), self.kind, self.level)
+        self.images.append(image)
+        return image
 
     def close(self, sums: Op | None = None) -> Image:
         """End the open group and store its result. Without an open group the image is stored."""
@@ -167,8 +222,7 @@ class _Planner:
             image = self.group.reads[0].image  # nothing new to store
             self.emit(replace(self.group, sums=sums))
         else:
-            image = Image(len(self.images), self.kind)
-            self.images.append(image)
+            image = self.new_image()
             self.emit(replace(self.group, writes=image, sums=sums))
         self.group, self.stored = None, image
         return image
@@ -178,12 +232,17 @@ class _Planner:
         block = group.stencil.pass_.block if group.stencil else 0
         shared = block or group.sums or any(op.pass_.random for op in group.ops)
         name = names[0] if len(names) == 1 else f"{names[0]}..{names[-1]}" if names else group.name
-        if group.stencil and group.stencil.pass_.function != group.stencil.step:
-            name = name.replace(
-                group.stencil.step, f"{group.stencil.step}.{group.stencil.pass_.function}", 1
+        if (op := group.opener) and op.pass_.function != op.step:
+            name = name.replace(op.step, f"{op.step}.{op.pass_.function}", 1)
+        self.launches.append(
+            replace(
+                group,
+                name=name,
+                rows=4 if shared else 2,
+                columns=max(block, 1),
+                level=self.level,
             )
-        rows = 4 if shared else 2
-        self.launches.append(replace(group, name=name, rows=rows, columns=max(block, 1)))
+        )
 
     def keep(self) -> Image:
         """Store the current image because it is wanted.
@@ -200,7 +259,7 @@ class _Planner:
     def foldable(self) -> Read | None:
         """The current image as cheap pointwise passes on a stored one, if it is that."""
         group = self.group
-        if not (self.fold and group and group.reads) or group.stencil:
+        if not (self.fold and group and group.reads) or group.opener:
             return self.folded
         cheap = all(op.pass_.cheap for op in group.ops)
         read = Read(group.reads[0].image, group.ops)
@@ -224,25 +283,30 @@ class _Planner:
             pass_ = op.pass_
             match pass_.access:
                 case Access.LINES:
-                    self.lines.append(op)
+                    self.lines.setdefault(self.level, []).append(op)
                     continue
                 case Access.SUMS:
                     self.close(sums=op)
                     self.split = None
-                    self.launches.append(Reduce(op, f"{op.step}.add_up"))
-                    self.launches.append(Finalize(op, f"{op.step}.{pass_.finish}"))
+                    self.launches.append(Reduce(op, f"{op.step}.add_up", self.level))
+                    self.launches.append(Finalize(op, f"{op.step}.{pass_.finish}", self.level))
                     continue
                 case Access.HISTOGRAM:
                     stored = Read(self.close())
                     self.split = None
-                    self.launches.append(Histogram(op, (stored,), f"{op.step}.count"))
-                    self.launches.append(Reduce(op, f"{op.step}.add_up"))
-                    self.launches.append(Finalize(op, f"{op.step}.{pass_.finish}"))
+                    count = Histogram(op, (stored,), f"{op.step}.count", self.level)
+                    self.launches.append(count)
+                    self.launches.append(Reduce(op, f"{op.step}.add_up", self.level))
+                    self.launches.append(Finalize(op, f"{op.step}.{pass_.finish}", self.level))
                     continue
                 case Access.STENCIL:
                     if written not in local:
                         local[written] = Read(self.close())
                     self.group = Launch("", (op,), tuple(local[name] for name in pass_.reads))
+                case Access.RESAMPLE:
+                    assert pass_.resampling
+                    self.group = Launch("", (op,), (Read(self.close()),))
+                    self.resamplings.append(pass_.resampling)
                 case Access.POINTWISE | Access.CURVE:
                     if self.group is None:
                         assert self.stored is not None
@@ -312,14 +376,12 @@ def make_plan(
     group = planner.group or Launch("encode", (), (Read(planner.close()),))
     final_image = None
     if final:
-        final_image = Image(len(planner.images), planner.kind)
-        planner.images.append(final_image)
+        final_image = planner.new_image()
         if last in keep:
             kept[last] = final_image
     planner.emit(replace(group, writes=final_image, encodes=encode))
     launches = list(planner.launches)
-    if planner.lines:
-        launches.insert(0, Lines(tuple(planner.lines)))
+    launches[:0] = [Lines(tuple(ops), level=level) for level, ops in planner.lines.items()]
     pinned = {image.number for image in kept.values()}
     if final_image:
         pinned.add(final_image.number)
@@ -335,6 +397,7 @@ def make_plan(
         final=final_image,
         encoded=chain.result if encode else None,
         border=max(radii, default=0),
+        resamplings=tuple(planner.resamplings),
     )
 
 
@@ -369,21 +432,3 @@ def assign_slots(
             if last_use[read] == i and read not in pinned:
                 free.extend(slots[read])
     return slots, count
-
-
-def launch_bytes(plan: Plan, launch: AnyLaunch, lanes: int) -> float:
-    """Bytes per pixel that a launch reads and writes in device memory, each sample once."""
-    if isinstance(launch, Reduce) and launch.op.pass_.access is Access.SUMS:
-        return 16 / (lanes * 4)
-    total = float(sum(4 * len(read.image.kind.channels) for read in reads_of(launch)))
-    if not isinstance(launch, Launch):
-        return total
-    if not launch.reads:
-        total += len(plan.source.channels) * (2 if plan.half else 4)
-    if launch.writes:
-        total += 4 * len(launch.writes.kind.channels)
-    if launch.encodes and plan.encoded:
-        total += len(plan.encoded.channels)
-    if launch.sums:
-        total += 16 / (lanes * launch.rows)
-    return total

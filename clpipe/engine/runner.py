@@ -10,10 +10,10 @@ from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.registry import user_code_errors
-from clpipe.engine.codegen import Parameter
 from clpipe.engine.device import Device, Timing
 from clpipe.engine.plan import Finalize, Plan, make_plan, ops_of
 from clpipe.engine.programs import announced
+from clpipe.engine.writer import Parameter
 from clpipe.reference.curve import compose, to_8_bit
 from clpipe.reference.random import Stream, stream_of
 from clpipe.stage import Frame, NoiseScope
@@ -111,6 +111,8 @@ class Runner:
             structure = (half, fold, chain.source, chain.result, ops)
             plan = self._plans.get(structure)
             if plan is None:
+                if len(self._plans) >= 64:
+                    self._plans.clear()
                 plan = make_plan(chain, half, self.keep, self.encode, self.final, fold)
                 self._plans[structure] = plan
             self._own_plans[key] = plan
@@ -176,7 +178,8 @@ class Runner:
             return Result(None, None, {}, {})
         if not self.device:
             return self._run_numpy(np.asarray(image, np.float32), noise_key)
-        plan = self.plan(image.dtype == np.float16, fold=min(image.shape[:2]) > 1)
+        smallest = min(self.chain.size(*image.shape[1::-1]))
+        plan = self.plan(image.dtype == np.float16, fold=smallest > 1)
         try:
             self._make_ready(plan)
         except DeviceFailedError:
@@ -197,8 +200,13 @@ class Runner:
         """Put an image through a plan on the device; arguments as for :meth:`run`."""
         assert self.device
         keys: dict[str, dict[NoiseScope, Stream]] = {}
+        sizes = plan.sizes(*image.shape[1::-1])
 
         def bind(parameter: Parameter) -> Any:
+            if parameter.role == "taps":
+                resampling, size = plan.resamplings[parameter.number], sizes[parameter.number]
+                value = getattr(resampling.taps(resampling.along(*size)), parameter.item)
+                return np.uint32(value) if isinstance(value, int) else value
             if parameter.role == "table8":
                 return self._composed(parameter.item)
             if parameter.role == "value":

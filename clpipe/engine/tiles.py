@@ -3,6 +3,9 @@
 A tile is a core, the part of the result that it makes, with a halo around it for stencils to read.
 Cores begin with whole blocks of lanes and of four rows, so a pixel has the same place in its work
 item as in the whole image: its noise, its CFA phase and its arithmetic are the same, bit for bit.
+
+A tile has an extent on each level of the plan. Its cores cover the images of each level once; what
+it stores of a level is enough for its core there and for what it stores of the next level.
 """
 
 import math
@@ -52,6 +55,11 @@ class Box:
         """How many rows."""
         return self.bottom - self.top
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether it has no pixels."""
+        return self.width <= 0 or self.height <= 0
+
 
 @dataclass(frozen=True)
 class Extent:
@@ -76,6 +84,11 @@ class Extent:
         pitch = self.padded_width + 2 * border_left(self.border, self.lanes)
         # Rows a multiple of 4 KiB apart would fall into the same cache sets.
         return pitch + self.lanes * (pitch % 1024 == 0)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing is stored, because nothing is needed."""
+        return self.stored.is_empty
 
     @property
     def padded_width(self) -> int:
@@ -116,22 +129,34 @@ class Extent:
         return {name: np.uint32(value) for name, value in numbers.items()}
 
 
-def buffer_sizes(plan: Plan, extent: Extent) -> dict[str, int]:
+# An image or a tile on each level of a plan.
+Extents = tuple[Extent, ...]
+
+
+def whole_image(plan: Plan, width: int, height: int, lanes: int) -> Extents:
+    """An image in one piece, from the width and height of the source."""
+    return tuple(Extent.whole(*size, lanes, plan.border) for size in plan.sizes(width, height))
+
+
+def buffer_sizes(plan: Plan, extents: Extents) -> dict[str, int]:
     """The device buffers that a plan needs for an image or a tile: bytes by name."""
-    pixels = extent.padded_height * extent.stored.width
-    source = pixels * len(plan.source.channels) + 3 * extent.lanes
+    first, last = extents[0], extents[-1]
+    pixels = first.padded_height * first.stored.width
+    source = pixels * len(plan.source.channels) + 3 * first.lanes
     sizes = {"src": source * (2 if plan.half else 4)}
-    sizes |= {f"slot{number}": extent.plane_bytes for number in range(plan.slot_count)}
+    for number, levels in enumerate(plan.levels_of_slots):
+        sizes[f"slot{number}"] = max(extents[level].plane_bytes for level in levels)
     if plan.encoded:
-        sizes["dst"] = extent.stored.width * extent.stored.height * len(plan.encoded.channels)
+        sizes["dst"] = last.stored.width * last.stored.height * len(plan.encoded.channels)
     # Line tables are the image's: whole blocks of rows, and the last vector.
-    longest = round_up(max(extent.width, extent.height), max(extent.lanes, 4)) + 2 * extent.lanes
+    longest = round_up(max(first.width, first.height), max(first.lanes, 4)) + 2 * first.lanes
     for launch in plan.launches:
         match launch:
             case Lines(ops=ops):
                 sizes |= {f"lines.{op.step}": longest * 4 for op in ops}
-            case Launch(sums=sums) if sums:
-                sizes |= {"sums": extent.blocks * 16, "partials": PARTIALS * 32}
+            case Launch(sums=sums, level=level) if sums:
+                blocks = max(extents[level].blocks * 16, sizes.get("sums", 0))
+                sizes |= {"sums": blocks, "partials": PARTIALS * 32}
             case Histogram(op=op):
                 bins = op.pass_.bins
                 sizes["counts"] = max(sizes.get("counts", 0), PARTIALS * bins * 4)
@@ -154,7 +179,7 @@ class Phase:
 class Tiling:
     """How an image goes through a plan: its tiles, in which phases, and the bytes it takes."""
 
-    tiles: tuple[Extent, ...]
+    tiles: tuple[Extents, ...]
     phases: tuple[Phase, ...]
     sizes: dict[str, int]
 
@@ -208,20 +233,100 @@ def leading_to(plan: Plan, ends: set[int]) -> tuple[int, ...]:
     return tuple(reversed(chosen))
 
 
-def halo_of(plan: Plan) -> int:
-    """How many pixels around each the source is read, through all stencils in a row."""
+def halos_of(plan: Plan) -> tuple[int, ...]:
+    """How many pixels around each the first image of each level is read, through all stencils in a
+    row.
+    """
     reach: dict[int, int] = {}  # around each image that is stored
-    source = 0
+    halos = [0] * (len(plan.resamplings) + 1)
     for launch in reversed(plan.launches):
+        own = 0
         if isinstance(launch, Launch):
             own = reach.get(launch.writes.number, 0) if launch.writes else 0
             own += launch.stencil.pass_.radius if launch.stencil else 0
-            source = source if launch.reads else max(source, own)
-        else:
-            own = 0
+            if not launch.reads or launch.reads[0].image.level < launch.level:
+                halos[launch.level] = max(halos[launch.level], own)
+                own = 0
         for read in reads_of(launch):
             reach[read.image.number] = max(reach.get(read.image.number, 0), own)
-    return source
+    return tuple(halos)
+
+
+class _Cutter:
+    """Cuts an image into tiles whose cores begin at multiples of ``across`` and of 4."""
+
+    def __init__(self, plan: Plan, width: int, height: int, lanes: int) -> None:
+        self.whole = whole_image(plan, width, height, lanes)
+        columns = (x.columns for x in plan.launches if isinstance(x, Launch))
+        self.across = lanes * math.lcm(2, *columns)
+        self._halos = halos_of(plan)
+        self._resamplings = plan.resamplings
+
+    def spans(self, axis: str, begin: int, end: int) -> list[tuple[int, ...]]:
+        """The rows or columns of a tile on each level: of its core, and of what is stored.
+
+        Args:
+            axis: "rows" or "columns".
+            begin: the first of the core on level 0.
+            end: behind the last of it.
+        """
+        step = self.across if axis == "columns" else 4
+        sizes = [e.width if axis == "columns" else e.height for e in self.whole]
+        spans: list[tuple[int, ...]] = []
+        low = high = 0  # what the next level needs of this one
+        for level in reversed(range(len(sizes))):
+            size, halo = sizes[level], self._halos[level]
+            # Rounded up, so that the first tile has a core on every level.
+            core = [
+                min(round_up(-(-place * size // sizes[0]), step), size) for place in (begin, end)
+            ]
+            if core[0] < core[1]:
+                low, high = (min(low, core[0]), max(high, core[1])) if low < high else core
+            if low < high:
+                low, high = max(low - halo, 0), min(high + halo, size)
+            spans.append((*core, low // step * step, high))
+            if level and low < high and self._resamplings[level - 1].axis == axis:
+                low, high = self._resamplings[level - 1].needed(sizes[level - 1], low, high)
+        return spans[::-1]
+
+    def tile(self, left: int, top: int, columns: int, rows: int) -> Extents:
+        """The tile whose core begins there on level 0, and is of that size inside the image."""
+        width, height = self.whole[0].width, self.whole[0].height
+        across = self.spans("columns", left, min(left + columns, width))
+        down = self.spans("rows", top, min(top + rows, height))
+        return tuple(
+            replace(
+                extent,
+                core=Box(x[0], y[0], x[1], y[1]),
+                stored=Box(x[2], y[2], x[3], y[3]),
+            )
+            for extent, x, y in zip(self.whole, across, down, strict=True)
+        )
+
+    def amid(self, columns: int, rows: int) -> Extents:
+        """A tile of that size, on each level as large as one of that size can be."""
+        wide, high = self._longest("columns", columns), self._longest("rows", rows)
+        boxes = [Box(0, 0, x, y) for x, y in zip(wide, high, strict=True)]
+        pairs = zip(self.whole, boxes, strict=True)
+        return tuple(replace(extent, core=box, stored=box) for extent, box in pairs)
+
+    def _longest(self, axis: str, core: int) -> list[int]:
+        """The most that a tile can store on each level, of rows or columns."""
+        step = self.across if axis == "columns" else 4
+        sizes = [e.width if axis == "columns" else e.height for e in self.whole]
+        found = []
+        low = high = 0  # what is needed before and behind the place of the core of level 0
+        for level in reversed(range(len(sizes))):
+            size, halo = sizes[level], self._halos[level]
+            rounding = step if level else 0
+            low, high = low + halo, max(high, rounding) + halo
+            length = -(-core * size // sizes[0]) + round_up(low, step) + rounding + high
+            found.append(min(length, round_up(size, step)))
+            if level and self._resamplings[level - 1].axis == axis:
+                before = sizes[level - 1]
+                taps = self._resamplings[level - 1].taps(before).count + 1
+                low, high = (-(-each * before // size) + taps for each in (low, high))
+        return found[::-1]
 
 
 @lru_cache(maxsize=64)
@@ -241,35 +346,17 @@ def tiling_of(plan: Plan, width: int, height: int, lanes: int, memory: int, larg
     Raises:
         ImageError: not even the smallest tile fits; the message says what it needs.
     """
-    whole = Extent.whole(width, height, lanes, plan.border)
+    cut = _Cutter(plan, width, height, lanes)
+    whole, across = cut.whole, cut.across
 
-    def fits(extent: Extent, memory: int) -> bool:
-        sizes = buffer_sizes(plan, extent).values()
+    def fits(extents: Extents, memory: int) -> bool:
+        sizes = buffer_sizes(plan, extents).values()
         return sum(sizes) <= memory and max(sizes) <= largest
 
     if fits(whole, memory):
         every = tuple(range(len(plan.launches)))
         return Tiling((whole,), (Phase((), every, ()),), buffer_sizes(plan, whole))
-    across = lanes * math.lcm(2, *(x.columns for x in plan.launches if isinstance(x, Launch)))
-    halo = halo_of(plan)
     of_tile = min(memory, LARGEST_TILE)
-
-    def tile(left: int, top: int, columns: int, rows: int) -> Extent:
-        core = Box(left, top, min(left + columns, width), min(top + rows, height))
-        stored = Box(
-            max(left - round_up(halo, across), 0),
-            max(top - round_up(halo, 4), 0),
-            min(core.right + halo, width),
-            min(core.bottom + halo, height),
-        )
-        return replace(whole, core=core, stored=stored)
-
-    def amid(columns: int, rows: int) -> Extent:
-        """A tile of that size with the most halo that one can have."""
-        wide, high = columns + round_up(halo, across) + halo, rows + round_up(halo, 4) + halo
-        box = Box(0, 0, min(wide, round_up(width, across)), min(high, round_up(height, 4)))
-        return replace(whole, core=box, stored=box)
-
     best: tuple[float, int, int] | None = None
     for columns in dict.fromkeys(
         round_up(-(-width // parts), across) for parts in divisions(-(-width // across))
@@ -277,17 +364,17 @@ def tiling_of(plan: Plan, width: int, height: int, lanes: int, memory: int, larg
         blocks = bisect_left(
             range(1, -(-height // 4) + 1),
             True,
-            key=lambda n: not fits(amid(columns, 4 * n), of_tile),
+            key=lambda n: not fits(cut.amid(columns, 4 * n), of_tile),
         )
         if blocks:
             parts = -(-height // (4 * blocks))
             rows = round_up(-(-height // parts), 4)
-            extent = amid(columns, rows).stored
+            extent = cut.amid(columns, rows)[0].stored
             cost = extent.width * extent.height / (columns * rows)
             if best is None or cost < best[0] / 1.02:
                 best = cost, columns, rows
     if best is None:
-        least = amid(across, 4)
+        least = cut.amid(across, 4)
         needs = buffer_sizes(plan, least)
         raise ImageError(
             f"{width}x{height} pixels need {in_words(sum(buffer_sizes(plan, whole).values()))} of "
@@ -297,11 +384,11 @@ def tiling_of(plan: Plan, width: int, height: int, lanes: int, memory: int, larg
         )
     _, columns, rows = best
     tiles = tuple(
-        tile(left, top, columns, rows)
+        cut.tile(left, top, columns, rows)
         for top in range(0, height, rows)
         for left in range(0, width, columns)
     )
-    return Tiling(tiles, phases_of(plan), buffer_sizes(plan, amid(columns, rows)))
+    return Tiling(tiles, phases_of(plan), buffer_sizes(plan, cut.amid(columns, rows)))
 
 
 def divisions(most: int) -> Iterator[int]:

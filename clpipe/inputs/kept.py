@@ -16,11 +16,13 @@ from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings, settings_from
+from clpipe.chain.truth import CLEAN, adds_noise
 from clpipe.images.attributes import read_attributes
 from clpipe.images.read import SourceImage
 from clpipe.inputs.plausibility import input_warnings
 
-NOISE = "sensor_noise"  # the attribute of an image without sensor noise; its value is "none"
+# The attribute of an image without sensor noise: "none", or "clean" where it is of --truth clean.
+NOISE = "sensor_noise"
 
 
 def attributes_of(step: Step, chain: Chain, key: str, frame: int | None = None) -> dict[str, str]:
@@ -41,7 +43,7 @@ def attributes_of(step: Step, chain: Chain, key: str, frame: int | None = None) 
         "kind": step.stage.writes.label,
         "image_key": of_frame(key, frame),
         "settings": json.dumps(settings.record()),
-        **({} if is_noisy else {NOISE: "none"}),
+        **({} if is_noisy else {NOISE: CLEAN if step.context.clean else "none"}),
     }
 
 
@@ -134,7 +136,10 @@ class KeptLoader:
             chain = self._chain(request, carried_settings(attributes, self.folder))
         except RequestError as error:
             raise ImageError(f"{path}: what it was made with cannot be used: {error}") from None
-        return _without_input_noise(chain) if attributes.get(NOISE) == "none" else chain
+        noise = attributes.get(NOISE)
+        if noise == CLEAN and not any(map(adds_noise, chain.steps)):
+            return chain.cleaned()
+        return _without_input_noise(chain) if noise in ("none", CLEAN) else chain
 
     @staticmethod
     def _chain(request: Request, carried: Settings | None) -> Chain:
@@ -166,7 +171,11 @@ def kind_message(error: KindError, chain: Chain, start_at: str | None) -> str:
 def _entries_of(kind: str, chain: Chain) -> str:
     """Where an image of a kind can enter a chain, in words."""
     stages = {name: all_stages()[base_name(name)] for name in chain.names}
-    names = [name for name, stage in stages.items() if stage.reads.label == kind]
+    names = [
+        name
+        for name, stage in stages.items()
+        if kind in [each.label for each in (stage.reads, *stage.also)]
+    ]
     if not names:
         return f"no stage of the chain reads {kind}"
     return f"{kind} can enter with --start-at {' or '.join(names)}"

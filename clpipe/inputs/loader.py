@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.errors import KindError, NoPictureError
+from clpipe.base.errors import KindError, NoPictureError, RequestError
 from clpipe.base.reading import unchanged
 from clpipe.chain.chain import Chain, entry
 from clpipe.chain.identity import image_key
@@ -77,7 +77,11 @@ class ImageLoader:
         start_at = self.request.start_at
         if start_at is None:
             return entry(self.settings)
-        return stage_named("--start-at", base_name(start_at)).reads
+        stage = stage_named("--start-at", base_name(start_at))
+        try:
+            return self.chain.source if stage.also else stage.reads
+        except RequestError:  # the stage is in the chain that a kept image carries
+            return stage.reads
 
     @property
     def kept(self) -> KeptLoader | None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import sha256_of
-from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_cameras, load_camera
+from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_name, load_camera
 from clpipe.chain.chain import Chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.request import Request
@@ -248,9 +248,8 @@ def camera_named(make: str, model: str) -> Camera | None:
     >>> camera_named("SONY", "ILCE-7RM2").name, camera_named("Canon", "EOS-1") is None
     ('sony-a7r2', True)
     """
-    cameras = map(load_camera, built_in_cameras())
-    names = (make.casefold(), model.casefold())
-    return next((c for c in cameras if (c.make.casefold(), c.model.casefold()) == names), None)
+    name = built_in_name(f"{make} {model}")
+    return load_camera(name) if name else None
 
 
 def tags_of(facts: RawFacts, chain: Chain) -> Tags:

@@ -6,16 +6,23 @@ from functools import lru_cache
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.identity import noise_key
 from clpipe.chain.truth import (
+    CLEAN,
     DEVELOPMENT,
     MOSAIC,
     TRUTHS,
     VARIANCE,
     noisy_mosaic,
+    picture_without_noise,
     signal_and_noise,
 )
 
 # What is put behind the image's name for each truth.
-SUFFIXES = {DEVELOPMENT: ".truth", MOSAIC: ".truth_mosaic", VARIANCE: ".truth_variance"}
+SUFFIXES = {
+    DEVELOPMENT: ".truth",
+    CLEAN: ".truth_clean",
+    MOSAIC: ".truth_mosaic",
+    VARIANCE: ".truth_variance",
+}
 
 # Mosaics in float, whatever the format of pictures is.
 FLOAT_MOSAICS = (SUFFIXES[MOSAIC], SUFFIXES[VARIANCE])
@@ -120,5 +127,6 @@ def truth_of(truth: str, chain: Chain) -> Rendition:
     if truth == VARIANCE:
         signal, noise = signal_and_noise(chain)
         return Rendition(SUFFIXES[truth], signal, "", noise=noise)
-    noisy = noisy_mosaic(chain) if truth == MOSAIC else chain
-    return Rendition(SUFFIXES[truth], noisy.without_noise(), "")
+    if truth == MOSAIC:
+        return Rendition(SUFFIXES[truth], noisy_mosaic(chain).without_noise(), "")
+    return Rendition(SUFFIXES[truth], picture_without_noise(truth, chain), "")

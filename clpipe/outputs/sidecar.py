@@ -132,6 +132,7 @@ def sidecar(
     facts = source.facts if isinstance(source, RawImage) else None
     noise = chain.noise if not facts or chain.is_noisy else None
     size, modified = stamp
+    width, height = chain.size(*source.pixels.shape[1::-1])
     return {
         OWN: __version__,
         "input": job.input,
@@ -145,8 +146,8 @@ def sidecar(
         "image_key": rendition.key,
         "noise_key": rendition.noise_key,
         "seed": chain.seed,
-        "width": source.pixels.shape[1],
-        "height": source.pixels.shape[0],
+        "width": width,
+        "height": height,
         "camera": chain.camera.name,
         "iso": chain.iso,
         "output": chain.settings.output.filled(source.shot).model_dump(),

@@ -12,7 +12,7 @@ from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
 from clpipe.chain.formats import DNG, FORMATS, Format, ending_of
 from clpipe.chain.request import Request
-from clpipe.chain.truth import DEVELOPMENT, variance_of
+from clpipe.chain.truth import PICTURES, variance_of
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.dng import write_dng
@@ -24,7 +24,7 @@ from clpipe.inputs.kept import attributes_of
 from clpipe.outputs.existing import Existing
 from clpipe.outputs.folder import RESUMABLE, write_problem
 from clpipe.outputs.negative import negative_of
-from clpipe.outputs.renditions import FLOAT_MOSAICS, SUFFIXES, Rendition, RenditionPlan
+from clpipe.outputs.renditions import FLOAT_MOSAICS, Rendition, RenditionPlan, truth_named
 from clpipe.outputs.results import results_of
 from clpipe.outputs.sidecar import SIDECAR
 from clpipe.reference.curve import to_16_bit
@@ -72,7 +72,7 @@ class OutputWriter:
         """The steps whose image is written beside a rendition, by its name, where it has them."""
         if name in FLOAT_MOSAICS:
             return ()
-        if name == SUFFIXES[DEVELOPMENT] and self.request.truth_keep is not None:
+        if truth_named(name) in PICTURES and self.request.truth_keep is not None:
             return self.request.truth_keep
         return self.request.keep
 
@@ -147,13 +147,14 @@ class OutputWriter:
         """The file of a job with an ending; ``name`` is that of the rendition."""
         return self.folder / f"{job.stem}{name}.{ending}"
 
-    def check_size(self, source: SourceImage) -> None:
-        """See that an image fits into the formats.
+    def check_size(self, source: SourceImage, chain: Chain) -> None:
+        """See that what a chain makes of an image fits into the formats.
 
         Raises:
             ImageError: it is too large for one.
         """
-        if "jpg" in self.formats and max(source.pixels.shape[:2]) > JPEG_MAX_SIDE:
+        size = chain.size(*source.pixels.shape[1::-1])
+        if "jpg" in self.formats and max(size) > JPEG_MAX_SIDE:
             raise ImageError(f"JPEG holds at most {JPEG_MAX_SIDE} pixels a side; use --format png")
 
     def existing(self, job: Job, name: str) -> Existing:

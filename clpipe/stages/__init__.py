@@ -28,6 +28,7 @@ DEFAULT_CHAIN = (
     "demosaic",
     "denoise",
     "color_matrix",
+    "sharpen",
     "tone_curve",
     "gamma",
     "picture_noise",

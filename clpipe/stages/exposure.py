@@ -1,6 +1,7 @@
 """Exposure compensation."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -10,28 +11,47 @@ from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, pa
 
 
 class Gain(Method):
-    """Linear light times 2^ev.
+    """Linear light times 2^(ev - headroom).
+
+    A camera exposes so that a white surface lies well below what its sensor can hold, and its tone
+    curve brings it back; highlights above 1.0 then roll off where they would be cut.
 
     >>> from clpipe.stage import run_reference
     >>> run_reference(Gain(ev=-1.0), np.float32([[[0.5, 1, 4]]])).tolist()
-    [[[0.25, 0.5, 2.0]]]
+    [[[0.125, 0.25, 1.0]]]
     """
 
     method: ClassVar = "gain"
     kernel: ClassVar = "exposure"
-    summary: ClassVar = "multiply linear light by 2^ev"
+    summary: ClassVar = "multiply linear light by 2^(ev - headroom)"
     example: ClassVar = {"ev": 0.7}
 
     ev: float = parameter(0.0, "Exposure compensation; +1 doubles the light.", "EV", ge=-20, le=20)
+    headroom: float = parameter(
+        1.0,
+        "How far the sensor's white lies above a render's 1.0, for highlights; "
+        "the tone curve filmic gives one stop of it back, linear all.",
+        "EV",
+        ge=0,
+        le=10,
+    )
+
+    def after(self, context: Context) -> Context:
+        return replace(context, headroom=context.headroom + self.headroom)
+
+    @property
+    def gain(self) -> np.float32:
+        """The factor."""
+        return np.float32(2.0 ** (self.ev - self.headroom))
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("exposure", arguments=("gain",)),)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
-        return {"gain": np.float32(2.0**self.ev)}
+        return {"gain": self.gain}
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        return image * np.float32(2.0**self.ev)
+        return image * self.gain
 
 
 STAGE = Stage("exposure", "Brighten or darken the scene.", Kind.RGB, Kind.RGB, (Gain,))

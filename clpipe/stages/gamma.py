@@ -40,4 +40,4 @@ class Srgb(Curve):
         return SRGB_TABLE
 
 
-STAGE = Stage("gamma", "Encode for a display.", Kind.RGB, Kind.DISPLAY, (Power, Srgb))
+STAGE = Stage("gamma", "Encode for a display.", Kind.RGB, Kind.DISPLAY, (Srgb, Power))

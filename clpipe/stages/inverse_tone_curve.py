@@ -1,5 +1,6 @@
 """Inverse tone curve: from a photograph's contrast back to that of the scene."""
 
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import ClassVar
 
@@ -8,8 +9,20 @@ from pydantic import field_validator
 
 from clpipe.base.types import Floats
 from clpipe.reference.curve import tabulate
-from clpipe.stage import Curve, Kind, Stage, Unchanged, parameter
-from clpipe.stages.tone_curve import DEFAULT
+from clpipe.stage import (
+    Argument,
+    Context,
+    Curve,
+    Frame,
+    Kind,
+    Method,
+    Pass,
+    Stage,
+    Unchanged,
+    parameter,
+)
+from clpipe.stages.tone_curve import CAMERA_RAW
+from clpipe.stages.tone_curve.filmic import A, B, C, D, inverse_filmic, keep_hue
 from clpipe.stages.tone_curve.table import table_of
 
 
@@ -28,22 +41,40 @@ def inverse_table(path: str) -> Floats:
     return tabulate(lambda y: np.interp(y, value, linear[first]))
 
 
-class Default(Curve):
+class Filmic(Method):
+    """The inverse of the curve filmic: the raw's light, with its one stop of headroom."""
+
+    method: ClassVar = "filmic"
+    kernel: ClassVar = "inverse_tone_curve_filmic"
+    summary: ClassVar = "undo the curve filmic"
+    tolerance: ClassVar = 5e-5  # the kernel's root is a short iteration
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("inverse_filmic", arguments=("a", "b", "c", "d")),)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {"a": A, "b": B, "c": C, "d": D}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        return keep_hue(image, inverse_filmic)
+
+
+class CameraRaw(Curve):
     """The inverse of the default curve of Adobe Camera Raw, on each channel.
 
     >>> from clpipe.reference.curve import curve_index
-    >>> from clpipe.stages.tone_curve import Default as Forward
+    >>> from clpipe.stages.tone_curve import CameraRaw as Forward
     >>> x = np.float32([0.01, 0.1, 0.5, 1.0])
     >>> there = Forward().table()[curve_index(x)]
-    >>> Default().table()[curve_index(there)].round(3).tolist()
+    >>> CameraRaw().table()[curve_index(there)].round(3).tolist()
     [0.009999999776482582, 0.10000000149011612, 0.5, 1.0]
     """
 
-    method: ClassVar = "default"
+    method: ClassVar = "camera_raw"
     summary: ClassVar = "undo the default curve of Adobe Camera Raw (DNG SDK)"
 
     def table(self) -> Floats:
-        return inverse_table(DEFAULT)
+        return inverse_table(CAMERA_RAW)
 
 
 class Linear(Unchanged):
@@ -60,9 +91,9 @@ class File(Curve):
     summary: ClassVar = "undo a curve from a .csv or one-dimensional .cube file"
 
     path: str = parameter(
-        DEFAULT,
+        CAMERA_RAW,
         "The file of the curve; a configuration gives it relative to itself.",
-        auto="default.csv",
+        auto="camera_raw.csv",
         file=True,
     )
 
@@ -81,5 +112,5 @@ STAGE = Stage(
     "Undo the contrast of a photograph.",
     Kind.RGB,
     Kind.RGB,
-    (Default, Linear, File),
+    (Filmic, CameraRaw, Linear, File),
 )

@@ -20,6 +20,7 @@ from clpipe.stage import (
     Kind,
     Literal,
     Method,
+    Noiseless,
     Pass,
     Stage,
     odd_size,
@@ -83,6 +84,9 @@ class NonLocalMeans(Method):
             return self
         a, b = context.noise_parameters()
         return self.filled(a=a, b=b)
+
+    def where_clean(self, context: Context) -> Method:
+        return Noiseless()
 
     @property
     def reach(self) -> int:

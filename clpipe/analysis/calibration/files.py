@@ -12,7 +12,7 @@ from clpipe.analysis.calibration.frames import (
 )
 from clpipe.analysis.calibration.groups import calibrate_group, group_frames
 from clpipe.analysis.calibration.plot import calibration_png
-from clpipe.analysis.calibration.profile import profile_text
+from clpipe.analysis.calibration.profile import calibrated_profile
 from clpipe.analysis.calibration.result import Calibration
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.extras import require
@@ -51,18 +51,6 @@ def calibrate_files(
     return scene[0], [calibrate_group(group) for group in groups]
 
 
-def check_profile_name(path: Path) -> None:
-    """See that the name of a profile ends in .toml.
-
-    Raises:
-        RequestError: it does not.
-    """
-    if path.suffix != ".toml":
-        raise RequestError(
-            f"{path}: the name of a camera profile must end in .toml, such as camera.toml"
-        )
-
-
 def write_profile(path: Path, frame: CalibrationFrame, calibrations: Sequence[Calibration]) -> Path:
     """Write the profile, and the picture of the fit beside it.
 
@@ -77,7 +65,7 @@ def write_profile(path: Path, frame: CalibrationFrame, calibrations: Sequence[Ca
     Raises:
         ImageError: a file cannot be written, or the estimates make no valid profile.
     """
-    text = profile_text(
+    text = calibrated_profile(
         path.stem, frame.make, frame.model, calibrations, frame.gains, frame.xyz_to_camera
     )
 

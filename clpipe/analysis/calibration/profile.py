@@ -1,6 +1,5 @@
 """A camera profile from calibrations: TOML text, with the source of every figure."""
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,11 +10,12 @@ from clpipe.analysis.calibration.gain_stages import gain_stages
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.result import Calibration
 from clpipe.camera.profile import Matrix
+from clpipe.camera.text import profile_text
 
 Gains = tuple[float, float]
 
 
-def profile_text(
+def calibrated_profile(
     name: str,
     make: str,
     model: str,
@@ -59,28 +59,12 @@ def profile_text(
         sources[key] = source
     for key in ("row_noise", "column_noise"):
         sources[key] = _line_source(calibrations, key)
-    lines = [f"{key} = {_toml(value)}" for key, value in values.items()]
-    for stage in gain_stages(calibrations):
-        lines += ["", "[[gain_stages]]", *_stage_lines(stage)]
-    lines += ["", "[sources]", *(f"{key} = {_toml(text)}" for key, text in sources.items())]
-    return "\n".join(lines) + "\n"
+    stages = map(_stage_tables, gain_stages(calibrations))
+    return profile_text(values, list(stages), sources)
 
 
-def _toml(value: Any) -> str:
-    """A TOML value: a text, a number to six digits, or a list of these.
-
-    >>> _toml((100.0, 1 / 3)), _toml('a "b"')
-    ('[100, 0.333333]', '"a \\\\"b\\\\""')
-    """
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, Sequence):
-        return f"[{', '.join(_toml(part) for part in value)}]"
-    return f"{value:.6g}"
-
-
-def _stage_lines(stage: Sequence[Calibration]) -> list[str]:
-    """The lines of a gain stage in the profile; tables that lack an ISO are left out."""
+def _stage_tables(stage: Sequence[Calibration]) -> dict[str, list[float]]:
+    """The tables of a gain stage in the profile; those that lack an ISO are left out."""
     tables: Mapping[str, list[float | None]] = {
         "iso": [c.iso for c in stage],
         "system_gain": [c.pooled.gain.value for c in stage],
@@ -88,7 +72,8 @@ def _stage_lines(stage: Sequence[Calibration]) -> list[str]:
         "row_noise": [_significant(c.row_noise) for c in stage],
         "column_noise": [_significant(c.column_noise) for c in stage],
     }
-    return [f"{key} = {_toml(row)}" for key, row in tables.items() if None not in row]
+    known = {key: [v for v in row if v is not None] for key, row in tables.items()}
+    return {key: row for key, row in known.items() if len(row) == len(stage)}
 
 
 def read_noise(one: Calibration) -> float:

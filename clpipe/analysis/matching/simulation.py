@@ -64,13 +64,13 @@ class Simulator:
 
     def _linear_light(self, chain: Chain, scene: Scene) -> Floats:
         """The scene in the light, and of the size, that the chain starts on."""
-        methods, scale = undoing(chain), scale_of(chain)
-        key = scene.name, scale, *((type(m), m.model_dump_json()) for m in methods)
+        methods, scale, gain = undoing(chain), scale_of(chain), gain_of(chain)
+        key = scene.name, scale, gain, *((type(m), m.model_dump_json()) for m in methods)
         if key not in self._linear:
             image = (scene.clean / 255).astype(np.float32)
             for method in methods:
                 image = method.reference(image, Frame(chain.steps[0].context, {}, {}))
-            self._linear[key] = np.ascontiguousarray(enlarged(image, scale))
+            self._linear[key] = np.ascontiguousarray(enlarged(image / np.float32(gain), scale))
         return self._linear[key]
 
 
@@ -78,6 +78,11 @@ def finished(pixels: Array | None, scene: Scene) -> Floats:
     """A developed picture, (height, width, 3), 0 to 255, as the scene's frames were encoded."""
     assert pixels is not None
     return (through_jpeg(pixels, scene.jpeg) if scene.jpeg else pixels).astype(np.float32)
+
+
+def gain_of(chain: Chain) -> float:
+    """By how much a chain brightens linear light, curves aside: in exposure and in linear tone."""
+    return math.prod(float(s.method.gain) for s in chain.steps if hasattr(s.method, "gain"))
 
 
 def scale_of(chain: Chain) -> float:

@@ -17,14 +17,12 @@ from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings, overlay
 from clpipe.stage import Method
 
-# The stages whose methods and numbers are searched, where the registry has them, in the order in
-# which they are tried; and before which stage one goes that the chain lacks.
+# The stages whose methods and numbers are searched, in the order in which they are tried.
 DEVELOPMENT = ("denoise", "demosaic", "sharpen")
 RESIZE, SCALES = "resize", (0.5, 2 / 3, 0.75)  # of cameras' smaller pictures
-BEFORE = {"sharpen": "tone_curve", RESIZE: "tone_curve"}
-LIGHT = ("red_gain", "blue_gain")  # of inverse_white_balance: the light of a scene decides them
-GAINS = 1.0, 4.0
-SPAN = 8.0  # a parameter without near limits is searched within this factor of its default
+BEFORE = "tone_curve"  # where a stage of these goes that the chain lacks
+SEARCHED_UNITS = ("", "px")  # what is in units of the signal follows from the noise
+SPAN = 8.0  # a number is searched within this factor of where it starts
 
 
 @dataclass(frozen=True)
@@ -108,33 +106,32 @@ def is_number(annotation: Any) -> bool:
 def dimensions_of(chain: Chain) -> list[Dimension]:
     """The numbers of a chain's development that kernels get as arguments, with their ranges.
 
-    A parameter whose two limits are at most 2 apart is searched between them, any other within a
-    factor of 8 of its default, as far as its limits allow. What the camera or the chain decides is
-    not searched, but for the white balance gains; nor what is off by default and has no near
-    limits.
+    Each is searched within a factor of 8 of its value in the chain, as far as its limits allow;
+    what is 0 there, between its limits. Numbers in units of the signal are not searched, because
+    they follow from the noise; nor those without an upper limit.
     """
     found = []
     for step in chain.steps:
-        if step.stage.name == "inverse_white_balance":
-            starts = {name: getattr(step.method, name) for name in LIGHT}
-            found += [
-                Dimension(f"{step.name}.{name}", *GAINS, start, logarithmic=True)
-                for name, start in starts.items()
-            ]
         if step.stage.name not in DEVELOPMENT:
             continue
         for name, declared in type(step.method).model_fields.items():
             extra: Any = declared.json_schema_extra
-            default = declared.default
-            if extra["structural"] or default is None or not is_number(declared.annotation):
+            if (
+                extra["structural"]
+                or extra["unit"] not in SEARCHED_UNITS
+                or not is_number(declared.annotation)
+            ):
                 continue
             low, high = limits_of(declared.metadata)
-            dotted, start = f"{step.name}.{name}", float(getattr(step.method, name))
-            if high - low <= 2:
-                found.append(Dimension(dotted, low, high, start))
-            elif default > 0:
-                ends = max(default / SPAN, low), min(default * SPAN, high)
+            start = float(getattr(step.method, name))
+            dotted = f"{step.name}.{name}"
+            if not math.isfinite(low + high):
+                continue
+            if start > 0:
+                ends = max(start / SPAN, low), min(start * SPAN, high)
                 found.append(Dimension(dotted, *ends, start, logarithmic=True))
+            else:
+                found.append(Dimension(dotted, low, high, start))
     return found
 
 
@@ -153,10 +150,8 @@ def space_for(settings: Settings, iso_is_given: bool) -> Space:
     """The whole space: every part of the development, and the ISO where it is not given."""
     choices: dict[str, tuple[Choice, ...]] = {}
     for name in (*DEVELOPMENT, "tone_curve"):
-        stage = all_stages().get(name)
-        if stage is None:
-            continue
-        added = {} if name in settings.stages else {name: BEFORE[name]}
+        stage = all_stages()[name]
+        added = {} if name in settings.stages else {name: BEFORE}
         own = [
             Choice(f"{name} {m.method}", {name: {"method": m.method}}, added)
             for m in stage.methods
@@ -164,8 +159,8 @@ def space_for(settings: Settings, iso_is_given: bool) -> Space:
         ]
         without = [Choice(f"no {name}")] if added else []
         choices[name] = (*without, *own)
-    if RESIZE in all_stages() and RESIZE not in settings.stages:
-        added = {RESIZE: BEFORE[RESIZE]}
+    if RESIZE not in settings.stages:
+        added = {RESIZE: BEFORE}
         smaller = [
             Choice(
                 f"{RESIZE} {m.method} {scale:.3g}",
@@ -210,6 +205,8 @@ def variants_of(settings: Settings, step: str) -> Iterator[Choice]:
             values = [value for value in get_args(declared.annotation) if value != own]
         elif declared.annotation is int:
             values = [own - 2, own + 2, own + 4]
+        elif declared.annotation is float:
+            values = [float(f"{own * factor:.3g}") for factor in (0.5, 0.7, 1.4, 2.0)]
         for value in values:
             choice = Choice(f"{step}.{name} {value}", {step: {**table, name: value}})
             try:

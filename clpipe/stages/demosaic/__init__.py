@@ -2,6 +2,7 @@
 
 from clpipe.stage import Kind, Stage
 from clpipe.stages.demosaic.bilinear import Bilinear
+from clpipe.stages.demosaic.bounded import Bounded
 from clpipe.stages.demosaic.edge_directed import EdgeDirected
 from clpipe.stages.demosaic.edge_directed_median import EdgeDirectedMedian
 from clpipe.stages.demosaic.malvar2004 import Malvar2004
@@ -13,5 +14,5 @@ STAGE = Stage(
     "Give every pixel its two missing colours.",
     Kind.MOSAIC,
     Kind.RGB,
-    (EdgeDirectedMedian, EdgeDirected, Median, Bilinear, Malvar2004, Menon2007),
+    (Bounded, EdgeDirectedMedian, EdgeDirected, Median, Bilinear, Malvar2004, Menon2007),
 )

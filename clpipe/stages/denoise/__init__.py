@@ -3,11 +3,12 @@
 from clpipe.stage import Context, Kind, Stage
 from clpipe.stages.denoise import strength
 from clpipe.stages.denoise.bilateral import Bilateral
+from clpipe.stages.denoise.biweight import Biweight
 from clpipe.stages.denoise.mean import Mean
 from clpipe.stages.denoise.median import Median
 from clpipe.stages.denoise.non_local_means import NonLocalMeans
 
-METHODS = (Bilateral, NonLocalMeans, Median, Mean)
+METHODS = (Biweight, Bilateral, NonLocalMeans, Median, Mean)
 
 
 def explain(context: Context) -> str:

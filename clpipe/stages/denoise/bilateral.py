@@ -10,14 +10,14 @@ from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.reference.image import tap
 from clpipe.stage import Context, Frame, parameter
-from clpipe.stages.denoise.strength import Denoiser
+from clpipe.stages.denoise.strength import WindowDenoiser
 
 # Sigma of the range weight, in multiples of strength * noise. Chosen, not derived; tools/quality
 # measures the PSNR that it gives, and no test holds it to be the best.
 RANGE = 3.0
 
 
-class Bilateral(Denoiser):
+class Bilateral(WindowDenoiser):
     """Bilateral filter (Tomasi and Manduchi, ICCV 1998) in YCbCr.
 
     Luma is weighted by the distance in luma, both chroma planes by their common distance. The

@@ -8,7 +8,7 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.stage import Context, Frame
-from clpipe.stages.denoise.strength import Denoiser
+from clpipe.stages.denoise.strength import WindowDenoiser
 
 # Assumed standard deviation of detail against its neighbours, signal units. Chosen, not derived;
 # tools/quality measures the PSNR that it gives, and no test holds it to be the best.
@@ -27,7 +27,7 @@ def blend_share(amount: float) -> np.float32:
     return np.float32(amount**2 / (amount**2 + DETAIL**2))
 
 
-class BlendedFilter(Denoiser):
+class BlendedFilter(WindowDenoiser):
     """centre + share * (filtered - centre); the share grows with the noise, :func:`blend_share`."""
 
     names: ClassVar = ("luma_share", "chroma_share")

@@ -13,7 +13,7 @@ from clpipe.reference.patch import bias_of, decay_of, patch_distances, patch_sum
 from clpipe.stage import Context, Frame, Kind, Pass
 from clpipe.stages.denoise.strength import (
     MID_GREY,
-    Denoiser,
+    WindowDenoiser,
     noise_of_luma_and_chroma,
     size_parameter,
 )
@@ -24,7 +24,7 @@ FACTOR = 1.1
 PATCH = 9  # pixels of a patch
 
 
-class NonLocalMeans(Denoiser):
+class NonLocalMeans(WindowDenoiser):
     """Non-local means (Buades, Coll and Morel, CVPR 2005; IPOL 2011) in YCbCr, 3x3 patches.
 
     A pixel becomes a weighted mean of the pixels in its window. The weight is

@@ -16,7 +16,18 @@ import numpy as np
 from pydantic import field_validator
 
 from clpipe.reference.colour import LUMA
-from clpipe.stage import Access, Argument, Context, Kind, Literal, Method, Pass, odd_size, parameter
+from clpipe.stage import (
+    Access,
+    Argument,
+    Context,
+    Kind,
+    Literal,
+    Method,
+    Noiseless,
+    Pass,
+    odd_size,
+    parameter,
+)
 
 MID_GREY = 0.18  # signal units
 PREDICTED = "the {} noise at mid grey that a, b and the gains predict"
@@ -70,6 +81,32 @@ def predicted_noise(context: Context) -> tuple[float, float]:
     return sqrt(luma.at(MID_GREY)), sqrt(chroma.at(MID_GREY))
 
 
+def offset_of_roots(context: Context) -> float:
+    """The offset of roots of the signal, see :mod:`clpipe.reference.roots`, that suits the noise.
+
+    Twice the noise of the noisiest colour at black, so that little is cut, and 0.003, a tenth of a
+    level of 255 more than none. Found by trying: a larger one lets dark colours take the noise of
+    luma, which shows as dots on saturated surfaces.
+
+    >>> from clpipe.camera.profile import load_camera
+    >>> round(offset_of_roots(Context(load_camera("sony-a7r2"), 25600)), 4)
+    0.0134
+    """
+    return 0.003 + 2 * sqrt(max(colour.at(0) for colour in noise_of_colours(context)))
+
+
+def offset_parameter() -> Any:
+    """Declare the offset of a method that works on roots of the signal."""
+    return parameter(
+        None,
+        "What is added to the signal before its root is taken.",
+        "signal",
+        "0.003 plus twice the noise at black",
+        gt=0,
+        le=1,
+    )
+
+
 def explain(context: Context) -> str:
     """The steps from a and b to luma and chroma noise, in a few lines, with a context's numbers."""
     a, b = context.noise_parameters()
@@ -99,21 +136,8 @@ def size_parameter(plane: str, default: int, largest: int) -> Any:
 
 
 class Denoiser(Method):
-    """The base of all methods: luma and chroma, each with a window, a strength and its noise.
+    """The base of all methods: luma and chroma, each with a strength and its noise."""
 
-    Subclasses name the stencil of their kernel file; the passes into and out of YCbCr are shared.
-    """
-
-    largest_size: ClassVar[int] = 15
-    function: ClassVar[str]  # the stencil in the kernel file
-    names: ClassVar[tuple[str, ...]]  # the stencil's run-time arguments, after the two reaches
-    enter: ClassVar[Pass] = Pass("to_luma_chroma", writes="planes", kind=Kind.YCBCR)
-    leave: ClassVar[Pass] = Pass("from_luma_chroma", reads=("filtered",))
-    extra_reach: ClassVar[int] = 0  # px that the stencil reads beyond its window
-    block: ClassVar[int] = 0  # as in Pass
-
-    luma_size: int = size_parameter("luma", 5, 15)
-    chroma_size: int = size_parameter("chroma", 5, 15)
     luma_strength: float = parameter(
         1.0, "Strength on luma, relative to luma_noise; 0 is off.", ge=0, le=100
     )
@@ -135,19 +159,12 @@ class Denoiser(Method):
         ge=0,
     )
 
-    @field_validator("luma_size", "chroma_size")
-    @classmethod
-    def _odd(cls, size: int) -> int:
-        return odd_size(size, cls.largest_size)
-
     def resolve(self, context: Context) -> Self:
         luma, chroma = predicted_noise(context)
         return self.filled(luma_noise=luma, chroma_noise=chroma)
 
-    @property
-    def reaches(self) -> tuple[int, int]:
-        """The largest offsets in the windows of luma and chroma, px."""
-        return self.luma_size // 2, self.chroma_size // 2
+    def where_clean(self, context: Context) -> Method:
+        return Noiseless()
 
     @property
     def amounts(self) -> tuple[float, float]:
@@ -159,6 +176,34 @@ class Denoiser(Method):
     def effect(self) -> str:
         """The effect of the (resolved) strengths and noises, in a few words."""
         raise NotImplementedError(type(self).__name__)
+
+
+class WindowDenoiser(Denoiser):
+    """The base of the methods whose windows have any size.
+
+    Subclasses name the stencil of their kernel file; the passes into and out of YCbCr are shared.
+    """
+
+    largest_size: ClassVar[int] = 15
+    function: ClassVar[str]  # the stencil in the kernel file
+    names: ClassVar[tuple[str, ...]]  # the stencil's run-time arguments, after the two reaches
+    enter: ClassVar[Pass] = Pass("to_luma_chroma", writes="planes", kind=Kind.YCBCR)
+    leave: ClassVar[Pass] = Pass("from_luma_chroma", reads=("filtered",))
+    extra_reach: ClassVar[int] = 0  # px that the stencil reads beyond its window
+    block: ClassVar[int] = 0  # as in Pass
+
+    luma_size: int = size_parameter("luma", 5, 15)
+    chroma_size: int = size_parameter("chroma", 5, 15)
+
+    @field_validator("luma_size", "chroma_size")
+    @classmethod
+    def _odd(cls, size: int) -> int:
+        return odd_size(size, cls.largest_size)
+
+    @property
+    def reaches(self) -> tuple[int, int]:
+        """The largest offsets in the windows of luma and chroma, px."""
+        return self.luma_size // 2, self.chroma_size // 2
 
     def numbers(self, context: Context) -> Mapping[str, np.float32]:
         """The run-time arguments of all passes, by name."""

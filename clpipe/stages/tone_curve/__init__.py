@@ -1,36 +1,63 @@
 """Tone curve: the contrast of a photograph, on linear RGB, before gamma."""
 
+from collections.abc import Mapping
 from importlib import resources
-from typing import ClassVar
+from typing import ClassVar, Self
 
+import numpy as np
 from pydantic import field_validator
 
 from clpipe.base.types import Floats
-from clpipe.stage import Curve, Kind, Stage, Unchanged, parameter
+from clpipe.stage import Argument, Context, Curve, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.stages.tone_curve.filmic import Filmic
 from clpipe.stages.tone_curve.table import table_of
 
-DEFAULT = str(resources.files("clpipe.stages.tone_curve") / "default.csv")
+CAMERA_RAW = str(resources.files("clpipe.stages.tone_curve") / "camera_raw.csv")
 
 
-class Default(Curve):
+class CameraRaw(Curve):
     """The default curve of Adobe Camera Raw, on each channel of linear RGB, 0..1.
 
     The knots are from the DNG SDK (reference [15] of Bielova et al. 2019), with a monotone cubic
-    between them.
+    between them. On each channel it turns hues: orange becomes yellow.
     """
 
-    method: ClassVar = "default"
-    summary: ClassVar = "the default curve of Adobe Camera Raw (DNG SDK)"
+    method: ClassVar = "camera_raw"
+    summary: ClassVar = "the default curve of Adobe Camera Raw (DNG SDK), on each channel"
 
     def table(self) -> Floats:
-        return table_of(DEFAULT)
+        return table_of(CAMERA_RAW)
 
 
-class Linear(Unchanged):
-    """No curve: the contrast of the scene."""
+class Linear(Method):
+    """No curve: the scene's contrast, as bright as it was before ``exposure`` left headroom."""
 
     method: ClassVar = "linear"
-    summary: ClassVar = "no curve"
+    kernel: ClassVar = "exposure"
+    summary: ClassVar = "no curve; gives back the headroom that exposure left"
+    example: ClassVar = {"headroom": 1.0}
+
+    headroom: float | None = parameter(
+        None, "Stops by which the image is brightened.", "EV", "from exposure", ge=0, le=100
+    )
+
+    def resolve(self, context: Context) -> Self:
+        return self.filled(headroom=context.headroom)
+
+    @property
+    def gain(self) -> np.float32:
+        """The factor."""
+        assert self.headroom is not None
+        return np.float32(2.0**self.headroom)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("exposure", arguments=("gain",)),) if self.headroom else ()
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {"gain": self.gain}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        return image * self.gain
 
 
 class File(Curve):
@@ -40,9 +67,9 @@ class File(Curve):
     summary: ClassVar = "a curve from a .csv (x,y; monotone cubic) or one-dimensional .cube file"
 
     path: str = parameter(
-        DEFAULT,
+        CAMERA_RAW,
         "The file of the curve; a configuration gives it relative to itself.",
-        auto="default.csv",
+        auto="camera_raw.csv",
         file=True,
     )
 
@@ -61,5 +88,5 @@ STAGE = Stage(
     "Give the image the contrast of a photograph.",
     Kind.RGB,
     Kind.RGB,
-    (Default, Linear, File),
+    (Filmic, CameraRaw, Linear, File),
 )

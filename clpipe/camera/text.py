@@ -1,0 +1,56 @@
+"""A camera profile as the text of its TOML file."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from clpipe.base.errors import RequestError
+
+
+def profile_text(
+    values: Mapping[str, Any],
+    gain_stages: Sequence[Mapping[str, Sequence[float]]],
+    sources: Mapping[str, str],
+) -> str:
+    """The text of a profile, as :func:`clpipe.camera.profile.load_camera` reads it.
+
+    Args:
+        values: the keys of :class:`clpipe.camera.profile.Camera` that stand in no table.
+        gain_stages: the tables of each :class:`clpipe.camera.profile.GainStage`.
+        sources: where each figure is from.
+    """
+    lines = _lines(values)
+    for stage in gain_stages:
+        lines += ["", "[[gain_stages]]", *_lines(stage)]
+    lines += ["", "[sources]", *_lines(sources)]
+    return "\n".join(lines) + "\n"
+
+
+def _lines(values: Mapping[str, Any]) -> list[str]:
+    return [f"{key} = {_toml(value)}" for key, value in values.items()]
+
+
+def _toml(value: Any) -> str:
+    """A TOML value: a text, a number to six digits, or a list of these.
+
+    >>> _toml((100.0, 1 / 3)), _toml('a "b"')
+    ('[100, 0.333333]', '"a \\\\"b\\\\""')
+    """
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, Sequence):
+        return f"[{', '.join(_toml(part) for part in value)}]"
+    return f"{value:.6g}"
+
+
+def check_profile_name(path: Path) -> None:
+    """See that the name of a profile ends in .toml.
+
+    Raises:
+        RequestError: it does not.
+    """
+    if path.suffix != ".toml":
+        raise RequestError(
+            f"{path}: the name of a camera profile must end in .toml, such as camera.toml"
+        )

@@ -1,0 +1,169 @@
+"""Smaller images: where the pixels of one lie in the larger, and of which it is a weighted mean.
+
+A resampling makes the rows or the columns of an image fewer. The first and the last edge stay where
+they are, so the field of view does too: place x of ``size`` becomes x * smaller / size, counted in
+pixels from the edge, in depth maps and other companions as well.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+
+from clpipe.base.types import Array, Floats
+
+# Lines beyond the last one whose taps a kernel reads, though it stores nothing there: rows of a
+# block and lanes.
+PADDING = 16
+
+# The weight of samples by their distance from the centre of the new pixel, in pixels of the larger
+# image, of which the new pixel is ``ratio`` wide.
+Weight = Callable[[Array, float], Array]
+
+
+@dataclass(frozen=True, eq=False)
+class Taps:
+    """The lines of the larger image that each line of the smaller is made of.
+
+    Line i is the sum of ``weights[i, k] * line(first[i] + k)``, with ``weights`` float32 (line,
+    tap) of sum 1, and ``first`` int32. All of these lines lie in the larger image. Both arrays go
+    on for :data:`PADDING` lines as the last one; ``table`` is ``weights`` as the kernel reads it.
+    """
+
+    first: Array
+    weights: Floats
+    table: Floats
+
+    @property
+    def count(self) -> int:
+        """How many old lines each new one is made of."""
+        return int(self.weights.shape[1])
+
+    @property
+    def stride(self) -> int:
+        """The length of a row of ``table``."""
+        return int(self.table.shape[1])
+
+
+@dataclass(frozen=True)
+class Resampling:
+    """How many rows, or columns, an image becomes, and how.
+
+    Args:
+        axis: which of them.
+        scale: the new size over the old one, at most 1.
+        weight: the filter.
+        support: the largest distance at which ``weight`` is not 0, over the ratio, less 1/2 px.
+    """
+
+    axis: Literal["rows", "columns"]
+    scale: float
+    weight: Weight
+    support: float
+
+    def size(self, size: int) -> int:
+        """The new number of rows or columns: at least 1, a half rounded up.
+
+        >>> halved = Resampling("rows", 0.5, overlap, 0.5)
+        >>> [halved.size(n) for n in (1, 2, 3, 4, 5)]
+        [1, 1, 2, 2, 3]
+        """
+        return max(int(np.floor(size * self.scale + 0.5)), 1)
+
+    def along(self, width: int, height: int) -> int:
+        """The one of an image's sides that becomes shorter."""
+        return height if self.axis == "rows" else width
+
+    def taps(self, size: int) -> Taps:
+        """What the new rows or columns of an image of ``size`` are made of."""
+        return _taps(self, size)
+
+    def needed(self, size: int, start: int, stop: int) -> tuple[int, int]:
+        """The old rows or columns, first and behind the last, of which some new ones are made."""
+        taps = self.taps(size)
+        return int(taps.first[start]), int(taps.first[stop - 1]) + taps.count
+
+
+def sizes(
+    resamplings: Iterable[Resampling], width: int, height: int
+) -> tuple[tuple[int, int], ...]:
+    """The width and height of an image, and after each of these resamplings, one after the other.
+
+    >>> halves = [Resampling(axis, 0.5, overlap, 0.5) for axis in ("rows", "columns")]
+    >>> sizes(halves, 7, 5)
+    ((7, 5), (7, 3), (4, 3))
+    """
+    found = [(width, height)]
+    for each in resamplings:
+        width, height = found[-1]
+        by_rows = each.axis == "rows"
+        found.append((width, each.size(height)) if by_rows else (each.size(width), height))
+    return tuple(found)
+
+
+@lru_cache(maxsize=64)
+def _taps(resampling: Resampling, size: int) -> Taps:
+    count = resampling.size(size)
+    ratio = size / count
+    line = np.arange(count)[:, None]
+
+    def weights(places: Array) -> Array:
+        # The distance of two centres, in whole numbers up to the division.
+        distance = (2 * places * count - (2 * line + 1) * size + count) / (2 * count)
+        return resampling.weight(distance, ratio)
+
+    reach = int(np.ceil(resampling.support * ratio + 1))
+    centre = (2 * line + 1) * size // (2 * count)
+    around = centre + np.arange(-reach, reach + 1)
+    counts = (weights(around) != 0) & (around >= 0) & (around < size)
+    lowest = np.where(counts, around, size).min(1)
+    width = int((np.where(counts, around, 0).max(1) - lowest).max()) + 1
+    first = np.minimum(lowest, size - width)
+    own = weights(first[:, None] + np.arange(width))
+    own = (own / own.sum(1, keepdims=True)).astype(np.float32)
+    padded = np.minimum(np.arange(count + PADDING), count - 1)
+    first, own = first[padded].astype(np.int32), own[padded]
+    table = own if resampling.axis == "rows" else own.T
+    return Taps(first, own, np.ascontiguousarray(table))
+
+
+def overlap(distance: Array, ratio: float) -> Array:
+    """The share of a pixel, one wide, that lies within one of width ``ratio``: the area average.
+
+    >>> overlap(np.array([0.0, 1.0, 1.5, 2.0]), 2.5).tolist()
+    [1.0, 0.75, 0.25, 0.0]
+    """
+    inside = np.minimum(distance + 0.5, ratio / 2) - np.maximum(distance - 0.5, -ratio / 2)
+    return np.maximum(inside, 0)
+
+
+def lanczos3(distance: Array, ratio: float) -> Array:
+    """sinc(x) * sinc(x / 3) for |x| < 3, x = distance / ratio (Duchon, J. Appl. Meteor. 1979).
+
+    Stretched by the ratio, it takes out what the smaller image cannot hold.
+
+    >>> lanczos3(np.array([0.0, 1.0, 3.0, 6.0]), 2.0).round(3).tolist()
+    [1.0, 0.608, -0.135, 0.0]
+    """
+    x = distance / ratio
+    return np.where(np.abs(x) < 3, np.sinc(x) * np.sinc(x / 3), 0)
+
+
+def resample(image: Floats, resampling: Resampling) -> Floats:
+    """The smaller image, (height, width[, channel]) float32; taps are added up in order.
+
+    >>> halved = Resampling("columns", 0.5, overlap, 0.5)
+    >>> resample(np.float32([[1, 3, 5, 7]]), halved).tolist()
+    [[2.0, 6.0]]
+    """
+    axis = 0 if resampling.axis == "rows" else 1
+    taps = resampling.taps(image.shape[axis])
+    size = resampling.size(image.shape[axis])
+    shape = (-1, *(1,) * (image.ndim - 1 - axis))
+    total: Floats = np.zeros((), np.float32)
+    for k in range(taps.count):
+        weight = taps.weights[:size, k].reshape(shape)
+        total = total + weight * image.take(taps.first[:size] + k, axis)
+    return total

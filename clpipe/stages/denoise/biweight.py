@@ -1,0 +1,150 @@
+"""Means weighted by Tukey's biweight, which leave grain as a camera does."""
+
+from collections.abc import Mapping
+from math import hypot
+from typing import ClassVar, Self
+
+import numpy as np
+
+from clpipe.base.types import Floats
+from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
+from clpipe.reference.image import tap
+from clpipe.reference.roots import from_root, noise_in_roots, root_of
+from clpipe.stage import Access, Argument, Context, Frame, Kind, Pass, parameter
+from clpipe.stages.denoise.strength import MID_GREY, Denoiser, offset_of_roots, offset_parameter
+
+# The difference that weighs nothing, in multiples of strength * noise. Found by trying: at 6 in
+# luma, noise that happens to be large stays alone and makes the tails of the noise longer than a
+# camera's; beyond 10 nothing changes but soft edges.
+RANGE_LUMA, RANGE_CHROMA = 10.0, 2.5
+# The least noise that luma is filtered for, in roots, about two levels of 255: in a picture of ISO
+# 100 what is smaller is noise or cannot be told from it.
+LEAST_NOISE = 0.006
+
+# Weights by squared distance, px: for luma a binomial window, for chroma a wider one, of pixels that
+# demosaicing made of other samples than the centre's.
+LUMA_WINDOW = {1: 0.5, 2: 0.25}
+CHROMA_WINDOW = {2: 0.6, 4: 0.45}
+
+
+def window_offsets(window: Mapping[int, float]) -> list[tuple[int, int, np.float32]]:
+    """The offsets in px, right and down, and weights of a window's pixels but for its centre.
+
+    >>> len(window_offsets(LUMA_WINDOW)), len(window_offsets(CHROMA_WINDOW))
+    (8, 8)
+    """
+    steps = range(-2, 3)
+    squares = [(dx, dy, dx * dx + dy * dy) for dy in steps for dx in steps]
+    return [(dx, dy, np.float32(window[r2])) for dx, dy, r2 in squares if r2 in window]
+
+
+def biweight(planes: Floats, window: Mapping[int, float], scale: np.float32) -> Floats:
+    """The weighted mean about each pixel, (height, width, plane) in and out.
+
+    A pixel weighs (1 - scale * d^2)^2, d its distance from the centre in all planes, or 0 where
+    scale * d^2 is above 1 (Tukey's biweight; Mosteller and Tukey 1977), times the window's weight.
+
+    >>> step = np.float32([[[0], [0], [1], [1]]])
+    >>> biweight(step, LUMA_WINDOW, np.float32(1))[0, :, 0].tolist()
+    [0.0, 0.0, 1.0, 1.0]
+    """
+    total, weights = planes.copy(), np.ones_like(planes[..., :1])
+    for dx, dy, near in window_offsets(window):
+        other = tap(planes, dx, dy)
+        squared = np.square(other - planes).sum(-1, keepdims=True) * scale
+        weight = np.square(np.maximum(np.float32(1) - squared, np.float32(0))) * near
+        total += weight * other
+        weights += weight
+    return np.asarray(total / weights)
+
+
+class Biweight(Denoiser):
+    """Means weighted by Tukey's biweight of the difference, on roots of luma and chroma.
+
+    In roots of the signal noise has one size at all levels, and a dark colour does not take the
+    noise of a bright one. The mean reaches one pixel in luma and two in chroma. A share of luma's
+    grain stays, as cameras leave it: the noise of a finished picture is fine-grained in luma, and
+    coarser in chroma.
+    """
+
+    method: ClassVar = "biweight"
+    kernel: ClassVar = "denoise_biweight"
+    summary: ClassVar = "weighted mean of near pixels, as light as a camera's; keeps grain"
+    tolerance: ClassVar = 5e-5  # the kernel's root is a short iteration
+
+    grain: float | None = parameter(
+        None,
+        "Share of luma's noise that stays as it is.",
+        "",
+        "0.35 where there is little noise, less where there is more",
+        ge=0,
+        le=1,
+    )
+    offset: float | None = offset_parameter()
+
+    @property
+    def roots(self) -> tuple[float, float]:
+        """The noise of luma and of chroma at mid grey, in roots of the signal."""
+        assert self.luma_noise is not None and self.chroma_noise is not None
+        assert self.offset is not None
+        luma, chroma = self.luma_noise, self.chroma_noise
+        at = MID_GREY, self.offset
+        return noise_in_roots(luma, *at), noise_in_roots(chroma, *at)
+
+    def resolve(self, context: Context) -> Self:
+        resolved = super().resolve(context).filled(offset=offset_of_roots(context))
+        return resolved.filled(grain=0.35 / (1 + (resolved.roots[0] / 0.02) ** 2))
+
+    @property
+    def effect(self) -> str:
+        luma, chroma = (f"{each:.3g}" for each in self.ranges)
+        return f"differences of roots up to: luma {luma}, chroma {chroma}; grain {self.grain:.0%}"
+
+    @property
+    def ranges(self) -> tuple[float, float]:
+        """The differences of luma and of chroma that weigh nothing, in roots of the signal."""
+        luma, chroma = self.roots
+        return (
+            RANGE_LUMA * self.luma_strength * hypot(luma, LEAST_NOISE),
+            RANGE_CHROMA * self.chroma_strength * chroma,
+        )
+
+    @property
+    def scales(self) -> tuple[float, float]:
+        """One over the squares of the ranges, for luma and for chroma."""
+        luma, chroma = (1 / max(each, 1e-6) ** 2 for each in self.ranges)
+        return luma, chroma
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (
+            Pass("to_root_luma_chroma", arguments=("offset",), writes="planes", kind=Kind.YCBCR),
+            Pass(
+                "biweight",
+                Access.STENCIL,
+                ("luma_scale", "chroma_scale", "grain"),
+                reads=("planes",),
+                writes="filtered",
+                kind=Kind.YCBCR,
+                radius=2,
+            ),
+            Pass("from_root_luma_chroma", arguments=("offset",), reads=("filtered",)),
+        )
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        luma, chroma = self.scales
+        return {
+            "luma_scale": np.float32(luma),
+            "chroma_scale": np.float32(chroma),
+            "grain": np.float32(self.grain),
+            "offset": np.float32(self.offset),
+        }
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        luma_scale, chroma_scale = (np.float32(each) for each in self.scales)
+        grain, offset = np.float32(self.grain), np.float32(self.offset)
+        planes = rgb_to_ycbcr(root_of(image, offset))
+        y, c = planes[..., :1], planes[..., 1:]
+        filtered = biweight(y, LUMA_WINDOW, luma_scale)
+        y = filtered + grain * (y - filtered)
+        c = biweight(c, CHROMA_WINDOW, chroma_scale)
+        return from_root(ycbcr_to_rgb(np.concatenate([y, c], axis=-1)), offset)

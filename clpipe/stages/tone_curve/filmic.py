@@ -1,0 +1,78 @@
+"""A rational tone curve that keeps hues, and its inverse."""
+
+from collections.abc import Callable, Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.base.types import Floats
+from clpipe.stage import Argument, Context, Frame, Method, Pass
+
+# y = x (a x + b) / (x (c x + d) + 1); a + b = c + d + 1, so that 1 stays 1. Fitted (in roots of y)
+# to three fifths of Camera Raw's default curve and two fifths of the render's own light, which is
+# 2 x up to 0.25 and rolls off from there. 0.09, which is 18 % grey with a stop of headroom, becomes
+# 0.173, and what was 1.0 becomes 0.8.
+A, B, C, D = (np.float32(value) for value in (13.5, 1.27, 11.6, 2.17))
+
+
+def filmic(x: Floats) -> Floats:
+    """The curve on values 0..1 of any shape.
+
+    >>> filmic(np.float32([0, 0.09, 0.5, 1])).round(3).tolist()
+    [0.0, 0.173, 0.805, 1.0]
+    """
+    one = np.float32(1)
+    return np.asarray(x * (A * x + B) / (x * (C * x + D) + one))
+
+
+def inverse_filmic(y: Floats) -> Floats:
+    """The inverse of :func:`filmic`: the root of (a - c y) x^2 + (b - d y) x - y = 0 in 0..1.
+
+    >>> inverse_filmic(filmic(np.float32([0, 0.09, 0.5, 1]))).round(5).tolist()
+    [0.0, 0.09000000357627869, 0.5, 1.0]
+    """
+    quadratic, linear = A - C * y, B - D * y
+    root = np.sqrt(np.maximum(linear * linear + np.float32(4) * quadratic * y, np.float32(0)))
+    return (root - linear) / (np.float32(2) * quadratic)
+
+
+def keep_hue(image: Floats, curve: Callable[[Floats], Floats]) -> Floats:
+    """A curve on the largest and smallest of the three colours; the third keeps its relative place.
+
+    So Adobe's DNG software applies its tone curves. Hue in HSV stays, and on each channel alone it
+    would not: orange would become yellow.
+
+    Args:
+        image: (height, width, 3), clipped to 0..1.
+        curve: on an array of values 0..1.
+
+    >>> keep_hue(np.float32([[[0.25, 0.5, 1]]]), np.sqrt).round(3).tolist()
+    [[[0.5, 0.6669999957084656, 1.0]]]
+    """
+    inside = np.clip(np.nan_to_num(image), np.float32(0), np.float32(1))
+    low, high = inside.min(-1, keepdims=True), inside.max(-1, keepdims=True)
+    to_low, to_high = curve(low), curve(high)
+    slope = (to_high - to_low) / np.maximum(high - low, np.float32(1e-6))
+    return to_low + (inside - low) * slope
+
+
+class Filmic(Method):
+    """A curve with a toe and a shoulder that makes a picture as bright as the render looks in sRGB.
+
+    It is meant for a raw with one stop of headroom, as ``exposure`` leaves it. Hues stay: the curve
+    is applied to the largest and the smallest colour, and the third keeps its place between them.
+    """
+
+    method: ClassVar = "filmic"
+    kernel: ClassVar = "tone_curve_filmic"
+    summary: ClassVar = "toe and shoulder; keeps hues, and the brightness of the render"
+    tolerance: ClassVar = 1e-5  # sums may be contracted
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("filmic", arguments=("a", "b", "c", "d")),)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {"a": A, "b": B, "c": C, "d": D}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        return keep_hue(image, filmic)

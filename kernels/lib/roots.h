@@ -1,0 +1,19 @@
+// Square roots of the signal, in which shot noise has the same size at all levels. The offset keeps the
+// slope of the root finite at black; noise that reaches below it is cut.
+#ifndef CLPIPE_ROOTS_H
+#define CLPIPE_ROOTS_H
+
+INLINE vf root_of(vf v, float offset) { return square_root(vmax(v + offset, (vf)(0.0f))); }
+INLINE vf from_root(vf s, float offset) { return s * s - offset; }
+
+INLINE rgb roots_of(rgb c, float offset) {
+    const rgb v = {root_of(c.r, offset), root_of(c.g, offset), root_of(c.b, offset)};
+    return v;
+}
+
+INLINE rgb from_roots(rgb s, float offset) {
+    const rgb v = {from_root(s.r, offset), from_root(s.g, offset), from_root(s.b, offset)};
+    return v;
+}
+
+#endif

@@ -1,0 +1,50 @@
+// Smaller images: each row, then each column, as a weighted mean of those of the larger image. Which,
+// and their weights, are worked out by the host: line i is made of `count` lines from first[i] on.
+//
+// `r`, `g`, `b` are where the larger image's first pixel would be in each plane. Rows and lanes beyond
+// an image or a tile are computed too; what they read is moved into it.
+INLINE int inside(int first, uint low, uint size, uint count) {
+    const int last = (int)(low + size) - (int)count;
+    return first < (int)low ? (int)low : first > last ? last : first;
+}
+
+INLINE rgb resize_rows(site at, __global const float *r, __global const float *g,
+                       __global const float *b, extent from, __global const int *first,
+                       __global const float *weights, uint count, uint stride) {
+    const long start = inside(first[at.y], from.top, from.rows, count);
+    __global const float *own = weights + (size_t)at.y * count;
+    rgb sum = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
+    for (uint k = 0; k < count; ++k) {
+        const vf weight = (vf)(own[k]);
+        const long place = (start + k) * (long)from.pitch + at.x;
+        sum.r += weight * load(r + place);
+        sum.g += weight * load(g + place);
+        sum.b += weight * load(b + place);
+    }
+    return sum;
+}
+
+INLINE vf gather(__global const float *row, const int *start, uint k) {
+    float lanes[LANES];
+#pragma unroll
+    for (int lane = 0; lane < LANES; ++lane) lanes[lane] = row[start[lane] + (int)k];
+    return unspill(lanes);
+}
+
+INLINE rgb resize_columns(site at, __global const float *r, __global const float *g,
+                          __global const float *b, extent from, __global const int *first,
+                          __global const float *weights, uint count, uint stride) {
+    const long row = (long)at.y * (long)from.pitch;
+    int start[LANES];
+#pragma unroll
+    for (int lane = 0; lane < LANES; ++lane)
+        start[lane] = inside(first[at.x + lane], from.left, from.columns, count);
+    rgb sum = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
+    for (uint k = 0; k < count; ++k) {
+        const vf weight = load(weights + (size_t)k * stride + at.x);
+        sum.r += weight * gather(r + row, start, k);
+        sum.g += weight * gather(g + row, start, k);
+        sum.b += weight * gather(b + row, start, k);
+    }
+    return sum;
+}

@@ -1,0 +1,46 @@
+// Unsharp mask on the root of luma; the ratios of the colours stay.
+#include "lib/roots.h"
+
+// The root of luma, and blue and red over luma, all with the root's offset.
+INLINE ycbcr to_root_and_ratios(rgb c, site at, float offset) {
+    const vf luma = vmax(rgb_to_ycbcr(c).y + offset, (vf)(1e-6f));
+    const vf inverse = inverse_root(luma), per_luma = inverse * inverse;
+    const ycbcr v = {luma * inverse, (c.b + offset) * per_luma, (c.r + offset) * per_luma};
+    return v;
+}
+
+INLINE rgb from_root_and_ratios(ycbcr c, site at, float offset) {
+    const vf luma = c.y * c.y;
+    const vf green = ((vf)(1.0f) - 0.299f * c.cr - 0.114f * c.cb) * 1.7035775f;
+    const rgb v = {c.cr * luma - offset, green * luma - offset, c.cb * luma - offset};
+    return v;
+}
+
+// Adds `amount` of what a Gaussian blur takes away, less `threshold`, and at most `limit`. Four rows
+// at once share the sums along their rows; weights[k] is that of a pixel k px away.
+INLINE void unsharp(site at, image planes, int reach, __global const float *weights, float amount,
+                    float threshold, float limit, ycbcr *out) {
+#pragma OPENCL FP_CONTRACT ON
+    vf blurred[4] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
+#pragma unroll
+    for (int row = -reach; row < 4 + reach; ++row) {
+        vf sum = weights[0] * tap_ycbcr(planes, 0, row).y;
+#pragma unroll
+        for (int k = 1; k <= reach; ++k)
+            sum += weights[k] * (tap_ycbcr(planes, -k, row).y + tap_ycbcr(planes, k, row).y);
+#pragma unroll
+        for (int y = 0; y < 4; ++y) {
+            const int away = row < y ? y - row : row - y;
+            if (away <= reach) blurred[y] += weights[away] * sum;
+        }
+    }
+#pragma unroll
+    for (int y = 0; y < 4; ++y) {
+        ycbcr c = tap_ycbcr(planes, 0, y);
+        const vf detail = c.y - blurred[y];
+        const vf size = vmax(magnitude(detail) - threshold, (vf)(0.0f)) * amount;
+        const vf change = vmin(size, (vf)(limit));
+        c.y = vmax(c.y + (detail < 0.0f ? -change : change), (vf)(0.0f));
+        out[y] = c;
+    }
+}
