@@ -1,13 +1,20 @@
 """tools/validate: known noise comes back, and finished pictures are like a real camera's."""
 
+import doctest
 import sys
 from dataclasses import replace
 from importlib.machinery import SourceFileLoader
 from importlib.util import module_from_spec, spec_from_loader
 
+import numpy as np
 import pytest
+import real_cameras
+import side_by_side
+from PIL import Image
+from scipy import ndimage
 
 from clpipe.camera.profile import load_camera
+from clpipe.images.read import read_image
 from tests.conftest import ROOT
 
 LOADER = SourceFileLoader("validate", str(ROOT / "tools" / "validate"))
@@ -51,7 +58,78 @@ def test_poisson_numbers_agree_with_the_exact_law():
     assert validate.poisson_p(9.9, 200_000) > 0.001
 
 
-def test_the_page(monkeypatch, capsys, jpegs):
+def camera_like(seed=0):
+    """A ramp of grey, and the same with noise that is correlated as a camera's."""
+    random = np.random.default_rng(seed)
+    clean = np.repeat(np.linspace(60, 200, 240)[None, :, None], 3, 2).repeat(180, 0)
+    own = ndimage.gaussian_filter(random.normal(0, 16, clean.shape), (1.2, 1.2, 0))
+    shared = ndimage.gaussian_filter(random.laplace(0, 8, clean.shape[:2]), 0.64)
+    noisy = clean + own + shared[..., None]
+    return real_cameras.Pair(*(np.rint(image).astype(np.uint8) for image in (noisy, clean)))
+
+
+def test_the_default_chain_is_like_a_camera():
+    pair = real_cameras.develop(read_image(validate.RENDER).pixels, 1600)
+    record = pair.signature().record()
+    assert not real_cameras.outside(record), record
+
+
+def test_the_cameras_that_were_measured_are_in_the_range():
+    for name, record in real_cameras.MEASURED.items():
+        assert not real_cameras.outside(record), name
+
+
+@pytest.mark.parametrize("module", [real_cameras, side_by_side])
+def test_the_examples_of_what_tools_share(module):
+    assert doctest.testmod(module).failed == 0
+
+
+def test_real_pairs_are_found_by_camera_and_measured_by_their_median(tmp_path):
+    pairs = [camera_like(seed) for seed in range(3)]
+    for number, pair in enumerate(pairs, 1):
+        Image.fromarray(pair.noisy).save(tmp_path / f"x_iso3200_{number}_real.png")
+        Image.fromarray(pair.clean).save(tmp_path / f"x_iso3200_{number}_mean.png")
+    found = real_cameras.read_pairs(tmp_path)
+    assert {name: len(each) for name, each in found.items()} == {"x_iso3200": 3}
+    middle = sorted(pair.signature().rms for pair in pairs)[1]
+    assert real_cameras.medians(found["x_iso3200"])["rms"] == middle
+    (tmp_path / "x_iso3200_2_mean.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"2_real.png has no x_iso3200_2_mean.png"):
+        real_cameras.read_pairs(tmp_path)
+
+
+def test_the_section_of_cameras(monkeypatch, capsys, tmp_path):
+    pair = camera_like()
+    real = tmp_path / "real"
+    real.mkdir()
+    Image.fromarray(pair.noisy).save(real / "x_1_real.png")
+    Image.fromarray(pair.clean).save(real / "x_1_mean.png")
+    out = tmp_path / "out"
+    command = ["validate", "--only", "cameras", "--real", str(real), "-o", str(out)]
+    monkeypatch.setattr("sys.argv", command)
+    monkeypatch.setattr(validate, "DOCS", tmp_path)
+    monkeypatch.setattr(real_cameras, "develop", lambda *_: pair)
+    status = validate.main()
+    said = capsys.readouterr().out
+    assert status == 0, said
+    assert "| Nikon D800, ISO 3200 | 5.3 | 3.4 |" in said
+    assert "| x, 1 measured here | " in said
+    assert "Photo-electrons" not in said
+    assert "**" not in said.partition("| asked for |")[2]
+    assert "ISO 6400" in (tmp_path / "real_cameras.svg").read_text()
+    for crops, columns in ((tmp_path, 4), (out, 5)):
+        with Image.open(crops / "real_cameras_crops.png") as image:
+            assert image.width // (side_by_side.CROP[1] * side_by_side.SCALE) == columns
+    independent = np.random.default_rng(0).normal(0, 5, pair.clean.shape)
+    other = replace(pair, noisy=np.rint(pair.clean + independent).astype(np.uint8))
+    monkeypatch.setattr(real_cameras, "develop", lambda *_: other)
+    monkeypatch.setattr("sys.argv", command[:3])
+    assert validate.main() == 1
+    assert "| clpipe, ISO 800 | " in (said := capsys.readouterr().out)
+    assert "| **-0.0" in said or "| **0.0" in said  # the autocorrelation
+
+
+def test_the_page(monkeypatch, capsys, tmp_path, jpegs):
     # One loop and one picture stand for all: others are the tests above.
     loop = validate.close_loop("sony-a7r2", 3200, "RGGB", 800, 1024, "gaussian")
     monkeypatch.setattr(validate, "close_loop", lambda *_: loop)
@@ -59,12 +137,19 @@ def test_the_page(monkeypatch, capsys, jpegs):
     monkeypatch.setattr(validate, "CAMERAS", ("sony-a7r2",))
     monkeypatch.setattr(validate, "ISOS", (3200,))
     monkeypatch.setattr(validate, "MEANS", (5,))
+    monkeypatch.setattr(validate, "DOCS", tmp_path)
+    monkeypatch.setattr(real_cameras, "develop", lambda *_: camera_like())
     monkeypatch.setattr("sys.argv", ["validate", "--size", "1024x800", "--draws", "100000"])
     status = validate.main()
     out = capsys.readouterr().out
     assert status == 0, out
     assert "| sony-a7r2 | 3200 | " in out
-    for heading in ("Known noise in", "Photo-electrons", "A real camera's finished pictures"):
+    for heading in (
+        "Known noise in",
+        "Photo-electrons",
+        "A real camera's finished",
+        "Real cameras",
+    ):
         assert heading in out
     monkeypatch.setattr(validate, "close_loop", lambda *_: replace(loop, a=0.5))
     assert validate.main() == 1

@@ -21,8 +21,8 @@ RANGE_LUMA, RANGE_CHROMA = 10.0, 2.5
 # 100 what is smaller is noise or cannot be told from it.
 LEAST_NOISE = 0.006
 
-# Weights by squared distance, px: for luma a binomial window, for chroma a wider one, of pixels that
-# demosaicing made of other samples than the centre's.
+# Weights by squared distance, px: for luma a binomial window, for chroma a wider one of pixels
+# that demosaicing made of other samples than the centre's.
 LUMA_WINDOW = {1: 0.5, 2: 0.25}
 CHROMA_WINDOW = {2: 0.6, 4: 0.45}
 

@@ -1,0 +1,130 @@
+"""Charts whose colours are known, as linear renders: square patches on grey, six in a row."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clpipe.base.types import Doubles, Floats, Mask
+from clpipe.reference.transfer import inverse_srgb_curve
+
+SIDE = 64  # px, of a patch
+EDGE = SIDE // 8  # px of background around each
+INNER = SIDE // 4  # px from a patch's place to what counts of it: no neighbour reaches that far
+ROW = 6  # patches
+BACKGROUND = 0.18  # linear
+
+GREY = 21  # of CHART: the patch of 18 % reflectance
+# sRGB levels of the 24 patches of a ColorChecker, row by row, after X-Rite, "Colorimetric values
+# for ColorChecker family of targets" (charts made before November 2014).
+CHART = (
+    *((115, 82, 68), (194, 150, 130), (98, 122, 157), (87, 108, 67), (133, 128, 177)),
+    *((103, 189, 170), (214, 126, 44), (80, 91, 166), (193, 90, 99), (94, 60, 108)),
+    *((157, 188, 64), (224, 163, 46), (56, 61, 150), (70, 148, 73), (175, 54, 60)),
+    *((231, 199, 31), (187, 86, 149), (8, 133, 161), (243, 243, 242), (200, 200, 200)),
+    *((160, 160, 160), (122, 122, 121), (85, 85, 85), (52, 52, 52)),
+)
+
+# Linear light of the saturated chart: each hue bright and dim, with a darkest channel near black,
+# where a colour difference that passes noise on shows most.
+BRIGHT = (0.7, 0.2)
+DARK = (0.03, 0.004)
+HUES = ((1, 0, 0), (1, 0.4, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1))
+
+
+def chart_patches() -> Doubles:
+    """The 24 patches of a ColorChecker, (24, 3) in sRGB levels, 0 to 255, row by row.
+
+    >>> chart_patches()[GREY].tolist()
+    [122.0, 122.0, 121.0]
+    """
+    return np.array(CHART, np.float64)
+
+
+def linear(levels: NDArray[np.number]) -> Doubles:
+    """The linear light, 0 to 1, of sRGB levels, 0 to 255.
+
+    >>> linear(np.array([0, 122, 255])).round(3).tolist()
+    [0.0, 0.195, 1.0]
+    """
+    return inverse_srgb_curve(np.asarray(levels / 255, np.float64))
+
+
+def saturated_patches() -> Doubles:
+    """24 saturated colours, (24, 3) in linear light: six hues, two brightnesses, two darknesses.
+
+    >>> saturated_patches()[0].tolist()
+    [0.7, 0.03, 0.03]
+    """
+    hues = np.array(HUES, np.float64)
+    return np.concatenate([d + (b - d) * hues for b in BRIGHT for d in DARK])
+
+
+def patch_image(colours: Doubles) -> Floats:
+    """Flat patches on grey as a linear render, (rows * 64, 384, 3).
+
+    Args:
+        colours: (patch, 3), linear RGB.
+    """
+    rows = -(-len(colours) // ROW)
+    image = np.full((rows * SIDE, ROW * SIDE, 3), BACKGROUND, np.float32)
+    for number, colour in enumerate(colours):
+        y, x = (index * SIDE for index in divmod(number, ROW))
+        image[y + EDGE : y + SIDE - EDGE, x + EDGE : x + SIDE - EDGE] = colour
+    return image
+
+
+def chart_image() -> Floats:
+    """The 24 patches of :func:`chart_patches` as a linear render, (256, 384, 3)."""
+    return patch_image(linear(chart_patches()))
+
+
+def saturated_image() -> Floats:
+    """The 24 patches of :func:`saturated_patches` above ramps and fine textures of their hues.
+
+    A linear render, (640, 384, 3): below row 256 each hue has a column of a ramp to black, then
+    one of stripes and grains of 1 to 4 px.
+    """
+    flat = patch_image(saturated_patches())
+    height, width = 6 * SIDE, SIDE
+    y, x = np.mgrid[0:height, 0:width]
+    ramp = BRIGHT[0] * np.linspace(1, 0, SIDE) ** 2
+    generator = np.random.default_rng(0)
+    textured = np.empty((height, ROW, width, 3))
+    for number, hue in enumerate(np.array(HUES, np.float64)):
+        light = np.empty((height, width))
+        for part in range(6):
+            rows = slice(part * SIDE, (part + 1) * SIDE)
+            if part < 2:  # ramps, across and down
+                light[rows] = ramp if part else ramp[:, None]
+            elif part < 5:  # slanted stripes of 2, 3 and 4 px
+                light[rows] = np.where((x + y)[rows] % (2 * part) < part, *BRIGHT)
+            else:
+                grains = generator.uniform(DARK[0], BRIGHT[0], (SIDE // 2, SIDE // 2))
+                light[rows] = grains.repeat(2, 0).repeat(2, 1)
+        textured[:, number] = np.maximum(light[..., None] * hue, DARK[1])
+    return np.concatenate([flat, textured.reshape(height, -1, 3).astype(np.float32)])
+
+
+def patch_places(height: int, patches: int = 24) -> Mask:
+    """The inner halves of the patches of an image of them, (height, 384).
+
+    >>> int(patch_places(256).sum()) == 24 * 32 * 32
+    True
+    """
+    y, x = np.mgrid[0:height, 0 : ROW * SIDE]
+    inner = [(axis % SIDE >= INNER) & (axis % SIDE < SIDE - INNER) for axis in (y, x)]
+    return np.asarray(inner[0] & inner[1] & (y // SIDE * ROW + x // SIDE < patches))
+
+
+def patch_means(picture: NDArray[np.number], patches: int = 24) -> Doubles:
+    """What the patches of an image came out as, (patch, 3): the means of their inner halves.
+
+    Args:
+        picture: (height, 384, 3), of any unit.
+
+    >>> bool(np.allclose(patch_means(chart_image()), linear(chart_patches())))
+    True
+    """
+    rows = -(-patches // ROW)
+    blocks = picture[: rows * SIDE].reshape(rows, SIDE, ROW, SIDE, -1)
+    inner = blocks[:, INNER:-INNER, :, INNER:-INNER].mean((1, 3), dtype=np.float64)
+    return np.asarray(inner.reshape(rows * ROW, -1)[:patches])

@@ -1,0 +1,119 @@
+"""How near a finished picture comes to what it pictures: colours, brightness, errors of edges.
+
+All pictures are of sRGB levels, 0 to 255.
+"""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clpipe.analysis.charts import GREY, linear
+from clpipe.analysis.signature import luma
+from clpipe.base.types import Doubles
+from clpipe.camera.profile import SRGB_TO_XYZ
+
+HAS_HUE = 10.0  # CIELAB chroma of a colour from which on its hue is compared
+DOT = 32  # levels of luma from the median of the 3x3
+SMOOTH = 16  # the same, of the reference, where a dot can be told
+
+
+def cielab(levels: NDArray[np.number]) -> Doubles:
+    """CIELAB of sRGB levels under D65, (..., 3): L*, a*, b* (CIE 15:2018, eq. 8.3 to 8.11).
+
+    >>> cielab(np.array([[255, 255, 255], [122, 122, 122], [255, 0, 0]])).round(1).tolist()
+    [[100.0, 0.0, 0.0], [51.2, 0.0, 0.0], [53.2, 80.1, 67.2]]
+    """
+    ratio = linear(levels) @ (SRGB_TO_XYZ / SRGB_TO_XYZ.sum(1, keepdims=True)).T
+    x, y, z = np.moveaxis(
+        np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio * (29 / 6) ** 2 / 3 + 4 / 29), -1, 0
+    )
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
+
+
+@dataclass(frozen=True)
+class ColourErrors:
+    """How the patches of a chart came out, against the chart itself, in CIELAB.
+
+    Hue and chroma are of the patches whose own chroma is at least 10; others have no hue to keep.
+    """
+
+    grey: float  # level of green that the 18 % grey comes out as; 122 in the chart
+    lightness: float  # mean difference of L*
+    hue: float  # median error, degrees
+    largest_hue: float  # degrees
+    chroma: float  # median ratio to the chart's
+
+    def record(self) -> dict[str, float]:
+        """The figures by name."""
+        return asdict(self)
+
+
+def colour_errors(pictured: NDArray[np.number], true: NDArray[np.number]) -> ColourErrors:
+    """Compare the patches of a picture of a ColorChecker with their true colours.
+
+    Args:
+        pictured: (24, 3).
+        true: (24, 3), as of :func:`~clpipe.analysis.charts.chart_patches`.
+
+    >>> from clpipe.analysis.charts import chart_patches
+    >>> true = chart_patches()
+    >>> colour_errors(true, true)
+    ColourErrors(grey=122.0, lightness=0.0, hue=0.0, largest_hue=0.0, chroma=1.0)
+    """
+    found, asked = cielab(pictured), cielab(true)
+    (found_chroma, found_hue), (chroma, hue) = (
+        (np.hypot(lab[:, 1], lab[:, 2]), np.arctan2(lab[:, 2], lab[:, 1])) for lab in (found, asked)
+    )
+    coloured = chroma >= HAS_HUE
+    turned = np.degrees(np.abs((found_hue - hue + np.pi) % (2 * np.pi) - np.pi))[coloured]
+    return ColourErrors(
+        grey=float(pictured[GREY, 1]),
+        lightness=float((found[:, 0] - asked[:, 0]).mean()),
+        hue=float(np.median(turned)),
+        largest_hue=float(turned.max()),
+        chroma=float(np.median(found_chroma[coloured] / chroma[coloured])),
+    )
+
+
+def delta_e(one: NDArray[np.number], two: NDArray[np.number]) -> Doubles:
+    """The distance of colours in CIELAB (CIE 1976), pixel by pixel.
+
+    >>> delta_e(np.array([255, 0, 0]), np.array([0, 255, 0])).round(1).tolist()
+    170.6
+    """
+    return np.linalg.norm(cielab(one) - cielab(two), axis=-1)
+
+
+def dots(picture: NDArray[np.number], reference: NDArray[np.number]) -> float:
+    """Lone pixels that the reference lacks, per 10,000.
+
+    A dot's luma is more than 32 from the median of its 3x3, where the reference's own is within 16.
+
+    Args:
+        picture: (height, width, 3).
+        reference: the same without what makes dots: a mosaic, noise.
+
+    >>> grey = np.full((100, 100, 3), 128.0)
+    >>> spotted = grey.copy()
+    >>> spotted[50, 50] += 40
+    >>> dots(spotted, grey), dots(spotted, spotted)
+    (1.0, 0.0)
+    """
+    from scipy import ndimage
+
+    def alone(levels: NDArray[np.number]) -> Doubles:
+        y = luma(levels)
+        return np.abs(y - ndimage.median_filter(y, 3))
+
+    return float(1e4 * ((alone(picture) > DOT) & (alone(reference) <= SMOOTH)).mean())
+
+
+def psnr(one: NDArray[np.number], two: NDArray[np.number]) -> float:
+    """Peak signal-to-noise ratio, dB, over all channels; infinite where both are the same.
+
+    >>> round(psnr(np.zeros((2, 2, 3)), np.ones((2, 2, 3))), 2)
+    48.13
+    """
+    error = ((one.astype(np.float64) - two) ** 2).mean()
+    return float(10 * np.log10(255**2 / error)) if error else np.inf

@@ -1,0 +1,122 @@
+"""tools/compare_converters, and what it shares with tools/validate; no converter is needed here."""
+
+import sys
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
+
+import numpy as np
+import pytest
+import side_by_side
+from PIL import Image
+
+from clpipe.analysis.charts import chart_image, chart_patches, saturated_image
+from clpipe.analysis.fidelity import colour_errors
+from tests.conftest import ROOT
+
+LOADER = SourceFileLoader("compare_converters", str(ROOT / "tools" / "compare_converters"))
+tool = module_from_spec(spec_from_loader("compare_converters", LOADER))
+sys.modules["compare_converters"] = tool  # its dataclasses look themselves up there
+LOADER.exec_module(tool)
+
+COPY = tool.Converter("copy", "none", "cp DNG PICTURE")
+PRINT = tool.Converter("print", "none", "cat DNG")
+FAIL = tool.Converter("fail", "none", "cat HOME/missing")
+
+
+def comparison(folder, *converters):
+    return tool.Comparison(folder, ("default",), converters)
+
+
+def save(folder, maker, iso, name, pixels):
+    path = folder / maker / f"iso{iso}" / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path)
+    return path
+
+
+@pytest.mark.parametrize("converter", [COPY, PRINT])
+def test_a_picture_is_what_the_converter_writes_or_prints(tmp_path, converter):
+    negative = tmp_path / "a.dng"
+    negative.write_bytes(b"raw")
+    picture = tmp_path / "out" / "a.png"
+    comparison(tmp_path, converter).convert(converter, negative, picture)
+    assert picture.read_bytes() == b"raw"
+
+
+def test_a_converter_that_fails_is_named_with_its_reason(tmp_path):
+    with pytest.raises(tool.ComparisonError, match=r"^cat failed: .*No such file"):
+        comparison(tmp_path, FAIL).convert(FAIL, tmp_path / "a.dng", tmp_path / "a.png")
+
+
+def test_a_converter_that_makes_nothing_is_no_success(tmp_path):
+    silent = tool.Converter("silent", "none", "true DNG PICTURE")
+    stale = save(tmp_path, "silent", 100, "a.png", np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(tool.ComparisonError, match="silent made nothing"):
+        comparison(tmp_path, silent).convert(silent, tmp_path / "a.dng", stale)
+
+
+def test_a_border_that_a_converter_cuts_off_does_not_shift_the_picture(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    save(tmp_path, "clpipe-default", 100, "a.png", pixels)
+    save(tmp_path, "copy", 100, "a.png", pixels[4:-4, 4:-4])
+    found = comparison(tmp_path, COPY).picture("copy", 100, "a")
+    assert found.shape == pixels.shape
+    assert np.array_equal(found[4:-4, 4:-4], pixels[4:-4, 4:-4])
+    save(tmp_path, "copy", 100, "a.png", pixels[:, :-20])
+    with pytest.raises(tool.ComparisonError, match="is 40x40; expected 60x40"):
+        comparison(tmp_path, COPY).picture("copy", 100, "a")
+
+
+def test_the_middle_of_what_was_enlarged_is_the_image():
+    image = np.random.default_rng(0).random((6, 4, 3)).astype(np.float32)
+    assert np.array_equal(tool.reduced(tool.enlarged(image)), image)
+
+
+def test_a_place_is_where_the_picture_is_saturated_or_detailed():
+    picture = np.full((300, 400, 3), 128, np.uint8)
+    picture[20:120, 30:160] = 250, 0, 0
+    picture[180:290:2, 220:390] = 0
+    places = side_by_side.telling_places(picture)
+    assert (places["saturated"].of(picture) == (250, 0, 0)).all()
+    assert side_by_side.luma(places["detail"].of(picture)).std() > 60
+
+
+def test_a_sheet_holds_the_crops_at_400_percent():
+    crop = np.random.default_rng(0).integers(0, 256, (*side_by_side.CROP, 3), dtype=np.uint8)
+    page = np.asarray(side_by_side.sheet(["one", "two"], {"a, b": [crop, 255 - crop]}))
+    high, wide = (side * 4 for side in side_by_side.CROP)
+    top, left = side_by_side.HEAD, side_by_side.SIDE
+    assert np.array_equal(page[top : top + high : 4, left : left + wide : 4], crop)
+
+
+def test_the_charts_fit_the_sensor():
+    for image in (chart_image(), saturated_image()):
+        assert 0 <= image.min() < image.max() <= 1
+        assert image.shape[0] % 2 == image.shape[1] % 2 == 0
+
+
+def test_errors_of_colour_are_told_apart():
+    true = chart_patches()
+    brighter = colour_errors(true * 1.05, true)
+    assert brighter.grey == pytest.approx(128.1)
+    assert brighter.lightness > 2 > 1 > brighter.hue
+    grey = true.mean(1, keepdims=True)
+    assert colour_errors(grey + (true - grey) / 2, true).chroma == pytest.approx(0.5, abs=0.05)
+    only_red = true.copy()
+    only_red[14] = only_red[14, [0, 2, 1]] + (0, 60, 0)  # red towards orange
+    turned = colour_errors(only_red, true)
+    assert turned.hue == 0
+    assert 20 < turned.largest_hue < 60
+    assert turned.chroma == 1
+
+
+def test_what_is_missing_is_named_and_left_out(monkeypatch, capsys, tmp_path):
+    seen = []
+    monkeypatch.setattr(tool, "compare", lambda comparison, *_: seen.append(comparison))
+    monkeypatch.setattr(tool.shutil, "which", lambda name: name if name == "dcraw" else None)
+    monkeypatch.setattr("sys.argv", ["compare_converters", "-c", "paper", "-o", str(tmp_path)])
+    assert tool.main() == 0
+    assert list(seen[0].makers) == ["clpipe, default", "clpipe, paper", "dcraw"]
+    said = capsys.readouterr().err
+    assert "darktable is left out: apt-get install darktable" in said
+    assert "RawTherapee is left out: apt-get install rawtherapee" in said

@@ -1,0 +1,102 @@
+"""What tools print and draw where developments are compared: Markdown tables, sheets of crops."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+from scipy import ndimage
+
+from clpipe.analysis.signature import Signature, luma
+from clpipe.base.types import Array, Doubles
+
+SCALE = 4  # of crops
+CROP = 64, 96  # px: height, width
+GAP, HEAD, SIDE = 6, 24, 150  # px: between crops, above and left of them
+
+# The columns of a signature as a table has them: heading, attribute, format.
+COLUMNS = (
+    ("rms", "rms", ".1f"),
+    ("kurtosis", "kurtosis", ".1f"),
+    ("beyond 4 sigma, 1e-4", "beyond_4_sigma", ".0f"),
+    ("right", "right", ".2f"),
+    ("below", "below", ".2f"),
+    ("diagonal", "diagonal", ".2f"),
+    ("2 right", "two_right", ".2f"),
+    ("half", "half", ".2f"),
+    ("chroma right", "chroma_right", ".2f"),
+    ("R-G", "red_green", ".2f"),
+)
+
+
+def cells(signature: Signature | Mapping[str, float]) -> list[str]:
+    """The columns of a signature as texts."""
+    record = signature.record() if isinstance(signature, Signature) else signature
+    return [format(record[name], form) if name in record else "" for _, name, form in COLUMNS]
+
+
+def markdown(heads: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
+    """A table.
+
+    >>> print(markdown(["a", "b"], [["1", "2"]]))
+    | a | b |
+    |---|---|
+    | 1 | 2 |
+    """
+    first, *others = (f"| {' | '.join(row)} |" for row in (heads, *rows))
+    return "\n".join([first, "|---" * len(heads) + "|", *others])
+
+
+class Place(NamedTuple):
+    """Where a crop is: its top and its left, px."""
+
+    top: int
+    left: int
+
+    def of(self, picture: Array) -> Array:
+        """The crop of a picture."""
+        return picture[self.top : self.top + CROP[0], self.left : self.left + CROP[1]]
+
+
+def telling_places(picture: Array) -> dict[str, Place]:
+    """Where a crop shows most: the most saturated place, and the richest in detail.
+
+    Args:
+        picture: without noise, (height, width, 3) of 0 to 255, larger than a crop.
+    """
+    levels = picture.astype(np.float64)
+    y = luma(levels)
+    gradient = np.hypot(ndimage.sobel(y, 0), ndimage.sobel(y, 1))
+    of = {"saturated": np.ptp(levels, axis=2), "detail": gradient}
+    return {name: _highest(np.asarray(measure)) for name, measure in of.items()}
+
+
+def _highest(measure: Doubles) -> Place:
+    """The crop with the largest mean."""
+    mean = ndimage.uniform_filter(measure, CROP)
+    (up, left), (height, width) = (side // 2 for side in CROP), measure.shape
+    inside = mean[up : height - CROP[0] + up + 1, left : width - CROP[1] + left + 1]
+    top, first = np.unravel_index(inside.argmax(), inside.shape)
+    return Place(int(top), int(first))
+
+
+def sheet(columns: Sequence[str], rows: Mapping[str, Sequence[Array]]) -> Image.Image:
+    """Crops at 400 %: a row of them for each caption, a column for each development.
+
+    Args:
+        columns: their captions.
+        rows: caption -> as many crops, (height, width, 3) uint8, all of one size.
+    """
+    height, width = (side * SCALE for side in CROP)
+    size = SIDE + len(columns) * (width + GAP), HEAD + len(rows) * (height + GAP)
+    page = Image.new("RGB", size, "white")
+    draw, font = ImageDraw.Draw(page), ImageFont.load_default(15)
+    for column, caption in enumerate(columns):
+        draw.text((SIDE + column * (width + GAP), 3), caption, fill="black", font=font)
+    for row, (caption, crops) in enumerate(rows.items()):
+        top = HEAD + row * (height + GAP)
+        draw.multiline_text((3, top), caption.replace(", ", "\n"), fill="black", font=font)
+        for column, crop in enumerate(crops):
+            enlarged = crop.repeat(SCALE, 0).repeat(SCALE, 1)
+            page.paste(Image.fromarray(enlarged), (SIDE + column * (width + GAP), top))
+    return page
