@@ -146,7 +146,11 @@ def load_scenes(frames: Sequence[str], means: Sequence[str]) -> Scenes:
             f"{len(paths)} frames without a mean: kurtosis and tails are left out; "
             f"{FEWEST_FRAMES} frames tell them"
         )
-    pieces = [crop for scene in whole for crop in crops_of(scene)]
+    pieces = [
+        crop
+        for scene in whole
+        for crop in ([scene] if max(scene.mask.shape) <= LARGEST else crops_of(scene))
+    ]
     flat = sum(int(piece.mask.sum()) for piece in pieces)
     if flat < FEWEST_FLAT:
         names, cleans = [scene.name for scene in whole], [scene.mean for scene in whole]
@@ -293,32 +297,39 @@ def too_few(names: Sequence[str], cleans: Sequence[Doubles], flat: int, needed: 
     )
 
 
-def crops_of(scene: Scene) -> list[Scene]:
-    """A scene itself, or the flattest crops of a large one."""
+def crops_of(scene: Scene, size: int = CROP, count: int = CROPS) -> list[Scene]:
+    """The flattest crops of a scene, at most ``count``, up to ``size`` wide and high."""
     height, width = scene.mask.shape
-    if max(height, width) <= LARGEST:
-        return [scene]
-    down, right = min(CROP, height), min(CROP, width)
+    down, right = min(size, height), min(size, width)
+    step = min(CROP, size // 2)
     places = [
         (top, left)
-        for top in range(0, height - down + 1, CROP)
-        for left in range(0, width - right + 1, CROP)
+        for top in range(0, height - down + 1, step)
+        for left in range(0, width - right + 1, step)
     ]
-    windows = {
-        place: np.s_[place[0] : place[0] + down, place[1] : place[1] + right] for place in places
-    }
-    flattest = sorted(places, key=lambda place: -int(scene.mask[windows[place]].sum()))[:CROPS]
-    return [
-        replace(
-            scene,
-            name=f"{scene.name} at {left},{top}",
-            frames=tuple(frame[windows[top, left]] for frame in scene.frames),
-            mean=scene.mean[windows[top, left]],
-            mask=scene.mask[windows[top, left]],
-            held=scene.held[windows[top, left]],
-        )
-        for top, left in flattest
-    ]
+    flattest: list[tuple[int, int]] = []
+    for top, left in sorted(places, key=lambda at: -int(scene.mask[window(at, down, right)].sum())):
+        apart = [abs(top - y) >= down or abs(left - x) >= right for y, x in flattest]
+        if all(apart) and len(flattest) < count:
+            flattest.append((top, left))
+    return [cut(scene, window(place, down, right), place) for place in flattest]
+
+
+def window(place: tuple[int, int], height: int, width: int) -> tuple[slice, slice]:
+    """The rows and columns of a crop whose upper left corner is at a place, (row, column)."""
+    return np.s_[place[0] : place[0] + height, place[1] : place[1] + width]
+
+
+def cut(scene: Scene, at: tuple[slice, slice], place: tuple[int, int]) -> Scene:
+    """A crop of a scene."""
+    return replace(
+        scene,
+        name=f"{scene.name} at {place[1]},{place[0]}",
+        frames=tuple(frame[at] for frame in scene.frames),
+        mean=scene.mean[at],
+        mask=scene.mask[at],
+        held=scene.held[at],
+    )
 
 
 def held_out(pieces: Sequence[Scene]) -> tuple[Scene, ...]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from clpipe.analysis.matching.columns import COLUMNS, Figures, Noise, Places, errors_of, figures_of
-from clpipe.analysis.matching.scenes import Scene, Scenes
+from clpipe.analysis.matching.scenes import Scene, Scenes, crops_of
 from clpipe.analysis.matching.simulation import Simulator
 from clpipe.analysis.matching.space import (
     DEVELOPMENT,
@@ -30,11 +30,11 @@ from clpipe.engine.device import Device
 LOG = logging.getLogger(__name__)
 
 GLANCE, QUICK, FULL = 2, 3, 12  # steps of least squares: at first, while promising, at the end
-PROMISING = 1.6  # times the best cost, after a glance
+HOPELESS, PROMISING = 5.0, 1.6  # times the best cost, before and after a glance
 STEP = 0.03  # of a dimension's range, for differences
 KNEE = 3.0  # residuals beyond count less than their squares (soft L1)
-BETTER = 0.97  # share of the cost below which another method is taken
-FEW = 2  # scenes by which methods are compared
+BETTER = 0.92  # share of the cost below which another method is taken
+FEW, SMALL = 2, 384  # scenes by which methods are compared, and the size of their crops, px
 ROUNDS = 2  # of all parts
 
 
@@ -91,7 +91,9 @@ class Search:
 
     def run(self) -> Candidate:
         """The best development that is found."""
-        few = sorted(self.targets, key=lambda t: -int(t.scene.mask.sum()))[:FEW]
+        flattest = sorted(self.targets, key=lambda t: -int(t.scene.mask.sum()))[:FEW]
+        crops = [crops_of(target.scene, SMALL, 1)[0] for target in flattest]
+        few = [target_of(crop, crop.mask) for crop in crops]
         best = self.fit(self.space.first, {}, few, QUICK)
         LOG.info("start: residuals of %.2g", typical(best, few))
         tried = {labels(best)}
@@ -99,10 +101,10 @@ class Search:
             before = best
             for part, choices in self.space.choices.items():
                 for choice in choices:
-                    best = self.attempt(best, {**best.choices, part: choice}, few, tried)
+                    best = self.attempt(best, part, choice, few, tried)
                 for choice in variants_of(best.settings, part) if part in DEVELOPMENT else ():
-                    changed = {**best.choices, part: merged(best.choices[part], choice)}
-                    best = self.attempt(best, changed, few, tried)
+                    variant = merged(best.choices[part], choice)
+                    best = self.attempt(best, part, variant, few, tried, own=True)
             if best is before:
                 break
         return self.fit(best.choices, best.numbers, self.targets, FULL)
@@ -110,16 +112,26 @@ class Search:
     def attempt(
         self,
         best: Candidate,
-        choices: Mapping[str, Choice],
+        part: str,
+        choice: Choice,
         targets: Sequence[Target],
         tried: set[tuple[str, ...]],
+        own: bool = False,
     ) -> Candidate:
-        """The better of the best and another set of choices, fitted from the best's numbers."""
-        other = tuple(choice.text for choice in choices.values())
+        """The better of the best and the same with another choice of a part.
+
+        Its numbers start from the best's; those of the part do so where the choice is the best's
+        ``own`` method, because to another method they mean other things.
+        """
+        choices = {**best.choices, part: choice}
+        other = tuple(each.text for each in choices.values())
         if other in tried:
             return best
         tried.add(other)
-        found = self.fit(choices, best.numbers, targets, GLANCE)
+        start = {k: v for k, v in best.numbers.items() if own or k.partition(".")[0] != part}
+        found = self.fit(choices, start, targets, 0)
+        if found.cost < HOPELESS * best.cost:
+            found = self.fit(choices, start, targets, GLANCE)
         if BETTER * best.cost <= found.cost < PROMISING * best.cost:
             found = self.fit(choices, found.numbers, targets, QUICK)
         LOG.debug("%s: cost %.1f, best %.1f", ", ".join(other), found.cost, best.cost)
@@ -155,9 +167,10 @@ class Search:
 
         # From 1 to 2, not from 0: SciPy's steps for differences are relative.
         places = np.clip([1 + d.share(numbers[d.name]) for d in dimensions], 1.01, 1.99)
-        if not dimensions:
-            cost = float((residuals(places) ** 2).sum() / 2)
-            return Candidate(choices, settings, {}, cost)
+        if not (dimensions and steps):
+            knee = (residuals(places) / KNEE) ** 2
+            cost = float(KNEE**2 * (np.sqrt(1 + knee) - 1).sum())  # as SciPy's soft_l1
+            return Candidate(choices, with_numbers(settings, numbers), numbers, cost)
         found = least_squares(
             residuals,
             places,
