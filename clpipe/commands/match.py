@@ -107,16 +107,8 @@ def residual_text(row: Row) -> str:
 
 def summary(found: Match) -> str:
     """What was found, in two lines."""
-    worst = found.worst
-    settings = found.settings
-    methods = [
-        f"{name} {table['method']}"
-        for name, table in settings.parameters.items()
-        if "method" in table
-    ]
-    numbers = (f"{name} = {value_text(value)}" for name, value in found.numbers.items())
-    return (
-        f"{', '.join([*methods, *numbers])}; after {found.evaluations} developments\n"
-        f"largest residual of a correlation on crops not searched: {worst.residual:+.3f} "
-        f"({COLUMNS[worst.name].text})"
-    )
+    tables = found.settings.parameters.items()
+    methods = [f"{name} {table['method']}" for name, table in tables if "method" in table]
+    numbers = [f"{name} = {value_text(value)}" for name, value in found.numbers.items()]
+    developments = f"after {found.evaluations} developments"
+    return f"{', '.join([*methods, *numbers])}; {developments}\n{found.verdict}"

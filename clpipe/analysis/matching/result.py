@@ -63,10 +63,16 @@ class Match:
     noises: tuple[Compared, ...]
 
     @property
-    def worst(self) -> Row:
+    def verdict(self) -> str:
         """The correlation with the largest residual in crops that the search did not see."""
         rows = [row for row in self.unseen if not row.relative and abs(row.theirs) <= 1]
-        return max(rows, key=lambda row: np.nan_to_num(abs(row.residual)))
+        if not rows:
+            return "the crops that were not searched are too few to tell"
+        worst = max(rows, key=lambda row: abs(row.residual))
+        return (
+            "largest residual of a correlation on crops not searched: "
+            f"{worst.residual:+.3f} ({COLUMNS[worst.name].text})"
+        )
 
     def record(self) -> dict[str, Any]:
         """The match as JSON values; what could not be compared is null."""
@@ -164,13 +170,12 @@ def configuration(match: Match) -> str:
     Every parameter of the stages that were searched is written, so that it stays the same where a
     default changes.
     """
-    settings, worst = match.settings, match.worst
+    settings = match.settings
     names = [scene.name for scene in match.scenes.each]
     more = f" and {len(names) - 1} more" if len(names) > 1 else ""
     lines = [
-        f"# Noise like that of {names[0]}{more}; found by clpipe match. In crops that the",
-        f"# search did not see, the largest residual of a correlation is {worst.residual:+.3f} "
-        f"({COLUMNS[worst.name].text}).",
+        f"# Noise like that of {names[0]}{more}; found by clpipe match:",
+        f"# {match.verdict}.",
         f"camera = {value_text(settings.camera)}",
         f"iso = {value_text(settings.iso)}",
     ]
