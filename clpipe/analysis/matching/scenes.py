@@ -230,6 +230,17 @@ def still_places(path: Path, frame: Floats, clean: Doubles, against: str, flat: 
 
     difference = luma(frame) - luma(clean)
     difference -= difference.mean()
+    sharp = difference - ndimage.gaussian_filter(difference, DRIFT)
+    slopes = np.gradient(ndimage.gaussian_filter(luma(clean), 1.0))
+    design = np.stack([slope.ravel() for slope in slopes], axis=1)
+    shift = -np.linalg.lstsq(design, sharp.ravel(), rcond=None)[0]
+    errors = np.sqrt((sharp**2).mean() / np.maximum((design**2).sum(0), 1e-9))  # of white noise
+    if (np.abs(shift) > np.maximum(SHIFT, SURE * errors)).any():
+        down, right = shift
+        raise RequestError(
+            f"{path} lies {right:+.1f} px to the right and {down:+.1f} px below {against}; "
+            "a scene that moves tells nothing of noise; use a tripod"
+        )
     energy = float((difference**2).mean())
     wide = block_means(difference, SCENE_BLOCK)
     if energy and (share := float((wide**2).mean()) / energy) > SCENE_SHARE:
@@ -238,18 +249,8 @@ def still_places(path: Path, frame: Floats, clean: Doubles, against: str, flat: 
             f"{SCENE_BLOCK}x{SCENE_BLOCK} pixels, {share:.0%} of the difference remains, of noise "
             f"less than {SCENE_SHARE:.0%} would"
         )
-    difference -= ndimage.gaussian_filter(difference, DRIFT)
-    slopes = np.gradient(ndimage.gaussian_filter(luma(clean), 1.0))
-    design = np.stack([slope.ravel() for slope in slopes], axis=1)
-    down, right = -np.linalg.lstsq(design, difference.ravel(), rcond=None)[0]
-    least = np.sqrt((difference**2).mean() / (design**2).sum(0).min())  # error of white noise
-    if max(abs(down), abs(right)) > max(SHIFT, SURE * least):
-        raise RequestError(
-            f"{path} lies {right:+.1f} px to the right and {down:+.1f} px below {against}; "
-            "a scene that moves tells nothing of noise; use a tripod"
-        )
-    sigma = float(difference[flat].std()) if flat.any() else float(difference.std())
-    moved = np.abs(block_means(difference, MOVED_BLOCK)) > MOVED * sigma
+    sigma = float(sharp[flat].std())
+    moved = np.abs(block_means(sharp, MOVED_BLOCK)) > MOVED * sigma
     if moved.mean() > MOST_MOVED:
         raise RequestError(
             f"{path}: {moved.mean():.0%} of the picture differs from {against} by more than noise; "
