@@ -1,4 +1,4 @@
-// Demosaicing that invents nothing: every missing sample lies between its neighbours of that colour.
+// Demosaicing that bounds what it invents by the samples around.
 #include "lib/demosaic.h"
 #include "lib/roots.h"
 
@@ -28,19 +28,45 @@ INLINE vf bounded_green(site at, image roots, cfa pattern, float even) {
     return by_site(at, pattern, centre - green, centre, centre - green);
 }
 
-// Red and blue from colour differences, between the least and the greatest neighbour of that colour.
-INLINE rgb bounded_red_and_blue(site at, image roots, image known, cfa pattern,
-                                float offset) {
-    const vf centre = tap_mosaic(roots, 0, 0);
-    const vf west = tap_mosaic(roots, -1, 0), east = tap_mosaic(roots, 1, 0);
-    const vf north = tap_mosaic(roots, 0, -1), south = tap_mosaic(roots, 0, 1);
-    const vf one = tap_mosaic(roots, -1, -1), two = tap_mosaic(roots, 1, -1);
-    const vf three = tap_mosaic(roots, -1, 1), four = tap_mosaic(roots, 1, 1);
-    const vf least = vmin(vmin(one, two), vmin(three, four));
-    const vf most = vmax(vmax(one, two), vmax(three, four));
-    const pair low = red_and_blue(at, pattern, centre, vmin(west, east), vmin(north, south), least);
-    const pair high = red_and_blue(at, pattern, centre, vmax(west, east), vmax(north, south), most);
-    rgb c = from_differences(at, pattern, centre, spread_differences(at, known, pattern));
+typedef struct { vf low, high; } bounds;
+
+INLINE bounds extended(bounds b, vf v) {
+    const bounds w = {vmin(b.low, v), vmax(b.high, v)};
+    return w;
+}
+
+// How far red or blue may go: as far as its neighbours do, and beyond them by as much as green here
+// goes beyond green there, less what noise may do. A line narrower than the pattern is an extreme of
+// green, too; where a colour ends green only rises or falls.
+INLINE bounds with_excess(bounds colour, bounds green, vf here, float noise) {
+    const bounds v = {colour.low + vmin(here - green.low + noise, (vf)(0.0f)),
+                      colour.high + vmax(here - green.high - noise, (vf)(0.0f))};
+    return v;
+}
+
+// Red and blue from colour differences, within bounds.
+INLINE rgb bounded_red_and_blue(site at, image roots, image known, cfa pattern, float offset,
+                                float noise) {
+    rgb c = from_differences(at, pattern, tap_mosaic(roots, 0, 0),
+                             spread_differences(at, known, pattern));
+    bounds colour[3], green[3];  // in the row, in the column, at the corners
+#pragma unroll
+    for (int i = 0; i < 8; ++i) {
+        const int set = i / 2 < 2 ? i / 2 : 2, sign = i & 1 ? 1 : -1;
+        const int dx = set == 1 ? 0 : sign, dy = set == 0 ? 0 : set == 1 ? sign : i < 6 ? -1 : 1;
+        const vf sample = tap_mosaic(roots, dx, dy), other = sample - tap_mosaic(known, dx, dy);
+        const bounds first = {sample, sample}, first_green = {other, other};
+        const bool begins = i == 0 || i == 2 || i == 4;
+        colour[set] = begins ? first : extended(colour[set], sample);
+        green[set] = begins ? first_green : extended(green[set], other);
+    }
+#pragma unroll
+    for (int set = 0; set < 3; ++set) colour[set] = with_excess(colour[set], green[set], c.g, noise);
+    const vf own = tap_mosaic(roots, 0, 0);
+    const pair low =
+        red_and_blue(at, pattern, own, colour[0].low, colour[1].low, colour[2].low);
+    const pair high =
+        red_and_blue(at, pattern, own, colour[0].high, colour[1].high, colour[2].high);
     c.r = vmin(vmax(c.r, low.first), high.first);
     c.b = vmin(vmax(c.b, low.second), high.second);
     return from_roots(c, offset);

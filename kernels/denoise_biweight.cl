@@ -1,27 +1,30 @@
 // Means weighted by Tukey's biweight of the difference, on the roots of luma and chroma.
 #include "lib/roots.h"
 
-INLINE ycbcr to_root_luma_chroma(rgb c, site at, float offset) {
-    return rgb_to_ycbcr(roots_of(c, offset));
+// In units of the difference that weighs nothing.
+INLINE ycbcr to_root_luma_chroma(rgb c, site at, float offset, float luma_range,
+                                 float chroma_range) {
+    const ycbcr v = rgb_to_ycbcr(roots_of(c, offset));
+    const float luma = 1.0f / luma_range, chroma = 1.0f / chroma_range;
+    const ycbcr w = {v.y * luma, v.cb * chroma, v.cr * chroma};
+    return w;
 }
 
-INLINE rgb from_root_luma_chroma(ycbcr c, site at, float offset) {
-    return from_roots(ycbcr_to_rgb(c), offset);
-}
-
-// (1 - difference^2)^2, 0 beyond 1.
-INLINE vf biweight_of(vf squared) {
-    const vf near = vmax((vf)(1.0f) - squared, (vf)(0.0f));
-    return near * near;
+INLINE rgb from_root_luma_chroma(ycbcr c, site at, float offset, float luma_range,
+                                 float chroma_range) {
+    const ycbcr v = {c.y * luma_range, c.cb * chroma_range, c.cr * chroma_range};
+    return from_roots(ycbcr_to_rgb(v), offset);
 }
 
 // Luma from the pixels around, chroma from those at the corners and two pixels away, whose own noise
-// demosaicing has made differ from the centre's. `grain` is the share of luma that stays as it is.
-INLINE ycbcr biweight(site at, image planes, float luma_scale, float chroma_scale, float grain) {
+// demosaicing has made differ from the centre's. `grain` is the share of luma that stays as it is. What
+// is equally far has one weight, which comes last.
+INLINE ycbcr biweight(site at, image planes, float grain) {
 #pragma OPENCL FP_CONTRACT ON
-    const ycbcr centre = tap_ycbcr(planes, 0, 0);
-    ycbcr sum = centre;
-    vf luma_weight = (vf)(1.0f), chroma_weight = (vf)(1.0f);
+    const ycbcr centre = tap_ycbcr(planes, 0, 0), none = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
+    ycbcr sums[5] = {none, none, none, none, none};  // by squared distance
+    vf luma_weights[5] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
+    vf chroma_weights[5] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
 #pragma unroll
     for (int dy = -2; dy <= 2; ++dy) {
 #pragma unroll
@@ -30,22 +33,27 @@ INLINE ycbcr biweight(site at, image planes, float luma_scale, float chroma_scal
             if (distance == 1 || distance == 2) {
                 const vf y = tap_ycbcr(planes, dx, dy).y;
                 const vf d = y - centre.y;
-                const vf weight = biweight_of(d * d * luma_scale) * (distance == 1 ? 0.5f : 0.25f);
-                sum.y += weight * y;
-                luma_weight += weight;
+                const vf near = vmax((vf)(1.0f) - d * d, (vf)(0.0f)), weight = near * near;
+                sums[distance].y += weight * y;
+                luma_weights[distance] += weight;
             }
             if (distance == 2 || distance == 4) {
                 const ycbcr c = tap_ycbcr(planes, dx, dy);
                 const vf db = c.cb - centre.cb, dr = c.cr - centre.cr;
-                const vf weight = biweight_of((db * db + dr * dr) * chroma_scale) *
-                                  (distance == 2 ? 0.6f : 0.45f);
-                sum.cb += weight * c.cb;
-                sum.cr += weight * c.cr;
-                chroma_weight += weight;
+                const vf near = vmax((vf)(1.0f) - db * db - dr * dr, (vf)(0.0f));
+                const vf weight = near * near;
+                sums[distance].cb += weight * c.cb;
+                sums[distance].cr += weight * c.cr;
+                chroma_weights[distance] += weight;
             }
         }
     }
-    const vf y = sum.y / luma_weight, chroma = 1.0f / chroma_weight;
-    const ycbcr v = {y + grain * (centre.y - y), sum.cb * chroma, sum.cr * chroma};
+    const vf luma_weight = (vf)(1.0f) + 0.5f * luma_weights[1] + 0.25f * luma_weights[2];
+    const vf chroma_weight = (vf)(1.0f) + 0.6f * chroma_weights[2] + 0.45f * chroma_weights[4];
+    const vf y = (centre.y + 0.5f * sums[1].y + 0.25f * sums[2].y) / luma_weight;
+    const vf inverse = 1.0f / chroma_weight;
+    const ycbcr v = {y + grain * (centre.y - y),
+                     (centre.cb + 0.6f * sums[2].cb + 0.45f * sums[4].cb) * inverse,
+                     (centre.cr + 0.6f * sums[2].cr + 0.45f * sums[4].cr) * inverse};
     return v;
 }

@@ -1,12 +1,18 @@
-// A rational curve with a toe and a shoulder.
+// A rational curve, x (a x + b) / (x (c x + d) + 1), on the largest and the smallest of the three colours;
+// the one between keeps its relative place, which is its hue (as in Adobe's DNG software).
 #include "lib/hue.h"
 
-INLINE vf filmic_of(vf x, float a, float b, float c, float d) {
+// The chord's slope between both ends has their denominators below it, and the difference of the ends
+// cancels: one division does for all. `twist` is a d - b c.
+INLINE rgb filmic(rgb v, site at, float a, float b, float c, float d, float twist) {
 #pragma OPENCL FP_CONTRACT ON
-    return x * (a * x + b) / (x * (c * x + d) + 1.0f);
-}
-
-INLINE rgb filmic(rgb v, site at, float a, float b, float c, float d) {
     const extremes x = extremes_of(v);
-    return between_extremes(x, filmic_of(x.low, a, b, c, d), filmic_of(x.high, a, b, c, d));
+    const vf below_low = x.low * (c * x.low + d) + 1.0f;
+    const vf below_high = x.high * (c * x.high + d) + 1.0f;
+    const vf scale = 1.0f / (below_low * below_high);
+    const vf low = x.low * (a * x.low + b) * below_high * scale;
+    const vf slope = (a * (x.high + x.low) + b + twist * (x.high * x.low)) * scale;
+    const rgb w = {low + (x.inside.r - x.low) * slope, low + (x.inside.g - x.low) * slope,
+                   low + (x.inside.b - x.low) * slope};
+    return w;
 }

@@ -353,3 +353,20 @@ def test_a_cameras_raw_as_a_dng_loses_nothing(clpipe, tmp_path, pattern):
         ours, its = np.array(other.camera_whitebalance[:3]), np.array(one.camera_whitebalance[:3])
         assert ours / ours[1] == pytest.approx(its / its[1], rel=1e-4)
         assert np.abs(other.color_matrix - one.color_matrix).max() < 0.01
+
+
+@pytest.mark.parametrize("headroom", [1, 0, 1.5])
+def test_a_converter_is_told_of_the_headroom(tmp_path, scene, clpipe, headroom):
+    option = ("--set", f"exposure.headroom={headroom}")
+    clpipe("run", scene(8, 8), "-o", tmp_path, "--format", "dng", "--device", "numpy", *option)
+    first, _ = directories(tmp_path / "scene.dng")
+    assert float(first[50730]) == headroom  # BaselineExposure
+
+
+def test_of_a_raw_alone_the_clipped_pixels_are_counted(tmp_path, write_exr, clpipe):
+    pixels = np.full((8, 8, 3), 0.1, np.float32)
+    pixels[:2] = 100
+    path = write_exr("bright.exr", pixels)
+    told = clpipe("run", path, "-o", tmp_path, "--format", "dng", "--device", "numpy")
+    assert json.loads((tmp_path / "bright.json").read_text())["clipped"] == 0.25
+    assert "25 % of its pixels are clipped" in told

@@ -11,6 +11,8 @@ from PIL import Image, ImageDraw, ImageFont
 import clpipe
 from clpipe.base.types import Array
 from clpipe.images.read import read_image
+from clpipe.reference.curve import to_8_bit
+from clpipe.reference.transfer import srgb_curve
 
 ROOT = Path(__file__).resolve().parent.parent
 RENDER = ROOT / "tests" / "data" / "still_life.exr"
@@ -20,9 +22,8 @@ ISOS = (800, 6400)
 
 
 def plain(pixels: Array) -> Array:
-    """Linear RGB as a viewer shows it: clipped, gamma 2.2, eight bits."""
-    encoded = np.clip(pixels.astype(np.float32), 0, 1) ** (1 / 2.2)
-    return np.rint(encoded * 255).astype(np.uint8)
+    """Linear RGB as a viewer shows it: clipped, in sRGB, eight bits."""
+    return to_8_bit(np.float32(srgb_curve(np.clip(pixels.astype(np.float64), 0, 1))))
 
 
 def sheet(columns: list[tuple[str, Image.Image]]) -> Image.Image:
@@ -46,7 +47,7 @@ def sheet(columns: list[tuple[str, Image.Image]]) -> Image.Image:
 def main() -> None:
     """Write the picture."""
     render = read_image(RENDER).pixels
-    pictures = [("render, gamma 2.2", plain(render))]
+    pictures = [("render, sRGB", plain(render))]
     for iso in ISOS:
         shot = clpipe.Pipeline(iso=iso).process(render, RENDER.name)
         pictures.append((f"clpipe, ISO {iso}", shot.image))

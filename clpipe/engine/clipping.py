@@ -27,11 +27,13 @@ def clipped_share(result: Result, chain: Chain) -> float | None:
         None where the last image has no upper end, or was not asked for.
     """
     image = result.final if result.encoded is None else result.encoded
-    last = chain.steps[-1]
+    # Of a chain that only has to give a raw, no more than that is run: it is final and kept.
+    kept = [chain.step_named(name) for name, each in result.kept.items() if each is image]
+    last, kind = (kept[0], kept[0].stage.writes) if kept else (chain.steps[-1], chain.result)
     top: float | None = None
-    if chain.result is Kind.DISPLAY:
+    if kind is Kind.DISPLAY:
         top = 255 if result.encoded is not None else 1
-    elif chain.result is Kind.RAW:
+    elif kind is Kind.RAW:
         top = last.method.after(last.context).white_level
     if image is None or top is None:
         return None

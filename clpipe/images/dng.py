@@ -38,7 +38,8 @@ class Negative:
     ``step`` is the step of the chain whose image is the raw; None is the image that enters the
     chain. Levels are in DN; ``gains`` are those of white balance for red and blue (green = 1).
     ``xyz_to_camera`` is the 3x3 matrix from CIE XYZ under D65 to the sensor's RGB before white
-    balance. ``noise`` is None where it is unknown.
+    balance. ``noise`` is None where it is unknown. ``headroom`` is by how many stops the scene was
+    darkened, which a converter gives back.
     """
 
     step: str | None
@@ -48,6 +49,7 @@ class Negative:
     gains: tuple[float, float]
     xyz_to_camera: Doubles
     noise: NoiseModel | None
+    headroom: float = 0.0
 
 
 def xyz_to_camera(colours: Doubles, gains: tuple[float, float]) -> Doubles:
@@ -93,7 +95,7 @@ def preview(dn: Array, negative: Negative) -> Array:
     neutral = np.array([1 / negative.gains[0], 1, 1 / negative.gains[1]])
     clipped = np.clip(signal / neutral, 0, 1) * neutral
     to_camera = negative.xyz_to_camera @ SRGB_TO_XYZ
-    linear = clipped @ np.linalg.inv(to_camera).T * to_camera.sum(1)[1]
+    linear = clipped @ np.linalg.inv(to_camera).T * to_camera.sum(1)[1] * 2**negative.headroom
     return to_8_bit(srgb_curve(np.clip(linear, 0, 1)).astype(np.float32))
 
 
@@ -124,6 +126,7 @@ def main_directory(
         50708: tiff.text(SIMULATED + whole_name),  # UniqueCameraModel
         50721: tiff.signed_rational(*negative.xyz_to_camera.ravel().round(7)),  # ColorMatrix1
         50728: tiff.rational(1 / red, 1, 1 / blue),  # AsShotNeutral
+        50730: tiff.signed_rational(negative.headroom),  # BaselineExposure
         50778: tiff.short(D65),  # CalibrationIlluminant1
     }
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from functools import lru_cache
-from math import ceil
 from typing import ClassVar, Self
 
 import numpy as np
@@ -40,13 +39,13 @@ LEAST_LIMIT = 0.008  # without noise; two levels of 255
 
 @lru_cache(maxsize=64)
 def blur_weights(radius: float) -> Floats:
-    """The weights of a Gaussian blur 0, 1, 2... px away, to twice the radius; their sum over both
+    """The weights of a Gaussian blur 0, 1, 2... px away, to twice the radius, rounded; their sum over both
     sides is 1. Cached, so that they are uploaded once.
 
     >>> blur_weights(0.5).round(3).tolist()
     [0.786, 0.107]
     """
-    away = np.arange(ceil(2 * radius) + 1)
+    away = np.arange(max(round(2 * radius), 1) + 1)
     weights = np.exp(-(away**2) / (2 * radius**2))
     return np.asarray(weights / (2 * weights.sum() - 1), np.float32)
 

@@ -1,15 +1,16 @@
-"""Demosaicing whose samples stay between their neighbours."""
+"""Demosaicing within bounds that the samples around set."""
 
 from collections.abc import Mapping
-from typing import ClassVar
+from math import sqrt
+from typing import ClassVar, Self
 
 import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
-from clpipe.reference.roots import from_root, root_of
-from clpipe.stage import Access, Argument, Context, Frame, Kind, Method, Pass
+from clpipe.reference.roots import from_root, noise_in_roots, root_of
+from clpipe.stage import Access, Argument, Context, Frame, Kind, Method, Pass, parameter
 from clpipe.stages.demosaic.common import (
     QUARTER,
     from_differences,
@@ -18,6 +19,7 @@ from clpipe.stages.demosaic.common import (
     red_and_blue,
     spread_differences,
 )
+from clpipe.stages.denoise.strength import MID_GREY, noise_of_colours
 
 # The gradient, in roots of the signal, below which both directions are alike. Chosen: a hundredth
 # of white is less than the noise of most pictures, and no edge.
@@ -57,20 +59,74 @@ def green_or_difference(roots: Floats, pattern: Pattern) -> Floats:
     return by_site(roots.shape, pattern, roots - green, roots, roots - green)
 
 
-class Bounded(Method):
-    """Edge-directed, on roots of the signal, with every missing sample between its neighbours.
+SETS = (
+    ((-1, 0), (1, 0)),  # in the row
+    ((0, -1), (0, 1)),  # in the column
+    ((-1, -1), (1, -1), (-1, 1), (1, 1)),  # at the corners
+)
 
-    Green follows edges (Hamilton and Adams, US patent 5,629,734, 1997), softly. Red and blue follow
-    from bilinear colour differences. A missing sample is never below the least or above the
-    greatest of its nearest neighbours of that colour, as in AHD (Hirakawa and Parks, IEEE TIP 2005)
-    and PPG. In linear light, colour differences invent colours at the edges of saturated surfaces,
+
+def bounds(
+    roots: Floats, known: Floats, green: Floats, pattern: Pattern, doubt: np.float32
+) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+    """How low and how high red and blue may be, (red, blue) each, (height, width), in roots.
+
+    As far as the nearest samples of that colour go, and beyond them by as much as green goes beyond
+    what it is there, less ``doubt``. A line narrower than the pattern is an extreme of green, too,
+    and red and blue must follow; where a colour ends, green only rises or falls, and they must not
+    overshoot.
+
+    Args:
+        roots: the samples.
+        known: :func:`green_or_difference` of them.
+        green: at every pixel.
+        pattern: the CFA pattern.
+        doubt: what noise alone may do to green.
+    """
+    there = roots - known  # green at red and blue sites
+    low, high = [], []
+    for steps in SETS:
+        samples = [tap(roots, *step) for step in steps]
+        greens = [tap(there, *step) for step in steps]
+        below = np.minimum(green - np.minimum.reduce(greens) + doubt, np.float32(0))
+        above = np.maximum(green - np.maximum.reduce(greens) - doubt, np.float32(0))
+        low.append(np.minimum.reduce(samples) + below)
+        high.append(np.maximum.reduce(samples) + above)
+    return red_and_blue(pattern, roots, *low), red_and_blue(pattern, roots, *high)
+
+
+class Bounded(Method):
+    """Edge-directed, on roots of the signal, within bounds that the samples around set.
+
+    Green follows edges (Hamilton and Adams, US patent 5,629,734, 1997), softly, and stays between
+    its two neighbours, as in AHD (Hirakawa and Parks, IEEE TIP 2005) and PPG. Red and blue follow
+    from bilinear colour differences, and stay between their neighbours where green does. In linear
+    light and without bounds, colour differences invent colours at the edges of saturated surfaces,
     and pass the noise of a bright colour on to the dark ones beside it.
     """
 
     method: ClassVar = "bounded"
     kernel: ClassVar = "demosaic_bounded"
-    summary: ClassVar = "edge-directed; no missing sample is beyond its neighbours"
+    summary: ClassVar = "edge-directed, within the bounds of the samples around"
     tolerance: ClassVar = 5e-5  # the kernel's root is a short iteration
+
+    noise: float | None = parameter(
+        None,
+        "Standard deviation of green's noise at mid grey.",
+        "signal",
+        "from a and b, as sensor_noise used them",
+        ge=0,
+    )
+
+    def resolve(self, context: Context) -> Self:
+        _, green, _ = noise_of_colours(context)
+        return self.filled(noise=sqrt(green.at(MID_GREY)))
+
+    @property
+    def doubt(self) -> np.float32:
+        """What noise alone may do to green, in roots: three sigma, and what no eye would see."""
+        assert self.noise is not None
+        return np.float32(0.01 + 3 * noise_in_roots(self.noise, MID_GREY, float(OFFSET)))
 
     def passes(self) -> tuple[Pass, ...]:
         return (
@@ -87,27 +143,22 @@ class Bounded(Method):
             Pass(
                 "bounded_red_and_blue",
                 Access.STENCIL,
-                ("pattern", "offset"),
+                ("pattern", "offset", "noise"),
                 reads=("roots", "known"),
                 radius=1,
             ),
         )
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
-        return {"pattern": context.cfa, "even": EVEN, "offset": OFFSET}
+        return {"pattern": context.cfa, "even": EVEN, "offset": OFFSET, "noise": self.doubt}
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
         pattern, roots = frame.context.pattern, root_of(image, OFFSET)
-        differences = spread_differences(green_or_difference(roots, pattern), pattern)
+        known = green_or_difference(roots, pattern)
+        differences = spread_differences(known, pattern)
         red, green, blue = np.moveaxis(from_differences(roots, pattern, *differences), -1, 0)
-        corners = [tap(roots, dx, dy) for dx in (-1, 1) for dy in (-1, 1)]
-        beside = [tap(roots, -1, 0), tap(roots, 1, 0)]
-        above_below = [tap(roots, 0, -1), tap(roots, 0, 1)]
-
-        def bound(reduce: np.ufunc) -> tuple[Floats, Floats]:
-            sets = (beside, above_below, corners)
-            return red_and_blue(pattern, roots, *(reduce.reduce(taps) for taps in sets))
-
-        low, high = bound(np.minimum), bound(np.maximum)
-        red, blue = np.clip(red, low[0], high[0]), np.clip(blue, low[1], high[1])
+        (red_low, blue_low), (red_high, blue_high) = bounds(
+            roots, known, green, pattern, self.doubt
+        )
+        red, blue = np.clip(red, red_low, red_high), np.clip(blue, blue_low, blue_high)
         return from_root(np.stack([red, green, blue], axis=-1), OFFSET)

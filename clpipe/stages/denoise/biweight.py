@@ -38,24 +38,25 @@ def window_offsets(window: Mapping[int, float]) -> list[tuple[int, int, np.float
     return [(dx, dy, np.float32(window[r2])) for dx, dy, r2 in squares if r2 in window]
 
 
-def biweight(planes: Floats, window: Mapping[int, float], scale: np.float32) -> Floats:
+def biweight(planes: Floats, window: Mapping[int, float], reach: np.float32) -> Floats:
     """The weighted mean about each pixel, (height, width, plane) in and out.
 
-    A pixel weighs (1 - scale * d^2)^2, d its distance from the centre in all planes, or 0 where
-    scale * d^2 is above 1 (Tukey's biweight; Mosteller and Tukey 1977), times the window's weight.
+    A pixel weighs (1 - d^2 / reach^2)^2, d its difference from the centre in all planes, or 0 where
+    d is above the reach (Tukey's biweight; Mosteller and Tukey 1977), times the window's weight.
 
     >>> step = np.float32([[[0], [0], [1], [1]]])
     >>> biweight(step, LUMA_WINDOW, np.float32(1))[0, :, 0].tolist()
     [0.0, 0.0, 1.0, 1.0]
     """
-    total, weights = planes.copy(), np.ones_like(planes[..., :1])
+    scaled = planes * (np.float32(1) / reach)
+    total, weights = scaled.copy(), np.ones_like(planes[..., :1])
     for dx, dy, near in window_offsets(window):
-        other = tap(planes, dx, dy)
-        squared = np.square(other - planes).sum(-1, keepdims=True) * scale
+        other = tap(scaled, dx, dy)
+        squared = np.square(other - scaled).sum(-1, keepdims=True)
         weight = np.square(np.maximum(np.float32(1) - squared, np.float32(0))) * near
         total += weight * other
         weights += weight
-    return np.asarray(total / weights)
+    return np.asarray(total / weights * reach)
 
 
 class Biweight(Denoiser):
@@ -104,47 +105,43 @@ class Biweight(Denoiser):
     def ranges(self) -> tuple[float, float]:
         """The differences of luma and of chroma that weigh nothing, in roots of the signal."""
         luma, chroma = self.roots
-        return (
+        ranges = (
             RANGE_LUMA * self.luma_strength * hypot(luma, LEAST_NOISE),
             RANGE_CHROMA * self.chroma_strength * chroma,
         )
-
-    @property
-    def scales(self) -> tuple[float, float]:
-        """One over the squares of the ranges, for luma and for chroma."""
-        luma, chroma = (1 / max(each, 1e-6) ** 2 for each in self.ranges)
-        return luma, chroma
+        return max(ranges[0], 1e-6), max(ranges[1], 1e-6)
 
     def passes(self) -> tuple[Pass, ...]:
+        units = ("offset", "luma_range", "chroma_range")
         return (
-            Pass("to_root_luma_chroma", arguments=("offset",), writes="planes", kind=Kind.YCBCR),
+            Pass("to_root_luma_chroma", arguments=units, writes="planes", kind=Kind.YCBCR),
             Pass(
                 "biweight",
                 Access.STENCIL,
-                ("luma_scale", "chroma_scale", "grain"),
+                ("grain",),
                 reads=("planes",),
                 writes="filtered",
                 kind=Kind.YCBCR,
                 radius=2,
             ),
-            Pass("from_root_luma_chroma", arguments=("offset",), reads=("filtered",)),
+            Pass("from_root_luma_chroma", arguments=units, reads=("filtered",)),
         )
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
-        luma, chroma = self.scales
+        luma, chroma = self.ranges
         return {
-            "luma_scale": np.float32(luma),
-            "chroma_scale": np.float32(chroma),
+            "luma_range": np.float32(luma),
+            "chroma_range": np.float32(chroma),
             "grain": np.float32(self.grain),
             "offset": np.float32(self.offset),
         }
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        luma_scale, chroma_scale = (np.float32(each) for each in self.scales)
+        luma_range, chroma_range = (np.float32(each) for each in self.ranges)
         grain, offset = np.float32(self.grain), np.float32(self.offset)
         planes = rgb_to_ycbcr(root_of(image, offset))
         y, c = planes[..., :1], planes[..., 1:]
-        filtered = biweight(y, LUMA_WINDOW, luma_scale)
+        filtered = biweight(y, LUMA_WINDOW, luma_range)
         y = filtered + grain * (y - filtered)
-        c = biweight(c, CHROMA_WINDOW, chroma_scale)
+        c = biweight(c, CHROMA_WINDOW, chroma_range)
         return from_root(ycbcr_to_rgb(np.concatenate([y, c], axis=-1)), offset)

@@ -69,10 +69,10 @@ class Filmic(Method):
     tolerance: ClassVar = 1e-5  # sums may be contracted
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("filmic", arguments=("a", "b", "c", "d")),)
+        return (Pass("filmic", arguments=("a", "b", "c", "d", "twist")),)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
-        return {"a": A, "b": B, "c": C, "d": D}
+        return {"a": A, "b": B, "c": C, "d": D, "twist": A * D - B * C}
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
         return keep_hue(image, filmic)
