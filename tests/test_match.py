@@ -25,7 +25,7 @@ from clpipe.chain.files import load_settings
 from clpipe.chain.settings import Settings, overlay
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding, through_jpeg
 from clpipe.pipeline import Pipeline
-from tests.conftest import ROOT
+from tests.conftest import ROOT, SHARED
 
 SIZE, FRAMES = 128, 4
 KNOWN = {
@@ -287,3 +287,21 @@ def test_wrong_names_and_files_are_refused(clpipe, burst, tmp_path):
     assert "expected a name that ends in .toml" in wrong
     Image.fromarray(burst[0]).save(tmp_path / "b.jpg", quality=80)
     assert "give pictures of one setting" in refusal(clpipe, tmp_path, name, tmp_path / "b.jpg")
+
+
+PAIRS = {"canon-5d3-jpeg": "5dmark3_iso3200", "nikon-d800-jpeg": "d800_iso1600"}
+WITHIN = ("right", "below", "diagonal", "two_right", "half", "chroma_right", "red_green")
+
+
+@pytest.mark.skipif(not (SHARED / "real_noise").exists(), reason="needs ../shared/data/real_noise")
+@pytest.mark.parametrize("look", PAIRS)
+def test_looks_are_like_the_cameras(look, device):
+    frames, means = (f"{SHARED}/real_noise/{PAIRS[look]}_?_{kind}.png" for kind in ("real", "mean"))
+    simulator, residuals = Simulator(device), []
+    for one in load_scenes([frames], [means]).each:
+        places = Places(one.mask | one.held)
+        ours = figures_of(simulator.noise(load_settings(look), one, "test"), places)
+        theirs = figures_of(one.noise, places)
+        residuals.append([ours[name] - theirs[name] for name in WITHIN])
+        assert ours["rms"] == pytest.approx(theirs["rms"], rel=0.25)
+    assert np.abs(np.mean(residuals, axis=0)).max() < 0.1
