@@ -49,11 +49,11 @@ INLINE ycbcr biweight(site at, image planes, float grain) {
         }
     }
     const vf luma_weight = (vf)(1.0f) + 0.5f * luma_weights[1] + 0.25f * luma_weights[2];
-    const vf chroma_weight = (vf)(1.0f) + 0.6f * chroma_weights[2] + 0.45f * chroma_weights[4];
+    const vf chroma_weight = (vf)(1.0f) + 0.4f * chroma_weights[2] + 0.25f * chroma_weights[4];
     const vf y = (centre.y + 0.5f * sums[1].y + 0.25f * sums[2].y) / luma_weight;
     const vf inverse = 1.0f / chroma_weight;
     const ycbcr v = {y + grain * (centre.y - y),
-                     (centre.cb + 0.6f * sums[2].cb + 0.45f * sums[4].cb) * inverse,
-                     (centre.cr + 0.6f * sums[2].cr + 0.45f * sums[4].cr) * inverse};
+                     (centre.cb + 0.4f * sums[2].cb + 0.25f * sums[4].cb) * inverse,
+                     (centre.cr + 0.4f * sums[2].cr + 0.25f * sums[4].cr) * inverse};
     return v;
 }

@@ -39,8 +39,9 @@ LEAST_LIMIT = 0.008  # without noise; two levels of 255
 
 @lru_cache(maxsize=64)
 def blur_weights(radius: float) -> Floats:
-    """The weights of a Gaussian blur 0, 1, 2... px away, to twice the radius, rounded; their sum over both
-    sides is 1. Cached, so that they are uploaded once.
+    """The weights of a Gaussian blur 0, 1, 2... px away, to twice the radius, rounded.
+
+    Their sum over both sides is 1. Cached, so that they are uploaded once.
 
     >>> blur_weights(0.5).round(3).tolist()
     [0.786, 0.107]

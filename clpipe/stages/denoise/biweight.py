@@ -24,7 +24,7 @@ LEAST_NOISE = 0.006
 # Weights by squared distance, px: for luma a binomial window, for chroma a wider one of pixels
 # that demosaicing made of other samples than the centre's.
 LUMA_WINDOW = {1: 0.5, 2: 0.25}
-CHROMA_WINDOW = {2: 0.6, 4: 0.45}
+CHROMA_WINDOW = {2: 0.4, 4: 0.25}
 
 
 def window_offsets(window: Mapping[int, float]) -> list[tuple[int, int, np.float32]]:
