@@ -1,5 +1,6 @@
-"""Measurement of noise: statistics of images, and cameras, calibrated or of others' noise models.
+"""Measurement of noise: statistics of images; cameras, calibrated or of others' noise models;
+and the development of a camera, matched.
 
-This room works on arrays and on files that ``images`` reads; it never develops pictures. It imports
-``outputs`` and below, and is the only room that imports SciPy and Matplotlib.
+This room works on arrays and on files that ``images`` reads; only ``matching`` develops pictures.
+It imports ``outputs`` and below, and is the only room that imports SciPy and Matplotlib.
 """

@@ -25,6 +25,7 @@ COMMANDS = (
     "devices",
     "measure",
     "calibrate",
+    "match",
     "check",
     "bench",
 )

@@ -1,0 +1,272 @@
+"""The columns in which two developments are compared: the signature, and more of the same noise.
+
+The columns of :mod:`clpipe.analysis.signature` are joined by more lags, correlations of channels,
+the power spectrum of luma in four bands, and luma noise at four intensities.
+"""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from clpipe.analysis.signature import BIN, FEWEST, LUMA, chroma, luma, noise_of
+from clpipe.base.types import Array, Doubles, Floats, Mask
+
+REACH = 6  # px, the longest lag
+BANDS = (0.0, 0.125, 0.25, 0.375, 0.75)  # edges in cycles per pixel; a corner is at 0.71
+LEVELS = (30, 70, 110, 160, 226)  # of luma; noise by intensity is compared between two of them
+BLOCK = 32  # px
+GROUPS = 8  # of blocks, of which a jackknife leaves out one at a time
+FEWEST_FRAMES = 4  # for tails: what is left of a frame beside the mean of few is their mixture
+
+
+@dataclass(frozen=True)
+class Column:
+    """One figure of a signature: how it is named, and when two of them count as equal.
+
+    A ``relative`` residual is a share of theirs. ``floor`` is the residual that the search regards
+    as small; it is added to the standard error.
+    """
+
+    text: str
+    floor: float
+    relative: bool = False
+
+    def residual(self, ours: float, theirs: float) -> float:
+        """By how much ours is larger; a share of theirs where the column is ``relative``."""
+        if not self.relative:
+            return ours - theirs
+        return ours / theirs - 1 if theirs else np.nan
+
+
+TAILS = ("kurtosis", "beyond_4_sigma")
+COLUMNS: Mapping[str, Column] = {
+    "rms": Column("luma rms, levels", 0.03, relative=True),
+    "kurtosis": Column("kurtosis", 0.2),
+    "beyond_4_sigma": Column("beyond 4 sigma, 1e-4", 10),
+    "right": Column("luma, 1 right", 0.02),
+    "below": Column("luma, 1 below", 0.02),
+    "diagonal": Column("luma, diagonal", 0.02),
+    "two_right": Column("luma, 2 right", 0.02),
+    "two_below": Column("luma, 2 below", 0.03),
+    "half": Column("luma left after 2x2", 0.02),
+    "chroma_rms": Column("chroma rms, levels", 0.05, relative=True),
+    "chroma_right": Column("chroma, 1 right", 0.02),
+    "chroma_below": Column("chroma, 1 below", 0.03),
+    "chroma_two_right": Column("chroma, 2 right", 0.04),
+    "red_green": Column("R-G", 0.03),
+    "green_blue": Column("G-B", 0.06),
+    "red_blue": Column("R-B", 0.06),
+    **{
+        f"band_{k}": Column(f"luma power, {low:g}-{min(high, 0.71):g} cycles/px", 0.03)
+        for k, (low, high) in enumerate(itertools.pairwise(BANDS), 1)
+    },
+    **{
+        f"sigma_{low}": Column(f"luma rms at {low}-{high - 1}, levels", 0.15, relative=True)
+        for low, high in itertools.pairwise(LEVELS)
+    },
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """The pixels of a scene that count, (height, width)."""
+
+    mask: Mask
+
+    @cached_property
+    def pairs(self) -> Doubles:
+        """How many pairs of them there are at each lag, (13, 13); NaN where there is none."""
+        count = products(self.mask[None].astype(np.float64)).round()
+        return np.where(count > 0, count, np.nan)
+
+
+Figures = dict[str, float]  # by the names of COLUMNS; what cannot be computed is NaN
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The noise of the frames of one scene, and the luma of their mean.
+
+    ``rgb`` is (frame, height, width, 3) without drift, ``level`` (height, width), 0 to 255.
+    """
+
+    rgb: Doubles
+    level: Doubles
+
+    @cached_property
+    def planes(self) -> tuple[Doubles, Doubles, Doubles]:
+        """Luma, Cb and Cr, (frame, height, width) each."""
+        y = luma(self.rgb)
+        return y, *chroma(self.rgb, y)
+
+
+def noise_of_frames(frames: Sequence[Floats], mean: Doubles | Floats | None) -> Noise:
+    """The noise of frames of one scene.
+
+    Without a mean, it is their difference from their own mean, times sqrt(n / (n - 1)).
+
+    Args:
+        frames: (height, width, 3) each, 0 to 255.
+        mean: the scene without noise.
+    """
+    clean = np.mean(frames, axis=0) if mean is None else mean
+    count = len(frames)
+    scale = 1.0 if mean is not None else (count / (count - 1)) ** 0.5
+    noise = np.stack([noise_of(frame, clean) for frame in frames])
+    return Noise(noise * noise.dtype.type(scale), luma(clean))
+
+
+def figures_of(noise: Noise, places: Places) -> Figures:
+    """The columns of noise, over all frames, at the pixels that count."""
+    found, mask = dict.fromkeys(COLUMNS, np.nan), places.mask
+    if not mask.any():
+        return found
+    y, cb, cr = noise.planes
+    luma_map, *chroma_maps = (autocorrelation(plane, places) for plane in (y, cb, cr))
+    chroma_map = (chroma_maps[0] + chroma_maps[1]) / 2
+    samples = noise.rgb[:, mask].reshape(-1, 3)
+    power = samples.T @ samples / len(samples)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        red_green, red_blue, green_blue = (
+            power[a, b] / np.sqrt(power[a, a] * power[b, b]) for a, b in ((0, 1), (0, 2), (1, 2))
+        )
+    found |= {
+        "rms": float(np.sqrt(LUMA @ power @ LUMA)),
+        "chroma_rms": float(np.sqrt(sum((p[:, mask] ** 2).mean() for p in (cb, cr)) / 2)),
+        "half": energy_left(y, mask),
+        **lags(luma_map, "", ("right", "below", "diagonal", "two_right", "two_below")),
+        **lags(chroma_map, "chroma_", ("right", "below", "two_right")),
+        "red_green": float(red_green),
+        "green_blue": float(green_blue),
+        "red_blue": float(red_blue),
+        **bands(luma_map),
+        **by_intensity(y[:, mask], noise.level[mask]),
+    }
+    return found
+
+
+PLACES = {"right": (0, 1), "below": (1, 0), "diagonal": (1, 1), "two_right": (0, 2)}
+PLACES["two_below"] = (2, 0)
+
+
+def lags(table: Doubles, prefix: str, names: Sequence[str]) -> Figures:
+    """Named lags of a map of autocorrelation."""
+    places = {name: (REACH + PLACES[name][0], REACH + PLACES[name][1]) for name in names}
+    return {f"{prefix}{name}": float(table[place]) for name, place in places.items()}
+
+
+def products(planes: Doubles) -> Doubles:
+    """The sums of products at all lags up to 6 px, (13, 13) with lag 0 in the middle.
+
+    They come by way of the power spectrum (Wiener and Khinchin), of which so few lags need but two
+    products of matrices.
+
+    Args:
+        planes: (frame, height, width), 0 beyond their borders.
+    """
+    from scipy import fft
+
+    height, width = (fft.next_fast_len(size + REACH, real=True) for size in planes.shape[1:])
+    power = (np.abs(fft.rfft2(planes.astype(np.float32), (height, width))) ** 2).sum(0)
+    steps = np.arange(-REACH, REACH + 1)
+    down = np.exp(2j * np.pi * np.outer(steps, np.arange(height)) / height)
+    right = np.exp(2j * np.pi * np.outer(np.arange(width // 2 + 1), steps) / width)
+    right[1 : (width + 1) // 2] *= 2  # the other half of the spectrum of real numbers
+    return np.asarray((down @ power @ right).real / (height * width))
+
+
+def autocorrelation(plane: Doubles, places: Places) -> Doubles:
+    """The autocorrelation of noise at all lags up to 6 px, (13, 13) with lag 0 in the middle.
+
+    As :func:`clpipe.analysis.signature.lag`, over all frames, and with the mean of opposite lags.
+
+    Args:
+        plane: (frame, height, width).
+        places: the pixels that count.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        covariance = products(plane * places.mask) / (places.pairs * len(plane))
+        return np.asarray(covariance / covariance[REACH, REACH])
+
+
+def spectrum_of(table: Doubles) -> tuple[Doubles, Doubles]:
+    """The power spectrum of an autocorrelation, and the frequency in cycles per pixel, (64, 64).
+
+    It is the transform of the autocorrelation under a triangular window (Blackman and Tukey, 1958;
+    the window is Bartlett's). Independent noise has 1 everywhere.
+    """
+    steps, frequency = np.arange(-REACH, REACH + 1), np.fft.fftfreq(64)
+    fall = 1 - np.abs(steps) / (REACH + 1)
+    waves = np.exp(-2j * np.pi * np.outer(frequency, steps))
+    spectrum = (waves @ (np.nan_to_num(table) * np.outer(fall, fall)) @ waves.T).real
+    return spectrum, np.hypot(frequency[:, None], frequency[None])
+
+
+def bands(table: Doubles) -> Figures:
+    """The shares of luma's power in four bands of frequency."""
+    spectrum, radius = spectrum_of(table)
+    edges = itertools.pairwise(BANDS)
+    inside = [spectrum[(radius >= low) & (radius < high)].sum() for low, high in edges]
+    return {f"band_{k}": float(v / spectrum.sum()) for k, v in enumerate(inside, 1)}
+
+
+def energy_left(plane: Doubles, mask: Mask) -> float:
+    """The share of the variance that 2x2 averaging leaves, over all frames."""
+    height, width = (size // 2 * 2 for size in mask.shape)
+    shape = (height // 2, 2, width // 2, 2)
+    whole = mask[:height, :width].reshape(shape).all((1, 3))
+    blocks = plane[:, :height, :width].reshape(len(plane), *shape)
+    energy = (blocks**2).mean((2, 4))[:, whole].sum()
+    return float((blocks.mean((2, 4))[:, whole] ** 2).sum() / energy) if energy else np.nan
+
+
+def by_intensity(noise: Doubles, level: Doubles) -> Figures:
+    """Tails, over the sigma of the intensity's bin, and luma rms at four intensities.
+
+    Args:
+        noise: of luma, (frame, sample).
+        level: luma of the mean, (sample,).
+    """
+    found: Figures = {}
+    for low, high in itertools.pairwise(LEVELS):
+        own = noise[:, (level >= low) & (level < high)]
+        found[f"sigma_{low}"] = float(np.sqrt((own**2).mean())) if own.size >= FEWEST else np.nan
+    bins = (level // BIN).astype(int)
+    count = np.bincount(bins) * len(noise)
+    first = np.bincount(bins, noise.sum(0))
+    second = np.bincount(bins, (noise**2).sum(0))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        variance = second / count - (first / count) ** 2
+        kept = (count >= FEWEST) & (variance > 0)
+        z = (noise / np.sqrt(variance)[bins])[:, kept[bins]].ravel()
+    if z.size:
+        found["kurtosis"] = float((z**4).mean() / (z**2).mean() ** 2)
+        found["beyond_4_sigma"] = float(1e4 * (np.abs(z) > 4).mean())
+    return found
+
+
+def block_numbers(shape: tuple[int, ...]) -> Array:
+    """A number for each pixel, (height, width): the same in a block of 32x32, and no two alike."""
+    rows, columns = (np.arange(size) // BLOCK for size in shape[:2])
+    return np.asarray(rows[:, None] * (columns[-1] + 1) + columns[None])
+
+
+def errors_of(noise: Noise, places: Places) -> Figures:
+    """The standard errors of the columns, by the jackknife over blocks (Quenouille, 1956).
+
+    The blocks are dealt into eight groups, each left out in turn.
+    """
+    mask = places.mask
+    numbers = block_numbers(mask.shape)
+    rank = {number: k for k, number in enumerate(np.unique(numbers[mask]))}
+    dealt = np.array([rank.get(k, 0) % GROUPS for k in range(numbers.max() + 1)])[numbers]
+    without = [figures_of(noise, Places(mask & (dealt != group))) for group in range(GROUPS)]
+    errors = {}
+    for name in COLUMNS:
+        values = np.array([figures[name] for figures in without])
+        spread = float(((values - values.mean()) ** 2).sum())
+        errors[name] = np.sqrt((GROUPS - 1) / GROUPS * spread)
+    return errors

@@ -1,0 +1,70 @@
+"""The whole way of ``clpipe match``: pictures in, a development out."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from clpipe.analysis.matching.result import Match, measured
+from clpipe.analysis.matching.scenes import Scenes, load_scenes
+from clpipe.analysis.matching.search import Search
+from clpipe.analysis.matching.space import Space, space_for
+from clpipe.base.errors import RequestError
+from clpipe.chain.settings import Settings, overlay
+from clpipe.engine.device import open_device
+
+
+def check_names(output: Path, plot: Path | None) -> None:
+    """See that files to write have names that say what they are.
+
+    Raises:
+        RequestError: one has not.
+    """
+    if output.suffix != ".toml":
+        raise RequestError(f"-o: found {output}; expected a name that ends in .toml")
+    if plot is not None and plot.suffix != ".png":
+        raise RequestError(f"--plot: found {plot}; expected a name that ends in .png")
+
+
+def match_files(
+    frames: Sequence[str],
+    means: Sequence[str],
+    camera: str | None = None,
+    iso: float | None = None,
+    device: str | None = None,
+) -> Match:
+    """Find the development whose noise is that of pictures.
+
+    Args:
+        frames: files or globs of pictures, as :func:`clpipe.analysis.matching.scenes.load_scenes`.
+        means: files or globs of their means; none for a burst.
+        camera: whose raw noise is developed; None is the default camera.
+        iso: at which; None finds the ISO, too.
+        device: where, as ``clpipe devices`` lists them, or "numpy"; None chooses.
+
+    Raises:
+        RequestError: the pictures do not belong together, or there is no such camera or ISO.
+        ImageError: a file cannot be read, or does not tell of noise.
+        DeviceError: there is no such device.
+    """
+    values = {"camera": camera, "iso": iso}
+    settings = overlay(Settings(), {k: v for k, v in values.items() if v is not None})
+    settings.check_cameras()
+    scenes = load_scenes(frames, means)
+    return match_scenes(scenes, settings, space_for(settings, iso is not None), device)
+
+
+def match_scenes(
+    scenes: Scenes, settings: Settings, space: Space, device: str | None = None
+) -> Match:
+    """Find the development in a space whose noise is that of scenes.
+
+    Args:
+        scenes: what to match.
+        settings: to start from.
+        space: what may change.
+        device: as for :func:`match_files`.
+
+    Raises:
+        DeviceError: there is no such device.
+    """
+    search = Search(scenes, settings, space, open_device(device))
+    return measured(search, search.run(), scenes)

@@ -1,0 +1,125 @@
+"""The picture of a match: theirs and ours, side by side."""
+
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from clpipe.analysis.matching.columns import (
+    COLUMNS,
+    REACH,
+    Noise,
+    Places,
+    autocorrelation,
+    spectrum_of,
+)
+from clpipe.analysis.matching.result import Match, Row
+from clpipe.base.files import write_new
+from clpipe.base.types import Doubles
+
+INKS = {"theirs": "#222222", "ours": "#c8102e"}
+STEP = 16  # levels between two points of noise by intensity
+FEWEST = 500  # samples of such a point
+
+
+def draw(match: Match, path: Path) -> None:
+    """Draw a match as a PNG, 1600 px wide.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    figure = Figure(figsize=(16, 11), dpi=100, layout="constrained")
+    grid = figure.subplots(2, 2)
+    draw_lags(grid[0, 0], match)
+    draw_spectrum(grid[0, 1], match)
+    draw_intensity(grid[1, 0], match)
+    draw_residuals(grid[1, 1], match.unseen)
+    first = match.scenes.each[0].name
+    more = f" and {len(match.noises) - 1} more" if len(match.noises) > 1 else ""
+    figure.suptitle(f"Noise of {first}{more}, and of the development that was found", fontsize=15)
+    FigureCanvasAgg(figure)
+    png = BytesIO()
+    figure.savefig(png)
+    write_new(path, png.getvalue())
+
+
+def mean_table(match: Match, who: str, planes: Sequence[int]) -> Doubles:
+    """The autocorrelation of planes (0 luma, 1 Cb, 2 Cr) of "theirs" or "ours", over scenes."""
+    tables = [
+        autocorrelation(getattr(scene, who).planes[plane], Places(scene.mask))
+        for scene in match.noises
+        for plane in planes
+    ]
+    return np.asarray(np.nanmean(tables, axis=0))
+
+
+def draw_lags(axes: Axes, match: Match) -> None:
+    """Draw the autocorrelation of luma and chroma to the right."""
+    lags = np.arange(REACH + 1)
+    for who, ink in INKS.items():
+        for planes, style, what in (((0,), "-o", "luma"), ((1, 2), "--s", "chroma")):
+            table = mean_table(match, who, planes)
+            axes.plot(lags, table[REACH, REACH:], style, color=ink, label=f"{what}, {who}")
+    axes.set_title("Autocorrelation")
+    axes.set_xlabel("lag right, px")
+    axes.set_ylabel("correlation")
+    axes.grid(alpha=0.3)
+    axes.legend()
+
+
+def draw_spectrum(axes: Axes, match: Match) -> None:
+    """Draw the power spectrum of luma over the distance from frequency 0."""
+    edges = np.linspace(0, 0.7, 15)
+    for who, ink in INKS.items():
+        spectrum, radius = spectrum_of(mean_table(match, who, (0,)))
+        rings = np.digitize(radius, edges)
+        power = [spectrum[rings == k].mean() for k in range(1, len(edges))]
+        axes.plot((edges[1:] + edges[:-1]) / 2, power, "-o", color=ink, label=who)
+    axes.set_title("Power spectrum of luma; independent noise: 1")
+    axes.set_xlabel("cycles/px")
+    axes.set_ylabel("power over variance")
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
+    axes.legend()
+
+
+def draw_intensity(axes: Axes, match: Match) -> None:
+    """Draw the luma noise of all scenes over their luma."""
+    for who, ink in INKS.items():
+        squares, count = np.zeros(256 // STEP), np.zeros(256 // STEP)
+        for scene in match.noises:
+            noise: Noise = getattr(scene, who)
+            bins = (noise.level[scene.mask] // STEP).astype(int)
+            power = (noise.planes[0][:, scene.mask] ** 2).mean(0)
+            squares += np.bincount(bins, power, minlength=len(squares))
+            count += np.bincount(bins, minlength=len(count))
+        kept = count >= FEWEST
+        middle = (np.arange(len(count)) + 0.5) * STEP
+        sigma = np.sqrt(squares[kept] / count[kept])
+        axes.plot(middle[kept], sigma, "-o", color=ink, label=who)
+    axes.set_title("Noise of luma by intensity")
+    axes.set_xlabel("luma, levels")
+    axes.set_ylabel("sigma, levels")
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
+    axes.legend()
+
+
+def draw_residuals(axes: Axes, rows: Sequence[Row]) -> None:
+    """Draw the residuals of the crops that were not searched, with their standard errors."""
+    shown = [row for row in rows if not np.isnan(row.residual) and row.name != "beyond_4_sigma"]
+    places = np.arange(len(shown))[::-1]
+    residuals, errors = ([getattr(row, key) for row in shown] for key in ("residual", "error"))
+    axes.axvspan(-0.1, 0.1, color="0.92")
+    axes.axvline(0, color="0.4", linewidth=1)
+    axes.errorbar(
+        residuals, places, xerr=np.nan_to_num(errors), fmt="o", color=INKS["ours"], capsize=3
+    )
+    names = [COLUMNS[r.name].text + (" (share)" if r.relative else "") for r in shown]
+    axes.set_yticks(places, names, fontsize=9)
+    axes.set_title("Ours less theirs on crops that were not searched; grey: within 0.1")
+    axes.grid(alpha=0.3, axis="x")

@@ -1,0 +1,347 @@
+"""The pictures of a camera that a development is matched to: read, checked, cut, and masked."""
+
+import glob
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from clpipe.analysis.matching.columns import (
+    FEWEST_FRAMES,
+    TAILS,
+    Noise,
+    block_numbers,
+    noise_of_frames,
+)
+from clpipe.analysis.signature import DRIFT, flat_places, luma
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.types import Doubles, Floats, Mask
+from clpipe.images.jpeg import JpegEncoding, jpeg_encoding
+from clpipe.images.read import read_finished
+
+LARGEST = 640  # px; of a larger picture, the flattest crops of CROP x CROP are taken
+CROP = 512  # px; crops begin at multiples of 16, where the blocks of a JPEG do
+CROPS = 4
+FEWEST_FLAT = 4000  # pixels of all scenes that are neither clipped nor near an edge
+FEWEST_OF_EACH = 1000  # and of each
+HELD = 3  # one crop in so many is kept out of the search
+SMOOTH = 1.5  # px, over which the mean of a burst is smoothed before it is developed again
+
+SHIFT = 0.5  # px, by which a frame may lie beside its mean
+SURE = 15.0  # standard errors of white noise from which a shift is one; three of a camera's noise
+SCENE_SHARE, SCENE_BLOCK = 0.05, 64  # as in clpipe.analysis.measure
+MOVED, MOVED_BLOCK = 1.0, 16  # sigma, px: the mean of a block that noise does not reach
+MOST_MOVED = 0.1  # share of the blocks
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Frames of one scene, (height, width, 3), 0 to 255, and what they are compared with.
+
+    ``mean`` is what was given, or their own mean where ``own_mean``. ``mask`` are the flat places
+    that the search sees, ``held`` those that it does not; one of them may be empty. Columns in
+    ``left_out`` cannot be compared.
+    """
+
+    name: str
+    frames: tuple[Floats, ...]
+    mean: Doubles
+    own_mean: bool
+    mask: Mask
+    held: Mask
+    jpeg: JpegEncoding | None = None
+
+    @cached_property
+    def noise(self) -> Noise:
+        """The noise of the frames."""
+        return noise_of_frames(self.frames, None if self.own_mean else self.mean)
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """The columns that so few frames without a mean do not have."""
+        return TAILS if self.own_mean and len(self.frames) < FEWEST_FRAMES else ()
+
+    @property
+    def clean(self) -> Doubles:
+        """The scene without noise, to be developed again, (height, width, 3), 0 to 255.
+
+        The mean of a burst still has noise; it is smoothed, since flat places alone count.
+        """
+        if not self.own_mean:
+            return self.mean
+        from scipy import ndimage
+
+        return np.asarray(ndimage.gaussian_filter(self.mean, (SMOOTH, SMOOTH, 0)))
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """The scenes of one camera, and what a reader of the report must know of them."""
+
+    each: tuple[Scene, ...]
+    jpeg: JpegEncoding | None
+    notes: tuple[str, ...]
+
+
+def expand(patterns: Sequence[str], what: str) -> list[Path]:
+    """The files of names and globs, in order.
+
+    Raises:
+        RequestError: a glob matches nothing.
+    """
+    found: list[Path] = []
+    for pattern in patterns:
+        names = sorted(glob.glob(pattern)) if glob.has_magic(pattern) else [pattern]
+        if not names:
+            raise RequestError(f"{what}: nothing matches {pattern}")
+        found += map(Path, names)
+    return found
+
+
+def load_scenes(frames: Sequence[str], means: Sequence[str]) -> Scenes:
+    """Read pictures of a camera, and choose where their noise is compared.
+
+    Args:
+        frames: files or globs; without ``means``, a burst of one scene.
+        means: the mean of many pictures of each frame's scene, in the order of the frames; or one
+            for all.
+
+    Raises:
+        RequestError: too few frames, or pictures that do not belong together.
+        ImageError: a file cannot be read, or has too few flat places.
+    """
+    paths, mean_paths = expand(frames, "FRAME"), expand(means, "--mean")
+    pictures = [read_picture(path) for path in paths]
+    if not mean_paths and len(paths) == 1:
+        raise RequestError(
+            f"{paths[0]}: one frame, and nothing to tell its noise from its scene; give more "
+            "frames of the same scene, or their mean (--mean)"
+        )
+    if mean_paths and len(mean_paths) not in (1, len(paths)):
+        raise RequestError(
+            f"--mean: found {len(mean_paths)} for {len(paths)} frames; give one for each frame, in "
+            "the same order, or one for all"
+        )
+    encodings = [jpeg_encoding(path) for path in paths]
+    if len(set(encodings)) > 1:
+        different = next(i for i, e in enumerate(encodings) if e != encodings[0])
+        raise RequestError(
+            f"{paths[different]} is {encoding_text(encodings[different])}, but {paths[0]} is "
+            f"{encoding_text(encodings[0])}; give pictures of one setting of the camera"
+        )
+    notes: list[str] = []
+    whole: list[Scene] = []
+    if len(mean_paths) in (0, 1):
+        mean = read_picture(mean_paths[0]) if mean_paths else None
+        mean_name = mean_paths[0] if mean_paths else None
+        whole.append(checked_scene(paths, pictures, mean, mean_name, encodings[0], notes))
+    else:
+        for path, picture, mean_path in zip(paths, pictures, mean_paths, strict=True):
+            mean = read_picture(mean_path)
+            whole.append(checked_scene([path], [picture], mean, mean_path, encodings[0], notes))
+    if whole[0].left_out:
+        notes.append(
+            f"{len(paths)} frames without a mean: kurtosis and tails are left out; "
+            f"{FEWEST_FRAMES} frames tell them"
+        )
+    pieces = [
+        crop
+        for scene in whole
+        for crop in ([scene] if max(scene.mask.shape) <= LARGEST else crops_of(scene))
+    ]
+    flat = sum(int(piece.mask.sum()) for piece in pieces)
+    if flat < FEWEST_FLAT:
+        names, cleans = [scene.name for scene in whole], [scene.mean for scene in whole]
+        raise ImageError(too_few(names, cleans, flat, FEWEST_FLAT))
+    return Scenes(held_out(pieces), encodings[0], tuple(notes))
+
+
+def read_picture(path: Path) -> Floats:
+    """A finished picture, (height, width, 3), 0 to 255.
+
+    Raises:
+        ImageError: the file cannot be read, or is no finished picture.
+    """
+    source = read_finished(path)
+    if source is None:
+        raise ImageError(f"{path}: not a finished picture; expected a JPEG, PNG or TIFF in colour")
+    return source.pixels * np.float32(255)
+
+
+def encoding_text(encoding: JpegEncoding | None) -> str:
+    """An encoding in words."""
+    if encoding is None:
+        return "no JPEG that clpipe can write"
+    return f"a JPEG of quality {encoding.quality}, {encoding.subsampling}"
+
+
+def checked_scene(
+    paths: Sequence[Path],
+    frames: Sequence[Floats],
+    mean: Floats | None,
+    mean_path: Path | None,
+    jpeg: JpegEncoding | None,
+    notes: list[str],
+) -> Scene:
+    """Frames of one scene, seen to be that; what moves in a small part of them is masked.
+
+    Raises:
+        RequestError: sizes or scenes differ, or things move.
+    """
+    own = mean is None
+    for path, frame in zip(
+        [*paths, *([mean_path] if mean_path else [])],
+        [*frames, *([mean] if mean is not None else [])],
+        strict=True,
+    ):
+        if frame.shape != frames[0].shape:
+            (height, width), (first_height, first_width) = frame.shape[:2], frames[0].shape[:2]
+            raise RequestError(
+                f"{path} is {width}x{height}, but {paths[0]} is {first_width}x{first_height}; "
+                "give pictures of one size"
+            )
+    if min(frames[0].shape[:2]) < 2 * SCENE_BLOCK:
+        raise ImageError(f"{paths[0]}: too small; expected {2 * SCENE_BLOCK} px or more each way")
+    clean = np.asarray(np.mean(frames, axis=0) if mean is None else mean, np.float64)
+    against = str(mean_path) if mean_path else "the mean of the frames"
+    mask = flat_places(clean)
+    if mask.sum() < FEWEST_OF_EACH:
+        raise ImageError(too_few([str(paths[0])], [clean], int(mask.sum()), FEWEST_OF_EACH))
+    still = np.ones_like(mask)
+    for path, frame in zip(paths, frames, strict=True):
+        still &= still_places(path, frame, clean, against, mask)
+    if not still.all():
+        notes.append(f"{paths[0]}: {(~still).mean():.1%} of the picture moves, and is left out")
+    if mean is not None:
+        refuse_noisy_mean(paths[0], frames[0], mean, against)
+    scene = Scene(paths[0].stem, tuple(frames), clean, own, mask & still, np.zeros_like(mask), jpeg)
+    return scene
+
+
+def still_places(path: Path, frame: Floats, clean: Doubles, against: str, flat: Mask) -> Mask:
+    """Where a frame shows what its mean shows, (height, width).
+
+    Raises:
+        RequestError: it shows another scene, or has moved as a whole or in wide parts.
+    """
+    from scipy import ndimage
+
+    difference = luma(frame) - luma(clean)
+    difference -= difference.mean()
+    sharp = difference - ndimage.gaussian_filter(difference, DRIFT)
+    slopes = np.gradient(ndimage.gaussian_filter(luma(clean), 1.0))
+    design = np.stack([slope.ravel() for slope in slopes], axis=1)
+    shift = -np.linalg.lstsq(design, sharp.ravel(), rcond=None)[0]
+    errors = np.sqrt((sharp**2).mean() / np.maximum((design**2).sum(0), 1e-9))  # of white noise
+    if (np.abs(shift) > np.maximum(SHIFT, SURE * errors)).any():
+        down, right = shift
+        raise RequestError(
+            f"{path} lies {right:+.1f} px to the right and {down:+.1f} px below {against}; "
+            "a scene that moves tells nothing of noise; use a tripod"
+        )
+    energy = float((difference**2).mean())
+    wide = block_means(difference, SCENE_BLOCK)
+    if energy and (share := float((wide**2).mean()) / energy) > SCENE_SHARE:
+        raise RequestError(
+            f"{path} does not show the same scene as {against}: averaged over "
+            f"{SCENE_BLOCK}x{SCENE_BLOCK} pixels, {share:.0%} of the difference remains, of noise "
+            f"less than {SCENE_SHARE:.0%} would"
+        )
+    sigma = float(sharp[flat].std())
+    moved = np.abs(block_means(sharp, MOVED_BLOCK)) > MOVED * sigma
+    if moved.mean() > MOST_MOVED:
+        raise RequestError(
+            f"{path}: {moved.mean():.0%} of the picture differs from {against} by more than noise; "
+            "give pictures of a scene in which nothing moves"
+        )
+    wide_moved = ndimage.binary_dilation(moved, np.ones((3, 3)))
+    still = np.ones(flat.shape, bool)
+    rows, columns = (n * MOVED_BLOCK for n in moved.shape)
+    still[:rows, :columns] = ~wide_moved.repeat(MOVED_BLOCK, 0).repeat(MOVED_BLOCK, 1)
+    return still
+
+
+def block_means(plane: Doubles, block: int) -> Doubles:
+    """The means of whole blocks, (rows, columns)."""
+    rows, columns = (size // block for size in plane.shape)
+    whole = plane[: rows * block, : columns * block]
+    return np.asarray(whole.reshape(rows, block, columns, block).mean((1, 3)))
+
+
+def refuse_noisy_mean(path: Path, frame: Floats, mean: Floats, against: str) -> None:
+    """See that a mean has less noise than its frame.
+
+    Raises:
+        RequestError: it has more.
+    """
+    rough = [float((np.diff(luma(p), 2) ** 2).mean()) for p in (frame, mean)]
+    if rough[1] > rough[0]:
+        raise RequestError(
+            f"--mean: {against} has more noise than {path}; are frame and mean exchanged?"
+        )
+
+
+def too_few(names: Sequence[str], cleans: Sequence[Doubles], flat: int, needed: int) -> str:
+    """Why so few pixels of scenes count, in one sentence."""
+    y = np.concatenate([luma(clean).ravel() for clean in cleans])
+    out = float(((y < 30) | (y > 225)).mean())
+    why = (
+        f"{out:.0%} of the picture is clipped, dark or nearly white (luma below 30 or above 225)"
+        if out > 0.5
+        else "too little of it is flat"
+    )
+    return (
+        f"{', '.join(names)}: {flat} pixels tell of noise, at least {needed} are needed: {why}; "
+        "give pictures of a scene with smooth, middle tones, or more of them"
+    )
+
+
+def crops_of(scene: Scene, size: int = CROP, count: int = CROPS) -> list[Scene]:
+    """The flattest crops of a scene, at most ``count``, up to ``size`` wide and high."""
+    height, width = scene.mask.shape
+    down, right = min(size, height), min(size, width)
+    step = min(CROP, size // 2)
+    places = [
+        (top, left)
+        for top in range(0, height - down + 1, step)
+        for left in range(0, width - right + 1, step)
+    ]
+    flattest: list[tuple[int, int]] = []
+    for top, left in sorted(places, key=lambda at: -int(scene.mask[window(at, down, right)].sum())):
+        apart = [abs(top - y) >= down or abs(left - x) >= right for y, x in flattest]
+        if all(apart) and len(flattest) < count:
+            flattest.append((top, left))
+    return [cut(scene, window(place, down, right), place) for place in flattest]
+
+
+def window(place: tuple[int, int], height: int, width: int) -> tuple[slice, slice]:
+    """The rows and columns of a crop whose upper left corner is at a place, (row, column)."""
+    return np.s_[place[0] : place[0] + height, place[1] : place[1] + width]
+
+
+def cut(scene: Scene, at: tuple[slice, slice], place: tuple[int, int]) -> Scene:
+    """A crop of a scene."""
+    return replace(
+        scene,
+        name=f"{scene.name} at {place[1]},{place[0]}",
+        frames=tuple(frame[at] for frame in scene.frames),
+        mean=scene.mean[at],
+        mask=scene.mask[at],
+        held=scene.held[at],
+    )
+
+
+def held_out(pieces: Sequence[Scene]) -> tuple[Scene, ...]:
+    """The crops, with one third kept out of the search: whole crops, or blocks of one or two."""
+    if len(pieces) >= HELD:
+        return tuple(
+            replace(p, mask=p.held, held=p.mask) if k % HELD == HELD - 1 else p
+            for k, p in enumerate(pieces)
+        )
+    parted = []
+    for piece in pieces:
+        kept = block_numbers(piece.mask.shape) % HELD == HELD - 1
+        parted.append(replace(piece, mask=piece.mask & ~kept, held=piece.mask & kept))
+    return tuple(parted)

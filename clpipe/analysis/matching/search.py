@@ -1,0 +1,256 @@
+"""The search for a development whose noise has a camera's signature.
+
+Methods are tried part by part (coordinate descent), each with its numbers fitted by least squares
+(scipy's trust region, with bounds). All evaluations share their random numbers, so that the sum of
+squares is a smooth function of the numbers.
+"""
+
+import logging
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from clpipe.analysis.matching.columns import COLUMNS, Figures, Noise, Places, errors_of, figures_of
+from clpipe.analysis.matching.scenes import Scene, Scenes, crops_of
+from clpipe.analysis.matching.simulation import Simulator
+from clpipe.analysis.matching.space import (
+    DEVELOPMENT,
+    Choice,
+    Space,
+    dimensions_of,
+    variants_of,
+)
+from clpipe.base.types import Doubles, Mask
+from clpipe.chain.chain import make_chain
+from clpipe.chain.settings import Settings, overlay
+from clpipe.engine.device import Device
+
+LOG = logging.getLogger(__name__)
+
+GLANCE, QUICK, FULL = 2, 3, 12  # steps of least squares: at first, while promising, at the end
+HOPELESS, PROMISING = 5.0, 1.6  # times the best cost, before and after a glance
+STEP = 0.03  # of a dimension's range, for differences
+KNEE = 3.0  # residuals beyond count less than their squares (soft L1)
+BETTER = 0.92  # share of the cost below which another method is taken
+FEW, SMALL = 2, 384  # scenes by which methods are compared, and the size of their crops, px
+ROUNDS = 2  # of all parts
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A development: its settings, the numbers that were fitted, and the cost that is left."""
+
+    choices: Mapping[str, Choice]
+    settings: Settings
+    numbers: Mapping[str, float]
+    cost: float
+
+
+@dataclass(frozen=True)
+class Target:
+    """A scene with the figures that are searched for, and their standard errors."""
+
+    scene: Scene
+    places: Places
+    figures: Figures
+    errors: Figures
+
+    def residuals(self, ours: Figures) -> Doubles:
+        """The residual of each column that can be compared, over its error and floor together."""
+        found = []
+        for name, column in COLUMNS.items():
+            theirs, error = self.figures[name], self.errors[name]
+            if np.isnan(theirs) or name in self.scene.left_out:
+                continue
+            difference = column.residual(ours[name], theirs)
+            scale = np.hypot(column.floor, abs(column.residual(theirs + error, theirs)))
+            found.append(np.nan_to_num(difference, nan=KNEE * column.floor) / scale)
+        return np.clip(found, -30, 30)
+
+
+class Search:
+    """Looks for a development of some scenes' noise.
+
+    Args:
+        scenes: the camera's pictures.
+        settings: to start from.
+        space: what may change.
+        device: where to develop; None is NumPy.
+    """
+
+    def __init__(
+        self, scenes: Scenes, settings: Settings, space: Space, device: Device | None
+    ) -> None:
+        self.settings = settings
+        self.space = space
+        self.simulator = Simulator(device)
+        self.targets = [target_of(s, s.mask) for s in scenes.each if s.mask.any()]
+        self.evaluations = 0
+
+    def run(self) -> Candidate:
+        """The best development that is found."""
+        flattest = sorted(self.targets, key=lambda t: -int(t.scene.mask.sum()))[:FEW]
+        crops = [crops_of(target.scene, SMALL, 1)[0] for target in flattest]
+        few = [target_of(crop, crop.mask) for crop in crops]
+        best = self.fit(self.space.first, {}, few, QUICK)
+        LOG.info("start: residuals of %.2g", typical(best, few))
+        tried = {labels(best)}
+        for _ in range(ROUNDS):
+            before = best
+            for part, choices in self.space.choices.items():
+                for choice in choices:
+                    best = self.attempt(best, part, choice, few, tried)
+                for choice in variants_of(best.settings, part) if part in DEVELOPMENT else ():
+                    variant = merged(best.choices[part], choice)
+                    best = self.attempt(best, part, variant, few, tried, own=True)
+            if best is before:
+                break
+        return self.fit(best.choices, best.numbers, self.targets, FULL)
+
+    def attempt(
+        self,
+        best: Candidate,
+        part: str,
+        choice: Choice,
+        targets: Sequence[Target],
+        tried: set[tuple[str, ...]],
+        own: bool = False,
+    ) -> Candidate:
+        """The better of the best and the same with another choice of a part.
+
+        Its numbers start from the best's; those of the part do so where the choice is the best's
+        ``own`` method, because to another method they mean other things.
+        """
+        choices = {**best.choices, part: choice}
+        other = tuple(each.text for each in choices.values())
+        if other in tried:
+            return best
+        tried.add(other)
+        start = {k: v for k, v in best.numbers.items() if own or k.partition(".")[0] != part}
+        found = self.fit(choices, start, targets, 0)
+        if found.cost < HOPELESS * best.cost:
+            found = self.fit(choices, start, targets, GLANCE)
+        if BETTER * best.cost <= found.cost < PROMISING * best.cost:
+            found = self.fit(choices, found.numbers, targets, QUICK)
+        LOG.debug("%s: cost %.1f, best %.1f", ", ".join(other), found.cost, best.cost)
+        if found.cost >= BETTER * best.cost:
+            return best
+        LOG.info("%s: residuals of %.2g", ", ".join(other), typical(found, targets))
+        return found
+
+    def fit(
+        self,
+        choices: Mapping[str, Choice],
+        start: Mapping[str, float],
+        targets: Sequence[Target],
+        steps: int,
+    ) -> Candidate:
+        """The numbers of a set of choices, fitted from a start as far as it has them."""
+        from scipy.optimize import least_squares
+
+        settings = self.settings
+        for choice in choices.values():
+            settings = choice.over(settings)
+        dimensions = dimensions_of(make_chain(settings))
+        if self.space.strength:
+            dimensions = [self.space.strength, *dimensions]
+        numbers = {d.name: start.get(d.name, d.start) for d in dimensions}
+        numbers = self.scaled(settings, numbers, targets[0])
+
+        def residuals(places: Doubles) -> Doubles:
+            values = {
+                d.name: d.value(place - 1) for d, place in zip(dimensions, places, strict=True)
+            }
+            return self.residuals(with_numbers(settings, values), targets)
+
+        # From 1 to 2, not from 0: SciPy's steps for differences are relative.
+        places = np.clip([1 + d.share(numbers[d.name]) for d in dimensions], 1.01, 1.99)
+        if not (dimensions and steps):
+            knee = (residuals(places) / KNEE) ** 2
+            cost = float(KNEE**2 * (np.sqrt(1 + knee) - 1).sum())  # as SciPy's soft_l1
+            return Candidate(choices, with_numbers(settings, numbers), numbers, cost)
+        found = least_squares(
+            residuals,
+            places,
+            bounds=(1, 2),
+            diff_step=STEP,
+            loss="soft_l1",
+            f_scale=KNEE,
+            max_nfev=steps,
+            xtol=1e-3,
+            ftol=1e-3,
+        )
+        values = {d.name: d.value(x - 1) for d, x in zip(dimensions, found.x, strict=True)}
+        return Candidate(choices, with_numbers(settings, values), values, float(found.cost))
+
+    def scaled(
+        self, settings: Settings, numbers: Mapping[str, float], target: Target
+    ) -> dict[str, float]:
+        """The numbers with a strength that gives about the luma rms of a scene.
+
+        Variance is about proportional to the ISO.
+        """
+        scaled, strength = dict(numbers), self.space.strength
+        for _ in range(2 if strength else 0):
+            assert strength
+            ours = self.figures(with_numbers(settings, scaled), target)["rms"]
+            ratio = target.figures["rms"] / max(ours, 0.1)
+            scaled["iso"] = strength.value(strength.share(scaled["iso"] * ratio**2))
+        return scaled
+
+    def residuals(self, settings: Settings, targets: Sequence[Target]) -> Doubles:
+        """The residuals of all columns of some scenes."""
+        with ThreadPoolExecutor() as pool:
+            figures = pool.map(lambda target: self.figures(settings, target), targets)
+            found = [t.residuals(f) for t, f in zip(targets, figures, strict=True)]
+        return np.concatenate(found) / len(targets) ** 0.5
+
+    def figures(self, settings: Settings, target: Target) -> Figures:
+        """The columns of a scene's development."""
+        self.evaluations += 1
+        noise = self.simulator.noise(settings, target.scene, "search")
+        return figures_of(noise, target.places)
+
+
+def target_of(scene: Scene, mask: Mask) -> Target:
+    """A scene as what is searched for, at the pixels that count."""
+    return target_at(scene, scene.noise, Places(mask))
+
+
+def target_at(scene: Scene, noise: Noise, places: Places) -> Target:
+    """The figures of noise in a scene; NaN where there are too few samples for an error."""
+    figures, errors = figures_of(noise, places), errors_of(noise, places)
+    kept = {name: np.nan if np.isnan(errors[name]) else figures[name] for name in figures}
+    return Target(scene, places, kept, errors)
+
+
+def typical(candidate: Candidate, targets: Sequence[Target]) -> float:
+    """The residual of a typical column, in its error and floor together."""
+    columns = sum(len(target.residuals(target.figures)) for target in targets) / len(targets)
+    return float((2 * candidate.cost / columns) ** 0.5)
+
+
+def labels(candidate: Candidate) -> tuple[str, ...]:
+    """What a candidate's choices are called."""
+    return tuple(choice.text for choice in candidate.choices.values())
+
+
+def merged(first: Choice, second: Choice) -> Choice:
+    """A choice and a variant of it, as one."""
+    return Choice(second.text, {**first.values, **second.values}, first.stages)
+
+
+def with_numbers(settings: Settings, numbers: Mapping[str, float]) -> Settings:
+    """The settings with numbers by their dotted names over them."""
+    values: dict[str, object] = {}
+    for name, number in numbers.items():
+        step, _, parameter = name.rpartition(".")
+        if step:
+            table = values.setdefault(step, {})
+            assert isinstance(table, dict)
+            table[parameter] = number
+        else:
+            values[name] = number
+    return overlay(settings, values)

@@ -1,0 +1,113 @@
+"""A scene developed: the picture of the camera, back in linear light, through a chain."""
+
+import math
+import threading
+from collections.abc import Hashable
+from dataclasses import replace
+
+import numpy as np
+
+from clpipe.analysis.matching.columns import Noise, noise_of_frames
+from clpipe.analysis.matching.scenes import Scene
+from clpipe.analysis.matching.space import RESIZE
+from clpipe.base.types import Array, Floats
+from clpipe.chain.chain import Chain, make_chain
+from clpipe.chain.registry import all_stages
+from clpipe.chain.settings import Settings
+from clpipe.engine.device import Device
+from clpipe.engine.runner import Runner
+from clpipe.images.jpeg import through_jpeg
+from clpipe.stage import Frame, Method
+
+UNDONE = ("gamma", "tone_curve")  # by the stage of that name with "inverse_" before it
+
+
+class Simulator:
+    """Develops scenes with one setting after another, on one device.
+
+    Args:
+        device: where; None is NumPy.
+    """
+
+    def __init__(self, device: Device | None) -> None:
+        self._device = device
+        self._lock = threading.Lock()
+        self._noisy: Runner | None = None  # shares plans with all runners of noisy chains
+        self._quiet: Runner | None = None
+        self._linear: dict[Hashable, Floats] = {}
+
+    def noise(self, settings: Settings, scene: Scene, key: str, count: int | None = None) -> Noise:
+        """The noise of a scene's development, at the intensities of the camera's pictures.
+
+        A burst is developed as often as it has frames, and compared with its own mean, as the
+        camera's is; other frames are compared with their development without noise.
+
+        Args:
+            settings: of the development.
+            scene: whose mean is developed, and encoded as its frames were.
+            key: what the noise is made of.
+            count: how many frames; None is as many as the scene has.
+        """
+        chain = make_chain(settings)
+        keys = [f"{key}:{scene.name}:{number}" for number in range(count or len(scene.frames))]
+        with self._lock:  # a device is for one thread
+            linear = self._linear_light(chain, scene)
+            self._noisy = (self._noisy or Runner(chain, self._device)).of(chain)
+            pictures = [self._noisy.run(linear, name).encoded for name in keys]
+            if not scene.own_mean:
+                clean = chain.without_noise()
+                self._quiet = (self._quiet or Runner(clean, self._device)).of(clean)
+                pictures.append(self._quiet.run(linear, "").encoded)
+        frames = [finished(picture, scene) for picture in pictures]
+        mean = None if scene.own_mean else frames.pop()
+        return replace(noise_of_frames(frames, mean), level=scene.noise.level)
+
+    def _linear_light(self, chain: Chain, scene: Scene) -> Floats:
+        """The scene in the light, and of the size, that the chain starts on."""
+        methods, scale, gain = undoing(chain), scale_of(chain), gain_of(chain)
+        key = scene.name, scale, gain, *((type(m), m.model_dump_json()) for m in methods)
+        if key not in self._linear:
+            image = (scene.clean / 255).astype(np.float32)
+            for method in methods:
+                image = method.reference(image, Frame(chain.steps[0].context, {}, {}))
+            self._linear[key] = np.ascontiguousarray(enlarged(image / np.float32(gain), scale))
+        return self._linear[key]
+
+
+def finished(pixels: Array | None, scene: Scene) -> Floats:
+    """A developed picture, (height, width, 3), 0 to 255, as the scene's frames were encoded."""
+    assert pixels is not None
+    return (through_jpeg(pixels, scene.jpeg) if scene.jpeg else pixels).astype(np.float32)
+
+
+def gain_of(chain: Chain) -> float:
+    """By how much a chain brightens linear light, curves aside: in exposure and in linear tone."""
+    return math.prod(float(s.method.gain) for s in chain.steps if hasattr(s.method, "gain"))
+
+
+def scale_of(chain: Chain) -> float:
+    """How large the picture that a chain makes is, over what it starts on."""
+    scales = (getattr(s.method, "scale", 1.0) for s in chain.steps if s.stage.name == RESIZE)
+    return math.prod(scales)
+
+
+def enlarged(image: Floats, scale: float) -> Floats:
+    """A picture, (height, width, 3), so large that scaled it has its size again; linear between."""
+    if scale == 1:
+        return image
+    from scipy import ndimage
+
+    height, width = image.shape[:2]
+    factors = round(height / scale) / height, round(width / scale) / width, 1
+    return np.asarray(ndimage.zoom(image, factors, order=1, mode="nearest", grid_mode=True))
+
+
+def undoing(chain: Chain) -> list[Method]:
+    """The methods that take a finished picture back to the light that the chain starts on."""
+    found = []
+    for step in reversed(chain.steps):
+        if step.stage.name in UNDONE:
+            inverse = all_stages()[f"inverse_{step.stage.name}"].by_name[step.method.method]
+            values = step.method.model_dump(include=set(inverse.model_fields))
+            found.append(inverse.model_validate(values))
+    return found

@@ -1,0 +1,216 @@
+"""What a search may change: the methods of the development's stages, and the numbers they declare.
+
+Nothing here names a method or a parameter: a new one in a stage of the development is searched,
+too. Only methods that need a file or a matrix of the user's are not.
+"""
+
+import math
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Union, get_args, get_origin
+
+from clpipe.base.errors import ClpipeError
+from clpipe.chain.chain import Chain, make_chain
+from clpipe.chain.registry import all_stages
+from clpipe.chain.settings import Settings, overlay
+from clpipe.stage import Method
+
+# The stages whose methods and numbers are searched, in the order in which they are tried.
+DEVELOPMENT = ("denoise", "demosaic", "sharpen")
+RESIZE, SCALES = "resize", (0.5, 2 / 3, 0.75)  # of cameras' smaller pictures
+BEFORE = "tone_curve"  # where a stage of these goes that the chain lacks
+SEARCHED_UNITS = ("", "px")  # what is in units of the signal follows from the noise
+SPAN = 8.0  # a number is searched within this factor of where it starts
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """A number that is searched: its dotted name, its range, its first value, its scale."""
+
+    name: str
+    low: float
+    high: float
+    start: float
+    logarithmic: bool = False
+
+    def value(self, share: float) -> float:
+        """The value at a share of the range, 0 to 1, to four digits.
+
+        >>> Dimension("a.b", 1, 100, 10, logarithmic=True).value(0.5)
+        10.0
+        """
+        share = min(max(share, 0.0), 1.0)
+        if self.logarithmic:
+            value = self.low * (self.high / self.low) ** share
+        else:
+            value = self.low + (self.high - self.low) * share
+        return min(max(float(f"{value:.4g}"), self.low), self.high)
+
+    def share(self, value: float) -> float:
+        """The share of the range at which a value lies; the inverse of :meth:`value`."""
+        value = min(max(value, self.low), self.high)
+        if self.logarithmic:
+            return math.log(value / self.low) / math.log(self.high / self.low)
+        return (value - self.low) / (self.high - self.low)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A way to do a part of the development: values of a configuration, and stages to add.
+
+    ``stages`` are added before the stage that they are mapped to, unless the chain has them.
+    """
+
+    text: str
+    values: Mapping[str, Any] = field(default_factory=dict)
+    stages: Mapping[str, str] = field(default_factory=dict)
+
+    def over(self, settings: Settings) -> Settings:
+        """The settings with this choice over them.
+
+        Raises:
+            KeyedError: they do not allow it.
+        """
+        names = list(settings.stages)
+        for name, before in self.stages.items():
+            names.insert(names.index(before), name)
+        return overlay(settings, {**self.values, "stages": names})
+
+
+@dataclass(frozen=True)
+class Space:
+    """The choices to compare, by what they are about, and the strength that is searched, if any."""
+
+    choices: Mapping[str, tuple[Choice, ...]]
+    strength: Dimension | None
+
+    @cached_property
+    def first(self) -> dict[str, Choice]:
+        """The first choice of each part."""
+        return {part: choices[0] for part, choices in self.choices.items()}
+
+
+def is_number(annotation: Any) -> bool:
+    """Whether a parameter is a float, not a choice, a list or a whole number.
+
+    >>> is_number(float | None), is_number(int)
+    (True, False)
+    """
+    if get_origin(annotation) in (Union, type(int | str)):
+        return any(map(is_number, get_args(annotation)))
+    return annotation is float
+
+
+def dimensions_of(chain: Chain) -> list[Dimension]:
+    """The numbers of a chain's development that kernels get as arguments, with their ranges.
+
+    Each is searched within a factor of 8 of its value in the chain, as far as its limits allow;
+    what is 0 there, between its limits. Numbers in units of the signal are not searched, because
+    they follow from the noise; nor those without an upper limit.
+    """
+    found = []
+    for step in chain.steps:
+        if step.stage.name not in DEVELOPMENT:
+            continue
+        for name, declared in type(step.method).model_fields.items():
+            extra: Any = declared.json_schema_extra
+            if (
+                extra["structural"]
+                or extra["unit"] not in SEARCHED_UNITS
+                or not is_number(declared.annotation)
+            ):
+                continue
+            low, high = limits_of(declared.metadata)
+            start = float(getattr(step.method, name))
+            dotted = f"{step.name}.{name}"
+            if not math.isfinite(low + high):
+                continue
+            if start > 0:
+                ends = max(start / SPAN, low), min(start * SPAN, high)
+                found.append(Dimension(dotted, *ends, start, logarithmic=True))
+            else:
+                found.append(Dimension(dotted, low, high, start))
+    return found
+
+
+def limits_of(metadata: list[Any]) -> tuple[float, float]:
+    """The declared limits of a parameter; infinite where there is none."""
+    low, high = -math.inf, math.inf
+    for limit in metadata:
+        for key in ("ge", "gt"):
+            low = max(low, getattr(limit, key, low))
+        for key in ("le", "lt"):
+            high = min(high, getattr(limit, key, high))
+    return low, high
+
+
+def space_for(settings: Settings, iso_is_given: bool) -> Space:
+    """The whole space: every part of the development, and the ISO where it is not given."""
+    choices: dict[str, tuple[Choice, ...]] = {}
+    for name in (*DEVELOPMENT, "tone_curve"):
+        stage = all_stages()[name]
+        added = {} if name in settings.stages else {name: BEFORE}
+        own = [
+            Choice(f"{name} {m.method}", {name: {"method": m.method}}, added)
+            for m in stage.methods
+            if usable(m)
+        ]
+        without = [Choice(f"no {name}")] if added else []
+        choices[name] = (*without, *own)
+    if RESIZE not in settings.stages:
+        added = {RESIZE: BEFORE}
+        smaller = [
+            Choice(
+                f"{RESIZE} {m.method} {scale:.3g}",
+                {RESIZE: {"method": m.method, "scale": scale}},
+                added,
+            )
+            for scale in SCALES
+            for m in all_stages()[RESIZE].methods
+        ]
+        choices[RESIZE] = (Choice("full size"), *smaller)
+    if "color_matrix" in settings.stages:
+        camera = {
+            "color_matrix": {"method": "inverse_camera"},
+            "color_matrix_2": {"method": "camera"},
+        }
+        choices["colours"] = (
+            Choice("colours of the scene"),
+            Choice("colours of the camera", camera, {"color_matrix": "mosaic"}),
+        )
+    low, high = settings.isos().low, settings.isos().high
+    strength = Dimension("iso", low, high, math.sqrt(low * high), logarithmic=True)
+    return Space(choices, None if iso_is_given else strength)
+
+
+def usable(method: type[Method]) -> bool:
+    """Whether a method works as it is, without a file of the user's."""
+    fields: list[Any] = [f.json_schema_extra for f in method.model_fields.values()]
+    return not any(extra["file"] for extra in fields)
+
+
+def variants_of(settings: Settings, step: str) -> Iterator[Choice]:
+    """A step's method with one of its structural parameters a step up or down, or chosen anew."""
+    method = settings.method(step)
+    table = settings.parameters.get(step, {})
+    for name, declared in type(method).model_fields.items():
+        extra: Any = declared.json_schema_extra
+        own = getattr(method, name)
+        if not extra["structural"]:
+            continue
+        values: list[Any] = []
+        if get_origin(declared.annotation) is typing.Literal:
+            values = [value for value in get_args(declared.annotation) if value != own]
+        elif declared.annotation is int:
+            values = [own - 2, own + 2, own + 4]
+        elif declared.annotation is float:
+            values = [float(f"{own * factor:.3g}") for factor in (0.5, 0.7, 1.4, 2.0)]
+        for value in values:
+            choice = Choice(f"{step}.{name} {value}", {step: {**table, name: value}})
+            try:
+                make_chain(choice.over(settings))
+            except ClpipeError:
+                continue
+            yield choice

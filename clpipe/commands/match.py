@@ -1,0 +1,114 @@
+"""``clpipe match``: from pictures of a camera to a development with the same noise."""
+
+from pathlib import Path
+
+import click
+
+from clpipe.analysis.matching.columns import COLUMNS
+from clpipe.analysis.matching.match import check_names, match_files
+from clpipe.analysis.matching.result import Match, Row, write_configuration
+from clpipe.base.extras import require
+from clpipe.chain.toml import value_text
+from clpipe.commands.chain_options import camera_option
+from clpipe.commands.options import Command, device_option, json_option
+from clpipe.commands.printing import Rows, number, show, show_json
+
+
+@click.command("match", cls=Command)
+@click.argument("frames", nargs=-1, required=True, metavar="FRAME...")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=click.Path(path_type=Path),
+    metavar="CONFIG.toml",
+    help="The configuration to write.",
+)
+@click.option(
+    "--mean",
+    "means",
+    multiple=True,
+    metavar="FILES",
+    help="The mean of many pictures of each FRAME's scene, in the same order; a file or a quoted "
+    "glob; may be repeated. [default: the FRAMEs are a burst of one scene]",
+)
+@camera_option
+@click.option(
+    "--iso",
+    type=float,
+    help="The ISO at which the raw noise is the camera's. [default: the strength is found, too]",
+)
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    metavar="FILE.png",
+    help="Draw autocorrelation, power spectrum, noise by intensity and residuals.",
+)
+@device_option
+@json_option
+def match(
+    frames: tuple[str, ...],
+    output: Path,
+    means: tuple[str, ...],
+    camera: str | None,
+    iso: float | None,
+    plot: Path | None,
+    selector: str | None,
+    as_json: bool,
+) -> None:
+    """Find the development whose noise is that of a camera's finished pictures.
+
+    FRAMEs are JPEGs, PNGs or TIFFs as the camera made them, or crops of them that are not scaled: a
+    burst of a scene in which nothing moves, or single pictures, each with the mean of many of its
+    scene (--mean). The methods and numbers of demosaicing, denoising and what follows are searched
+    until the noise of the developed means has the same signature.
+
+    \b
+    clpipe match burst/*.jpg -o camera-jpeg.toml
+    clpipe match a_frame.png b_frame.png --mean a_mean.png --mean b_mean.png -o camera-jpeg.toml
+    clpipe run render.exr -o out -c camera-jpeg.toml
+    """
+    require("clpipe match", "calibrate", "scipy", *(["matplotlib"] if plot else []))
+    check_names(output, plot)
+    found = match_files(frames, means, camera, iso, selector)
+    write_configuration(output, found)
+    if plot is not None:
+        from clpipe.analysis.matching.plot import draw
+
+        draw(found, plot)
+    if as_json:
+        show_json({"configuration": str(output), **found.record()})
+        return
+    for note in found.scenes.notes:
+        click.echo(f"note: {note}")
+    headings, *rows = columns_table(found)
+    show(headings, rows, left=1)
+    click.echo(f"\n{summary(found)}")
+    click.echo(f"wrote {' and '.join(map(str, [output, *([plot] if plot else [])]))}")
+
+
+def columns_table(found: Match) -> Rows:
+    """A row for each column; residuals with their standard errors."""
+    rows: Rows = [("column", "theirs", "ours", "residual", "on crops not searched")]
+    for seen, unseen in zip(found.seen, found.unseen, strict=True):
+        text = COLUMNS[seen.name].text
+        figures = number(seen.theirs, ".3f"), number(seen.ours, ".3f")
+        rows.append((text, *figures, residual_text(seen), residual_text(unseen)))
+    return rows
+
+
+def residual_text(row: Row) -> str:
+    """A residual and its error; in percent where it is relative."""
+    if row.residual != row.residual:
+        return "-"
+    factor, form, unit = (100, ".1f", " %") if row.relative else (1, ".3f", "")
+    return f"{row.residual * factor:+{form}} ± {row.error * factor:{form}}{unit}"
+
+
+def summary(found: Match) -> str:
+    """What was found, in two lines."""
+    tables = found.settings.parameters.items()
+    methods = [f"{name} {table['method']}" for name, table in tables if "method" in table]
+    numbers = [f"{name} = {value_text(value)}" for name, value in found.numbers.items()]
+    developments = f"after {found.evaluations} developments"
+    return f"{', '.join([*methods, *numbers])}; {developments}\n{found.verdict}"

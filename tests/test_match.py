@@ -1,0 +1,308 @@
+"""clpipe match: its columns, known developments that come back, the pictures that it refuses."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clpipe.analysis.matching import match, search
+from clpipe.analysis.matching.columns import (
+    COLUMNS,
+    TAILS,
+    Places,
+    errors_of,
+    figures_of,
+    noise_of_frames,
+)
+from clpipe.analysis.matching.scenes import Scenes, held_out, load_scenes
+from clpipe.analysis.matching.simulation import Simulator
+from clpipe.analysis.matching.space import Choice, Dimension, Space, dimensions_of, space_for
+from clpipe.analysis.signature import flat_places, signature
+from clpipe.chain.chain import make_chain
+from clpipe.chain.files import load_settings
+from clpipe.chain.settings import Settings, overlay
+from clpipe.images.jpeg import JpegEncoding, jpeg_encoding, through_jpeg
+from clpipe.pipeline import Pipeline
+from tests.conftest import ROOT, SHARED
+
+SIZE, FRAMES = 128, 4
+KNOWN = {
+    "iso": 3200.0,
+    "demosaic": {"method": "bilinear"},
+    "denoise": {"method": "mean", "luma_strength": 4.0, "chroma_strength": 6.0},
+    "sharpen": {"method": "none"},
+}
+# The methods are known here; the search finds them among others in tools and by hand.
+SMALL = Space(
+    {"known": (Choice("known", {k: KNOWN[k] for k in ("demosaic", "denoise", "sharpen")}),)},
+    Dimension("iso", 100, 25600, 1600, logarithmic=True),
+)
+
+
+def scene():
+    """A smooth scene in linear light with some edges, (SIZE, SIZE, 3)."""
+    y, x = np.mgrid[:SIZE, :SIZE] / SIZE
+    light = np.stack([0.1 + 0.2 * x, 0.15 + 0.1 * y, 0.25 - 0.1 * x], axis=-1)
+    light[:, 60:66] *= 0.3
+    return light.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def burst():
+    """Six frames of a known development, uint8."""
+    camera = Pipeline(device="numpy", **KNOWN)
+    return [camera.process(scene(), f"frame {k}").image for k in range(FRAMES)]
+
+
+@pytest.fixture(scope="module")
+def grey():
+    """A grey picture, and the same with independent noise of 5 levels, uint8."""
+    generator = np.random.default_rng(3)
+    noisy = 128 + generator.normal(0, 5, (160, 160, 3))
+    return np.full((160, 160, 3), 128, np.uint8), noisy.round().clip(0, 255).astype(np.uint8)
+
+
+def saved(folder, **pictures):
+    """Pictures as PNGs in a folder; their paths."""
+    for name, pixels in pictures.items():
+        Image.fromarray(pixels).save(folder / f"{name}.png")
+    return [str(folder / f"{name}.png") for name in pictures]
+
+
+def test_the_columns_of_the_signature_are_the_signature(burst):
+    mean = np.mean(burst, axis=0)
+    noise = noise_of_frames([burst[0].astype(np.float64)], mean)
+    mask = flat_places(mean)
+    own = signature(burst[0], mean, mask).record()
+    found = figures_of(noise, Places(mask))
+    assert {name: found[name] for name in own} == pytest.approx(own, rel=1e-5, abs=1e-5)
+
+
+def test_independent_noise(grey):
+    clean, noisy = (picture.astype(np.float64) for picture in grey)
+    places = Places(np.ones(clean.shape[:2], bool))
+    found = figures_of(noise := noise_of_frames([noisy], clean), places)
+    for name in ("right", "two_below", "chroma_right", "red_green", "green_blue"):
+        assert abs(found[name]) < 0.03, name
+    # The shares of the plane of frequencies in rings of 1/8 cycle per pixel, up to its corners.
+    rings = [np.pi * (k / 8) ** 2 for k in (1, 2, 3)]
+    shares = [rings[0], rings[1] - rings[0], rings[2] - rings[1], 1 - rings[2]]
+    assert [found[f"band_{k}"] for k in (1, 2, 3, 4)] == pytest.approx(shares, abs=0.03)
+    assert found["sigma_110"] == pytest.approx(found["rms"])
+    assert np.isnan(found["sigma_30"])
+    # The relative standard error of the rms of n independent samples is 1 / sqrt(2 n).
+    error = errors_of(noise, places)["rms"] / found["rms"]
+    assert 0.3 < error * np.sqrt(2 * 160 * 160) < 3
+
+
+def test_noise_against_the_mean_of_a_burst_is_that_of_a_frame(burst):
+    frames = [frame.astype(np.float32) for frame in burst]
+    places = Places(flat_places(np.mean(burst, axis=0)))
+    clean = Pipeline(device="numpy", **KNOWN, skip=["sensor_noise", "row_noise", "column_noise"])
+    truth = clean.process(scene(), "").image.astype(np.float64)
+    against_truth = figures_of(noise_of_frames(frames, truth), places)
+    against_mean = figures_of(noise_of_frames(frames[:4], None), places)
+    for name, column in COLUMNS.items():
+        if name not in TAILS and not np.isnan(against_truth[name]):
+            assert abs(column.residual(against_mean[name], against_truth[name])) < 0.06, name
+
+
+@pytest.fixture(scope="module")
+def found(burst, tmp_path_factory):
+    """What clpipe match finds for the burst: its JSON, and the folder of its files."""
+    from click.testing import CliRunner
+
+    from clpipe.commands.main import main
+
+    folder = tmp_path_factory.mktemp("match")
+    names = saved(folder, **{f"frame{k}": frame for k, frame in enumerate(burst)})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(match, "space_for", lambda *_: SMALL)
+        patch.setattr(search, "FULL", 4)
+        options = ["-o", folder / "look.toml", "--plot", folder / "look.png", "--device", "numpy"]
+        words = ["match", str(folder / "frame?.png"), *map(str, options), "--json"]
+        result = CliRunner().invoke(main, words, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert len(names) == FRAMES
+    return json.loads(result.stdout), folder
+
+
+def test_a_known_development_comes_back(found):
+    report, _ = found
+    for name, column in report["columns"].items():
+        row = column["searched"]
+        if name != "beyond_4_sigma" and row["residual"] is not None:
+            assert abs(row["residual"]) < 0.03 + 2 * row["error"], (name, row)
+            assert row["error"] < 0.2, name
+    assert report["searched"]["iso"] == pytest.approx(KNOWN["iso"], rel=0.1)
+    strength = report["searched"]["denoise.luma_strength"]
+    assert strength == pytest.approx(KNOWN["denoise"]["luma_strength"], rel=0.2)
+
+
+def test_crops_that_were_not_searched_prove_it(found):
+    report, _ = found
+    for name in ("right", "below", "diagonal", "half", "red_green", "rms"):
+        row = report["columns"][name]["not_searched"]
+        assert abs(row["residual"]) < 0.03 + 2 * row["error"], (name, row)
+
+
+def test_the_configuration_develops_what_was_measured(found):
+    report, folder = found
+    settings = load_settings(str(folder / "look.toml"))
+    assert (
+        settings.parameters["denoise"]["luma_strength"]
+        == (report["searched"]["denoise.luma_strength"])
+    )
+    assert settings.iso == report["searched"]["iso"]
+    assert settings.output.jpeg_subsampling == "4:4:4"
+    picture = Pipeline(folder / "look.toml", device="numpy").process(scene(), "a").image
+    assert picture.shape == (SIZE, SIZE, 3)
+    assert (folder / "look.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_table(found, clpipe, monkeypatch, tmp_path):
+    _, folder = found
+    monkeypatch.setattr(match, "space_for", lambda *_: replace(SMALL, strength=None))
+    monkeypatch.setattr(search, "QUICK", 1)
+    monkeypatch.setattr(search, "FULL", 1)
+    frames = [folder / f"frame{k}.png" for k in range(3)]
+    result = clpipe("match", *frames, "-o", tmp_path / "a.toml", "--iso", 3200, "--device", "numpy")
+    assert "note: 3 frames without a mean: kurtosis and tails are left out" in result.stdout
+    rows = {line[:22].strip(): line[22:].split() for line in result.stdout.splitlines()}
+    assert rows["kurtosis"][-1] == "-"
+    assert rows["luma, 1 right"][-2] == "±"
+    assert "largest residual of a correlation on crops not searched" in result.stdout
+
+
+def test_jpegs_say_their_quality_and_subsampling(burst, tmp_path):
+    frame = tmp_path / "a.jpg"
+    for encoding in (JpegEncoding(92, "4:2:2"), JpegEncoding(60, "4:2:0")):
+        Image.fromarray(burst[0]).save(
+            frame, quality=encoding.quality, subsampling=encoding.subsampling
+        )
+        assert jpeg_encoding(frame) == encoding
+        assert np.array_equal(through_jpeg(burst[0], encoding), np.asarray(Image.open(frame)))
+    (png,) = saved(tmp_path, b=burst[0])
+    assert jpeg_encoding(png) is None
+
+
+def test_what_is_developed_goes_through_the_same_jpeg(burst, tmp_path):
+    for k, picture in enumerate(burst[:4]):
+        Image.fromarray(picture).save(tmp_path / f"{k}.jpg", quality=50, subsampling="4:2:0")
+    scenes = load_scenes([str(tmp_path / "?.jpg")], [])
+    assert scenes.jpeg == JpegEncoding(50, "4:2:0")
+    settings = overlay(Settings(), KNOWN)
+    one, simulator = scenes.each[0], Simulator(None)
+    places = Places(one.mask)
+    ours = figures_of(simulator.noise(settings, one, "a"), places)
+    without = figures_of(simulator.noise(settings, replace(one, jpeg=None), "a"), places)
+    theirs = figures_of(one.noise, places)
+    assert abs(ours["chroma_right"] - theirs["chroma_right"]) < 0.05
+    assert abs(without["chroma_right"] - theirs["chroma_right"]) > 0.05
+
+
+def test_every_number_of_the_development_is_searched():
+    names = {d.name for d in dimensions_of(make_chain(Settings()))}
+    assert {"denoise.luma_strength", "denoise.grain", "sharpen.amount"} <= names
+    assert not {"denoise.luma_noise", "sharpen.threshold"} & names  # in units of the signal
+    space = space_for(Settings(), iso_is_given=False)
+    assert space.strength is not None
+    methods = {choice.text for choice in space.choices["demosaic"]}
+    assert {"demosaic bilinear", "demosaic menon2007"} <= methods
+    assert not any("file" in choice.text for choice in space.choices["tone_curve"])
+    camera = space.choices["colours"][1].over(Settings())
+    assert [s.method.method for s in make_chain(camera).steps if "matrix" in s.name] == [
+        "inverse_camera",
+        "camera",
+    ]
+
+
+def test_a_third_is_kept_out_of_the_search(burst, tmp_path):
+    names = saved(tmp_path, **{f"{k}": frame for k, frame in enumerate(burst)})
+    (one,) = load_scenes(names, []).each
+    assert not (one.mask & one.held).any()
+    assert one.held.sum() / (one.mask | one.held).sum() == pytest.approx(1 / 3, abs=0.12)
+    whole = replace(one, mask=one.mask | one.held, held=np.zeros_like(one.held))
+    kept = held_out([whole] * 4)
+    assert [s.mask.any() for s in kept] == [True, True, False, True]
+    assert isinstance(Scenes(kept, None, ()), Scenes)
+
+
+def refusal(clpipe, folder, *words):
+    result = clpipe("match", *words, "-o", folder / "a.toml", status=(1, 2))
+    assert not (folder / "a.toml").exists()
+    return result.stderr
+
+
+def test_pictures_that_do_not_belong_together_are_refused(clpipe, burst, grey, tmp_path):
+    one, *others = burst
+    moved = [np.roll(burst[k], k, 1) for k in range(4)]
+    other = burst[1].copy()
+    other[:, : SIZE // 2] //= 2
+    paths = dict(
+        zip(
+            ("one", "two", "small", "other", "wall", "m0", "m1", "m2", "m3", "mean", "noisy"),
+            saved(
+                tmp_path,
+                one=one,
+                two=others[0],
+                small=one[:120],
+                other=other,
+                wall=grey[1],
+                **{f"m{k}": picture for k, picture in enumerate(moved)},
+                mean=np.mean(burst, axis=0).round().astype(np.uint8),
+                noisy=grey[0],
+            ),
+            strict=True,
+        )
+    )
+    tried = {
+        ("one",): "one frame, and nothing to tell its noise from its scene",
+        ("one", "small"): "small.png is 128x120, but",
+        ("one", "two", "other"): "does not show the same scene as",
+        ("m0", "m1", "m2", "m3"): "px to the right",
+        ("one", "two", "--mean", "mean", "--mean", "mean", "--mean", "mean"): "found 3 for 2",
+        ("mean", "--mean", "one"): "are frame and mean exchanged?",
+    }
+    for words, message in tried.items():
+        given = [paths.get(word, word) for word in words]
+        assert message in refusal(clpipe, tmp_path, *given), words
+
+
+@pytest.mark.parametrize(("factor", "why"), [(2.5, "clipped, dark or nearly white")])
+def test_clipped_pictures_are_refused(clpipe, burst, tmp_path, factor, why):
+    bright = [(frame * factor).clip(0, 255).astype(np.uint8) for frame in burst]
+    names = saved(tmp_path, **{f"{k}": frame for k, frame in enumerate(bright)})
+    assert why in refusal(clpipe, tmp_path, *names)
+
+
+def test_wrong_names_and_files_are_refused(clpipe, burst, tmp_path):
+    (name,) = saved(tmp_path, a=burst[0])
+    render = ROOT / "tests" / "data" / "still_life.exr"
+    assert "not a finished picture" in refusal(clpipe, tmp_path, name, render)
+    assert "nothing matches" in refusal(clpipe, tmp_path, str(tmp_path / "x*.png"))
+    wrong = clpipe("match", name, "-o", tmp_path / "a.txt", status=2).stderr
+    assert "expected a name that ends in .toml" in wrong
+    Image.fromarray(burst[0]).save(tmp_path / "b.jpg", quality=80)
+    assert "give pictures of one setting" in refusal(clpipe, tmp_path, name, tmp_path / "b.jpg")
+
+
+PAIRS = {"canon-5d3-jpeg": "5dmark3_iso3200", "nikon-d800-jpeg": "d800_iso1600"}
+WITHIN = ("right", "below", "diagonal", "two_right", "half", "chroma_right", "red_green")
+
+
+@pytest.mark.skipif(not (SHARED / "real_noise").exists(), reason="needs ../shared/data/real_noise")
+@pytest.mark.parametrize("look", PAIRS)
+def test_looks_are_like_the_cameras(look, device):
+    frames, means = (f"{SHARED}/real_noise/{PAIRS[look]}_?_{kind}.png" for kind in ("real", "mean"))
+    simulator, residuals, sizes = Simulator(device), [], []
+    for one in load_scenes([frames], [means]).each:
+        places = Places(one.mask | one.held)
+        ours = figures_of(simulator.noise(load_settings(look), one, "test"), places)
+        theirs = figures_of(one.noise, places)
+        residuals.append([ours[name] - theirs[name] for name in WITHIN])
+        sizes.append(ours["rms"] / theirs["rms"])
+    assert np.mean(sizes) == pytest.approx(1, abs=0.2)
+    assert np.abs(np.mean(residuals, axis=0)).max() < 0.1
