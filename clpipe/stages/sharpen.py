@@ -71,7 +71,7 @@ class Unsharp(Method):
     tolerance: ClassVar = 1e-4  # the kernel's root is a short iteration
     example: ClassVar = {"amount": 0.8, "threshold": 0.002, "limit": 0.03}
 
-    radius: float = parameter(2.2, "Sigma of the blur.", "px", structural=True, ge=0.3, le=8)
+    radius: float = parameter(2.4, "Sigma of the blur.", "px", structural=True, ge=0.3, le=8)
     amount: float | None = parameter(
         None,
         "How much of the difference from the blurred picture is added; 0 is off.",
