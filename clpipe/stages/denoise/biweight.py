@@ -13,8 +13,8 @@ from clpipe.reference.roots import from_root, noise_in_roots, root_of
 from clpipe.stage import Access, Argument, Context, Frame, Kind, Pass, parameter
 from clpipe.stages.denoise.strength import MID_GREY, Denoiser, offset_of_roots, offset_parameter
 
-# The difference that weighs nothing, in multiples of strength * noise. Found by trying: at 6 in luma,
-# noise that happens to be large stays alone and makes the tails of the noise longer than a
+# The difference that weighs nothing, in multiples of strength * noise. Found by trying: at 6 in
+# luma, noise that happens to be large stays alone and makes the tails of the noise longer than a
 # camera's; above 16 edges become softer.
 RANGE_LUMA, RANGE_CHROMA = 16.0, 2.5
 # The least noise that luma is filtered for, in roots, less than a level of 255. Found by trying: at
