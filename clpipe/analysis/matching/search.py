@@ -17,6 +17,7 @@ from clpipe.analysis.matching.scenes import Scene, Scenes, crops_of
 from clpipe.analysis.matching.simulation import Simulator
 from clpipe.analysis.matching.space import (
     DEVELOPMENT,
+    RESIZE,
     Choice,
     Space,
     dimensions_of,
@@ -33,8 +34,8 @@ GLANCE, QUICK, FULL = 2, 3, 12  # steps of least squares: at first, while promis
 HOPELESS, PROMISING = 5.0, 1.6  # times the best cost, before and after a glance
 STEP = 0.03  # of a dimension's range, for differences
 KNEE = 3.0  # residuals beyond count less than their squares (soft L1)
-BETTER = 0.92  # share of the cost below which another method is taken
-FEW, SMALL = 2, 384  # scenes by which methods are compared, and the size of their crops, px
+BETTER = 0.8  # share of the cost below which another method is taken; by chance, some reach 0.9
+FEW, SMALL = 4, 384  # scenes by which methods are compared, and the size of their crops, px
 ROUNDS = 2  # of all parts
 
 
@@ -102,9 +103,10 @@ class Search:
             for part, choices in self.space.choices.items():
                 for choice in choices:
                     best = self.attempt(best, part, choice, few, tried)
-                for choice in variants_of(best.settings, part) if part in DEVELOPMENT else ():
-                    variant = merged(best.choices[part], choice)
-                    best = self.attempt(best, part, variant, few, tried, own=True)
+                for step in steps_of(best, part):
+                    for choice in variants_of(best.settings, step):
+                        variant = merged(best.choices[part], choice)
+                        best = self.attempt(best, part, variant, few, tried, own=True)
             if best is before:
                 break
         return self.fit(best.choices, best.numbers, self.targets, FULL)
@@ -121,7 +123,7 @@ class Search:
         """The better of the best and the same with another choice of a part.
 
         Its numbers start from the best's; those of the part do so where the choice is the best's
-        ``own`` method, because to another method they mean other things.
+        ``own`` method, because to another method they mean other things, and none at another size.
         """
         choices = {**best.choices, part: choice}
         other = tuple(each.text for each in choices.values())
@@ -129,6 +131,8 @@ class Search:
             return best
         tried.add(other)
         start = {k: v for k, v in best.numbers.items() if own or k.partition(".")[0] != part}
+        if part == RESIZE:
+            start = {}
         found = self.fit(choices, start, targets, 0)
         if found.cost < HOPELESS * best.cost:
             found = self.fit(choices, start, targets, GLANCE)
@@ -235,6 +239,12 @@ def typical(candidate: Candidate, targets: Sequence[Target]) -> float:
 def labels(candidate: Candidate) -> tuple[str, ...]:
     """What a candidate's choices are called."""
     return tuple(choice.text for choice in candidate.choices.values())
+
+
+def steps_of(candidate: Candidate, part: str) -> list[str]:
+    """The steps of a part whose structure is searched: its own, and the denoising that it adds."""
+    own = candidate.choices[part].values
+    return [part] if part in DEVELOPMENT else [step for step in own if step.startswith("denoise")]
 
 
 def merged(first: Choice, second: Choice) -> Choice:
