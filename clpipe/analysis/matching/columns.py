@@ -54,11 +54,11 @@ COLUMNS: Mapping[str, Column] = {
     "half": Column("luma left after 2x2", 0.02),
     "chroma_rms": Column("chroma rms, levels", 0.1, relative=True),
     "chroma_right": Column("chroma, 1 right", 0.02),
-    "chroma_below": Column("chroma, 1 below", 0.04),
-    "chroma_two_right": Column("chroma, 2 right", 0.06),
+    "chroma_below": Column("chroma, 1 below", 0.03),
+    "chroma_two_right": Column("chroma, 2 right", 0.04),
     "red_green": Column("R-G", 0.03),
-    "green_blue": Column("G-B", 0.12),
-    "red_blue": Column("R-B", 0.12),
+    "green_blue": Column("G-B", 0.1),
+    "red_blue": Column("R-B", 0.1),
     **{
         f"band_{k}": Column(f"luma power, {low:g}-{min(high, 0.71):g} cycles/px", 0.05)
         for k, (low, high) in enumerate(itertools.pairwise(BANDS), 1)

@@ -31,7 +31,9 @@ from clpipe.engine.device import Device
 LOG = logging.getLogger(__name__)
 
 GLANCE, QUICK, FULL = 2, 3, 12  # steps of least squares: at first, while promising, at the end
-HOPELESS, PROMISING = 5.0, 1.6  # times the best cost, before and after a glance
+HOPELESS, PROMISING = 3.0, 1.5  # times the best cost, before and after a glance
+ENOUGH = 0.5  # residuals of a typical column below which no other method is tried
+CONVERGED = 0.95  # share of the cost above which another few steps gain too little to go on
 STEP = 0.03  # of a dimension's range, for differences
 KNEE = 3.0  # residuals beyond count less than their squares (soft L1)
 BETTER = 0.8  # share of the cost below which another method is taken; by chance, some reach 0.9
@@ -127,7 +129,7 @@ class Search:
         """
         choices = {**best.choices, part: choice}
         other = tuple(each.text for each in choices.values())
-        if other in tried:
+        if other in tried or typical(best, targets) < ENOUGH:
             return best
         tried.add(other)
         start = {k: v for k, v in best.numbers.items() if own or k.partition(".")[0] != part}
@@ -136,7 +138,12 @@ class Search:
         found = self.fit(choices, start, targets, 0)
         if found.cost < HOPELESS * best.cost:
             found = self.fit(choices, start, targets, GLANCE)
-        if BETTER * best.cost <= found.cost < PROMISING * best.cost:
+        before = np.inf
+        while (
+            BETTER * best.cost <= found.cost < PROMISING * best.cost
+            and found.cost < CONVERGED * before
+        ):
+            before = found.cost
             found = self.fit(choices, found.numbers, targets, QUICK)
         LOG.debug("%s: cost %.1f, best %.1f", ", ".join(other), found.cost, best.cost)
         if found.cost >= BETTER * best.cost:

@@ -208,7 +208,10 @@ def usable(method: type[Method]) -> bool:
 
 
 def variants_of(settings: Settings, step: str) -> Iterator[Choice]:
-    """A step's method with one of its structural parameters a step up or down, or chosen anew."""
+    """A step's method with one of its structural parameters a step up or down, or chosen anew.
+
+    A window of one pixel is switched off, and stays so.
+    """
     method = settings.method(step)
     table = settings.parameters.get(step, {})
     for name, declared in type(method).model_fields.items():
@@ -219,7 +222,7 @@ def variants_of(settings: Settings, step: str) -> Iterator[Choice]:
         values: list[Any] = []
         if get_origin(declared.annotation) is typing.Literal:
             values = [value for value in get_args(declared.annotation) if value != own]
-        elif declared.annotation is int:
+        elif declared.annotation is int and own > 1:
             values = [own - 2, own + 2, own + 4]
         elif declared.annotation is float:
             values = [float(f"{own * factor:.3g}") for factor in (0.5, 0.7, 1.4, 2.0)]
