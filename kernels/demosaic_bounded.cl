@@ -30,43 +30,56 @@ INLINE vf bounded_green(site at, image roots, cfa pattern, float even) {
 
 typedef struct { vf low, high; } bounds;
 
-INLINE bounds extended(bounds b, vf v) {
-    const bounds w = {vmin(b.low, v), vmax(b.high, v)};
-    return w;
+INLINE bounds bounds_of(vf a, vf b) {
+    const bounds v = {vmin(a, b), vmax(a, b)};
+    return v;
 }
 
-// How far red or blue may go: as far as its neighbours do, and beyond them by as much as green here
-// goes beyond green there, less what noise may do. A line narrower than the pattern is an extreme of
-// green, too; where a colour ends green only rises or falls.
-INLINE bounds with_excess(bounds colour, bounds green, vf here, float noise) {
-    const bounds v = {colour.low + vmin(here - green.low + noise, (vf)(0.0f)),
-                      colour.high + vmax(here - green.high - noise, (vf)(0.0f))};
+INLINE bounds both(bounds a, bounds b) {
+    const bounds v = {vmin(a.low, b.low), vmax(a.high, b.high)};
     return v;
+}
+
+INLINE vf sample_at(image roots, int dx, int dy) { return tap_mosaic(roots, dx, dy); }
+INLINE vf green_at(image roots, image known, int dx, int dy) {
+    return tap_mosaic(roots, dx, dy) - tap_mosaic(known, dx, dy);
+}
+
+// How far red or blue may go: as far as its neighbours do, and beyond them by as much as green here,
+// less and more what noise may do, goes beyond green there. A line narrower than the pattern is an
+// extreme of green, too; where a colour ends green only rises or falls.
+INLINE bounds with_excess(bounds colour, bounds green, vf here, float noise) {
+    const bounds v = {colour.low + vmin(here + noise - green.low, (vf)(0.0f)),
+                      colour.high + vmax(here - noise - green.high, (vf)(0.0f))};
+    return v;
+}
+
+// The bounds from two neighbours on opposite sides.
+INLINE bounds bounds_from(image roots, image known, int dx, int dy, vf here, float noise) {
+    return with_excess(bounds_of(sample_at(roots, -dx, -dy), sample_at(roots, dx, dy)),
+                       bounds_of(green_at(roots, known, -dx, -dy), green_at(roots, known, dx, dy)),
+                       here, noise);
+}
+
+INLINE bounds bounds_from_corners(image roots, image known, vf here, float noise) {
+    const bounds colour = both(bounds_of(sample_at(roots, -1, -1), sample_at(roots, 1, -1)),
+                               bounds_of(sample_at(roots, -1, 1), sample_at(roots, 1, 1)));
+    const bounds green =
+        both(bounds_of(green_at(roots, known, -1, -1), green_at(roots, known, 1, -1)),
+             bounds_of(green_at(roots, known, -1, 1), green_at(roots, known, 1, 1)));
+    return with_excess(colour, green, here, noise);
 }
 
 // Red and blue from colour differences, within bounds.
 INLINE rgb bounded_red_and_blue(site at, image roots, image known, cfa pattern, float offset,
                                 float noise) {
-    rgb c = from_differences(at, pattern, tap_mosaic(roots, 0, 0),
-                             spread_differences(at, known, pattern));
-    bounds colour[3], green[3];  // in the row, in the column, at the corners
-#pragma unroll
-    for (int i = 0; i < 8; ++i) {
-        const int set = i / 2 < 2 ? i / 2 : 2, sign = i & 1 ? 1 : -1;
-        const int dx = set == 1 ? 0 : sign, dy = set == 0 ? 0 : set == 1 ? sign : i < 6 ? -1 : 1;
-        const vf sample = tap_mosaic(roots, dx, dy), other = sample - tap_mosaic(known, dx, dy);
-        const bounds first = {sample, sample}, first_green = {other, other};
-        const bool begins = i == 0 || i == 2 || i == 4;
-        colour[set] = begins ? first : extended(colour[set], sample);
-        green[set] = begins ? first_green : extended(green[set], other);
-    }
-#pragma unroll
-    for (int set = 0; set < 3; ++set) colour[set] = with_excess(colour[set], green[set], c.g, noise);
     const vf own = tap_mosaic(roots, 0, 0);
-    const pair low =
-        red_and_blue(at, pattern, own, colour[0].low, colour[1].low, colour[2].low);
-    const pair high =
-        red_and_blue(at, pattern, own, colour[0].high, colour[1].high, colour[2].high);
+    rgb c = from_differences(at, pattern, own, spread_differences(at, known, pattern));
+    const bounds row = bounds_from(roots, known, 1, 0, c.g, noise);
+    const bounds column = bounds_from(roots, known, 0, 1, c.g, noise);
+    const bounds corners = bounds_from_corners(roots, known, c.g, noise);
+    const pair low = red_and_blue(at, pattern, own, row.low, column.low, corners.low);
+    const pair high = red_and_blue(at, pattern, own, row.high, column.high, corners.high);
     c.r = vmin(vmax(c.r, low.first), high.first);
     c.b = vmin(vmax(c.b, low.second), high.second);
     return from_roots(c, offset);

@@ -16,22 +16,26 @@ INLINE rgb from_root_and_ratios(ycbcr c, site at, float offset) {
     return v;
 }
 
-// Adds `amount` of what a Gaussian blur takes away, less `threshold`, and at most `limit`. Four rows
-// at once share the sums along their rows; weights[k] is that of a pixel k px away.
-INLINE void unsharp(site at, image planes, int reach, __global const float *weights, float amount,
-                    float threshold, float limit, ycbcr *out) {
+// Adds `amount` of what a Gaussian blur takes away, less `threshold`, and at most `limit`. The blur looks
+// at every `step`-th pixel; weights[k] is that of a pixel k steps away. Four rows at once share the sums
+// along their rows.
+INLINE void unsharp(site at, image planes, int reach, int step, __global const float *weights,
+                    float amount, float threshold, float limit, ycbcr *out) {
 #pragma OPENCL FP_CONTRACT ON
     vf blurred[4] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
 #pragma unroll
-    for (int row = -reach; row < 4 + reach; ++row) {
+    for (int row = -reach * step; row < 4 + reach * step; ++row) {
         vf sum = weights[0] * tap_ycbcr(planes, 0, row).y;
 #pragma unroll
-        for (int k = 1; k <= reach; ++k)
-            sum += weights[k] * (tap_ycbcr(planes, -k, row).y + tap_ycbcr(planes, k, row).y);
+        for (int k = 1; k <= reach; ++k) {
+            const vf west = tap_ycbcr(planes, -k * step, row).y;
+            const vf east = tap_ycbcr(planes, k * step, row).y;
+            sum += weights[k] * (west + east);
+        }
 #pragma unroll
         for (int y = 0; y < 4; ++y) {
             const int away = row < y ? y - row : row - y;
-            if (away <= reach) blurred[y] += weights[away] * sum;
+            if (away <= reach * step && away % step == 0) blurred[y] += weights[away / step] * sum;
         }
     }
 #pragma unroll

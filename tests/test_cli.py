@@ -153,7 +153,7 @@ def test_a_configuration_with_options_over_it(clpipe, small, tmp_path):
     stages = {s["name"]: s["parameters"] for s in sidecar["stages"]}
     assert sidecar["iso"] == 400
     assert stages["mosaic"] == {"pattern": "GBRG"}
-    assert stages["exposure"] == {"ev": -1}
+    assert stages["exposure"] == {"ev": -1, "headroom": 1}
     assert not {"denoise", "row_noise"} & set(stages)
 
 
@@ -178,10 +178,11 @@ def test_a_folder_keeps_its_structure_and_a_bad_file_stops_nobody(clpipe, write_
     ("arguments", "status", "message"),
     [
         (["--set", "demosaic.method=bilinaer"], 2, "did you mean 'bilinear'"),
-        (["--set", "denois.luma_size=3"], 2, "did you mean 'denoise'"),
-        (["--set", "denoise.luma_sise=3"], 2, "did you mean 'luma_size'"),
+        (["--set", "denois.grain=0"], 2, "did you mean 'denoise'"),
+        (["--set", "denoise.grian=0"], 2, "did you mean 'grain'"),
+        (["--set", "denoise.luma_size=5"], 2, "'luma_size' is a parameter of bilateral and non"),
         (
-            ["--set", "denoise.luma_size=4"],
+            ["--set", "denoise.method=mean", "--set", "denoise.luma_size=4"],
             2,
             "denoise.luma_size: found 4: it must be odd, 1 to 15",
         ),
@@ -189,9 +190,9 @@ def test_a_folder_keeps_its_structure_and_a_bad_file_stops_nobody(clpipe, write_
         (["--stages", "mosaic,gamma"], 2, "gamma reads rgb, but mosaic gives mosaic"),
         (["--set", "denoise.method=[1]"], 2, "denoise.method: unknown method"),
         (["--set", "sensor_noise_2.a=1"], 2, "unknown stage in this chain 'sensor_noise_2'"),
-        (["--set", "denoise.luma_size=3", "--skip", "denoise"], 2, "in this chain 'denoise'"),
+        (["--set", "denoise.grain=0", "--skip", "denoise"], 2, "in this chain 'denoise'"),
         (["--set", "sensor_noise.a=1e300"], 2, "sensor_noise.a: found 1e+300"),
-        (["--set", "denoise.luma_size=true"], 2, "denoise.luma_size: found True"),
+        (["--set", "denoise.grain=true"], 2, "denoise.grain: found True"),
         (["--device", ""], 3, "unknown device ''"),
         (["--skip", "noise"], 2, "unknown stage 'noise'"),
         (["--keep", "noise"], 2, "unknown stage in this chain 'noise'"),
@@ -237,10 +238,10 @@ def test_a_kept_stage_never_overwrites_an_input_or_another_result(clpipe, write_
 
 
 def test_the_order_of_assignments_does_not_matter(clpipe, small, tmp_path):
-    (tmp_path / "p.toml").write_text("[denoise]\nspatial_sigma = 3\n")
+    (tmp_path / "p.toml").write_text('[denoise]\nmethod = "bilateral"\nspatial_sigma = 3\n')
     method, size = ("--set", "denoise.method=bilateral"), ("--set", "denoise.luma_size=7")
     for options in ((*method, *size), (*size, *method)):
-        clpipe("run", small, "-o", "out", "-c", "p.toml", *options)
+        clpipe("run", small, "-o", "out", "-c", "p.toml", "--device", "numpy", *options)
         sidecar = json.loads((tmp_path / "out" / "small.json").read_text())
         values = next(s["parameters"] for s in sidecar["stages"] if s["name"] == "denoise")
         assert (values["luma_size"], values["spatial_sigma"]) == (7, 3)
@@ -298,14 +299,14 @@ def test_a_jpeg_has_its_limit(clpipe, write_exr):
 
 def test_plan(clpipe):
     result = clpipe("plan", "--set", "white_balance.method=gray_world")
-    assert "8 launches, 6 slots" in result.stdout
+    assert "9 launches, 6 slots" in result.stdout
     record = json.loads(clpipe("plan", "--json", "--keep", "sensor_noise").stdout)
     assert record["kept"] == ["sensor_noise"]
     assert len(record["launches"]) == 7
 
 
 def test_stages(clpipe):
-    assert "edge_directed_median, edge_directed" in clpipe("stages").stdout
+    assert "bounded, edge_directed_median" in clpipe("stages").stdout
     assert "from the camera and ISO" in clpipe("stages", "sensor_noise").stdout
     assert "did you mean 'demosaic'" in clpipe("stages", "demosaik", status=2).stderr
     assert len(json.loads(clpipe("stages", "--json").stdout)) >= 13
@@ -335,18 +336,19 @@ def test_bench(clpipe):
 
 
 def test_bench_of_methods(clpipe):
-    # Sizes that test_kernels.py compiles too.
-    sizes = ("--set", "denoise.luma_size=5", "--set", "denoise.chroma_size=3")
-    options = ("--size", "320x200", "--repeat", 1, *sizes)
-    text = clpipe("bench", "--methods", "denoise", *options).stdout
-    assert "bilateral luma_size=5 chroma_size=3" in text
+    options = ("--size", "320x200", "--repeat", 1)
+    strength = ("--set", "denoise.luma_strength=0.5")
+    text = clpipe("bench", "--methods", "denoise", *options, *strength).stdout
+    assert "biweight luma_strength=0.5" in text and "bilateral luma_strength=0.5" in text
     white = clpipe("bench", "--methods", "white_balance", "--size", "320x200", "--json").stdout
     records = json.loads(white)
     launches = {record["method"]: record["launches"] for record in records}
     assert launches["as_shot"] == 1
     assert launches["gray_world"] > 2
     assert all(record["mp_per_s"] > 0 for record in records if record["launches"])
-    one = ("--set", "denoise.method=mean", "--json")
+    # Sizes that test_kernels.py compiles too.
+    sizes = ("--set", "denoise.luma_size=5", "--set", "denoise.chroma_size=3")
+    one = ("--set", "denoise.method=mean", *sizes, "--json")
     records = json.loads(clpipe("bench", "--methods", "denoise", *options, *one).stdout)
     assert [record["method"] for record in records] == ["mean luma_size=5 chroma_size=3"]
     assert "did you mean 'denoise'" in clpipe("bench", "--methods", "denoize", status=2).stderr

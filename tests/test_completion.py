@@ -73,7 +73,8 @@ def test_only_stages_with_several_methods_have_methods_to_time():
 
 def test_parameters():
     assert values("run", "--set", "expo") == ["exposure."]
-    assert values("run", "--set", "exposure.") == ["exposure.method=", "exposure.ev="]
+    names = ["exposure.method=", "exposure.ev=", "exposure.headroom="]
+    assert values("run", "--set", "exposure.") == names
     assert values("run", "--set", "gamma.method=s") == ["gamma.method=srgb"]
     assert values("run", "--set", "nothing.") == []
 

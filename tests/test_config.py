@@ -35,7 +35,10 @@ def build(**settings):
         ({"sensor_noise": {"a": "much"}}, r"sensor_noise.a: found 'much': .*number"),
         ({"sensor_noise": {"a": float("nan")}}, r"sensor_noise.a: found nan: .*finite"),
         ({"mosaic": {"pattern": "RGBG"}}, "mosaic.pattern: found 'RGBG': .*'RGGB', 'BGGR', 'GRBG'"),
-        ({"denoise": {"luma_size": 4}}, "denoise.luma_size: found 4: it must be odd, 1 to 15"),
+        (
+            {"denoise": {"method": "mean", "luma_size": 4}},
+            "denoise.luma_size: found 4: it must be odd, 1 to 15",
+        ),
         (
             {"denoise": {"method": "median", "chroma_size": 7}},
             "denoise.chroma_size: found 7: it must be odd, 1 to 5",
@@ -159,10 +162,11 @@ def test_built_in_configurations():
 
 
 def test_what_is_laid_over_settings():
-    base = settings_from({"iso": 800, "skip": ["denoise"], "gamma": {"exponent": 2}})
+    gamma = {"method": "power", "exponent": 2}
+    base = settings_from({"iso": 800, "skip": ["denoise"], "gamma": gamma})
     over = overlay(base, {"seed": 3, "skip": ["row_noise"], "exposure": {"ev": 1}})
     assert (over.iso, over.seed, over.skip) == (800, 3, ("denoise", "row_noise"))
-    assert over.parameters == {"gamma": {"exponent": 2}, "exposure": {"ev": 1}}
+    assert over.parameters == {"gamma": gamma, "exposure": {"ev": 1}}
     other = overlay(base, {"gamma": {"method": "srgb"}})
     assert other.parameters["gamma"] == {"method": "srgb"}
     assert overlay(base, {}) == base

@@ -258,7 +258,7 @@ def test_what_memory_held_before_does_not_matter(device, monkeypatch, byte):
         return buffer
 
     monkeypatch.setattr(Device, "_new_buffer", used)
-    for memory in (None, 60_000):  # whole, and in tiles
+    for memory in (None, 80_000):  # whole, and in tiles
         result = Runner(chain, Device(device.info, memory)).run(image, "k")
         assert np.array_equal(result.encoded, expected)
 
@@ -289,7 +289,7 @@ def test_another_chain_of_the_same_structure_is_not_planned_again(device, monkey
     runner = Runner(make_chain(settings_from({})), device)
     image = np.full((20, 30, 3), 0.5, np.float16)
     runner.run(image, "k")
-    values = {"iso": 3200, "exposure": {"ev": 1}, "seed": 4, "gamma": {"exponent": 1.8}}
+    values = {"iso": 3200, "exposure": {"ev": 1}, "seed": 4, "sharpen": {"amount": 0.5}}
     changed = make_chain(settings_from(values))
     alone = Runner(changed, device).run(image, "k").encoded
     other = make_chain(settings_from({"mosaic": {"pattern": "BGGR"}}))

@@ -31,7 +31,7 @@ DRAWS = {
         "b": {"log_normal_of": "sensor_noise.a", "slope": 2.18, "intercept": 1.2, "sigma": 0.26},
         "a": {"log_uniform": [1e-4, 0.012]},
     },
-    "denoise": {"luma_size": {"choice": [3, 5]}},
+    "denoise": {"method": "mean", "luma_size": {"choice": [3, 5]}},
     "output": {"jpeg_quality": {"uniform": [70, 97]}},
 }
 
@@ -200,7 +200,8 @@ def test_files_that_are_drawn_are_relative_to_the_configuration(tmp_path):
 def test_a_pipeline_draws_by_the_key():
     image = np.full((4, 6, 3), 0.25, np.float32)
     ev = {"uniform": np.array([-1.0, 1.0])}
-    camera = clpipe.Pipeline(stages=["exposure"], exposure={"ev": ev}, device="numpy")
+    exposure = {"ev": ev, "headroom": 0}
+    camera = clpipe.Pipeline(stages=["exposure"], exposure=exposure, device="numpy")
     settings = settings_from({"exposure": {"ev": {"uniform": [-1, 1]}}})
     for key in ("a", "b"):
         gain = np.float32(2.0 ** settings.drawn(key).parameters["exposure"]["ev"])
@@ -257,8 +258,8 @@ def test_brooks_2019():
         ("[sensr_noise]\na = { uniform = [0, 1] }", "unknown stage 'sensr_noise'"),
         ("[mosaic]\npattern = { uniform = [0, 1] }", "no single number, so it is drawn by choice"),
         ("[mosaic]\npattern = { choice = ['RGGB', 'RGBG'] }", "mosaic.pattern: found 'RGBG'"),
-        ("[denoise]\nluma_size = { uniform = [3, 7] }", "luma_size: found 4: it must be odd"),
-        ("[denoise]\nluma_size = { uniform = [3.5, 7] }", "luma_size: found 3.5: .*integer"),
+        ("[mosaic_denoise]\nsize = { uniform = [3, 7] }", "size: found 4: it must be odd"),
+        ("[mosaic_denoise]\nsize = { uniform = [3.5, 7] }", "size: found 3.5: .*integer"),
         ("[quantize]\nbits = { uniform = [4, 12] }", "quantize.bits: found 4: .*greater"),
         ("[demosaic]\nmethod = { choice = ['biliner'] }", "unknown method 'biliner'"),
         ("[demosaic]\nmethod = { uniform = [1, 2] }", "method: found .*drawn by choice"),

@@ -21,6 +21,7 @@ from clpipe.engine.runner import Runner
 from clpipe.engine.sources import kernel_folder
 from clpipe.reference.cfa import PATTERNS
 from clpipe.stage import Kind, variant_label, variants
+from clpipe.stages.denoise.strength import WindowDenoiser
 
 METHODS = [(stage, method) for stage in all_stages().values() for method in stage.methods]
 VARIANTS = [
@@ -97,6 +98,7 @@ SMALL = ((1, 1), (1, 5), (40, 1), (4, 3), (9, 8), (33, 70))
 WINDOWS = [
     (method, sizes)
     for method in all_stages()["denoise"].methods
+    if issubclass(method, WindowDenoiser)
     for sizes in ((1, 5), (5, 3), (15, 7))
     if max(sizes) <= method.largest_size
 ]

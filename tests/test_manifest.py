@@ -261,7 +261,7 @@ def test_a_manifest_that_is_not_there(tmp_path):
         ("demosaic.method\nbiliner", "row 2: demosaic.method: unknown method .*'bilinear'"),
         ("picture_noise.sigma\n0.1", "row 2: unknown parameter of picture_noise .none. 'sigma'"),
         ("mosaic_denoise.size\n5", "row 2: unknown stage in this chain 'mosaic_denoise'"),
-        ("denoise_2.luma_size\n5", "row 2: unknown stage in this chain 'denoise_2'"),
+        ("denoise_2.luma_strength\n5", "row 2: unknown stage in this chain 'denoise_2'"),
     ],
 )
 def test_a_row_whose_values_are_wrong(manifest, cells, message):
@@ -278,7 +278,7 @@ def test_what_is_wrong_in_several_rows(manifest):
 
 
 def test_an_image_that_brings_its_own_camera_may_have_its_isos(manifest):
-    rows = manifest("path,iso,denoise_2.luma_size\na.ARW,50,5\n")
+    rows = manifest("path,iso,denoise_2.luma_strength\na.ARW,50,5\n")
     assert check_rows(rows, DEFAULT, lambda path: path.suffix == ".ARW")[0].iso == 50
 
 

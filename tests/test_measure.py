@@ -108,10 +108,12 @@ def test_processing_correlates_noise(clpipe, measured):
         channels = report["channels"]
         assert list(channels) == ["R", "G", "B", "Y", "Cb", "Cr"]
         assert 0.2 < report["share_used"] < 0.6
-        assert channels["Cb"]["energy_left_2x2"] > 0.8 > 0.7 > channels["Y"]["energy_left_2x2"]
-        assert channels["Cr"]["autocorrelation"][8][9] > 0.8
-        assert report["correlation"]["R-G"] > 0.3
         linear = ending == "demosaic.exr"
+        least = 0.55 if linear else 0.8  # denoising correlates chroma further
+        left = {name: each["energy_left_2x2"] for name, each in channels.items()}
+        assert min(left["Cb"], left["Cr"]) > least > left["Y"] + 0.05
+        assert channels["Cr"]["autocorrelation"][8][9] > least
+        assert report["correlation"]["R-G"] > 0.3
         assert report["kind"] == ("rgb" if linear else "display")
         assert (channels["G"]["law"] is not None) == linear
         assert channels["Y"]["law"] is None

@@ -58,9 +58,9 @@ def test_no_noise_costs_nothing():
 
 def test_a_chain_may_end_before_the_display():
     linear = settings_from({"skip": ["tone_curve", "gamma"]})
-    assert make_chain(linear).names[-1] == "color_matrix"
+    assert make_chain(linear).names[-1] == "sharpen"
     loud = {"method": "iid_gaussian", "sigma": 0.1}
-    with pytest.raises(RequestError, match="picture_noise reads display, but color_matrix gives"):
+    with pytest.raises(RequestError, match="picture_noise reads display, but sharpen gives"):
         make_chain(settings_from({"skip": ["tone_curve", "gamma"], "picture_noise": loud}))
 
 

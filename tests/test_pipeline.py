@@ -1,9 +1,12 @@
 """Whole chains: the same bits whatever is kept, fused or run before; and sane pictures."""
 
+from types import MappingProxyType
+
 import numpy as np
 import pytest
 
 from clpipe.chain.chain import make_chain
+from clpipe.chain.files import load_config
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import settings_from
 from clpipe.engine.runner import Runner
@@ -53,10 +56,11 @@ def test_what_is_kept_changes_no_bit(device, still_life, settings, shape):
 def test_device_and_numpy_agree(device, still_life, settings):
     image = np.ascontiguousarray(still_life[100:301, 250:553])
     steps = ["quantize", "demosaic"]
-    one = runner(settings, device, keep=steps).run(image, "k")
-    two = runner(settings, None, keep=steps).run(image, "k")
+    on_device = runner(settings, device, keep=steps)
+    one, two = on_device.run(image, "k"), runner(settings, None, keep=steps).run(image, "k")
+    tolerance = on_device.chain.step_named("demosaic").method.tolerance or 1e-6
     assert np.array_equal(one.kept["quantize"], two.kept["quantize"])
-    assert np.abs(one.kept["demosaic"] - two.kept["demosaic"]).max() < 1e-6
+    assert np.abs(one.kept["demosaic"] - two.kept["demosaic"]).max() < tolerance
     assert np.abs(one.encoded.astype(int) - two.encoded).max() <= 1
     for step, values in two.estimates.items():
         assert one.estimates[step] == pytest.approx(values, rel=1e-6)
@@ -78,8 +82,9 @@ def test_half_and_float_sources_agree(device, still_life):
 
 def test_a_render_keeps_its_colours(develop, still_life):
     crop = np.ascontiguousarray(still_life[120:240, 120:360])
-    result = develop(crop, skip=["sensor_noise", "row_noise", "denoise", "tone_curve", "gamma"])
-    clean = np.minimum(crop.astype(np.float64), 1)
+    quiet = ["sensor_noise", "row_noise", "denoise", "sharpen", "gamma"]
+    result = develop(crop, skip=quiet, tone_curve={"method": "linear"})
+    clean = crop.astype(np.float64)
     assert np.abs(result.final.mean((0, 1)) - clean.mean((0, 1))).max() < 2e-3
 
 
@@ -209,13 +214,16 @@ def test_the_law_is_explained_with_the_numbers_it_gives():
     assert max(map(len, text.splitlines())) <= 100
 
 
-def test_denoising_takes_noise_away_and_leaves_edges(develop):
+@pytest.mark.parametrize(("method", "left"), [("biweight", 0.75), ("bilateral", 0.6)])
+def test_denoising_takes_noise_away_and_leaves_edges(develop, method, left):
     image = np.full((128, 128, 3), 0.1, np.float32)
     image[:, 64:] = 0.6
-    result = develop(image, iso=3200, skip=["tone_curve", "gamma"], keep=("demosaic",))
+    linear = {"exposure": {"headroom": 0}, "skip": ["sharpen", "tone_curve", "gamma"]}
+    denoise = {"denoise": {"method": method}, "keep": ("demosaic",)}
+    result = develop(image, numpy=True, iso=3200, **linear, **denoise)
     before, after = result.kept["demosaic"], result.final
     flat = (slice(8, -8), slice(8, 50))
-    assert after[flat].std() < 0.6 * before[flat].std()
+    assert after[flat].std() < left * before[flat].std()
     step = after[8:-8, 66].mean() - after[8:-8, 61].mean()
     assert step > 0.48
 
@@ -228,12 +236,14 @@ def test_demosaicing_keeps_samples_and_leaves_flat_areas_flat(develop, method, p
     colours = random.random((24, 31, 3)).astype(np.float32)
     result = develop(colours, demosaic={"method": method}, **chain)
     red_x, red_y = red_site(pattern)
+    # On roots of the signal, samples come back rounded.
+    error = 1e-5 if method == "bounded" else 0
     for channel, x, y in ((0, red_x, red_y), (1, 1 - red_x, red_y), (2, 1 - red_x, 1 - red_y)):
-        assert np.array_equal(
-            result.final[y::2, x::2, channel], result.kept["mosaic"][y::2, x::2]
-        ), channel
+        own, sample = result.final[y::2, x::2, channel], result.kept["mosaic"][y::2, x::2]
+        assert np.allclose(own, sample, rtol=error, atol=error / 10), channel
     flat = np.full((24, 31, 3), 0.25, np.float32)
-    assert np.array_equal(develop(flat, demosaic={"method": method}, **chain).final, flat)
+    again = develop(flat, demosaic={"method": method}, **chain).final
+    assert np.allclose(again, flat, rtol=error, atol=0)
 
 
 def psnr(one, two, peak):
@@ -248,11 +258,12 @@ def judged(device, still_life):
     """PSNR of a picture against the same chain without noise and denoising: linear RGB, 8 bit."""
     image = np.ascontiguousarray(still_life[160:480, 240:720])
 
-    def judge(iso, **settings):
+    def judge(iso, base=MappingProxyType({}), on=device, **settings):
         def pictures(skip=(), **more):
-            values = {"iso": iso, "skip": ["tone_curve", "gamma", *skip], **more}
-            linear = runner(values, device, encode=False, final=True).run(image, "k").final
-            curves = make_chain(settings_from({"iso": iso}), start_at="tone_curve")
+            skip = ["sharpen", "tone_curve", "gamma", *skip]
+            values = base | {"iso": iso, **more, "skip": skip}
+            linear = runner(values, on, encode=False, final=True).run(image, "k").final
+            curves = make_chain(settings_from(base | {"iso": iso}), start_at="tone_curve")
             return linear, Runner(curves, None).run(linear, "k").encoded
 
         clean = pictures([*NOISE, "denoise"])
@@ -266,12 +277,20 @@ def judged(device, still_life):
 def test_non_local_means_is_the_best_denoiser(judged, iso):
     noisy = judged(iso, skip=["denoise"])
     others = {name: judged(iso, denoise={"method": name}) for name in ("mean", "median")}
-    bilateral = judged(iso)
+    default = judged(iso)
     best = judged(iso, denoise={"method": "non_local_means"})
     for i in (0, 1):
-        assert best[i] > bilateral[i] + 1
+        assert best[i] > default[i] + 1
         assert best[i] > max(value[i] for value in others.values()) + 1
-        assert bilateral[i] > noisy[i] + 0.4
+        assert default[i] > noisy[i] + 0.4
+
+
+@pytest.mark.parametrize("iso", [1600, 12800])
+def test_the_papers_denoising_makes_a_better_picture(judged, iso):
+    paper = load_config("paper").values
+    noisy, ours = judged(iso, paper, None, skip=["denoise"]), judged(iso, paper, None)
+    for i in (0, 1):
+        assert ours[i] > noisy[i] + 0.4
 
 
 def with_mosaic_denoise(after):

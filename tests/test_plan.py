@@ -27,43 +27,47 @@ def names(plan):
 def test_default_chain():
     assert names(plan_of()) == [
         "lines",
-        "exposure..white_balance",
-        "demosaic.green_or_difference",
-        "demosaic.spread_differences",
-        "demosaic.freeman..denoise",
-        "denoise.bilateral..gamma",
+        "exposure..demosaic",
+        "demosaic.bounded_green",
+        "demosaic.bounded_red_and_blue..denoise",
+        "denoise.biweight..sharpen",
+        "sharpen.unsharp..gamma",
     ]
 
 
-def test_default_chain_with_gray_world_is_eight_launches_and_at_most_48_bytes():
+def test_default_chain_with_gray_world_is_nine_launches_and_at_most_48_bytes():
     plan = plan_of(**GRAY_WORLD)
     assert [type(launch) for launch in plan.launches] == [Lines, Launch, Reduce, Finalize] + [
         Launch
-    ] * 4
+    ] * 5
     assert bytes_per_pixel(plan, 8) <= 48
 
 
 def test_gains_estimated_from_the_image_are_applied_where_the_stencil_reads():
-    plan = plan_of(**GRAY_WORLD)
+    settings = {"demosaic": {"method": "edge_directed_median"}, **GRAY_WORLD}
+    plan = plan_of(**settings)
     prologues = [
         [op.step for read in launch.reads for op in read.prologue]
         for launch in plan.launches
         if isinstance(launch, Launch)
     ]
-    assert prologues == [[], ["white_balance"], [], ["white_balance"], []]
-    unfolded = plan_of(fold=False, **GRAY_WORLD)
+    assert prologues == [[], ["white_balance"], [], ["white_balance"], [], []]
+    unfolded = plan_of(fold=False, **settings)
     assert "white_balance" in names(unfolded)
 
 
 def test_keeping_a_stage_inside_a_group_splits_it():
     plain, kept = plan_of(), plan_of(keep=("sensor_noise",))
     assert len(kept.launches) == len(plain.launches) + 1
-    assert names(kept)[1:3] == ["exposure..sensor_noise", "row_noise..white_balance"]
+    assert names(kept)[1:3] == ["exposure..sensor_noise", "row_noise..demosaic"]
     assert [name for name, _ in kept.kept] == ["sensor_noise"]
 
 
 def test_keeping_a_stage_at_the_end_of_a_group_costs_no_launch_but_a_slot():
-    assert len(plan_of(keep=("white_balance",)).launches) == len(plan_of().launches)
+    bilinear = {"demosaic": {"method": "bilinear"}}  # the default begins with a pointwise pass
+    plain, kept = plan_of(**bilinear), plan_of(keep=("white_balance",), **bilinear)
+    assert len(kept.launches) == len(plain.launches)
+    assert [name for name, _ in kept.kept] == ["white_balance"]
 
 
 @pytest.mark.parametrize(
@@ -119,20 +123,22 @@ def test_a_plan_depends_on_structure_alone():
     assert one == two
     assert hash(one) == hash(two)
     assert one != plan_of(mosaic={"pattern": "BGGR"})
-    assert one != plan_of(denoise={"luma_size": 7})
+    assert one != plan_of(sharpen={"radius": 3})
 
 
 def test_the_border_is_as_wide_as_the_widest_stencil():
-    assert plan_of().border == 2
-    assert plan_of(denoise={"chroma_size": 11}).border == 5
+    assert plan_of().border == 4  # of sharpening, twice its sigma of 2.2
+    assert plan_of(skip=["sharpen"]).border == 2
+    assert plan_of(denoise={"method": "mean", "chroma_size": 13}).border == 6
     assert plan_of(stages=["exposure", "gamma"]).border == 0
 
 
 def test_curves_before_eight_bits_become_one_table():
-    plan = plan_of()
+    curve = {"tone_curve": {"method": "camera_raw"}}
+    plan = plan_of(**curve)
     kernel = write_kernel(plan, plan.launches[-1], 8)
     assert [p.item for p in kernel.parameters if p.role == "table8"] == ["tone_curve,gamma"]
-    kept = plan_of(keep=("tone_curve",))
+    kept = plan_of(keep=("tone_curve",), **curve)
     kernel = write_kernel(kept, kept.launches[-1], 8)
     assert [p.item for p in kernel.parameters if p.role == "table8"] == ["gamma"]
 
@@ -143,7 +149,8 @@ def test_a_stage_that_is_not_in_the_chain_cannot_be_kept():
 
 
 def test_a_chain_may_begin_with_a_stencil():
-    chain = make_chain(settings_from({"stages": ["demosaic"]}), Kind.MOSAIC)
+    bilinear = {"stages": ["demosaic"], "demosaic": {"method": "bilinear"}}
+    chain = make_chain(settings_from(bilinear), Kind.MOSAIC)
     assert names(make_plan(chain))[0] == "load"
 
 
@@ -175,13 +182,13 @@ def test_a_kernel_does_not_depend_on_names_slots_places_or_the_border():
         return write_kernel(plan, launches[number], 8)
 
     alike = {"stages": ["exposure", "denoise", "denoise", "denoise", "color_matrix"]}
-    own = {"luma_size": 5, "chroma_size": 5}
+    own = {"method": "bilateral", "luma_size": 5, "chroma_size": 5}
     plain = plan_of(**alike, denoise=own, denoise_2=own, denoise_3=own, encode=False, final=True)
     first, second = blur(plain, 0), blur(plain, 1)
     assert first.source == second.source
     assert first.name == second.name
     assert first.parameters != second.parameters  # they are bound to other slots and steps
-    wide = {"luma_size": 5, "chroma_size": 11}
+    wide = {**own, "chroma_size": 11}
     other = plan_of(**alike, denoise=own, denoise_2=own, denoise_3=wide, encode=False, final=True)
     assert other.border > plain.border
     assert blur(other, 0).source == first.source

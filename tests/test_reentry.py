@@ -17,8 +17,8 @@ from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import STILL_LIFE, written
 
 OPTIONS = ("--iso", "3200", "--seed", "5", "--set", "mosaic.pattern=GBRG")
-OPTIONS += ("--set", "white_balance.method=gray_world", "--set", "gamma.exponent=1.9")
-OPTIONS += ("--set", "row_noise.sigma=0.01")
+OPTIONS += ("--set", "white_balance.method=gray_world", "--set", "row_noise.sigma=0.01")
+OPTIONS += ("--set", "sharpen.radius=2.1", "--set", "gamma.method=power")
 
 
 def clpipe(*arguments, status=0):
@@ -69,14 +69,14 @@ def test_going_on_with_some_stages_gives_the_same_images(kept, tmp_path):
 
 
 def test_options_given_again_win_over_those_of_the_kept_image(kept, tmp_path):
-    entry = (kept / "crop.denoise.exr", "--start-at", "tone_curve", "--format", "png")
+    entry = (kept / "crop.color_matrix.exr", "--start-at", "sharpen", "--format", "png")
     clpipe("run", *entry, "-o", tmp_path / "a")
-    clpipe("run", *entry, "-o", tmp_path / "b", "--set", "gamma.exponent=2.5")
+    clpipe("run", *entry, "-o", tmp_path / "b", "--set", "sharpen.radius=2.0")
     clpipe("run", *entry, "-o", tmp_path / "c", "-c", "default")
-    names = [tmp_path / folder / "crop.denoise.json" for folder in "abc"]
+    names = [tmp_path / folder / "crop.color_matrix.json" for folder in "abc"]
     stages = [{s["name"]: s for s in json.loads(n.read_text())["stages"]} for n in names]
-    exponents = [by_name["gamma"]["parameters"]["exponent"] for by_name in stages]
-    assert exponents == [1.9, 2.5, 2.2]
+    assert [s["sharpen"]["parameters"]["radius"] for s in stages] == [2.1, 2.0, 2.2]
+    assert [s["gamma"]["method"] for s in stages] == ["power", "power", "srgb"]
 
 
 def test_what_was_edited_is_honoured(kept, tmp_path):
@@ -155,8 +155,8 @@ def test_an_image_of_another_kind_is_refused_and_the_others_go_on(
 def test_a_folder_gives_what_was_kept_right_before(kept, tmp_path):
     output = clpipe("run", kept, "-o", tmp_path, "--start-at", "denoise")
     assert written(tmp_path) == ["crop.demosaic.jpg", "crop.demosaic.json"]
-    assert "17 images in folders were kept after other stages and left out" in output
-    assert "1 of 18 images done, 0 failed" in output
+    assert "18 images in folders were kept after other stages and left out" in output
+    assert "1 of 19 images done, 0 failed" in output
 
 
 def test_entering_elsewhere_than_right_after_is_told(kept, tmp_path):

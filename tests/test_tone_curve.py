@@ -6,7 +6,7 @@ import pytest
 from clpipe.base.errors import RequestError
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
-from clpipe.stages.tone_curve import DEFAULT
+from clpipe.stages.tone_curve import CAMERA_RAW
 from clpipe.stages.tone_curve.table import table_of
 
 RAMP = np.linspace(0, 1, 300, dtype=np.float32).reshape(10, 10, 3)
@@ -99,15 +99,22 @@ def test_a_file_that_changed_is_read_again(tmp_path):
     assert table_of(str(path))[-1] == 0.5
 
 
-def test_the_default_curve_is_a_file_of_the_same_form(develop):
-    one = develop(RAMP, stages=["tone_curve"]).final
-    two = develop(RAMP, stages=["tone_curve"], tone_curve={"method": "file", "path": DEFAULT}).final
-    assert np.array_equal(one, two)
-    assert develop(np.full((1, 1, 3), 0.2, np.float32), stages=["tone_curve"]).final == (
-        pytest.approx(0.4294, abs=1e-4)
-    )
+def test_camera_raws_curve_is_a_file_of_the_same_form(develop):
+    def curve(image, **values):
+        return develop(image, stages=["tone_curve"], tone_curve=values).final
+
+    named = curve(RAMP, method="camera_raw")
+    assert np.array_equal(named, curve(RAMP, method="file", path=CAMERA_RAW))
+    grey = curve(np.full((1, 1, 3), 0.2, np.float32), method="camera_raw")
+    assert grey == pytest.approx(0.4294, abs=1e-4)
 
 
-def test_a_linear_tone_curve_changes_nothing(develop):
-    result = develop(RAMP, stages=["tone_curve"], tone_curve={"method": "linear"})
-    assert np.array_equal(result.final, RAMP)
+def test_a_linear_tone_curve_gives_the_headroom_back_and_changes_nothing_else(develop):
+    linear = {"method": "linear"}
+    assert np.array_equal(develop(RAMP, stages=["tone_curve"], tone_curve=linear).final, RAMP)
+    for headroom in (1.0, 2.0):
+        stages = {"stages": ["exposure", "tone_curve"], "exposure": {"headroom": headroom}}
+        for numpy in (False, True):
+            result = develop(RAMP, numpy=numpy, keep=("exposure",), tone_curve=linear, **stages)
+            assert np.array_equal(result.kept["exposure"] * 2**headroom, RAMP)
+            assert np.array_equal(result.final, RAMP)

@@ -9,12 +9,14 @@ from clpipe import Pipeline
 from clpipe.base.errors import RequestError
 from clpipe.commands.main import main
 from clpipe.reference.curve import curve_index
+from clpipe.stage import run_reference
 from clpipe.stages.gamma import Power, Srgb
 from clpipe.stages.inverse_gamma import Power as InversePower
 from clpipe.stages.inverse_gamma import Srgb as InverseSrgb
-from clpipe.stages.inverse_tone_curve import Default as InverseTone
+from clpipe.stages.inverse_tone_curve import CameraRaw as InverseCameraRaw
 from clpipe.stages.inverse_tone_curve import File as InverseFile
-from clpipe.stages.tone_curve import Default as Tone
+from clpipe.stages.inverse_tone_curve import Filmic as InverseFilmic
+from clpipe.stages.tone_curve import CameraRaw, Filmic
 from tests.conftest import written
 
 QUIET = ["sensor_noise", "row_noise", "denoise"]
@@ -34,15 +36,23 @@ def smooth(height: int = 96, width: int = 128) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("there", "back"),
-    [(Srgb(), InverseSrgb()), (Power(), InversePower()), (Tone(), InverseTone())],
+    [(Srgb(), InverseSrgb()), (Power(), InversePower()), (CameraRaw(), InverseCameraRaw())],
 )
 def test_what_is_undone_was_there(there, back):
     x = np.linspace(0, 1, 4001, dtype=np.float32)
-    light = x if isinstance(there, Tone) else x**2
+    light = x if isinstance(there, CameraRaw) else x**2
     again = back.table()[curve_index(there.table()[curve_index(light)])]
     # Entries of both tables are 2^-13 apart, and where a curve is flat that is more light.
     assert np.abs(again - light).max() < 2e-3
     assert np.abs(again - light)[light > 0.01].mean() < 2e-4
+
+
+def test_the_filmic_curve_is_undone_for_all_colours():
+    light = np.random.default_rng(0).random((40, 50, 3), np.float32) ** 2
+    light[:, 25:] *= 1 / 64  # the toe
+    curved = run_reference(Filmic(), light)
+    assert np.abs(curved - light).max() > 0.2
+    assert np.abs(run_reference(InverseFilmic(), curved) - light).max() < 2e-6
 
 
 def test_a_curve_that_falls_cannot_be_undone(tmp_path):

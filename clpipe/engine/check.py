@@ -189,9 +189,10 @@ def check_ends(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Chec
     """
     total, cases = Difference(), 0
     mosaic = Settings(stages=("mosaic", "inverse_white_balance"))
+    curves = {"tone_curve": {"method": "camera_raw"}}
     for chain in (
         make_chain(Settings(stages=("exposure",))),
-        make_chain(Settings(stages=("exposure", "tone_curve", "gamma"))),
+        make_chain(Settings(stages=("exposure", "tone_curve", "gamma"), parameters=curves)),
         make_chain(mosaic, start_at="inverse_white_balance"),
     ):
         for half in (False, True):

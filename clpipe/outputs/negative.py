@@ -44,7 +44,7 @@ def negative_of(chain: Chain) -> Negative:
         gains=gains,
         xyz_to_camera=xyz_to_camera(_colours(context, end, is_input), gains),
         noise=context.noise,
-        headroom=context.headroom,
+        headroom=0.0 if is_input else context.headroom,
     )
 
 

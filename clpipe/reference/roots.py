@@ -16,13 +16,15 @@ def root_of(signal: Floats, offset: np.float32) -> Floats:
 
 
 def from_root(root: Floats, offset: np.float32) -> Floats:
-    """The inverse of :func:`root_of`.
+    """The inverse of :func:`root_of`; -offset for all roots below 0, as sums of colours can be.
 
     >>> offset = np.float32(0.01)
     >>> from_root(root_of(np.float32([0, 0.25, 1]), offset), offset).round(6).tolist()
     [0.0, 0.25, 1.0]
+    >>> from_root(np.float32([-0.5]), offset).round(6).tolist()
+    [-0.009999999776482582]
     """
-    return root * root - offset
+    return np.square(np.maximum(root, np.float32(0))) - offset
 
 
 def noise_in_roots(sigma: float, level: float, offset: float) -> float:

@@ -4,7 +4,10 @@
 #define CLPIPE_ROOTS_H
 
 INLINE vf root_of(vf v, float offset) { return square_root(vmax(v + offset, (vf)(0.0f))); }
-INLINE vf from_root(vf s, float offset) { return s * s - offset; }
+INLINE vf from_root(vf s, float offset) {
+    const vf root = vmax(s, (vf)(0.0f));  // where a difference of colours went below 0
+    return root * root - offset;
+}
 
 INLINE rgb roots_of(rgb c, float offset) {
     const rgb v = {root_of(c.r, offset), root_of(c.g, offset), root_of(c.b, offset)};
