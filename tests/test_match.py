@@ -180,7 +180,7 @@ def test_the_table(found, clpipe, monkeypatch, tmp_path):
     rows = {line[:22].strip(): line[22:].split() for line in result.stdout.splitlines()}
     assert rows["kurtosis"][-1] == "-"
     assert rows["luma, 1 right"][-2] == "±"
-    assert "largest residual of a correlation on crops not searched" in result.stdout
+    assert "largest residual of a correlation in places not searched" in result.stdout
 
 
 def test_jpegs_say_their_quality_and_subsampling(burst, tmp_path):
