@@ -31,7 +31,7 @@ from clpipe.engine.device import Device
 LOG = logging.getLogger(__name__)
 
 GLANCE, QUICK, FULL = 2, 3, 12  # steps of least squares: at first, while promising, at the end
-HOPELESS, PROMISING = 3.0, 1.5  # times the best cost, before and after a glance
+HOPELESS, PROMISING = 5.0, 1.5  # times the best cost, before and after a glance
 ENOUGH = 0.5  # residuals of a typical column below which no other method is tried
 CONVERGED = 0.95  # share of the cost above which another few steps gain too little to go on
 STEP = 0.03  # of a dimension's range, for differences
