@@ -100,17 +100,18 @@ class Search:
         best = self.fit(self.space.first, {}, few, QUICK)
         LOG.info("start: residuals of %.2g", typical(best, few))
         tried = {labels(best)}
-        for _ in range(ROUNDS):
-            before = best
-            for part, choices in self.space.choices.items():
-                for choice in choices:
-                    best = self.attempt(best, part, choice, few, tried)
-                for step in steps_of(best, part):
-                    for choice in variants_of(best.settings, step):
-                        variant = merged(best.choices[part], choice)
-                        best = self.attempt(best, part, variant, few, tried, own=True)
-            if best is before:
+        unchanged = 0  # parts that were tried since the best changed
+        for part, choices in list(self.space.choices.items()) * ROUNDS:
+            if unchanged == len(self.space.choices):
                 break
+            before = best
+            for choice in choices:
+                best = self.attempt(best, part, choice, few, tried)
+            for step in steps_of(best, part):
+                for choice in variants_of(best.settings, step):
+                    variant = merged(best.choices[part], choice)
+                    best = self.attempt(best, part, variant, few, tried, own=True)
+            unchanged = unchanged + 1 if best is before else 1
         return self.fit(best.choices, best.numbers, self.targets, FULL)
 
     def attempt(
