@@ -97,7 +97,7 @@ class Search:
         flattest = sorted(self.targets, key=lambda t: -int(t.scene.mask.sum()))[:FEW]
         crops = [crops_of(target.scene, SMALL, 1)[0] for target in flattest]
         few = [target_of(crop, crop.mask) for crop in crops]
-        best = self.fit(self.space.first, {}, few, QUICK)
+        best = self.converged(self.fit(self.space.first, {}, few, QUICK), few)
         LOG.info("start: residuals of %.2g", typical(best, few))
         tried = {labels(best)}
         unchanged = 0  # parts that were tried since the best changed
@@ -139,18 +139,25 @@ class Search:
         found = self.fit(choices, start, targets, 0)
         if found.cost < HOPELESS * best.cost:
             found = self.fit(choices, start, targets, GLANCE)
-        before = np.inf
-        while (
-            BETTER * best.cost <= found.cost < PROMISING * best.cost
-            and found.cost < CONVERGED * before
-        ):
-            before = found.cost
-            found = self.fit(choices, found.numbers, targets, QUICK)
+        found = self.converged(found, targets, PROMISING * best.cost)
         LOG.debug("%s: cost %.1f, best %.1f", ", ".join(other), found.cost, best.cost)
         if found.cost >= BETTER * best.cost:
             return best
         LOG.info("%s: residuals of %.2g", ", ".join(other), typical(found, targets))
         return found
+
+    def converged(
+        self, candidate: Candidate, targets: Sequence[Target], limit: float = np.inf
+    ) -> Candidate:
+        """A candidate fitted until a few steps gain too little to go on, or not below a limit.
+
+        A best that is not would lose to any other that is.
+        """
+        before = np.inf
+        while candidate.cost < min(limit, CONVERGED * before):
+            before = candidate.cost
+            candidate = self.fit(candidate.choices, candidate.numbers, targets, QUICK)
+        return candidate
 
     def fit(
         self,
