@@ -18,7 +18,14 @@ from clpipe.analysis.matching.columns import (
 )
 from clpipe.analysis.matching.scenes import Scenes, held_out, load_scenes
 from clpipe.analysis.matching.simulation import Simulator
-from clpipe.analysis.matching.space import Choice, Dimension, Space, dimensions_of, space_for
+from clpipe.analysis.matching.space import (
+    Choice,
+    Dimension,
+    Space,
+    dimensions_of,
+    smaller,
+    space_for,
+)
 from clpipe.analysis.signature import flat_places, signature
 from clpipe.chain.chain import make_chain
 from clpipe.chain.files import load_settings
@@ -173,7 +180,7 @@ def test_the_table(found, clpipe, monkeypatch, tmp_path):
     rows = {line[:22].strip(): line[22:].split() for line in result.stdout.splitlines()}
     assert rows["kurtosis"][-1] == "-"
     assert rows["luma, 1 right"][-2] == "±"
-    assert "largest residual of a correlation on crops not searched" in result.stdout
+    assert "largest residual of a correlation in places not searched" in result.stdout
 
 
 def test_jpegs_say_their_quality_and_subsampling(burst, tmp_path):
@@ -212,11 +219,22 @@ def test_every_number_of_the_development_is_searched():
     methods = {choice.text for choice in space.choices["demosaic"]}
     assert {"demosaic bilinear", "demosaic menon2007"} <= methods
     assert not any("file" in choice.text for choice in space.choices["tone_curve"])
-    camera = space.choices["colours"][1].over(Settings())
-    assert [s.method.method for s in make_chain(camera).steps if "matrix" in s.name] == [
+    camera = space.choices["chroma"][-1].over(Settings())
+    chain = make_chain(camera)
+    assert [s.method.method for s in chain.steps if "matrix" in s.name] == [
         "inverse_camera",
         "camera",
     ]
+    smoother = {d.name for d in dimensions_of(chain) if d.name.startswith("denoise_2.")}
+    assert smoother == {"denoise_2.chroma_strength", "denoise_2.spatial_sigma"}
+
+
+def test_a_smaller_picture_is_sharpened_before_or_after():
+    before, after = list(smaller(Settings()))[:2]
+    for choice, order in ((before, ["sharpen", "resize"]), (after, ["resize", "sharpen"])):
+        names = choice.over(Settings()).stages
+        assert [name for name in names if name in order] == order
+        assert names[-3:] == ("tone_curve", "gamma", "picture_noise")
 
 
 def test_a_third_is_kept_out_of_the_search(burst, tmp_path):
@@ -225,8 +243,9 @@ def test_a_third_is_kept_out_of_the_search(burst, tmp_path):
     assert not (one.mask & one.held).any()
     assert one.held.sum() / (one.mask | one.held).sum() == pytest.approx(1 / 3, abs=0.12)
     whole = replace(one, mask=one.mask | one.held, held=np.zeros_like(one.held))
-    kept = held_out([whole] * 4)
-    assert [s.mask.any() for s in kept] == [True, True, False, True]
+    kept = held_out([whole] * 6)
+    assert [s.mask.any() for s in kept] == [True, True, False] * 2
+    assert [s.mask.any() and s.held.any() for s in held_out([whole] * 5)] == [True] * 5
     assert isinstance(Scenes(kept, None, ()), Scenes)
 
 

@@ -89,7 +89,7 @@ def match(
 
 def columns_table(found: Match) -> Rows:
     """A row for each column; residuals with their standard errors."""
-    rows: Rows = [("column", "theirs", "ours", "residual", "on crops not searched")]
+    rows: Rows = [("column", "theirs", "ours", "residual", "in places not searched")]
     for seen, unseen in zip(found.seen, found.unseen, strict=True):
         text = COLUMNS[seen.name].text
         figures = number(seen.theirs, ".3f"), number(seen.ours, ".3f")

@@ -27,7 +27,7 @@ class Column:
     """One figure of a signature: how it is named, and when two of them count as equal.
 
     A ``relative`` residual is a share of theirs. ``floor`` is the residual that the search regards
-    as small; it is added to the standard error.
+    as small; it is added to the standard error. It is least for what a signature has.
     """
 
     text: str
@@ -44,27 +44,27 @@ class Column:
 TAILS = ("kurtosis", "beyond_4_sigma")
 COLUMNS: Mapping[str, Column] = {
     "rms": Column("luma rms, levels", 0.03, relative=True),
-    "kurtosis": Column("kurtosis", 0.2),
-    "beyond_4_sigma": Column("beyond 4 sigma, 1e-4", 10),
+    "kurtosis": Column("kurtosis", 0.3),
+    "beyond_4_sigma": Column("beyond 4 sigma, 1e-4", 20),
     "right": Column("luma, 1 right", 0.02),
     "below": Column("luma, 1 below", 0.02),
     "diagonal": Column("luma, diagonal", 0.02),
     "two_right": Column("luma, 2 right", 0.02),
-    "two_below": Column("luma, 2 below", 0.03),
+    "two_below": Column("luma, 2 below", 0.04),
     "half": Column("luma left after 2x2", 0.02),
-    "chroma_rms": Column("chroma rms, levels", 0.05, relative=True),
+    "chroma_rms": Column("chroma rms, levels", 0.1, relative=True),
     "chroma_right": Column("chroma, 1 right", 0.02),
     "chroma_below": Column("chroma, 1 below", 0.03),
     "chroma_two_right": Column("chroma, 2 right", 0.04),
     "red_green": Column("R-G", 0.03),
-    "green_blue": Column("G-B", 0.06),
-    "red_blue": Column("R-B", 0.06),
+    "green_blue": Column("G-B", 0.1),
+    "red_blue": Column("R-B", 0.1),
     **{
-        f"band_{k}": Column(f"luma power, {low:g}-{min(high, 0.71):g} cycles/px", 0.03)
+        f"band_{k}": Column(f"luma power, {low:g}-{min(high, 0.71):g} cycles/px", 0.05)
         for k, (low, high) in enumerate(itertools.pairwise(BANDS), 1)
     },
     **{
-        f"sigma_{low}": Column(f"luma rms at {low}-{high - 1}, levels", 0.15, relative=True)
+        f"sigma_{low}": Column(f"luma rms at {low}-{high - 1}, levels", 0.3, relative=True)
         for low, high in itertools.pairwise(LEVELS)
     },
 }

@@ -110,7 +110,7 @@ def draw_intensity(axes: Axes, match: Match) -> None:
 
 
 def draw_residuals(axes: Axes, rows: Sequence[Row]) -> None:
-    """Draw the residuals of the crops that were not searched, with their standard errors."""
+    """Draw the residuals of places that were not searched, with their standard errors."""
     shown = [row for row in rows if not np.isnan(row.residual) and row.name != "beyond_4_sigma"]
     places = np.arange(len(shown))[::-1]
     residuals, errors = ([getattr(row, key) for row in shown] for key in ("residual", "error"))
@@ -121,5 +121,5 @@ def draw_residuals(axes: Axes, rows: Sequence[Row]) -> None:
     )
     names = [COLUMNS[r.name].text + (" (share)" if r.relative else "") for r in shown]
     axes.set_yticks(places, names, fontsize=9)
-    axes.set_title("Ours less theirs on crops that were not searched; grey: within 0.1")
+    axes.set_title("Ours less theirs in places that were not searched; grey: within 0.1")
     axes.grid(alpha=0.3, axis="x")

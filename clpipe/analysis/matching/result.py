@@ -51,7 +51,7 @@ class Compared(NamedTuple):
 class Match:
     """A development, and how like the camera's its noise is.
 
-    ``seen`` are the columns of the crops that the search saw, ``unseen`` of those that it did not.
+    ``seen`` are the columns of the places that the search saw, ``unseen`` of those that it did not.
     """
 
     settings: Settings
@@ -64,13 +64,13 @@ class Match:
 
     @property
     def verdict(self) -> str:
-        """The correlation with the largest residual in crops that the search did not see."""
+        """The correlation with the largest residual in places that the search did not see."""
         rows = [row for row in self.unseen if not row.relative and abs(row.theirs) <= 1]
         if not rows:
-            return "the crops that were not searched are too few to tell"
+            return "the places that were not searched are too few to tell"
         worst = max(rows, key=lambda row: abs(row.residual))
         return (
-            "largest residual of a correlation on crops not searched: "
+            "largest residual of a correlation in places not searched: "
             f"{worst.residual:+.3f} ({COLUMNS[worst.name].text})"
         )
 

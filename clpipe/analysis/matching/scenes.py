@@ -26,7 +26,8 @@ CROP = 512  # px; crops begin at multiples of 16, where the blocks of a JPEG do
 CROPS = 4
 FEWEST_FLAT = 4000  # pixels of all scenes that are neither clipped nor near an edge
 FEWEST_OF_EACH = 1000  # and of each
-HELD = 3  # one crop in so many is kept out of the search
+HELD = 3  # one crop or block in so many is kept out of the search
+MANY = 6  # crops, of which whole ones are kept out; of fewer, a whole one would be one odd scene
 SMOOTH = 1.5  # px, over which the mean of a burst is smoothed before it is developed again
 
 SHIFT = 0.5  # px, by which a frame may lie beside its mean
@@ -334,8 +335,8 @@ def cut(scene: Scene, at: tuple[slice, slice], place: tuple[int, int]) -> Scene:
 
 
 def held_out(pieces: Sequence[Scene]) -> tuple[Scene, ...]:
-    """The crops, with one third kept out of the search: whole crops, or blocks of one or two."""
-    if len(pieces) >= HELD:
+    """The crops, with one third kept out of the search: whole crops of six, or blocks of fewer."""
+    if len(pieces) >= MANY:
         return tuple(
             replace(p, mask=p.held, held=p.mask) if k % HELD == HELD - 1 else p
             for k, p in enumerate(pieces)

@@ -17,6 +17,7 @@ from clpipe.analysis.matching.scenes import Scene, Scenes, crops_of
 from clpipe.analysis.matching.simulation import Simulator
 from clpipe.analysis.matching.space import (
     DEVELOPMENT,
+    RESIZE,
     Choice,
     Space,
     dimensions_of,
@@ -30,11 +31,13 @@ from clpipe.engine.device import Device
 LOG = logging.getLogger(__name__)
 
 GLANCE, QUICK, FULL = 2, 3, 12  # steps of least squares: at first, while promising, at the end
-HOPELESS, PROMISING = 5.0, 1.6  # times the best cost, before and after a glance
+HOPELESS, PROMISING = 5.0, 1.5  # times the best cost, before and after a glance
+ENOUGH = 0.5  # residuals of a typical column below which no other method is tried
+CONVERGED = 0.95  # share of the cost above which another few steps gain too little to go on
 STEP = 0.03  # of a dimension's range, for differences
 KNEE = 3.0  # residuals beyond count less than their squares (soft L1)
-BETTER = 0.92  # share of the cost below which another method is taken
-FEW, SMALL = 2, 384  # scenes by which methods are compared, and the size of their crops, px
+BETTER = 0.8  # share of the cost below which another method is taken; by chance, some reach 0.9
+FEW, SMALL = 4, 384  # scenes by which methods are compared, and the size of their crops, px
 ROUNDS = 2  # of all parts
 
 
@@ -94,19 +97,21 @@ class Search:
         flattest = sorted(self.targets, key=lambda t: -int(t.scene.mask.sum()))[:FEW]
         crops = [crops_of(target.scene, SMALL, 1)[0] for target in flattest]
         few = [target_of(crop, crop.mask) for crop in crops]
-        best = self.fit(self.space.first, {}, few, QUICK)
+        best = self.converged(self.fit(self.space.first, {}, few, QUICK), few)
         LOG.info("start: residuals of %.2g", typical(best, few))
         tried = {labels(best)}
-        for _ in range(ROUNDS):
+        unchanged = 0  # parts that were tried since the best changed
+        for part, choices in list(self.space.choices.items()) * ROUNDS:
+            if unchanged == len(self.space.choices):
+                break
             before = best
-            for part, choices in self.space.choices.items():
-                for choice in choices:
-                    best = self.attempt(best, part, choice, few, tried)
-                for choice in variants_of(best.settings, part) if part in DEVELOPMENT else ():
+            for choice in choices:
+                best = self.attempt(best, part, choice, few, tried)
+            for step in steps_of(best, part):
+                for choice in variants_of(best.settings, step):
                     variant = merged(best.choices[part], choice)
                     best = self.attempt(best, part, variant, few, tried, own=True)
-            if best is before:
-                break
+            unchanged = unchanged + 1 if best is before else 1
         return self.fit(best.choices, best.numbers, self.targets, FULL)
 
     def attempt(
@@ -121,24 +126,38 @@ class Search:
         """The better of the best and the same with another choice of a part.
 
         Its numbers start from the best's; those of the part do so where the choice is the best's
-        ``own`` method, because to another method they mean other things.
+        ``own`` method, because to another method they mean other things, and none at another size.
         """
         choices = {**best.choices, part: choice}
         other = tuple(each.text for each in choices.values())
-        if other in tried:
+        if other in tried or typical(best, targets) < ENOUGH:
             return best
         tried.add(other)
         start = {k: v for k, v in best.numbers.items() if own or k.partition(".")[0] != part}
+        if part == RESIZE:
+            start = {}
         found = self.fit(choices, start, targets, 0)
         if found.cost < HOPELESS * best.cost:
             found = self.fit(choices, start, targets, GLANCE)
-        if BETTER * best.cost <= found.cost < PROMISING * best.cost:
-            found = self.fit(choices, found.numbers, targets, QUICK)
+        found = self.converged(found, targets, PROMISING * best.cost)
         LOG.debug("%s: cost %.1f, best %.1f", ", ".join(other), found.cost, best.cost)
         if found.cost >= BETTER * best.cost:
             return best
         LOG.info("%s: residuals of %.2g", ", ".join(other), typical(found, targets))
         return found
+
+    def converged(
+        self, candidate: Candidate, targets: Sequence[Target], limit: float = np.inf
+    ) -> Candidate:
+        """A candidate fitted until a few steps gain too little to go on, or not below a limit.
+
+        A best that is not would lose to any other that is.
+        """
+        before = np.inf
+        while candidate.cost < min(limit, CONVERGED * before):
+            before = candidate.cost
+            candidate = self.fit(candidate.choices, candidate.numbers, targets, QUICK)
+        return candidate
 
     def fit(
         self,
@@ -235,6 +254,12 @@ def typical(candidate: Candidate, targets: Sequence[Target]) -> float:
 def labels(candidate: Candidate) -> tuple[str, ...]:
     """What a candidate's choices are called."""
     return tuple(choice.text for choice in candidate.choices.values())
+
+
+def steps_of(candidate: Candidate, part: str) -> list[str]:
+    """The steps of a part whose structure is searched: its own, and the denoising that it adds."""
+    own = candidate.choices[part].values
+    return [part] if part in DEVELOPMENT else [step for step in own if step.startswith("denoise")]
 
 
 def merged(first: Choice, second: Choice) -> Choice:

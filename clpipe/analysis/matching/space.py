@@ -1,7 +1,8 @@
 """What a search may change: the methods of the development's stages, and the numbers they declare.
 
-Nothing here names a method or a parameter: a new one in a stage of the development is searched,
-too. Only methods that need a file or a matrix of the user's are not.
+A new method or parameter in a stage of the development is searched, too. Only methods that need a
+file or a matrix of the user's are not. What cameras do and the default chain does not is named
+here: smaller pictures, colours of their own, and smoother chroma.
 """
 
 import math
@@ -21,6 +22,9 @@ from clpipe.stage import Method
 DEVELOPMENT = ("denoise", "demosaic", "sharpen")
 RESIZE, SCALES = "resize", (0.5, 2 / 3, 0.75)  # of cameras' smaller pictures
 BEFORE = "tone_curve"  # where a stage of these goes that the chain lacks
+SHARPEN = "sharpen"
+# Chroma alone, once more and wider: cameras smooth it at a half or a quarter of the resolution.
+SMOOTHER = {"method": "bilateral", "luma_size": 1, "luma_strength": 0.0, "chroma_size": 7}
 SEARCHED_UNITS = ("", "px")  # what is in units of the signal follows from the noise
 SPAN = 8.0  # a number is searched within this factor of where it starts
 
@@ -106,9 +110,9 @@ def is_number(annotation: Any) -> bool:
 def dimensions_of(chain: Chain) -> list[Dimension]:
     """The numbers of a chain's development that kernels get as arguments, with their ranges.
 
-    Each is searched within a factor of 8 of its value in the chain, as far as its limits allow;
-    what is 0 there, between its limits. Numbers in units of the signal are not searched, because
-    they follow from the noise; nor those without an upper limit.
+    Each is searched within a factor of 8 of its value in the chain, as far as its limits allow.
+    What is 0 there is switched off, and stays so. Numbers in units of the signal are not searched,
+    because they follow from the noise; nor those without an upper limit.
     """
     found = []
     for step in chain.steps:
@@ -125,13 +129,9 @@ def dimensions_of(chain: Chain) -> list[Dimension]:
             low, high = limits_of(declared.metadata)
             start = float(getattr(step.method, name))
             dotted = f"{step.name}.{name}"
-            if not math.isfinite(low + high):
-                continue
-            if start > 0:
+            if start > 0 and math.isfinite(low + high):
                 ends = max(start / SPAN, low), min(start * SPAN, high)
                 found.append(Dimension(dotted, *ends, start, logarithmic=True))
-            else:
-                found.append(Dimension(dotted, low, high, start))
     return found
 
 
@@ -147,8 +147,14 @@ def limits_of(metadata: list[Any]) -> tuple[float, float]:
 
 
 def space_for(settings: Settings, iso_is_given: bool) -> Space:
-    """The whole space: every part of the development, and the ISO where it is not given."""
+    """The whole space: every part of the development, and the ISO where it is not given.
+
+    What changes the most comes first, so that the rest is compared where it belongs.
+    """
     choices: dict[str, tuple[Choice, ...]] = {}
+    if RESIZE not in settings.stages:
+        choices[RESIZE] = (Choice("full size"), *smaller(settings))
+    choices["chroma"] = tuple(chroma_ways(settings))
     for name in (*DEVELOPMENT, "tone_curve"):
         stage = all_stages()[name]
         added = {} if name in settings.stages else {name: BEFORE}
@@ -159,30 +165,40 @@ def space_for(settings: Settings, iso_is_given: bool) -> Space:
         ]
         without = [Choice(f"no {name}")] if added else []
         choices[name] = (*without, *own)
-    if RESIZE not in settings.stages:
-        added = {RESIZE: BEFORE}
-        smaller = [
-            Choice(
-                f"{RESIZE} {m.method} {scale:.3g}",
-                {RESIZE: {"method": m.method, "scale": scale}},
-                added,
-            )
-            for scale in SCALES
-            for m in all_stages()[RESIZE].methods
-        ]
-        choices[RESIZE] = (Choice("full size"), *smaller)
-    if "color_matrix" in settings.stages:
-        camera = {
-            "color_matrix": {"method": "inverse_camera"},
-            "color_matrix_2": {"method": "camera"},
-        }
-        choices["colours"] = (
-            Choice("colours of the scene"),
-            Choice("colours of the camera", camera, {"color_matrix": "mosaic"}),
-        )
     low, high = settings.isos().low, settings.isos().high
     strength = Dimension("iso", low, high, math.sqrt(low * high), logarithmic=True)
     return Space(choices, None if iso_is_given else strength)
+
+
+def smaller(settings: Settings) -> Iterator[Choice]:
+    """The ways to a smaller picture: each scale and method, before sharpening and after it."""
+    for scale in SCALES:
+        for method in all_stages()[RESIZE].methods:
+            values = {RESIZE: {"method": method.method, "scale": scale}}
+            text = f"{RESIZE} {method.method} {scale:.3g}"
+            yield Choice(text, values, {RESIZE: BEFORE})
+            if SHARPEN in settings.stages:
+                yield Choice(f"{text}, then sharpen", values, {RESIZE: SHARPEN})
+
+
+def chroma_ways(settings: Settings) -> Iterator[Choice]:
+    """What makes the noise of chroma: the colours of the scene or the sensor's; smoother or not.
+
+    Each alone may gain nothing where both together do: a matrix makes chroma noise stronger.
+    """
+    camera = {
+        "color_matrix": {"method": "inverse_camera"},
+        "color_matrix_2": {"method": "camera"},
+    }
+    before = SHARPEN if SHARPEN in settings.stages else BEFORE
+    smooth = {"denoise_2": SMOOTHER}, {"denoise": before}
+    yield Choice("colours of the scene")
+    yield Choice("colours of the scene, smoother", *smooth)
+    if "color_matrix" in settings.stages:
+        added = {"color_matrix": "mosaic"}
+        yield Choice("colours of the camera", camera, added)
+        both = {**camera, **smooth[0]}, {**added, **smooth[1]}
+        yield Choice("colours of the camera, smoother", *both)
 
 
 def usable(method: type[Method]) -> bool:
@@ -192,7 +208,10 @@ def usable(method: type[Method]) -> bool:
 
 
 def variants_of(settings: Settings, step: str) -> Iterator[Choice]:
-    """A step's method with one of its structural parameters a step up or down, or chosen anew."""
+    """A step's method with one of its structural parameters a step up or down, or chosen anew.
+
+    A window of one pixel is switched off, and stays so.
+    """
     method = settings.method(step)
     table = settings.parameters.get(step, {})
     for name, declared in type(method).model_fields.items():
@@ -203,7 +222,7 @@ def variants_of(settings: Settings, step: str) -> Iterator[Choice]:
         values: list[Any] = []
         if get_origin(declared.annotation) is typing.Literal:
             values = [value for value in get_args(declared.annotation) if value != own]
-        elif declared.annotation is int:
+        elif declared.annotation is int and own > 1:
             values = [own - 2, own + 2, own + 4]
         elif declared.annotation is float:
             values = [float(f"{own * factor:.3g}") for factor in (0.5, 0.7, 1.4, 2.0)]
