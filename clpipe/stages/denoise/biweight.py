@@ -94,7 +94,7 @@ class Biweight(Denoiser):
 
     def resolve(self, context: Context) -> Self:
         resolved = super().resolve(context).filled(offset=offset_of_roots(context))
-        return resolved.filled(grain=0.35 / (1 + (resolved.roots[0] / 0.02) ** 2))
+        return resolved.filled(grain=0.35 / (1 + (resolved.roots[0] / 0.03) ** 2))
 
     @property
     def effect(self) -> str:
