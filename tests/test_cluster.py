@@ -49,7 +49,7 @@ def workers():
 
 @pytest.fixture
 def address(workers):
-    workers.wait_for_workers(2, timeout=30)
+    workers.wait_for_workers(2, timeout=120)
     return workers.scheduler.address
 
 
