@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clpipe.analysis.spatial import energy_left
 from clpipe.base.types import Doubles, Mask
 
 DRIFT = 12.0  # px; what is smoother than this is no noise but light or focus that changed
@@ -119,16 +120,6 @@ def lag(noise: Doubles, mask: Mask, down: int, right: int) -> float:
     return float((noise[here] * noise[there])[both].mean() / variance)
 
 
-def energy_left(noise: Doubles, mask: Mask) -> float:
-    """The share of the variance that 2x2 averaging leaves, among whole blocks that count."""
-    height, width = (size // 2 * 2 for size in noise.shape)
-    shape = (height // 2, 2, width // 2, 2)
-    whole = mask[:height, :width].reshape(shape).all((1, 3))
-    blocks = noise[:height, :width].reshape(shape)
-    energy = (blocks**2).mean((1, 3))[whole]
-    return float((blocks.mean((1, 3))[whole] ** 2).sum() / energy.sum()) if energy.any() else np.nan
-
-
 def signature(
     picture: NDArray[np.number], mean: NDArray[np.number], mask: Mask | None = None
 ) -> Signature:
@@ -162,7 +153,7 @@ def signature(
         below=lag(y, mask, 1, 0),
         diagonal=lag(y, mask, 1, 1),
         two_right=lag(y, mask, 0, 2),
-        half=energy_left(y, mask),
+        half=energy_left(y[None], mask),
         chroma_right=(lag(cb, mask, 0, 1) + lag(cr, mask, 0, 1)) / 2,
         red_green=float((red * green).sum() / power) if power else np.nan,
         chroma_rms=float(np.sqrt(((cb[mask] ** 2 + cr[mask] ** 2) / 2).mean())) if some else np.nan,

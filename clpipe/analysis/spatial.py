@@ -88,7 +88,7 @@ def line_noise(noise: Floats, mask: Mask) -> LineNoise:
     return LineNoise(math.sqrt(max(float(variance), 0.0)), math.sqrt(3 * float(error)))
 
 
-def energy_left(standard: Floats, mask: Mask) -> float:
+def energy_left(standard: NDArray[np.floating[Any]], mask: Mask) -> float:
     """The share of the noise's energy that remains after averaging 2x2 pixels.
 
     It is a quarter for independent noise and more for noise that processing has correlated (Bielova

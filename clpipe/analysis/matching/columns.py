@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from clpipe.analysis.signature import BIN, FEWEST, LUMA, chroma, luma, noise_of
+from clpipe.analysis.spatial import energy_left
 from clpipe.base.types import Array, Doubles, Floats, Mask
 
 REACH = 6  # px, the longest lag
@@ -211,16 +212,6 @@ def bands(table: Doubles) -> Figures:
     edges = itertools.pairwise(BANDS)
     inside = [spectrum[(radius >= low) & (radius < high)].sum() for low, high in edges]
     return {f"band_{k}": float(v / spectrum.sum()) for k, v in enumerate(inside, 1)}
-
-
-def energy_left(plane: Doubles, mask: Mask) -> float:
-    """The share of the variance that 2x2 averaging leaves, over all frames."""
-    height, width = (size // 2 * 2 for size in mask.shape)
-    shape = (height // 2, 2, width // 2, 2)
-    whole = mask[:height, :width].reshape(shape).all((1, 3))
-    blocks = plane[:, :height, :width].reshape(len(plane), *shape)
-    energy = (blocks**2).mean((2, 4))[:, whole].sum()
-    return float((blocks.mean((2, 4))[:, whole] ** 2).sum() / energy) if energy else np.nan
 
 
 def by_intensity(noise: Doubles, level: Doubles) -> Figures:
