@@ -10,6 +10,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
+import dask
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster, WorkerPlugin
@@ -39,8 +40,12 @@ IMAGES = 40
 
 @pytest.fixture(scope="module")
 def workers():
-    """A client of two workers, processes of their own, which are started again where they die."""
+    """A client of two workers, processes of their own, which are started again where they die.
+
+    Dask gives up one that is not back after 15 s, which a busy machine may need.
+    """
     with (
+        dask.config.set({"distributed.deploy.lost-worker-timeout": "10m"}),
         LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as local,
         Client(local, set_as_default=False) as client,
     ):
