@@ -151,7 +151,7 @@ def _load(writer: Writer, launch: Launch) -> tuple[list[str], list[str], Kind]:
         return [], [f"const {kind.c_type} v0 = source_{kind.c_name}_{dtype}(src, at, e);"], kind
     block = stencil.pass_.block if stencil else 0
     images = [
-        f"image_at({', '.join(writer.planes(read))}, e, first, {'0' if block else 'row'})"
+        f"image_at({', '.join(writer.planes(read))}, e, first, {'0' if block else 'ROW'})"
         for read in launch.reads
     ]
     if launch.opener and not stencil:
@@ -206,7 +206,7 @@ def _pixels(writer: Writer, launch: Launch) -> str:
         writer.parameter("sums", "__global int4 *restrict ", "sums")
         sample = call(launch.sums, [value, *writer.arguments(launch.sums)])
         lines.append(f"const vi sample = only_inside({sample}, at, {writer.core()});")
-        lines.append("if (row & 1) odd_rows += sample; else even_rows += sample;")
+        lines.append("if (ROW & 1) odd_rows += sample; else even_rows += sample;")
         once.append("vi even_rows = (vi)(0), odd_rows = (vi)(0);")
         after = (
             "    const size_t block = get_global_id(1) * ((columns + LANES - 1) / LANES) + "
@@ -218,57 +218,73 @@ def _pixels(writer: Writer, launch: Launch) -> str:
     if not block:
         # All rows before the first store: what they have in common is then done once, because no
         # store can have changed what they read.
-        once.append(f"{kind.c_type} values[{launch.rows}];")
-        lines.append(f"values[row] = {value};")
-        value = "values[row]"
+        once.append(f"{kind.c_type} {', '.join(f'values_{row}' for row in range(launch.rows))};")
+        lines.append(f"values_ROW = {value};")
+        value = "values_ROW"
     writes, encodes = [], []
     if launch.writes:
         slots = [writer.slot(n, True) for n in plan.slots[launch.writes.number]]
         writes.append(f"store_{kind.c_name}({', '.join([value, *slots])}, at, e);")
     if launch.encodes:
         encodes.append(_encode(writer, value, kind, curves))
-    start = "".join(f"    {line}\n" for line in once)
     if block:
-        body = _over_rows(_over_columns([*lines, *writes, *encodes], launch), launch.rows, False)
+        body = _over_block([*lines, *writes, *encodes], launch)
     else:
-        body = _over_rows(lines, launch.rows) + _store(writes, launch.rows)
-        body += _over_rows(encodes, launch.rows) if encodes else ""
+        body = _each_row(lines, launch.rows) + _store(writes, kind, launch.rows)
+        body += _each_row(encodes, launch.rows)
+    start = "".join(f"    {line}\n" for line in [*once, *body])
     return (
         f"    const uint x = left * LANES + (uint)get_global_id(0) * {max(block, 1)} * LANES;\n"
         f"    const uint y = top * 4 + (uint)get_global_id(1) * {launch.rows};\n"
         "    if (x - e.left >= columns) return;\n"
-        f"    const site first = site_at(x, y);\n{start}{body}{after}"
+        f"    const site first = site_at(x, y);\n{start}{after}"
     )
 
 
-def _over_columns(lines: Sequence[str], launch: Launch) -> list[str]:
-    """Lines for each vector of a row of a stencil's block."""
-    head = f"for (uint column = 0; column < {launch.columns}; ++column) {{"
-    beyond = "    if (x - e.left + column * LANES >= columns) break;"
-    place = "    const site at = site_at(x + column * LANES, y + row);"
-    return [head, beyond, place, *(f"    {line}" for line in lines), "}"]
+def _over_block(lines: Sequence[str], launch: Launch) -> list[str]:
+    """Lines for each vector of a stencil's block, which is in memory: no loop need be unrolled."""
+    return [
+        "#pragma unroll 1",
+        f"for (uint row = 0; row < {launch.rows}; ++row) {{",
+        f"    for (uint column = 0; column < {launch.columns}; ++column) {{",
+        "        if (x - e.left + column * LANES >= columns) break;",
+        "        const site at = site_at(x + column * LANES, y + row);",
+        *(f"        {line}" for line in lines),
+        "    }",
+        "}",
+    ]
 
 
-def _over_rows(lines: Sequence[str], rows: int, unroll: bool = True) -> str:
-    """A loop over the rows of a work item. What is in an array already need not be unrolled."""
-    place = ["const site at = site_at(x, y + row);"] if unroll else []
-    body = "".join(f"        {line}\n" for line in [*place, *lines])
-    pragma = "#pragma unroll" if unroll else "#pragma unroll 1"
-    return f"{pragma}\n    for (uint row = 0; row < {rows}; ++row) {{\n{body}    }}\n"
+def _each_row(lines: Sequence[str], rows: int) -> list[str]:
+    """Lines for each row of a work item, written out with its number in place of ROW.
+
+    Mesa's compiler mixes up an array of rows that one loop fills and another reads.
+    """
+    if not lines:
+        return []
+    place = "const site at = shifted(first, 0, ROW);"
+    scope = ["{", *(f"    {line}" for line in [place, *lines]), "}"]
+    return [line.replace("ROW", str(row)) for row in range(rows) for line in scope]
 
 
-def _store(writes: Sequence[str], rows: int) -> str:
+def _store(writes: Sequence[str], kind: Kind, rows: int) -> list[str]:
     """The stores of all rows of a work item: at edges in a loop of its own, which is slow code."""
     if not writes:
-        return ""
-    place = "        const site at = site_at(x, y + row);\n"
-    loop = f"    for (uint row = 0; row < {rows}; ++row) {{\n{place}"
-    at_edge = "".join(f"        {line}\n" for line in writes)
-    inside = at_edge.replace("(", "_inside(", 1)
-    return (
-        f"    if (near_edge(first, {rows}, e)) {{\n#pragma unroll 1\n{loop}{at_edge}    }}\n"
-        f"    }} else {{\n#pragma unroll\n{loop}{inside}    }}\n    }}\n"
-    )
+        return []
+    inside = [line.replace("(", "_inside(", 1) for line in writes]
+    chosen = "".join(f"row == {row} ? values_{row} : " for row in range(rows - 1))
+    return [
+        f"if (near_edge(first, {rows}, e)) {{",
+        "#pragma unroll 1",
+        f"    for (uint row = 0; row < {rows}; ++row) {{",
+        "        const site at = shifted(first, 0, row);",
+        f"        const {kind.c_type} value = {chosen}values_{rows - 1};",
+        *(f"        {line.replace('values_ROW', 'value')}" for line in writes),
+        "    }",
+        "} else {",
+        *(f"    {line}" for line in _each_row(inside, rows)),
+        "}",
+    ]
 
 
 def _lines(writer: Writer, launch: Lines) -> str:

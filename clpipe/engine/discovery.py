@@ -133,14 +133,17 @@ def is_pocl(platform: str) -> bool:
 def lanes_for(type_: str, platform: str, device: Any) -> int:
     """How many lanes the kernels are compiled for: one vector register on a CPU, 1 on a GPU.
 
+    A CPU whose natural vectors are one wide has a compiler like a GPU's: Mesa's rusticl, which gets
+    the pictures of wider ones wrong.
     PoCL's compiler takes 8 everywhere: PoCL 3.0 (LLVM 14) crashes on 16 on CPUs that have AVX-512
     but are newer than it (seen on AMD Zen 4), and gains nothing from 16 on the others.
     """
     if type_ != "CPU":
         return 1
-    if is_pocl(platform) or device.native_vector_width_float < 16:
+    if is_pocl(platform):
         return 8
-    return 16
+    width = device.native_vector_width_float
+    return 1 if width == 1 else 8 if width < 16 else 16
 
 
 def problem_with(type_: str, platform: str, device: Any) -> str:
