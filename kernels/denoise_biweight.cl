@@ -22,7 +22,7 @@ INLINE rgb from_root_luma_chroma(ycbcr c, site at, float offset, float luma_rang
 INLINE ycbcr biweight(site at, image planes, float grain) {
 #pragma OPENCL FP_CONTRACT ON
     const ycbcr centre = tap_ycbcr(planes, 0, 0), none = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
-    ycbcr sums[5] = {none, none, none, none, none};  // by squared distance
+    ycbcr sums[5] = {none, none, none, none, none};  // of weighted differences, by squared distance
     vf luma_weights[5] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
     vf chroma_weights[5] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
 #pragma unroll
@@ -31,29 +31,27 @@ INLINE ycbcr biweight(site at, image planes, float grain) {
         for (int dx = -2; dx <= 2; ++dx) {
             const int distance = dx * dx + dy * dy;
             if (distance == 1 || distance == 2) {
-                const vf y = tap_ycbcr(planes, dx, dy).y;
-                const vf d = y - centre.y;
+                const vf d = centre.y - tap_ycbcr(planes, dx, dy).y;
                 const vf near = vmax((vf)(1.0f) - d * d, (vf)(0.0f)), weight = near * near;
-                sums[distance].y += weight * y;
+                sums[distance].y += weight * d;
                 luma_weights[distance] += weight;
             }
             if (distance == 2 || distance == 4) {
                 const ycbcr c = tap_ycbcr(planes, dx, dy);
-                const vf db = c.cb - centre.cb, dr = c.cr - centre.cr;
+                const vf db = centre.cb - c.cb, dr = centre.cr - c.cr;
                 const vf near = vmax((vf)(1.0f) - db * db - dr * dr, (vf)(0.0f));
                 const vf weight = near * near;
-                sums[distance].cb += weight * c.cb;
-                sums[distance].cr += weight * c.cr;
+                sums[distance].cb += weight * db;
+                sums[distance].cr += weight * dr;
                 chroma_weights[distance] += weight;
             }
         }
     }
     const vf luma_weight = (vf)(1.0f) + 0.5f * luma_weights[1] + 0.25f * luma_weights[2];
     const vf chroma_weight = (vf)(1.0f) + 0.4f * chroma_weights[2] + 0.25f * chroma_weights[4];
-    const vf y = (centre.y + 0.5f * sums[1].y + 0.25f * sums[2].y) / luma_weight;
-    const vf inverse = 1.0f / chroma_weight;
-    const ycbcr v = {y + grain * (centre.y - y),
-                     (centre.cb + 0.4f * sums[2].cb + 0.25f * sums[4].cb) * inverse,
-                     (centre.cr + 0.4f * sums[2].cr + 0.25f * sums[4].cr) * inverse};
+    const vf luma = (1.0f - grain) / luma_weight, chroma = 1.0f / chroma_weight;
+    const ycbcr v = {centre.y - (0.5f * sums[1].y + 0.25f * sums[2].y) * luma,
+                     centre.cb - (0.4f * sums[2].cb + 0.25f * sums[4].cb) * chroma,
+                     centre.cr - (0.4f * sums[2].cr + 0.25f * sums[4].cr) * chroma};
     return v;
 }
