@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from clpipe.reference.math import exponential, exponential_minus_1, negative_log, square_root
-from clpipe.reference.random import Stream, normal_at, normal_of, philox, stream_of
+from clpipe.reference.random import Stream, normal_at, normal_of, normals_of, philox, stream_of
 from clpipe.stage import Kind
 
 A, B = 2e-4, 3e-6
@@ -45,6 +45,22 @@ def test_normals_invert_the_normal_distribution():
     assert 6.1 < z[0] < 6.2
     assert 6.3 < normal_of(np.uint32([0])).item() < 6.4
     assert np.array_equal(normal_of(steps | np.uint32(0x80000000)), -normal_of(steps))
+
+
+def test_pairs_of_normals_are_on_circles():
+    steps = np.unique(np.geomspace(1, 2**31 - 1, 20000).astype(np.uint32))
+    direction = np.arange(steps.size, dtype=np.uint32) * np.uint32(2654435769)
+    one, other = (z.astype(np.float64) for z in normals_of(steps, direction))
+    exact = np.sqrt(-2 * np.log((steps + 0.5) / 2**31))
+    assert np.all(np.abs(np.hypot(one, other) - exact) < 2e-5 * exact + 1e-3 * (exact < 1e-3))
+    angle = (direction << np.uint32(2)).view(np.int32) * (np.pi / 4 / 2**31)
+    sine = np.where(direction >> 31, one, other)
+    assert np.all(np.abs(sine - exact * np.sin(angle)) < 2e-5 * exact + 1e-3 * (exact < 1e-3))
+    # All eight ways to exchange them and to change their signs are as frequent.
+    octant = (one < 0) * 4 + (other < 0) * 2 + (np.abs(one) < np.abs(other))
+    assert np.abs(np.bincount(octant, minlength=8) / steps.size - 1 / 8).max() < 0.01
+    least = np.uint32([0]), np.uint32([0])
+    assert 6.6 < normals_of(*least)[0].item() < 6.7
 
 
 def test_logarithm_root_and_exponential_have_the_errors_that_they_state():
