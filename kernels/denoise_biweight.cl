@@ -10,10 +10,15 @@ INLINE ycbcr to_root_luma_chroma(rgb c, site at, float offset, float luma_range,
     return w;
 }
 
+// As ycbcr_to_rgb, with the units in its factors.
 INLINE rgb from_root_luma_chroma(ycbcr c, site at, float offset, float luma_range,
                                  float chroma_range) {
-    const ycbcr v = {c.y * luma_range, c.cb * chroma_range, c.cr * chroma_range};
-    return from_roots(ycbcr_to_rgb(v), offset);
+#pragma OPENCL FP_CONTRACT ON
+    const float red = chroma_range * 1.4025246f, blue = chroma_range * 1.7730496f;
+    const float green_red = red * (-0.299f * 1.7035775f), green_blue = blue * (-0.114f * 1.7035775f);
+    const vf y = c.y * luma_range;
+    const rgb v = {c.cr * red + y, c.cb * green_blue + (c.cr * green_red + y), c.cb * blue + y};
+    return from_roots(v, offset);
 }
 
 // Luma from the pixels around, chroma from those at the corners and two pixels away, whose own noise

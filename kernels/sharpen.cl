@@ -3,15 +3,18 @@
 
 // The root of luma, and blue and red over luma, all with the root's offset.
 INLINE ycbcr to_root_and_ratios(rgb c, site at, float offset) {
-    const vf luma = vmax(rgb_to_ycbcr(c).y + offset, (vf)(1e-6f));
+#pragma OPENCL FP_CONTRACT ON
+    const vf y = 0.299f * c.r + (0.587f * c.g + (0.114f * c.b + offset));
+    const vf luma = vmax(y, (vf)(1e-6f));
     const vf inverse = inverse_root(luma), per_luma = inverse * inverse;
     const ycbcr v = {luma * inverse, (c.b + offset) * per_luma, (c.r + offset) * per_luma};
     return v;
 }
 
 INLINE rgb from_root_and_ratios(ycbcr c, site at, float offset) {
+#pragma OPENCL FP_CONTRACT ON
     const vf luma = c.y * c.y;
-    const vf green = ((vf)(1.0f) - 0.299f * c.cr - 0.114f * c.cb) * 1.7035775f;
+    const vf green = c.cb * (-0.114f * 1.7035775f) + (c.cr * (-0.299f * 1.7035775f) + 1.7035775f);
     const rgb v = {c.cr * luma - offset, green * luma - offset, c.cb * luma - offset};
     return v;
 }

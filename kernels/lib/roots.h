@@ -5,6 +5,7 @@
 
 INLINE vf root_of(vf v, float offset) { return square_root(vmax(v + offset, (vf)(0.0f))); }
 INLINE vf from_root(vf s, float offset) {
+#pragma OPENCL FP_CONTRACT ON
     const vf root = vmax(s, (vf)(0.0f));  // where a difference of colours went below 0
     return root * root - offset;
 }
