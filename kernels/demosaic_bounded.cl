@@ -71,8 +71,7 @@ INLINE bounds bounds_from_corners(image roots, image known, vf here, float noise
 }
 
 // Red and blue from colour differences, within bounds.
-INLINE rgb bounded_red_and_blue(site at, image roots, image known, cfa pattern, float offset,
-                                float noise) {
+INLINE rgb bounded_red_and_blue(site at, image roots, image known, cfa pattern, float noise) {
     const vf own = tap_mosaic(roots, 0, 0);
     rgb c = from_differences(at, pattern, own, spread_differences(at, known, pattern));
     const bounds row = bounds_from(roots, known, 1, 0, c.g, noise);
@@ -82,5 +81,5 @@ INLINE rgb bounded_red_and_blue(site at, image roots, image known, cfa pattern, 
     const pair high = red_and_blue(at, pattern, own, row.high, column.high, corners.high);
     c.r = vmin(vmax(c.r, low.first), high.first);
     c.b = vmin(vmax(c.b, low.second), high.second);
-    return from_roots(c, offset);
+    return c;
 }

@@ -27,7 +27,6 @@ from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.reference.curve import curve_index, to_8_bit
 from clpipe.reference.roots import root_of
 from clpipe.stage import Context, Frame, run_reference
-from clpipe.stages.demosaic.bounded import OFFSET as BOUNDED_OFFSET
 from clpipe.stages.demosaic.bounded import Bounded
 from clpipe.stages.demosaic.edge_directed_median import EdgeDirectedMedian
 from clpipe.stages.denoise.bilateral import Bilateral
@@ -98,8 +97,8 @@ def test_bounded_invents_no_extremes(pattern):
     red, blue = ((y % 2 == red_y) & (x % 2 == red_x)), ((y % 2 != red_y) & (x % 2 != red_x))
     for values in (noise, edges, ramp, noise * np.where(red, 1, 0.05)):
         mosaic = values.astype(np.float32)
-        full = run_reference(Bounded(noise=0.0), mosaic, pattern=pattern)
-        roots = root_of(full, BOUNDED_OFFSET)
+        full = run_reference(Bounded(noise=0.0, offset=0.03), mosaic, pattern=pattern)
+        roots = root_of(full, np.float32(0.03))
         green = roots[..., 1]
         for channel, sites in enumerate((red, ~red & ~blue, blue)):
             own = roots[..., channel]

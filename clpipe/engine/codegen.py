@@ -13,7 +13,8 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from clpipe.engine.plan import AnyLaunch, Finalize, Histogram, Launch, Lines, Op, Plan, Read, Reduce
+from clpipe.engine.ops import Op
+from clpipe.engine.plan import AnyLaunch, Finalize, Histogram, Launch, Lines, Plan, Read, Reduce
 from clpipe.engine.sources import LIBRARY, files_text
 from clpipe.engine.writer import Parameter, Writer
 from clpipe.stage import Access, Kind

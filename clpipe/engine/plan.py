@@ -8,27 +8,15 @@ buffer on the device, from the launch that writes it to the last one that reads 
 Images of one size are a level. The source is on level 0; each resampling leads to the next.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
-import numpy as np
-
-from clpipe.chain.chain import Chain, Step
+from clpipe.chain.chain import Chain
+from clpipe.engine.ops import Op, chain_ops
 from clpipe.reference.resample import Resampling, sizes
-from clpipe.stage import Access, Argument, Kind, Literal, Pass
-
-
-@dataclass(frozen=True)
-class Op:
-    """One pass of one step, with the types of its run-time arguments and its literals."""
-
-    step: str
-    kernel: str  # file, relative to the kernel folder; a plug-in's is an absolute path
-    pass_: Pass
-    kind: Kind  # of the image that it writes
-    types: tuple[tuple[str, str], ...]  # argument -> OpenCL type
-    literals: tuple[tuple[str, str], ...]  # argument -> OpenCL text
+from clpipe.stage import Access, Kind
 
 
 @dataclass(frozen=True)
@@ -244,16 +232,33 @@ class _Planner:
             )
         )
 
-    def keep(self) -> Image:
+    def keep(self, undone: bool) -> Image:
         """Store the current image because it is wanted.
 
-        Stencils after it read what they would read otherwise, so they are the same kernels.
+        Stencils after it read what they would read otherwise, so they are the same kernels. Where
+        the next pass has ``undone`` the last one, it goes on from what that one has read, so that
+        it gives the same bits.
         """
+        if undone:
+            return self._keep_beside()
         folded, is_open = self.foldable(), self.group is not None
         image = self.close()
         self.folded = folded
         if is_open and not folded:
             self.split = image
+        return image
+
+    def _keep_beside(self) -> Image:
+        """Store the current image in a launch of its own, and leave its last pass to be done."""
+        assert self.group
+        *before, last = self.group.ops
+        kind, self.kind = self.kind, before[-1].kind
+        self.group = replace(self.group, ops=tuple(before))
+        read = Read(self.close())
+        self.kind = kind
+        self.group = Launch("", (last,), (read,))
+        image = self.new_image()
+        self.emit(replace(self.group, writes=image))
         return image
 
     def foldable(self) -> Read | None:
@@ -311,32 +316,10 @@ class _Planner:
                     if self.group is None:
                         assert self.stored is not None
                         self.group = Launch("", (), (Read(self.stored),))
-                    self.group = replace(self.group, ops=(*self.group.ops, op))
+                    before = self.group.ops[:-1] if op.joins else self.group.ops
+                    self.group = replace(self.group, ops=(*before, op))
             self.folded = None
             self.kind, written = op.kind, pass_.writes
-
-
-def ops_of(step: Step, arguments: Mapping[str, Argument]) -> tuple[Op, ...]:
-    """The passes of a step with the types of its arguments, which decide the kernels' signatures.
-
-    Chains whose steps have the same names and the same ops have the same plan.
-    """
-    passes = step.method.passes()
-    if not passes:
-        return ()
-    types, literals = [], []
-    for name, value in arguments.items():
-        if isinstance(value, Literal):
-            literals.append((name, value.text))
-        elif isinstance(value, np.ndarray):
-            types.append((name, "__global const float *"))
-        else:
-            types.append((name, {"f": "float", "u": "uint", "i": "int"}[value.dtype.kind]))
-    kernel = f"{step.method.kernel}.cl"
-    if step.stage.folder:
-        kernel = str(step.stage.folder / kernel)
-    given = tuple(types), tuple(literals)
-    return tuple(Op(step.name, kernel, p, p.kind or step.stage.writes, *given) for p in passes)
 
 
 def make_plan(
@@ -369,10 +352,12 @@ def make_plan(
     final = final or last in keep
     planner = _Planner(chain.source, fold)
     kept: dict[str, Image] = {}
-    for step in chain.steps:
-        planner.add_step(ops_of(step, step.method.arguments(step.context)))
-        if step.name in keep and step.name != last:
-            kept[step.name] = planner.keep()
+    arguments = {step.name: step.method.arguments(step.context) for step in chain.steps}
+    steps = [*chain_ops(chain, arguments), ("", ())]
+    for (name, ops), (_, following) in pairwise(steps):
+        planner.add_step(ops)
+        if name in keep and name != last:
+            kept[name] = planner.keep(any(op.joins for op in following))
     group = planner.group or Launch("encode", (), (Read(planner.close()),))
     final_image = None
     if final:

@@ -11,7 +11,8 @@ from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.registry import user_code_errors
 from clpipe.engine.device import Device, Timing
-from clpipe.engine.plan import Finalize, Plan, make_plan, ops_of
+from clpipe.engine.ops import chain_ops
+from clpipe.engine.plan import Finalize, Plan, make_plan
 from clpipe.engine.programs import announced
 from clpipe.engine.writer import Parameter
 from clpipe.reference.curve import compose, to_8_bit
@@ -107,7 +108,7 @@ class Runner:
         """The plan for a source of half floats or floats."""
         chain, key = self.chain, (half, fold)
         if key not in self._own_plans:
-            ops = tuple((s.name, ops_of(s, self._arguments[s.name])) for s in chain.steps)
+            ops = chain_ops(chain, self._arguments)
             structure = (half, fold, chain.source, chain.result, ops)
             plan = self._plans.get(structure)
             if plan is None:

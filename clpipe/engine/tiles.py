@@ -19,13 +19,13 @@ import numpy as np
 from clpipe.base.errors import ImageError
 from clpipe.base.memory import in_words
 from clpipe.engine.codegen import PARTIALS, border_left, round_up
+from clpipe.engine.ops import Op
 from clpipe.engine.plan import (
     AnyLaunch,
     Finalize,
     Histogram,
     Launch,
     Lines,
-    Op,
     Plan,
     Reduce,
     reads_of,

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from clpipe.engine.plan import Finalize, Op, Plan, Read
+from clpipe.engine.ops import Op
+from clpipe.engine.plan import Finalize, Plan, Read
 from clpipe.stage import NoiseScope
 
 LARGER = (

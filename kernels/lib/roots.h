@@ -10,13 +10,19 @@ INLINE vf from_root(vf s, float offset) {
     return root * root - offset;
 }
 
-INLINE rgb roots_of(rgb c, float offset) {
+INLINE rgb light_to_roots(rgb c, site at, float offset) {
     const rgb v = {root_of(c.r, offset), root_of(c.g, offset), root_of(c.b, offset)};
     return v;
 }
 
-INLINE rgb from_roots(rgb s, float offset) {
+INLINE rgb roots_to_light(rgb s, site at, float offset) {
     const rgb v = {from_root(s.r, offset), from_root(s.g, offset), from_root(s.b, offset)};
+    return v;
+}
+
+// What is left of roots_to_light and light_to_roots, one after the other.
+INLINE rgb roots_above_0(rgb s, site at) {
+    const rgb v = {vmax(s.r, (vf)(0.0f)), vmax(s.g, (vf)(0.0f)), vmax(s.b, (vf)(0.0f))};
     return v;
 }
 

@@ -19,15 +19,16 @@ from clpipe.stages.demosaic.common import (
     red_and_blue,
     spread_differences,
 )
-from clpipe.stages.denoise.strength import MID_GREY, noise_of_colours
+from clpipe.stages.denoise.strength import (
+    MID_GREY,
+    noise_of_colours,
+    offset_of_roots,
+    offset_parameter,
+)
 
 # The gradient, in roots of the signal, below which both directions are alike. Chosen: a hundredth
 # of white is less than the noise of most pictures, and no edge.
 EVEN = np.float32(0.01**2)
-
-# Of the roots, in signal units. Chosen: at 0.005 to 0.04 the PSNR of a noise-free picture is the
-# same within 0.2 dB.
-OFFSET = np.float32(0.03)
 
 
 def between(values: Floats, *neighbours: Floats) -> Floats:
@@ -117,16 +118,17 @@ class Bounded(Method):
         "from a and b, as sensor_noise used them",
         ge=0,
     )
+    offset: float | None = offset_parameter()
 
     def resolve(self, context: Context) -> Self:
         _, green, _ = noise_of_colours(context)
-        return self.filled(noise=sqrt(green.at(MID_GREY)))
+        return self.filled(noise=sqrt(green.at(MID_GREY)), offset=offset_of_roots(context))
 
     @property
     def doubt(self) -> np.float32:
         """What noise alone may do to green, in roots: three sigma, and what no eye would see."""
-        assert self.noise is not None
-        return np.float32(0.01 + 3 * noise_in_roots(self.noise, MID_GREY, float(OFFSET)))
+        assert self.noise is not None and self.offset is not None
+        return np.float32(0.01 + 3 * noise_in_roots(self.noise, MID_GREY, self.offset))
 
     def passes(self) -> tuple[Pass, ...]:
         return (
@@ -143,17 +145,25 @@ class Bounded(Method):
             Pass(
                 "bounded_red_and_blue",
                 Access.STENCIL,
-                ("pattern", "offset", "noise"),
+                ("pattern", "noise"),
                 reads=("roots", "known"),
+                writes="colours",
                 radius=1,
             ),
+            Pass("roots_to_light", arguments=("offset",), reads=("colours",)),
         )
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
-        return {"pattern": context.cfa, "even": EVEN, "offset": OFFSET, "noise": self.doubt}
+        return {
+            "pattern": context.cfa,
+            "even": EVEN,
+            "noise": self.doubt,
+            "offset": np.float32(self.offset),
+        }
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        pattern, roots = frame.context.pattern, root_of(image, OFFSET)
+        pattern, offset = frame.context.pattern, np.float32(self.offset)
+        roots = root_of(image, offset)
         known = green_or_difference(roots, pattern)
         differences = spread_differences(known, pattern)
         red, green, blue = np.moveaxis(from_differences(roots, pattern, *differences), -1, 0)
@@ -161,4 +171,4 @@ class Bounded(Method):
             roots, known, green, pattern, self.doubt
         )
         red, blue = np.clip(red, red_low, red_high), np.clip(blue, blue_low, blue_high)
-        return from_root(np.stack([red, green, blue], axis=-1), OFFSET)
+        return from_root(np.stack([red, green, blue], axis=-1), offset)

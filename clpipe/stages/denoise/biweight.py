@@ -119,9 +119,22 @@ class Biweight(Denoiser):
     def passes(self) -> tuple[Pass, ...]:
         if self.is_off:
             return ()
-        units = ("offset", "luma_range", "chroma_range")
+        units = ("luma_range", "chroma_range")
         return (
-            Pass("to_root_luma_chroma", arguments=units, writes="planes", kind=Kind.YCBCR),
+            Pass(
+                "light_to_roots",
+                arguments=("offset",),
+                writes="roots",
+                undoes="roots_to_light",
+                leaves="roots_above_0",
+            ),
+            Pass(
+                "to_luma_chroma",
+                arguments=units,
+                reads=("roots",),
+                writes="planes",
+                kind=Kind.YCBCR,
+            ),
             Pass(
                 "biweight",
                 Access.STENCIL,
@@ -131,7 +144,7 @@ class Biweight(Denoiser):
                 kind=Kind.YCBCR,
                 radius=2,
             ),
-            Pass("from_root_luma_chroma", arguments=units, reads=("filtered",)),
+            Pass("from_luma_chroma", arguments=("offset", *units), reads=("filtered",)),
         )
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:

@@ -1,0 +1,80 @@
+"""The passes of a chain's steps, as launches are made of them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from clpipe.chain.chain import Chain, Step
+from clpipe.stage import Argument, Kind, Literal, Pass
+
+
+@dataclass(frozen=True)
+class Op:
+    """One pass of one step, with the types of its run-time arguments and its literals."""
+
+    step: str
+    kernel: str  # file, relative to the kernel folder; a plug-in's is an absolute path
+    pass_: Pass
+    kind: Kind  # of the image that it writes
+    types: tuple[tuple[str, str], ...]  # argument -> OpenCL type
+    literals: tuple[tuple[str, str], ...]  # argument -> OpenCL text
+    joins: bool = False  # undoes the pass before it, and does what is left of both
+
+
+def chain_ops(
+    chain: Chain, arguments: Mapping[str, Mapping[str, Argument]]
+) -> tuple[tuple[str, tuple[Op, ...]], ...]:
+    """The passes of each step of a chain, by its name. Chains with the same ones have one plan.
+
+    Args:
+        chain: the chain.
+        arguments: of the steps' methods, by the steps' names.
+    """
+    steps: list[tuple[str, tuple[Op, ...]]] = []
+    last: Op | None = None
+    for step in chain.steps:
+        own = arguments[step.name]
+        ops = ops_of(step, own)
+        if ops:
+            if last and undone(ops[0].pass_, own, last.pass_, arguments[last.step]):
+                rest = replace(ops[0].pass_, function=ops[0].pass_.leaves, arguments=())
+                ops = (replace(ops[0], pass_=rest, joins=True), *ops[1:])
+            last = ops[-1]
+        steps.append((step.name, ops))
+    return tuple(steps)
+
+
+def undone(
+    pass_: Pass, own: Mapping[str, Argument], before: Pass, others: Mapping[str, Argument]
+) -> bool:
+    """Whether a pass with its step's arguments undoes the pass before, with those of its step."""
+    return pass_.undoes == before.function and all(
+        bytes_of(own[mine]) == bytes_of(others[theirs])
+        for mine, theirs in zip(pass_.arguments, before.arguments, strict=True)
+    )
+
+
+def bytes_of(argument: Argument) -> bytes:
+    """An argument's value, to compare it."""
+    return argument.text.encode() if isinstance(argument, Literal) else argument.tobytes()
+
+
+def ops_of(step: Step, arguments: Mapping[str, Argument]) -> tuple[Op, ...]:
+    """The passes of a step with the types of its arguments, which decide its kernels' text."""
+    passes = step.method.passes()
+    if not passes:
+        return ()
+    types, literals = [], []
+    for name, value in arguments.items():
+        if isinstance(value, Literal):
+            literals.append((name, value.text))
+        elif isinstance(value, np.ndarray):
+            types.append((name, "__global const float *"))
+        else:
+            types.append((name, {"f": "float", "u": "uint", "i": "int"}[value.dtype.kind]))
+    kernel = f"{step.method.kernel}.cl"
+    if step.stage.folder:
+        kernel = str(step.stage.folder / kernel)
+    given = tuple(types), tuple(literals)
+    return tuple(Op(step.name, kernel, p, p.kind or step.stage.writes, *given) for p in passes)
