@@ -7,7 +7,7 @@ import numpy as np
 
 from clpipe.engine.buffers import Pool, buffer_name
 from clpipe.engine.codegen import LOCAL_SIZE, PARTIALS, Kernel, round_up
-from clpipe.engine.plan import Finalize, Histogram, Launch, Lines, Reduce
+from clpipe.engine.plan import Border, Finalize, Histogram, Launch, Lines, Reduce
 from clpipe.engine.tiles import Extent, Extents
 from clpipe.engine.writer import Parameter
 
@@ -28,6 +28,10 @@ def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[
             return (PARTIALS,), (LOCAL_SIZE,)
         case Finalize():
             return (1,), (1,)
+        case Border():
+            wide = extent.stored.width + 2 * extent.border
+            high = extent.stored.height + 2 * extent.border
+            return (round_up(wide, LOCAL_SIZE), high), (LOCAL_SIZE, 1)
 
 
 class Call:

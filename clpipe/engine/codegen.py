@@ -13,7 +13,18 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from clpipe.engine.plan import AnyLaunch, Finalize, Histogram, Launch, Lines, Op, Plan, Read, Reduce
+from clpipe.engine.plan import (
+    AnyLaunch,
+    Border,
+    Finalize,
+    Histogram,
+    Launch,
+    Lines,
+    Op,
+    Plan,
+    Read,
+    Reduce,
+)
 from clpipe.engine.sources import LIBRARY, files_text
 from clpipe.engine.writer import Parameter, Writer
 from clpipe.stage import Access, Kind
@@ -36,7 +47,7 @@ class Kernel:
     name: str
     source: str
     parameters: tuple[Parameter, ...]
-    launch: AnyLaunch
+    launch: AnyLaunch | Border
     files: tuple[str, ...]
 
 
@@ -55,7 +66,7 @@ def call(op: Op, arguments: Sequence[str]) -> str:
     return f"{op.pass_.function}({', '.join(arguments)})"
 
 
-def write_kernel(plan: Plan, launch: AnyLaunch, lanes: int) -> Kernel:
+def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
     """The OpenCL source of one launch of a plan, for a device with that many lanes."""
     writer = Writer(plan)
     for number in ("width", "height", "pitch", "left", "top", "columns", "rows", "border"):
@@ -82,6 +93,9 @@ def write_kernel(plan: Plan, launch: AnyLaunch, lanes: int) -> Kernel:
         case Finalize():
             body = _find(writer, launch)
             text += files_text(kernels_of([launch.op]), seen)
+        case Border():
+            at = "(uint)get_global_id(0), (uint)get_global_id(1)"
+            body = f"    fill_border({writer.slot(launch.slot, True)}, {at}, e);\n"
     signature = ",\n    ".join(p.declaration for p in writer.parameters.values())
     size = 1 if isinstance(launch, Finalize) else LOCAL_SIZE
     setup = "".join(f"    {line}\n" for line in writer.setup)

@@ -91,6 +91,11 @@ class Extent:
         return self.stored.is_empty
 
     @property
+    def is_small(self) -> bool:
+        """Whether stores leave a part of the border to be filled, see ``kernels/lib/image.h``."""
+        return min(self.stored.width, self.stored.height) <= 2 * self.border + 1
+
+    @property
     def padded_width(self) -> int:
         """The width of the planes, in whole blocks."""
         return round_up(self.stored.width, self.lanes)
