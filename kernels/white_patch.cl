@@ -19,22 +19,27 @@ INLINE int white_patch_bin(__global const float *origin, uint x, uint y, extent 
     return (int)off_red * WHITE_PATCH_BINS + ((as_int(inside) - 0x39800000) >> 14);
 }
 
-// The middle of the bin that holds the percentile, given in millionths; 0 where nothing was counted.
-INLINE float white_patch_level(__global const uint *bins, uint millionths) {
+// The middle of the bin that holds the percentile of a colour, given in millionths; 0 where nothing was
+// counted. Behind the bins of all colours stand the sums of each RUN of them.
+INLINE float white_patch_level(__global const uint *histogram, uint colour, uint millionths) {
+    __global const uint *bins = histogram + colour * WHITE_PATCH_BINS;
+    __global const uint *runs = histogram + (3 * RUN + colour) * (WHITE_PATCH_BINS / RUN);
     ulong count = 0, below = 0;
-    for (uint k = 0; k < WHITE_PATCH_BINS; ++k) count += bins[k];
+    for (uint k = 0; k < WHITE_PATCH_BINS / RUN; ++k) count += runs[k];
     if (count == 0) return 0.0f;
     const ulong rank = (count * millionths + 999999) / 1000000;
-    uint bin = 0;
+    uint run = 0;
+    for (; below + runs[run] < rank; ++run) below += runs[run];
+    uint bin = run * RUN;
     while ((below += bins[bin]) < rank) ++bin;
     return as_float(0x39800000 + (int)(bin << 14) + (1 << 13));
 }
 
 INLINE void white_patch(__global const uint *histogram, uint millionths, extent e,
                         __global float *estimates) {
-    const float red = white_patch_level(histogram, millionths);
-    const float green = white_patch_level(histogram + WHITE_PATCH_BINS, millionths);
-    const float blue = white_patch_level(histogram + 2 * WHITE_PATCH_BINS, millionths);
+    const float red = white_patch_level(histogram, 0, millionths);
+    const float green = white_patch_level(histogram, 1, millionths);
+    const float blue = white_patch_level(histogram, 2, millionths);
     estimates[0] = red > 0.0f && green > 0.0f ? green / red : 1.0f;
     estimates[1] = blue > 0.0f && green > 0.0f ? green / blue : 1.0f;
 }

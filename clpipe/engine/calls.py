@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from clpipe.engine.buffers import Pool, buffer_name
-from clpipe.engine.codegen import LOCAL_SIZE, PARTIALS, Kernel, round_up
-from clpipe.engine.plan import Finalize, Histogram, Launch, Lines, Reduce
+from clpipe.engine.codegen import PARTIALS, Kernel, local_size, round_up, summed_together
+from clpipe.engine.plan import Border, Finalize, Histogram, Launch, Lines, Reduce
 from clpipe.engine.tiles import Extent, Extents
 from clpipe.engine.writer import Parameter
 
@@ -16,18 +16,25 @@ Bind = Callable[[Parameter], Any]
 
 def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """The global and the local size of a kernel, in work items."""
+    lanes, local = extent.lanes, local_size(extent.lanes)
     match kernel.launch:
         case Launch(rows=rows, columns=columns):
-            across = round_up(extent.padded_width, extent.lanes * columns)
-            blocks = round_up(across // (extent.lanes * columns), LOCAL_SIZE)
-            return (blocks, -(-extent.stored.height // rows)), (LOCAL_SIZE, 1)
-        case Lines():
-            longest = round_up(max(extent.width, extent.height), extent.lanes)
-            return (round_up(longest // extent.lanes, LOCAL_SIZE),), (LOCAL_SIZE,)
-        case Histogram() | Reduce():
-            return (PARTIALS,), (LOCAL_SIZE,)
+            across = round_up(extent.padded_width, lanes * columns)
+            blocks = round_up(across // (lanes * columns), local)
+            return (blocks, -(-extent.stored.height // rows)), (local, 1)
+        case Border():
+            wide = extent.stored.width + 2 * extent.border
+            high = extent.stored.height + 2 * extent.border
+            return (round_up(wide, local), high), (local, 1)
         case Finalize():
             return (1,), (1,)
+        case Lines():
+            items = round_up(max(extent.width, extent.height), lanes) // lanes
+        case Histogram():
+            items = PARTIALS * summed_together(lanes)
+        case Reduce(op=op):
+            items = op.pass_.bins if lanes == 1 and op.pass_.bins else PARTIALS
+    return (round_up(items, local),), (local,)
 
 
 class Call:

@@ -14,7 +14,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from clpipe.engine.ops import Op
-from clpipe.engine.plan import AnyLaunch, Finalize, Histogram, Launch, Lines, Plan, Read, Reduce
+from clpipe.engine.plan import (
+    AnyLaunch,
+    Border,
+    Finalize,
+    Histogram,
+    Launch,
+    Lines,
+    Plan,
+    Read,
+    Reduce,
+)
 from clpipe.engine.sources import LIBRARY, files_text
 from clpipe.engine.writer import Parameter, Writer
 from clpipe.stage import Access, Kind
@@ -22,8 +32,8 @@ from clpipe.stage import Access, Kind
 # What is known of the origin when compiling: it is in whole blocks, so the rows that share a
 # Philox call and the phase of a Bayer pattern are too.
 EXTENT = "{width, height, pitch, left * LANES, top * 4, columns, rows, border}"
-LOCAL_SIZE = 64
-PARTIALS = 256  # work items of a reduction's first half, each with a partial sum or histogram
+PARTIALS = 256  # sums or histograms that a reduction's first half leaves
+RUN = 64  # bins of a histogram that are also added up
 UNNAMED = "kernel_without_a_name_yet"
 
 
@@ -37,7 +47,7 @@ class Kernel:
     name: str
     source: str
     parameters: tuple[Parameter, ...]
-    launch: AnyLaunch
+    launch: AnyLaunch | Border
     files: tuple[str, ...]
 
 
@@ -51,19 +61,29 @@ def border_left(border: int, lanes: int) -> int:
     return round_up(border, lanes)
 
 
+def local_size(lanes: int) -> int:
+    """Work items of a work-group. On a GPU, 64 would not fill a multiprocessor."""
+    return 128 if lanes == 1 else 64
+
+
+def summed_together(lanes: int) -> int:
+    """Work items that store one sum: on a GPU a work-group, on a CPU, where they are few, one."""
+    return local_size(lanes) if lanes == 1 else 1
+
+
 def call(op: Op, arguments: Sequence[str]) -> str:
     """The call of a pass's function."""
     return f"{op.pass_.function}({', '.join(arguments)})"
 
 
-def write_kernel(plan: Plan, launch: AnyLaunch, lanes: int) -> Kernel:
+def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
     """The OpenCL source of one launch of a plan, for a device with that many lanes."""
-    writer = Writer(plan)
+    writer = Writer(plan, lanes)
     for number in ("width", "height", "pitch", "left", "top", "columns", "rows", "border"):
         writer.tile(number)
     seen: set[str] = set()
     columns = launch.columns if isinstance(launch, Launch) else 1
-    text = f"#define LANES {lanes}\n#define COLUMNS {columns}\n"
+    text = f"#define LANES {lanes}\n#define COLUMNS {columns}\n#define RUN {RUN}\n"
     text += files_text([f"lib/{part}.h" for part in LIBRARY], seen)
     match launch:
         case Launch():
@@ -83,8 +103,11 @@ def write_kernel(plan: Plan, launch: AnyLaunch, lanes: int) -> Kernel:
         case Finalize():
             body = _find(writer, launch)
             text += files_text(kernels_of([launch.op]), seen)
+        case Border():
+            at = "(uint)get_global_id(0), (uint)get_global_id(1)"
+            body = f"    fill_border({writer.slot(launch.slot, True)}, {at}, e);\n"
     signature = ",\n    ".join(p.declaration for p in writer.parameters.values())
-    size = 1 if isinstance(launch, Finalize) else LOCAL_SIZE
+    size = 1 if isinstance(launch, Finalize) else local_size(lanes)
     setup = "".join(f"    {line}\n" for line in writer.setup)
     # The hint keeps Intel's compiler from making vectors of our vectors, up to nine times slower.
     text += (
@@ -202,19 +225,13 @@ def _pixels(writer: Writer, launch: Launch) -> str:
         kind = op.kind
         made = call(op, [f"v{i}", "at", *writer.arguments(op)])
         lines.append(f"const {kind.c_type} v{i + 1} = {made};")
-    value, after = f"v{len(ops)}", ""
+    value = f"v{len(ops)}"
     if launch.sums:
         writer.parameter("sums", "__global int4 *restrict ", "sums")
         sample = call(launch.sums, [value, *writer.arguments(launch.sums)])
         lines.append(f"const vi sample = only_inside({sample}, at, {writer.core()});")
         lines.append("if (ROW & 1) odd_rows += sample; else even_rows += sample;")
         once.append("vi even_rows = (vi)(0), odd_rows = (vi)(0);")
-        after = (
-            "    const size_t block = get_global_id(1) * ((columns + LANES - 1) / LANES) + "
-            "get_global_id(0);\n"
-            "    sums[block] = (int4)(fold_columns(even_rows, first), "
-            "fold_columns(odd_rows, first));\n"
-        )
     block = launch.stencil.pass_.block if launch.stencil else 0
     if not block:
         # All rows before the first store: what they have in common is then done once, because no
@@ -233,12 +250,23 @@ def _pixels(writer: Writer, launch: Launch) -> str:
     else:
         body = _each_row(lines, launch.rows) + _store(writes, kind, launch.rows)
         body += _each_row(encodes, launch.rows)
-    start = "".join(f"    {line}\n" for line in [*once, *body])
-    return (
+    place = (
         f"    const uint x = left * LANES + (uint)get_global_id(0) * {max(block, 1)} * LANES;\n"
         f"    const uint y = top * 4 + (uint)get_global_id(1) * {launch.rows};\n"
-        "    if (x - e.left >= columns) return;\n"
-        f"    const site first = site_at(x, y);\n{start}{after}"
+    )
+    rows = "".join(f"    {line}\n" for line in [*once, *body])
+    rows = f"    const site first = site_at(x, y);\n{rows}"
+    if not launch.sums:
+        return f"{place}    if (x - e.left >= columns) return;\n{rows}"
+    own = "(int4)(fold_columns(even_rows, first), fold_columns(odd_rows, first))"
+    if (together := summed_together(writer.lanes)) == 1:
+        store = f"    store_sums({own}, sums, e);\n"
+        return f"{place}    if (x - e.left >= columns) return;\n{rows}{store}"
+    # No work item may leave before a barrier.
+    return (
+        f"    __local int4 group[{together}];\n{place}    int4 own = (int4)(0);\n"
+        f"    if (x - e.left < columns) {{\n{rows}    own = {own};\n    }}\n"
+        "    store_group_sums(own, group, sums);\n"
     )
 
 
@@ -305,14 +333,19 @@ def _count(writer: Writer, launch: Histogram) -> str:
     counts = writer.parameter("counts", "__global uint *", "counts", number=bins)
     arguments = ["origin", "x", "y", "e", *writer.arguments(op)]
     core = writer.core()
+    if writer.lanes == 1:  # a work-group counts together, each of its work items other columns
+        row, first, step = "get_group_id(0)", "(uint)get_local_id(0)", "(uint)get_local_size(0)"
+        wait, count = "    barrier(CLK_GLOBAL_MEM_FENCE);\n", "atomic_inc(own + bin)"
+    else:
+        row, first, step, wait, count = "get_global_id(0)", "0", "1", "", "own[bin] += 1"
     return (
         f"    __global const float *origin = image_origin({plane}, e);\n"
-        f"    __global uint *own = {counts} + (size_t)get_global_id(0) * {bins};\n"
-        f"    for (uint k = 0; k < {bins}; ++k) own[k] = 0;\n"
-        f"    for (uint y = {core}.top + get_global_id(0); y < {core}.bottom; y += {PARTIALS}) {{\n"
-        f"        for (uint x = {core}.left; x < {core}.right; ++x) {{\n"
+        f"    __global uint *own = {counts} + (size_t){row} * {bins};\n"
+        f"    for (uint k = {first}; k < {bins}; k += {step}) own[k] = 0;\n{wait}"
+        f"    for (uint y = {core}.top + {row}; y < {core}.bottom; y += {PARTIALS}) {{\n"
+        f"        for (uint x = {core}.left + {first}; x < {core}.right; x += {step}) {{\n"
         f"            const int bin = {call(op, arguments)};\n"
-        "            if (bin >= 0) own[bin] += 1;\n"
+        f"            if (bin >= 0) {count};\n"
         "        }\n    }\n"
     )
 
@@ -322,7 +355,11 @@ def _add_up(writer: Writer, launch: Reduce) -> str:
     if bins := launch.op.pass_.bins:
         writer.parameter("counts", "__global const uint *", "counts", number=bins)
         writer.parameter("histogram", "__global uint *", "histogram", number=bins)
-        return f"    add_up_counts(counts, histogram, {bins}, {PARTIALS}, {tile});\n"
+        arguments = f"counts, histogram, {bins}, {PARTIALS}, {tile}"
+        if writer.lanes > 1:
+            return f"    add_up_counts({arguments});\n"
+        group = f"    __local uint group[{local_size(writer.lanes)}];\n"
+        return f"{group}    add_up_counts({arguments}, group);\n"
     writer.parameter("sums", "__global const int4 *", "sums")
     writer.parameter("partials", "__global long4 *", "partials")
     return f"    add_up_blocks(sums, partials, {writer.tile('blocks')}, {tile});\n"

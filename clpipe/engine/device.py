@@ -22,7 +22,7 @@ from clpipe.engine.discovery import (
     shared_out,
     usable_memory,
 )
-from clpipe.engine.plan import Plan
+from clpipe.engine.plan import Border, Launch, Plan
 from clpipe.engine.programs import forget_programs, programs_of
 from clpipe.engine.tiles import Extent, Extents, Tiling, tiling_of
 from clpipe.engine.writer import Parameter
@@ -94,6 +94,7 @@ class Device:
         self._programs = programs_of(self.info)
         self._context = self._programs.context
         self._calls: dict[Plan, list[Call]] = {}
+        self._border_calls: dict[Border, Call] = {}
         self._pool = Pool(self._new_buffer)
         self._tables: dict[int, tuple[Array, Any]] = {}
         try:
@@ -124,6 +125,16 @@ class Device:
             kernels = [write_kernel(plan, launch, self.info.lanes) for launch in plan.launches]
             self._calls[plan.unscaled] = [Call(k, self._programs.kernel(k)) for k in kernels]
         return self._calls[plan.unscaled]
+
+    def _borders(self, plan: Plan, written: Launch) -> Iterator[Call]:
+        """The calls that fill the borders of the planes that a launch has written."""
+        slots = plan.slots[written.writes.number] if written.writes else ()
+        for slot in slots:
+            border = Border(slot, written.level)
+            if border not in self._border_calls:
+                kernel = write_kernel(plan, border, self.info.lanes)
+                self._border_calls[border] = Call(kernel, self._programs.kernel(kernel))
+            yield self._border_calls[border]
 
     def run(
         self,
@@ -213,16 +224,20 @@ class Device:
             value = bind(parameter)
             return self._table(value) if isinstance(value, np.ndarray) else value
 
+        def enqueue(call: Call, extents: Extents, tile: int) -> Any:
+            call.set_arguments(self._pool, extents, tile, value_of)
+            sizes = index_space(call.kernel, extents[call.kernel.launch.level])
+            return self._cl.enqueue_nd_range_kernel(self._queue, call.compiled, *sizes)
+
         def launch(numbers: tuple[int, ...], extents: Extents, tile: int) -> None:
             for number in numbers:
-                call = calls[number]
-                extent = extents[call.kernel.launch.level]
-                if extent.is_empty:
+                done = calls[number].kernel.launch
+                if extents[done.level].is_empty:
                     continue
-                call.set_arguments(self._pool, extents, tile, value_of)
-                sizes = index_space(call.kernel, extent)
-                event = self._cl.enqueue_nd_range_kernel(self._queue, call.compiled, *sizes)
-                events.append((call.kernel.launch.name, event))
+                events.append((done.name, enqueue(calls[number], extents, tile)))
+                if isinstance(done, Launch) and extents[done.level].is_small:
+                    for border in self._borders(plan, done):
+                        enqueue(border, extents, tile)
 
         for phase in tiling.phases:
             launch(phase.first, tiling.tiles[0], 0)

@@ -18,7 +18,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError
 from clpipe.base.memory import in_words
-from clpipe.engine.codegen import PARTIALS, border_left, round_up
+from clpipe.engine.codegen import PARTIALS, RUN, border_left, round_up, summed_together
 from clpipe.engine.ops import Op
 from clpipe.engine.plan import (
     AnyLaunch,
@@ -91,6 +91,11 @@ class Extent:
         return self.stored.is_empty
 
     @property
+    def is_small(self) -> bool:
+        """Whether stores leave a part of the border to be filled, see ``kernels/lib/image.h``."""
+        return min(self.stored.width, self.stored.height) <= 2 * self.border + 1
+
+    @property
     def padded_width(self) -> int:
         """The width of the planes, in whole blocks."""
         return round_up(self.stored.width, self.lanes)
@@ -102,8 +107,9 @@ class Extent:
 
     @property
     def blocks(self) -> int:
-        """The number of blocks of lanes and four rows, each of which has sums of its own."""
-        return self.padded_width // self.lanes * (self.padded_height // 4)
+        """The number of blocks, four rows high, each of which has sums of its own."""
+        across = -(-self.padded_width // (self.lanes * summed_together(self.lanes)))
+        return across * (self.padded_height // 4)
 
     @property
     def plane_bytes(self) -> int:
@@ -160,7 +166,8 @@ def buffer_sizes(plan: Plan, extents: Extents) -> dict[str, int]:
             case Histogram(op=op):
                 bins = op.pass_.bins
                 sizes["counts"] = max(sizes.get("counts", 0), PARTIALS * bins * 4)
-                sizes["histogram"] = max(sizes.get("histogram", 0), bins * 4)
+                with_runs = bins + -(-bins // RUN)
+                sizes["histogram"] = max(sizes.get("histogram", 0), with_runs * 4)
             case Finalize(op=op):
                 sizes[f"estimates.{op.step}"] = 16
     return sizes

@@ -2,6 +2,7 @@
 
 import math
 
+from clpipe.engine.codegen import summed_together
 from clpipe.engine.plan import AnyLaunch, Launch, Plan, Reduce, reads_of
 from clpipe.stage import Access
 
@@ -11,13 +12,18 @@ def share(plan: Plan, level: int) -> float:
     return math.prod(each.scale for each in plan.resamplings[:level])
 
 
+def sum_bytes(lanes: int) -> float:
+    """Bytes per pixel of the sums that the blocks of an image have."""
+    return 16 / (lanes * summed_together(lanes) * 4)
+
+
 def bytes_per_pixel(plan: Plan, lanes: int) -> float:
     """Bytes of device memory per pixel: source, slots, block sums and eight-bit result."""
     total = float(len(plan.source.channels) * (2 if plan.half else 4))
     total += sum(4 * share(plan, min(levels)) for levels in plan.levels_of_slots)
     for launch in plan.launches:
         if isinstance(launch, Launch) and launch.sums:
-            total += 16 / (lanes * launch.rows) * share(plan, launch.level)
+            total += sum_bytes(lanes) * share(plan, launch.level)
     encoded = len(plan.encoded.channels) if plan.encoded else 0
     return total + encoded * share(plan, len(plan.resamplings))
 
@@ -25,7 +31,7 @@ def bytes_per_pixel(plan: Plan, lanes: int) -> float:
 def launch_bytes(plan: Plan, launch: AnyLaunch, lanes: int) -> float:
     """Bytes per pixel that a launch reads and writes in device memory, each sample once."""
     if isinstance(launch, Reduce) and launch.op.pass_.access is Access.SUMS:
-        return 16 / (lanes * 4) * share(plan, launch.level)
+        return sum_bytes(lanes) * share(plan, launch.level)
     images = [read.image for read in reads_of(launch)]
     total = sum(4 * len(i.kind.channels) * share(plan, i.level) for i in images)
     if not isinstance(launch, Launch):
@@ -38,5 +44,5 @@ def launch_bytes(plan: Plan, launch: AnyLaunch, lanes: int) -> float:
     if launch.encodes and plan.encoded:
         written += len(plan.encoded.channels)
     if launch.sums:
-        written += 16 / (lanes * launch.rows)
+        written += sum_bytes(lanes)
     return total + written * share(plan, launch.level)

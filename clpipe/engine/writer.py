@@ -33,8 +33,9 @@ class Parameter:
 class Writer:
     """Collects the parameters and the body of one kernel, and gives canonical names to both."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, lanes: int) -> None:
         self.plan = plan
+        self.lanes = lanes
         self.parameters: dict[str, Parameter] = {}
         self.setup: list[str] = []
         self._steps: list[str] = []

@@ -96,45 +96,47 @@ INLINE ycbcr tap_ycbcr(image i, int dx, int dy) {
 }
 #undef TAP
 
-// Reflect-101 shows the pixel at place i of n at i and -i, and at both again a period further. Stores
-// at edges go over these places from the lowest one in the border on. Their loops are not unrolled,
-// since few blocks come there, and they would be most of a kernel's code.
-INLINE int mirror_period(int n) { return n > 1 ? 2 * (n - 1) : 1; }
-
-// The lowest place not below `lowest` that is a whole number of periods from `place`.
-INLINE int lowest_place(int place, int period, int lowest) {
-    const int above = (place - lowest) % period;
-    return lowest + (above < 0 ? above + period : above);
+// The place of a pixel's mirror image along a side of n, or its own if it has none. Pixels have more
+// than one where n <= 2 * border + 1; a launch of `fill_border` then follows the stores.
+INLINE int mirror_image(int place, int n, int border) {
+    return place <= border ? -place : place + border >= n - 1 ? 2 * (n - 1) - place : place;
 }
 
-static void store_row(vf v, __global float *row, int x, extent e) {
-    const int border = (int)e.border, width = (int)e.columns, period = mirror_period(width);
-    if (x > border && x + LANES + border < width) {
+// `x` and `y` are counted from where the planes begin.
+INLINE void store_at_edge(vf v, __global float *dst, int x, int y, extent e) {
+    const int border = (int)e.border, columns = (int)e.columns;
+    __global float *origin = dst + (size_t)border * e.pitch + border_left(e);
+    __global float *row = origin + (long)y * (long)e.pitch;
+    __global float *image_row = origin + (long)mirror_image(y, (int)e.rows, border) * (long)e.pitch;
+    if (LANES > 1 && x > border && x + LANES + border < columns) {
         store(v, row + x);
+        store(v, image_row + x);
         return;
     }
     float lanes[LANES];
     spill(v, lanes);
 #pragma unroll 1
-    for (int k = 0; k < 2 * LANES; ++k) {
-        const int column = x + k / 2, place = k & 1 ? -column : column;
-        if (column >= width) break;
-#pragma unroll 1
-        for (int i = lowest_place(place, period, -border); i < width + border; i += period)
-            row[i] = lanes[k / 2];
+    for (int k = 0; k < LANES && x + k < columns; ++k) {
+        const int image_column = mirror_image(x + k, columns, border);
+        row[x + k] = row[image_column] = lanes[k];
+        image_row[x + k] = image_row[image_column] = lanes[k];
     }
 }
 
-// `x` and `y` are counted from where the planes begin.
-static void store_at_edge(vf v, __global float *dst, int x, int y, extent e) {
-    const int border = (int)e.border, rows = (int)e.rows, period = mirror_period(rows);
-    __global float *origin = dst + (size_t)border * e.pitch + border_left(e);
-#pragma unroll 1
-    for (int k = 0; k < 2; ++k) {
-#pragma unroll 1
-        for (int i = lowest_place(k ? -y : y, period, -border); i < rows + border; i += period)
-            store_row(v, origin + (long)i * (long)e.pitch, x, e);
-    }
+// The pixel that reflect-101 shows at a place of a side of n, or of the border around it.
+INLINE int mirrored(int place, int n, int border) {
+    const int period = n > 1 ? 2 * (n - 1) : 1, within = (place + border * period) % period;
+    return within < n ? within : period - within;
+}
+
+// One place of a plane and its border, `column` and `row` counted from the border's corner.
+INLINE void fill_border(__global float *plane, uint column, uint row, extent e) {
+    const int border = (int)e.border, columns = (int)e.columns;
+    const int x = (int)column - border, y = (int)row - border;
+    const int from_x = mirrored(x, columns, border), from_y = mirrored(y, (int)e.rows, border);
+    __global float *origin = plane + (size_t)border * e.pitch + border_left(e);
+    if (x < columns + border && (x != from_x || y != from_y))
+        origin[(long)y * (long)e.pitch + x] = origin[(long)from_y * (long)e.pitch + from_x];
 }
 
 // Whether a block of rows has pixels that the border mirrors, or that are outside the image.

@@ -23,6 +23,23 @@ INLINE int2 fold_columns(vi v, site at) {
 #endif
 }
 
+#if LANES == 1
+// The sums of a work-group, a power of two of work items: on a GPU they would take long to add up.
+INLINE void store_group_sums(int4 own, __local int4 *group, __global int4 *sums) {
+    const uint i = get_local_id(0);
+    group[i] = own;
+    for (uint n = get_local_size(0) / 2; n > 0; n /= 2) {
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (i < n) group[i] += group[i + n];
+    }
+    if (i == 0) sums[get_group_id(1) * get_num_groups(0) + get_group_id(0)] = group[0];
+}
+#else
+INLINE void store_sums(int4 own, __global int4 *sums, extent e) {
+    sums[get_global_id(1) * ((e.columns + LANES - 1) / LANES) + get_global_id(0)] = own;
+}
+#endif
+
 // Work item i of n adds up its share of the blocks, on top of those of the tiles before.
 INLINE void add_up_blocks(__global const int4 *blocks, __global long4 *partials, uint count,
                           uint tile) {
@@ -38,14 +55,38 @@ INLINE long4 add_up_partials(__global const long4 *partials, uint count) {
     return sum;
 }
 
-// Each work item adds up some of the bins, over all partials, on top of those of the tiles before.
+// A histogram from partial ones, on top of those of the tiles before. Behind its bins stand the sums of
+// each RUN of them, with which a percentile is found in few steps.
+#if LANES == 1
 INLINE void add_up_counts(__global const uint *counts, __global uint *histogram, uint bins,
-                          uint partials, uint tile) {
-    for (uint bin = get_global_id(0); bin < bins; bin += get_global_size(0)) {
-        uint sum = tile ? histogram[bin] : 0;
+                          uint partials, uint tile, __local uint *group) {
+    const uint bin = get_global_id(0), i = get_local_id(0);
+    uint sum = 0;
+    if (bin < bins) {
+        if (tile) sum = histogram[bin];
         for (uint k = 0; k < partials; ++k) sum += counts[(size_t)k * bins + bin];
         histogram[bin] = sum;
     }
+    group[i] = sum;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (bin >= bins || i % RUN) return;
+    for (uint k = 1; k < RUN; ++k) sum += group[i + k];
+    histogram[bins + bin / RUN] = sum;
 }
+#else
+INLINE void add_up_counts(__global const uint *counts, __global uint *histogram, uint bins,
+                          uint partials, uint tile) {
+    for (uint run = get_global_id(0); run * RUN < bins; run += get_global_size(0)) {
+        uint total = 0;
+        for (uint bin = run * RUN; bin < bins && bin < (run + 1) * RUN; ++bin) {
+            uint sum = tile ? histogram[bin] : 0;
+            for (uint k = 0; k < partials; ++k) sum += counts[(size_t)k * bins + bin];
+            histogram[bin] = sum;
+            total += sum;
+        }
+        histogram[bins + run] = total;
+    }
+}
+#endif
 
 #endif
