@@ -16,6 +16,11 @@ from clpipe.stage import Kind
 IMAGES = [example(Kind.RGB, (40, 48), half=True, seed=seed) for seed in range(5)]
 
 
+def planes_of(image: np.ndarray) -> np.ndarray:
+    """The channels of an image one behind the other, (3, height, width)."""
+    return np.ascontiguousarray(image.transpose(2, 0, 1))
+
+
 @pytest.fixture
 def runner(device: Device) -> Runner:
     """A single launch, on a device of its own."""
@@ -58,6 +63,7 @@ def test_a_cpu_uses_an_image_where_it_is(runner, copied):
         pytest.param(lambda image: image[::-1].copy()[::-1], id="rows upside down"),
         pytest.param(lambda image: np.concatenate([image] * 2, axis=1)[:, :48], id="part of rows"),
         pytest.param(np.asfortranarray, id="columns first"),
+        pytest.param(lambda image: planes_of(image).transpose(1, 2, 0), id="planes"),
     ],
 )
 @pytest.mark.parametrize("type_", ["CPU", "GPU"])
@@ -65,6 +71,20 @@ def test_an_image_may_lie_in_memory_in_any_way(runner, type_, changed):
     runner.device = Device(replace(runner.device.info, type=type_))
     expected = runner.run(IMAGES[0], "k").encoded
     assert np.array_equal(runner.run(changed(IMAGES[0]), "k").encoded, expected)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_planes_are_read_where_they_are(runner, copied, dtype):
+    image = IMAGES[0].astype(dtype)
+    expected = runner.run(image, "k").encoded
+    planar = planes_of(image).transpose(1, 2, 0)
+    assert np.array_equal(runner.run(planar, "k").encoded, expected)
+    copied.clear()
+    assert np.array_equal(runner.run(planar, "k").encoded, expected)
+    assert not copied
+    for memory in (20_000, 9_000):  # in tiles
+        runner.device.memory = memory
+        assert np.array_equal(runner.run(planar, "k").encoded, expected)
 
 
 @pytest.mark.parametrize("type_", ["CPU", "GPU"])

@@ -186,6 +186,8 @@ class Flow:
         ):
             return sent
         pixels = source[box.top : box.bottom, box.left : box.right]
+        if work.plan.planar:
+            pixels = pixels.transpose(2, 0, 1)
         dtype = np.float16 if work.plan.half else np.float32
         size = source_bytes(work.plan, extents[0])
         sent = self._transfers.upload(source, pixels, dtype, size)
