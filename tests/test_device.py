@@ -18,6 +18,7 @@ from clpipe.commands.devices import device_rows
 from clpipe.engine import hardware
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.discovery import choose, choose_all, find_devices
+from clpipe.engine.flow import Flow
 from clpipe.engine.hardware import Hardware, hardware_of
 from clpipe.engine.runner import Runner
 from clpipe.engine.tiles import Extent
@@ -151,8 +152,10 @@ def test_devices_run_at_the_same_time(device):
             assert all(np.array_equal(a, b) for a, b in zip(results, expected, strict=True))
 
 
-def test_timings_are_those_of_a_trace(device):
-    runner = Runner(make_chain(settings_from({"iso": 3200})), device)
+@pytest.mark.parametrize("type_", ["CPU", "GPU"])
+def test_timings_are_those_of_a_trace(device, type_):
+    on = Device(replace(device.info, type=type_))
+    runner = Runner(make_chain(settings_from({"iso": 3200})), on)
     image = np.full((64, 80, 3), 0.5, np.float16)
     runner.run(image, "k")
     timings = []
@@ -162,7 +165,7 @@ def test_timings_are_those_of_a_trace(device):
     names = [t.name for t in timings]
     launches = [launch.name for launch in runner.plan().launches]
     assert [t.name for t in timings if not t.transfer] == launches
-    assert names[0] == "upload"
+    assert names.count("upload") == (type_ == "GPU")  # a CPU reads the image where it is
     assert names[-1] == "download"
     assert all(t.transfer for t in timings if t.name in ("upload", "download"))
     for one, two in pairwise(timings):
@@ -223,8 +226,8 @@ def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
     runner = Runner(make_chain(settings_from({})), fresh)
     runner.warm_up()
     made = []
-    make = fresh._pool._make
-    monkeypatch.setattr(fresh._pool, "_make", lambda size: made.append(size) or make(size))
+    make = fresh._flow.pool._make
+    monkeypatch.setattr(fresh._flow.pool, "_make", lambda size: made.append(size) or make(size))
     images = [
         np.full((h, w, 3), 0.4, np.float16) for h, w in ((60, 50), (20, 90), (7, 8), (60, 50))
     ]
@@ -233,7 +236,9 @@ def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
         pixels.tobytes() for pixels in alone
     ]
     most = max(made)
-    assert len(made) == len(fresh._pool.held) + 1  # a line table, for the width of the second one
+    assert (
+        len(made) == len(fresh._flow.pool.held) + 1
+    )  # a line table, for the width of the second one
     # What is held for others goes when it would take more than is allowed.
     fresh.memory = fresh.bytes_held
     other = Runner(make_chain(settings_from({"stages": ["exposure", "gamma"]})), fresh, final=True)
@@ -242,7 +247,7 @@ def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
     fresh.memory = 8 * most
     runner.run(images[0], "k")
     other.run(images[0], "k")
-    assert len(fresh._pool.held) > 4
+    assert len(fresh._flow.pool.held) > 4
 
 
 @pytest.mark.parametrize("byte", [0xFF, 0x7F])  # NaN, and numbers near the largest
@@ -250,17 +255,18 @@ def test_what_memory_held_before_does_not_matter(device, monkeypatch, byte):
     chain = make_chain(settings_from({}))
     image = np.random.default_rng(0).random((37, 53, 3)).astype(np.float16)
     expected = Runner(chain, device).run(image, "k").encoded
-    make = Device._new_buffer
+    make = Flow.new_buffer
 
     def used(self, size):
         buffer = make(self, size)
-        cl.enqueue_copy(self._queue, buffer, np.full(size, byte, np.uint8))
+        cl.enqueue_copy(self.queue, buffer, np.full(size, byte, np.uint8))
         return buffer
 
-    monkeypatch.setattr(Device, "_new_buffer", used)
-    for memory in (None, 80_000):  # whole, and in tiles
-        result = Runner(chain, Device(device.info, memory)).run(image, "k")
-        assert np.array_equal(result.encoded, expected)
+    monkeypatch.setattr(Flow, "new_buffer", used)
+    for info in (device.info, replace(device.info, type="GPU")):
+        for memory in (None, 80_000):  # whole, and in tiles
+            result = Runner(chain, Device(info, memory)).run(image, "k")
+            assert np.array_equal(result.encoded, expected)
 
 
 def test_pixels_into_an_array_that_is_there(device):

@@ -41,13 +41,13 @@ class Fault:
         self.lock = threading.Lock()
         launch, copy = cl.enqueue_nd_range_kernel, cl.enqueue_copy
 
-        def launched(on, *arguments):
+        def launched(on, *arguments, **options):
             with self.lock:
                 number, self.count = self.count, self.count + 1
                 if number in self.launches:
                     self.dead[on.context.int_ptr] = on.context
             self.check(on)
-            return launch(on, *arguments)
+            return launch(on, *arguments, **options)
 
         def copied(on, *arguments, **options):
             self.check(on)
@@ -111,11 +111,11 @@ def test_a_lack_of_memory_needs_no_new_context(device, monkeypatch):
     expected = runner.run(IMAGE, "k").encoded
     before, launch, errors = programs_of(device.info), cl.enqueue_nd_range_kernel, [1]
 
-    def launched(*arguments):
+    def launched(*arguments, **options):
         if errors:
             errors.pop()
             raise cl.MemoryError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES")
-        return launch(*arguments)
+        return launch(*arguments, **options)
 
     monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
     assert np.array_equal(runner.run(IMAGE, "k").encoded, expected)
@@ -128,10 +128,10 @@ def test_a_launch_that_fails_once_is_tried_again_in_the_same_context(device, mon
     before, launch = programs_of(device.info), cl.enqueue_nd_range_kernel
     errors = [cl.RuntimeError("clEnqueueNDRangeKernel failed: INVALID_OPERATION")]
 
-    def launched(*arguments):
+    def launched(*arguments, **options):
         if errors:
             raise errors.pop()
-        return launch(*arguments)
+        return launch(*arguments, **options)
 
     monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
     assert np.array_equal(runner.run(IMAGE, "k").encoded, expected)

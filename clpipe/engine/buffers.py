@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.types import Array
+from clpipe.engine.codegen import border_left
 from clpipe.engine.plan import Finalize, Plan
+from clpipe.engine.tiles import Extent
 from clpipe.engine.writer import Parameter
 from clpipe.stage import Kind
 
@@ -59,6 +61,30 @@ def room_for(plan: Plan, width: int, height: int, into: Array | None) -> HostIma
             x.op.step: np.empty(4, np.float32) for x in plan.launches if isinstance(x, Finalize)
         },
     )
+
+
+def copy_encoded(extent: Extent, pixels: Array, whole: Array) -> None:
+    """Copy the core of a tile's eight-bit pixels into the whole image, unless they are its own."""
+    if not np.may_share_memory(pixels, whole):
+        core, stored = extent.core, extent.stored
+        part = pixels.reshape(stored.height, stored.width, -1)
+        rows = slice(core.top - stored.top, core.bottom - stored.top)
+        columns = slice(core.left - stored.left, core.right - stored.left)
+        image = whole.reshape(extent.height, extent.width, -1)
+        image[core.top : core.bottom, core.left : core.right] = part[rows, columns]
+
+
+def copy_plane(extent: Extent, plane: Array, whole: Array, channel: int) -> None:
+    """Copy the core of a tile's plane into a channel of the whole image."""
+    core, stored, border = extent.core, extent.stored, extent.border
+    height = extent.padded_height + 2 * border
+    top = border + core.top - stored.top
+    left = border_left(border, extent.lanes) + core.left - stored.left
+    rows = plane[: height * extent.pitch].reshape(height, extent.pitch)
+    image = whole.reshape(extent.height, extent.width, -1)
+    image[core.top : core.bottom, core.left : core.right, channel] = rows[
+        top : top + core.height, left : left + core.width
+    ]
 
 
 class Pool:

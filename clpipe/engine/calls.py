@@ -1,6 +1,6 @@
 """A compiled kernel with its arguments, and how many work items it is launched over."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -48,14 +48,22 @@ class Call:
         self.compiled = compiled
         numbered = list(enumerate(kernel.parameters))
         names = [(i, buffer_name(p)) for i, p in numbered]
-        self._buffers = [(i, name) for i, name in names if name]
+        self._ends = [(i, name) for i, name in names if name in ("src", "dst")]
+        self._buffers = [(i, name) for i, name in names if name and name not in ("src", "dst")]
         self._numbers = [(i, p.item) for i, p in numbered if p.role == "tile"]
         self._values = [(i, p) for i, p in numbered if p.role in ("value", "key", "table8", "taps")]
         self._last: list[Any] = [None] * len(numbered)
         self._place: tuple[Any, ...] = ()
 
-    def set_arguments(self, pool: "Pool", extents: Extents, tile: int, bind: Bind) -> None:
-        """Set the arguments that differ from the last launch: buffers, a tile's numbers, values."""
+    def set_arguments(
+        self, pool: Pool, ends: Mapping[str, Any], extents: Extents, tile: int, bind: Bind
+    ) -> None:
+        """Set the arguments that differ from the last launch: buffers, a tile's numbers, values.
+
+        ``ends`` are the buffers "src" and "dst", which are an image's own.
+        """
+        for i, name in self._ends:
+            self.compiled.set_arg(i, ends[name])
         place = pool.generation, extents, tile
         if place != self._place:
             level = self.kernel.launch.level

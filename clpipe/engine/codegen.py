@@ -172,7 +172,8 @@ def _load(writer: Writer, launch: Launch) -> tuple[list[str], list[str], Kind]:
     if not launch.reads:
         kind, dtype = plan.source, "half" if plan.half else "float"
         writer.parameter("src", f"__global const {dtype} *restrict ", "source")
-        return [], [f"const {kind.c_type} v0 = source_{kind.c_name}_{dtype}(src, at, e);"], kind
+        source = f"source_{kind.c_name}_{dtype}{'_planes' if plan.planar else ''}"
+        return [], [f"const {kind.c_type} v0 = {source}(src, at, e);"], kind
     block = stencil.pass_.block if stencil else 0
     images = [
         f"image_at({', '.join(writer.planes(read))}, e, first, {'0' if block else 'ROW'})"

@@ -2,18 +2,18 @@
 
 import logging
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array
-from clpipe.engine.buffers import HostImages, Pool, room_for
-from clpipe.engine.calls import Bind, Call, index_space
-from clpipe.engine.codegen import border_left, write_kernel
+from clpipe.engine.buffers import HostImages, room_for
+from clpipe.engine.calls import Bind, Call
+from clpipe.engine.codegen import write_kernel
 from clpipe.engine.discovery import (
     DeviceInfo,
     choose,
@@ -22,10 +22,10 @@ from clpipe.engine.discovery import (
     shared_out,
     usable_memory,
 )
+from clpipe.engine.flow import Flow, Passage, Work
 from clpipe.engine.plan import Border, Launch, Plan
 from clpipe.engine.programs import forget_programs, programs_of
-from clpipe.engine.tiles import Extent, Extents, Tiling, tiling_of
-from clpipe.engine.writer import Parameter
+from clpipe.engine.tiles import Tiling, tiling_of
 
 log = logging.getLogger(__name__)
 FAILURES = 3  # images in a row that a device fails at, before it is given up
@@ -83,33 +83,32 @@ class Device:
         self.memory = memory or usable_memory(chosen)
         self._cl = cl
         self._failures = 0  # images in a row
+        self._generation = 0  # counts up when what is on the way is lost
         self._open()
 
     def _open(self) -> None:
-        """Make a queue, and nothing else yet, in the context that all on this device share.
+        """Make queues, and nothing else yet, in the context that all on this device share.
 
         Raises:
             DeviceError: the device cannot be opened.
         """
         self._programs = programs_of(self.info)
-        self._context = self._programs.context
         self._calls: dict[Plan, list[Call]] = {}
         self._border_calls: dict[Border, Call] = {}
-        self._pool = Pool(self._new_buffer)
-        self._tables: dict[int, tuple[Array, Any]] = {}
         try:
-            self._queue = self._new_queue()
+            self._flow = Flow(self._programs.context, self.info.in_place)
         except self._cl.Error as error:
             raise DeviceError(f"{self.info.label} cannot be opened: {error}") from None
-
-    def _new_queue(self) -> Any:
-        profiling = self._cl.command_queue_properties.PROFILING_ENABLE
-        return self._cl.CommandQueue(self._context, properties=profiling)
 
     @property
     def bytes_held(self) -> int:
         """Device memory of the buffers that are kept from image to image."""
-        return self._pool.bytes
+        return self._flow.pool.bytes
+
+    @property
+    def depth(self) -> int:
+        """How many images it can work on at a time."""
+        return self._flow.depth
 
     def is_ready(self, plan: Plan) -> bool:
         """Whether the kernels of a plan are compiled."""
@@ -136,6 +135,51 @@ class Device:
                 self._border_calls[border] = Call(kernel, self._programs.kernel(kernel))
             yield self._border_calls[border]
 
+    def submit(
+        self,
+        plan: Plan,
+        source: Array,
+        bind: Bind,
+        timings: list[Timing] | None = None,
+        download: bool = True,
+        into: Array | None = None,
+        unchanged: bool = False,
+    ) -> Callable[[], HostImages]:
+        """Begin to put one image through a plan, in tiles if it does not fit into the memory.
+
+        Up to :attr:`depth` images may be begun before the results of the first are taken.
+
+        Args:
+            plan: the plan.
+            source: the image, (height, width[, channel]), of a type that converts without loss to
+                what the plan reads, half or float. It must stay as it is until the results are
+                taken.
+            bind: the value of a "value", "key" or "table8" parameter: a NumPy scalar or array.
+            timings: one entry a launch and transfer is appended, in order.
+            download: bring results back; False leaves them on the device, for measuring.
+            into: an array to use for the eight-bit pixels, (height, width[, channel]) uint8,
+                C-contiguous; a used one saves the time that new memory takes.
+            unchanged: the source, if it is the last image's array, still has the same pixels, and
+                need not be sent again.
+
+        Returns:
+            What waits for the results and gives them, called once and in the order of images. If
+            the device runs out of memory before the limit is reached, buffers of earlier images are
+            given back, then tiles become smaller. If a kernel fails, the image is tried once more;
+            if its context is of no more use then, everything is made anew before. It raises
+            ImageError where memory is not enough for tiles of any size, DeviceFailedError where the
+            device fails again, and DeviceError where it has failed at :data:`FAILURES` images in a
+            row.
+
+        Raises:
+            ImageError: the image does not fit into the device's memory, not even in tiles.
+            DeviceError: a kernel does not compile.
+        """
+        output = room_for(plan, source.shape[1], source.shape[0], into)
+        work = Work(plan, source, bind, output, download, unchanged)
+        begun = self._begin(work, self.memory)
+        return partial(self._result, work, begun, self._generation, timings)
+
     def run(
         self,
         plan: Plan,
@@ -145,53 +189,57 @@ class Device:
         download: bool = True,
         into: Array | None = None,
     ) -> HostImages:
-        """Put one image through a plan, in tiles if it does not fit into the memory.
+        """Put one image through a plan, and wait for it: see :meth:`submit`."""
+        return self.submit(plan, source, bind, timings, download, into)()
 
-        If the device runs out of memory before the limit is reached, buffers of earlier images are
-        given back, then tiles become smaller. If a kernel fails, the image is tried once more; if
-        its context is of no more use then, everything is made anew before.
+    def _tiling(self, work: Work, memory: int) -> Tiling:
+        height, width = work.source.shape[:2]
+        largest = min(memory, self.info.max_buffer)
+        return tiling_of(work.plan, width, height, self.info.lanes, memory, largest, self.depth)
 
-        Args:
-            plan: the plan.
-            source: the image, (height, width[, channel]), of a type that converts without loss to
-                what the plan reads, half or float.
-            bind: the value of a "value", "key" or "table8" parameter: a NumPy scalar or array.
-            timings: one entry a launch and transfer is appended, in order.
-            download: bring results back; False leaves them on the device, for measuring.
-            into: an array to use for the eight-bit pixels, (height, width[, channel]) uint8,
-                C-contiguous; a used one saves the time that new memory takes.
+    def _begin(self, work: Work, memory: int) -> Passage | Exception:
+        """Enqueue an image; what the device raises is returned."""
+        try:
+            borders = partial(self._borders, work.plan)
+            passage = Passage(work, self.prepare(work.plan), borders, self._tiling(work, memory))
+            self._flow.start(passage, self.memory)
+            return passage
+        except self._cl.Error as error:
+            return error
 
-        Raises:
-            ImageError: the image does not fit into the device's memory, not even in tiles.
-            DeviceFailedError: the device fails, also when it is tried again.
-            DeviceError: a kernel does not compile, or the device has failed at :data:`FAILURES`
-                images in a row.
-        """
-        cl = self._cl
-        height, width = source.shape[:2]
-        memory = self.memory
+    def _result(
+        self,
+        work: Work,
+        begun: Passage | Exception,
+        generation: int,
+        timings: list[Timing] | None,
+    ) -> HostImages:
+        """The results of an image that was begun in a generation; see :meth:`submit`."""
+        cl, memory = self._cl, self.memory
         full: Exception | None = None  # the device's error when its memory ran out
         failed = False
         while True:
+            if generation != self._generation:  # what was begun is lost
+                try:
+                    begun, generation = self._begin(work, memory), self._generation
+                except ImageError:
+                    if full is None:
+                        raise
+                    height, width = work.source.shape[:2]
+                    raise ImageError(
+                        f"{width}x{height} pixels: {self.info.label} is out of memory, in tiles of "
+                        f"any size; others may be using it ({full})"
+                    ) from None
             try:
-                tiling = tiling_of(
-                    plan, width, height, self.info.lanes, memory, min(memory, self.info.max_buffer)
-                )
-            except ImageError:
-                if full is None:
-                    raise
-                raise ImageError(
-                    f"{width}x{height} pixels: {self.info.label} is out of memory, in tiles of any "
-                    f"size; others may be using it ({full})"
-                ) from None
-            try:
-                output = self._run(plan, tiling, source, bind, timings, download, into)
+                if isinstance(begun, Exception):
+                    raise begun
+                self._flow.finish(begun)
             except cl.Error as error:
                 self._abandon()
                 if not self._works():
                     self._renew()
                 elif isinstance(error, cl.MemoryError):
-                    memory = memory if full is None else tiling.bytes // 2
+                    memory = memory if full is None else self._tiling(work, memory).bytes // 2
                     full = error
                     continue
                 if not failed:
@@ -200,71 +248,17 @@ class Device:
                 self._count_failure(error)
                 raise DeviceFailedError(f"{self.info.label} failed: {error}") from None
             self._failures = 0
-            return output
-
-    def _run(
-        self,
-        plan: Plan,
-        tiling: Tiling,
-        source: Array,
-        bind: Bind,
-        timings: list[Timing] | None,
-        download: bool,
-        into: Array | None,
-    ) -> HostImages:
-        calls = self.prepare(plan)
-        if len(self._tables) > 32:
-            self._tables.clear()
-        upload = download or len(tiling.tiles) > 1 or "src" not in self._pool.held
-        self._pool.reserve(tiling.sizes, self.memory)
-        output = room_for(plan, source.shape[1], source.shape[0], into)
-        events: list[tuple[str, Any]] = []
-
-        def value_of(parameter: Parameter) -> Any:
-            value = bind(parameter)
-            return self._table(value) if isinstance(value, np.ndarray) else value
-
-        def enqueue(call: Call, extents: Extents, tile: int) -> Any:
-            call.set_arguments(self._pool, extents, tile, value_of)
-            sizes = index_space(call.kernel, extents[call.kernel.launch.level])
-            return self._cl.enqueue_nd_range_kernel(self._queue, call.compiled, *sizes)
-
-        def launch(numbers: tuple[int, ...], extents: Extents, tile: int) -> None:
-            for number in numbers:
-                done = calls[number].kernel.launch
-                if extents[done.level].is_empty:
-                    continue
-                events.append((done.name, enqueue(calls[number], extents, tile)))
-                if isinstance(done, Launch) and extents[done.level].is_small:
-                    for border in self._borders(plan, done):
-                        enqueue(border, extents, tile)
-
-        for phase in tiling.phases:
-            launch(phase.first, tiling.tiles[0], 0)
-            for tile, extents in enumerate(tiling.tiles):
-                if upload:
-                    events.append(("upload", self._upload(plan, extents[0], source)))
-                launch(phase.each, extents, tile)
-                if download and phase is tiling.phases[-1]:
-                    events += [("download", e) for e in self._download(plan, extents, output)]
-            launch(phase.last, tiling.tiles[0], 0)
-        if download:
-            events += [("download", e) for e in self._download_estimates(output)]
-        self._queue.finish()
-        if timings is not None:
-            timings += timed(events)
-        return output if download else HostImages({}, None, {})
-
-    def _new_buffer(self, size: int) -> Any:
-        return self._cl.Buffer(self._context, self._cl.mem_flags.READ_WRITE, size)
+            if timings is not None:
+                timings += timed(begun.events)
+            return work.output if work.download else HostImages({}, None, {})
 
     def _abandon(self) -> None:
-        """After a failure: wait for the rest of that image, and give all memory back."""
-        with suppress(self._cl.Error):
-            self._queue.finish()
-        with suppress(self._cl.Error):
-            self._tables.clear()
-            self._pool.release()
+        """After a failure: wait for all that is on the way, and give all memory back.
+
+        What other images were on the way must be started again.
+        """
+        self._generation += 1
+        self._flow.abandon()
 
     def _works(self) -> bool:
         """Whether the context still does what it is told, after an error.
@@ -274,9 +268,9 @@ class Device:
         """
         cl, sent, back = self._cl, np.arange(4, dtype=np.uint8), np.zeros(4, np.uint8)
         try:
-            queue = self._new_queue()
+            queue = self._flow.new_queue()
             flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
-            cl.enqueue_copy(queue, back, cl.Buffer(self._context, flags, hostbuf=sent))
+            cl.enqueue_copy(queue, back, cl.Buffer(self._flow.context, flags, hostbuf=sent))
             queue.finish()
         except cl.Error:
             return False
@@ -305,81 +299,14 @@ class Device:
                 f"{error}"
             ) from None
 
-    def _table(self, table: Array) -> Any:
-        """A small constant array on the device, uploaded once."""
-        cl = self._cl
-        if id(table) not in self._tables:
-            flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
-            # The array is held so that its id stays its own.
-            self._tables[id(table)] = table, cl.Buffer(self._context, flags, hostbuf=table)
-        return self._tables[id(table)][1]
-
-    def _upload(self, plan: Plan, extent: Extent, image: Array) -> Any:
-        box = extent.stored
-        dtype = np.float16 if plan.half else np.float32
-        part = np.ascontiguousarray(image[box.top : box.bottom, box.left : box.right], dtype)
-        event = self._cl.enqueue_copy(self._queue, self._pool.held["src"], part, is_blocking=False)
-        if part.flags.owndata:
-            event.wait()  # or the event would hold the copy until the image is done
-        return event
-
-    def _download(self, plan: Plan, extents: Extents, output: HostImages) -> Iterator[Any]:
-        """Copy the core of a tile into the whole images."""
-        if output.encoded is not None and not extents[-1].core.is_empty:
-            yield self._download_encoded(extents[-1], output.encoded)
-        for number, image in output.images.items():
-            extent = extents[plan.level_of(number)]
-            core, stored = extent.core, extent.stored
-            if core.is_empty:
-                continue
-            plane = np.empty(extent.plane_bytes // 4, np.float32)
-            height = extent.padded_height + 2 * plan.border
-            top = plan.border + core.top - stored.top
-            left = border_left(plan.border, extent.lanes) + core.left - stored.left
-            whole = image.reshape(extent.height, extent.width, -1)
-            part = whole[core.top : core.bottom, core.left : core.right]
-            for channel, slot in enumerate(plan.slots[number]):
-                yield self._cl.enqueue_copy(
-                    self._queue, plane, self._pool.held[f"slot{slot}"], is_blocking=True
-                )
-                rows = plane[: height * extent.pitch].reshape(height, extent.pitch)
-                part[..., channel] = rows[top : top + core.height, left : left + core.width]
-
-    def _download_encoded(self, extent: Extent, whole: Array) -> Any:
-        """Copy the core of a tile into the whole eight-bit image."""
-        core, stored, encoded = extent.core, extent.stored, self._pool.held["dst"]
-        channels = whole.size // (extent.width * extent.height)
-        left, top = core.left - stored.left, core.top - stored.top
-        if core.width == extent.width:
-            rows = whole[core.top : core.bottom]
-            start = top * core.width * channels
-            return self._cl.enqueue_copy(
-                self._queue, rows, encoded, src_offset=start, is_blocking=False
-            )
-        return self._cl.enqueue_copy(
-            self._queue,
-            whole,
-            encoded,
-            buffer_origin=(left * channels, top, 0),
-            host_origin=(core.left * channels, core.top, 0),
-            region=(core.width * channels, core.height, 1),
-            buffer_pitches=(stored.width * channels,),
-            host_pitches=(extent.width * channels,),
-        )
-
-    def _download_estimates(self, output: HostImages) -> Iterator[Any]:
-        """Copy the numbers that stages estimated from the image."""
-        for step, values in output.estimates.items():
-            yield self._cl.enqueue_copy(self._queue, values, self._pool.held[f"estimates.{step}"])
-
     def copy_speed(self, size: int = 96 * 2**20) -> float:
         """Bytes a second, read plus written, of the device's own buffer copy; the best of five."""
         cl = self._cl
-        one, two = (cl.Buffer(self._context, cl.mem_flags.READ_WRITE, size) for _ in range(2))
+        one, two = (self._flow.new_buffer(size) for _ in range(2))
         best = 0.0
         for _ in range(6):
             start = time.perf_counter()
-            cl.enqueue_copy(self._queue, two, one, byte_count=size).wait()
+            cl.enqueue_copy(self._flow.queue, two, one, byte_count=size).wait()
             best = max(best, 2 * size / (time.perf_counter() - start))
         one.release()
         two.release()

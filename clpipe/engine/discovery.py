@@ -41,6 +41,11 @@ class DeviceInfo:
         """Name and platform, as people tell devices apart."""
         return f"{self.name.strip()} ({self.platform})"
 
+    @property
+    def in_place(self) -> bool:
+        """Whether kernels can use the host's memory where it is, at the speed of their own."""
+        return self.type == "CPU" and bool(self.handle.host_unified_memory)
+
 
 def find_devices() -> list[DeviceInfo]:
     """Every device of every OpenCL platform, in the platforms' order.

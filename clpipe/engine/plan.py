@@ -140,6 +140,7 @@ class Plan:
 
     source: Kind
     half: bool
+    planar: bool  # whether the source is planes one behind the other, not interleaved
     launches: tuple[AnyLaunch, ...]
     slots: dict[int, tuple[int, ...]]  # image number -> slots of its planes
     slot_count: int = 0
@@ -155,7 +156,17 @@ class Plan:
     @cached_property
     def _hash(self) -> int:
         # A plan is looked up for each image, and hashing all that is in it takes a while.
-        return hash((self.source, self.half, self.launches, self.kept, self.final, self.encoded))
+        return hash(
+            (
+                self.source,
+                self.half,
+                self.planar,
+                self.launches,
+                self.kept,
+                self.final,
+                self.encoded,
+            )
+        )
 
     @cached_property
     def unscaled(self) -> "Plan":
@@ -341,6 +352,7 @@ def make_plan(
     encode: bool = True,
     final: bool = False,
     fold: bool = True,
+    planar: bool = False,
 ) -> Plan:
     """The plan of a chain.
 
@@ -352,6 +364,7 @@ def make_plan(
             last step to keep.
         fold: whether a stencil redoes cheap passes at its taps. It must not for images one pixel
             wide or high, where mirroring changes the Bayer phase.
+        planar: whether the source is planes one behind the other, not interleaved.
 
     Raises:
         RequestError: the chain has no such step to keep.
@@ -387,6 +400,7 @@ def make_plan(
     return Plan(
         source=chain.source,
         half=half,
+        planar=planar,
         launches=tuple(launches),
         slots=slots,
         slot_count=count,

@@ -54,6 +54,17 @@ class Result:
         return None if self.final is None and self.encoded is None else png_bytes(self.image)
 
 
+def is_planar(image: Array) -> bool:
+    """Whether the channels of an image lie in memory as planes, one behind the other.
+
+    >>> is_planar(np.zeros((3, 4, 5)).transpose(1, 2, 0)), is_planar(np.zeros((4, 5, 3)))
+    (True, False)
+    """
+    if image.ndim != 3 or image.flags.c_contiguous:
+        return False
+    return image.transpose(2, 0, 1).flags.c_contiguous
+
+
 def streams(chain: Chain, step: Step, noise_key: str) -> dict[NoiseScope, Stream]:
     """The random streams of a step for one image.
 
@@ -90,7 +101,7 @@ class Runner:
         self.encode = encode
         self.final = final
         self._arguments = {s.name: s.method.arguments(s.context) for s in chain.steps}
-        self._own_plans: dict[tuple[bool, bool], Plan] = {}
+        self._own_plans: dict[tuple[bool, ...], Plan] = {}
         # Shared with the runners of other chains, by a chain's structure.
         self._plans: dict[Any, Plan] = {}
         self._tables: dict[Any, tuple[Sequence[Array], Array]] = {}
@@ -104,17 +115,17 @@ class Runner:
         other._plans, other._tables = self._plans, self._tables
         return other
 
-    def plan(self, half: bool = True, fold: bool = True) -> Plan:
-        """The plan for a source of half floats or floats."""
-        chain, key = self.chain, (half, fold)
+    def plan(self, half: bool = True, fold: bool = True, planar: bool = False) -> Plan:
+        """The plan for a source of half floats or floats, interleaved or in planes."""
+        chain, key = self.chain, (half, fold, planar)
         if key not in self._own_plans:
             ops = chain_ops(chain, self._arguments)
-            structure = (half, fold, chain.source, chain.result, ops)
+            structure = (*key, chain.source, chain.result, ops)
             plan = self._plans.get(structure)
             if plan is None:
                 if len(self._plans) >= 64:
                     self._plans.clear()
-                plan = make_plan(chain, half, self.keep, self.encode, self.final, fold)
+                plan = make_plan(chain, half, self.keep, self.encode, self.final, fold, planar)
                 self._plans[structure] = plan
             self._own_plans[key] = plan
         return self._own_plans[key]
@@ -180,7 +191,7 @@ class Runner:
         if not self.device:
             return self._run_numpy(np.asarray(image, np.float32), noise_key)
         smallest = min(self.chain.size(*image.shape[1::-1]))
-        plan = self.plan(image.dtype == np.float16, fold=smallest > 1)
+        plan = self.plan(image.dtype == np.float16, smallest > 1, is_planar(image))
         try:
             self._make_ready(plan)
         except DeviceFailedError:

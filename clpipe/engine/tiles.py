@@ -144,16 +144,25 @@ def whole_image(plan: Plan, width: int, height: int, lanes: int) -> Extents:
     return tuple(Extent.whole(*size, lanes, plan.border) for size in plan.sizes(width, height))
 
 
-def buffer_sizes(plan: Plan, extents: Extents) -> dict[str, int]:
-    """The device buffers that a plan needs for an image or a tile: bytes by name."""
+def source_bytes(plan: Plan, extent: Extent) -> int:
+    """The bytes of the source that kernels may read: whole blocks, also beyond its last pixel."""
+    stored = extent.stored
+    pixels = (extent.padded_height - 1) * stored.width + extent.padded_width
+    return pixels * len(plan.source.channels) * (2 if plan.half else 4)
+
+
+def buffer_sizes(plan: Plan, extents: Extents, ends: int = 1) -> dict[str, int]:
+    """The device buffers that a plan needs for an image or a tile: bytes by name.
+
+    ``ends`` is how many sources and eight-bit results there are at a time.
+    """
     first, last = extents[0], extents[-1]
-    pixels = first.padded_height * first.stored.width
-    source = pixels * len(plan.source.channels) + 3 * first.lanes
-    sizes = {"src": source * (2 if plan.half else 4)}
+    sizes = {f"src{i}": source_bytes(plan, first) for i in range(ends)}
     for number, levels in enumerate(plan.levels_of_slots):
         sizes[f"slot{number}"] = max(extents[level].plane_bytes for level in levels)
     if plan.encoded:
-        sizes["dst"] = last.stored.width * last.stored.height * len(plan.encoded.channels)
+        encoded = last.stored.width * last.stored.height * len(plan.encoded.channels)
+        sizes |= {f"dst{i}": encoded for i in range(ends)}
     # Line tables are the image's: whole blocks of rows, and the last vector.
     longest = round_up(max(first.width, first.height), max(first.lanes, 4)) + 2 * first.lanes
     for launch in plan.launches:
@@ -337,7 +346,9 @@ class _Cutter:
 
 
 @lru_cache(maxsize=64)
-def tiling_of(plan: Plan, width: int, height: int, lanes: int, memory: int, largest: int) -> Tiling:
+def tiling_of(
+    plan: Plan, width: int, height: int, lanes: int, memory: int, largest: int, ends: int = 1
+) -> Tiling:
     """How an image goes through a plan in limited memory: whole if it fits, else in tiles.
 
     Of the divisions that fit, the one with the smallest share of halos is chosen. Among those that
@@ -349,6 +360,7 @@ def tiling_of(plan: Plan, width: int, height: int, lanes: int, memory: int, larg
         lanes: of the device.
         memory: bytes that all buffers together may take.
         largest: bytes that a single buffer may take.
+        ends: how many sources and eight-bit results there are at a time.
 
     Raises:
         ImageError: not even the smallest tile fits; the message says what it needs.
@@ -357,12 +369,12 @@ def tiling_of(plan: Plan, width: int, height: int, lanes: int, memory: int, larg
     whole, across = cut.whole, cut.across
 
     def fits(extents: Extents, memory: int) -> bool:
-        sizes = buffer_sizes(plan, extents).values()
+        sizes = buffer_sizes(plan, extents, ends).values()
         return sum(sizes) <= memory and max(sizes) <= largest
 
     if fits(whole, memory):
         every = tuple(range(len(plan.launches)))
-        return Tiling((whole,), (Phase((), every, ()),), buffer_sizes(plan, whole))
+        return Tiling((whole,), (Phase((), every, ()),), buffer_sizes(plan, whole, ends))
     of_tile = min(memory, LARGEST_TILE)
     best: tuple[float, int, int] | None = None
     for columns in dict.fromkeys(
@@ -382,9 +394,9 @@ def tiling_of(plan: Plan, width: int, height: int, lanes: int, memory: int, larg
                 best = cost, columns, rows
     if best is None:
         least = cut.amid(across, 4)
-        needs = buffer_sizes(plan, least)
+        needs, wants = (buffer_sizes(plan, extents, ends) for extents in (least, whole))
         raise ImageError(
-            f"{width}x{height} pixels need {in_words(sum(buffer_sizes(plan, whole).values()))} of "
+            f"{width}x{height} pixels need {in_words(sum(wants.values()))} of "
             f"device memory, or in the smallest tiles {in_words(sum(needs.values()))}, with "
             f"{in_words(max(needs.values()))} in one piece; allowed are {in_words(memory)}, with "
             f"{in_words(largest)} in one piece"
@@ -395,7 +407,7 @@ def tiling_of(plan: Plan, width: int, height: int, lanes: int, memory: int, larg
         for top in range(0, height, rows)
         for left in range(0, width, columns)
     )
-    return Tiling(tiles, phases_of(plan), buffer_sizes(plan, cut.amid(columns, rows)))
+    return Tiling(tiles, phases_of(plan), buffer_sizes(plan, cut.amid(columns, rows), ends))
 
 
 def divisions(most: int) -> Iterator[int]:

@@ -1,5 +1,5 @@
-// Lanes out of an image, or a tile of it, as a file holds it: interleaved channels, half or float, no
-// padding between rows. The buffer has room for whole blocks beyond its last pixel, so a block at the
+// Lanes out of an image, or a tile of it, as a file holds it: interleaved channels or planes, half or
+// float, no padding between rows. The buffer has room for whole blocks beyond its last pixel, so a block at the
 // right or lower edge may read beyond the image; what it reads there is never stored.
 #ifndef CLPIPE_SOURCE_H
 #define CLPIPE_SOURCE_H
@@ -32,6 +32,21 @@ INLINE rgb source_rgb_float(__global const float *src, site at, extent e) {
     __global const float *p = src + 3 * pixel_number(at, e);
     const vf a = load(p), b = load(p + LANES), c = load(p + 2 * LANES);
     const rgb v = DEINTERLEAVE(a, b, c);
+    return v;
+}
+
+// The same from planes one behind the other.
+INLINE rgb source_rgb_half_planes(__global const half *src, site at, extent e) {
+    __global const half *p = src + pixel_number(at, e);
+    const size_t plane = (size_t)e.columns * e.rows;
+    const rgb v = {load_half(p), load_half(p + plane), load_half(p + 2 * plane)};
+    return v;
+}
+
+INLINE rgb source_rgb_float_planes(__global const float *src, site at, extent e) {
+    __global const float *p = src + pixel_number(at, e);
+    const size_t plane = (size_t)e.columns * e.rows;
+    const rgb v = {load(p), load(p + plane), load(p + 2 * plane)};
     return v;
 }
 

@@ -1,0 +1,223 @@
+"""How pixels reach a device and come back: where they lie in memory, or through staging buffers.
+
+An image, or a tile of it, goes one way in three steps: ``upload``, ``target`` for the eight-bit
+pixels, and ``fetch`` for each result, whose array may be read when its event is complete and until
+``done``. At most ``depth`` may be between the first step and ``done``.
+"""
+
+import weakref
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from clpipe.base.types import Array
+from clpipe.engine.buffers import Pool
+
+Sent = tuple[Any, list[Any]]  # a buffer, and the events after which it can be read
+Fetched = tuple[Array, Any]  # bytes, and the event after which they are there
+
+
+def bytes_from(array: Array, size: int) -> Array | None:
+    """The ``size`` bytes from the first of a C-contiguous array on, in the memory that it lies in.
+
+    None where that memory ends before.
+
+    >>> room = np.arange(6, dtype=np.uint8)
+    >>> bytes_from(room[1:3], 4), bytes_from(room[1:3], 6)
+    (array([1, 2, 3, 4], dtype=uint8), None)
+    """
+    owner = array
+    while isinstance(owner.base, np.ndarray):
+        owner = owner.base
+    if not owner.flags.c_contiguous:
+        return None
+    start = array.ctypes.data - owner.ctypes.data
+    whole = owner.reshape(-1).view(np.uint8)
+    return whole[start : start + size] if start + size <= whole.size else None
+
+
+def _unmap(array: Array, queue: Any) -> None:
+    """Give mapped memory back."""
+    base: Any = array.base
+    base.release(queue)
+
+
+class InPlace:
+    """For a device that works in the host's memory: kernels use NumPy's arrays where they are.
+
+    An array that has not the right type, order or room behind it is copied first.
+    """
+
+    depth = 1
+
+    def __init__(self, cl: Any, queue: Any) -> None:
+        self._cl = cl
+        self._queue = queue
+        self._flags = cl.mem_flags.USE_HOST_PTR
+        self._scratch: dict[str, Array] = {}
+        self._maps: list[Array] = []
+        self._ends: list[Any] = []
+
+    def needs(self, sizes: Mapping[str, int]) -> dict[str, int]:
+        """The buffers that are to be made, of those that a tiling names: bytes by name."""
+        return {name: size for name, size in sizes.items() if name[:3] not in ("src", "dst")}
+
+    def upload(self, source: Array, pixels: Array, dtype: Any, size: int) -> Sent:
+        """A buffer of ``size`` bytes that begins with an image, whose samples become ``dtype``.
+
+        ``pixels`` are of the array ``source``.
+        """
+        data = None
+        if pixels.dtype == dtype and pixels.flags.c_contiguous:
+            data = bytes_from(pixels, size)
+        if data is None:
+            data = self._room("src", size)
+            copied = data[: pixels.size * np.dtype(dtype).itemsize].view(dtype)
+            np.copyto(copied.reshape(pixels.shape), pixels, casting="unsafe")
+        return self._end(self._cl.mem_flags.READ_ONLY, data), []
+
+    def again(self, source: Array) -> Sent | None:
+        """What the last upload sent, if it was of that array; here it costs nothing to do so."""
+        return None
+
+    def target(self, size: int, whole: Array | None) -> Any:
+        """A buffer for eight-bit pixels: the array ``whole``, where it is the result of one run."""
+        data = self._room("dst", size) if whole is None else whole
+        return self._end(self._cl.mem_flags.READ_WRITE, data)
+
+    def fetch(self, name: str, buffer: Any, size: int, after: Sequence[Any]) -> Fetched:
+        """The bytes of a buffer on the host, when the launches ``after`` are done."""
+        array, event = self._cl.enqueue_map_buffer(
+            self._queue,
+            buffer,
+            self._cl.map_flags.READ,
+            0,
+            (size,),
+            np.uint8,
+            wait_for=after,
+            is_blocking=False,
+        )
+        self._maps.append(array)
+        return array, event
+
+    def flush(self) -> None:
+        """Have the device begin."""
+        self._queue.flush()
+
+    def done(self) -> None:
+        """What was fetched is not needed any more."""
+        maps, self._maps = self._maps, []
+        ends, self._ends = self._ends, []
+        for array in maps:
+            _unmap(array, self._queue)
+        for buffer in ends:
+            buffer.release()
+
+    def release(self) -> None:
+        """Give all memory back."""
+        self._scratch.clear()
+        self.done()
+
+    def _room(self, name: str, size: int) -> Array:
+        """Memory of our own, kept from image to image where it is large enough."""
+        if name not in self._scratch or self._scratch[name].size < size:
+            self._scratch[name] = np.empty(size, np.uint8)
+        return self._scratch[name][:size]
+
+    def _end(self, access: int, data: Array) -> Any:
+        context = self._queue.context
+        self._ends.append(self._cl.Buffer(context, access | self._flags, hostbuf=data))
+        return self._ends[-1]
+
+
+class Staged:
+    """For a device with memory of its own: copies in both directions while kernels run.
+
+    Queues of their own copy from and to page-locked memory, since from other memory the host would
+    wait for each copy. There are two of every buffer, in turn.
+    """
+
+    depth = 2
+
+    def __init__(self, cl: Any, queue: Any, new_queue: Any, pool: Pool) -> None:
+        self._cl = cl
+        self._queue = queue
+        self._pool = pool
+        self._up, self._down = new_queue(), new_queue()
+        self._pinned: dict[str, tuple[Any, Array]] = {}
+        self._source = self._turn = 0
+        self._sent: tuple[weakref.ref[Array], Sent] | None = None
+
+    def needs(self, sizes: Mapping[str, int]) -> dict[str, int]:
+        """See :meth:`InPlace.needs`."""
+        return dict(sizes)
+
+    def upload(self, source: Array, pixels: Array, dtype: Any, size: int) -> Sent:
+        """See :meth:`InPlace.upload`."""
+        self._source = 1 - self._source
+        count = pixels.size * np.dtype(dtype).itemsize
+        data = self._page_locked(f"src{self._source}", size)[:count]
+        np.copyto(data.view(dtype).reshape(pixels.shape), pixels, casting="unsafe")
+        buffer = self._pool.held[f"src{self._source}"]
+        sent = buffer, [self._cl.enqueue_copy(self._up, buffer, data, is_blocking=False)]
+        self._up.flush()
+        self._sent = weakref.ref(source), sent
+        return sent
+
+    def again(self, source: Array) -> Sent | None:
+        """See :meth:`InPlace.again`."""
+        if not self._sent or self._sent[0]() is not source:
+            return None
+        sent = self._sent[1]
+        return sent if self._pool.held.get(f"src{self._source}") is sent[0] else None
+
+    def target(self, size: int, whole: Array | None) -> Any:
+        """See :meth:`InPlace.target`."""
+        self._turn = 1 - self._turn
+        return self._pool.held.get(f"dst{self._turn}")
+
+    def fetch(self, name: str, buffer: Any, size: int, after: Sequence[Any]) -> Fetched:
+        """See :meth:`InPlace.fetch`."""
+        self._queue.flush()
+        array = self._page_locked(f"{name}.{self._turn}", size)[:size]
+        event = self._cl.enqueue_copy(
+            self._down, array, buffer, wait_for=list(after), is_blocking=False
+        )
+        return array, event
+
+    def flush(self) -> None:
+        """See :meth:`InPlace.flush`."""
+        self._queue.flush()
+        self._down.flush()
+
+    def done(self) -> None:
+        """See :meth:`InPlace.done`."""
+
+    def release(self) -> None:
+        """See :meth:`InPlace.release`."""
+        self._sent = None
+        pinned, self._pinned = self._pinned, {}
+        for queue in (self._up, self._down):
+            queue.finish()
+        for buffer, array in pinned.values():
+            _unmap(array, self._down)
+            buffer.release()
+
+    def _page_locked(self, name: str, size: int) -> Array:
+        """Page-locked memory of that size at least, kept from image to image."""
+        cl = self._cl
+        held = self._pinned.get(name)
+        if held and held[1].size >= size:
+            return held[1]
+        flags = cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR
+        buffer = cl.Buffer(self._queue.context, flags, size)
+        both = cl.map_flags.READ | cl.map_flags.WRITE
+        array, _ = cl.enqueue_map_buffer(
+            self._down, buffer, both, 0, (size,), np.uint8, is_blocking=True
+        )
+        if held:
+            _unmap(held[1], self._down)
+            held[0].release()
+        self._pinned[name] = buffer, array
+        return array
