@@ -20,11 +20,8 @@ def sha256_of(path: Path) -> tuple[str, int]:
         OSError: it cannot be read, or is no regular file.
     """
     check_regular(path)
-    digest = hashlib.sha256()
     with open(path, "rb", buffering=0) as file:
-        while part := file.read(4 << 20):
-            digest.update(part)
-        return digest.hexdigest(), file.tell()
+        return hashlib.file_digest(file, "sha256").hexdigest(), file.tell()
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""OpenEXR files of luminance and subsampled chroma. Only this module imports OpenEXR."""
+"""OpenEXR files of luminance and subsampled chroma."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,6 +11,7 @@ from clpipe.base.errors import ImageError
 from clpipe.base.text import printable
 from clpipe.base.types import Array, Floats
 from clpipe.images.colour import SRGB, rgb_to_xyz
+from clpipe.images.openexr import open_exr
 from clpipe.images.openimageio import error_text
 from clpipe.images.pixels import check_size
 
@@ -40,14 +41,11 @@ def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
     Raises:
         ImageError: the file is damaged, too large, deep, or has other subsampled channels.
     """
-    import OpenEXR
 
     def read(header_only: bool) -> tuple[Any, Any]:
         """The first part, and all."""
         try:
-            parts = OpenEXR.File(
-                str(path), separate_channels=True, header_only=header_only, num_threads=1
-            ).parts
+            parts = open_exr(path, header_only).parts
             return parts[0], parts
         except Exception as error:  # exceptions of the C++ library arrive as many types
             raise ImageError(f"{path}: damaged: {error_text(str(error))}") from None
@@ -55,7 +53,7 @@ def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
     first, parts = read(header_only=True)
     header = first.header
     names = sorted(channel.name for channel in header["channels"])
-    is_flat = all(part.header["type"] == OpenEXR.scanlineimage for part in parts)
+    is_flat = all(part.header["type"].name == "scanlineimage" for part in parts)
     if not set(CHANNELS) <= set(names) or not is_flat:
         raise ImageError(
             f"{path}: subsampled channels can be read as {', '.join(CHANNELS)} only; "

@@ -1,6 +1,8 @@
 """Arrays of pixels as files hold them: sizes, data windows, and values that are not finite."""
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +12,7 @@ from clpipe.base.types import Array
 MAX_PIXELS = 1_000_000_000  # the largest --max-pixels
 USUAL_MAX_PIXELS = 200_000_000  # its default: what a file may claim
 HALF_MAX = np.float32(65504)  # the largest half
+BLOCK = 1 << 18  # samples that are looked at while they are in a cache
 
 
 def check_size(path: Path, width: int, height: int, max_pixels: int) -> None:
@@ -38,16 +41,36 @@ def display_window(data: Array, x: int, y: int, width: int, height: int) -> Arra
     return window
 
 
-def without_non_finite(pixels: Array) -> tuple[Array, int]:
-    """The image with 0 in place of each NaN and infinity, and their number."""
-    if pixels.dtype == np.float16:
-        bits = pixels.view(np.uint16)
-        if bits.max() < 0x7C00:  # all are finite, and none is negative
-            return pixels, 0
-        bad = (bits & 0x7C00) == 0x7C00
-    else:
-        bad = ~np.isfinite(pixels)
-    count = int(np.count_nonzero(bad))
-    if count:
-        pixels = np.where(bad, pixels.dtype.type(0), pixels)
-    return pixels, count
+def make_finite(pixels: Array) -> int:
+    """Set each NaN and infinity of an image to 0, in place, and count them."""
+    infinity = np.array(np.inf, pixels.dtype)
+    count = 0
+    for block in _blocks_beyond(pixels, np.nextafter(infinity, pixels.dtype.type(0))):
+        bad = ~np.isfinite(block)
+        count += int(np.count_nonzero(bad))
+        block[bad] = 0
+    return count
+
+
+def clip_to_half(pixels: Array) -> int:
+    """Clip float32 samples to the range of half, in place, and count those that were beyond."""
+    count = 0
+    for block in _blocks_beyond(pixels, HALF_MAX):
+        count += int(np.count_nonzero(np.abs(block) > HALF_MAX))
+        np.clip(block, -HALF_MAX, HALF_MAX, out=block)
+    return count
+
+
+def _blocks_beyond(pixels: Array, limit: Any) -> Iterator[Array]:
+    """Views of an image, which may be planar in memory: blocks with samples beyond -limit..limit.
+
+    Bits compare faster than floats. Those of floats from 0 on are in the floats' order, NaN last.
+    """
+    whole = np.dtype(f"u{pixels.dtype.itemsize}")
+    largest, without_sign = limit.view(whole), np.iinfo(whole).max >> 1
+    samples = pixels.ravel("K")
+    for start in range(0, samples.size, BLOCK):
+        block = samples[start : start + BLOCK]
+        bits = block.view(whole)
+        if bits.max() > largest and (bits & without_sign).max() > largest:
+            yield block

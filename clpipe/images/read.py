@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 
+from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.base.types import Array, Doubles
@@ -22,19 +24,22 @@ from clpipe.images.layers import (
     picture_channels,
 )
 from clpipe.images.luminance_chroma import read_luminance_chroma
+from clpipe.images.openexr import read_channels
 from clpipe.images.openimageio import SubsampledError, error_text, open_image
 from clpipe.images.pixels import (
     HALF_MAX,
     USUAL_MAX_PIXELS,
     check_size,
+    clip_to_half,
     display_window,
-    without_non_finite,
+    make_finite,
 )
 from clpipe.reference.transfer import inverse_srgb_curve
 from clpipe.stage import Kind
 
 RENDER_SUFFIXES = (".exr", ".hdr", ".pfm", ".tif", ".tiff")
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
+LARGE_FILE = 4 << 20  # bytes; to start a thread takes as long as the SHA-256 of a small one
 READ_AT_ONCE = 8  # channels; those of a picture may lie hundreds apart
 
 
@@ -43,9 +48,10 @@ class SourceImage:
     """An image as it came from a file.
 
     ``pixels`` is (height, width, 3) linear RGB or a (height, width) mosaic, float16 or float32,
-    finite and C-contiguous. ``layer`` is the name of the layer that was read. ``attributes`` are
-    clpipe's own, which a kept image has. ``shot`` is what the file says of exposure_time (s),
-    focal_length and sensor_width (mm).
+    finite. It is C-contiguous, or planar: a transposed view of a C-contiguous (3, height, width)
+    array. ``layer`` is the name of the layer that was read. ``attributes`` are clpipe's own, which
+    a kept image has. ``shot`` is what the file says of exposure_time (s), focal_length and
+    sensor_width (mm).
     """
 
     pixels: Array
@@ -101,8 +107,8 @@ def read_image(
             raise
         decoded = _decode_luminance_chroma(path, max_pixels)
     warnings = []
-    pixels, count = without_non_finite(decoded.pixels)
-    if count:
+    pixels = decoded.pixels
+    if count := make_finite(pixels):
         warnings.append(f"{count} samples were NaN or infinite and were set to 0")
     if pixels.ndim == 2 and not mosaic:
         pixels = np.stack([pixels] * 3, axis=-1)
@@ -111,15 +117,10 @@ def read_image(
         matrix = _srgb_matrix(path, decoded)
         if matrix is not None:
             with np.errstate(all="ignore"):  # overflow is clipped below
-                pixels = np.nan_to_num(pixels.astype(np.float32) @ matrix.T)
+                pixels = np.nan_to_num(pixels.astype(np.float32) @ matrix.T, copy=False)
             warnings.append("its colours were converted to linear sRGB")
-    if (
-        not mosaic
-        and pixels.dtype == np.float32
-        and (beyond := int((np.abs(pixels) > HALF_MAX).sum()))
-    ):
-        # So bright that nothing is lost, and no stage's squares overflow.
-        pixels = np.clip(pixels, -HALF_MAX, HALF_MAX)
+    # Beyond half it is so bright that nothing is lost, and no stage's squares overflow.
+    if not mosaic and pixels.dtype == np.float32 and (beyond := clip_to_half(pixels)):
         warnings.append(f"{beyond} samples beyond {HALF_MAX:g}, the range of half, were clipped")
     return SourceImage(
         pixels, decoded.sha256, decoded.layer, tuple(warnings), decoded.attributes, decoded.shot
@@ -220,10 +221,13 @@ def _decode(path: Path, mosaic: bool, layer: str | None, max_pixels: int) -> _De
     """
     with open_image(path) as file:
         location = find_picture(path, file, mosaic, layer)
-        spec, pixels = file.spec(), _read_part(path, file, location, mosaic, max_pixels)
+        spec = file.spec()
+        pixels, digest = _with_digest(
+            path, lambda: _read_part(path, file, location, mosaic, max_pixels)
+        )
         return _Decoded(
             pixels,
-            _digest(path),
+            digest,
             location.layer,
             own_attributes(spec),
             shot_attributes(spec),
@@ -239,6 +243,19 @@ def _decode_luminance_chroma(path: Path, max_pixels: int) -> _Decoded:
     header = window.attributes
     chromaticities, neutral = header.get("chromaticities"), header.get("adoptedNeutral")
     return _Decoded(pixels, _digest(path), "", {}, {}, chromaticities, neutral)
+
+
+def _with_digest(path: Path, read: Callable[[], Array]) -> tuple[Array, str]:
+    """What is read of a file, and the file's SHA-256, computed meanwhile if it takes long.
+
+    Raises:
+        ImageError: one of them cannot be had.
+    """
+    if stamp_of(path)[0] < LARGE_FILE:
+        return read(), _digest(path)
+    with ThreadPoolExecutor(1) as beside:
+        digest = beside.submit(_digest, path)
+        return read(), digest.result()
 
 
 def _digest(path: Path) -> str:
@@ -291,13 +308,18 @@ def _read_part(
     check_size(path, spec.width, spec.height, max_pixels)
     # Whole numbers are read as they are: as float, OpenImageIO would scale them to 0..1.
     type_ = types.pop() if whole else oiio.HALF if types == {oiio.HALF} else oiio.FLOAT
-    pixels = _channels(path, file, location.part, channels, type_)
+    pixels = None
+    if file.format_name() == "openexr" and not whole:
+        names = [spec.channelnames[i] for i in channels]
+        pixels = read_channels(path, names, (spec.height, spec.width))
+    if pixels is None:
+        pixels = _channels(path, file, location.part, channels, type_)
     if whole:
         pixels = pixels.astype(np.float32)
     x, y = spec.x - spec.full_x, spec.y - spec.full_y
     if (x, y, spec.width, spec.height) != (0, 0, width, height):
         pixels = display_window(pixels, x, y, width, height)
-    return np.ascontiguousarray(pixels if len(channels) > 1 else pixels[..., 0])
+    return pixels if len(channels) > 1 else np.ascontiguousarray(pixels[..., 0])
 
 
 def _channels(path: Path, file: Any, part: int, channels: Sequence[int], type_: Any) -> Array:

@@ -24,6 +24,7 @@ from clpipe.images.pixels import HALF_MAX
 from clpipe.images.tags import Tags, exif
 
 JPEG_MAX_SIDE = 65500
+PNG_LEVEL = 4  # of noisy pictures, 6 takes twice as long and leaves 1.5 % less
 
 # Without it, OpenImageIO puts in the time of writing, and no two runs make the same bytes.
 NO_TIME = "1970:01:01 00:00:00"
@@ -53,6 +54,7 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> Stored:
     output = tags.output
     jpeg = path.suffix == ".jpg"
     spec.attribute("compression", f"jpeg:{output.jpeg_quality}" if jpeg else "zip")
+    spec.attribute("png:compressionLevel", PNG_LEVEL)
     if jpeg:
         spec.attribute("jpeg:subsampling", output.jpeg_subsampling)
         spec.attribute("jpeg:progressive", int(output.jpeg_progressive))

@@ -1,0 +1,125 @@
+"""Decoding with the OpenEXR package, which takes half of OpenImageIO's time, and half its memory.
+
+Only this module imports it. The package decodes every channel of every part, and says on standard
+output, not with an exception, that a part is damaged.
+"""
+
+import contextlib
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clpipe.base.types import Array
+from clpipe.images.exr_header import read_header
+
+WASTE = 2  # all channels take at most so many times the memory of those that are wanted
+
+
+def open_exr(path: Path, header_only: bool = False, separate: bool = True) -> Any:
+    """The file as an ``OpenEXR.File``, without the parts whose pixels are damaged.
+
+    Args:
+        path: the file.
+        header_only: read no pixels.
+        separate: a plane for each channel; else R, G and B of a layer are interleaved.
+
+    Raises:
+        Exception: the file is damaged; exceptions of the C++ library arrive as many types.
+    """
+    import OpenEXR
+
+    with _silence():
+        return OpenEXR.File(
+            str(path), separate_channels=separate, header_only=header_only, num_threads=1
+        )
+
+
+def read_channels(path: Path, names: Sequence[str], shape: tuple[int, int]) -> Array | None:
+    """Some channels of an OpenEXR file as stored: (rows, columns, channel), float16 or float32.
+
+    R, G and B without alpha are interleaved in memory; other channels are one plane behind the
+    other, of which the array is a view.
+
+    Args:
+        path: the file, whose header was judged by OpenImageIO.
+        names: of the channels, as they are in the file.
+        shape: rows and columns of its data window.
+
+    Returns:
+        None where OpenImageIO must read it: it is unusual, or damaged, or other channels would take
+        too much time and memory.
+    """
+    header = read_header(path, shape)
+    if header is None or not header.channels.keys() >= set(names):
+        return None
+    types = header.channels
+    dtype = types[names[0]]
+    size = sum(each.itemsize for each in types.values())
+    if {types[name] for name in names} != {dtype} or dtype.kind != "f":
+        return None
+    if size > WASTE * len(names) * dtype.itemsize:
+        return None
+    layer = names[0].removesuffix("R")
+    is_rgb = list(names) == [layer + colour for colour in "RGB"] and layer + "A" not in types
+    try:
+        channels = open_exr(path, separate=not is_rgb).parts[0].channels
+        if is_rgb:
+            pixels = channels[layer.removesuffix(".") or "RGB"].pixels
+        else:
+            pixels = _joined(channels, names, dtype)
+    except Exception:  # OpenImageIO says what is wrong
+        return None
+    return pixels if (pixels.shape, pixels.dtype) == ((*shape, len(names)), dtype) else None
+
+
+def _joined(channels: dict[str, Any], names: Sequence[str], dtype: np.dtype[Any]) -> Array:
+    """Planes as one array, (rows, columns, channel); each is dropped when it has been copied."""
+    for name in channels.keys() - set(names):
+        del channels[name]
+    shape = channels[names[0]].pixels.shape
+    if len(names) == 1:
+        return channels[names[0]].pixels[..., np.newaxis]
+    planes = np.empty((len(names), *shape), dtype)
+    for plane, name in zip(planes, names, strict=True):
+        plane[...] = channels.pop(name).pixels
+    return planes.transpose(1, 2, 0)
+
+
+class _Stdout:
+    """Standard output, without what threads write in :func:`_silence`."""
+
+    def __init__(self, stream: Any) -> None:
+        self.stream = stream
+
+    def write(self, text: str) -> int:
+        return len(text) if hasattr(_thread, "is_silent") else self.stream.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+
+_thread = threading.local()
+_lock = threading.Lock()
+_silent: list[threading.Thread] = []
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keep from standard output what this thread writes there; others go on writing."""
+    with _lock:
+        if not _silent:
+            sys.stdout = _Stdout(sys.stdout)
+        _silent.append(threading.current_thread())
+    _thread.is_silent = True
+    try:
+        yield
+    finally:
+        del _thread.is_silent
+        with _lock:
+            _silent.pop()
+            if not _silent and isinstance(sys.stdout, _Stdout):
+                sys.stdout = sys.stdout.stream
