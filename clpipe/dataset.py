@@ -6,8 +6,9 @@ import os
 import threading
 import warnings
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -184,7 +185,7 @@ class Dataset(ReadOnly):
         number = index + len(self) if index < 0 else index
         if number < 0 or not self._jobs or (self._epochs is not None and number >= len(self)):
             raise IndexError(f"found sample {index}; there are {len(self)}")
-        return self._develop(*self._place(number), self._read(*self._place(number)))
+        return self._begin(*self._place(number), self._read(*self._place(number)))()
 
     def __iter__(self) -> Iterator[Sample]:
         """Every sample in order; images are decoded and developed ahead, a few at a time.
@@ -194,7 +195,7 @@ class Dataset(ReadOnly):
             DeviceError: there is no usable device.
         """
         set_codec_threads(max(available_processors() // self._threads, 1))
-        ahead: deque[Future[Sample]] = deque()
+        ahead: deque[Future[Callable[[], Sample]]] = deque()
         decoders = ThreadPoolExecutor(self._threads, "decode")
         developer = ThreadPoolExecutor(1, "device")
         try:
@@ -202,14 +203,16 @@ class Dataset(ReadOnly):
             for number in itertools.count() if endless else range(len(self)):
                 place = self._place(number)
                 read = decoders.submit(self._read, *place)
-                ahead.append(developer.submit(self._develop_read, *place, read))
+                ahead.append(developer.submit(self._begin_read, *place, read))
                 if len(ahead) > self._threads + 1:
-                    yield ahead.popleft().result()
+                    yield ahead.popleft().result()()
             while ahead:
-                yield ahead.popleft().result()
+                yield ahead.popleft().result()()
         finally:
             decoders.shutdown(cancel_futures=True)
             developer.shutdown(cancel_futures=True)
+            if self._opened:
+                self._opened.drain()
 
     def _place(self, number: int) -> tuple[Job, int]:
         """The image and the epoch of a sample."""
@@ -232,19 +235,37 @@ class Dataset(ReadOnly):
             warnings.warn(f"{job.path}: {warning}", stacklevel=2)
         return loaded
 
-    def _develop_read(self, job: Job, epoch: int, read: Future[LoadedImage]) -> Sample:
-        return self._develop(job, epoch, read.result())
+    def _begin_read(self, job: Job, epoch: int, read: Future[LoadedImage]) -> Callable[[], Sample]:
+        return self._begin(job, epoch, read.result())
 
-    def _develop(self, job: Job, epoch: int, loaded: LoadedImage) -> Sample:
-        chain = loaded.chain
+    def _begin(self, job: Job, epoch: int, loaded: LoadedImage) -> Callable[[], Sample]:
+        """Begin to develop a sample; what is returned waits for it."""
+        key = noise_key(loaded.chain.settings, loaded.key, epoch)
+        with self._errors_of(job):
+            begun = self._developer().begin(loaded, key)
+
+        def finish() -> Sample:
+            with self._errors_of(job):
+                return {**begun(), **self._facts(job, epoch, loaded)}
+
+        return finish
+
+    @contextmanager
+    def _errors_of(self, job: Job) -> Iterator[None]:
+        """Errors within say which image they are of."""
         try:
-            arrays = self._developer().develop(loaded, noise_key(chain.settings, loaded.key, epoch))
+            yield
         except (ImageError, RequestError, MemoryError) as error:
             raise ImageError(self._loader.error_text(job, error)) from None
+
+    @staticmethod
+    def _facts(job: Job, epoch: int, loaded: LoadedImage) -> Sample:
+        """What a sample has beside its arrays."""
+        chain = loaded.chain
         adds_noise = chain.is_noisy or not isinstance(loaded.source, RawImage)
         noise = chain.noise if adds_noise else None
         a, b = (noise.a, noise.b) if noise else (0.0, 0.0)
-        return {**arrays, "key": job.key, "epoch": epoch, "iso": chain.iso, "a": a, "b": b}
+        return {"key": job.key, "epoch": epoch, "iso": chain.iso, "a": a, "b": b}
 
     def _developer(self) -> "_Developer":
         """The developer of this process.
@@ -263,7 +284,7 @@ _opening = threading.Lock()
 
 
 class _Developer:
-    """Develops images on a device, one at a time."""
+    """Develops images on a device, in the order in which they are begun."""
 
     def __init__(
         self, device: Device | None, keep: Sequence[str], encode: bool, truth: str | None
@@ -277,21 +298,40 @@ class _Developer:
         self._chain: Chain | None = None
         self._runners: dict[str, Runner] = {}
 
-    def develop(self, loaded: LoadedImage, noise_key: str) -> Sample:
-        """The arrays of a sample: "image", "truth" and kept images.
+    def begin(self, loaded: LoadedImage, noise_key: str) -> Callable[[], Sample]:
+        """Begin with the arrays of a sample, "image", "truth" and kept images.
+
+        Returns:
+            What waits for them and gives them; it raises the same errors.
 
         Raises:
             ImageError, RequestError, MemoryError: the image cannot be developed.
         """
-        arrays: Sample = {}
+        pixels = loaded.source.pixels
         with self._lock:
             self._prepare(loaded.chain)
-            for name, runner in self._runners.items():
-                result = runner.run(loaded.source.pixels, noise_key)
+            begun = {
+                name: runner.submit(pixels, noise_key, unchanged=True)
+                for name, runner in self._runners.items()
+            }
+
+        def finish() -> Sample:
+            arrays: Sample = {}
+            for name, wait in begun.items():
+                with self._lock:
+                    result = wait()
                 prefix = "" if name == "image" else f"{name}."
                 arrays |= {prefix + step: image for step, image in result.kept.items()}
                 arrays[name] = result.image
-        return arrays
+            return arrays
+
+        return finish
+
+    def drain(self) -> None:
+        """Wait for what was begun."""
+        with self._lock:
+            if self._device:
+                self._device.drain()
 
     def _prepare(self, chain: Chain) -> None:
         """Make runners for a chain, unless it is that of the image before."""

@@ -212,13 +212,13 @@ def test_several_devices_share_a_run(clpipe, renders, tmp_path):
 def test_devices_develop_at_the_same_time(renders, tmp_path, monkeypatch):
     renders(8)
     (tmp_path / "out").mkdir()
-    develop, both = ImageWorker.develop, threading.Barrier(2)
+    begin, both = ImageWorker.begin, threading.Barrier(2)
 
     def together(self, task, rendition, runner):
         both.wait(timeout=20)  # for the other device's image
-        return develop(self, task, rendition, runner)
+        return begin(self, task, rendition, runner)
 
-    monkeypatch.setattr(ImageWorker, "develop", together)
+    monkeypatch.setattr(ImageWorker, "begin", together)
     worker, jobs = worker_of(tmp_path)
     batch = Batch(worker, [None, None])
     outcomes = list(batch.run(jobs))
@@ -727,7 +727,7 @@ class Panic(BaseException):
 # Where an image is decoded, developed and encoded.
 INSIDE = {
     "decode": (ImageLoader, "read"),
-    "device": (Runner, "run"),
+    "device": (Runner, "submit"),
     "encode": (OutputWriter, "write"),
 }
 
@@ -800,7 +800,7 @@ def test_what_a_device_leaves_another_does(renders, tmp_path, monkeypatch, caplo
     worker, jobs = worker_of(tmp_path)
     broken = []
 
-    def develop(self, task, rendition, runner):
+    def begin(self, task, rendition, runner):
         if threading.current_thread().name == "device 0":
             broken.append(task.job)
             raise DeviceError("it is given up")
@@ -808,8 +808,8 @@ def test_what_a_device_leaves_another_does(renders, tmp_path, monkeypatch, caplo
             time.sleep(0.01)
         return right(self, task, rendition, runner)
 
-    right = ImageWorker.develop
-    monkeypatch.setattr(ImageWorker, "develop", develop)
+    right = ImageWorker.begin
+    monkeypatch.setattr(ImageWorker, "begin", begin)
     outcomes = list(Batch(worker, [None, None]).run(jobs))
     assert [o.status for o in outcomes] == ["done"] * 8
     assert len(broken) == 1

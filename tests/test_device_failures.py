@@ -1,6 +1,7 @@
 """Devices that fail: with the errors, and in the state, in which drivers leave them."""
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pyopencl as cl
@@ -64,6 +65,12 @@ class Fault:
 @pytest.fixture(autouse=True)
 def _contexts_of_their_own(monkeypatch):
     monkeypatch.setattr(programs, "_by_device", {})  # those of other tests stay shared
+
+
+@pytest.fixture(params=["CPU", "GPU"])
+def device(device, request):
+    """The device, also as if its memory were its own."""
+    return Device(replace(device.info, type=request.param))
 
 
 def runner_on(device):

@@ -1,15 +1,19 @@
 """Pixels on their way to a device and back: where they lie, or through staging buffers."""
 
+import itertools
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
+from clpipe.base.errors import DeviceFailedError
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
+from clpipe.engine import programs
 from clpipe.engine.check import example
-from clpipe.engine.device import Device
+from clpipe.engine.device import Device, Timing
 from clpipe.engine.runner import Runner
 from clpipe.stage import Kind
 
@@ -99,3 +103,94 @@ def test_both_ways_give_the_same(device, type_, memory):
         expected, found = one.run(image, "k"), two.run(image, "k")
         for name in ("final", "encoded", "kept", "estimates"):
             np.testing.assert_equal(getattr(found, name), getattr(expected, name))
+
+
+def queued(device: Device, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
+    """What is enqueued from now on, and in which queue."""
+    seen = []
+
+    def watched(name: str) -> None:
+        real = getattr(cl, name)
+
+        def call(queue: cl.CommandQueue, *arguments: Any, **options: Any) -> cl.Event:
+            seen.append((name, queue.int_ptr))
+            return real(queue, *arguments, **options)
+
+        monkeypatch.setattr(cl, name, call)
+
+    watched("enqueue_copy")
+    watched("enqueue_nd_range_kernel")
+    return seen
+
+
+@pytest.fixture
+def gpu_runner(runner: Runner) -> Runner:
+    """The same on a device with memory of its own, as far as clpipe knows."""
+    runner.device = Device(replace(runner.device.info, type="GPU"))
+    runner.warm_up()
+    return runner
+
+
+def test_transfers_of_an_image_run_beside_the_kernels_of_its_neighbours(gpu_runner, monkeypatch):
+    expected = [gpu_runner.run(image, "k").encoded for image in IMAGES]
+    device, gate = gpu_runner.device, cl.UserEvent(gpu_runner.device._flow.context)
+    seen = queued(device, monkeypatch)
+    # Kernels are held back: the first one's, and so all that follow.
+    cl._enqueue_marker_with_wait_list(device._flow.queue, [gate])
+    timings: list[list[Timing]] = [[], []]
+    begun = [gpu_runner.submit(IMAGES[i], "k", timings[i]) for i in range(2)]
+    wanted = ["enqueue_copy", "enqueue_nd_range_kernel", "enqueue_copy"] * 2
+    assert [name for name, _ in seen] == wanted  # and the host did not wait
+    up, run, down = (queue for _, queue in seen[:3])
+    assert len({up, run, down}) == 3
+    assert [queue for _, queue in seen[3:]] == [up, run, down]
+    gate.set_status(cl.command_execution_status.COMPLETE)
+    results = [wait().encoded for wait in begun]
+    assert all(np.array_equal(a, b) for a, b in zip(results, expected, strict=False))
+    (sent, _, _), (sent_next, launched_next, _) = timings
+    assert sent.start <= sent_next.start <= launched_next.start
+    # More than can be on the way: the oldest is waited for.
+    waits = [gpu_runner.submit(image, "k") for image in IMAGES]
+    assert [np.array_equal(wait().encoded, e) for wait, e in zip(waits, expected, strict=True)] == [
+        True
+    ] * 5
+
+
+def test_a_source_that_is_there_is_not_sent_again(gpu_runner):
+    image = IMAGES[0].copy()
+
+    def sent(unchanged: bool) -> tuple[int, np.ndarray]:
+        timings: list[Timing] = []
+        result = gpu_runner.submit(image, "k", timings, unchanged=unchanged)()
+        return [t.name for t in timings].count("upload"), result.encoded
+
+    (first, pixels), (again, same) = sent(True), sent(True)
+    assert (first, again) == (1, 0) and np.array_equal(pixels, same)
+    image[:] = IMAGES[1]
+    changed, other = sent(False)
+    assert changed == 1 and np.array_equal(other, gpu_runner.run(IMAGES[1], "k").encoded)
+    image = image.copy()
+    assert sent(True)[0] == 1  # another array
+
+
+@pytest.mark.parametrize("fails", [0, 1])
+def test_an_error_of_one_image_leaves_the_others_whole(gpu_runner, monkeypatch, fails):
+    monkeypatch.setattr(programs, "_by_device", {})
+    expected = [gpu_runner.run(image, "k").encoded for image in IMAGES]
+    launch, numbers = cl.enqueue_nd_range_kernel, itertools.count()
+    failing = {fails, 2}  # and when that image is tried again
+
+    def launched(*arguments: Any, **options: Any) -> cl.Event:
+        if next(numbers) in failing:
+            raise cl.RuntimeError("clEnqueueNDRangeKernel failed: INVALID_OPERATION")
+        return launch(*arguments, **options)
+
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
+    begun = [gpu_runner.submit(image, "k") for image in IMAGES[:2]]
+    for number, wait in enumerate(begun):
+        if number == fails:
+            with pytest.raises(DeviceFailedError, match="INVALID_OPERATION"):
+                wait()
+        else:
+            assert np.array_equal(wait().encoded, expected[number])
+    assert np.array_equal(gpu_runner.run(IMAGES[2], "k").encoded, expected[2])

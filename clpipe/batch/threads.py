@@ -11,7 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -32,7 +32,26 @@ Decoded = tuple[Task, deque[Rendition]]
 # A rendition between a device and its files.
 Developed = tuple[Task, Rendition, Result, Device | None]
 
+
+@dataclass(frozen=True)
+class Begun:
+    """A rendition that a device works on, and what waits for its result."""
+
+    decoded: Decoded
+    rendition: Rendition
+    finish: Callable[[], Result | None]
+
+
 log = logging.getLogger(__name__)
+
+
+def depth_of(device: Device | None) -> int:
+    """How many images a device works on at a time; None is NumPy."""
+    return device.depth if device else 1
+
+
+def no_result() -> None:
+    """The result of what is not developed."""
 
 
 def failure_text(job: Job, error: BaseException) -> str:
@@ -69,9 +88,10 @@ class Batch:
     ) -> None:
         self.devices = list(devices)
         self.threads = threads or available_processors()
-        self.in_flight = self.threads + len(self.devices) + 1
+        results = self.threads + sum(map(depth_of, self.devices))  # at a time
+        self.in_flight = results + 1
         self._worker = worker
-        worker.reserve(self.threads + len(self.devices))
+        worker.reserve(results)
         self._waiting: deque[Job] = deque()
         self._admitted = 0
         self._developing = len(self.devices)
@@ -82,7 +102,7 @@ class Batch:
         self._lock = threading.Lock()
         self._places = threading.Semaphore(self.in_flight)
         self._room = Room(usual_room() if room is None else room)
-        self._results = threading.Semaphore(self.threads + len(self.devices))
+        self._results = threading.Semaphore(results)
         self._decoded: queue.SimpleQueue[Decoded | None] = queue.SimpleQueue()
         self._developed: queue.SimpleQueue[Developed | None] = queue.SimpleQueue()
         # None: a thread that decodes has ended, or one of any kind has failed.
@@ -220,10 +240,11 @@ class Batch:
         if self._closing:
             return
         decoded: Decoded | None = None
+        begun: deque[Begun] = deque()
         try:
             runners = self._worker.runners(device)
-            while decoded := self._decoded.get():
-                self._develop(*decoded, runners, device)
+            while decoded := self._next_decoded(begun, device):
+                self._develop(decoded, begun, runners, device)
                 decoded = None  # or its memory would be held until there is another one
         except DeviceError as error:
             with self._lock:
@@ -232,36 +253,75 @@ class Batch:
             if is_last:
                 raise
             log.warning("%s; the other devices go on", error)
-            if decoded:
-                self._decoded.put(decoded)
+            left = [each.decoded for each in begun] + ([decoded] if decoded else [])
+            for each in {id(each): each for each in left}.values():
+                self._decoded.put(each)
+            for _ in begun:
+                self._results.release()
+        finally:
+            if device:
+                device.drain()
+
+    def _next_decoded(self, begun: deque[Begun], device: Device | None) -> Decoded | None:
+        """The next task, None at the end; what is begun does not wait for it."""
+        while begun:
+            try:
+                decoded = self._decoded.get_nowait()
+            except queue.Empty:
+                self._finish(begun, device)
+                continue
+            while begun and not decoded:
+                self._finish(begun, device)
+            return decoded
+        return self._decoded.get()
 
     def _develop(
-        self, task: Task, left: deque[Rendition], runners: Runners, device: Device | None
+        self, decoded: Decoded, begun: deque[Begun], runners: Runners, device: Device | None
     ) -> None:
-        """Develop what is left of a task.
+        """Begin what is left of a task, and finish what a device cannot have beside that.
 
         Raises:
-            DeviceError: the device cannot be used any more; what it did not develop is left.
+            DeviceError: the device cannot be used any more; what it did not finish is left.
         """
-        while left and not self._broken:
-            self._results.acquire()
+        task, left = decoded
+        for rendition in tuple(left):
+            while not self._results.acquire(blocking=not begun):
+                self._finish(begun, device)
             if self._broken:
                 return
-            result = None
+            finish: Callable[[], Result | None] = no_result
             try:
                 if not task.error:
-                    result = self._worker.develop(task, left[0], runners.of(left[0]))
+                    finish = self._worker.begin(task, rendition, runners.of(rendition))
             except DeviceError:
                 self._results.release()
                 raise
             except BaseException as error:
                 task.error = failure_text(task.job, error)
-            rendition = left.popleft()
-            if result:
-                self._developed.put((task, rendition, result, device))
-            else:
-                self._count_written(task)
-            del result
+            begun.append(Begun(decoded, rendition, finish))
+            if len(begun) >= depth_of(device):
+                self._finish(begun, device)
+
+    def _finish(self, begun: deque[Begun], device: Device | None) -> None:
+        """Wait for the oldest rendition that was begun, and hand it on.
+
+        Raises:
+            DeviceError: the device cannot be used any more; the rendition stays begun.
+        """
+        task, left = begun[0].decoded
+        result = None
+        try:
+            result = begun[0].finish()
+        except DeviceError:
+            raise
+        except BaseException as error:
+            task.error = failure_text(task.job, error)
+        rendition = begun.popleft().rendition
+        left.popleft()
+        if result:
+            self._developed.put((task, rendition, result, device))
+        else:
+            self._count_written(task)
 
     def _encode_all(self) -> None:
         while developed := self._developed.get():

@@ -6,8 +6,8 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any
+from functools import cached_property, partial
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,8 @@ from clpipe.outputs.renditions import Rendition
 from clpipe.outputs.sidecar import SIDECAR, sidecar, write_sidecar
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
+
+T = TypeVar("T")
 
 
 @dataclass
@@ -55,8 +57,12 @@ class Task:
         try:
             yield
         finally:
-            name = threading.current_thread().name
-            self.spans.append(Span(step, name, start, time.perf_counter() - start))
+            self.note(step, start)
+
+    def note(self, step: str, start: float) -> None:
+        """Note that this thread has done a step that was begun at ``start``."""
+        name = threading.current_thread().name
+        self.spans.append(Span(step, name, start, time.perf_counter() - start))
 
     def outcome(self) -> Outcome:
         """What became of the job."""
@@ -200,25 +206,56 @@ class ImageWorker:
 
     def develop(self, task: Task, rendition: Rendition, runner: Runner) -> Result | None:
         """Develop one rendition; None where it fails."""
+        return self.begin(task, rendition, runner)()
+
+    def begin(
+        self, task: Task, rendition: Rendition, runner: Runner
+    ) -> Callable[[], Result | None]:
+        """Begin to develop one rendition.
+
+        Returns:
+            What waits for the result and gives it; None where it fails. It raises DeviceError, too.
+
+        Raises:
+            DeviceError: the device cannot be used any more.
+        """
         assert task.source
+        start, pixels = time.perf_counter(), task.source.pixels
         timings: list[Timing] | None = [] if self._trace and runner.device else None
-        with task.timed("device"):
-            try:
-                pixels = task.source.pixels
-                width, height = runner.chain.size(*pixels.shape[1::-1])
-                shape = (height, width, *pixels.shape[2:])
-                into = self._spare.take(shape) if runner.encode and runner.device else None
-                result = runner.run(pixels, rendition.noise_key, timings, into=into)
-            except (ImageError, RequestError, MemoryError) as error:
-                task.error = task.loader.error_text(task.job, error)
-                return None
-        name = threading.current_thread().name
-        task.spans += [Span(t.name, name, t.start, t.seconds) for t in timings or []]
-        if rendition is task.renditions[-1] and DNG not in self.writer.formats:
-            # Of the pixels only their shape is still needed; their memory is not.
-            shape = task.source.pixels.shape
-            task.source = replace(task.source, pixels=np.broadcast_to(np.float16(0), shape))
-        return result
+        wait = self._tried(task, partial(self._submit, pixels, rendition, runner, timings))
+
+        def finish() -> Result | None:
+            result = self._tried(task, wait) if wait else None
+            task.note("device", start)
+            name = threading.current_thread().name
+            task.spans += [Span(t.name, name, t.start, t.seconds) for t in timings or []]
+            if result and rendition is task.renditions[-1] and DNG not in self.writer.formats:
+                # Of the pixels only their shape is still needed; their memory is not.
+                assert task.source
+                empty = np.broadcast_to(np.float16(0), task.source.pixels.shape)
+                task.source = replace(task.source, pixels=empty)
+            return result
+
+        return finish
+
+    def _submit(
+        self, pixels: Array, rendition: Rendition, runner: Runner, timings: list[Timing] | None
+    ) -> Callable[[], Result]:
+        """Have a runner begin with an image, whose pixels nobody changes."""
+        width, height = runner.chain.size(*pixels.shape[1::-1])
+        shape = (height, width, *pixels.shape[2:])
+        into = self._spare.take(shape) if runner.encode and runner.device else None
+        key = rendition.noise_key
+        return runner.submit(pixels, key, timings, into=into, unchanged=True)
+
+    @staticmethod
+    def _tried(task: Task, work: Callable[[], T]) -> T | None:
+        """What some work gives; None where it fails, which is noted as the task's error."""
+        try:
+            return work()
+        except (ImageError, RequestError, MemoryError) as error:
+            task.error = task.loader.error_text(task.job, error)
+            return None
 
     def encode(
         self, task: Task, rendition: Rendition, result: Result, device: Device | None

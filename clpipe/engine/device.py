@@ -147,7 +147,8 @@ class Device:
     ) -> Callable[[], HostImages]:
         """Begin to put one image through a plan, in tiles if it does not fit into the memory.
 
-        Up to :attr:`depth` images may be begun before the results of the first are taken.
+        So many images are on the way at a time as :attr:`depth` says; before one more is begun, the
+        oldest is waited for.
 
         Args:
             plan: the plan.
@@ -180,17 +181,9 @@ class Device:
         begun = self._begin(work, self.memory)
         return partial(self._result, work, begun, self._generation, timings)
 
-    def run(
-        self,
-        plan: Plan,
-        source: Array,
-        bind: Bind,
-        timings: list[Timing] | None = None,
-        download: bool = True,
-        into: Array | None = None,
-    ) -> HostImages:
-        """Put one image through a plan, and wait for it: see :meth:`submit`."""
-        return self.submit(plan, source, bind, timings, download, into)()
+    def drain(self) -> None:
+        """Wait for what was begun, so that it uses no memory of the host any more."""
+        self._flow.drain()
 
     def _tiling(self, work: Work, memory: int) -> Tiling:
         height, width = work.source.shape[:2]

@@ -145,6 +145,11 @@ class Flow:
         if passage.error:
             raise passage.error
 
+    def drain(self) -> None:
+        """Wait until nothing is on the way."""
+        while self._parts:
+            self._land()
+
     def abandon(self) -> None:
         """After a failure: wait for all that is on the way, and give all memory back."""
         self._parts.clear()

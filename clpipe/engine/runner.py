@@ -1,7 +1,8 @@
 """One image through a chain, on a device or in NumPy."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.registry import user_code_errors
+from clpipe.engine.buffers import HostImages
 from clpipe.engine.device import Device, Timing
 from clpipe.engine.ops import chain_ops
 from clpipe.engine.plan import Finalize, Plan, make_plan
@@ -153,7 +155,7 @@ class Runner:
             shape = (8, 8, 3)[: 2 if len(self.chain.source.channels) == 1 else 3]
             tiny = np.zeros(shape, np.float16 if plan.half else np.float32)
             with announced(self.device.info):
-                self._run_plan(plan, tiny, "")
+                self._submit_plan(plan, tiny, "")()
 
     def run(
         self,
@@ -163,7 +165,19 @@ class Runner:
         download: bool = True,
         into: Array | None = None,
     ) -> Result:
-        """Put one image through.
+        """Put one image through, and wait for it; see :meth:`submit`."""
+        return self.submit(image, noise_key, timings, download, into)()
+
+    def submit(
+        self,
+        image: Array,
+        noise_key: str,
+        timings: list[Timing] | None = None,
+        download: bool = True,
+        into: Array | None = None,
+        unchanged: bool = False,
+    ) -> Callable[[], Result]:
+        """Begin to put one image through; see :meth:`clpipe.engine.device.Device.submit`.
 
         Args:
             image: (height, width, 3) linear RGB, or (height, width) for a chain that starts on a
@@ -173,6 +187,11 @@ class Runner:
             download: False leaves the results on the device, for measuring.
             into: an array to use for the eight-bit pixels (devices only), of their shape; a used
                 one saves the time that new memory takes.
+            unchanged: the image, if it is the same array as that before, has the same pixels still.
+
+        Returns:
+            What waits for the result and gives it; it raises ImageError, DeviceFailedError and
+            DeviceError, too.
 
         Raises:
             ImageError: an image of the wrong shape, or one that does not fit the device.
@@ -187,9 +206,9 @@ class Runner:
                 f"{self.chain.source.label} with {channels} channel(s)"
             )
         if not (self.encode or self.final or self.keep):
-            return Result(None, None, {}, {})
+            return lambda: Result(None, None, {}, {})
         if not self.device:
-            return self._run_numpy(np.asarray(image, np.float32), noise_key)
+            return partial(self._run_numpy, np.asarray(image, np.float32), noise_key)
         smallest = min(self.chain.size(*image.shape[1::-1]))
         plan = self.plan(image.dtype == np.float16, smallest > 1, is_planar(image))
         try:
@@ -198,18 +217,12 @@ class Runner:
             raise
         except ImageError:
             pass  # the tiny image is too large; the one below says it of this image
-        return self._run_plan(plan, image, noise_key, timings, download, into)
+        return self._submit_plan(plan, image, noise_key, timings, download, into, unchanged)
 
-    def _run_plan(
-        self,
-        plan: Plan,
-        image: Array,
-        noise_key: str,
-        timings: list[Timing] | None = None,
-        download: bool = True,
-        into: Array | None = None,
-    ) -> Result:
-        """Put an image through a plan on the device; arguments as for :meth:`run`."""
+    def _submit_plan(
+        self, plan: Plan, image: Array, noise_key: str, *options: Any
+    ) -> Callable[[], Result]:
+        """Begin to put an image through a plan; ``options`` are those of :meth:`submit`."""
         assert self.device
         keys: dict[str, dict[NoiseScope, Stream]] = {}
         sizes = plan.sizes(*image.shape[1::-1])
@@ -232,7 +245,12 @@ class Runner:
             stream = of[NoiseScope(parameter.item[:-1])]
             return np.uint32(stream.key1 if parameter.item.endswith("1") else stream.key0)
 
-        output = self.device.run(plan, image, bind, timings, download, into)
+        results = self.device.submit(plan, image, bind, *options)
+        return lambda: self._result(plan, results())
+
+    @staticmethod
+    def _result(plan: Plan, output: HostImages) -> Result:
+        """What the device made of an image, by steps."""
         names = {x.op.step: x.op.pass_.estimates for x in plan.launches if isinstance(x, Finalize)}
         return Result(
             final=output.images.get(plan.final.number) if plan.final else None,
