@@ -1,6 +1,5 @@
 """Reading images: renders and kept images as linear light, mosaics, finished pictures."""
 
-import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -128,11 +127,10 @@ def read_image(
 
 
 def decode_first_part(path: Path) -> Array:
-    """The samples of a file's first part as stored, (height, width, channel); for benchmarks."""
-    file = oiio.ImageInput.open(str(path))
-    assert file
-    with contextlib.closing(file):
-        return np.asarray(file.read_image(file.spec().format))
+    """The samples of a render as :func:`read_image` decodes them, no more; for benchmarks."""
+    with open_image(path) as file:
+        location = find_picture(path, file, False, None)
+        return _read_part(path, file, location, False, USUAL_MAX_PIXELS)
 
 
 TRANSFERS: dict[str, Callable[[Doubles], Doubles]] = {
