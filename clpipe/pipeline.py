@@ -30,7 +30,7 @@ class Pipeline(ReadOnly):
     Args:
         config: a built-in configuration ("default", "paper") or a TOML file.
         device: an index or a part of a name as ``clpipe devices`` lists them, or "numpy"; None
-            takes the first GPU, else the first CPU.
+            takes the first GPU, else the CPU.
         keep: steps whose image is returned beside the last one, or "all".
         start_at: the first step to run; images are then of the kind that it reads.
         until: the last step to run.

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import click
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from PIL import Image
 
 from clpipe.commands.main import COMMANDS, main
+from clpipe.engine import discovery
 from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import ROOT, STILL_LIFE, written
 
@@ -323,14 +325,25 @@ def test_check(clpipe):
     record = json.loads(clpipe("check", "mosaic", "quantize", "--small", "--json").stdout)
     assert record["failed"] == 0
     assert [c["stage"] for c in record["checks"]] == ["mosaic", "quantize"]
+    assert record["device"]["driver"] and record["versions"]["pyopencl"] and record["clpipe"]
     assert "unknown stage 'mosiac'" in clpipe("check", "mosiac", status=2).stderr
     assert "numpy is the reference" in clpipe("check", "--device", "numpy", status=2).stderr
+
+
+def test_a_device_that_is_no_cpu_is_to_be_reported(clpipe, monkeypatch):
+    command = ("check", "mosaic", "--small")
+    assert "--json" not in clpipe(*command).stdout
+    describe = discovery.describe
+    monkeypatch.setattr(discovery, "describe", lambda *a: replace(describe(*a), type="GPU"))
+    assert "this GPU, send its developers what the same command prints with --json" in " ".join(
+        clpipe(*command).stdout.split()
+    )
 
 
 def test_bench(clpipe):
     record = json.loads(clpipe("bench", "--size", "640x480", "--repeat", 2, "--json").stdout)
     assert record["mp_per_s"] > 0
-    assert len(record["launches"]) == 6
+    assert len(record["launches"]) == 6 and record["device"]["lanes"]
     assert all(launch["mp_per_s"] > 0 for launch in record["launches"])
     assert "expected WIDTHxHEIGHT" in clpipe("bench", "--size", "big", status=2).stderr
 
@@ -341,7 +354,7 @@ def test_bench_of_methods(clpipe):
     text = clpipe("bench", "--methods", "denoise", *options, *strength).stdout
     assert "biweight luma_strength=0.5" in text and "bilateral luma_strength=0.5" in text
     white = clpipe("bench", "--methods", "white_balance", "--size", "320x200", "--json").stdout
-    records = json.loads(white)
+    records = json.loads(white)["methods"]
     launches = {record["method"]: record["launches"] for record in records}
     assert launches["as_shot"] == 1
     assert launches["gray_world"] > 2
@@ -349,7 +362,7 @@ def test_bench_of_methods(clpipe):
     # Sizes that test_kernels.py compiles too.
     sizes = ("--set", "denoise.luma_size=5", "--set", "denoise.chroma_size=3")
     one = ("--set", "denoise.method=mean", *sizes, "--json")
-    records = json.loads(clpipe("bench", "--methods", "denoise", *options, *one).stdout)
+    records = json.loads(clpipe("bench", "--methods", "denoise", *options, *one).stdout)["methods"]
     assert [record["method"] for record in records] == ["mean luma_size=5 chroma_size=3"]
     assert "did you mean 'denoise'" in clpipe("bench", "--methods", "denoize", status=2).stderr
 

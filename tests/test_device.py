@@ -17,7 +17,7 @@ from clpipe.chain.settings import settings_from
 from clpipe.commands.devices import device_rows
 from clpipe.engine import hardware
 from clpipe.engine.device import Device, open_devices
-from clpipe.engine.discovery import choose, choose_all, find_devices
+from clpipe.engine.discovery import choose, choose_all, find_devices, lanes_for
 from clpipe.engine.flow import Flow
 from clpipe.engine.hardware import Hardware, hardware_of
 from clpipe.engine.runner import Runner
@@ -38,9 +38,28 @@ def devices(device):
     ]
 
 
-def test_a_gpu_comes_first_then_a_cpu(devices):
-    assert choose(None, devices).name == "fast"
-    assert choose(None, devices[:3]).name == "slow"
+def test_a_gpu_comes_first_then_intels_runtime_then_pocl(devices):
+    pocl = devices[0]
+    mesa = replace(pocl, index=4, name="llvmpipe", platform="rusticl")
+    intel = replace(pocl, index=5, name="Xeon", platform="Intel(R) OpenCL")
+    assert choose(None, [mesa, *devices, intel]).name == "fast"
+    assert choose(None, [mesa, *devices[:3], intel]) is choose("cpu", [mesa, pocl, intel]) is intel
+    assert choose(None, [mesa, *devices[:3]]).name == "slow"
+    assert choose(None, [devices[1], mesa]) is mesa
+
+
+@pytest.mark.parametrize(
+    ("type_", "platform", "width", "lanes"),
+    [
+        ("GPU", "NVIDIA CUDA", 1, 1),
+        ("CPU", "Portable Computing Language", 16, 8),
+        ("CPU", "Intel(R) OpenCL", 16, 16),
+        ("CPU", "Intel(R) OpenCL", 8, 8),
+        ("CPU", "rusticl", 1, 1),
+    ],
+)
+def test_lanes(type_, platform, width, lanes):
+    assert lanes_for(type_, platform, SimpleNamespace(native_vector_width_float=width)) == lanes
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from clpipe.chain.methods import stage_named
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import chain_options
 from clpipe.commands.completion import methods_of
+from clpipe.commands.machine import ask_for_report, machine_record
 from clpipe.commands.options import Command, device_option, json_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.bench import bench as run_bench
@@ -88,23 +89,25 @@ def bench(
         stage = stage_named("--methods", methods)
         speeds = bench_methods(device, stage, chain.settings, int(width), int(height), repeat)
         if as_json:
-            show_json([asdict(speed) for speed in speeds])
+            show_json({**machine_record(device), "methods": [asdict(speed) for speed in speeds]})
             return
         click.echo(f"{device.info.label}: {stage.name}, {width}x{height}, planes to planes")
         rows = [(s.method, f"{s.launches}", f"{s.ms:.1f}", f"{s.mp_per_s:.0f}") for s in speeds]
         show(("method", "launches", "ms", "MP/s"), rows, left=1)
+        ask_for_report(device)
         return
     if batch:
         batches = [bench_batch(device, request, load) for load in loads()]
         if as_json:
-            show_json({"device": device.info.label, "batches": [b.record() for b in batches]})
+            show_json({**machine_record(device), "batches": [b.record() for b in batches]})
             return
         click.echo(f"{device.info.label}: half EXR to JPEG, {available_processors()} CPUs")
         show(BATCH_HEADINGS, map(batch_row, batches), left=1)
+        ask_for_report(device)
         return
     report = run_bench(device, chain, int(width), int(height), repeat)
     if as_json:
-        show_json(report.record())
+        show_json(report.record() | machine_record(device))
         return
     click.echo(
         f"{report.device}: {report.width}x{report.height}, copy {report.copy_gb_per_s:.1f} GB/s, "
@@ -124,6 +127,7 @@ def bench(
         ),
         left=1,
     )
+    ask_for_report(device)
 
 
 def batch_row(speed: BatchSpeed) -> tuple[str, ...]:

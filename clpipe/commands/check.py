@@ -9,6 +9,7 @@ from clpipe.base.errors import RequestError
 from clpipe.chain.methods import stage_named
 from clpipe.chain.registry import load_stage_file
 from clpipe.commands.completion import steps
+from clpipe.commands.machine import ask_for_report, machine_record
 from clpipe.commands.options import Command, device_option, json_option, stage_file_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.check import SIZES, Check, check_all
@@ -42,12 +43,13 @@ def check(
     failed = sum(not c.passed for c in checks)
     if as_json:
         records = [c.record() for c in checks]
-        show_json({"device": device.info.label, "failed": failed, "checks": records})
+        show_json({**machine_record(device), "failed": failed, "checks": records})
     else:
         click.echo(f"{device.info.label}, driver {device.info.driver}, {device.info.lanes} lanes")
         headings = ("stage", "method", "cases", "samples", "differing", "largest", "allowed", "")
         show(headings, map(check_row, checks))
         click.echo(f"{len(checks) - failed} passed, {failed} failed")
+        ask_for_report(device)
     sys.exit(1 if failed else 0)
 
 

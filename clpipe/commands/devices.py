@@ -39,7 +39,7 @@ def device_rows(devices: Sequence[DeviceInfo]) -> list[dict[str, Any]]:
         elif used and used.type == "GPU" and device.type != "GPU":
             status = f"passed over: there is a GPU; --device {device.index}"
         else:
-            status = f"passed over: an earlier one serves; --device {device.index}"
+            status = f"passed over: another one comes first; --device {device.index}"
         rows.append(
             {
                 "index": device.index,

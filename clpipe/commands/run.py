@@ -105,7 +105,7 @@ if TYPE_CHECKING:
     multiple=True,
     metavar="SEL",
     help="An index or a part of a name from 'clpipe devices', or numpy; may be repeated. [default: "
-    "the first GPU and all of its kind, else the first CPU]",
+    "the first GPU and all of its kind, else the CPU]",
 )
 @click.option(
     "--memory",

@@ -11,6 +11,7 @@ from clpipe.base.memory import available_memory
 from clpipe.base.text import one_of
 from clpipe.engine.cache_folder import pocl_problem, prepare_environment
 from clpipe.engine.hardware import Hardware, hardware_of
+from clpipe.engine.vendors import intel_visible
 
 _process: int | None = None  # the process id that first used OpenCL, here or before a fork
 
@@ -66,7 +67,8 @@ def find_devices() -> list[DeviceInfo]:
     except (ImportError, OSError) as error:
         raise DeviceError(f"pyopencl cannot be loaded: {error}") from None
     try:
-        platforms = cl.get_platforms()
+        with intel_visible():
+            platforms = cl.get_platforms()
     except cl.Error as error:
         if "PLATFORM_NOT_FOUND" in str(error):
             return []
@@ -166,7 +168,7 @@ def problem_with(type_: str, platform: str, device: Any) -> str:
 
 
 def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
-    """The device to use: the one that a selector names, else the first usable GPU, else CPU.
+    """The device to use: the one that a selector names, else the first usable one by :func:`rank`.
 
     Args:
         selector: an index from ``clpipe devices``, or a part of a device's or platform's name.
@@ -194,12 +196,21 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
         usable = [d for d in matching if not d.problem]
         if not usable:
             raise DeviceError(f"device {matching[0].label}: {matching[0].problem}")
-        return usable[0]
-    usable = [d for kind in ("GPU", "CPU") for d in devices if d.type == kind and not d.problem]
+        return min(usable, key=rank)
+    usable = [d for d in devices if d.type in ("GPU", "CPU") and not d.problem]
     if not usable:
         reasons = "; ".join(f"{d.label}: {d.problem or 'an emulator'}" for d in devices)
         raise DeviceError(f"no usable OpenCL device ({reasons}); or use --device numpy")
-    return usable[0]
+    return min(usable, key=rank)
+
+
+def rank(device: DeviceInfo) -> int:
+    """A device's place among those to use by default: GPUs, CPUs by how fast their platform is."""
+    if device.type == "GPU":
+        return 0
+    if "Intel" in device.platform:
+        return 1
+    return 2 if is_pocl(device.platform) else 3
 
 
 def choose_all(selectors: Sequence[str], devices: list[DeviceInfo]) -> list[DeviceInfo]:
