@@ -1,6 +1,5 @@
 """Reading images: renders and kept images as linear light, mosaics, finished pictures."""
 
-import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -13,6 +12,7 @@ import OpenImageIO as oiio
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
+from clpipe.base.steps import Step
 from clpipe.base.types import Array, Doubles
 from clpipe.images.attributes import own_attributes, shot_attributes
 from clpipe.images.colour import CIE_XYZ, SRGB, to_linear_srgb
@@ -127,14 +127,6 @@ def read_image(
     )
 
 
-def decode_first_part(path: Path) -> Array:
-    """The samples of a file's first part as stored, (height, width, channel); for benchmarks."""
-    file = oiio.ImageInput.open(str(path))
-    assert file
-    with contextlib.closing(file):
-        return np.asarray(file.read_image(file.spec().format))
-
-
 TRANSFERS: dict[str, Callable[[Doubles], Doubles]] = {
     "linear": lambda x: x,
     "srgb": inverse_srgb_curve,
@@ -213,6 +205,7 @@ def holds_mosaic(path: Path) -> bool:
     return not any(map(picture_channels, parts)) and any(map(mosaic_channel, parts))
 
 
+@Step("decode")
 def _decode(path: Path, mosaic: bool, layer: str | None, max_pixels: int) -> _Decoded:
     """The picture of a file that OpenImageIO reads; arguments and errors as :func:`read_image`.
 
@@ -236,6 +229,7 @@ def _decode(path: Path, mosaic: bool, layer: str | None, max_pixels: int) -> _De
         )
 
 
+@Step("decode")
 def _decode_luminance_chroma(path: Path, max_pixels: int) -> _Decoded:
     """The picture of a file whose chroma is subsampled."""
     window = read_luminance_chroma(path, max_pixels)
