@@ -1,6 +1,7 @@
 """The benchmark of whole batches."""
 
 import json
+import time
 
 import pytest
 
@@ -15,21 +16,29 @@ def short(monkeypatch):
     monkeypatch.setattr(bench_command, "loads", lambda: (Load(6, 32, 24), Load(5, 40, 17)))
 
 
-def test_a_batch_is_timed_against_the_same_work_done_serially(clpipe, short):
+def test_cpu_time_by_step_is_that_of_the_process(clpipe, short, monkeypatch):
+    taken = []
+    real = bench_batch.StepTimes.__exit__
+
+    def leave(times, *error):
+        real(times, *error)
+        taken.append(time.process_time() - times._process)
+
+    monkeypatch.setattr(bench_batch.StepTimes, "__exit__", leave)
     result = json.loads(clpipe("bench", "--batch", "--json").stdout)
     assert [b["images"] for b in result["batches"]] == [6, 5]
-    for speed in result["batches"]:
-        assert set(speed["cpu_ms"]) == {"decode", "device", "encode"}
-        assert set(speed["alone_ms"]) == {"decoder", "kernels", "encoder"}
-        assert all(ms > 0 for ms in (*speed["cpu_ms"].values(), *speed["alone_ms"].values()))
-        assert speed["share_of_limit"] == pytest.approx(speed["limit_s"] / speed["batch_s"])
-        beyond = speed["serial_s"] / speed["images"] * 1e3 - sum(speed["alone_ms"].values())
-        assert speed["overhead_ms"] == pytest.approx(beyond)
+    for speed, seconds in zip(result["batches"], taken, strict=True):
+        assert tuple(speed["cpu_ms"]) == bench_batch.CPU_STEPS
+        steps = set(bench_batch.CPU_STEPS) - {"convert", "upload", "download"}  # nearly nothing
+        assert all(speed["cpu_ms"][step] > 0 for step in steps)
+        total = sum(speed["cpu_ms"].values()) * speed["images"] / 1e3
+        assert total == pytest.approx(seconds, rel=0.05)
+        assert speed["busy"] == pytest.approx(total / speed["seconds"] / speed["processors"])
 
 
 def test_the_table(clpipe, short):
     text = clpipe("bench", "--batch").stdout
-    assert "6 of 32x24" in text and "5 of 40x17" in text and "of limit" in text
+    assert "6 of 32x24" in text and "5 of 40x17" in text and "hash" in text and "busy" in text
 
 
 def test_it_leaves_no_files(device, tmp_path, monkeypatch):

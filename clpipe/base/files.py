@@ -11,8 +11,10 @@ from typing import BinaryIO
 
 from clpipe.base.errors import ImageError
 from clpipe.base.reading import check_regular
+from clpipe.base.steps import Step
 
 
+@Step("hash")
 def sha256_of(path: Path) -> tuple[str, int]:
     """The SHA-256 of a file, and its size in bytes.
 
@@ -74,6 +76,7 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
         _unfinished.discard(beside)
 
 
+@Step("write")
 def write_whole(path: Path, *parts: bytes | memoryview) -> Stored:
     """Write a file, all of it or nothing; an existing one is replaced.
 
@@ -88,7 +91,8 @@ def write_whole(path: Path, *parts: bytes | memoryview) -> Stored:
     with whole_file(path) as file:
         for part in parts:
             file.write(part)
-            digest.update(part)
+            with Step("hash"):
+                digest.update(part)
             size += len(part)
     return Stored(size, digest.hexdigest())
 

@@ -1,11 +1,12 @@
-"""Benchmark of whole batches: how near threads come to the limit that their CPU time sets."""
+"""Benchmark of whole batches: how fast they are, and what their CPU time goes into."""
 
 import re
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections import defaultdict
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,24 +15,26 @@ import numpy as np
 
 from clpipe.base.errors import ImageError
 from clpipe.base.processors import available_processors
-from clpipe.batch.outcome import DONE, STEPS, Outcome
+from clpipe.base.steps import Step, StepTimes
+from clpipe.batch.outcome import DONE, STEPS, Span
 from clpipe.batch.threads import Batch
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.request import Request
 from clpipe.engine.bench import scene
 from clpipe.engine.device import Device
-from clpipe.engine.runner import Runner
-from clpipe.images.read import decode_first_part
-from clpipe.images.tags import Tags
-from clpipe.images.write import write_display, write_exr
-from clpipe.inputs.find import Job, find_jobs
+from clpipe.images.write import write_exr
+from clpipe.inputs.find import find_jobs
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
-CODED = 100  # images on which the decoder and the encoder are timed alone
-
 TRANSFERS = ("upload", "download")
+
+# What CPU time goes into, in the order of the work; "Python" is all that is not within another.
+CPU_STEPS = (
+    *("decode", "convert", "hash", "upload", "kernels", "download", "encode", "write"),
+    "Python",
+)
 
 DISTINCT = 4  # renders; the others are links to them
 
@@ -56,63 +59,42 @@ class BatchSpeed:
 
     Args:
         images, width, height: the load.
-        serial_s: how long its images take one after the other.
-        batch_s: how long they take in threads.
-        limit_s: the CPU time of the serial run, divided by the number of processors.
-        cpu_ms: the CPU time of an image in the serial run, by step.
-        alone_ms: what the decoder, the encoder and the kernels take alone, for an image.
-        overhead_ms: what an image takes serially beyond these.
-        peak_mib: the most memory that the process held in threads.
+        seconds: how long its images take.
+        cpu_ms: the CPU time of an image, by step, see :data:`CPU_STEPS`.
+        processors: how many there are for the process.
+        peak_mib: the most memory that the process held.
     """
 
     images: int
     width: int
     height: int
-    serial_s: float
-    batch_s: float
-    limit_s: float
+    seconds: float
     cpu_ms: dict[str, float]
-    alone_ms: dict[str, float]
-    overhead_ms: float
+    processors: int
     peak_mib: float
 
     @property
-    def share_of_limit(self) -> float:
-        """How near the batch comes to the limit; 1 is at the limit."""
-        return self.limit_s / self.batch_s
+    def busy(self) -> float:
+        """The share of the processors' time that the steps explain; 1 is no time unexplained."""
+        return sum(self.cpu_ms.values()) * self.images / 1e3 / (self.seconds * self.processors)
 
     @property
     def megapixels_per_second(self) -> float:
         """The speed of the batch."""
-        return self.images * self.width * self.height / 1e6 / self.batch_s
+        return self.images * self.width * self.height / 1e6 / self.seconds
 
     def record(self) -> dict[str, Any]:
         """The speeds and their ratios as JSON values."""
-        ratios = {
-            "share_of_limit": self.share_of_limit,
-            "mp_per_s": self.megapixels_per_second,
-            "batch_over_serial": self.serial_s / self.batch_s,
-        }
-        return asdict(self) | ratios
-
-
-class _Clock:
-    """Time and CPU time of this process, summed by name."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self.cpu: dict[str, float] = {}
-
-    @contextmanager
-    def on(self, name: str) -> Iterator[None]:
-        start, cpu = time.perf_counter(), time.process_time()
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-        self.cpu[name] = self.cpu.get(name, 0.0) + time.process_time() - cpu
+        return asdict(self) | {"busy": self.busy, "mp_per_s": self.megapixels_per_second}
 
 
 def bench_batch(device: Device, request: Request, load: Load) -> BatchSpeed:
-    """Time one load: half EXR in, JPEG out; serially, in threads, and each part alone.
+    """Time one load: half EXR in, JPEG out, and the CPU time of each step.
+
+    A step's time is that of the clocks of the threads that do it. What the process takes beyond
+    its own threads is the driver's, as kernels and transfers take it on a CPU. It is shared out by
+    how long those last, a kernel on all compute units, a transfer on one. "Python" is what
+    threads take outside of all steps.
 
     The files lie in a temporary folder while it lasts.
     """
@@ -124,81 +106,52 @@ def bench_batch(device: Device, request: Request, load: Load) -> BatchSpeed:
         jobs = find_jobs([str(folder / "in")], folder / "out")
         chain = loader.first_chain(jobs)
 
-        def worker(trace: bool = False) -> ImageWorker:
+        def batch() -> Batch:
             shutil.rmtree(folder / "out", ignore_errors=True)
             (folder / "out").mkdir()
-            return ImageWorker(loader, writer, chain, trace=trace)
+            return Batch(ImageWorker(loader, writer, chain, trace=True), [device])
 
         # A few first, so that nothing is compiled and no file is cold in what is timed.
-        list(Batch(worker(), [device]).run(jobs[: 2 * DISTINCT]))
-        clock = _Clock()
-        encoded = Runner(chain, device).run(decode_first_part(jobs[0].path), "").image
-        tags = Tags(chain.camera.make, chain.camera.model, chain.iso)
-        serial = []
-        for outcome in one_by_one(worker(trace=True), device, jobs, clock.on):
-            serial.append(outcome)
-            if len(serial) % max(load.images // CODED, 1) == 0:
-                # In between, because the speed of machines changes with time.
-                with clock.on("decoder"):
-                    decode_first_part(outcome.job.path)
-                with clock.on("encoder"):
-                    write_display(folder / "alone.jpg", encoded, tags)
+        list(batch().run(jobs[: 2 * DISTINCT]))
         forget_peak_memory()
-        batch = Batch(worker(), [device])
-        with clock.on("batch"):
-            threaded = list(batch.run(jobs))
-        for outcome in (*serial, *threaded):
-            if outcome.status != DONE:
-                raise ImageError(outcome.error)
+        timed = batch()
+        start = time.perf_counter()
+        with StepTimes() as times, Step("Python"):
+            outcomes = list(timed.run(jobs))
+        seconds = time.perf_counter() - start
         peak = peak_memory()
-        spans = [span for outcome in serial for span in outcome.spans]
-        kernels = sum(s.seconds for s in spans if s.step not in (*STEPS, *TRANSFERS))
-    n = load.images
-    coded = n // max(n // CODED, 1)
-    alone = {name: clock.seconds[name] / coded * 1e3 for name in ("decoder", "encoder")}
-    alone["kernels"] = kernels / n * 1e3
-    cpu = {step: clock.cpu[step] / n * 1e3 for step in STEPS}
-    serial_s = sum(clock.seconds[step] for step in STEPS)
+    for outcome in outcomes:
+        if outcome.status != DONE:
+            raise ImageError(outcome.error)
+    spans = [span for outcome in outcomes for span in outcome.spans if span.step not in STEPS]
+    cpu = defaultdict(float, times.seconds)
+    for step, share in driver_shares(spans, device.info.compute_units).items():
+        cpu[step] += share * times.elsewhere
     return BatchSpeed(
-        n,
+        load.images,
         load.width,
         load.height,
-        serial_s=serial_s,
-        batch_s=clock.seconds["batch"],
-        limit_s=sum(clock.cpu[step] for step in STEPS) / available_processors(),
-        cpu_ms=cpu,
-        alone_ms=alone,
-        overhead_ms=serial_s / n * 1e3 - sum(alone.values()),
+        seconds=seconds,
+        cpu_ms={step: cpu[step] / load.images * 1e3 for step in CPU_STEPS},
+        processors=available_processors(),
         peak_mib=peak / 2**20,
     )
 
 
-def one_by_one(
-    worker: ImageWorker,
-    device: Device | None,
-    jobs: Sequence[Job],
-    on: Callable[[str], AbstractContextManager[None]],
-) -> Iterator[Outcome]:
-    """Do jobs serially in this thread, which batches are measured against.
+def driver_shares(spans: Iterable[Span], compute_units: int) -> dict[str, float]:
+    """How the CPU time of a driver is shared out between transfers and kernels; the sum is 1.
 
-    Args:
-        worker: what is done to each image.
-        device: where to develop.
-        jobs: the images.
-        on: entered around each step of each image, with the step's name.
+    >>> spans = [Span("upload", "", 0, 1.0), Span("demosaic", "", 0, 2.0)]
+    >>> driver_shares(spans, compute_units=2)
+    {'upload': 0.2, 'kernels': 0.8}
     """
-    worker.reserve(1)
-    runners = worker.runners(device)
-    for job in jobs:
-        with on("decode"):
-            task = worker.decode(job, lambda: None)
-        for rendition in task.renditions:
-            with on("device"):
-                result = worker.develop(task, rendition, runners.of(rendition))
-            if result:
-                with on("encode"):
-                    worker.encode(task, rendition, result, device)
-        yield task.outcome()
+    work: dict[str, float] = {}
+    for span in spans:
+        transfer = span.step in TRANSFERS
+        name, units = (span.step, 1) if transfer else ("kernels", compute_units)
+        work[name] = work.get(name, 0.0) + span.seconds * units
+    total = sum(work.values())
+    return {name: each / total for name, each in work.items()}
 
 
 def forget_peak_memory() -> None:

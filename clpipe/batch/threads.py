@@ -17,6 +17,7 @@ from typing import Any
 
 from clpipe.base.errors import ClpipeError, DeviceError, OutputError
 from clpipe.base.processors import available_processors
+from clpipe.base.steps import Step
 from clpipe.batch.outcome import FAILED, Outcome
 from clpipe.batch.room import Room, host_bytes, usual_room
 from clpipe.batch.work import ImageWorker, Runners, Task
@@ -142,7 +143,8 @@ class Batch:
 
         def guarded() -> None:
             try:
-                work(*arguments)
+                with Step("Python"):
+                    work(*arguments)
             except BaseException as error:
                 self._fail(error if isinstance(error, Exception) else RuntimeError(repr(error)))
                 self._broken = True

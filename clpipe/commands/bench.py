@@ -7,7 +7,7 @@ import click
 
 from clpipe.base.errors import RequestError
 from clpipe.base.processors import available_processors
-from clpipe.batch.bench import BatchSpeed, bench_batch, loads
+from clpipe.batch.bench import CPU_STEPS, BatchSpeed, bench_batch, loads
 from clpipe.chain.methods import stage_named
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import chain_options
@@ -20,18 +20,7 @@ from clpipe.engine.bench import bench_methods
 from clpipe.engine.device import open_device
 from clpipe.images.pixels import MAX_PIXELS
 
-BATCH_HEADINGS = (
-    "images",
-    "MP/s",
-    "serial s",
-    "batch s",
-    "of limit",
-    "decode",
-    "device",
-    "encode ms CPU",
-    "beyond codec, kernels ms",
-    "peak MiB",
-)
+BATCH_HEADINGS = ("images", "MP/s", "s", *CPU_STEPS, "ms CPU", "busy", "peak MiB")
 
 
 @click.command("bench", cls=Command)
@@ -56,7 +45,7 @@ BATCH_HEADINGS = (
 @click.option(
     "--batch",
     is_flag=True,
-    help="Time batches of files instead, half EXR to JPEG, in threads and serially.",
+    help="Time batches of files instead, half EXR to JPEG, and the CPU time of their steps.",
 )
 @json_option
 def bench(
@@ -101,7 +90,10 @@ def bench(
         if as_json:
             show_json({**machine_record(device), "batches": [b.record() for b in batches]})
             return
-        click.echo(f"{device.info.label}: half EXR to JPEG, {available_processors()} CPUs")
+        click.echo(
+            f"{device.info.label}: half EXR to JPEG, {available_processors()} CPUs; "
+            "ms of CPU time an image by step, their sum, and its share of the CPUs' time"
+        )
         show(BATCH_HEADINGS, map(batch_row, batches), left=1)
         ask_for_report(device)
         return
@@ -135,10 +127,9 @@ def batch_row(speed: BatchSpeed) -> tuple[str, ...]:
     return (
         f"{speed.images} of {speed.width}x{speed.height}",
         f"{speed.megapixels_per_second:.1f}",
-        f"{speed.serial_s:.1f}",
-        f"{speed.batch_s:.1f}",
-        f"{speed.share_of_limit:.2f}",
+        f"{speed.seconds:.1f}",
         *(f"{ms:.1f}" for ms in speed.cpu_ms.values()),
-        f"{speed.overhead_ms:.1f}",
+        f"{sum(speed.cpu_ms.values()):.1f}",
+        f"{speed.busy:.0%}",
         f"{speed.peak_mib:.0f}",
     )

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from clpipe.base.steps import Step
 from clpipe.base.types import Array
 from clpipe.engine.buffers import HostImages, Pool, copy_encoded, copy_plane
 from clpipe.engine.calls import Bind, Call, index_space
@@ -183,6 +184,7 @@ class Flow:
         self._parts.append(part)
         self._transfers.flush()
 
+    @Step("upload")
     def _send(self, passage: Passage, extents: Extents) -> tuple[Any, list[Any]]:
         """Send what a tile stores of the source, unless it is there already."""
         work, source, box = passage.work, passage.work.source, extents[0].stored
@@ -275,9 +277,11 @@ class Flow:
         part.passage.parts -= 1
         try:
             if part.events:
-                self._cl.wait_for_events(part.events)
-            for copy in part.copies:
-                copy()
+                with Step("kernels"):
+                    self._cl.wait_for_events(part.events)
+            with Step("download"):
+                for copy in part.copies:
+                    copy()
             self._transfers.done()
         except self._cl.Error as error:
             part.passage.error = part.passage.error or error

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.errors import ImageError
+from clpipe.base.steps import Step
 from clpipe.base.types import Array
 
 MAX_PIXELS = 1_000_000_000  # the largest --max-pixels
@@ -27,6 +28,7 @@ def check_size(path: Path, width: int, height: int, max_pixels: int) -> None:
         )
 
 
+@Step("convert")
 def display_window(data: Array, x: int, y: int, width: int, height: int) -> Array:
     """The display window of an image, (height, width, channel), black outside its data window.
 
@@ -41,6 +43,7 @@ def display_window(data: Array, x: int, y: int, width: int, height: int) -> Arra
     return window
 
 
+@Step("convert")
 def make_finite(pixels: Array) -> int:
     """Set each NaN and infinity of an image to 0, in place, and count them."""
     infinity = np.array(np.inf, pixels.dtype)
@@ -52,6 +55,7 @@ def make_finite(pixels: Array) -> int:
     return count
 
 
+@Step("convert")
 def clip_to_half(pixels: Array) -> int:
     """Clip float32 samples to the range of half, in place, and count those that were beyond."""
     count = 0

@@ -12,6 +12,7 @@ import OpenImageIO as oiio
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
+from clpipe.base.steps import Step
 from clpipe.base.types import Array, Doubles
 from clpipe.images.attributes import own_attributes, shot_attributes
 from clpipe.images.colour import CIE_XYZ, SRGB, to_linear_srgb
@@ -126,13 +127,6 @@ def read_image(
     )
 
 
-def decode_first_part(path: Path) -> Array:
-    """The samples of a render as :func:`read_image` decodes them, no more; for benchmarks."""
-    with open_image(path) as file:
-        location = find_picture(path, file, False, None)
-        return _read_part(path, file, location, False, USUAL_MAX_PIXELS)
-
-
 TRANSFERS: dict[str, Callable[[Doubles], Doubles]] = {
     "linear": lambda x: x,
     "srgb": inverse_srgb_curve,
@@ -211,6 +205,7 @@ def holds_mosaic(path: Path) -> bool:
     return not any(map(picture_channels, parts)) and any(map(mosaic_channel, parts))
 
 
+@Step("decode")
 def _decode(path: Path, mosaic: bool, layer: str | None, max_pixels: int) -> _Decoded:
     """The picture of a file that OpenImageIO reads; arguments and errors as :func:`read_image`.
 
@@ -234,6 +229,7 @@ def _decode(path: Path, mosaic: bool, layer: str | None, max_pixels: int) -> _De
         )
 
 
+@Step("decode")
 def _decode_luminance_chroma(path: Path, max_pixels: int) -> _Decoded:
     """The picture of a file whose chroma is subsampled."""
     window = read_luminance_chroma(path, max_pixels)

@@ -17,6 +17,7 @@ from PIL import ImageCms
 from clpipe.base.about import __version__
 from clpipe.base.errors import ImageError
 from clpipe.base.files import Stored, write_whole
+from clpipe.base.steps import Step
 from clpipe.base.types import Array, Floats
 from clpipe.images.attributes import PREFIX
 from clpipe.images.openimageio import error_text
@@ -138,6 +139,7 @@ def _check_file_limit(size: int) -> None:
         raise OSError(errno.EFBIG, f"{os.strerror(errno.EFBIG)} (ulimit -f)")
 
 
+@Step("encode")
 def _encode(format_: str, to: str, spec: Any, pixels: Array) -> None:
     """Encode pixels to a file.
 

@@ -1,0 +1,135 @@
+"""tools/compare_opencv and what it uses; the script itself only where OpenCV is installed."""
+
+import sys
+from argparse import ArgumentTypeError
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
+
+import numpy as np
+import other_methods
+import pytest
+import turns
+
+from clpipe.batch.bench import Load
+from clpipe.chain.request import Request
+from clpipe.images.jpeg import JpegEncoding, jpeg_encoding
+from tests.conftest import ROOT
+
+LOADER = SourceFileLoader("compare_opencv", str(ROOT / "tools" / "compare_opencv"))
+tool = module_from_spec(spec_from_loader("compare_opencv", LOADER))
+sys.modules["compare_opencv"] = tool
+LOADER.exec_module(tool)
+
+
+def test_works_take_turns_and_what_comes_before_is_not_counted(monkeypatch):
+    calls, now = [], [0]
+
+    def lasting(name, seconds):
+        def work():
+            calls.append(name)
+            now[0] += seconds
+
+        return work
+
+    monkeypatch.setattr(turns.time, "perf_counter", lambda: now[0])
+    works = {"a": lasting("a", 1), "b": lasting("b", 2)}
+    assert turns.in_turns(works, 2, lasting("before", 10)) == {"a": [1, 1], "b": [2, 2]}
+    assert calls == ["before", "a", "before", "b"] * 2
+
+
+def test_a_ratio_is_of_one_turn():
+    # The second turn was disturbed: both took ten times as long.
+    row = turns.Comparison("w", 12.0, (1.0, 10.0, 1.0), {"x": (4.0, 40.0, 2.0)})
+    assert row.ratios("x") == (3, 4, 4)
+    assert row.cells() == ["w", "12", "3", "4.00", "3.00 4.00"]
+    assert row.record()["x"] == {"mp_per_s": 3.0, "ratio_quartiles": (3, 4, 4)}
+
+
+@pytest.mark.parametrize("text", ["6000", "0x4", "ax4", "5x4", "2x4x6"])
+def test_a_size_is_two_even_numbers(text):
+    assert tool.size_of("6000x4000") == (6000, 4000)
+    assert tool.load_of("3x6x4") == Load(3, 6, 4)
+    with pytest.raises(ArgumentTypeError, match=f"^found '{text}'; "):
+        tool.size_of(text)
+
+
+def test_what_is_missing_is_named(monkeypatch, capsys):
+    monkeypatch.setattr(tool, "NEEDED", ("numpy", "no_such_module"))
+    monkeypatch.setattr("sys.argv", ["compare_opencv"])
+    assert tool.main() == 1
+    assert capsys.readouterr().err == "no_such_module: missing; pip install 'clpipe[compare]'\n"
+
+
+def test_methods_run_on_one_image_and_a_missing_package_is_named(monkeypatch, capsys):
+    monkeypatch.setattr(other_methods, "SIZE", (16, 8))
+    seen = []
+    there, missing = (
+        other_methods.Other(
+            name,
+            name,
+            {"demosaic": {"method": "bilinear"}},
+            lambda module, mosaic: lambda: seen.append((module.__name__, mosaic.shape)),
+        )
+        for name in ("json", "no_such_module")
+    )
+    (row,) = other_methods.compare_methods(None, 3, [missing, there])
+    assert row.work == "demosaic bilinear: json"
+    assert len(row.ours) == len(row.theirs["other"]) == 3
+    assert set(seen) == {("json", (8, 16))}
+    said = capsys.readouterr().err
+    assert (
+        said == "demosaic bilinear: no_such_module is left out: No module named 'no_such_module'\n"
+    )
+
+
+def test_the_methods_that_are_compared_exist():
+    for other in other_methods.OTHERS:
+        stages = other_methods.settings_from({"stages": list(other.stages), **other.stages})
+        assert stages.stages == tuple(other.stages)
+
+
+@pytest.fixture
+def script():
+    pytest.importorskip("cv2", reason="needs OpenCV, of the extra compare")
+    from opencv_chain import OpenCVChain
+
+    return OpenCVChain(Request.from_options().chain())
+
+
+def test_the_script_makes_the_same_picture_and_noise(script, device):
+    alike = tool.likeness(device)
+    assert alike.difference < 3
+    assert alike.noise == pytest.approx(1, abs=0.05)
+
+
+def test_bands_join_without_seams(script, monkeypatch):
+    import opencv_chain
+
+    monkeypatch.setattr(opencv_chain, "BAND", 64 * 40)
+    monkeypatch.setattr(script, "expose", lambda render: render[..., 0])
+    raw = np.random.default_rng(0).integers(500, 16000, (130, 64, 1), dtype=np.uint16)
+    whole = script.develop(raw[..., 0])
+    assert abs(script.run_in_bands(raw).astype(int) - whole).max() <= 1
+
+
+def test_threads_draw_different_noise(script):
+    from opencv_chain import pool
+
+    grey = np.full((8, 8, 3), 0.2, np.float16)
+    raws = []
+    for _ in range(2):
+        with pool(1) as threads:
+            raws.append(threads.submit(script.expose, grey).result())
+    assert not np.array_equal(*raws)
+
+
+def test_both_make_the_same_files(script, device, tmp_path):
+    files = tool.Files(device, Load(3, 32, 16), tmp_path)
+    encodings = []
+    for work in (files.clpipe, lambda: files.opencv(bands=False), lambda: files.opencv(bands=True)):
+        files.clear()
+        work()
+        pictures = sorted(files.out.glob("*.jpg"))
+        assert [path.stem for path in pictures] == ["0", "1", "2"]
+        encodings.append(jpeg_encoding(pictures[0]))
+    assert encodings == [JpegEncoding(97, "4:2:2")] * 3
