@@ -100,7 +100,7 @@ class Pass:
     or HISTOGRAM pass, or of the table that an earlier LINES pass writes.
 
     A function returns its pixel. A STENCIL with a ``block`` instead fills an array, its last
-    argument, with 4 rows of that many vectors.
+    argument, with 4 rows of COLUMNS vectors: of that many, on one lane of one.
 
     The first pass of a stage may undo the last one of the stage before: where ``undoes`` names that
     one's function and both have arguments of the same values, ``leaves`` is done in place of both.

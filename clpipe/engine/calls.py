@@ -6,8 +6,16 @@ from typing import Any
 import numpy as np
 
 from clpipe.engine.buffers import Pool, buffer_name
-from clpipe.engine.codegen import PARTIALS, Kernel, local_size, round_up, summed_together
-from clpipe.engine.plan import Border, Finalize, Histogram, Launch, Lines, Reduce
+from clpipe.engine.codegen import (
+    PARTIALS,
+    Border,
+    Kernel,
+    columns_of,
+    local_size,
+    round_up,
+    summed_together,
+)
+from clpipe.engine.plan import Finalize, Histogram, Launch, Lines, Reduce
 from clpipe.engine.tiles import Extent, Extents
 from clpipe.engine.writer import Parameter
 
@@ -18,9 +26,9 @@ def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[
     """The global and the local size of a kernel, in work items."""
     lanes, local = extent.lanes, local_size(extent.lanes)
     match kernel.launch:
-        case Launch(rows=rows, columns=columns):
-            across = round_up(extent.padded_width, lanes * columns)
-            blocks = round_up(across // (lanes * columns), local)
+        case Launch(rows=rows) as launch:
+            wide = lanes * columns_of(launch, lanes)
+            blocks = round_up(-(-extent.padded_width // wide), local)
             return (blocks, -(-extent.stored.height // rows)), (local, 1)
         case Border():
             wide = extent.stored.width + 2 * extent.border

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from clpipe.engine.ops import Op
 from clpipe.engine.plan import (
     AnyLaunch,
-    Border,
     Finalize,
     Histogram,
     Launch,
@@ -35,6 +34,18 @@ EXTENT = "{width, height, pitch, left * LANES, top * 4, columns, rows, border}"
 PARTIALS = 256  # sums or histograms that a reduction's first half leaves
 RUN = 64  # bins of a histogram that are also added up
 UNNAMED = "kernel_without_a_name_yet"
+
+
+@dataclass(frozen=True)
+class Border:
+    """One launch that fills the border of a plane, after stores that do not fill it.
+
+    It is in no plan: only images that are hardly wider than two borders need it.
+    """
+
+    slot: int
+    level: int = 0
+    name: str = "border"
 
 
 @dataclass(frozen=True)
@@ -71,6 +82,11 @@ def summed_together(lanes: int) -> int:
     return local_size(lanes) if lanes == 1 else 1
 
 
+def columns_of(launch: AnyLaunch | Border, lanes: int) -> int:
+    """Vectors side by side in a work item's block: on a GPU one, so that work items share lines."""
+    return launch.columns if isinstance(launch, Launch) and lanes > 1 else 1
+
+
 def call(op: Op, arguments: Sequence[str]) -> str:
     """The call of a pass's function."""
     return f"{op.pass_.function}({', '.join(arguments)})"
@@ -82,8 +98,8 @@ def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
     for number in ("width", "height", "pitch", "left", "top", "columns", "rows", "border"):
         writer.tile(number)
     seen: set[str] = set()
-    columns = launch.columns if isinstance(launch, Launch) else 1
-    text = f"#define LANES {lanes}\n#define COLUMNS {columns}\n#define RUN {RUN}\n"
+    text = f"#define LANES {lanes}\n#define COLUMNS {columns_of(launch, lanes)}\n"
+    text += f"#define RUN {RUN}\n"
     text += files_text([f"lib/{part}.h" for part in LIBRARY], seen)
     match launch:
         case Launch():
@@ -200,8 +216,10 @@ def _load(writer: Writer, launch: Launch) -> tuple[list[str], list[str], Kind]:
     if not block:
         return [], [*lines, f"const {kind.c_type} v0 = {call(stencil, ['at', *given])};"], kind
     lines.append(f"{call(stencil, ['first', *given, 'block'])};")
-    once = [f"{kind.c_type} block[{launch.rows * block}];", "{", *(f"    {x}" for x in lines), "}"]
-    return once, [f"const {kind.c_type} v0 = block[row * {block} + column];"], kind
+    size = launch.rows * columns_of(launch, writer.lanes)
+    once = [f"{kind.c_type} block[{size}];", "{", *(f"    {x}" for x in lines), "}"]
+    place = "ROW" if writer.lanes == 1 else "row * COLUMNS + column"
+    return once, [f"const {kind.c_type} v0 = block[{place}];"], kind
 
 
 def _encode(writer: Writer, value: str, kind: Kind, curves: Sequence[Op]) -> str:
@@ -233,8 +251,8 @@ def _pixels(writer: Writer, launch: Launch) -> str:
         lines.append(f"const vi sample = only_inside({sample}, at, {writer.core()});")
         lines.append("if (ROW & 1) odd_rows += sample; else even_rows += sample;")
         once.append("vi even_rows = (vi)(0), odd_rows = (vi)(0);")
-    block = launch.stencil.pass_.block if launch.stencil else 0
-    if not block:
+    wide = launch.stencil and launch.stencil.pass_.block and writer.lanes > 1
+    if not wide:
         # All rows before the first store: what they have in common is then done once, because no
         # store can have changed what they read.
         once.append(f"{kind.c_type} {', '.join(f'values_{row}' for row in range(launch.rows))};")
@@ -246,13 +264,13 @@ def _pixels(writer: Writer, launch: Launch) -> str:
         writes.append(f"store_{kind.c_name}({', '.join([value, *slots])}, at, e);")
     if launch.encodes:
         encodes.append(_encode(writer, value, kind, curves))
-    if block:
+    if wide:
         body = _over_block([*lines, *writes, *encodes], launch)
     else:
         body = _each_row(lines, launch.rows) + _store(writes, kind, launch.rows)
         body += _each_row(encodes, launch.rows)
     place = (
-        f"    const uint x = left * LANES + (uint)get_global_id(0) * {max(block, 1)} * LANES;\n"
+        f"    const uint x = left * LANES + (uint)get_global_id(0) * (COLUMNS * LANES);\n"
         f"    const uint y = top * 4 + (uint)get_global_id(1) * {launch.rows};\n"
     )
     rows = "".join(f"    {line}\n" for line in [*once, *body])
@@ -276,7 +294,7 @@ def _over_block(lines: Sequence[str], launch: Launch) -> list[str]:
     return [
         "#pragma unroll 1",
         f"for (uint row = 0; row < {launch.rows}; ++row) {{",
-        f"    for (uint column = 0; column < {launch.columns}; ++column) {{",
+        "    for (uint column = 0; column < COLUMNS; ++column) {",
         "        if (x - e.left + column * LANES >= columns) break;",
         "        const site at = site_at(x + column * LANES, y + row);",
         *(f"        {line}" for line in lines),

@@ -13,7 +13,7 @@ from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array
 from clpipe.engine.buffers import HostImages, room_for
 from clpipe.engine.calls import Bind, Call
-from clpipe.engine.codegen import write_kernel
+from clpipe.engine.codegen import Border, write_kernel
 from clpipe.engine.discovery import (
     DeviceInfo,
     choose,
@@ -23,7 +23,7 @@ from clpipe.engine.discovery import (
     usable_memory,
 )
 from clpipe.engine.flow import Flow, Passage, Work
-from clpipe.engine.plan import Border, Launch, Plan
+from clpipe.engine.plan import Launch, Plan
 from clpipe.engine.programs import forget_programs, programs_of
 from clpipe.engine.tiles import Tiling, tiling_of
 

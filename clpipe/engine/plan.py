@@ -109,18 +109,6 @@ class Finalize:
 AnyLaunch = Launch | Lines | Histogram | Reduce | Finalize
 
 
-@dataclass(frozen=True)
-class Border:
-    """One launch that fills the border of a plane, after stores that do not fill it.
-
-    It is in no plan: only images that are hardly wider than two borders need it.
-    """
-
-    slot: int
-    level: int = 0
-    name: str = "border"
-
-
 def unscaled(launch: AnyLaunch) -> AnyLaunch:
     """A launch without the scale of the resampling that opens it, if one does."""
     if not isinstance(launch, Launch) or not launch.opener:

@@ -18,7 +18,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError
 from clpipe.base.memory import in_words
-from clpipe.engine.codegen import PARTIALS, RUN, border_left, round_up, summed_together
+from clpipe.engine.codegen import PARTIALS, RUN, border_left, columns_of, round_up, summed_together
 from clpipe.engine.ops import Op
 from clpipe.engine.plan import (
     AnyLaunch,
@@ -273,7 +273,7 @@ class _Cutter:
 
     def __init__(self, plan: Plan, width: int, height: int, lanes: int) -> None:
         self.whole = whole_image(plan, width, height, lanes)
-        columns = (x.columns for x in plan.launches if isinstance(x, Launch))
+        columns = (columns_of(x, lanes) for x in plan.launches)
         self.across = lanes * math.lcm(2, *columns)
         self._halos = halos_of(plan)
         self._resamplings = plan.resamplings

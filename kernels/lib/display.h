@@ -11,8 +11,13 @@ INLINE vi to_8_bit(vf v) {
 // Three channels of levels, or of indices into a table of levels.
 typedef struct { int r[LANES], g[LANES], b[LANES]; } levels;
 
+#if LANES == 1
+typedef int stored_int;
+#else
 // Volatile, because the compiler would else take each number out of a vector, which is slower.
-INLINE uchar level(const volatile int *number, __global const uchar *table, bool by_table) {
+typedef volatile int stored_int;
+#endif
+INLINE uchar level(const stored_int *number, __global const uchar *table, bool by_table) {
     return by_table ? table[(uint)*number] : (uchar)*number;
 }
 

@@ -29,6 +29,14 @@ typedef ulong8 vh;
 #endif
 #endif
 
+// Before a loop over the rows of a window, which a GPU goes through one by one: all at once they take so
+// many registers that few work items find room.
+#if LANES == 1
+#define UNROLL_ROWS _Pragma("unroll 1")
+#else
+#define UNROLL_ROWS _Pragma("unroll")
+#endif
+
 // Loads, stores, conversions, minimum and maximum are written without the OpenCL built-ins: on a CPU
 // that PoCL 3.0 does not know it does not inline those, and a call for each costs a factor of ten.
 #if LANES == 1

@@ -56,6 +56,9 @@ INLINE vf exponential_minus_1(vf x) {
 // denormals are slow.
 INLINE vf exp2_of_negative(vf x) {
 #pragma OPENCL FP_CONTRACT ON
+#if LANES == 1
+    return native_exp2(vmax(x, -30.0f));  // one instruction of a GPU
+#else
     const vf round_magic = (vf)(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer
     x = vmax(x, (vf)(-30.0f));
     const vf shifted = x + round_magic;
@@ -64,6 +67,7 @@ INLINE vf exp2_of_negative(vf x) {
     p = p * f + 0.69326097f;
     p = p * f + 0.99992806f;
     return bits_to_float(float_bits(p) + (float_bits(shifted) << 23));
+#endif
 }
 
 #endif

@@ -1,5 +1,5 @@
 // Parts that non-local means over 3x3 patches share. They work on blocks of 4 rows and COLUMNS
-// vectors, as the pass declares. Sums of three squared differences, one below the other, are stored
+// vectors. Sums of three squared differences, one below the other, are stored
 // once, and each patch adds three of them side by side. The first patch begins a pixel to the left of
 // the block and the last one ends a pixel to its right, so there are more columns of sums than of
 // pixels.
