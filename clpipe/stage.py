@@ -205,7 +205,10 @@ class Method(BaseModel):
     those that do not hold for it as they are.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    # Schemas are built when they are first used: of most methods, in no run.
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True
+    )
 
     method: ClassVar[str]
     kernel: ClassVar[str]  # file name in kernels/, without .cl

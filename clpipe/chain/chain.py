@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
@@ -11,7 +12,7 @@ from clpipe.chain.draws import Draw
 from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
-from clpipe.reference.resample import sizes
+from clpipe.reference.resample import Resampling, sizes
 from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
 
 
@@ -68,8 +69,12 @@ class Chain:
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """The width and height of what comes out, in px, from those of what enters."""
+        return sizes(self._resamplings, width, height)[-1]
+
+    @cached_property
+    def _resamplings(self) -> tuple[Resampling, ...]:
         passes = (p for step in self.steps for p in step.method.passes())
-        return sizes((p.resampling for p in passes if p.resampling), width, height)[-1]
+        return tuple(p.resampling for p in passes if p.resampling)
 
     @property
     def noise(self) -> NoiseModel | None:

@@ -5,7 +5,7 @@ import os
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict
-from functools import cache
+from functools import cache, lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from clpipe.base.about import __version__
 from clpipe.base.errors import ImageError
 from clpipe.base.files import Stored, keep_names, write_whole
 from clpipe.base.reading import parse_json, read_bytes
+from clpipe.chain.chain import Chain
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.images.read import SourceImage
@@ -155,18 +156,10 @@ def sidecar(
         "starts_on": chain.source.label,
         **({"raw": asdict(facts)} if facts else {}),
         "stages": [
-            {
-                "name": step.name,
-                "stage": step.stage.name,
-                "method": step.method.method,
-                "parameters": step.method.model_dump(),
-                **(
-                    {"estimates": result.estimates[step.name]}
-                    if step.name in result.estimates
-                    else {}
-                ),
-            }
-            for step in chain.steps
+            each | {"estimates": result.estimates[each["name"]]}
+            if each["name"] in result.estimates
+            else each
+            for each in stage_records(chain)
         ],
         "clipped": clipped if clipped is None else round(clipped, 4),
         "outputs": [
@@ -178,6 +171,20 @@ def sidecar(
         "versions": all_versions(),
         "request": request,
     }
+
+
+@lru_cache(maxsize=8)
+def stage_records(chain: Chain) -> list[dict[str, Any]]:
+    """What a sidecar says of the steps of a chain, as JSON values; cached, as images share it."""
+    return [
+        {
+            "name": step.name,
+            "stage": step.stage.name,
+            "method": step.method.method,
+            "parameters": step.method.model_dump(),
+        }
+        for step in chain.steps
+    ]
 
 
 def device_record(device: Device | None) -> dict[str, Any]:
