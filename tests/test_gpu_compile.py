@@ -1,0 +1,67 @@
+"""tools/gpu_compile, on a few kernels, for each target whose compilers are here."""
+
+import re
+import subprocess
+from dataclasses import replace
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
+
+import pytest
+
+from tests.conftest import ROOT
+
+LOADER = SourceFileLoader("gpu_compile", str(ROOT / "tools" / "gpu_compile"))
+SPEC = spec_from_loader("gpu_compile", LOADER)
+assert SPEC
+tool = module_from_spec(SPEC)
+LOADER.exec_module(tool)
+
+FUSED = {  # the same line with a fused multiply-add of floats, and one of integers
+    tool.NVIDIA_FUSED: ("FFMA R1, R2, R3, R4 ;", "IMAD R1, R2, R3, R4 ;"),
+    tool.AMD_FUSED: ("v_fmac_f32_e32 v1, v2, v3", "v_mad_u64_u32 v[5:6], null, s3, s4, v[5:6]"),
+    tool.INTEL_FUSED: (
+        "(W) mad (16|M0) r3.0<1>:f r1.0<8;1>:f r2.0<8;1>:f r4.0<1>:f",
+        "mad (16|M0) r3.0<1>:d r1.0<8;1>:d r2.0<8;1>:w r4.0<1>:w",
+    ),
+}
+
+
+@pytest.mark.parametrize("pattern", FUSED)
+def test_fused_multiply_adds_of_floats_are_found(pattern):
+    floats, integers = FUSED[pattern]
+    assert re.search(pattern, floats) and not re.search(pattern, integers)
+
+
+@pytest.fixture
+def job():
+    """The kernel that makes the raw in the default chain."""
+    (found,) = [job for job in tool.jobs("raw: default") if job.pixels]
+    return found
+
+
+def test_what_a_kernel_may_not_do(job):
+    good = tool.Compiled(40, 0, 0, "100%", 500, 0)
+    assert tool.wrong_with(job, good) == ""
+    assert tool.wrong_with(job, replace(good, fused=1)) == "FUSED"
+    assert tool.wrong_with(job, replace(good, spilled=4)) == "SPILLS"
+    assert tool.wrong_with(replace(job, chain="gamma=srgb"), replace(good, fused=1)) == ""
+
+
+@pytest.mark.parametrize("target", ["sm_90", "gfx1030", "dg2"])
+def test_the_raw_is_compiled_without_spills_and_fused_multiply_adds(job, target, tmp_path):
+    source = tmp_path / "k.cl"
+    source.write_text(job.kernel.source)
+    try:
+        result = tool.TARGETS[target](source)
+    except tool.MissingError as error:
+        pytest.skip(f"there is {error}")
+    assert tool.wrong_with(job, result) == "" and result.registers and result.instructions > 100
+
+
+def test_a_kernel_that_does_not_compile_is_told(job, tmp_path, monkeypatch):
+    def fail(source):
+        raise subprocess.CalledProcessError(1, "clang", "k.cl:1: error: no")
+
+    monkeypatch.setitem(tool.TARGETS, "sm_90", fail)
+    texts, good = tool.row(job, "sm_90", tmp_path)
+    assert not good and texts[-1] == "does not compile: k.cl:1: error: no"
