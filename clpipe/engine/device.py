@@ -96,7 +96,9 @@ class Device:
         self._calls: dict[Plan, list[Call]] = {}
         self._border_calls: dict[Border, Call] = {}
         try:
-            self._flow = Flow(self._programs.context, self.info.in_place)
+            self._flow = Flow(
+                self._programs.context, self.info.alignment if self.info.in_place else None
+            )
         except self._cl.Error as error:
             raise DeviceError(f"{self.info.label} cannot be opened: {error}") from None
 

@@ -84,10 +84,10 @@ class Flow:
 
     Args:
         context: the ``pyopencl.Context``.
-        in_place: whether the device works in the host's memory.
+        alignment: of the host's memory, in bytes, if the device works there; else None.
     """
 
-    def __init__(self, context: Any, in_place: bool) -> None:
+    def __init__(self, context: Any, alignment: int | None) -> None:
         import pyopencl as cl
 
         self._cl = cl
@@ -95,8 +95,8 @@ class Flow:
         self.queue = self.new_queue()
         self.pool = Pool(self.new_buffer)
         self._transfers: InPlace | Staged = (
-            InPlace(cl, self.queue)
-            if in_place
+            InPlace(cl, self.queue, alignment)
+            if alignment
             else Staged(cl, self.queue, self.new_queue, self.pool)
         )
         self._tables: dict[int, tuple[Array, Any]] = {}

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.types import Array
-from clpipe.engine.buffers import Pool
+from clpipe.engine.buffers import Pool, aligned_empty
 
 Sent = tuple[Any, list[Any]]  # a buffer, and the events after which it can be read
 Fetched = tuple[Array, Any]  # bytes, and the event after which they are there
@@ -46,14 +46,15 @@ def _unmap(array: Array, queue: Any) -> None:
 class InPlace:
     """For a device that works in the host's memory: kernels use NumPy's arrays where they are.
 
-    An array that has not the right type, order or room behind it is copied first.
+    An array that has not the right type, order, address or room behind it is copied first.
     """
 
     depth = 1
 
-    def __init__(self, cl: Any, queue: Any) -> None:
+    def __init__(self, cl: Any, queue: Any, alignment: int) -> None:
         self._cl = cl
         self._queue = queue
+        self._alignment = alignment
         self._flags = cl.mem_flags.USE_HOST_PTR
         self._scratch: dict[str, Array] = {}
         self._maps: list[Array] = []
@@ -71,7 +72,7 @@ class InPlace:
         data = None
         if pixels.dtype == dtype and pixels.flags.c_contiguous:
             data = bytes_from(pixels, size)
-        if data is None:
+        if data is None or data.ctypes.data % self._alignment:
             data = self._room("src", size)
             copied = data[: pixels.size * np.dtype(dtype).itemsize].view(dtype)
             np.copyto(copied.reshape(pixels.shape), pixels, casting="unsafe")
@@ -122,7 +123,7 @@ class InPlace:
     def _room(self, name: str, size: int) -> Array:
         """Memory of our own, kept from image to image where it is large enough."""
         if name not in self._scratch or self._scratch[name].size < size:
-            self._scratch[name] = np.empty(size, np.uint8)
+            self._scratch[name] = aligned_empty((size,), np.uint8)
         return self._scratch[name][:size]
 
     def _end(self, access: int, data: Array) -> Any:
