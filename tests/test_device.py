@@ -49,17 +49,21 @@ def test_a_gpu_comes_first_then_intels_runtime_then_pocl(devices):
 
 
 @pytest.mark.parametrize(
-    ("type_", "platform", "width", "lanes"),
+    ("type_", "platform", "cpu", "width", "lanes"),
     [
-        ("GPU", "NVIDIA CUDA", 1, 1),
-        ("CPU", "Portable Computing Language", 16, 8),
-        ("CPU", "Intel(R) OpenCL", 16, 16),
-        ("CPU", "Intel(R) OpenCL", 8, 8),
-        ("CPU", "rusticl", 1, 1),
+        ("GPU", "NVIDIA CUDA", "", 1, 1),
+        ("CPU", "Portable Computing Language", "cascadelake", 16, 16),
+        ("CPU", "Portable Computing Language", "znver3", 16, 8),  # a Zen 4, says PoCL 3.0
+        ("CPU", "Portable Computing Language", "haswell", 8, 8),
+        ("CPU", "Intel(R) OpenCL", "", 16, 16),
+        ("CPU", "Intel(R) OpenCL", "", 8, 8),
+        ("CPU", "rusticl", "", 1, 1),
     ],
 )
-def test_lanes(type_, platform, width, lanes):
-    assert lanes_for(type_, platform, SimpleNamespace(native_vector_width_float=width)) == lanes
+def test_lanes(type_, platform, cpu, width, lanes):
+    version = f"OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-{cpu} "
+    device = SimpleNamespace(native_vector_width_float=width, version=version)
+    assert lanes_for(type_, platform, device) == lanes
 
 
 @pytest.mark.parametrize(

@@ -75,11 +75,11 @@ def in_tiles(
 
 
 @pytest.mark.parametrize(("stage", "method"), METHODS)
-@pytest.mark.parametrize("lanes", [8, 1])
-def test_every_stage(device, scalar_device, monkeypatch, stage, method, lanes):
+@pytest.mark.parametrize("scalar", [False, True])
+def test_every_stage(device, scalar_device, monkeypatch, stage, method, scalar):
     # The chains of test_kernels.py, so that nothing new is compiled.
     chain = chain_for(stage, method, {}, "GRBG")
-    on = device if lanes == 8 else scalar_device
+    on = scalar_device if scalar else device
     runner = Runner(chain, on, encode=False, final=True)
     image = example(chain.source, (150, 203))
     image[::2] *= 0.5  # so that red and blue differ

@@ -146,18 +146,32 @@ def is_pocl(platform: str) -> bool:
     return "Portable Computing" in platform
 
 
+# CPUs with AVX-512, as LLVM names them, whose code from PoCL 3.0 (LLVM 14) is right and twice as
+# wide. On later ones that it takes for others (AMD Zen 4) it crashes on 16 lanes.
+WIDE_IN_POCL = (
+    "skylake-avx512",
+    "cascadelake",
+    "cooperlake",
+    "cannonlake",
+    "icelake-client",
+    "icelake-server",
+    "tigerlake",
+    "rocketlake",
+    "sapphirerapids",
+)
+
+
 def lanes_for(type_: str, platform: str, device: Any) -> int:
     """How many lanes the kernels are compiled for: one vector register on a CPU, 1 on a GPU.
 
     A CPU whose natural vectors are one wide has a compiler like a GPU's: Mesa's rusticl, which gets
     the pictures of wider ones wrong.
-    PoCL's compiler takes 8 everywhere: PoCL 3.0 (LLVM 14) crashes on 16 on CPUs that have AVX-512
-    but are newer than it (seen on AMD Zen 4), and gains nothing from 16 on the others.
     """
     if type_ != "CPU":
         return 1
     if is_pocl(platform):
-        return 8
+        # The version ends with the name of the CPU that PoCL compiles for.
+        return 16 if device.version.strip().endswith(WIDE_IN_POCL) else 8
     width = device.native_vector_width_float
     return 1 if width == 1 else 8 if width < 16 else 16
 
