@@ -102,8 +102,8 @@ class Pass:
     A function returns its pixel. A STENCIL with a ``block`` instead fills an array, its last
     argument, with 4 rows of COLUMNS vectors: of that many, on one lane of one.
 
-    The first pass of a stage may undo the last one of the stage before: where ``undoes`` names that
-    one's function and both have arguments of the same values, ``leaves`` is done in place of both.
+    The first pass of a stage may undo the last one of the stage before, bit for bit: if ``undoes``
+    names that one's function and both have arguments of the same values, neither is done.
     """
 
     function: str
@@ -117,7 +117,6 @@ class Pass:
     block: int = 0  # STENCIL: vectors in a row of the block; 0 returns a pixel
     cheap: bool = False  # a stencil after it may redo it at each tap
     undoes: str = ""  # POINTWISE: see above
-    leaves: str = ""  # with undoes: a function without arguments
     lines: str = ""  # LINES: "rows" or "columns"
     finish: str = ""  # SUMS, HISTOGRAM: the function that computes the estimates
     finish_arguments: tuple[str, ...] = ()  # of that function

@@ -70,16 +70,17 @@ INLINE bounds bounds_from_corners(image roots, image known, vf here, float noise
     return with_excess(colour, green, here, noise);
 }
 
-// Red and blue from colour differences, within bounds.
+// Red and blue from colour differences, within bounds. The roots of all colours are in steps.
 INLINE rgb bounded_red_and_blue(site at, image roots, image known, cfa pattern, float noise) {
     const vf own = tap_mosaic(roots, 0, 0);
-    rgb c = from_differences(at, pattern, own, spread_differences(at, known, pattern));
+    const rgb c = from_differences(at, pattern, own, spread_differences(at, known, pattern));
     const bounds row = bounds_from(roots, known, 1, 0, c.g, noise);
     const bounds column = bounds_from(roots, known, 0, 1, c.g, noise);
     const bounds corners = bounds_from_corners(roots, known, c.g, noise);
     const pair low = red_and_blue(at, pattern, own, row.low, column.low, corners.low);
     const pair high = red_and_blue(at, pattern, own, row.high, column.high, corners.high);
-    c.r = vmin(vmax(c.r, low.first), high.first);
-    c.b = vmin(vmax(c.b, low.second), high.second);
-    return c;
+    const vf red = vmin(vmax(c.r, low.first), high.first);
+    const vf blue = vmin(vmax(c.b, low.second), high.second);
+    const rgb v = {in_steps(red), in_steps(c.g), in_steps(blue)};
+    return v;
 }

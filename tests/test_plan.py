@@ -113,15 +113,10 @@ def functions(plan):
 
 
 def test_denoising_goes_on_from_the_roots_that_demosaicing_has():
-    joined = functions(plan_of())
-    assert "roots_above_0" in joined
-    assert not {"roots_to_light", "light_to_roots"} & set(joined)
+    assert not {"roots_to_light", "light_to_roots"} & set(functions(plan_of()))
     apart = functions(plan_of(denoise={"offset": 0.02}))
     assert apart.index("light_to_roots") == apart.index("roots_to_light") + 1
-    assert "roots_above_0" not in apart
-    kept = functions(plan_of(keep=("demosaic",)))
-    assert kept.count("roots_to_light") == 1
-    assert kept.index("roots_above_0") == kept.index("roots_to_light") + 1
+    assert functions(plan_of(keep=("demosaic",))) == apart
 
 
 def test_every_image_is_written_before_it_is_read():
@@ -188,9 +183,7 @@ def test_keeping_a_stage_compiles_at_most_the_two_halves_of_its_launch(settings)
     warm = texts(plan_of(**settings))
     for step in make_chain(settings_from(settings)).steps:
         kept = plan_of(keep=(step.name,), **settings)
-        # One that the next stage undoes is made beside the launches.
-        beside = "roots_above_0" in functions(kept) and step.name == "demosaic"
-        assert len(texts(kept) - warm) <= 2 + beside, step.name
+        assert len(texts(kept) - warm) <= 2, step.name
 
 
 def test_a_kernel_does_not_depend_on_names_slots_places_or_the_border():

@@ -19,7 +19,7 @@ class Op:
     kind: Kind  # of the image that it writes
     types: tuple[tuple[str, str], ...]  # argument -> OpenCL type
     literals: tuple[tuple[str, str], ...]  # argument -> OpenCL text
-    joins: bool = False  # undoes the pass before it, and does what is left of both
+    undoes: bool = False  # the pass before it, of another step
 
 
 def chain_ops(
@@ -38,8 +38,7 @@ def chain_ops(
         ops = ops_of(step, own)
         if ops:
             if last and undone(ops[0].pass_, own, last.pass_, arguments[last.step]):
-                rest = replace(ops[0].pass_, function=ops[0].pass_.leaves, arguments=())
-                ops = (replace(ops[0], pass_=rest, joins=True), *ops[1:])
+                ops = (replace(ops[0], undoes=True), *ops[1:])
             last = ops[-1]
         steps.append((step.name, ops))
     return tuple(steps)

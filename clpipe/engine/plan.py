@@ -11,7 +11,6 @@ Images of one size are a level. The source is on level 0; each resampling leads 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 
 from clpipe.chain.chain import Chain
 from clpipe.engine.ops import Op, chain_ops
@@ -243,33 +242,16 @@ class _Planner:
             )
         )
 
-    def keep(self, undone: bool) -> Image:
+    def keep(self) -> Image:
         """Store the current image because it is wanted.
 
-        Stencils after it read what they would read otherwise, so they are the same kernels. Where
-        the next pass has ``undone`` the last one, it goes on from what that one has read, so that
-        it gives the same bits.
+        Stencils after it read what they would read otherwise, so they are the same kernels.
         """
-        if undone:
-            return self._keep_beside()
         folded, is_open = self.foldable(), self.group is not None
         image = self.close()
         self.folded = folded
         if is_open and not folded:
             self.split = image
-        return image
-
-    def _keep_beside(self) -> Image:
-        """Store the current image in a launch of its own, and leave its last pass to be done."""
-        assert self.group
-        *before, last = self.group.ops
-        kind, self.kind = self.kind, before[-1].kind
-        self.group = replace(self.group, ops=tuple(before))
-        read = Read(self.close())
-        self.kind = kind
-        self.group = Launch("", (last,), (read,))
-        image = self.new_image()
-        self.emit(replace(self.group, writes=image))
         return image
 
     def foldable(self) -> Read | None:
@@ -327,8 +309,10 @@ class _Planner:
                     if self.group is None:
                         assert self.stored is not None
                         self.group = Launch("", (), (Read(self.stored),))
-                    before = self.group.ops[:-1] if op.joins else self.group.ops
-                    self.group = replace(self.group, ops=(*before, op))
+                    # Where the pass that it undoes was stored, it is done all the same.
+                    undone = op.undoes and self.group.ops
+                    ops_ = self.group.ops[:-1] if undone else (*self.group.ops, op)
+                    self.group = replace(self.group, ops=ops_)
             self.folded = None
             self.kind, written = op.kind, pass_.writes
 
@@ -366,11 +350,10 @@ def make_plan(
     planner = _Planner(chain.source, fold)
     kept: dict[str, Image] = {}
     arguments = {step.name: step.method.arguments(step.context) for step in chain.steps}
-    steps = [*chain_ops(chain, arguments), ("", ())]
-    for (name, ops), (_, following) in pairwise(steps):
+    for name, ops in chain_ops(chain, arguments):
         planner.add_step(ops)
         if name in keep and name != last:
-            kept[name] = planner.keep(any(op.joins for op in following))
+            kept[name] = planner.keep()
     group = planner.group or Launch("encode", (), (Read(planner.close()),))
     final_image = None
     if final:

@@ -9,7 +9,7 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
-from clpipe.reference.roots import from_root, noise_in_roots, root_of
+from clpipe.reference.roots import from_root, in_steps, noise_in_roots, root_of
 from clpipe.stage import Access, Argument, Context, Frame, Kind, Method, Pass, parameter
 from clpipe.stages.demosaic.common import (
     QUARTER,
@@ -171,4 +171,4 @@ class Bounded(Method):
             roots, known, green, pattern, self.doubt
         )
         red, blue = np.clip(red, red_low, red_high), np.clip(blue, blue_low, blue_high)
-        return from_root(np.stack([red, green, blue], axis=-1), offset)
+        return from_root(in_steps(np.stack([red, green, blue], axis=-1)), offset)

@@ -9,7 +9,7 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.reference.image import tap
-from clpipe.reference.roots import from_root, noise_in_roots, root_of
+from clpipe.reference.roots import from_root, in_steps, noise_in_roots, root_of
 from clpipe.stage import Access, Argument, Context, Frame, Kind, Pass, parameter
 from clpipe.stages.denoise.strength import MID_GREY, Denoiser, offset_of_roots, offset_parameter
 
@@ -126,7 +126,6 @@ class Biweight(Denoiser):
                 arguments=("offset",),
                 writes="roots",
                 undoes="roots_to_light",
-                leaves="roots_above_0",
             ),
             Pass(
                 "to_luma_chroma",
@@ -161,7 +160,7 @@ class Biweight(Denoiser):
             return image
         luma_range, chroma_range = (np.float32(each) for each in self.ranges)
         grain, offset = np.float32(self.grain), np.float32(self.offset)
-        planes = rgb_to_ycbcr(root_of(image, offset))
+        planes = rgb_to_ycbcr(in_steps(root_of(image, offset)))
         y, c = planes[..., :1], planes[..., 1:]
         filtered = biweight(y, LUMA_WINDOW, luma_range)
         y = filtered + grain * (y - filtered)
