@@ -2,7 +2,7 @@
 #include "lib/roots.h"
 
 // In units of the difference that weighs nothing.
-INLINE ycbcr to_luma_chroma(rgb c, site at, float luma_range, float chroma_range) {
+INLINE ycbcr roots_to_luma_chroma(rgb c, site at, float luma_range, float chroma_range) {
     const ycbcr v = rgb_to_ycbcr(c);
     const float luma = 1.0f / luma_range, chroma = 1.0f / chroma_range;
     const ycbcr w = {v.y * luma, v.cb * chroma, v.cr * chroma};
@@ -10,7 +10,7 @@ INLINE ycbcr to_luma_chroma(rgb c, site at, float luma_range, float chroma_range
 }
 
 // As ycbcr_to_rgb, with the units in its factors.
-INLINE rgb from_luma_chroma(ycbcr c, site at, float offset, float luma_range, float chroma_range) {
+INLINE rgb luma_chroma_to_light(ycbcr c, site at, float offset, float luma_range, float chroma_range) {
 #pragma OPENCL FP_CONTRACT ON
     const float red = chroma_range * 1.4025246f, blue = chroma_range * 1.7730496f;
     const float green_red = red * (-0.299f * 1.7035775f), green_blue = blue * (-0.114f * 1.7035775f);

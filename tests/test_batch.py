@@ -353,7 +353,7 @@ def test_a_trace_is_not_held_in_memory(tmp_path):
         for _ in range(100):
             trace.add(outcome)
         before = tracemalloc.get_traced_memory()[0]
-        for _ in range(600):
+        for _ in range(6000):
             trace.add(outcome)
         assert tracemalloc.get_traced_memory()[0] < before + 20_000
         tracemalloc.stop()
@@ -527,7 +527,7 @@ def start(folder, *arguments, environment=None):
 
 def wait_for(folder, count):
     """Wait until so many pictures are there."""
-    for _ in range(600):
+    for _ in range(6000):
         if len(list(folder.glob("*.json"))) >= count:
             return
         time.sleep(0.01)

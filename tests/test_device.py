@@ -276,7 +276,7 @@ def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
 @pytest.mark.parametrize("byte", [0xFF, 0x7F])  # NaN, and numbers near the largest
 def test_what_memory_held_before_does_not_matter(device, monkeypatch, byte):
     chain = make_chain(settings_from({}))
-    image = np.random.default_rng(0).random((37, 53, 3)).astype(np.float16)
+    image = np.random.default_rng(0).random((97, 203, 3)).astype(np.float16)
     expected = Runner(chain, device).run(image, "k").encoded
     make = Flow.new_buffer
 
@@ -287,7 +287,7 @@ def test_what_memory_held_before_does_not_matter(device, monkeypatch, byte):
 
     monkeypatch.setattr(Flow, "new_buffer", used)
     for info in (device.info, replace(device.info, type="GPU")):
-        for memory in (None, 80_000):  # whole, and in tiles
+        for memory in (None, 300_000):  # whole, and in tiles
             result = Runner(chain, Device(info, memory)).run(image, "k")
             assert np.array_equal(result.encoded, expected)
 

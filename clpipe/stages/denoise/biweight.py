@@ -128,7 +128,7 @@ class Biweight(Denoiser):
                 undoes="roots_to_light",
             ),
             Pass(
-                "to_luma_chroma",
+                "roots_to_luma_chroma",
                 arguments=units,
                 reads=("roots",),
                 writes="planes",
@@ -143,7 +143,7 @@ class Biweight(Denoiser):
                 kind=Kind.YCBCR,
                 radius=2,
             ),
-            Pass("from_luma_chroma", arguments=("offset", *units), reads=("filtered",)),
+            Pass("luma_chroma_to_light", arguments=("offset", *units), reads=("filtered",)),
         )
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
