@@ -28,7 +28,7 @@ def from_root(root: Floats, offset: np.float32) -> Floats:
 
 
 def in_steps(root: Floats) -> Floats:
-    """Roots in steps of 2^-16, from 0 on.
+    """Roots in steps of 2^-20, from 0 on.
 
     They are the same when they have been squared and taken again, so what goes on from a picture's
     roots has the bits of what goes on from its light.
@@ -37,7 +37,7 @@ def in_steps(root: Floats) -> Floats:
     >>> np.array_equal(in_steps(root_of(from_root(roots, offset), offset)), roots)
     True
     """
-    return (np.maximum(root, np.float32(0)) + np.float32(192)) - np.float32(192)
+    return (np.maximum(root, np.float32(0)) + np.float32(12)) - np.float32(12)
 
 
 def noise_in_roots(sigma: float, level: float, offset: float) -> float:

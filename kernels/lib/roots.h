@@ -10,9 +10,9 @@ INLINE vf from_root(vf s, float offset) {
     return root * root - offset;
 }
 
-// Roots in steps of 2^-16, from 0 on. Those are the same when they have been squared and taken again, so
+// Roots in steps of 2^-20, from 0 on. Those are the same when they have been squared and taken again, so
 // what goes on from a picture's roots has the bits of what goes on from its light.
-INLINE vf in_steps(vf s) { return (vmax(s, (vf)(0.0f)) + 192.0f) - 192.0f; }
+INLINE vf in_steps(vf s) { return (vmax(s, (vf)(0.0f)) + 12.0f) - 12.0f; }
 
 // The root to one step's thousandth: one Newton step more.
 INLINE vf exact_root(vf v, float offset) {
