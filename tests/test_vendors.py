@@ -19,7 +19,7 @@ from clpipe.engine.vendors import intel_library, intel_visible
 
 
 @pytest.fixture
-def machine(tmp_path, monkeypatch):
+def installed(tmp_path, monkeypatch):
     """Intel's package, and a system with one vendor, of the loader's folder ``/vendors``."""
     library = tmp_path / "lib" / "libintelocl.so"
     system = tmp_path / "vendors"
@@ -35,16 +35,16 @@ def machine(tmp_path, monkeypatch):
     return SimpleNamespace(library=library, system=system)
 
 
-def test_it_is_seen_beside_the_systems(machine):
+def test_it_is_seen_beside_the_systems(installed):
     with intel_visible():
         folder = Path(os.environ["OCL_ICD_VENDORS"])
         texts = {file.read_text().strip() for file in folder.glob("*.icd")}
-    assert texts == {"libgpu.so", str(machine.library)}
+    assert texts == {"libgpu.so", str(installed.library)}
     assert "OCL_ICD_VENDORS" not in os.environ and not folder.exists()
 
 
 @pytest.mark.parametrize("variable", vendors.VARIABLES)
-def test_a_users_own_choice_stays(machine, monkeypatch, variable):
+def test_a_users_own_choice_stays(installed, monkeypatch, variable):
     monkeypatch.setenv(variable, "/mine")
     before = dict(os.environ)
     with intel_visible():
@@ -52,14 +52,14 @@ def test_a_users_own_choice_stays(machine, monkeypatch, variable):
     assert dict(os.environ) == before
 
 
-def test_nothing_changes_without_the_package_or_where_it_is_found_anyhow(machine, monkeypatch):
-    (machine.system / "intel.icd").write_text(f"{machine.library}\n")
+def test_nothing_changes_without_the_package_or_where_it_is_found_anyhow(installed, monkeypatch):
+    (installed.system / "intel.icd").write_text(f"{installed.library}\n")
     with intel_visible():
         assert "OCL_ICD_VENDORS" not in os.environ
-    (machine.system / "intel.icd").write_text("/opt/wrong/libintelocl.so\n")
+    (installed.system / "intel.icd").write_text("/opt/wrong/libintelocl.so\n")
     with intel_visible():
         assert "OCL_ICD_VENDORS" in os.environ
-    machine.library.unlink()
+    installed.library.unlink()
     assert intel_library() is None
     with intel_visible():
         assert "OCL_ICD_VENDORS" not in os.environ
