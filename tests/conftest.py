@@ -52,8 +52,13 @@ def _compiling_is_not_announced() -> None:
 
 
 @pytest.fixture(scope="session")
-def device() -> Device:
-    return Device(choose(None, find_devices()))
+def device() -> Iterator[Device]:
+    device = Device(choose(None, find_devices()))
+    ours = programs.programs_of(device.info)
+    declared = ours.declares
+    yield device
+    # Every kernel of ours, and all that a test compiled, called only what builtins.h declares.
+    assert ours.declares == declared
 
 
 @pytest.fixture(scope="session")

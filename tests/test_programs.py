@@ -126,6 +126,19 @@ def test_a_second_process_compiles_nothing(device, tmp_path):
     assert compiled() == first
 
 
+def test_a_pocl_with_other_headers_declares_the_functions_itself(device, monkeypatch):
+    if "Portable Computing" not in device.info.platform:
+        pytest.skip("needs PoCL")
+    image = np.full((8, 8, 3), 0.5, np.float32)
+    chain = make_chain(settings_from(SMALL))
+    expected = Runner(chain, device).run(image, "a").image
+    monkeypatch.setattr(programs, "DECLARED_HERE", ("-D_OPENCL_H_", "-DOTHER_HEADERS"))
+    monkeypatch.setattr(programs, "_by_device", {})
+    given = Runner(chain, Device(device.info)).run(image, "a").image
+    np.testing.assert_array_equal(given, expected)
+    assert not programs.programs_of(device.info).declares
+
+
 def test_devices_and_chains_share_programs(device):
     image = np.zeros((8, 8, 3), np.float32)
     Runner(make_chain(settings_from(SMALL)), device).run(image, "a")

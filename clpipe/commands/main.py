@@ -1,6 +1,7 @@
 """The program: a group of commands, each imported when it is used."""
 
 import ast
+import gc
 import logging
 import re
 import sys
@@ -50,7 +51,10 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
+        gc.disable()  # what is imported stays: looking through it again and again takes a tenth
         command = getattr(import_module(f"clpipe.commands.{cmd_name}"), cmd_name)
+        gc.freeze()
+        gc.enable()
         assert isinstance(command, click.Command)
         return command
 

@@ -1,10 +1,9 @@
 """What a run prints on stderr: a bar on a terminal, otherwise a line for each image."""
 
 import contextlib
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from clpipe.base.text import one_line
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
@@ -13,7 +12,24 @@ from clpipe.chain.formats import ending_of
 from clpipe.engine.clipping import clipping_text
 from clpipe.outputs.writer import OutputWriter
 
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
 REPEATED = 20  # failures that are printed again at the end
+
+
+def bar_on(console: Console) -> "Progress":
+    """A bar of images with what is described and the time that remains; removed when it stops."""
+    from rich import progress  # takes a while, and a single image needs none
+
+    return progress.Progress(
+        progress.BarColumn(bar_width=None),
+        progress.TextColumn("{task.completed}/{task.total} images"),
+        progress.TextColumn("{task.description}"),
+        progress.TimeRemainingColumn(compact=True),
+        console=console,
+        transient=True,
+    )
 
 
 class Reporter:
@@ -36,14 +52,7 @@ class Reporter:
         self._several = summary.total > 1
         self._bar: Progress | None = None
         if self._several and console.is_terminal and not quiet:
-            self._bar = Progress(
-                BarColumn(bar_width=None),
-                TextColumn("{task.completed}/{task.total} images"),
-                TextColumn("{task.description}"),
-                TimeRemainingColumn(compact=True),
-                console=console,
-                transient=True,
-            )
+            self._bar = bar_on(console)
             self._task = self._bar.add_task("", total=summary.total)
 
     def __enter__(self) -> Self:

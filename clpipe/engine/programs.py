@@ -9,7 +9,7 @@ import re
 import threading
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,9 @@ from clpipe.engine.cache_folder import cache_folder, later_runs
 from clpipe.engine.codegen import Kernel
 from clpipe.engine.discovery import DeviceInfo, is_pocl
 
+# PoCL includes the declarations of all of OpenCL's functions before a program. The first says that
+# it has done so; the second has those that are called declared in kernels/lib/builtins.h.
+DECLARED_HERE = ("-D_OPENCL_H_", "-DDECLARED_HERE")
 LONG = 2.0  # s of compiling after which a user is told what is going on
 log = logging.getLogger(__name__)
 _by_device: dict[int, "Programs"] = {}
@@ -27,6 +30,9 @@ _announced = threading.Event()
 
 class Programs:
     """The OpenCL context of a device, and the programs that this process compiled in it.
+
+    Attributes:
+        declares: whether OpenCL's functions are declared by us; see :data:`DECLARED_HERE`.
 
     Raises:
         DeviceError: the device cannot be opened.
@@ -48,6 +54,7 @@ class Programs:
         # PoCL keeps programs in the same folder by itself, with what it makes of them at the first
         # launch. For other platforms pyopencl keeps binaries under a key of text, options, device
         # and driver.
+        self.declares = is_pocl(info.platform)
         folder = None if is_pocl(info.platform) else cache_folder()
         self._cache_dir = str(folder / "programs") if folder else False
 
@@ -71,17 +78,25 @@ class Programs:
         cl = self._cl
         # Not within catch_warnings, which changes the filters of all threads.
         warnings.filterwarnings("ignore", category=cl.CompilerWarning)
-        program = cl.Program(self.context, kernel.source)
+        stage_files = [file for file in kernel.files if Path(file).is_absolute()]
+        if self.declares and not stage_files:  # which may call any function
+            with suppress(cl.Error):
+                return self._build(kernel, [*self._options, *DECLARED_HERE])
         try:
-            return program.build(self._options, cache_dir=self._cache_dir)
+            program = self._build(kernel, self._options)
         except cl.MemoryError:
             raise
         except cl.Error as error:
             text = build_log(str(error))
-            for file in kernel.files:
-                if Path(file).is_absolute():
-                    raise RequestError(f"{file}: does not compile:\n{text}") from None
+            if stage_files:
+                raise RequestError(f"{stage_files[0]}: does not compile:\n{text}") from None
             raise DeviceError(f"{kernel.launch.name}: does not compile:\n{text}") from None
+        self.declares &= bool(stage_files)  # it failed only with our declarations
+        return program
+
+    def _build(self, kernel: Kernel, options: list[str]) -> Any:
+        program = self._cl.Program(self.context, kernel.source)
+        return program.build(options, cache_dir=self._cache_dir)
 
 
 def programs_of(info: DeviceInfo) -> Programs:

@@ -7,6 +7,7 @@ from importlib import resources
 from pathlib import Path
 
 LIBRARY = (
+    "builtins",
     "lanes",
     "math",
     "image",
