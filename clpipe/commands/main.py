@@ -53,7 +53,6 @@ class LazyGroup(click.Group):
             return None
         gc.disable()  # what is imported stays: looking through it again and again takes a tenth
         command = getattr(import_module(f"clpipe.commands.{cmd_name}"), cmd_name)
-        gc.freeze()
         gc.enable()
         assert isinstance(command, click.Command)
         return command
