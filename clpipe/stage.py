@@ -21,6 +21,7 @@ from clpipe.camera.noise import NoiseModel
 from clpipe.camera.profile import DEFAULT_CAMERA, IDENTITY, Camera, Matrix, load_camera
 from clpipe.reference.cfa import PATTERNS, Pattern, red_site
 from clpipe.reference.curve import curve_index
+from clpipe.reference.geometry import Geometry
 from clpipe.reference.random import Stream, stream_of
 from clpipe.reference.resample import Resampling
 
@@ -230,6 +231,10 @@ class Method(BaseModel):
     def passes(self) -> tuple[Pass, ...]:
         """The kernel functions, in order; none if the image stays as it is."""
         raise NotImplementedError(type(self).__name__)
+
+    def geometry(self) -> Geometry | None:
+        """How this (resolved) method moves pixels; None if each stays where it is."""
+        return None
 
     def without_noise(self) -> "Method | None":
         """This (resolved) method without its noise; None if nothing is left of it."""

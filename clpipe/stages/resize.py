@@ -3,6 +3,7 @@
 from typing import ClassVar
 
 from clpipe.base.types import Floats
+from clpipe.reference.geometry import Scaling
 from clpipe.reference.resample import Resampling, Weight, lanczos3, overlap, resample
 from clpipe.stage import Access, Frame, Kind, Method, Pass, Stage, parameter
 
@@ -28,6 +29,9 @@ class Filter(Method):
             Pass("resize_rows", Access.RESAMPLE, writes="fewer_rows", resampling=rows),
             Pass("resize_columns", Access.RESAMPLE, reads=("fewer_rows",), resampling=columns),
         )
+
+    def geometry(self) -> Scaling | None:
+        return Scaling(self.resamplings) if self.passes() else None
 
     @property
     def resamplings(self) -> tuple[Resampling, Resampling]:
