@@ -49,8 +49,13 @@ def test_the_main_job(clpipe, tmp_path):
     stages = {s["name"]: s for s in sidecar["stages"]}
     assert stages["sensor_noise"]["parameters"]["a"] == pytest.approx(5.0419 / 15871)
     assert stages["white_balance"]["parameters"] == {"red_gain": 2.77, "blue_gain": 1.36}
-    unused = stages.pop("sensor_noise")["parameters"]
-    assert {k for k, v in unused.items() if v is not None} == {"a", "b"}
+    for name, given in (
+        ("sensor_noise", {"a", "b"}),
+        ("motion_blur", {"length", "angle"}),
+        ("optical_blur", {"sigma", "pixel_pitch", "low_pass", "pixel_area"}),
+    ):
+        with_unused = stages.pop(name)["parameters"]
+        assert {k for k, v in with_unused.items() if v is not None} == given
     assert None not in [v for s in stages.values() for v in s["parameters"].values()]
     noise = sidecar["noise"]
     assert noise["signal"]["a"] == pytest.approx(5.0419 / 15871)
@@ -301,10 +306,10 @@ def test_a_jpeg_has_its_limit(clpipe, write_exr):
 
 def test_plan(clpipe):
     result = clpipe("plan", "--set", "white_balance.method=gray_world")
-    assert "9 launches, 6 slots" in result.stdout
+    assert "10 launches, 6 slots" in result.stdout
     record = json.loads(clpipe("plan", "--json", "--keep", "sensor_noise").stdout)
     assert record["kept"] == ["sensor_noise"]
-    assert len(record["launches"]) == 7
+    assert len(record["launches"]) == 8
 
 
 def test_stages(clpipe):
@@ -343,7 +348,7 @@ def test_a_device_that_is_no_cpu_is_to_be_reported(clpipe, monkeypatch):
 def test_bench(clpipe):
     record = json.loads(clpipe("bench", "--size", "640x480", "--repeat", 2, "--json").stdout)
     assert record["mp_per_s"] > 0
-    assert len(record["launches"]) == 6 and record["device"]["lanes"]
+    assert len(record["launches"]) == 7 and record["device"]["lanes"]
     assert all(launch["mp_per_s"] > 0 for launch in record["launches"])
     assert "expected WIDTHxHEIGHT" in clpipe("bench", "--size", "big", status=2).stderr
 

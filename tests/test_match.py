@@ -34,7 +34,7 @@ from clpipe.images.jpeg import JpegEncoding, jpeg_encoding, through_jpeg
 from clpipe.pipeline import Pipeline
 from tests.conftest import ROOT, SHARED
 
-SIZE, FRAMES = 128, 4
+SIZE, FRAMES = 128, 6
 KNOWN = {
     "iso": 3200.0,
     "demosaic": {"method": "bilinear"},

@@ -27,7 +27,8 @@ def names(plan):
 def test_default_chain():
     assert names(plan_of()) == [
         "lines",
-        "exposure..demosaic",
+        "load",
+        "optical_blur.blur..demosaic",
         "demosaic.bounded_green",
         "demosaic.bounded_red_and_blue..denoise",
         "denoise.biweight..sharpen",
@@ -35,11 +36,10 @@ def test_default_chain():
     ]
 
 
-def test_default_chain_with_gray_world_is_nine_launches_and_at_most_48_bytes():
+def test_default_chain_with_gray_world_is_ten_launches_and_at_most_48_bytes():
     plan = plan_of(**GRAY_WORLD)
-    assert [type(launch) for launch in plan.launches] == [Lines, Launch, Reduce, Finalize] + [
-        Launch
-    ] * 5
+    kinds = [Lines, Launch, Launch, Reduce, Finalize, *[Launch] * 5]
+    assert [type(launch) for launch in plan.launches] == kinds
     assert bytes_per_pixel(plan, 8) <= 48
 
 
@@ -51,7 +51,7 @@ def test_gains_estimated_from_the_image_are_applied_where_the_stencil_reads():
         for launch in plan.launches
         if isinstance(launch, Launch)
     ]
-    assert prologues == [[], ["white_balance"], [], ["white_balance"], [], []]
+    assert prologues == [[], [], ["white_balance"], [], ["white_balance"], [], []]
     unfolded = plan_of(fold=False, **settings)
     assert "white_balance" in names(unfolded)
 
@@ -59,7 +59,7 @@ def test_gains_estimated_from_the_image_are_applied_where_the_stencil_reads():
 def test_keeping_a_stage_inside_a_group_splits_it():
     plain, kept = plan_of(), plan_of(keep=("sensor_noise",))
     assert len(kept.launches) == len(plain.launches) + 1
-    assert names(kept)[1:3] == ["exposure..sensor_noise", "row_noise..demosaic"]
+    assert names(kept)[2:4] == ["optical_blur.blur..sensor_noise", "row_noise..demosaic"]
     assert [name for name, _ in kept.kept] == ["sensor_noise"]
 
 

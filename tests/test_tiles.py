@@ -204,7 +204,7 @@ def test_full_rows_come_before_narrow_tiles():
 
 
 def test_the_halo_is_what_all_stencils_reach_together():
-    assert halos_of(plan_of()) == (2 + 1 + 2 + 4,)  # demosaic, denoise, sharpen
+    assert halos_of(plan_of()) == (1 + 2 + 1 + 2 + 4,)  # optical_blur, demosaic, denoise, sharpen
     assert halos_of(plan_of(stages=["exposure", "gamma"])) == (0,)
     bilinear = {"stages": ["mosaic", "demosaic"], "demosaic": {"method": "bilinear"}}
     assert halos_of(plan_of(**bilinear)) == (1,)
@@ -215,10 +215,14 @@ def test_phases_end_with_what_is_found():
     first, second = phases_of(plan)
     names = [launch.name for launch in plan.launches]
     assert [names[i] for i in first.first] == ["lines"]
-    assert [names[i] for i in first.each] == ["exposure..normalize", "white_balance.add_up"]
+    assert [names[i] for i in first.each] == [
+        "load",
+        "optical_blur.blur..normalize",
+        "white_balance.add_up",
+    ]
     assert [names[i] for i in first.last] == ["white_balance.gray_world"]
     assert second.first == second.last == ()
-    assert len(second.each) == 6
+    assert len(second.each) == 7
 
 
 def test_memory_that_is_too_small_for_any_tile(device, monkeypatch):

@@ -119,7 +119,7 @@ class Camera(BaseModel):
     hot_pixel_share: Share = 0.0
     hot_pixel_level: NotNegative = 0.0  # e-, the smallest extra charge of a hot pixel
     dead_pixel_share: Share = 0.0
-    pixel_pitch: Positive | None = None  # µm, from the centre of a photosite to the next one's
+    pixel_pitch: Positive | None = None  # um, from the centre of a photosite to the next one's
     iso_range: tuple[Positive, Positive]
     gain_stages: Annotated[tuple[GainStage, ...], Field(min_length=1)]
     sources: dict[str, str]

@@ -18,6 +18,7 @@ FIXED = {
     "bits": "",
     "white_balance_gains": "red, blue",
     "full_well": "e-",
+    "pixel_pitch": "um",
     "tukey_lambda": "",
     "prnu": "",
     "dsnu": "e-",

@@ -159,7 +159,7 @@ def _source_image(writer: Writer, launch: Launch) -> str:
     reads = dict(zip(launch.stencil.pass_.reads, launch.reads, strict=True))
     read = reads.get("src")
     if not read or not read.prologue:
-        kind = read.image.kind if read else Kind.MOSAIC
+        kind = read.image.kind if read else launch.stencil.source
         return (
             "typedef image src_image;\n"
             f"INLINE {kind.c_type} src_tap(src_image src, int dx, int dy) "

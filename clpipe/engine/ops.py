@@ -16,6 +16,7 @@ class Op:
     step: str
     kernel: str  # file, relative to the kernel folder; a plug-in's is an absolute path
     pass_: Pass
+    source: Kind  # of the image that its stage reads, "src"
     kind: Kind  # of the image that it writes
     types: tuple[tuple[str, str], ...]  # argument -> OpenCL type
     literals: tuple[tuple[str, str], ...]  # argument -> OpenCL text
@@ -76,4 +77,5 @@ def ops_of(step: Step, arguments: Mapping[str, Argument]) -> tuple[Op, ...]:
     if step.stage.folder:
         kernel = str(step.stage.folder / kernel)
     given = tuple(types), tuple(literals)
-    return tuple(Op(step.name, kernel, p, p.kind or step.stage.writes, *given) for p in passes)
+    source, result = step.stage.reads, step.stage.writes
+    return tuple(Op(step.name, kernel, p, source, p.kind or result, *given) for p in passes)

@@ -2,8 +2,8 @@
 
 A file declares one stage: its methods, their parameters, kernels and NumPy references. Every module
 here must define ``STAGE``: :func:`own_stages` imports them all, so nothing else lists them. Code
-that several stages share belongs in ``reference`` or ``stage``. This room imports ``stage``,
-``reference``, ``camera`` and ``base``.
+that several stages share belongs in ``reference`` or ``stage``. This room imports ``images``,
+``stage``, ``reference``, ``camera`` and ``base``.
 """
 
 from functools import cache
@@ -13,6 +13,8 @@ from pkgutil import iter_modules
 from clpipe.stage import Stage
 
 DEFAULT_CHAIN = (
+    "motion_blur",
+    "optical_blur",
     "exposure",
     "mosaic",
     "inverse_white_balance",

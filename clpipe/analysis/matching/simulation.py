@@ -11,7 +11,8 @@ from clpipe.analysis.matching.columns import Noise, noise_of_frames
 from clpipe.analysis.matching.scenes import Scene
 from clpipe.analysis.matching.space import RESIZE
 from clpipe.base.types import Array, Floats
-from clpipe.chain.chain import Chain, make_chain
+from clpipe.chain.chain import Chain, make_chain, step_names
+from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
@@ -20,6 +21,7 @@ from clpipe.images.jpeg import through_jpeg
 from clpipe.stage import Frame, Method
 
 UNDONE = ("gamma", "tone_curve")  # by the stage of that name with "inverse_" before it
+SEEN = ("motion_blur", "optical_blur")  # stages that the light of a picture has gone through
 
 
 class Simulator:
@@ -48,7 +50,8 @@ class Simulator:
             key: what the noise is made of.
             count: how many frames; None is as many as the scene has.
         """
-        chain = make_chain(settings)
+        seen = [name for name in step_names(settings) if base_name(name) in SEEN]
+        chain = make_chain(replace(settings, skip=(*settings.skip, *seen)))
         keys = [f"{key}:{scene.name}:{number}" for number in range(count or len(scene.frames))]
         with self._lock:  # a device is for one thread
             linear = self._linear_light(chain, scene)

@@ -1,0 +1,62 @@
+"""Weighted means of the pixels around, for light that is spread: twin of ``kernels/convolve.cl``.
+
+A point spread function is (height, width, 3) float64 of odd sides, centred: how the light of a
+pixel falls on those around it, for red, green and blue, each of sum 1. Taps are what a pixel is
+made of, so they are its mirror image.
+"""
+
+import numpy as np
+
+from clpipe.base.types import Doubles, Floats
+from clpipe.reference.image import tap
+
+NEGLIGIBLE = 5e-4  # share of the light that may be left out, where it is thinnest
+
+
+def taps_of(spread: Doubles) -> Floats:
+    """The taps of a point spread function: (tap, 5) float32, by rows.
+
+    Each is dx and dy in px, and the weights of the pixel there for red, green and blue, each of sum
+    1 over all taps. The smallest weights are left out, up to :data:`NEGLIGIBLE` of them all.
+
+    >>> taps_of(np.float64([[0.5, 0, 0.5]])[..., None].repeat(3, 2)).tolist()
+    [[-1.0, 0.0, 0.5, 0.5, 0.5], [1.0, 0.0, 0.5, 0.5, 0.5]]
+    """
+    mirrored = spread[::-1, ::-1]
+    largest = mirrored.max(2)
+    ascending = np.argsort(largest, axis=None, kind="stable")
+    light = np.cumsum(largest.ravel()[ascending])
+    kept = np.ones(largest.size, bool)
+    kept[ascending[light <= NEGLIGIBLE * light[-1]]] = False
+    rows, columns = np.nonzero(kept.reshape(largest.shape))
+    weights = mirrored[rows, columns]
+    weights = weights / weights.sum(0)
+    places = np.stack([columns - spread.shape[1] // 2, rows - spread.shape[0] // 2], 1)
+    return np.ascontiguousarray(np.hstack([places, weights]), np.float32)
+
+
+def reach_of(taps: Floats) -> int:
+    """The largest distance of a tap along a row or a column, in px."""
+    return int(abs(taps[:, :2]).max())
+
+
+def convolve(image: Floats, taps: Floats) -> Floats:
+    """The weighted means; (height, width, 3) in and out, mirrored at the borders."""
+    total: Floats = np.zeros((), np.float32)
+    for dx, dy, *weights in taps:
+        total = total + np.asarray(weights, np.float32) * tap(image, int(dx), int(dy))
+    return total
+
+
+def blur(image: Floats, weights: Floats) -> Floats:
+    """As :func:`convolve`, by rows and columns alike.
+
+    ``weights[k]`` is that of the pixels k to either side; over both sides their sum is 1.
+    """
+    rows = weights[0] * image
+    for k, weight in enumerate(weights[1:], 1):
+        rows = rows + weight * (tap(image, -k, 0) + tap(image, k, 0))
+    total: Floats = np.zeros((), np.float32)
+    for dy in range(1 - len(weights), len(weights)):
+        total = total + weights[abs(dy)] * tap(rows, 0, dy)
+    return total

@@ -1,0 +1,133 @@
+"""Blur by a camera that moves while the shutter is open."""
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from pydantic import model_validator
+
+from clpipe.base.types import Floats
+from clpipe.reference.convolve import convolve, reach_of, taps_of
+from clpipe.stage import Access, Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+
+LONGEST = 200.0  # px
+PARTS = 64  # of a pixel of a streak's length, that are placed one by one
+
+
+@lru_cache(maxsize=64)
+def streak(length: float, angle: float) -> Floats:
+    """The taps of a straight streak, light at rest for the same time all along it.
+
+    Each part of it is shared by the four pixels around in proportion (bilinearly).
+
+    Args:
+        length: px, above 0.
+        angle: degrees, from the right upwards.
+
+    >>> streak(2.0, 0.0)[:, 2].round(3).tolist()
+    [0.25, 0.5, 0.25]
+    """
+    count = int(np.ceil(length * PARTS))
+    along = ((np.arange(count) + 0.5) / count - 0.5) * length
+    x, y = along * np.cos(np.deg2rad(angle)), -along * np.sin(np.deg2rad(angle))
+    reach = int(np.ceil(length / 2)) + 1
+    spread = np.zeros((2 * reach + 1, 2 * reach + 1))
+    for dx in (0, 1):
+        for dy in (0, 1):
+            columns, rows = np.floor(x).astype(int) + dx, np.floor(y).astype(int) + dy
+            share = (1 - abs(x - columns)) * (1 - abs(y - rows))
+            np.add.at(spread, (rows + reach, columns + reach), share)
+    return taps_of(spread[..., None].repeat(3, 2) / count)
+
+
+class Linear(Method):
+    """A straight streak, the same everywhere: that of a small rotation of the camera.
+
+    The camera turns evenly, about an axis in the plane of the picture. Away from its centre a real
+    streak is longer, by 1 / cos^2 of the angle to the axis of view, and bends; that is left out, as
+    in SyB3R's "linear blur" (Ley, Hänsch and Hellwich, ICCV Workshops 2017).
+
+    >>> from clpipe.stage import run_reference
+    >>> dot = np.zeros((1, 7, 3), np.float32)
+    >>> dot[0, 3] = 1
+    >>> run_reference(Linear(length=3.0), dot)[0, :, 0].astype(float).round(2).tolist()
+    [0.0, 0.04, 0.29, 0.33, 0.29, 0.04, 0.0]
+    """
+
+    method: ClassVar = "linear"
+    kernel: ClassVar = "convolve"
+    summary: ClassVar = "a straight streak, the same everywhere"
+    example: ClassVar = {"length": 5.3, "angle": 30.0}
+    alternatives: ClassVar = frozenset({"length", "rotation"})
+
+    length: float | None = parameter(
+        None, "Length of the streak; 0 is off.", "px", "from rotation, else 0", ge=0, le=LONGEST
+    )
+    angle: float = parameter(
+        0.0, "Its direction, from the right upwards.", "degrees", ge=-360, le=360
+    )
+    rotation: float | None = parameter(
+        None,
+        "How far the camera turns while the shutter is open, in place of a length.",
+        "degrees",
+        "none",
+        ge=0,
+        lt=45,
+    )
+    focal_length: float | None = parameter(
+        None, "Focal length, for the streak of a rotation.", "px", gt=0, le=1e6
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_measure(cls, values: Any) -> Any:
+        if isinstance(values, dict) and values.get("rotation") is not None:
+            if values.get("length") is not None:
+                raise ValueError("length and rotation both say how long the streak is; set one")
+            if values.get("focal_length") is None:
+                raise ValueError("rotation needs focal_length, in px")
+        return values
+
+    @model_validator(mode="after")
+    def _short_enough(self) -> "Linear":
+        if self.pixels > LONGEST:
+            raise ValueError(
+                f"rotation {self.rotation:g} at focal_length {self.focal_length:g} is a streak of "
+                f"{self.pixels:.0f} px; at most {LONGEST:g} are possible"
+            )
+        return self
+
+    def resolve(self, context: Context) -> Self:
+        return self.model_copy(update={"length": self.pixels, "rotation": None})
+
+    @property
+    def pixels(self) -> float:
+        """The length of the streak in px: f tan(rotation), in the middle of the picture."""
+        if self.rotation is not None and self.focal_length is not None:
+            return float(self.focal_length * np.tan(np.deg2rad(self.rotation)))
+        return self.length or 0.0
+
+    @property
+    def taps(self) -> Floats:
+        """See :func:`streak`."""
+        return streak(self.pixels, self.angle)
+
+    def passes(self) -> tuple[Pass, ...]:
+        if not self.pixels:
+            return ()
+        radius = reach_of(self.taps)
+        return (Pass("convolve", Access.STENCIL, ("taps", "count"), radius=radius),)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        if not self.pixels:
+            return {}
+        return {"taps": self.taps, "count": np.int32(len(self.taps))}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        return convolve(image, self.taps) if self.pixels else image
+
+
+STAGE = Stage(
+    "motion_blur", "Move the camera while its shutter is open.", Kind.RGB, Kind.RGB, (Linear,)
+)

@@ -1,0 +1,302 @@
+"""Blur by what lies before the photosites: lens, low-pass filter, and their own area."""
+
+from collections.abc import Mapping
+from functools import lru_cache
+from math import erf, sqrt
+from pathlib import Path
+from typing import ClassVar, Self
+
+import numpy as np
+from pydantic import field_validator
+
+from clpipe.base.errors import ImageError
+from clpipe.base.types import Doubles, Floats
+from clpipe.images.read import ReadOptions, read_source
+from clpipe.reference.convolve import NEGLIGIBLE, blur, convolve, reach_of, taps_of
+from clpipe.stage import (
+    Access,
+    Argument,
+    Context,
+    Frame,
+    Kind,
+    Literal,
+    Method,
+    Pass,
+    Stage,
+    Unchanged,
+    parameter,
+)
+
+WAVELENGTHS = (0.600, 0.540, 0.460)  # um, about the middle of what red, green and blue let through
+LARGEST = 65  # px, of a measured function
+FINE = 8  # samples a pixel where diffraction is worked out
+INSIDE = 0.995  # share of the light of a diffraction figure that is kept: its rings go on for ever
+GOOD_LENS = 0.4  # px
+UNROLLED = (
+    3  # px; a blur that goes further takes two launches, one along rows and one along columns
+)
+
+
+def along(sigma: float, low_pass: float, pixel_area: float) -> Doubles:
+    """How the light of a pixel falls along a row or a column: (pixel,) of odd length, of sum 1.
+
+    The light is even over the pixel's square, spread by a Gaussian, doubled by the low-pass filter,
+    and collected by photosites of some side. All arguments are in px; see :class:`Lens`.
+
+    >>> along(0, 0, 0).tolist(), along(0, 1, 0).tolist(), along(0.3, 0, 0).round(2).tolist()
+    ([0.0, 1.0, 0.0], [0.25, 0.5, 0.25], [0.0, 0.05, 0.9, 0.05, 0.0])
+    """
+    reach = int(np.ceil(4 * sigma + (low_pass + pixel_area) / 2 + 0.5))
+    edges = np.arange(-reach, reach + 2) - 0.5
+    parts = 64 if pixel_area else 1
+    places = ((np.arange(parts) + 0.5) / parts - 0.5) * pixel_area
+    places = np.concatenate([places - low_pass / 2, places + low_pass / 2])
+    from_edges = edges[:, None] - places
+    if sigma:
+        below = (1 + np.vectorize(erf)(from_edges / (sigma * sqrt(2)))) / 2
+    else:
+        below = (np.sign(from_edges) + 1) / 2
+    light = np.diff(below, axis=0).mean(1)
+    return np.asarray(light / light.sum(), np.float64)
+
+
+def diffracted(
+    sigma: float, low_pass: float, pixel_area: float, f_number: float, pitch: float
+) -> Doubles:
+    """As :func:`along`, with diffraction: a point spread function, (height, width, 3).
+
+    It is the Fourier transform of the product of all transfer functions. That of a round aperture
+    is (2 / pi)(acos(v) - v sqrt(1 - v^2)), v = frequency * wavelength * f-number (Goodman,
+    Introduction to Fourier Optics, 3rd ed. 2005, eq. 6-31).
+
+    Args:
+        sigma, low_pass, pixel_area: in px.
+        f_number: of the lens.
+        pitch: of the photosites, in um.
+    """
+    size = 2 * LARGEST * FINE
+    frequency = np.fft.fftfreq(size, 1 / FINE)  # cycles a pixel
+    one = np.exp(-2 * (np.pi * sigma * frequency) ** 2) * np.cos(np.pi * low_pass * frequency)
+    one *= np.sinc(pixel_area * frequency) * np.sinc(frequency)
+    radial = np.hypot(frequency[:, None], frequency)
+    planes = []
+    for wavelength in WAVELENGTHS:
+        v = np.minimum(radial * wavelength * f_number / pitch, 1)
+        transfer = 2 / np.pi * (np.arccos(v) - v * np.sqrt(1 - v**2))
+        light = np.fft.ifft2(transfer * one[:, None] * one).real[::FINE, ::FINE]
+        planes.append(np.fft.fftshift(np.maximum(light, 0)))
+    spread = np.stack(planes, -1)
+    middle = spread.shape[0] // 2
+    for reach in range(LARGEST // 2 + 1):
+        part = spread[middle - reach : middle + reach + 1, middle - reach : middle + reach + 1]
+        if (part.sum((0, 1)) >= INSIDE * spread.sum((0, 1))).all():
+            break
+    return np.asarray(part / part.sum((0, 1)))
+
+
+@lru_cache(maxsize=16)
+def measured(path: str) -> Doubles:
+    """The point spread function in an image file, (height, width, 3), each channel of sum 1.
+
+    Raises:
+        ValueError: the file cannot be read, or holds no such function.
+    """
+    try:
+        pixels = read_source(Path(path), Kind.RGB, ReadOptions(transfer="linear")).pixels
+    except ImageError as error:
+        raise ValueError(str(error)) from None
+    height, width = pixels.shape[:2]
+    if height % 2 == 0 or width % 2 == 0 or max(height, width) > LARGEST:
+        raise ValueError(
+            f"{path}: a point spread function has odd sides up to {LARGEST} px, its middle pixel "
+            f"being the centre; found {width}x{height}"
+        )
+    if pixels.min() < 0:
+        raise ValueError(f"{path}: light cannot be negative; found {pixels.min():g}")
+    total = pixels.sum((0, 1), dtype=np.float64)
+    if not total.all():
+        raise ValueError(f"{path}: a channel has no light")
+    return np.asarray(pixels / total)
+
+
+@lru_cache(maxsize=64)
+def half_of(sigma: float, low_pass: float, pixel_area: float) -> Floats:
+    """The middle and one side of :func:`along`, without what is negligible; the whole of sum 1.
+
+    >>> [round(float(weight), 2) for weight in half_of(0.4, 0, 0)]
+    [0.79, 0.11]
+    """
+    light = along(sigma, low_pass, pixel_area)
+    side = light[len(light) // 2 :]
+    from_there_on = 2 * np.cumsum(side[::-1])[::-1]
+    kept = side[from_there_on > NEGLIGIBLE / 2]
+    return np.asarray(kept / (2 * kept.sum() - kept[0]), np.float32)
+
+
+@lru_cache(maxsize=64)
+def line_taps(sigma: float, low_pass: float, pixel_area: float) -> tuple[Floats, Floats]:
+    """The taps of :func:`half_of` along a row, and those along a column."""
+    side = half_of(sigma, low_pass, pixel_area).astype(np.float64)
+    row = np.concatenate([side[:0:-1], side])[None, :, None].repeat(3, 2)
+    return taps_of(row), taps_of(row.transpose(1, 0, 2))
+
+
+@lru_cache(maxsize=64)
+def lens_taps(
+    sigma: float, low_pass: float, pixel_area: float, f_number: float, pitch: float, psf: str
+) -> Floats:
+    """The taps of a lens; see :class:`Lens`. An ``f_number`` of 0 is without diffraction."""
+    if f_number:
+        spread = diffracted(sigma, low_pass, pixel_area, f_number, pitch)
+    else:
+        one = along(sigma, low_pass, pixel_area)
+        spread = np.multiply.outer(one, one)[..., None].repeat(3, 2)
+    return taps_of(convolved(measured(psf), spread) if psf else spread)
+
+
+def convolved(first: Doubles, second: Doubles) -> Doubles:
+    """Two point spread functions one after the other."""
+    height, width = (a + b - 1 for a, b in zip(first.shape, second.shape[:2], strict=False))
+    total = np.zeros((height, width, 3))
+    for (y, x), weights in zip(np.ndindex(*second.shape[:2]), second.reshape(-1, 3), strict=True):
+        total[y : y + first.shape[0], x : x + first.shape[1]] += first * weights
+    return total
+
+
+class Lens(Method):
+    """Light is spread as by a good lens, so that hard edges alias no more than in photographs.
+
+    The point spread function is the Gaussian of the lens's aberrations, with the diffraction of an
+    aperture, the four spots of a low-pass filter, and the area of the photosites where they are
+    set. The light of a pixel of the render is even over the pixel. So along a row the modulation
+    transfer function of aberrations is exp(-2 (pi sigma f)^2) sinc(f), f in cycles a pixel, but for
+    what sampling folds back. Renderers average over pixels themselves, so photosites are points
+    unless they are set. Light is only moved: the mean stays.
+
+    >>> from clpipe.stage import run_reference
+    >>> dot = np.zeros((3, 5, 3), np.float32)
+    >>> dot[1, 2] = 1
+    >>> run_reference(Lens(), dot)[1, :, 0].astype(float).round(2).tolist()
+    [0.0, 0.08, 0.62, 0.08, 0.0]
+    """
+
+    method: ClassVar = "lens"
+    kernel: ClassVar = "convolve"
+    summary: ClassVar = "a good lens; diffraction, a low-pass filter or a measured function"
+    example: ClassVar = {"sigma": 0.7}
+    other_examples: ClassVar = (
+        {"sigma": 1.6},
+        {"sigma": 0.3, "f_number": 11.0, "low_pass": 0.6},
+    )
+
+    sigma: float | None = parameter(
+        None,
+        "Sigma of the lens's aberrations; 0 is off.",
+        "px",
+        f"{GOOD_LENS:g}, 0 with a psf",
+        ge=0,
+        le=8,
+    )
+    f_number: float | None = parameter(
+        None, "Diffraction at this f-number.", "", "no diffraction", ge=0.5, le=64
+    )
+    pixel_pitch: float | None = parameter(
+        None, "Distance of photosites, for diffraction.", "um", "from the camera", gt=0, le=100
+    )
+    low_pass: float = parameter(
+        0.0, "Distance of the spots of an optical low-pass filter; 0 is none.", "px", ge=0, le=4
+    )
+    pixel_area: float = parameter(
+        0.0, "Side of a photosite's light-sensitive square; 0 is a point.", "px", ge=0, le=1
+    )
+    psf: str | None = parameter(
+        None,
+        "An image of a measured point spread function, up to 65x65, in linear light.",
+        "",
+        "none",
+        file=True,
+    )
+
+    @field_validator("psf")
+    @classmethod
+    def _readable(cls, psf: str | None) -> str | None:
+        if psf is not None:
+            measured(psf)
+        return psf
+
+    def resolve(self, context: Context) -> Self:
+        pitch = context.camera.pixel_pitch
+        if self.f_number and not (pitch or self.pixel_pitch):
+            raise ValueError(
+                f"pixel_pitch: diffraction needs it, and camera {context.camera.name} does not "
+                "say; set it in um"
+            )
+        return self.filled(sigma=0.0 if self.psf else GOOD_LENS, pixel_pitch=pitch)
+
+    @property
+    def _by_lines(self) -> tuple[float, float, float] | None:
+        """The arguments of :func:`along`, where it is all; None for what is no product of lines."""
+        assert self.sigma is not None
+        whole = self.f_number is None and self.psf is None
+        return (self.sigma, self.low_pass, self.pixel_area) if whole else None
+
+    @property
+    def _taps(self) -> Floats:
+        assert self.sigma is not None
+        pitch = (self.pixel_pitch or 0.0) if self.f_number else 0.0
+        return lens_taps(
+            self.sigma, self.low_pass, self.pixel_area, self.f_number or 0.0, pitch, self.psf or ""
+        )
+
+    def passes(self) -> tuple[Pass, ...]:
+        lines = self._by_lines
+        if lines is None:
+            radius = reach_of(self._taps)
+            return (Pass("convolve", Access.STENCIL, ("taps", "count"), radius=radius),)
+        reach = len(half_of(*lines)) - 1
+        if reach == 0:
+            return ()
+        if reach <= UNROLLED:
+            return (Pass("blur", Access.STENCIL, ("reach", "weights"), radius=reach),)
+        across, down = (("across", "count"), ("down", "count"))
+        return (
+            Pass("convolve", Access.STENCIL, across, writes="rows", radius=reach),
+            Pass("convolve", Access.STENCIL, down, reads=("rows",), radius=reach),
+        )
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        lines = self._by_lines
+        if lines is None:
+            return {"taps": self._taps, "count": np.int32(len(self._taps))}
+        weights = half_of(*lines)
+        if len(weights) - 1 <= UNROLLED:
+            return {"reach": Literal(str(len(weights) - 1)), "weights": weights}
+        across, down = line_taps(*lines)
+        return {"across": across, "down": down, "count": np.int32(len(across))}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        own = self.resolve(frame.context)
+        lines = own._by_lines
+        if lines is None:
+            return convolve(image, own._taps)
+        weights = half_of(*lines)
+        if len(weights) - 1 <= UNROLLED:
+            return blur(image, weights)
+        across, down = line_taps(*lines)
+        return convolve(convolve(image, across), down)
+
+
+class NoBlur(Unchanged):
+    """No blur: a render is as sharp as no lens."""
+
+    method: ClassVar = "none"
+    summary: ClassVar = "no blur"
+
+
+STAGE = Stage(
+    "optical_blur",
+    "Spread light as a lens and the filter before a sensor do.",
+    Kind.RGB,
+    Kind.RGB,
+    (Lens, NoBlur),
+)

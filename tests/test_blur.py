@@ -1,0 +1,151 @@
+"""optical_blur and motion_blur: how light is spread, measured on what comes out."""
+
+import numpy as np
+import pytest
+
+from clpipe.base.errors import RequestError
+from clpipe.camera.profile import load_camera
+from clpipe.chain.chain import make_chain
+from clpipe.chain.files import load_settings
+from clpipe.chain.settings import settings_from
+from clpipe.engine.runner import Runner
+from clpipe.stages.motion_blur import streak
+from clpipe.stages.optical_blur import along, diffracted, lens_taps
+
+
+def blurred(image, device=None, **stages):
+    """An image through these stages, with their parameters."""
+    chain = make_chain(settings_from({"stages": list(stages), **stages}))
+    return Runner(chain, device, encode=False, final=True).run(image, "k").final
+
+
+def dot(size=65):
+    """One bright pixel in the middle."""
+    image = np.zeros((size, size, 3), np.float32)
+    image[size // 2, size // 2] = 1
+    return image
+
+
+def edge_mtf(picture, slope):
+    """The modulation transfer of an almost upright edge at 0.05 to 0.5 cycles a pixel (ISO 12233).
+
+    ``slope`` is how far the edge moves to the right with each row, in px.
+    """
+    rows, columns = picture.shape
+    x = np.arange(columns) - slope * np.arange(rows)[:, None]
+    bins = np.round((x - x.mean()) * 4).astype(int)
+    bins -= bins.min()
+    profile = np.bincount(bins.ravel(), picture.ravel()) / np.bincount(bins.ravel())
+    middle = len(profile) // 2
+    spread = np.diff(profile[middle - 80 : middle + 81])
+    frequency = np.arange(0.05, 0.51, 0.05)
+    place = np.arange(len(spread)) / 4
+    response = abs(np.exp(-2j * np.pi * frequency[:, None] * place) @ spread) / spread.sum()
+    # The edge itself was sampled by pixels' areas, and the profile in bins of a quarter pixel.
+    return frequency, response / np.sinc(frequency) / np.sinc(frequency / 4) ** 2
+
+
+@pytest.mark.parametrize(
+    "lens", [{}, {"sigma": 1.3}, {"sigma": 0.5, "low_pass": 0.8, "pixel_area": 1.0}]
+)
+def test_a_slanted_edge_is_as_sharp_as_the_lens_says(lens, device):
+    slope = 0.117
+    # Shares of pixels beyond the edge, worked out on a grid 16 times as fine.
+    y, x = (np.arange(200 * 16) + 0.5) / 16, (np.arange(96 * 16) + 0.5) / 16
+    beyond = (x > 48 + slope * (y[:, None] - 100)).astype(np.float32)
+    edge = beyond.reshape(200, 16, 96, 16).mean((1, 3))[..., None].repeat(3, 2)
+    frequency, sharp = edge_mtf(edge[..., 1], slope)
+    _, found = edge_mtf(blurred(edge, device, optical_blur=lens)[..., 1], slope)
+    light = along(lens.get("sigma", 0.4), lens.get("low_pass", 0), lens.get("pixel_area", 0))
+    places = np.arange(len(light)) - len(light) // 2
+    said = np.cos(2 * np.pi * frequency[:, None] * places) @ light
+    assert found / sharp == pytest.approx(said, abs=0.02)
+
+
+def test_light_is_moved_and_none_is_lost(device):
+    image = np.random.default_rng(5).random((90, 110, 3), np.float32) ** 4
+    image[:40] = image[-40:] = image[:, :40] = image[:, -40:] = 0.25
+    for stages in (
+        {"optical_blur": {}},
+        {"optical_blur": {"sigma": 2.5}},
+        {"optical_blur": {"f_number": 16.0}},
+        {"motion_blur": {"length": 31.0, "angle": 70.0}},
+    ):
+        after = blurred(image, device, **stages)
+        assert not np.array_equal(after, image)
+        assert after.mean((0, 1)) == pytest.approx(image.mean((0, 1)), rel=1e-4)
+
+
+def test_diffraction_is_widest_in_red_and_has_the_transfer_of_an_aperture():
+    spread = diffracted(0, 0, 0, 16.0, 4.5)
+    peaks = spread.max((0, 1))
+    assert peaks[0] < peaks[1] < peaks[2]
+    line = spread[..., 1].sum(0)
+    places = np.arange(len(line)) - len(line) // 2
+    v = 0.2 * 0.54 * 16 / 4.5
+    said = 2 / np.pi * (np.arccos(v) - v * np.sqrt(1 - v**2)) * np.sinc(0.2)
+    assert np.cos(2 * np.pi * 0.2 * places) @ line == pytest.approx(said, abs=0.02)
+
+
+def test_a_measured_function_is_seen_around_a_point_of_light(device, write_exr):
+    spread = np.random.default_rng(6).random((5, 7, 3)).astype(np.float32)
+    spread[..., 2] *= 3  # each channel is scaled to the sum 1
+    path = str(write_exr("psf.exr", spread))
+    seen = blurred(dot(), device, optical_blur={"psf": path})[30:35, 29:36]
+    assert seen == pytest.approx(spread / spread.sum((0, 1)), abs=2e-3)  # but for the thinnest
+    assert lens_taps(0.6, 0, 0, 0, 0, path)[:, 2:].sum(0) == pytest.approx(1)
+
+
+def test_a_streak_is_as_long_and_lies_as_is_said(device):
+    seen = blurred(dot(), device, motion_blur={"length": 24.0, "angle": 30.0})[..., 0]
+    y, x = np.indices(seen.shape) - 32.0
+    along_it = x * np.cos(np.deg2rad(30)) - y * np.sin(np.deg2rad(30))
+    across = x * np.sin(np.deg2rad(30)) + y * np.cos(np.deg2rad(30))
+    assert (seen * along_it).sum() == pytest.approx(0, abs=0.01)
+    assert (seen * along_it**2).sum() == pytest.approx(24**2 / 12, rel=0.02)
+    assert (seen * across**2).sum() < 0.4  # bilinear shares
+    turned = {"rotation": 1.2, "focal_length": 24 / np.tan(np.deg2rad(1.2)), "angle": 30.0}
+    assert blurred(dot(), None, motion_blur=turned)[..., 0] == pytest.approx(seen, abs=5e-4)
+    assert len(streak(200.0, 45.0)) < 600
+
+
+@pytest.mark.parametrize("direction", [0.0, 90.0])
+def test_a_streak_along_a_line_stays_on_it(direction):
+    seen = blurred(dot(9), motion_blur={"length": 4.0, "angle": direction})[..., 0]
+    line = seen[4] if direction == 0 else seen[:, 4]
+    assert line.sum() == pytest.approx(1)
+
+
+def test_the_default_has_a_good_lens_and_the_paper_none():
+    image = dot()
+    assert make_chain(settings_from({})).step_named("optical_blur").method.sigma == 0.4
+    paper = make_chain(load_settings("paper"))
+    kept = Runner(paper, None, ["exposure"], encode=False).run(image, "k").kept["exposure"]
+    assert np.array_equal(kept, image)
+
+
+@pytest.mark.parametrize(
+    ("stages", "message"),
+    [
+        ({"optical_blur": {"psf": "none.exr"}}, "none.exr: no such file"),
+        ({"optical_blur": {"psf": "even.exr"}}, "odd sides up to 65 px.*found 4x5"),
+        ({"optical_blur": {"psf": "dark.exr"}}, "dark.exr: a channel has no light"),
+        ({"optical_blur": {"psf": "minus.exr"}}, "minus.exr: light cannot be negative"),
+        ({"motion_blur": {"length": 300.0}}, "motion_blur.length.*200"),
+        ({"motion_blur": {"rotation": 1.0}}, "rotation needs focal_length"),
+        ({"motion_blur": {"rotation": 9.0, "focal_length": 5000.0}}, "a streak of 792 px"),
+        (
+            {"motion_blur": {"rotation": 1.0, "focal_length": 99.0, "length": 1.0}},
+            "length and rotation both say",
+        ),
+        ({"camera": "sony-imx686", "optical_blur": {"f_number": 2.0}}, "diffraction needs it"),
+    ],
+)
+def test_what_is_refused(stages, message, write_exr, monkeypatch, tmp_path):
+    assert load_camera("sony-imx686").pixel_pitch is None
+    monkeypatch.chdir(tmp_path)
+    write_exr("even.exr", np.ones((5, 4, 3), np.float32))
+    write_exr("dark.exr", np.ones((5, 5, 3), np.float32) * np.float32([1, 1, 0]))
+    write_exr("minus.exr", np.ones((5, 5, 3), np.float32) * np.float32(-1))
+    with pytest.raises(RequestError, match=message):
+        make_chain(settings_from(stages))
