@@ -2,6 +2,7 @@
 
 Stage by stage, with the parameters of clpipe's own chain:
 
+- optical_blur: cv2.sepFilter2D with the same weights.
 - exposure, mosaic, inverse_white_balance: a strided copy from the render for each colour of the
   pattern, and one gain a colour.
 - sensor_noise, row_noise: cv2.randn (three times faster than NumPy's generators), times the root
@@ -39,6 +40,7 @@ from clpipe.stages.tone_curve.filmic import filmic
 
 CODES = 65536  # of 16 bits
 TOP = CODES - 1
+BLUR_HALO = 4  # rows that the blur looks at beyond a band, or more
 HALO = 8  # rows that demosaicing, denoising and sharpening look at beyond a band
 BAND = 500_000  # pixels, most of which stay in the cache; found by trying
 
@@ -64,6 +66,8 @@ class OpenCVChain:
         of: dict[str, Any] = {step.name: step.method for step in chain.steps}
         before, after = of["inverse_white_balance"], of["white_balance"]
         levels, noise = of["quantize"], of["sensor_noise"]
+        side = of["optical_blur"].arguments(chain.steps[0].context)["weights"]
+        self.spread = np.concatenate([side[:0:-1], side])
         gain = float(of["exposure"].gain)
         self.gains = gain / before.red_gain, gain, gain / before.blue_gain
         self.a, self.b, self.row_sigma = noise.a, noise.b, of["row_noise"].sigma
@@ -90,8 +94,13 @@ class OpenCVChain:
         self.display = to_8_bit(np.float32(srgb_curve(filmic(np.float32(light)))))
         self.to_colours = cv2.COLOR_YCrCb2BGR if bgr else cv2.COLOR_YCrCb2RGB
 
-    def expose(self, render: Array) -> Array:
-        """The raw of a render: (height, width, 3) half or float to (height, width) uint16."""
+    def blur(self, render: Array) -> Floats:
+        """A render as the lens spreads it: (height, width, 3) half or float to float32."""
+        light = render.astype(np.float32)
+        return cv2.sepFilter2D(light, -1, self.spread, self.spread, light)
+
+    def expose(self, render: Floats) -> Array:
+        """The raw of what falls on the sensor: (height, width, 3) to (height, width) uint16."""
         height, width = render.shape[:2]
         y = np.empty((height, width), np.float32)
         for row, colours in enumerate(((0, 1), (1, 2))):  # of RGGB
@@ -144,7 +153,7 @@ class OpenCVChain:
 
     def run(self, render: Array) -> Array:
         """A render through the chain, whole: (height, width, 3) uint8."""
-        return self.develop(self.expose(render))
+        return self.develop(self.expose(self.blur(render)))
 
     def run_in_bands(self, render: Array, each: Each = map) -> Array:
         """The same in bands of rows that stay in the cache; ``each`` may be a pool's map."""
@@ -154,7 +163,9 @@ class OpenCVChain:
         picture = np.empty((height, width, 3), np.uint8)
 
         def expose(top: int) -> None:
-            raw[top : top + rows] = self.expose(render[top : top + rows])
+            above = max(top - BLUR_HALO, 0)
+            light = self.blur(render[above : top + rows + BLUR_HALO])
+            raw[top : top + rows] = self.expose(light[top - above :][:rows])
 
         def develop(top: int) -> None:
             above = max(top - HALO, 0)
