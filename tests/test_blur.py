@@ -1,4 +1,4 @@
-"""optical_blur and motion_blur: how light is spread, measured on what comes out."""
+"""shutter, motion_blur and optical_blur: what light falls where, measured on what comes out."""
 
 import numpy as np
 import pytest
@@ -149,3 +149,21 @@ def test_what_is_refused(stages, message, write_exr, monkeypatch, tmp_path):
     write_exr("minus.exr", np.ones((5, 5, 3), np.float32) * np.float32(-1))
     with pytest.raises(RequestError, match=message):
         make_chain(settings_from(stages))
+
+
+def test_rows_see_a_lamp_while_they_are_exposed(device):
+    shutter = {
+        "exposure_time": 3e-3,
+        "line_time": 4e-4,
+        "flicker_depth": 0.6,
+        "flicker_frequency": 120.0,
+        "flicker_phase": 50.0,
+    }
+    grey = np.full((50, 3, 3), 0.5, np.float32)
+    seen = blurred(grey, device, shutter=shutter)
+    for row in (0, 7, 49):
+        times = row * 4e-4 + (np.arange(1000) + 0.5) * 3e-6
+        light = 1 + 0.6 * np.cos(2 * np.pi * 120 * times + np.deg2rad(50))
+        assert seen[row] == pytest.approx(0.5 * light.mean(), rel=1e-4)
+    steady = blurred(grey, device, shutter={**shutter, "exposure_time": 1 / 60})
+    assert steady == pytest.approx(grey, rel=1e-6)  # two periods

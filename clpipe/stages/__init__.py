@@ -13,6 +13,7 @@ from pkgutil import iter_modules
 from clpipe.stage import Stage
 
 DEFAULT_CHAIN = (
+    "shutter",
     "motion_blur",
     "optical_blur",
     "exposure",

@@ -1,0 +1,95 @@
+"""When each row of the sensor sees the scene: a rolling shutter, and lamps that flicker."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.base.types import Doubles, Floats
+from clpipe.stage import Access, Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+
+
+class Rows(Method):
+    """Row y is exposed from y * line_time on, for exposure_time.
+
+    Light that flickers as 1 + depth cos(2 pi f t + phase) comes, averaged over a row's exposure T,
+    as 1 + depth sinc(f T) cos(2 pi f (y line_time + T / 2) + phase).
+
+    >>> from clpipe.stage import run_reference
+    >>> banded = Rows(exposure_time=1e-3, line_time=1e-3, flicker_depth=0.5, flicker_frequency=250)
+    >>> seen = run_reference(banded, np.ones((5, 1, 3), np.float32))
+    >>> [round(float(y), 2) for y in seen[:, 0, 0]]
+    [1.32, 0.68, 0.68, 1.32, 1.32]
+    """
+
+    method: ClassVar = "rows"
+    kernel: ClassVar = "shutter"
+    summary: ClassVar = "rows one after the other, or all at once"
+    tolerance: ClassVar = 1e-5
+    example: ClassVar = {"flicker_depth": 0.4, "line_time": 1e-3, "exposure_time": 4e-3}
+
+    exposure_time: float = parameter(0.01, "How long each row is exposed.", "s", gt=0, le=3600)
+    line_time: float = parameter(
+        0.0,
+        "From the start of a row to that of the next; 0 is a global shutter.",
+        "s",
+        ge=0,
+        le=1,
+    )
+    flicker_depth: float = parameter(
+        0.0, "How much the light swings about its mean; 0 is steady.", "", ge=0, le=1
+    )
+    flicker_frequency: float = parameter(
+        100.0, "Frequency of the light, twice that of the mains.", "Hz", gt=0, le=1e6
+    )
+    flicker_phase: float = parameter(
+        0.0, "Phase of the light when the first row's exposure starts.", "degrees", ge=-360, le=360
+    )
+
+    def times(self, rows: int) -> Doubles:
+        """When the exposure of each row starts, in s: (row,)."""
+        return np.arange(rows, dtype=np.float64) * self.line_time
+
+    @property
+    def swing(self) -> np.float32:
+        """The flicker that is left after a row's exposure has averaged it."""
+        return np.float32(self.flicker_depth * np.sinc(self.flicker_frequency * self.exposure_time))
+
+    def passes(self) -> tuple[Pass, ...]:
+        if not self.swing:
+            return ()
+        given = ("cycles", "start", "swing")
+        return (
+            Pass("flicker_of_rows", Access.LINES, given, lines="rows", writes="rows"),
+            Pass("flicker", arguments=("rows",)),
+        )
+
+    @property
+    def cycles(self) -> np.float32:
+        """Periods of the light from a row to the next, less whole ones."""
+        return np.float32(self.flicker_frequency * self.line_time % 1)
+
+    @property
+    def start(self) -> np.float32:
+        """The light's phase in the middle of the first row's exposure, in periods."""
+        middle = self.flicker_frequency * self.exposure_time / 2
+        return np.float32((middle + self.flicker_phase / 360) % 1)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {"cycles": self.cycles, "start": self.start, "swing": self.swing}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        if not self.swing:
+            return image
+        turns = np.arange(image.shape[0], dtype=np.float32) * self.cycles + self.start
+        gains = 1 + self.swing * np.cos(2 * np.pi * turns.astype(np.float64))
+        return image * gains.astype(np.float32)[:, None, None]
+
+
+STAGE = Stage(
+    "shutter",
+    "Expose rows one after the other, under lamps that flicker.",
+    Kind.RGB,
+    Kind.RGB,
+    (Rows,),
+)
