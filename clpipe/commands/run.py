@@ -35,6 +35,7 @@ from clpipe.images.read import PICTURE_SUFFIXES, TRANSFERS
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.folder import output_folder, remove_unfinished
+from clpipe.outputs.renditions import parse_bracket
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
@@ -58,6 +59,13 @@ if TYPE_CHECKING:
     type=click.IntRange(1, MAX_FRAMES),
     metavar="N",
     help="Make a burst of N frames of each image, each with its own noise, and their truth.",
+)
+@click.option(
+    "--bracket",
+    callback=lambda _context, _option, text: () if text is None else parse_bracket(text),
+    metavar="EV,EV,...",
+    help="Make an exposure of each image for each of these EVs, which are added to exposure.ev; "
+    "each has its own noise, and its own frames and truths.",
 )
 @click.option(
     "--truth",
@@ -183,8 +191,9 @@ def run(
 
     Each image makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used. A
     second run makes only what is missing or has changed. OUT/run.jsonl is the log. With --frames:
-    OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise. With --webdataset
-    these are in tars, and dots in NAME become "_", because a key of WebDataset has none.
+    OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise. With --bracket
+    -2,0,2: OUT/NAME.ev-2.jpg, OUT/NAME.ev+0.jpg and OUT/NAME.ev+2.jpg. With --webdataset these are
+    in tars, and dots in NAME become "_", because a key of WebDataset has none.
 
     --truth clean is OUT/NAME.truth_clean.jpg, the picture to train on: without noise, and without
     denoising and what else follows from the noise. --truth development is OUT/NAME.truth.jpg, also
