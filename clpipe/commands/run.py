@@ -27,11 +27,16 @@ from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.request import Request
 from clpipe.chain.truth import TRUTHS
 from clpipe.commands.chain_options import chain_options, format_option, keep_option
+from clpipe.commands.input_options import (
+    exclude_option,
+    layer_option,
+    max_pixels_option,
+    transfer_option,
+)
 from clpipe.commands.options import Command, raw_size_option, raw_type_option
 from clpipe.commands.progress import Reporter
 from clpipe.engine.device import Device, open_devices
-from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS
-from clpipe.images.read import PICTURE_SUFFIXES, TRANSFERS
+from clpipe.images.read import PICTURE_SUFFIXES
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.folder import output_folder, remove_unfinished
@@ -78,27 +83,10 @@ if TYPE_CHECKING:
 )
 @raw_size_option
 @raw_type_option
-@click.option(
-    "--transfer",
-    type=click.Choice(list(TRANSFERS)),
-    help="The transfer curve of renders in whole numbers (PNG, TIFF of 8 or 16 bits).",
-)
-@click.option("--layer", metavar="NAME", help="The layer or part of an EXR that is the picture.")
-@click.option(
-    "--max-pixels",
-    default=USUAL_MAX_PIXELS,
-    show_default=True,
-    type=click.IntRange(1, MAX_PIXELS),
-    metavar="N",
-    help="Refuse larger images, before memory is taken.",
-)
-@click.option(
-    "--exclude",
-    multiple=True,
-    metavar="GLOB",
-    help="Leave out what folders and globs would give: files and folders whose name, or path in "
-    "the input folder, matches; may be repeated.",
-)
+@transfer_option
+@layer_option
+@max_pixels_option
+@exclude_option
 @keep_option
 @format_option
 @click.option(
