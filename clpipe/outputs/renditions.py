@@ -94,9 +94,12 @@ class RenditionPlan:
         own = (*self._frame_names(), *(SUFFIXES[truth] for truth in self._all_truths()))
         return tuple(exposure + name for exposure in self._exposures() for name in own)
 
-    def _exposures(self) -> dict[str, float]:
-        """The EV of each exposure, by the name that stands before those of its renditions."""
-        return {bracket_name(ev): ev for ev in self.bracket} or {"": 0.0}
+    def _exposures(self) -> dict[str, float | None]:
+        """The EV of each exposure, by the name that stands before those of its renditions.
+
+        Without a bracket it is None, of the chain as it is.
+        """
+        return {bracket_name(ev): ev for ev in self.bracket} or {"": None}
 
     def _frame_names(self) -> tuple[str, ...]:
         if self.frames is None:
@@ -121,7 +124,8 @@ class RenditionPlan:
         named = list(zip(self._frame_names(), numbers, strict=True))
         renditions: list[Rendition] = []
         for exposure, ev in self._exposures().items():
-            own, own_key = exposed(chain, ev), of_bracket(key, ev)
+            own = chain if ev is None else exposed(chain, ev)
+            own_key = of_bracket(key, ev or 0.0)
             renditions += [Rendition(exposure + name, own, own_key, n) for name, n in named]
             for truth in (truth_of(each, own) for each in self._all_truths()):
                 renditions.append(replace(truth, name=exposure + truth.name, key=own_key))
