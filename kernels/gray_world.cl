@@ -1,7 +1,7 @@
 #include "site_gains.cl"
 // Gray world (Buchsbaum 1980): gains that make the means of the three colours equal.
 // Samples are summed as integers in steps of 2^-20, clipped to -1..1.
-INLINE vi gray_world_sample(vf y) {
+INLINE vi gray_world_sample(vf y, site at) {
     return to_int(nearest(vmin(vmax(y, (vf)(-1.0f)), (vf)(1.0f)) * 1048576.0f));
 }
 

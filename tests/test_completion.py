@@ -67,14 +67,14 @@ def test_keep_takes_all():
 
 
 def test_only_stages_with_several_methods_have_methods_to_time():
-    assert "exposure" not in values("bench", "--methods", "")
+    assert "mosaic" not in values("bench", "--methods", "")
     assert values("bench", "--methods", "den") == ["denoise"]
 
 
 def test_parameters():
     assert values("run", "--set", "expo") == ["exposure."]
-    names = ["exposure.method=", "exposure.ev=", "exposure.headroom="]
-    assert values("run", "--set", "exposure.") == names
+    names = ["quantize.method=", "quantize.bits=", "quantize.black_level=", "quantize.white_level="]
+    assert values("run", "--set", "quantize.") == names
     assert values("run", "--set", "gamma.method=s") == ["gamma.method=srgb"]
     assert values("run", "--set", "nothing.") == []
 

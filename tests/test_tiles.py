@@ -89,6 +89,16 @@ def test_every_stage(device, scalar_device, monkeypatch, stage, method, scalar):
         assert result.estimates["white_balance"]["red_gain"] != 1
 
 
+@pytest.mark.parametrize("scalar", [False, True])
+def test_auto_exposure_by_a_percentile(device, scalar_device, monkeypatch, scalar):
+    stage = all_stages()["exposure"]
+    chain = chain_for(stage, stage.by_name["auto"], {"rule": "percentile"}, "GRBG")
+    runner = Runner(chain, scalar_device if scalar else device, encode=False, final=True)
+    result, count = in_tiles(runner, example(Kind.RGB, (150, 203)), 70, 56, monkeypatch)
+    assert count >= 6
+    assert result.estimates["exposure"]["metered_ev"] != 0
+
+
 @pytest.mark.parametrize(
     ("pattern", "balance"),
     list(zip(PATTERNS, ("gray_world", "white_patch", "white_patch", "gray_world"), strict=True)),

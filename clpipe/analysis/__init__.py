@@ -1,6 +1,7 @@
 """Measurement of noise: statistics of images; cameras, calibrated or of others' noise models;
-and the development of a camera, matched.
+and the development of a camera, matched. And of light: the exposures of a sequence.
 
-This room works on arrays and on files that ``images`` reads; only ``matching`` develops pictures.
-It imports ``outputs`` and below, and is the only room that imports SciPy and Matplotlib.
+This room works on arrays and on files that ``images`` reads; only ``matching`` develops pictures,
+and ``metering`` runs a chain as far as its exposure. It imports ``outputs`` and below, and is the
+only room that imports SciPy and Matplotlib.
 """

@@ -14,7 +14,7 @@ from clpipe.chain.request import Request
 from clpipe.engine.device import Device
 from clpipe.inputs.find import Job
 from clpipe.inputs.manifest import check_output_name
-from clpipe.outputs.renditions import RenditionPlan, truth_named
+from clpipe.outputs.renditions import RenditionPlan, bracket_in, truth_named
 from clpipe.outputs.sidecar import all_versions, device_record, read_sidecar
 
 CODE = (".py", ".cl")  # the endings of files that are run
@@ -133,12 +133,13 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
     if not (frames is None or (type(frames) is int and 0 < frames <= MAX_FRAMES)):
         raise RequestError(f"found frames {frames}")
     truths = tuple(filter(None, [truth_named(picture)]))
-    if picture not in RenditionPlan(frames, truths).names():
+    bracket = bracket_in(picture)
+    if picture not in RenditionPlan(frames, truths, bracket).names():
         raise RequestError(f"found picture {picture!r}")
     request = Request.from_record(values["request"])
     if not request.formats:
         raise RequestError("found no formats")
-    request = replace(request, max_pixels=max_pixels, frames=frames, truths=truths)
+    request = replace(request, max_pixels=max_pixels, frames=frames, truths=truths, bracket=bracket)
     path = inputs[0] if inputs else Path(values["input"])
     job = Job(path, request.image_name, name, values=request.image, pictures=(picture,))
     were = {**flat(values["device"]), **values["versions"]}

@@ -40,6 +40,15 @@ def of_frame(key: str, frame: int | None) -> str:
     return key if frame is None else f"{key}#{frame}"
 
 
+def of_bracket(key: str, ev: float) -> str:
+    """The key of an image's exposure in a bracket; that at 0 EV is the image's own.
+
+    >>> of_bracket("a.exr@9f86d081884c7d65", -2), of_bracket("a.exr@9f86d081884c7d65", 0)
+    ('a.exr@9f86d081884c7d65#ev-2', 'a.exr@9f86d081884c7d65')
+    """
+    return f"{key}#ev{ev:+g}" if ev else key
+
+
 def noise_key(settings: "Settings", key: str, frame: int | None = None) -> str:
     """What noise is made of, beside the seed and the stage: the image and the ISO.
 

@@ -50,6 +50,8 @@ class Request:
         truths: which of :data:`clpipe.chain.truth.TRUTHS` are written beside each picture.
         truth_keep: steps whose image is written beside a truth that is a picture; None is
             ``keep``. See :meth:`with_outputs`.
+        bracket: what is added to the exposure's EV, for each exposure that is made of each image;
+            () is one exposure.
     """
 
     config: Mapping[str, Any] | None = None
@@ -67,6 +69,7 @@ class Request:
     frames: int | None = None
     truths: tuple[str, ...] = ()
     truth_keep: tuple[str, ...] | None = None
+    bracket: tuple[float, ...] = ()
 
     @classmethod
     def from_options(

@@ -31,14 +31,26 @@ iso_option = click.option(
     help=f"The ISO; noise and denoising follow from it. [default: {DEFAULTS.iso:g}]",
 )
 
+config_option = click.option(
+    "-c",
+    "--config",
+    metavar="NAME|FILE",
+    shell_complete=configs,
+    help=f"A configuration: {', '.join(built_in_configs())}, or a TOML file.",
+)
+
+set_option = click.option(
+    "--set",
+    "assignments",
+    multiple=True,
+    metavar="STAGE.PARAM=VALUE",
+    shell_complete=parameters,
+    help="Set a parameter; may be repeated. STAGE.method=NAME chooses a method; "
+    "'{uniform=[1, 2]}' as the value draws one for each image.",
+)
+
 _CHAIN_OPTIONS = (
-    click.option(
-        "-c",
-        "--config",
-        metavar="NAME|FILE",
-        shell_complete=configs,
-        help=f"A configuration: {', '.join(built_in_configs())}, or a TOML file.",
-    ),
+    config_option,
     camera_option,
     iso_option,
     click.option("--seed", type=int, help=f"The seed of the noise. [default: {DEFAULTS.seed}]"),
@@ -48,15 +60,7 @@ _CHAIN_OPTIONS = (
         help="Share the noise with all images that have this key, whatever their ISO. "
         "[default: each image and ISO has noise of its own]",
     ),
-    click.option(
-        "--set",
-        "assignments",
-        multiple=True,
-        metavar="STAGE.PARAM=VALUE",
-        shell_complete=parameters,
-        help="Set a parameter; may be repeated. STAGE.method=NAME chooses a method; "
-        "'{uniform=[1, 2]}' as the value draws one for each image.",
-    ),
+    set_option,
     click.option(
         "--stages",
         metavar="A,B,C",

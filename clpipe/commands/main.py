@@ -24,6 +24,7 @@ COMMANDS = (
     "stages",
     "cameras",
     "devices",
+    "meter",
     "measure",
     "calibrate",
     "match",

@@ -27,14 +27,20 @@ from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.request import Request
 from clpipe.chain.truth import TRUTHS
 from clpipe.commands.chain_options import chain_options, format_option, keep_option
+from clpipe.commands.input_options import (
+    exclude_option,
+    layer_option,
+    max_pixels_option,
+    transfer_option,
+)
 from clpipe.commands.options import Command, raw_size_option, raw_type_option
 from clpipe.commands.progress import Reporter
 from clpipe.engine.device import Device, open_devices
-from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS
-from clpipe.images.read import PICTURE_SUFFIXES, TRANSFERS
+from clpipe.images.read import PICTURE_SUFFIXES
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.folder import output_folder, remove_unfinished
+from clpipe.outputs.renditions import parse_bracket
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
@@ -60,6 +66,13 @@ if TYPE_CHECKING:
     help="Make a burst of N frames of each image, each with its own noise, and their truth.",
 )
 @click.option(
+    "--bracket",
+    callback=lambda _context, _option, text: () if text is None else parse_bracket(text),
+    metavar="EV,EV,...",
+    help="Make an exposure of each image for each of these EVs, which are added to exposure.ev; "
+    "each has its own noise, and its own frames and truths.",
+)
+@click.option(
     "--truth",
     "truths",
     multiple=True,
@@ -70,27 +83,10 @@ if TYPE_CHECKING:
 )
 @raw_size_option
 @raw_type_option
-@click.option(
-    "--transfer",
-    type=click.Choice(list(TRANSFERS)),
-    help="The transfer curve of renders in whole numbers (PNG, TIFF of 8 or 16 bits).",
-)
-@click.option("--layer", metavar="NAME", help="The layer or part of an EXR that is the picture.")
-@click.option(
-    "--max-pixels",
-    default=USUAL_MAX_PIXELS,
-    show_default=True,
-    type=click.IntRange(1, MAX_PIXELS),
-    metavar="N",
-    help="Refuse larger images, before memory is taken.",
-)
-@click.option(
-    "--exclude",
-    multiple=True,
-    metavar="GLOB",
-    help="Leave out what folders and globs would give: files and folders whose name, or path in "
-    "the input folder, matches; may be repeated.",
-)
+@transfer_option
+@layer_option
+@max_pixels_option
+@exclude_option
 @keep_option
 @format_option
 @click.option(
@@ -183,8 +179,9 @@ def run(
 
     Each image makes OUT/NAME.jpg and OUT/NAME.json, the sidecar with everything that was used. A
     second run makes only what is missing or has changed. OUT/run.jsonl is the log. With --frames:
-    OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise. With --webdataset
-    these are in tars, and dots in NAME become "_", because a key of WebDataset has none.
+    OUT/NAME.frame0.jpg and so on, and OUT/NAME.truth.jpg, the same without noise. With --bracket
+    -2,0,2: OUT/NAME.ev-2.jpg, OUT/NAME.ev+0.jpg and OUT/NAME.ev+2.jpg. With --webdataset these are
+    in tars, and dots in NAME become "_", because a key of WebDataset has none.
 
     --truth clean is OUT/NAME.truth_clean.jpg, the picture to train on: without noise, and without
     denoising and what else follows from the noise. --truth development is OUT/NAME.truth.jpg, also

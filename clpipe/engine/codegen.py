@@ -247,7 +247,7 @@ def _pixels(writer: Writer, launch: Launch) -> str:
     value = f"v{len(ops)}"
     if launch.sums:
         writer.parameter("sums", "__global int4 *restrict ", "sums")
-        sample = call(launch.sums, [value, *writer.arguments(launch.sums)])
+        sample = call(launch.sums, [value, "at", *writer.arguments(launch.sums)])
         lines.append(f"const vi sample = only_inside({sample}, at, {writer.core()});")
         lines.append("if (ROW & 1) odd_rows += sample; else even_rows += sample;")
         once.append("vi even_rows = (vi)(0), odd_rows = (vi)(0);")
@@ -348,17 +348,23 @@ def _lines(writer: Writer, launch: Lines) -> str:
 
 def _count(writer: Writer, launch: Histogram) -> str:
     op, bins = launch.op, launch.op.pass_.bins
-    plane = writer.planes(launch.reads[0])[0]
+    read = launch.reads[0]
+    planes = writer.planes(read)[: len(read.image.kind.channels)]
+    origins = [f"origin{i}" for i in range(len(planes))]
     counts = writer.parameter("counts", "__global uint *", "counts", number=bins)
-    arguments = ["origin", "x", "y", "e", *writer.arguments(op)]
+    arguments = [*origins, "x", "y", "e", *writer.arguments(op)]
     core = writer.core()
     if writer.lanes == 1:  # a work-group counts together, each of its work items other columns
         row, first, step = "get_group_id(0)", "(uint)get_local_id(0)", "(uint)get_local_size(0)"
         wait, count = "    barrier(CLK_GLOBAL_MEM_FENCE);\n", "atomic_inc(own + bin)"
     else:
         row, first, step, wait, count = "get_global_id(0)", "0", "1", "", "own[bin] += 1"
+    starts = "".join(
+        f"    __global const float *{origin} = image_origin({plane}, e);\n"
+        for origin, plane in zip(origins, planes, strict=True)
+    )
     return (
-        f"    __global const float *origin = image_origin({plane}, e);\n"
+        f"{starts}"
         f"    __global uint *own = {counts} + (size_t){row} * {bins};\n"
         f"    for (uint k = {first}; k < {bins}; k += {step}) own[k] = 0;\n{wait}"
         f"    for (uint y = {core}.top + {row}; y < {core}.bottom; y += {PARTIALS}) {{\n"

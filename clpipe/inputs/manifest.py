@@ -1,5 +1,7 @@
 """Manifests: images in a table, .csv or .jsonl, with values that hold for each alone."""
 
+import csv
+import io
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +18,7 @@ from clpipe.chain.methods import base_name
 from clpipe.chain.paths import from_folder
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings, overlay
+from clpipe.chain.toml import toml_value, value_text
 from clpipe.images.encoding import Output
 from clpipe.inputs.tables import OWN, PLAIN, TEXTS, csv_records, json_records
 
@@ -94,6 +97,43 @@ def read_manifest(path: Path, keep_suffix: bool = False) -> list[Row]:
     if not rows:
         raise RequestError(f"{path}: it has no rows, so there is nothing to do")
     return rows
+
+
+def manifest_text(folder: Path, rows: Sequence[Row]) -> bytes:
+    """A .csv that :func:`read_manifest` reads back as these rows.
+
+    Args:
+        folder: where it will lie.
+        rows: with values as they are when read, names of files joined to a folder.
+    """
+    records: list[dict[str, str]] = []
+    for row in rows:
+        path = os.path.abspath(row.path)
+        below = os.path.relpath(path, os.path.abspath(folder))
+        cells = {"path": path if below.startswith("../") else below, "name": row.name}
+        cells["frames"] = "" if row.frames is None else str(row.frames)
+        for key, value in from_folder(Path.cwd(), row.values).items():
+            table = value if key not in PLAIN and isinstance(value, Mapping) else None
+            named = {key: value} if table is None else {f"{key}.{k}": v for k, v in table.items()}
+            cells |= {name: _cell(each) for name, each in named.items()}
+        records.append(cells)
+    columns = dict.fromkeys(name for cells in records for name in cells)
+    filled = [name for name in columns if any(cells.get(name) for cells in records)]
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, filled, "", "ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(records)
+    return text.getvalue().encode()
+
+
+def _cell(value: Any) -> str:
+    """A value as :func:`clpipe.inputs.tables.csv_records` reads it back.
+
+    >>> _cell("gain"), _cell("100"), _cell(0.5)
+    ('gain', '"100"', '0.5')
+    """
+    is_plain = isinstance(value, str) and toml_value(value.strip()) == value != ""
+    return value if is_plain else value_text(value)
 
 
 class HasValues(Protocol):
@@ -207,7 +247,7 @@ def _row(folder: Path, place: str, record: Mapping[str, Any]) -> Row:
             values.setdefault(step, {})[parameter] = value
         elif column in PLAIN:
             values[column] = value
-    key = name or _relative(folder, path)
+    key = name or key_of(folder, folder / path)
     return Row(folder / path, key, name, from_folder(folder, values), frames, place)
 
 
@@ -239,13 +279,13 @@ def _check_text(column: str, value: Any) -> None:
         raise RequestError(f"{column}: found {value!r}, but a file's name has no NUL")
 
 
-def _relative(folder: Path, path: str) -> str:
-    """A path relative to a folder where it lies below that; else the name of the file.
+def key_of(folder: Path, path: Path) -> str:
+    """The key of an image without a name: its path where it lies below a manifest's folder; else
+    the name of the file.
 
-    >>> _relative(Path("a"), "b/../c/x.exr"), _relative(Path("a"), "../x.exr")
+    >>> key_of(Path("a"), Path("a/b/../c/x.exr")), key_of(Path("a"), Path("x.exr"))
     ('c/x.exr', 'x.exr')
     """
-    root = os.path.abspath(folder)
-    whole = os.path.abspath(folder / path)
-    below = os.path.relpath(whole, root)
+    whole = os.path.abspath(path)
+    below = os.path.relpath(whole, os.path.abspath(folder))
     return os.path.basename(whole) if below.startswith("../") else below

@@ -51,7 +51,7 @@ class OutputWriter:
     def plan_of(self, job: Job) -> RenditionPlan:
         """Which renditions are made of a job's image."""
         frames = self.request.frames if job.frames is None else job.frames
-        return RenditionPlan(frames, self.request.truths)
+        return RenditionPlan(frames, self.request.truths, self.request.bracket)
 
     def names_of(self, job: Job) -> tuple[str, ...]:
         """The name of each rendition that is made of a job's image."""
@@ -66,11 +66,11 @@ class OutputWriter:
 
     def formats_of(self, name: str) -> tuple[str, ...]:
         """The formats of a rendition, by its name."""
-        return ("exr",) if name in FLOAT_MOSAICS else self.formats
+        return ("exr",) if truth_named(name) in FLOAT_MOSAICS else self.formats
 
     def keep_of(self, name: str) -> tuple[str, ...]:
         """The steps whose image is written beside a rendition, by its name, where it has them."""
-        if name in FLOAT_MOSAICS:
+        if truth_named(name) in FLOAT_MOSAICS:
             return ()
         if truth_named(name) in PICTURES and self.request.truth_keep is not None:
             return self.request.truth_keep

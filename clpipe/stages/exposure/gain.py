@@ -1,4 +1,4 @@
-"""Exposure compensation."""
+"""Exposure by a number of stops."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.stage import Argument, Context, Frame, Method, Pass, parameter
 
 
 class Gain(Method):
@@ -52,6 +52,3 @@ class Gain(Method):
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
         return image * self.gain
-
-
-STAGE = Stage("exposure", "Brighten or darken the scene.", Kind.RGB, Kind.RGB, (Gain,))

@@ -1,0 +1,126 @@
+"""Auto exposure of sequences: metered frame by frame, smoothed over time, written as a manifest."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.files import write_new
+from clpipe.chain.identity import noise_key
+from clpipe.engine.device import Device
+from clpipe.engine.runner import Runner
+from clpipe.inputs.find import Job
+from clpipe.inputs.loader import ImageLoader, LoadedImage
+from clpipe.inputs.manifest import Row, key_of, manifest_text
+from clpipe.stages.exposure.auto import Auto
+
+EXPOSURE = "exposure"
+DIGITS = 4  # of an EV behind the point
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """The exposure of a frame, in EV.
+
+    ``metered`` is what ``exposure.method=auto`` finds for the frame alone, ``ev`` the same smoothed
+    over time, with the compensation that is set. ``headroom`` is that of the frame's chain.
+    """
+
+    job: Job
+    metered: float
+    ev: float
+    headroom: float
+
+
+def to_meter(jobs: Sequence[Job]) -> list[Job]:
+    """Jobs without what the row of a manifest says of their exposure."""
+    return [
+        replace(job, values={k: v for k, v in job.values.items() if k != EXPOSURE}) for job in jobs
+    ]
+
+
+def check_request(loader: ImageLoader, jobs: Sequence[Job]) -> None:
+    """See that frames can be metered.
+
+    Raises:
+        RequestError: a frame is a camera's raw, a row of a manifest is wrong, or the chain does not
+            expose by ``exposure.method=auto``.
+    """
+    for job in jobs:
+        if loader.raw.takes(job.path):
+            raise RequestError(f"{job.label}: it is a raw, which is exposed already; name renders")
+    loader.check(jobs)
+    for each in {id(one): one for one in map(loader.for_job, jobs)}.values():
+        method = each.chain.step_named(EXPOSURE).method
+        if not isinstance(method, Auto):
+            raise RequestError(
+                f"exposure.method: found {method.method}, but metering is what auto does; leave "
+                "it out"
+            )
+
+
+def exposures(
+    loader: ImageLoader, jobs: Sequence[Job], device: Device | None, frames: float
+) -> Iterator[Exposure]:
+    """The exposure of each frame, in the order of the jobs; each folder is a sequence of its own.
+
+    As a camera's does, it follows the metered one with a delay: after a change of light, all but
+    1/e of it is made up for within ``frames`` frames (exponential smoothing). A sequence begins
+    with what its first frame is metered at.
+
+    Args:
+        loader: of a request that ends with the step ``exposure``, see :func:`check_request`.
+        jobs: the frames, in order of time.
+        device: where to meter; None is NumPy.
+        frames: the time constant; 0 does not smooth.
+
+    Raises:
+        ImageError: a frame cannot be read or metered.
+    """
+    share = -math.expm1(-1 / frames) if frames else 1.0
+    runner: Runner | None = None
+    for _, sequence in groupby(jobs, key=lambda job: job.path.parent):
+        smooth: float | None = None
+        for job in sequence:
+            own = loader.for_job(job)
+            try:
+                loaded = own.enter(job, own.read(job))
+                assert loaded  # only where a chain starts in its midst it may be None
+                runner = runner.of(loaded.chain) if runner else Runner(loaded.chain, device)
+                metered = _metered(loaded, runner)
+            except (ImageError, RequestError, MemoryError) as error:
+                raise ImageError(own.error_text(job, error)) from None
+            smooth = metered if smooth is None else smooth + share * (metered - smooth)
+            method = loaded.chain.step_named(EXPOSURE).method
+            assert isinstance(method, Auto)
+            yield Exposure(job, metered, smooth + method.ev, method.headroom)
+
+
+def _metered(loaded: LoadedImage, runner: Runner) -> float:
+    """What metering finds for one image, in EV."""
+    chain = loaded.chain
+    result = runner.run(loaded.source.pixels, noise_key(chain.settings, loaded.key))
+    return result.estimates[EXPOSURE]["metered_ev"]
+
+
+def write_exposures(path: Path, found: Sequence[Exposure]) -> None:
+    """Write exposures as a manifest, with which a run gives each frame its ``exposure.ev``.
+
+    A frame that came from a manifest keeps what else its row said.
+
+    Raises:
+        ImageError: it cannot be written.
+    """
+    write_new(path, manifest_text(path.parent, [_row(path.parent, each) for each in found]))
+
+
+def _row(folder: Path, exposure: Exposure) -> Row:
+    job = exposure.job
+    name = job.name or (job.stem if key_of(folder, job.path) != job.key else "")
+    own = {"method": "gain", "ev": round(exposure.ev, DIGITS) + 0.0}
+    if exposure.headroom != Auto.model_fields["headroom"].default:
+        own["headroom"] = exposure.headroom
+    values = {**job.values, EXPOSURE: own}
+    return Row(job.path, job.key, name, values, job.frames, job.place)

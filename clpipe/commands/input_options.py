@@ -1,0 +1,33 @@
+"""Options that say which images are read, and how."""
+
+import click
+
+from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS
+from clpipe.images.read import TRANSFERS
+
+transfer_option = click.option(
+    "--transfer",
+    type=click.Choice(list(TRANSFERS)),
+    help="The transfer curve of renders in whole numbers (PNG, TIFF of 8 or 16 bits).",
+)
+
+layer_option = click.option(
+    "--layer", metavar="NAME", help="The layer or part of an EXR that is the picture."
+)
+
+max_pixels_option = click.option(
+    "--max-pixels",
+    default=USUAL_MAX_PIXELS,
+    show_default=True,
+    type=click.IntRange(1, MAX_PIXELS),
+    metavar="N",
+    help="Refuse larger images, before memory is taken.",
+)
+
+exclude_option = click.option(
+    "--exclude",
+    multiple=True,
+    metavar="GLOB",
+    help="Leave out what folders and globs would give: files and folders whose name, or path in "
+    "the input folder, matches; may be repeated.",
+)

@@ -1,0 +1,97 @@
+"""``clpipe meter``: the auto exposure of a sequence, smoothed over time, as a manifest."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+from clpipe.analysis.metering import check_request, exposures, to_meter, write_exposures
+from clpipe.base.errors import RequestError
+from clpipe.base.text import printable
+from clpipe.chain.request import Request
+from clpipe.commands.chain_options import config_option, set_option
+from clpipe.commands.input_options import (
+    exclude_option,
+    layer_option,
+    max_pixels_option,
+    transfer_option,
+)
+from clpipe.commands.options import Command, device_option, json_option, stage_file_option
+from clpipe.commands.printing import show_json
+from clpipe.engine.device import open_device
+from clpipe.inputs.find import find_jobs
+from clpipe.inputs.loader import ImageLoader
+
+
+@click.command("meter", cls=Command)
+@click.argument("frames", nargs=-1, required=True, metavar="FRAMES...")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=click.Path(path_type=Path),
+    metavar="EXPOSURES.csv",
+    help="The manifest to write.",
+)
+@click.option(
+    "--smooth",
+    default=8.0,
+    show_default=True,
+    type=click.FloatRange(0, 1e6),
+    metavar="FRAMES",
+    help="The time constant of the smoothing, after which 1/e of a change of light is left to make "
+    "up for; 0 is none.",
+)
+@config_option
+@set_option
+@stage_file_option
+@transfer_option
+@layer_option
+@max_pixels_option
+@exclude_option
+@device_option
+@json_option
+def meter(
+    frames: tuple[str, ...],
+    output: Path,
+    smooth: float,
+    assignments: tuple[str, ...],
+    exclude: tuple[str, ...],
+    selector: str | None,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Meter the frames of a sequence, and write their exposures as a manifest for clpipe run.
+
+    FRAMES are renders in order of time: files, folders, globs or manifests. Each is metered as
+    exposure.method=auto does it, with what --set exposure.NAME=VALUE says; then the EVs are
+    smoothed, each folder by itself. So a run needs no order, and any frame can be made again alone.
+
+    \b
+    clpipe meter renders/ -o exposures.csv --set exposure.metering=centre_weighted
+    clpipe run exposures.csv -o out --iso 1600
+    """
+    if output.suffix.lower() != ".csv":
+        raise RequestError(f"--output: found {output}; expected a name that ends in .csv")
+    if any(os.path.realpath(each) == os.path.realpath(output) for each in frames):
+        raise RequestError(f"--output: {output} is an input; choose another name")
+    metering = ("exposure.method=auto", *assignments)
+    request = Request.from_options(assignments=metering, until="exposure", **options)
+    loader = ImageLoader(request)
+    jobs = to_meter(find_jobs(frames, Path(os.devnull), loader.endings(), exclude))
+    check_request(loader, jobs)
+    found = []
+    for each in exposures(loader, jobs, open_device(selector), smooth):
+        found.append(each)
+        if not as_json:
+            name = printable(each.job.input)
+            click.echo(f"{name}  metered {each.metered:+.2f} EV, exposed {each.ev:+.2f} EV")
+    write_exposures(output, found)
+    if as_json:
+        frames_found = [
+            {"frame": each.job.input, "metered_ev": each.metered, "ev": each.ev} for each in found
+        ]
+        show_json({"manifest": str(output), "frames": frames_found})
+    else:
+        click.echo(f"wrote {output}")

@@ -1,0 +1,210 @@
+"""Exposure by metering: the gain follows from the luminance of the image itself."""
+
+from collections.abc import Mapping
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import model_validator
+
+from clpipe.base.types import Floats, Mask
+from clpipe.reference.math import negative_log, power_of_two
+from clpipe.stage import Access, Argument, Context, Frame, Pass, parameter
+from clpipe.stage import Literal as Text
+from clpipe.stages.exposure.gain import Gain
+
+STEPS = 4096  # of the logarithm to base 2, in which it is an integer
+_PER_NEPER = np.float32(-STEPS * 1.4426950408889634)
+
+OCTAVES = 36  # of the histogram, from 2^-18 on; each has 256 bins
+BINS = OCTAVES * 256
+_LOWEST = np.float32(2.0**-18)
+_FIRST = int(_LOWEST.view(np.int32))
+
+# The shorter side of the image over the diameter of the circle that is metered; 0 is no circle.
+CIRCLES = {"average": 0, "centre_weighted": 2, "spot": 6}
+# How often a pixel counts inside and outside of it.
+WEIGHTS = {"average": (1, 0), "centre_weighted": (20, 1), "spot": (1, 0)}
+TARGETS = {"log_average": 0.18, "percentile": 1.0}
+
+
+def luminance(image: Floats) -> Floats:
+    """Luminance of linear sRGB (ITU-R BT.709); (height, width, 3) to (height, width).
+
+    >>> luminance(np.float32([[[1, 1, 1], [0, 1, 0]]])).round(4).tolist()
+    [[1.0, 0.7152000069618225]]
+    """
+    red, green, blue = np.moveaxis(image, -1, 0)
+    return np.float32(0.2126) * red + np.float32(0.7152) * green + np.float32(0.0722) * blue
+
+
+def in_circle(height: int, width: int, share: int) -> Mask:
+    """Which pixels lie in the circle around an image's middle, (height, width).
+
+    ``share`` is the shorter side over its diameter, which is 2 px at least; with 0 all are inside.
+
+    >>> in_circle(4, 5, 2).astype(int).tolist()
+    [[0, 0, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 0, 0]]
+    """
+    dx = (2 * np.arange(width) + 1 - width).astype(np.float32)
+    dy = (2 * np.arange(height) + 1 - height).astype(np.float32)[:, None]
+    diameter = np.float32(max(min(width, height), 2 * share))
+    inside = (dx * dx + dy * dy) * np.float32(share * share) <= diameter * diameter
+    return np.asarray(inside)
+
+
+def steps_of(level: Floats) -> NDArray[np.int64]:
+    """log2 of levels above 0, in whole steps of 1/4096; int64."""
+    return np.rint(negative_log(level) * _PER_NEPER).astype(np.int64)
+
+
+class Auto(Gain):
+    """A gain that brings the luminance of the image to a target, times 2^(ev - headroom).
+
+    log_average is exp(mean(log(delta + L))) to a key of 0.18 (Reinhard et al., SIGGRAPH 2002, eq. 1
+    and 2), as SyB3R exposes; percentile brings a percentile of L to white. Both are integers: sums
+    of log2 in steps of 1/4096, or a histogram of 256 bins an octave. So the gain is the same on
+    every device and in tiles. An image without light is left as it is.
+
+    Metering is of the whole image (average); with three quarters of the weight, at 3:2, on a circle
+    of half the image's shorter side in diameter (centre_weighted, as 12 mm are on a 35 mm film);
+    or of a circle of a sixth of it alone (spot).
+
+    >>> from clpipe.stage import run_reference
+    >>> grey = np.full((2, 3, 3), 0.045, np.float32)
+    >>> run_reference(Auto(headroom=0.0), grey).round(3).max().item()
+    0.18000000715255737
+    """
+
+    method: ClassVar = "auto"
+    kernel: ClassVar = "exposure_auto"
+    summary: ClassVar = "meter the image, and bring its luminance to a target"
+    example: ClassVar = {"metering": "centre_weighted"}
+
+    rule: Literal["log_average", "percentile"] = parameter(
+        "log_average", "Which luminance is brought to the target.", structural=True
+    )
+    target: float | None = parameter(
+        None,
+        "Where that luminance comes to, before ev and headroom.",
+        "1 = white",
+        "0.18 for log_average, 1 for percentile",
+        ge=1e-6,
+        le=1e6,
+    )
+    metering: Literal["average", "centre_weighted", "spot"] = parameter(
+        "average", "Which places of the image count."
+    )
+    percentile: float = parameter(
+        99.0,
+        "With percentile: the share of pixels that are darker than what is metered.",
+        "%",
+        gt=0,
+        le=100,
+    )
+    delta: float = parameter(
+        1e-4,
+        "With log_average: added to each pixel's luminance, so that no black one decides alone.",
+        "1 = white",
+        ge=1e-9,
+        le=1,
+    )
+    min_ev: float = parameter(
+        -20.0, "The least that metering gives, before ev.", "EV", ge=-20, le=20
+    )
+    max_ev: float = parameter(20.0, "The most that metering gives, before ev.", "EV", ge=-20, le=20)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.min_ev > self.max_ev:
+            raise ValueError(
+                f"max_ev must not be below min_ev; found {self.max_ev:g} and {self.min_ev:g}"
+            )
+        return self
+
+    def resolve(self, context: Context) -> Self:
+        return self.filled(target=TARGETS[self.rule])
+
+    def passes(self) -> tuple[Pass, ...]:
+        limits, found = ("target", "lowest", "highest", "offset"), ("metered_ev", "gain")
+        circle = ("share", "inside", "outside")
+        if self.rule == "percentile":
+            search = Pass(
+                "metered_bin",
+                Access.HISTOGRAM,
+                ("share", "outside"),
+                finish="meter_percentile",
+                finish_arguments=("inside", "outside", "millionths", *limits),
+                estimates=found,
+                bins=2 * BINS,
+            )
+        else:
+            search = Pass(
+                "metered_log",
+                Access.SUMS,
+                ("extent", *circle, "delta"),
+                finish="meter_log_average",
+                finish_arguments=(*circle, "delta", *limits),
+                estimates=found,
+            )
+        return search, Pass("exposure", arguments=("gain",))
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        assert self.target is not None
+        inside, outside = WEIGHTS[self.metering]
+        return {
+            "extent": Text("e"),
+            "share": np.uint32(CIRCLES[self.metering]),
+            "inside": np.uint32(inside),
+            "outside": np.uint32(outside),
+            "delta": np.float32(self.delta),
+            "millionths": np.uint32(self._millionths),
+            "target": np.int32(round(np.log2(self.target) * STEPS)),
+            "lowest": np.int32(round(self.min_ev * STEPS)),
+            "highest": np.int32(round(self.max_ev * STEPS)),
+            "offset": self.gain,
+        }
+
+    @property
+    def _millionths(self) -> int:
+        return max(1, round(self.percentile * 10_000))
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        found = self._percentile(image) if self.rule == "percentile" else self._log_average(image)
+        ev = 0
+        if found is not None:
+            assert self.target is not None
+            ev = round(np.log2(self.target) * STEPS) - found
+            ev = min(max(ev, round(self.min_ev * STEPS)), round(self.max_ev * STEPS))
+        stops = np.array([ev / STEPS], np.float32)
+        whole, rest = power_of_two(stops)
+        (gain,) = (whole + whole * rest) * self.gain
+        frame.estimates["metered_ev"], frame.estimates["gain"] = float(stops[0]), float(gain)
+        return image * gain
+
+    def _circle(self, image: Floats) -> Mask:
+        return in_circle(image.shape[0], image.shape[1], CIRCLES[self.metering])
+
+    def _log_average(self, image: Floats) -> int | None:
+        """log2 of the image's log-average luminance, in steps; None without light."""
+        inside, outside = WEIGHTS[self.metering]
+        circle = self._circle(image)
+        delta = np.float32(self.delta)
+        steps = steps_of(np.maximum(luminance(image), np.float32(0)) + delta)
+        weights = np.where(circle, inside, outside)
+        total, weight = int((steps * weights).sum()), int(weights.sum())
+        black = int(steps_of(np.array([delta]))[0])
+        return None if total == black * weight else (2 * total + weight) // (2 * weight)
+
+    def _percentile(self, image: Floats) -> int | None:
+        """log2 of a percentile of the image's luminance, in steps; None without light."""
+        inside, outside = WEIGHTS[self.metering]
+        circle = self._circle(image)
+        level = np.maximum(luminance(image), _LOWEST)
+        bins = np.minimum((level.view(np.int32) - _FIRST) >> 15, BINS - 1)
+        counts = [np.bincount(bins[where], minlength=BINS) for where in (circle, ~circle)]
+        below = np.cumsum(inside * counts[0] + outside * counts[1])
+        rank = -(-int(below[-1]) * self._millionths // 1_000_000)
+        bin_ = int(np.argmax(below >= rank))
+        middle = np.array([_FIRST + (bin_ << 15) + (1 << 14)], np.int32).view(np.float32)
+        return int(steps_of(middle)[0]) if bin_ else None

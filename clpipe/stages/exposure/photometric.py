@@ -1,0 +1,74 @@
+"""Exposure by physics: what a camera's settings make of a scene in cd/m2."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.base.types import Floats
+from clpipe.stage import Argument, Context, Frame, parameter
+from clpipe.stages.exposure.gain import Gain
+
+SATURATION = 78.0  # lx s, over the ISO: the exposure that fills the sensor
+GREY = 10.0  # lx s, over the ISO: the exposure of an 18 % grey that is exposed right
+WHITE = GREY / 0.18 / SATURATION  # where a white surface then lies, over the sensor's full scale
+
+
+class Photometric(Gain):
+    """The focal-plane exposure H = q L t / N^2 over that which fills the sensor, 78 lx s / ISO.
+
+    L is the luminance of the scene, t the exposure time, N the f-number, and q what the lens and
+    its geometry take: pi/4 T v cos^4 = 0.65 for a transmittance T of 0.9, a vignetting v of 0.98
+    and 10 degrees off the axis (ISO 12232:2019, ISO 2720:1974). The speed is the saturation-based
+    one, S_sat = 78 / H_sat (ISO 12232:2019). At H = 10 / S an 18 % grey lies at 12.8 % of full
+    scale, and a white surface at 71 %; that half a stop is headroom, which tone_curve gives back.
+    A meter of K = 12.5 (ISO 2720), N^2 / t = L S / K, exposes with q K / S = 8.1 / S.
+
+    >>> from clpipe.stage import run_reference
+    >>> metered = Photometric(exposure_time=0.01, f_number=8.0)  # for L = 800 at ISO 100
+    >>> round(run_reference(metered, np.full((1, 1, 3), 800, np.float32)).max().item(), 4)
+    0.1042
+    """
+
+    method: ClassVar = "photometric"
+    summary: ClassVar = "exposure time, f-number and ISO on a render in cd/m2 (ISO 12232)"
+    example: ClassVar = {"exposure_time": 1.0, "f_number": 1.0, "scale": 100.0}
+
+    headroom: float = parameter(
+        0.0,
+        "How far the sensor's full scale lies above that of ISO 12232, 78 lx s / ISO; the tone "
+        "curve linear gives it back.",
+        "EV",
+        ge=0,
+        le=10,
+    )
+    exposure_time: float = parameter(0.01, "Exposure time, t.", "s", gt=0, le=86400)
+    f_number: float = parameter(8.0, "F-number of the lens, N.", gt=0, le=1000)
+    q: float = parameter(
+        0.65, "What the lens and its geometry leave of the light.", gt=0, le=math.pi / 4
+    )
+    scale: float = parameter(
+        1.0,
+        "Luminance of a render's 1.0: 1 for a render in cd/m2; for one in W/(sr m2) 683, if its "
+        "channels are weighted for the eye, or 179, a renderer's white light (Radiance).",
+        "cd/m2",
+        gt=0,
+        le=1e9,
+    )
+
+    def after(self, context: Context) -> Context:
+        headroom = context.headroom + self.headroom - math.log2(WHITE)
+        return replace(context, headroom=headroom)
+
+    def factor(self, iso: float) -> np.float32:
+        """What a render's unit becomes, over the sensor's full scale, at an ISO."""
+        exposure = self.q * self.scale * self.exposure_time / self.f_number**2  # lx s
+        return np.float32(exposure * iso / SATURATION * 2.0 ** (self.ev - self.headroom))
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {"gain": self.factor(context.iso)}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        return image * self.factor(frame.context.iso)
