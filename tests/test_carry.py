@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 import clpipe as clpipe_api
-from clpipe.base.errors import RequestError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.carry import parse_carry
 from clpipe.images.tags import upright
 from clpipe.inputs.carry import owner_of
@@ -279,6 +279,22 @@ def test_a_dataset_has_carried_layers(render, tmp_path):
     np.testing.assert_array_equal(sample["carried.Depth"][..., 0], given["View.Depth.Z"])
     assert sample["carried.CryptoObject"].shape == (9, 14, 2)
     assert sample["carried.valid"].shape == (9, 14) == sample["image"].shape[:2]
+
+
+def test_a_pipeline_moves_arrays():
+    stages = ["exposure", "resize", "gamma"]
+    half = clpipe_api.Pipeline(device="numpy", stages=stages, resize={"scale": 0.5})
+    depth, flow = np.arange(24.0).reshape(4, 6), np.full((4, 6, 2), 4.0)
+    moved, valid = half.carry(depth, "depth")
+    np.testing.assert_array_equal(moved, depth[1::2, 1::2])
+    assert valid.shape == (2, 3)
+    np.testing.assert_allclose(half.carry(flow, "flow")[0], np.full((2, 3, 2), 2.0), atol=1e-6)
+    whole, _ = half.carry(depth, "depth", resize={"scale": 1.0})
+    np.testing.assert_array_equal(whole, depth)
+    with pytest.raises(RequestError, match="unknown kind 'deep'"):
+        half.carry(depth, "deep")
+    with pytest.raises(ImageError, match="found 1 channels; flow has 2 or more"):
+        half.carry(depth, "flow")
 
 
 @pytest.mark.parametrize(

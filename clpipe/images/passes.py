@@ -39,6 +39,8 @@ NAMES: dict[LayerKind, tuple[str, ...]] = {
     "colour": ("albedo", "basecolor", "basecolour"),
 }
 
+CHANNELS: dict[LayerKind, int] = {"flow": 2, "normal": 3}  # at least
+
 CRYPTOMATTE = "cryptomatte/"  # begins the names of attributes that say what its numbers stand for
 
 ORDER = "RGBAXYZWUV"  # of channels within a layer

@@ -18,6 +18,7 @@ from clpipe.base.types import Array
 from clpipe.chain.carry import Carry
 from clpipe.chain.chain import Chain
 from clpipe.images.passes import (
+    CHANNELS,
     LayerLocation,
     cryptomatte_attributes,
     find_layers,
@@ -36,8 +37,6 @@ CARRIED = "carried"  # what stands behind an image's name in that of its carried
 SUFFIXES = (".exr", ".pfm", ".tif", ".tiff", ".png")  # of companions, the preferred one first
 
 SEPARATORS = "_.-"  # between an image's name and what its companion holds
-
-CHANNELS: dict[LayerKind, int] = {"flow": 2, "normal": 3}  # at least
 
 
 @dataclass(frozen=True)
