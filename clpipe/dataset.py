@@ -18,6 +18,7 @@ from clpipe.base.processors import available_processors
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import one_of
 from clpipe.base.validation import typed
+from clpipe.chain.carry import VALID
 from clpipe.chain.chain import Chain
 from clpipe.chain.identity import noise_key, of_frame
 from clpipe.chain.request import Request
@@ -45,6 +46,8 @@ class Dataset(ReadOnly):
     - "image": (height, width, 3) uint8 where the chain ends in display values, else float32,
     - "truth", with ``truth``: the same without noise; images of ``keep`` by the names of their
       steps, and "truth.NAME" for each of them without noise; float32,
+    - "carried.NAME" for each layer of ``carry``, (height, width, channel) as the picture is, and
+      "carried.valid", (height, width): 1 where the render has something, else 0,
     - "key": the name of the render, its path below the folder that was given, and "epoch",
     - "iso", "a" and "b": the sensor noise that was added, Var[y] = a*y + b in signal units (1 is
       the white level), zeros where none was.
@@ -67,6 +70,9 @@ class Dataset(ReadOnly):
         until: the last step to run.
         truth: whether a sample has its image without noise, too. "clean" is the picture to train
             on; "development", or True, is denoised as strongly as the noisy one is.
+        carry: layers that go along with the picture, such as "Depth" or "nn:normal", as ``--carry``
+            of ``clpipe run``.
+        companions: where they are, as ``--companion``.
         layer: the layer of an EXR that is the picture; None chooses.
         transfer: the transfer curve of renders in whole numbers: "srgb" or "linear".
         exclude: patterns of files that are not taken from folders and globs, such as depth.
@@ -91,6 +97,8 @@ class Dataset(ReadOnly):
         start_at: str | None = None,
         until: str | None = None,
         truth: bool | Literal["development", "clean"] = False,
+        carry: str | Sequence[str] = (),
+        companions: str | Sequence[str] = (),
         layer: str | None = None,
         transfer: str | None = None,
         exclude: str | Sequence[str] = (),
@@ -111,6 +119,8 @@ class Dataset(ReadOnly):
             until=until,
             layer=layer,
             transfer=transfer,
+            carry=(carry,) if isinstance(carry, str) else tuple(carry),
+            companions=(companions,) if isinstance(companions, str) else tuple(companions),
         )
         self._loader = ImageLoader(request)
         several = [inputs] if isinstance(inputs, str | Path) else inputs
@@ -185,7 +195,7 @@ class Dataset(ReadOnly):
         number = index + len(self) if index < 0 else index
         if number < 0 or not self._jobs or (self._epochs is not None and number >= len(self)):
             raise IndexError(f"found sample {index}; there are {len(self)}")
-        return self._begin(*self._place(number), self._read(*self._place(number)))()
+        return self._begin(*self._place(number), *self._read(*self._place(number)))()
 
     def __iter__(self) -> Iterator[Sample]:
         """Every sample in order; images are decoded and developed ahead, a few at a time.
@@ -219,11 +229,17 @@ class Dataset(ReadOnly):
         epoch, image = divmod(number, len(self._jobs))
         return self._jobs[image], self._epoch + epoch
 
-    def _read(self, job: Job, epoch: int) -> LoadedImage:
+    def _read(self, job: Job, epoch: int) -> tuple[LoadedImage, Sample]:
+        """An image, and the layers that go along with its picture."""
         loader = self._loader
+        carried: Sample = {}
         try:
             loader = loader.for_job(replace(job, key=of_frame(job.key, epoch or None)))
             loaded = loader.enter(job, loader.read(job))
+            if loaded and loader.request.carry:
+                along = loader.carried(job, loaded)
+                named = {**along.arrays(), VALID: along.valid}
+                carried = {f"carried.{name}": array for name, array in named.items()}
         except (ImageError, RequestError, MemoryError) as error:
             raise ImageError(loader.error_text(job, error)) from None
         if loaded is None:
@@ -233,12 +249,16 @@ class Dataset(ReadOnly):
             )
         for warning in loaded.source.warnings:
             warnings.warn(f"{job.path}: {warning}", stacklevel=2)
-        return loaded
+        return loaded, carried
 
-    def _begin_read(self, job: Job, epoch: int, read: Future[LoadedImage]) -> Callable[[], Sample]:
-        return self._begin(job, epoch, read.result())
+    def _begin_read(
+        self, job: Job, epoch: int, read: Future[tuple[LoadedImage, Sample]]
+    ) -> Callable[[], Sample]:
+        return self._begin(job, epoch, *read.result())
 
-    def _begin(self, job: Job, epoch: int, loaded: LoadedImage) -> Callable[[], Sample]:
+    def _begin(
+        self, job: Job, epoch: int, loaded: LoadedImage, carried: Sample
+    ) -> Callable[[], Sample]:
         """Begin to develop a sample; what is returned waits for it."""
         key = noise_key(loaded.chain.settings, loaded.key, epoch)
         with self._errors_of(job):
@@ -246,7 +266,7 @@ class Dataset(ReadOnly):
 
         def finish() -> Sample:
             with self._errors_of(job):
-                return {**begun(), **self._facts(job, epoch, loaded)}
+                return {**begun(), **carried, **self._facts(job, epoch, loaded)}
 
         return finish
 

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from xxhash import xxh3_64_hexdigest
 
-from clpipe.base.errors import ImageError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
+from clpipe.base.text import one_of
 from clpipe.base.types import Array
 from clpipe.base.validation import typed
 from clpipe.chain.chain import Chain, make_chain
@@ -21,6 +22,8 @@ from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.clipping import MUCH, clipped_share, clipping_text
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Result, Runner
+from clpipe.images.passes import CHANNELS, vectors_of
+from clpipe.reference.warp import RESAMPLING, Layer, LayerKind, warp
 from clpipe.stage import Kind
 
 
@@ -99,10 +102,7 @@ class Pipeline(ReadOnly):
             ImageError: an image of the wrong shape or type, not finite, or too large.
             RequestError: a name or value that is not allowed.
         """
-        runner = self._runner
-        own = overlay(self._settings, plain(settings)) if settings else self._settings
-        if settings or own.draws:
-            runner = runner.of(self._chain(own.drawn(key)))
+        runner = self._runner_for(key, settings)
         checked, chain = _checked(image, runner.chain.source), runner.chain
         own_key = image_key(key, "" if chain.settings.noise_key else digest_of(checked))
         with self._lock:
@@ -111,6 +111,47 @@ class Pipeline(ReadOnly):
         if share >= MUCH:
             warnings.warn(f"{key}: {clipping_text(share)}", stacklevel=2)
         return result
+
+    def carry(
+        self, layer: Array, kind: LayerKind, key: str = "", **settings: Any
+    ) -> tuple[Array, Array]:
+        """Move a layer that goes along with an image as :meth:`process` moves its pixels.
+
+        Args:
+            layer: (height, width[, channel]) of any type, as large as the image.
+            kind: "depth" and "label" are taken from the nearest pixel; a "normal" is blended, and
+                then as long as 1; so is a "flow", whose vectors in px to the right and down are
+                mapped at both ends; "colour" is blended.
+            key: the image's name, on which draws depend.
+            **settings: as for :meth:`process`.
+
+        Returns:
+            The layer as it is in the picture, 0 where the image has nothing, and a mask of (height,
+            width) that is 0 there, else 1.
+
+        Raises:
+            ImageError: it is no layer of that kind.
+            RequestError: a name or value that is not allowed.
+        """
+        if kind not in RESAMPLING:
+            raise RequestError(one_of("kind", str(kind), RESAMPLING))
+        if not isinstance(layer, np.ndarray) or layer.ndim not in (2, 3) or not layer.size:
+            raise ImageError("expected a layer as a NumPy array, (height, width[, channel])")
+        pixels = layer.reshape(*layer.shape[:2], -1)
+        if pixels.shape[2] < (least := CHANNELS.get(kind, 1)):
+            raise ImageError(f"found {pixels.shape[2]} channels; {kind} has {least} or more")
+        vectors = vectors_of("", ("",) * pixels.shape[2]) if kind == "flow" else ()
+        geometry = self._runner_for(key, settings).chain.geometry
+        height, width = layer.shape[:2]
+        (moved,), valid = warp([Layer(kind, pixels, vectors=vectors)], geometry, width, height)
+        return moved if layer.ndim == 3 else moved[..., 0], valid
+
+    def _runner_for(self, key: str, settings: Mapping[str, Any]) -> Runner:
+        """The runner for an image, with what is drawn and set for it alone."""
+        own = overlay(self._settings, plain(settings)) if settings else self._settings
+        return (
+            self._runner.of(self._chain(own.drawn(key))) if settings or own.draws else self._runner
+        )
 
     def process_many(
         self, images: Iterable[Array | tuple[Array, str | Mapping[str, Any]]]

@@ -85,6 +85,8 @@ def replay_of(
         replay = _replay(values, inputs, max_pixels)
         files = {str(name): str(digest) for name, digest in values["request"]["files"].items()}
         files[str(replay.job.path)] = str(values["sha256"])
+        for layer in values.get("carried", ()):
+            files[str(replay.job.path.parent / layer["file"])] = str(layer["sha256"])
     except (KeyError, TypeError, ValueError, AttributeError, RequestError) as error:
         raise RequestError(f"{path}: it is damaged: {error}") from None
     code = {name: files.pop(name) for name in list(files) if Path(name).suffix in CODE}

@@ -22,7 +22,9 @@ def usual_room(sharing: int = 1) -> int | None:
     return None if free is None else free // 2 // sharing
 
 
-def host_bytes(job: Job, renditions: int, formats: Sequence[str], keep: Sequence[str]) -> int:
+def host_bytes(
+    job: Job, renditions: int, formats: Sequence[str], keep: Sequence[str], carried: int = 0
+) -> int:
     """About how many bytes an image takes while it is in flight, by its file's header.
 
     Args:
@@ -31,6 +33,7 @@ def host_bytes(job: Job, renditions: int, formats: Sequence[str], keep: Sequence
         renditions: how many results there may be of it at a time.
         formats: of the last image, and of the raw.
         keep: steps whose image is written, too.
+        carried: how many layers go along with it, before and after they are moved.
     """
     is_raw = job.path.suffix.lower() in RAW_SUFFIXES
     pixels = None if is_raw else claimed_pixels(job.path)
@@ -38,7 +41,7 @@ def host_bytes(job: Job, renditions: int, formats: Sequence[str], keep: Sequence
         pixels = stamp_of(job.path)[0]
     deep = DNG in formats or any(FORMATS[name].bits > 8 for name in formats if name != DNG)
     result = 3 + FLOATS * (len(keep) + deep)
-    return pixels * (FLOATS + result * renditions)
+    return pixels * (FLOATS + result * renditions + 2 * FLOATS * carried)
 
 
 class Room:

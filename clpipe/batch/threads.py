@@ -232,7 +232,8 @@ class Batch:
         self._begun.set()
         writer = self._worker.writer
         results = min(len(writer.names_of(job)), self.threads + len(self.devices))
-        size = host_bytes(job, results, writer.formats, writer.request.keep)
+        request = writer.request
+        size = host_bytes(job, results, writer.formats, request.keep, len(request.carry))
         start = time.perf_counter()
         self._room.enter(job.stem, size)
         waits.append(time.perf_counter() - start)

@@ -21,6 +21,7 @@ from clpipe.engine.clipping import clipped_share
 from clpipe.engine.device import Device, Timing
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.read import SourceImage
+from clpipe.inputs.carry import Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.renditions import Rendition
@@ -48,6 +49,7 @@ class Task:
     error: str = ""
     reason: str = ""
     outputs: list[str] = field(default_factory=list)
+    carried: Carried | None = None  # until it is written
     clipped: float = 0.0  # the share of clipped pixels, of the rendition that has most
 
     @contextmanager
@@ -169,7 +171,7 @@ class ImageWorker:
         return [
             name
             for name in names
-            if not self.is_done(task.job, name, self.writer.record_of(task.request, name))
+            if not self.is_done(task.job, name, self.writer.record_of(task.job, task.request, name))
         ]
 
     def is_done(self, job: Job, name: str, request: Mapping[str, Any]) -> bool:
@@ -199,6 +201,9 @@ class ImageWorker:
             task.status = LEFT_OUT
             return
         self.writer.check_size(loaded.source, loaded.chain)
+        if any(self.writer.carries(job, name) for name in names):
+            turn = self.writer.turn_of(loaded.source, loaded.chain)
+            task.carried = task.loader.carried(job, loaded, turn)
         task.source = loaded.source
         renditions = self.writer.plan_of(job).renditions(loaded.chain, loaded.key)
         task.renditions = [rendition for rendition in renditions if rendition.name in names]
@@ -269,13 +274,16 @@ class ImageWorker:
         assert task.source
         with task.timed("encode"):
             try:
-                files = writer.write(job, rendition, task.source, result)
+                carried = None
+                if writer.carries(job, rendition.name):
+                    carried, task.carried = task.carried, None
+                files = writer.write(job, rendition, task.source, result, carried)
                 clipped = None if rendition.noise else clipped_share(result, rendition.chain)
                 task.clipped = max(task.clipped, clipped or 0.0)
                 path = writer.path(job, SIDECAR, rendition.name)
                 record = sidecar(
                     job,
-                    writer.record_of(task.request, rendition.name),
+                    writer.record_of(job, task.request, rendition.name),
                     task.stamp,
                     rendition,
                     writer.plan_of(job).frames,
@@ -284,6 +292,7 @@ class ImageWorker:
                     result,
                     files,
                     clipped,
+                    carried,
                 )
                 write_sidecar(path, record)
                 task.outputs += [str(f.relative_to(writer.folder)) for f in (*files, path)]

@@ -12,6 +12,7 @@ from clpipe.chain.draws import Draw
 from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
+from clpipe.reference.geometry import Composition
 from clpipe.reference.resample import Resampling, sizes
 from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
 
@@ -70,6 +71,12 @@ class Chain:
     def size(self, width: int, height: int) -> tuple[int, int]:
         """The width and height of what comes out, in px, from those of what enters."""
         return sizes(self._resamplings, width, height)[-1]
+
+    @cached_property
+    def geometry(self) -> Composition | None:
+        """Where the pixels of what comes out come from in what enters; None if each stays."""
+        moves = tuple(filter(None, (step.method.geometry() for step in self.steps)))
+        return Composition(moves) if moves else None
 
     @cached_property
     def _resamplings(self) -> tuple[Resampling, ...]:

@@ -10,6 +10,7 @@ from typing import Any
 from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
+from clpipe.chain.carry import Carry, check_companion, parse_carry
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.files import load_config
 from clpipe.chain.formats import EVERY_FORMAT
@@ -22,10 +23,15 @@ from clpipe.stage import Kind
 
 DEFAULTS = Settings()
 
+# What goes along with the first picture of an image.
+CARRY = ("carry", "companions", "depth_png")
+
+LISTS = ("stage_files", "formats", "keep", "carry", "companions")  # of texts
+
 # What decides about the bytes of a picture. The rest decides which pictures are made, or whether.
 RECORDED = (
     *("config", "options", "image", "start_at", "until", "stage_files", "image_name"),
-    *("layer", "transfer", "formats", "keep"),
+    *("layer", "transfer", "formats", "keep", *CARRY),
 )
 
 
@@ -48,6 +54,10 @@ class Request:
         keep: steps whose image is written too, or "all".
         frames: how many frames of each image; None is one picture instead of a burst.
         truths: which of :data:`clpipe.chain.truth.TRUTHS` are written beside each picture.
+        carry: layers that go along with each picture, as :func:`clpipe.chain.carry.parse_carry`
+            reads them.
+        companions: patterns of the names of files that hold them; () are those beside an image.
+        depth_png: write carried depth as PNG, too.
         truth_keep: steps whose image is written beside a truth that is a picture; None is
             ``keep``. See :meth:`with_outputs`.
         bracket: what is added to the exposure's EV, for each exposure that is made of each image;
@@ -66,6 +76,9 @@ class Request:
     max_pixels: int | None = None
     formats: tuple[str, ...] = ()
     keep: tuple[str, ...] = ()
+    carry: tuple[str, ...] = ()
+    companions: tuple[str, ...] = ()
+    depth_png: bool = False
     frames: int | None = None
     truths: tuple[str, ...] = ()
     truth_keep: tuple[str, ...] | None = None
@@ -126,6 +139,7 @@ class Request:
         if configuration:
             vars(request)["_configured"] = configuration.settings  # is validated already
         request.settings()
+        request.carried()  # refuses what is wrong
         return request
 
     @classmethod
@@ -137,7 +151,7 @@ class Request:
         """
         try:
             values = {name: record[name] for name in RECORDED}
-            lists = {name: tuple(record[name]) for name in ("stage_files", "formats", "keep")}
+            lists = {name: tuple(record[name]) for name in LISTS}
         except (TypeError, KeyError) as error:
             raise RequestError(f"the request in it is damaged: {error}") from None
         if not set(lists["formats"]) <= set(EVERY_FORMAT):
@@ -150,6 +164,7 @@ class Request:
         )
         if not are_texts or not all(isinstance(table, Mapping) for table in tables):
             raise RequestError("the request in it is damaged: a value is of the wrong type")
+        request.carried()  # refuses what is wrong
         return request
 
     def for_image(self, name: str, values: Mapping[str, Any]) -> "Request":
@@ -172,6 +187,21 @@ class Request:
         own = noisy_mosaic(chain).steps[-1].name if MOSAIC in self.truths else ""
         truth_keep = tuple(step for step in keep if step != own)
         return self._changed(formats=formats, keep=keep, truth_keep=truth_keep)
+
+    def carried(self) -> tuple[Carry, ...]:
+        """The layers that go along with each picture.
+
+        Raises:
+            RequestError: a layer or a pattern is wrong, or there is no depth for a PNG.
+        """
+        layers = parse_carry(self.carry)
+        for pattern in self.companions:
+            check_companion(pattern)
+        if self.companions and not layers:
+            raise RequestError("--companion: it says where layers are, but none is asked for")
+        if self.depth_png and not any(each.kind == "depth" for each in layers):
+            raise RequestError("--depth-png: no depth is carried; say --carry Depth as well")
+        return layers
 
     def settings(self, carried: Settings | None = None) -> Settings:
         """The settings that are asked for, drawn for the image where there is one.

@@ -17,6 +17,7 @@ from clpipe.commands.completion import (
     steps_or_all,
 )
 from clpipe.commands.options import stage_file_option
+from clpipe.reference.warp import RESAMPLING
 
 camera_option = click.option(
     "--camera",
@@ -98,6 +99,31 @@ keep_option = click.option(
     metavar="STAGE|all",
     shell_complete=steps_or_all,
     help="Write the image of a stage, too, as float EXR; may be repeated.",
+)
+
+carry_option = click.option(
+    "--carry",
+    multiple=True,
+    metavar="NAME[:KIND]",
+    help="Move a layer as the picture's pixels are moved, and write it to OUT/NAME.carried.exr: "
+    "depth, normals, flow, object numbers, of the image's own file or of one beside it. "
+    f"KIND is {', '.join(RESAMPLING)}, where its name does not say it; may be repeated.",
+)
+
+companion_option = click.option(
+    "--companion",
+    "companions",
+    multiple=True,
+    metavar="PATTERN",
+    help="Where a carried layer is that is not in the image's file, as '../depth/{name}.exr', from "
+    "the image's folder; may be repeated. [default: {name}_LAYER.exr and the like]",
+)
+
+depth_png_option = click.option(
+    "--depth-png",
+    is_flag=True,
+    help="Write carried depth, which is in metres, as OUT/NAME.LAYER.png, too: 16 bits, in "
+    "millimetres.",
 )
 
 format_option = click.option(

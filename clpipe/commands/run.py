@@ -26,7 +26,14 @@ from clpipe.chain.chain import Chain
 from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.request import Request
 from clpipe.chain.truth import TRUTHS
-from clpipe.commands.chain_options import chain_options, format_option, keep_option
+from clpipe.commands.chain_options import (
+    carry_option,
+    chain_options,
+    companion_option,
+    depth_png_option,
+    format_option,
+    keep_option,
+)
 from clpipe.commands.input_options import (
     exclude_option,
     layer_option,
@@ -88,6 +95,9 @@ if TYPE_CHECKING:
 @max_pixels_option
 @exclude_option
 @keep_option
+@carry_option
+@companion_option
+@depth_png_option
 @format_option
 @click.option(
     "--keep-suffix",
@@ -187,6 +197,11 @@ def run(
     denoising and what else follows from the noise. --truth development is OUT/NAME.truth.jpg, also
     without --frames: denoised as strongly as the noisy picture, so that their difference is the
     noise that is left. --truth mosaic is OUT/NAME.truth_mosaic.exr, the truth of --keep normalize.
+    --carry Depth --carry IndexOB writes OUT/NAME.carried.exr with these layers as they are in the
+    picture after all that moves its pixels, and a channel "valid": 0 where the render has nothing.
+    Depth and labels are those of the nearest pixel, the vectors of flow end where the picture has
+    their ends.
+
     --truth variance is OUT/NAME.truth_variance.exr: for each pixel of that mosaic the variance of
     the noise that the chain adds, in signal squared. It includes what is fixed to a sensor (PRNU,
     DSNU, columns) and rounding, but neither clipping nor defect pixels.

@@ -70,7 +70,7 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
             in_part = [PictureLocation(part - 1, *channel)] if channel else []
         else:
             in_part = [
-                PictureLocation(part - 1, _full_name(part_name, own_name), channels, xyz)
+                PictureLocation(part - 1, full_name(part_name, own_name), channels, xyz)
                 for own_name, channels, xyz in _layers(names, kept)
             ]
         if kept and not in_part:
@@ -114,10 +114,10 @@ def _refusal(spec: Any, has_levels: bool) -> str:
     return "a texture (one image in several sizes), not a picture" if has_levels else ""
 
 
-def _full_name(part: str, layer: str) -> str:
+def full_name(part: str, layer: str) -> str:
     """A layer's name with its part's name before it, unless it already begins with that.
 
-    >>> _full_name("left", ""), _full_name("left", "beauty"), _full_name("View", "View.Combined")
+    >>> full_name("left", ""), full_name("left", "beauty"), full_name("View", "View.Combined")
     ('left', 'left.beauty', 'View.Combined')
     """
     if f"{layer}.".startswith(f"{part}."):

@@ -188,7 +188,7 @@ def read_finished(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> SourceImage
         if picture is None or spec.format.basetype not in (oiio.UINT8, oiio.UINT16):
             return None
         check_size(path, spec.width, spec.height, max_pixels)
-        rgb = _channels(path, file, 0, picture[1], oiio.FLOAT)  # scales whole numbers to 0..1
+        rgb = read_samples(path, file, 0, picture[1], oiio.FLOAT)  # scales whole numbers to 0..1
         return SourceImage(np.ascontiguousarray(rgb), _digest(path), "", (), {})
 
 
@@ -307,7 +307,7 @@ def _read_part(
         names = [spec.channelnames[i] for i in channels]
         pixels = read_channels(path, names, (spec.height, spec.width))
     if pixels is None:
-        pixels = _channels(path, file, location.part, channels, type_)
+        pixels = read_samples(path, file, location.part, channels, type_)
     if whole:
         pixels = pixels.astype(np.float32)
     x, y = spec.x - spec.full_x, spec.y - spec.full_y
@@ -316,7 +316,7 @@ def _read_part(
     return pixels if len(channels) > 1 else np.ascontiguousarray(pixels[..., 0])
 
 
-def _channels(path: Path, file: Any, part: int, channels: Sequence[int], type_: Any) -> Array:
+def read_samples(path: Path, file: Any, part: int, channels: Sequence[int], type_: Any) -> Array:
     """Some channels of a part's data window, (rows, columns, channel), as samples of a type.
 
     Raises:
@@ -327,7 +327,7 @@ def _channels(path: Path, file: Any, part: int, channels: Sequence[int], type_: 
         raise ImageError(f"{path}: a volume of {spec.depth} images, not a picture")
     first, last = min(channels), max(channels) + 1
     if last - first > READ_AT_ONCE:
-        planes = [_channels(path, file, part, [i], type_) for i in channels]
+        planes = [read_samples(path, file, part, [i], type_) for i in channels]
         return np.concatenate(planes, axis=-1)
     data = file.read_image(part, 0, first, last, type_)
     problem = file.geterror()

@@ -94,12 +94,21 @@ def from_attributes(attributes: Mapping[str, str], default: Tags) -> tuple[Tags,
     try:
         text = attributes.get("exif")
         tags = TypeAdapter(Tags).validate_json(text) if text else default
-        orientation = int(attributes.get("orientation", 1))
-        if orientation not in FLIPS:
-            raise ValueError
     except ValueError:
-        raise ImageError("its attributes clpipe:exif and clpipe:orientation are damaged") from None
-    return tags, orientation
+        raise ImageError("its attribute clpipe:exif is damaged") from None
+    return tags, orientation_of(attributes)
+
+
+def orientation_of(attributes: Mapping[str, str]) -> int:
+    """The orientation that an image carries (EXIF's, 1 to 8), else 1 (upright).
+
+    Raises:
+        ImageError: the attribute is damaged.
+    """
+    orientation = attributes.get("orientation", "1")
+    if orientation not in map(str, FLIPS):
+        raise ImageError("its attribute clpipe:orientation is damaged")
+    return int(orientation)
 
 
 # By EXIF's orientation: whether to flip left to right, whether to flip upside down, and whether

@@ -4,7 +4,7 @@ import errno
 import mmap
 import os
 import resource
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -20,6 +20,7 @@ from clpipe.base.files import Stored, write_whole
 from clpipe.base.steps import Step
 from clpipe.base.types import Array, Floats
 from clpipe.images.attributes import PREFIX
+from clpipe.images.openexr import write_channels
 from clpipe.images.openimageio import error_text
 from clpipe.images.pixels import HALF_MAX
 from clpipe.images.tags import Tags, exif
@@ -108,19 +109,62 @@ def write_exr(
     return _write(path, spec, data.reshape(height, width, len(channels)))
 
 
+def write_planes(path: Path, planes: Mapping[str, Array], attributes: Mapping[str, str]) -> Stored:
+    """Write channels as OpenEXR with ZIP compression, each in its own type.
+
+    Args:
+        path: the file.
+        planes: (height, width) float16, float32 or uint32, by the names of the channels.
+        attributes: of the header, by their whole names.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+
+    def encode(to: str) -> None:
+        write_channels(to, planes, attributes)
+
+    return _stored(path, sum(plane.nbytes for plane in planes.values()), encode)
+
+
+def write_grey_png(path: Path, pixels: Array) -> Stored:
+    """Write whole numbers, (height, width), of 8 or 16 bits, as PNG.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 1, pixels.dtype.name)
+    spec.attribute("png:compressionLevel", PNG_LEVEL)
+    spec.attribute("Software", f"clpipe {__version__}")
+    return _write(path, spec, pixels[..., np.newaxis])
+
+
 def _write(path: Path, spec: Any, pixels: Array) -> Stored:
     """Write (height, width, channel) with OpenImageIO, which releases the GIL while it encodes.
 
     Raises:
         ImageError: the file cannot be written.
     """
+    return _stored(path, pixels.nbytes, lambda to: _encode(path.suffix[1:], to, spec, pixels))
 
+
+def _stored(path: Path, size: int, encode: Callable[[str], None]) -> Stored:
+    """Write what an encoder makes.
+
+    Args:
+        path: the file.
+        size: of the samples, in bytes.
+        encode: writes to a path; an OSError says why it cannot.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
     # The encoders do not notice all that a full disk refuses, and libjpeg then ends the process; so
     # they write to memory.
     with open(os.memfd_create("picture"), "rb", buffering=0) as memory:
         try:
-            _check_file_limit(2 * pixels.nbytes)
-            _encode(path.suffix[1:], f"/proc/self/fd/{memory.fileno()}", spec, pixels)
+            _check_file_limit(2 * size)
+            encode(f"/proc/self/fd/{memory.fileno()}")
             encoded = mmap.mmap(memory.fileno(), 0, prot=mmap.PROT_READ)
         except OSError as error:
             raise ImageError(f"{path}: cannot be written: {error.strerror or error}") from None

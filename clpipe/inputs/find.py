@@ -14,6 +14,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.text import printable
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import RENDER_SUFFIXES
+from clpipe.inputs.carry import owner_of
 from clpipe.inputs.manifest import MANIFEST_SUFFIXES, read_manifest
 
 T = TypeVar("T")
@@ -83,6 +84,8 @@ def find_jobs(
         exclude: patterns of what is not taken from folders and globs, see :class:`Exclusion`.
         keep_suffix: name outputs by the whole image key, and not without its suffix.
 
+    A file that goes with another one, see :func:`without_companions`, is no job.
+
     Raises:
         RequestError: no input, an empty name, a folder without images, or one that cannot be read,
             a glob that no file matches, or a manifest that is wrong.
@@ -119,9 +122,25 @@ def find_jobs(
             jobs.append(Job(path, path.name))
     for pattern in excluded.unused:
         log.warning("--exclude %s: matches nothing", pattern)
+    jobs = without_companions(jobs)
     if not jobs:
         raise RequestError("every file is excluded")
     return [replace(job, name=job.name or job.key) for job in jobs] if keep_suffix else jobs
+
+
+def without_companions(jobs: Sequence[Job]) -> list[Job]:
+    """The jobs but for those of files that belong to another job's image by their names.
+
+    So ``view00_depth.exr`` is no image beside ``view00.exr``. What a manifest lists is an image.
+    """
+    stems = {str(job.path.with_suffix("")) for job in jobs}
+    found = [job for job in jobs if not job.place and owner_of(job.path) in stems]
+    if found:
+        goes = "1 file goes" if len(found) == 1 else f"{len(found)} files go"
+        first = printable(str(found[0].path))
+        log.info("%s with an image beside, such as %s; see --carry", goes, first)
+    others = {id(job) for job in found}
+    return [job for job in jobs if id(job) not in others]
 
 
 class Exclusion:

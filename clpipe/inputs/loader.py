@@ -22,6 +22,7 @@ from clpipe.images.read import (
     SourceImage,
     read_source,
 )
+from clpipe.inputs.carry import Carried, carry
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import KeptLoader, kind_message
 from clpipe.inputs.manifest import check_rows
@@ -160,6 +161,22 @@ class ImageLoader:
             warning = f"was kept after {stage}; is it a render? See --start-at"
             source = replace(source, warnings=(*source.warnings, warning))
         return LoadedImage(self.chain, source, key)
+
+    def carried(self, job: Job, loaded: LoadedImage, orientation: int = 1) -> Carried:
+        """The layers that go along with a job's picture.
+
+        Args:
+            job: the image.
+            loaded: it, as :meth:`enter` gave it.
+            orientation: EXIF's, by which the picture is turned in the end.
+
+        Raises:
+            ImageError: one is missing, or does not fit the image.
+        """
+        request = self.request
+        most = request.max_pixels or USUAL_MAX_PIXELS
+        layers, patterns = request.carried(), request.companions
+        return carry(job.path, loaded.source, loaded.chain, layers, patterns, most, orientation)
 
     def is_left_out(self, job: Job, error: Exception) -> bool:
         """Whether an image that cannot enter was only found in a folder, beside others that can."""

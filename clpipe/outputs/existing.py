@@ -118,9 +118,25 @@ def is_current(
     size, modified = stamp_of(job.path)
     if values.get("input_size") != size:
         return False
-    if values.get("input_modified") == modified and not verify:
+    is_touched = values.get("input_modified") != modified
+    if (is_touched or verify) and values.get("sha256") not in digests([str(job.path)]).values():
+        return False
+    try:
+        return all(_is_same(job, each, verify) for each in values.get("carried", ()))
+    except (KeyError, TypeError):  # the sidecar is damaged
+        return False
+
+
+def _is_same(job: Job, carried: Mapping[str, Any], verify: bool) -> bool:
+    """Whether the file of a carried layer is what a sidecar says of it.
+
+    Raises:
+        KeyError, TypeError: the sidecar is damaged.
+    """
+    file = job.path.parent / carried["file"]
+    if (carried["size"], carried["modified"]) == stamp_of(file) and not verify:
         return True
-    return values.get("sha256") in digests([str(job.path)]).values()
+    return carried["sha256"] in digests([str(file)]).values()
 
 
 def _same_request(one: Any, other: Mapping[str, Any]) -> bool:

@@ -19,6 +19,7 @@ from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.images.read import SourceImage
 from clpipe.images.write import versions
+from clpipe.inputs.carry import Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.raw import RawImage
 from clpipe.outputs.renditions import Rendition
@@ -114,6 +115,7 @@ def sidecar(
     result: Result,
     outputs: Mapping[Path, Stored],
     clipped: float | None,
+    carried: Carried | None = None,
 ) -> dict[str, Any]:
     """Everything that is needed to make the files of a rendition again, as JSON values.
 
@@ -128,6 +130,7 @@ def sidecar(
         result: what was made of it.
         outputs: the files.
         clipped: the share of clipped pixels, 0 to 1; None where the image has no upper end.
+        carried: layers that were written beside it.
     """
     chain = rendition.whole
     facts = source.facts if isinstance(source, RawImage) else None
@@ -166,6 +169,7 @@ def sidecar(
             {"name": path.name, "size": file.size, "sha256": file.sha256}
             for path, file in outputs.items()
         ],
+        **({"carried": [layer.record for layer in carried.layers]} if carried else {}),
         "warnings": list(source.warnings),
         "device": device_record(device),
         "versions": all_versions(),

@@ -11,16 +11,18 @@ from clpipe.base.files import Stored, keep_names
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
 from clpipe.chain.formats import DNG, FORMATS, Format, ending_of
-from clpipe.chain.request import Request
+from clpipe.chain.request import CARRY, Request
 from clpipe.chain.truth import PICTURES, variance_of
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.dng import write_dng
 from clpipe.images.read import SourceImage
-from clpipe.images.tags import TAG_ATTRIBUTES, Tags, from_attributes, upright
+from clpipe.images.tags import TAG_ATTRIBUTES, Tags, from_attributes, orientation_of, upright
 from clpipe.images.write import JPEG_MAX_SIDE, write_display, write_exr
+from clpipe.inputs.carry import CARRIED, Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import attributes_of
+from clpipe.outputs.carried import write_carried
 from clpipe.outputs.existing import Existing
 from clpipe.outputs.folder import RESUMABLE, write_problem
 from clpipe.outputs.negative import negative_of
@@ -76,14 +78,30 @@ class OutputWriter:
             return self.request.truth_keep
         return self.request.keep
 
-    def record_of(self, request: Mapping[str, Any], name: str) -> dict[str, Any]:
+    def record_of(self, job: Job, request: Mapping[str, Any], name: str) -> dict[str, Any]:
         """The record of a request as far as it is about one rendition.
 
         Args:
-            request: the record for the image.
+            job: the image.
+            request: the record for it.
             name: of the rendition.
         """
-        return {**request, "keep": list(self.keep_of(name))}
+        carries = {} if self.carries(job, name) else dict(zip(CARRY, ([], [], False), strict=True))
+        return {**request, "keep": list(self.keep_of(name)), **carries}
+
+    def carries(self, job: Job, name: str) -> bool:
+        """Whether layers go along with a rendition, by its name: they do with an image's first."""
+        return bool(self.request.carry) and name == self.plan_of(job).names()[0]
+
+    def _carried_files(self, job: Job, name: str) -> dict[str, Path]:
+        """The files of carried layers: that of all, "", and the PNG of each depth by its name."""
+        if not self.carries(job, name):
+            return {}
+        depths = [each.name for each in self.request.carried() if each.kind == "depth"]
+        return {
+            "": self.path(job, f"{CARRIED}.exr"),
+            **{each: self.path(job, f"{each}.png") for each in depths if self.request.depth_png},
+        }
 
     def _kept_steps(self, rendition: Rendition) -> list[str]:
         """The steps of a rendition's chain whose image is written, too."""
@@ -162,6 +180,7 @@ class OutputWriter:
         never written, so kept images need not be there.
         """
         pictures = [self.path(job, ending_of(format_), name) for format_ in self.formats_of(name)]
+        pictures += self._carried_files(job, name).values()
         kept = [self.path(job, f"{step}.exr", name) for step in self.keep_of(name)]
         return Existing(self.path(job, SIDECAR, name), pictures, kept)
 
@@ -174,8 +193,24 @@ class OutputWriter:
         if reason := write_problem(self.folder):
             raise OutputError(f"{self.folder}: {reason}; {RESUMABLE}")
 
+    @staticmethod
+    def turn_of(source: SourceImage, chain: Chain) -> int:
+        """EXIF's orientation by which a picture is turned; a mosaic, whose pattern would change, is
+        not turned.
+
+        Raises:
+            ImageError: the attributes of the source are damaged.
+        """
+        is_mosaic = chain.result in (Kind.RAW, Kind.MOSAIC)
+        return 1 if is_mosaic else orientation_of(source.attributes)
+
     def write(
-        self, job: Job, rendition: Rendition, source: SourceImage, result: Result
+        self,
+        job: Job,
+        rendition: Rendition,
+        source: SourceImage,
+        result: Result,
+        carried: Carried | None = None,
     ) -> dict[Path, Stored]:
         """Write the images of one rendition.
 
@@ -184,6 +219,7 @@ class OutputWriter:
             rendition: the picture of it.
             source: the image, as it was loaded.
             result: what the rendition's :meth:`runner` made of it.
+            carried: layers that are written beside it.
 
         Returns:
             The files.
@@ -202,8 +238,7 @@ class OutputWriter:
         tag_attributes = {
             name: source.attributes[name] for name in TAG_ATTRIBUTES if name in source.attributes
         }
-        is_mosaic = chain.result in (Kind.RAW, Kind.MOSAIC)
-        turn = 1 if is_mosaic else orientation  # turning a mosaic would change its pattern
+        turn = self.turn_of(source, chain)
         outputs: dict[Path, Stored] = {}
         whose = rendition.key, rendition.frame
         for step in (chain.step_named(name) for name in self._kept_steps(rendition)):
@@ -233,6 +268,9 @@ class OutputWriter:
             else:
                 pixels = upright(samples(result, FORMATS[format_]), turn)
                 outputs[path] = write_display(path, pixels, tags)
+        if carried:
+            for layer, path in self._carried_files(job, rendition.name).items():
+                outputs[path] = write_carried(path, carried, layer)
         return outputs
 
     def _make_folder_of(self, job: Job) -> None:

@@ -7,6 +7,8 @@ pixel is at (0.5, 0.5), as COLMAP counts; OpenCV's first centre is (0, 0).
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from clpipe.base.types import Array
 from clpipe.reference.resample import Resampling, sizes
 
@@ -52,3 +54,117 @@ class Scaling:
         """See :meth:`Geometry.origins`."""
         columns, rows = self.size(width, height)
         return x * (width / columns), y * (height / rows)
+
+
+@dataclass(frozen=True)
+class Composition:
+    """Several geometries in a row, the first one's result going into the next.
+
+    >>> import numpy as np
+    >>> from clpipe.reference.resample import overlap
+    >>> half = Scaling((Resampling("columns", 0.5, overlap, 0.5),))
+    >>> twice = Composition((half, half))
+    >>> twice.size(8, 6), twice.origins(np.array(0.5), np.array(0.5), 8, 6)
+    ((2, 6), (np.float64(2.0), np.float64(0.5)))
+    """
+
+    parts: tuple[Geometry, ...]
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """See :meth:`Geometry.size`."""
+        for part in self.parts:
+            width, height = part.size(width, height)
+        return width, height
+
+    def origins(self, x: Array, y: Array, width: int, height: int) -> tuple[Array, Array]:
+        """See :meth:`Geometry.origins`."""
+        sizes_ = [(width, height)]
+        for part in self.parts:
+            sizes_.append(part.size(*sizes_[-1]))
+        for part, size in zip(reversed(self.parts), reversed(sizes_[:-1]), strict=True):
+            x, y = part.origins(x, y, *size)
+        return x, y
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """An image turned upright: flipped left to right, upside down, then transposed."""
+
+    mirrored: bool
+    upside_down: bool
+    transposed: bool
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """See :meth:`Geometry.size`."""
+        return (height, width) if self.transposed else (width, height)
+
+    def origins(self, x: Array, y: Array, width: int, height: int) -> tuple[Array, Array]:
+        """See :meth:`Geometry.origins`."""
+        x, y = (y, x) if self.transposed else (x, y)
+        return width - x if self.mirrored else x, height - y if self.upside_down else y
+
+
+RESIDUAL = 1e-6  # px, in the image that a geometry gets
+STEP = 1e-3  # px, of the finite differences
+ITERATIONS = 20
+
+
+def destinations(
+    geometry: Geometry,
+    to: tuple[Array, Array],
+    start: tuple[Array, Array],
+    width: int,
+    height: int,
+) -> tuple[Array, Array]:
+    """Where places of the image that a geometry gets are in its result: the inverse of its origins.
+
+    Newton's method in two dimensions, the Jacobian by finite differences, until a place's origin is
+    within :data:`RESIDUAL` of what it should be.
+
+    Args:
+        geometry: how the pixels move.
+        to: x and y of the places, float64 of any shape.
+        start: places of the result nearby, of that shape.
+        width, height: of the image that it gets.
+
+    Returns:
+        x and y; NaN where no place is found, as beyond the radius where a lens turns.
+
+    >>> import numpy as np
+    >>> mirror, start = Orientation(True, False, False), (np.zeros(1), np.zeros(1))
+    >>> x, y = destinations(mirror, (np.array([1.0]), np.array([2.0])), start, 8, 6)
+    >>> x.round(6).tolist(), y.round(6).tolist()
+    ([7.0], [2.0])
+    """
+    shape = to[0].shape
+    goal = np.stack([np.ravel(each) for each in to]).astype(np.float64)
+    found = np.stack([np.ravel(each) for each in start]).astype(np.float64)
+    result = np.full_like(found, np.nan)
+    right, down = np.array([[STEP], [0]]), np.array([[0], [STEP]])
+
+    def origins(places: Array) -> Array:
+        return np.stack(geometry.origins(places[0], places[1], width, height))
+
+    left = np.flatnonzero(np.isfinite(goal).all(0))
+    goal, found = goal[:, left], found[:, left]
+    with np.errstate(all="ignore"):  # what runs off to infinity is left at NaN
+        for _ in range(ITERATIONS):
+            here = origins(found)
+            error = goal - here
+            near = np.hypot(error[0], error[1]) <= RESIDUAL
+            result[:, left[near]] = found[:, near]
+            going = ~near & np.isfinite(error).all(0)
+            left, goal, found = left[going], goal[:, going], found[:, going]
+            if not left.size:
+                break
+            here, error = here[:, going], error[:, going]
+            by_x = (origins(found + right) - here) / STEP
+            by_y = (origins(found + down) - here) / STEP
+            area = by_x[0] * by_y[1] - by_x[1] * by_y[0]
+            found = found + np.stack(
+                [
+                    (error[0] * by_y[1] - error[1] * by_y[0]) / area,
+                    (error[1] * by_x[0] - error[0] * by_x[1]) / area,
+                ]
+            )
+    return result[0].reshape(shape), result[1].reshape(shape)

@@ -1,0 +1,227 @@
+"""What a render holds beside its picture: depth, normals, object numbers, motion, in layers."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+
+from clpipe.base.steps import Step
+from clpipe.base.types import Array
+from clpipe.images.layers import MOST_PARTS, full_name
+from clpipe.images.openimageio import open_image
+from clpipe.images.pixels import check_size
+from clpipe.images.read import read_samples
+from clpipe.reference.warp import LayerKind, Vector
+
+# What layers hold, by their names in Blender, Mitsuba and elsewhere: lower case, letters alone.
+NAMES: dict[LayerKind, tuple[str, ...]] = {
+    "depth": ("depth", "z", "zdepth", "mist", "distance"),
+    "label": (
+        *("indexob", "indexma", "objectindex", "materialindex", "objectid", "materialid", "id"),
+        *("index", "instance", "instanceid", "label", "labels", "segmentation", "seg", "semantic"),
+        *("mask", "crypto", "cryptoobject", "cryptomaterial", "cryptoasset", "cryptomatte"),
+        *("shapeindex", "primindex", "ids"),
+    ),
+    "normal": ("normal", "normals", "shnormal", "geonormal", "shadingnormal", "denoisingnormal"),
+    "flow": (
+        "vector",
+        "flow",
+        "opticalflow",
+        "motion",
+        "motionvector",
+        "motionvectors",
+        "velocity",
+    ),
+    "colour": ("albedo", "basecolor", "basecolour"),
+}
+
+CHANNELS: dict[LayerKind, int] = {"flow": 2, "normal": 3}  # at least
+
+CRYPTOMATTE = "cryptomatte/"  # begins the names of attributes that say what its numbers stand for
+
+ORDER = "RGBAXYZWUV"  # of channels within a layer
+
+FLOATS = {oiio.HALF: oiio.HALF, oiio.FLOAT: oiio.FLOAT, oiio.DOUBLE: oiio.FLOAT}
+
+
+@dataclass(frozen=True)
+class LayerLocation:
+    """Where in a file a layer is: the part's number, and the channels' numbers.
+
+    Args:
+        name: of the layer; "" for channels whose names have no layer.
+        part: the number of its part.
+        channels: the names of its channels, without the layer's.
+        places: their numbers in the part.
+        type: the ``oiio.BASETYPE`` of its samples.
+    """
+
+    name: str
+    part: int
+    channels: tuple[str, ...]
+    places: tuple[int, ...]
+    type: Any
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether it is one channel that belongs to no layer."""
+        return self.channels == (self.name,)
+
+    @property
+    def is_colour(self) -> bool:
+        """Whether its channels are red, green and blue."""
+        return {channel.upper() for channel in self.channels} >= set("RGB")
+
+    def answers_to(self, name: str) -> bool:
+        """Whether a name means it: its own or the end of its own, in any case.
+
+        All ranks of a Cryptomatte answer to the name without a number, and a Z alone to depth.
+        """
+        names = [self.name, self.without_rank, *(["depth"] if self.name in ("Z", "z") else [])]
+        return any(f".{each}".lower().endswith(f".{name}".lower()) for each in names)
+
+    @property
+    def without_rank(self) -> str:
+        """Its name, that of a Cryptomatte's layers without their number."""
+        is_rank = "crypto" in self.name.lower() and self.name[-2:].isdigit()
+        return self.name[:-2] if is_rank else self.name
+
+
+def kind_named(name: str) -> LayerKind | None:
+    """What a layer holds, by its name; None where that does not say it.
+
+    >>> kind_named("ViewLayer.CryptoObject00"), kind_named("sh_normal"), kind_named("DiffCol")
+    ('label', 'normal', None)
+    """
+    plain = re.sub(r"[^a-z]", "", name.rpartition(".")[2].lower())
+    return next((kind for kind, names in NAMES.items() if plain in names), None)
+
+
+def kind_of(name: str, location: LayerLocation) -> LayerKind | None:
+    """What a layer holds, by the name that it is known by and its channels; None is unknown."""
+    if kind := kind_named(name) or kind_named(location.name):
+        return kind
+    if location.type not in FLOATS:
+        return "label"
+    return "colour" if location.is_colour else None
+
+
+def vectors_of(name: str, channels: tuple[str, ...]) -> tuple[Vector, ...]:
+    """The vectors of a flow: of each the channels to the right and down, and their signs.
+
+    They point right and down, to where a surface is seen in the other frame, but in Blender's
+    Vector, whose Y and W point up: X and Y go to the frame before, Z and W come from the next one.
+
+    Args:
+        name: of the layer.
+        channels: the names of its channels; one alone is no vector.
+
+    >>> vectors_of("Vector", ("X", "Y", "Z", "W"))
+    (((0, 1), (1, -1)), ((2, -1), (3, 1)))
+    >>> vectors_of("flow", ("R", "G", "B"))
+    (((0, 1), (1, 1)),)
+    """
+    if name.rpartition(".")[2].lower() == "vector" and len(channels) == 4:
+        return ((0, 1), (1, -1)), ((2, -1), (3, 1))
+    return tuple(((i, 1), (i + 1, 1)) for i in range(0, len(channels) - 1, 2))
+
+
+def find_layers(path: Path) -> list[LayerLocation]:
+    """All layers of a file, in order; those without a name are its picture, or single channels.
+
+    Raises:
+        ImageError: it is missing, damaged or no image.
+    """
+    found: list[LayerLocation] = []
+    with open_image(path) as file:
+        several = file.seek_subimage(1, 0)
+        part = 0
+        while part < MOST_PARTS and file.seek_subimage(part, 0):
+            spec = file.spec()
+            if not spec.deep:
+                part_name = str(spec.getattribute("oiio:subimagename") or "") if several else ""
+                found += _layers_in(part, part_name, spec)
+            part += 1
+        file.geterror()  # clears it: the loop asked for a part that does not exist
+    return found
+
+
+def _layers_in(part: int, part_name: str, spec: Any) -> Iterator[LayerLocation]:
+    """The layers of one part."""
+    types = spec.channelformats or [spec.format] * spec.nchannels
+    for name, places in _grouped(spec.channelnames, bool(part_name)).items():
+        own = {i: spec.channelnames[i].rpartition(".")[2] for i in places}
+        order = sorted(places, key=lambda i: (ORDER.find(own[i].upper()), own[i]))
+        basetypes = {types[i].basetype for i in places}
+        type_ = basetypes.pop() if len(basetypes) == 1 else oiio.FLOAT
+        channels = tuple(own[i] for i in order)
+        yield LayerLocation(full_name(part_name, name), part, channels, tuple(order), type_)
+
+
+def _grouped(names: Sequence[str], in_part: bool = False) -> Mapping[str, list[int]]:
+    """The numbers of channels by their layers.
+
+    Channels without a layer are one, called "". But beside R, G and B, and in a file of one part
+    also without them, a channel that is no colour and no coordinate of a vector is its own layer.
+
+    >>> _grouped(["R", "G", "B", "A", "Z", "id", "Normal.X"])
+    {'': [0, 1, 2, 3], 'Z': [4], 'id': [5], 'Normal': [6]}
+    >>> _grouped(["X", "Y", "Z"]), _grouped(["Z"]), _grouped(["Z"], in_part=True)
+    ({'': [0, 1, 2]}, {'Z': [0]}, {'': [0]})
+    """
+    bare = {name.upper() for name in names if "." not in name}
+    wholes = ("RGBA", "XYZW", "XY", "UV", *([bare] if in_part else []))
+    whole = next((each for each in wholes if set(list(each)[:3]) <= bare), ())
+    groups: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        layer, dot, channel = name.rpartition(".")
+        own = layer if dot or channel.upper() in whole else channel
+        groups.setdefault(own, []).append(i)
+    return groups
+
+
+@Step("decode")
+def read_layer(
+    path: Path, location: LayerLocation, max_pixels: int
+) -> tuple[Array, tuple[int, int], tuple[int, int]]:
+    """A layer of a file as stored: half, float32, or whole numbers as uint32.
+
+    Args:
+        path: the file.
+        location: of the layer in it.
+        max_pixels: a file that claims more is refused before memory is taken.
+
+    Returns:
+        The samples of the data window, (rows, columns, channel); column and row of the first one in
+        the display window; and the display window's width and height.
+
+    Raises:
+        ImageError: the file is damaged or too large.
+    """
+    with open_image(path) as file:
+        file.seek_subimage(location.part, 0)
+        spec = file.spec()
+        width, height = spec.full_width, spec.full_height
+        check_size(path, width, height, max_pixels)
+        check_size(path, spec.width, spec.height, max_pixels)
+        type_ = FLOATS.get(location.type, location.type)  # whole numbers would be scaled
+        pixels = read_samples(path, file, location.part, location.places, type_)
+        if pixels.dtype.kind != "f":
+            pixels = pixels.astype(np.uint32)
+        return pixels, (spec.x - spec.full_x, spec.y - spec.full_y), (width, height)
+
+
+def cryptomatte_attributes(path: Path, part: int) -> dict[str, str]:
+    """What the header of a part says of the numbers in its Cryptomatte layers.
+
+    Raises:
+        ImageError: the file is damaged.
+    """
+    with open_image(path) as file:
+        file.seek_subimage(part, 0)
+        listed = file.spec().extra_attribs
+        return {a.name: str(a.value) for a in listed if a.name.startswith(CRYPTOMATTE)}
