@@ -126,7 +126,8 @@ class Dataset(ReadOnly):
         several = [inputs] if isinstance(inputs, str | Path) else inputs
         patterns = [exclude] if isinstance(exclude, str) else exclude
         named = [str(i) for i in several]
-        self._jobs = find_jobs(named, NOWHERE, self._loader.endings(), patterns)
+        found = find_jobs(named, NOWHERE, self._loader.endings(), patterns)
+        self._jobs = self._loader.exposures(found)
         self._loader.check(self._jobs)
         _check_files(self._jobs)
         _check_keys(self._jobs)

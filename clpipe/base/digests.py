@@ -1,6 +1,7 @@
 """SHA-256 of files, computed again only where a file has changed."""
 
-from collections.abc import Iterable
+import hashlib
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -17,6 +18,12 @@ def stamp_of(path: Path) -> tuple[int, int]:
     return info.st_size, info.st_mtime_ns
 
 
+def stamp_of_all(paths: Sequence[Path]) -> tuple[int, int]:
+    """The size of some files together, and the latest time of change; see :func:`stamp_of`."""
+    sizes, times = zip(*map(stamp_of, paths), strict=True)
+    return sum(sizes), max(times)
+
+
 def digests(files: Iterable[str]) -> dict[str, str]:
     """The SHA-256 of each file, by its name; files that cannot be read are left out."""
     by_name = {}
@@ -24,6 +31,17 @@ def digests(files: Iterable[str]) -> dict[str, str]:
         with suppress(OSError):
             by_name[file] = _digest(file, *stamp_of(Path(file)))
     return by_name
+
+
+def joint_digest(digests: Sequence[str]) -> str:
+    """One SHA-256 of several: that of their texts; of one, itself.
+
+    >>> joint_digest(["ab"]), joint_digest(["ab", "cd"])[:8]
+    ('ab', '88d4266f')
+    """
+    if len(digests) == 1:
+        return digests[0]
+    return hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
 @lru_cache(maxsize=1024)

@@ -78,7 +78,8 @@ class RunSpec:
     def anchored_job(self, job: Job) -> Job:
         """A job of the run with names of files absolute."""
         values = from_folder(self.folder, job.values)
-        return replace(job, path=self.folder / job.path, values=values, written=job.input)
+        first, *others = (self.folder / path for path in job.paths)
+        return replace(job, path=first, subframes=tuple(others), values=values, written=job.input)
 
 
 def as_written(outcome: Outcome) -> Outcome:

@@ -84,7 +84,9 @@ def replay_of(
     try:
         replay = _replay(values, inputs, max_pixels)
         files = {str(name): str(digest) for name, digest in values["request"]["files"].items()}
-        files[str(replay.job.path)] = str(values["sha256"])
+        frames = values.get("subframes") or [{"sha256": values["sha256"]}]
+        for file, each in zip(replay.job.paths, frames, strict=True):
+            files[str(file)] = str(each["sha256"])
         for layer in values.get("carried", ()):
             files[str(replay.job.path.parent / layer["file"])] = str(layer["sha256"])
     except (KeyError, TypeError, ValueError, AttributeError, RequestError) as error:
@@ -143,7 +145,15 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
         raise RequestError("found no formats")
     request = replace(request, max_pixels=max_pixels, frames=frames, truths=truths, bracket=bracket)
     path = inputs[0] if inputs else Path(values["input"])
-    job = Job(path, request.image_name, name, values=request.image, pictures=(picture,))
+    others = tuple(path.parent / str(each["file"]) for each in values.get("subframes", ())[1:])
+    job = Job(
+        path,
+        request.image_name,
+        name,
+        values=request.image,
+        pictures=(picture,),
+        subframes=others,
+    )
     were = {**flat(values["device"]), **values["versions"]}
     return Replay(request, job, {what: str(were[what]) for what in surroundings(None)})
 

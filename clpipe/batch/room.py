@@ -41,7 +41,8 @@ def host_bytes(
         pixels = stamp_of(job.path)[0]
     deep = DNG in formats or any(FORMATS[name].bits > 8 for name in formats if name != DNG)
     result = 3 + FLOATS * (len(keep) + deep)
-    return pixels * (FLOATS + result * renditions + 2 * FLOATS * carried)
+    averaging = FLOATS if job.subframes else 0
+    return pixels * (FLOATS + averaging + result * renditions + 2 * FLOATS * carried)
 
 
 class Room:

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from clpipe.base.digests import stamp_of
+from clpipe.base.digests import stamp_of_all
 from clpipe.base.errors import ImageError, NoPictureError, RequestError
 from clpipe.base.types import Array
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome, Span
@@ -194,7 +194,7 @@ class ImageWorker:
             ImageError, RequestError, MemoryError: it cannot be read, or cannot enter the chain.
         """
         job = task.job
-        task.stamp = stamp_of(job.path)
+        task.stamp = stamp_of_all(job.paths)
         source = task.loader.read(job)
         loaded = task.loader.enter(job, source)
         if loaded is None:

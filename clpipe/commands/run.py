@@ -222,7 +222,8 @@ def run(
     else:
         request = Request.from_options(max_pixels=max_pixels, **options)
         loader = ImageLoader(request)
-        jobs = find_jobs(inputs, output, loader.endings(), exclude, keep_suffix)
+        found = find_jobs(inputs, output, loader.endings(), exclude, keep_suffix)
+        jobs = loader.exposures(found)
         if per_tar:
             tars = shard.take(cut(jobs, per_tar, output))
             jobs = [job for tar in tars for job in tar.jobs]

@@ -51,7 +51,7 @@ class SourceImage:
     finite. It is C-contiguous, or planar: a transposed view of a C-contiguous (3, height, width)
     array. ``layer`` is the name of the layer that was read. ``attributes`` are clpipe's own, which
     a kept image has. ``shot`` is what the file says of exposure_time (s), focal_length and
-    sensor_width (mm).
+    sensor_width (mm). ``subframes`` are the names and SHA-256 of files that were averaged.
     """
 
     pixels: Array
@@ -60,6 +60,7 @@ class SourceImage:
     warnings: tuple[str, ...]
     attributes: Mapping[str, str]
     shot: Mapping[str, float] = field(default_factory=dict)
+    subframes: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True)

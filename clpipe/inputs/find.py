@@ -36,6 +36,7 @@ class Job:
         place: the manifest and the row that it stands in; "" where it is in none.
         pictures: names of the renditions to make; None is all.
         written: the path as the user wrote it, where ``path`` has been made absolute.
+        subframes: further files of the same exposure.
     """
 
     path: Path
@@ -47,6 +48,12 @@ class Job:
     place: str = ""
     pictures: tuple[str, ...] | None = None
     written: str = ""
+    subframes: tuple[Path, ...] = ()
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """All files of its exposure, the first one first."""
+        return (self.path, *self.subframes)
 
     @property
     def input(self) -> str:

@@ -27,6 +27,7 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.kept import KeptLoader, kind_message
 from clpipe.inputs.manifest import check_rows
 from clpipe.inputs.raw import RawImage, RawLoader
+from clpipe.inputs.subframes import average, exposures, shutter_of
 from clpipe.stage import Kind
 
 
@@ -113,6 +114,14 @@ class ImageLoader:
             return loader.raw.first_chain(path)
         return loader.kept.first_chain(path) if loader.kept else loader.chain
 
+    def exposures(self, jobs: Sequence[Job]) -> list[Job]:
+        """The jobs, with files that are one exposure together made one.
+
+        Raises:
+            RequestError: they cannot be.
+        """
+        return list(jobs) if self.kept else exposures(jobs, self.settings)
+
     def check(self, jobs: Sequence[Job]) -> None:
         """See that the values of single images are allowed.
 
@@ -129,6 +138,9 @@ class ImageLoader:
         Raises:
             ImageError: it cannot be read, is of another kind, or is written to at the same time.
         """
+        shutter = shutter_of(self.settings) if job.subframes else None
+        if shutter:
+            return average(job, self._read, shutter)
         with unchanged(job.path):
             return self._read(job.path)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.about import __version__
-from clpipe.base.digests import digests, stamp_of
+from clpipe.base.digests import digests, joint_digest, stamp_of, stamp_of_all
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.inputs.find import Job
@@ -115,16 +115,22 @@ def is_current(
     """
     if values.get(OWN) != __version__ or not _same_request(values.get("request"), request):
         return False
-    size, modified = stamp_of(job.path)
+    size, modified = stamp_of_all(job.paths)
     if values.get("input_size") != size:
         return False
     is_touched = values.get("input_modified") != modified
-    if (is_touched or verify) and values.get("sha256") not in digests([str(job.path)]).values():
+    if (is_touched or verify) and values.get("sha256") != _digest_of(job):
         return False
     try:
         return all(_is_same(job, each, verify) for each in values.get("carried", ()))
     except (KeyError, TypeError):  # the sidecar is damaged
         return False
+
+
+def _digest_of(job: Job) -> str | None:
+    """The SHA-256 of a job's input; None where it cannot be read."""
+    found = digests(map(str, job.paths))
+    return joint_digest(list(found.values())) if len(found) == len(set(job.paths)) else None
 
 
 def _is_same(job: Job, carried: Mapping[str, Any], verify: bool) -> bool:

@@ -104,6 +104,11 @@ def json_text(record: Mapping[str, Any]) -> str:
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
+def subframe_records(source: SourceImage) -> list[dict[str, str]]:
+    """The files that an exposure is the mean of, relative to the folder of the first."""
+    return [{"file": name, "sha256": digest} for name, digest in source.subframes]
+
+
 def sidecar(
     job: Job,
     request: Mapping[str, Any],
@@ -143,6 +148,7 @@ def sidecar(
         "input_size": size,
         "input_modified": modified,
         "sha256": source.sha256,
+        **({"subframes": subframe_records(source)} if source.subframes else {}),
         "layer": source.layer,
         "name": job.stem,
         "picture": rendition.name,

@@ -28,6 +28,13 @@ class Rows(Method):
     tolerance: ClassVar = 1e-5
     example: ClassVar = {"flicker_depth": 0.4, "line_time": 1e-3, "exposure_time": 4e-3}
 
+    subframes: int = parameter(
+        1,
+        "How many files in a row are one exposure: their mean; rows take of each frame what "
+        "falls into their time.",
+        ge=1,
+        le=10_000,
+    )
     exposure_time: float = parameter(0.01, "How long each row is exposed.", "s", gt=0, le=3600)
     line_time: float = parameter(
         0.0,
@@ -49,6 +56,17 @@ class Rows(Method):
     def times(self, rows: int) -> Doubles:
         """When the exposure of each row starts, in s: (row,)."""
         return np.arange(rows, dtype=np.float64) * self.line_time
+
+    def weights(self, frames: int, rows: int) -> Doubles:
+        """The share of each row's exposure that falls to each of some frames: (frame, row).
+
+        The frames follow each other without a gap, from the start of the first row's exposure to
+        the end of the last row's.
+        """
+        starts = self.times(rows)
+        bounds = np.linspace(0, starts[-1] + self.exposure_time, frames + 1)[:, None]
+        seen = np.clip(bounds, starts, starts + self.exposure_time)
+        return np.asarray(np.diff(seen, axis=0) / self.exposure_time)
 
     @property
     def swing(self) -> np.float32:

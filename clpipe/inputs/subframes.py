@@ -1,0 +1,121 @@
+"""Exposures that a renderer gives as several frames: grouped, and averaged without loading all."""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+
+from clpipe.base.digests import joint_digest
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.reading import unchanged
+from clpipe.base.types import Doubles, Floats
+from clpipe.chain.chain import step_names
+from clpipe.chain.settings import Settings
+from clpipe.images.read import SourceImage
+from clpipe.inputs.find import Job
+from clpipe.stages.shutter import Rows
+
+SHUTTER = "shutter"
+
+
+def shutter_of(settings: Settings) -> Rows | None:
+    """The shutter that averages several frames; None where each file is an exposure of its own.
+
+    Raises:
+        RequestError: how many frames it averages is drawn.
+    """
+    if SHUTTER not in step_names(settings):
+        return None
+    if f"{SHUTTER}.subframes" in settings.draws:
+        raise RequestError(
+            "shutter.subframes: found a draw; it says how files are grouped, so it is one number"
+        )
+    shutter = settings.method(SHUTTER)
+    return shutter if isinstance(shutter, Rows) and shutter.subframes > 1 else None
+
+
+def exposures(jobs: Sequence[Job], settings: Settings) -> list[Job]:
+    """The jobs with so many in a row made one as a shutter averages; it is named by the first.
+
+    Files of one folder belong together, in their order; rows of a manifest likewise, which must
+    have the same values.
+
+    Raises:
+        RequestError: there are too few or too many files in a folder, or rows differ.
+    """
+    shutter = shutter_of(settings)
+    if shutter is None or any(job.subframes for job in jobs):
+        return list(jobs)
+    count = shutter.subframes
+    grouped = []
+    for folder, own in groupby(jobs, lambda job: job.path.parent):
+        files = list(own)
+        if len(files) % count:
+            raise RequestError(
+                f"{folder}: shutter.subframes is {count}, but there are {len(files)} images; "
+                f"give a multiple of {count}"
+            )
+        for start in range(0, len(files), count):
+            first, *others = files[start : start + count]
+            if different := next((job for job in others if job.values != first.values), None):
+                raise RequestError(
+                    f"{different.label}: its values differ from those of {first.label}, which is "
+                    "a part of the same exposure"
+                )
+            grouped.append(replace(first, subframes=tuple(job.path for job in others)))
+    return grouped
+
+
+def average(job: Job, read: Callable[[Path], SourceImage], shutter: Rows) -> SourceImage:
+    """The exposure of a job: the mean of its frames, for each row over the time that it is exposed.
+
+    One frame is held at a time, beside the sum in float32.
+
+    Args:
+        job: its files.
+        read: reads one.
+        shutter: which part of each row's exposure a frame stands for.
+
+    Raises:
+        ImageError: one cannot be read, is no picture in linear light, or is of another size.
+    """
+    found: list[SourceImage] = []
+    total: Floats = np.empty(0, np.float32)
+    weights: Doubles = np.empty(0)
+    for number, path in enumerate(job.paths):
+        with unchanged(path):
+            source = read(path)
+        pixels = source.pixels
+        if pixels.ndim != 3:
+            raise ImageError(f"{path}: a mosaic; shutter.subframes averages renders")
+        if not found:
+            weights = shutter.weights(len(job.paths), pixels.shape[0])
+            total = np.zeros(pixels.shape, np.float32)
+        elif pixels.shape != total.shape:
+            height, width = total.shape[:2]
+            raise ImageError(
+                f"{path}: it is {pixels.shape[1]}x{pixels.shape[0]}, and {job.path}, a part of the "
+                f"same exposure, {width}x{height}"
+            )
+        seen = np.flatnonzero(weights[number])
+        if seen.size:
+            rows = slice(int(seen[0]), int(seen[-1]) + 1)
+            total[rows] += weights[number, rows, None, None].astype(np.float32) * pixels[rows]
+        found.append(replace(source, pixels=pixels[:0]))
+    names = (os.path.relpath(path, job.path.parent) for path in job.paths)
+    digests = [source.sha256 for source in found]
+    return replace(
+        found[0],
+        pixels=total,
+        sha256=joint_digest(digests),
+        warnings=tuple(dict.fromkeys(_warnings(job, found))),
+        subframes=tuple(zip(names, digests, strict=True)),
+    )
+
+
+def _warnings(job: Job, sources: Sequence[SourceImage]) -> Iterator[str]:
+    for path, source in zip(job.paths, sources, strict=True):
+        yield from (f"{path.name}: {warning}" for warning in source.warnings)

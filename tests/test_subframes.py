@@ -1,0 +1,115 @@
+"""shutter.subframes: exposures that a renderer gives as several frames."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clpipe.dataset import Dataset
+from clpipe.stages.shutter import Rows
+from tests.conftest import written
+
+PLAIN = ("--skip", "optical_blur", "--device", "numpy", "--until", "exposure", "--format", "exr")
+EIGHT = {"subframes": 8, "exposure_time": 0.02, "line_time": 0.0}
+
+
+@pytest.fixture
+def frames(tmp_path, write_exr, monkeypatch):
+    """A bar that moves four columns a frame through eight frames of 24 rows, in a folder."""
+    monkeypatch.chdir(tmp_path)
+    Path("in").mkdir()
+    for number in range(8):
+        image = np.full((24, 40, 3), 0.1, np.float16)
+        image[:, 4 * number : 4 * number + 4] = 0.9
+        write_exr(f"in/f{number:02}.exr", image)
+    return tmp_path / "in"
+
+
+def exposed(clpipe, *options, out="o"):
+    """What falls on the sensor of a run over the frames, (24, 40), and the run's sidecar."""
+    from clpipe.images.read import read_image
+
+    clpipe("run", "in", "-o", out, *PLAIN, *options)
+    (path,) = Path(out).glob("*.exr")
+    record = json.loads(path.with_suffix(".json").read_text())
+    return 2 * read_image(path).pixels[..., 0].astype(np.float32), record  # less headroom
+
+
+def test_frames_of_an_exposure_are_averaged(frames, clpipe):
+    seen, record = exposed(clpipe, "--set", "shutter.subframes=8")
+    assert written(Path("o")) == ["f00.exr", "f00.json"]
+    assert seen[:, :32] == pytest.approx(np.full((24, 32), 0.1 * 7 / 8 + 0.9 / 8), abs=1e-3)
+    assert [each["file"] for each in record["subframes"]] == [f"f{k:02}.exr" for k in range(8)]
+    for some, names in ((4, ["f00.exr", "f04.exr"]), (2, None)):
+        clpipe("run", "in", "-o", f"o{some}", *PLAIN, "--set", f"shutter.subframes={some}")
+        made = [name for name in written(Path(f"o{some}")) if name.endswith("exr")]
+        assert len(made) == 8 / some and (names is None or made == names)
+
+
+def test_rows_of_a_rolling_shutter_see_later_frames(frames, clpipe):
+    # The first row is exposed during the first frame, the last during the last, and each as long.
+    rolling = {"subframes": 8, "exposure_time": 1.0, "line_time": 7 / 23}
+    sets = [x for k, v in rolling.items() for x in ("--set", f"shutter.{k}={v}")]
+    seen, _ = exposed(clpipe, *sets)
+    middles = (seen - 0.1) @ np.arange(40) / (seen - 0.1).sum(1)
+    assert middles == pytest.approx(1.5 + 4 * np.arange(24) * 7 / 23, abs=0.05)
+
+
+def test_shares_of_frames_are_whole_exposures():
+    for shutter in (Rows(**EIGHT), Rows(subframes=3, exposure_time=0.01, line_time=1e-3)):
+        weights = shutter.weights(shutter.subframes, 30)
+        assert weights.sum(0) == pytest.approx(1)
+        assert weights.min() >= 0
+    assert Rows(**EIGHT).weights(8, 5) == pytest.approx(np.full((8, 5), 1 / 8))
+
+
+def test_a_run_is_resumed_and_replayed_with_all_frames(frames, clpipe, write_exr):
+    options = ("--set", "shutter.subframes=8", "--device", "numpy")
+    clpipe("run", "in", "-o", "o", *options)
+    assert "there already" in clpipe("run", "in", "-o", "o", *options).stderr
+    clpipe("run", "--replay", "o/f00.json", "-o", "r", "--device", "numpy")
+    assert Path("r/f00.jpg").read_bytes() == Path("o/f00.jpg").read_bytes()
+    write_exr("in/f05.exr", np.full((24, 40, 3), 0.3, np.float16))
+    again = clpipe("run", "--replay", "o/f00.json", "-o", "r2", status=2)
+    assert "f05.exr" in again.stderr and "changed" in again.stderr
+    assert "there already" not in clpipe("run", "in", "-o", "o", *options).stderr
+
+
+def test_a_dataset_and_a_manifest_group_frames_too(frames, write_exr):
+    (sample,) = Dataset("in", shutter={"subframes": 8}, device="numpy")
+    assert sample["image"].shape == (24, 40, 3)
+    Path("list.csv").write_text(
+        "path,iso\n" + "".join(f"in/f{k:02}.exr,{100 * (1 + k // 4)}\n" for k in range(8))
+    )
+    assert len(Dataset("list.csv", shutter={"subframes": 4}, device="numpy")) == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("shutter.subframes=3",), "in: shutter.subframes is 3, but there are 8 images"),
+        (("shutter.subframes={choice=[2, 4]}",), "shutter.subframes: found a draw"),
+        (("shutter.subframes=0",), "shutter.subframes"),
+    ],
+)
+def test_what_cannot_be_grouped(frames, clpipe, options, message):
+    sets = [x for option in options for x in ("--set", option)]
+    assert message in clpipe("run", "in", "-o", "o", *sets, status=2).stderr
+    assert not Path("o").exists()
+
+
+def test_rows_that_differ_are_no_exposure(frames, clpipe):
+    Path("list.csv").write_text("path,iso\nin/f00.exr,100\nin/f01.exr,200\n")
+    again = clpipe("run", "list.csv", "-o", "o", "--set", "shutter.subframes=2", status=2)
+    assert "its values differ from those of in/f00.exr" in again.stderr
+
+
+def test_a_frame_of_another_size_fails_alone(frames, clpipe, write_exr):
+    write_exr("in/f03.exr", np.zeros((24, 39, 3), np.float16))
+    options = ("--set", "shutter.subframes=4", "--device", "numpy")
+    told = clpipe("run", "in", "-o", "o", *options, status=1).stderr
+    assert "f03.exr: it is 39x24, and in/f00.exr, a part of the same exposure, 40x24" in told
+    with Image.open("o/f04.jpg") as picture:
+        assert picture.size == (40, 24)
