@@ -12,7 +12,7 @@ from clpipe.chain.draws import Draw
 from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
-from clpipe.reference.resample import Resampling, sizes
+from clpipe.reference.resample import Resampler, sizes
 from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
 
 
@@ -72,7 +72,7 @@ class Chain:
         return sizes(self._resamplings, width, height)[-1]
 
     @cached_property
-    def _resamplings(self) -> tuple[Resampling, ...]:
+    def _resamplings(self) -> tuple[Resampler, ...]:
         passes = (p for step in self.steps for p in step.method.passes())
         return tuple(p.resampling for p in passes if p.resampling)
 

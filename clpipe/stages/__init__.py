@@ -14,6 +14,8 @@ from clpipe.stage import Stage
 
 DEFAULT_CHAIN = (
     "motion_blur",
+    "distortion",
+    "vignetting",
     "optical_blur",
     "exposure",
     "mosaic",
