@@ -23,7 +23,7 @@ from clpipe.engine.clipping import MUCH, clipped_share, clipping_text
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.passes import CHANNELS, vectors_of
-from clpipe.reference.warp import RESAMPLING, Layer, LayerKind, warp
+from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
 from clpipe.stage import Kind
 
 

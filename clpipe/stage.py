@@ -23,7 +23,7 @@ from clpipe.reference.cfa import PATTERNS, Pattern, red_site
 from clpipe.reference.curve import curve_index
 from clpipe.reference.geometry import Geometry
 from clpipe.reference.random import Stream, stream_of
-from clpipe.reference.resample import Resampling
+from clpipe.reference.resample import Resampler
 
 # What a stage file may import from here.
 __all__ = [
@@ -78,7 +78,7 @@ class Access(Enum):
     POINTWISE = "pointwise"  # a pixel from that pixel
     CURVE = "curve"  # pointwise, each channel through the table named "table"
     STENCIL = "stencil"  # a pixel from its neighbours
-    RESAMPLE = "resample"  # rows or columns of a smaller image from those of the image
+    RESAMPLE = "resample"  # a pixel of a smaller or bent image from pixels of the image
     LINES = "lines"  # a table with a value a row or column, from no image
     SUMS = "sums"  # sums over the whole image, then a few numbers estimated from them
     HISTOGRAM = "histogram"  # counts over the whole image, then a few numbers estimated from them
@@ -123,7 +123,7 @@ class Pass:
     finish_arguments: tuple[str, ...] = ()  # of that function
     estimates: tuple[str, ...] = ()  # SUMS, HISTOGRAM: names of the numbers, at most four
     bins: int = 0  # HISTOGRAM: how many
-    resampling: Resampling | None = None  # RESAMPLE: how many rows or columns are left, and how
+    resampling: Resampler | None = None  # RESAMPLE: how it is made
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.carry import parse_carry
 from clpipe.images.tags import upright
 from clpipe.inputs.carry import owner_of
+from clpipe.reference.carried import Layer, nearest, warp
 from clpipe.reference.geometry import Composition, Orientation, destinations
-from clpipe.reference.warp import Layer, nearest, warp
 from tests.conftest import written
 
 HALF = ("--stages", "exposure,resize,gamma", "--set", "resize.scale=0.5")

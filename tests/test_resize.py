@@ -47,7 +47,7 @@ def test_every_tap_lies_in_the_image_and_weights_sum_to_one(name, scale):
         taps = resampling.taps(size)
         assert taps.first.min() >= 0 and taps.first.max() + taps.count <= size
         assert np.abs(taps.weights.sum(1, dtype=np.float64) - 1).max() < 1e-6
-        lowest, beyond = resampling.needed(size, 0, resampling.size(size))
+        lowest, beyond = resampling.needed("columns", (size, 1), 0, resampling.size(size))
         assert 0 <= lowest <= beyond <= size
 
 

@@ -13,7 +13,7 @@ from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
 from clpipe.reference.geometry import Composition
-from clpipe.reference.resample import Resampling, sizes
+from clpipe.reference.resample import Resampler, sizes
 from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
 
 
@@ -79,7 +79,7 @@ class Chain:
         return Composition(moves) if moves else None
 
     @cached_property
-    def _resamplings(self) -> tuple[Resampling, ...]:
+    def _resamplings(self) -> tuple[Resampler, ...]:
         passes = (p for step in self.steps for p in step.method.passes())
         return tuple(p.resampling for p in passes if p.resampling)
 

@@ -17,7 +17,7 @@ from clpipe.commands.completion import (
     steps_or_all,
 )
 from clpipe.commands.options import stage_file_option
-from clpipe.reference.warp import RESAMPLING
+from clpipe.reference.carried import RESAMPLING
 
 camera_option = click.option(
     "--camera",

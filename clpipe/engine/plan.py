@@ -14,7 +14,7 @@ from functools import cached_property
 
 from clpipe.chain.chain import Chain
 from clpipe.engine.ops import Op, chain_ops
-from clpipe.reference.resample import Resampling, sizes
+from clpipe.reference.resample import Resampler, sizes
 from clpipe.stage import Access, Kind
 
 
@@ -135,7 +135,7 @@ class Plan:
     final: Image | None = None  # the last image as float planes
     encoded: Kind | None = None  # the kind that is encoded to eight bits
     border: int = 0
-    resamplings: tuple[Resampling, ...] = ()  # from each level to the next
+    resamplings: tuple[Resampler, ...] = ()  # from each level to the next
 
     def __hash__(self) -> int:
         return self._hash
@@ -188,7 +188,7 @@ class _Planner:
         self.fold = fold
         self.launches: list[AnyLaunch] = []
         self.lines: dict[int, list[Op]] = {}  # by level
-        self.resamplings: list[Resampling] = []
+        self.resamplings: list[Resampler] = []
         self.images: list[Image] = []
         self.group: Launch | None = Launch("load", ())  # open, still to be stored
         self.stored: Image | None = None  # the current image, when no group is open
@@ -367,7 +367,7 @@ def make_plan(
     if final_image:
         pinned.add(final_image.number)
     slots, count = assign_slots(launches, planner.images, pinned)
-    radii = [x.stencil.pass_.radius for x in launches if isinstance(x, Launch) and x.stencil]
+    radii = [x.opener.pass_.radius for x in launches if isinstance(x, Launch) and x.opener]
     return Plan(
         source=chain.source,
         half=half,

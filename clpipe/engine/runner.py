@@ -229,9 +229,8 @@ class Runner:
 
         def bind(parameter: Parameter) -> Any:
             if parameter.role == "taps":
-                resampling, size = plan.resamplings[parameter.number], sizes[parameter.number]
-                value = getattr(resampling.taps(resampling.along(*size)), parameter.item)
-                return np.uint32(value) if isinstance(value, int) else value
+                level = parameter.number
+                return plan.resamplings[level].values(*sizes[level])[parameter.item]
             if parameter.role == "table8":
                 return self._composed(parameter.item)
             if parameter.role == "value":
@@ -245,6 +244,8 @@ class Runner:
             stream = of[NoiseScope(parameter.item[:-1])]
             return np.uint32(stream.key1 if parameter.item.endswith("1") else stream.key0)
 
+        for resampling, size in zip(plan.resamplings, sizes, strict=False):
+            resampling.values(*size)  # refuses what an image of that size cannot be made with
         results = self.device.submit(plan, image, bind, *options)
         return lambda: self._result(plan, results())
 

@@ -30,6 +30,7 @@ from clpipe.engine.plan import (
     Reduce,
     reads_of,
 )
+from clpipe.reference.resample import Axis
 
 # Larger ones are no faster, and memory that is new to a process costs time: 600 megapixels took
 # 28 s in tiles of 1 GiB and 39 s in tiles of 4 GiB (PoCL, two busy cores).
@@ -277,8 +278,9 @@ class _Cutter:
         self.across = lanes * math.lcm(2, *columns)
         self._halos = halos_of(plan)
         self._resamplings = plan.resamplings
+        self._sizes = plan.sizes(width, height)
 
-    def spans(self, axis: str, begin: int, end: int) -> list[tuple[int, ...]]:
+    def spans(self, axis: Axis, begin: int, end: int) -> list[tuple[int, ...]]:
         """The rows or columns of a tile on each level: of its core, and of what is stored.
 
         Args:
@@ -301,8 +303,9 @@ class _Cutter:
             if low < high:
                 low, high = max(low - halo, 0), min(high + halo, size)
             spans.append((*core, low // step * step, high))
-            if level and low < high and self._resamplings[level - 1].axis == axis:
-                low, high = self._resamplings[level - 1].needed(sizes[level - 1], low, high)
+            if level and low < high:
+                larger = self._sizes[level - 1]
+                low, high = self._resamplings[level - 1].needed(axis, larger, low, high)
         return spans[::-1]
 
     def tile(self, left: int, top: int, columns: int, rows: int) -> Extents:
@@ -326,7 +329,7 @@ class _Cutter:
         pairs = zip(self.whole, boxes, strict=True)
         return tuple(replace(extent, core=box, stored=box) for extent, box in pairs)
 
-    def _longest(self, axis: str, core: int) -> list[int]:
+    def _longest(self, axis: Axis, core: int) -> list[int]:
         """The most that a tile can store on each level, of rows or columns."""
         step = self.across if axis == "columns" else 4
         sizes = [e.width if axis == "columns" else e.height for e in self.whole]
@@ -338,10 +341,9 @@ class _Cutter:
             low, high = low + halo, max(high, rounding) + halo
             length = -(-core * size // sizes[0]) + round_up(low, step) + rounding + high
             found.append(min(length, round_up(size, step)))
-            if level and self._resamplings[level - 1].axis == axis:
-                before = sizes[level - 1]
-                taps = self._resamplings[level - 1].taps(before).count + 1
-                low, high = (-(-each * before // size) + taps for each in (low, high))
+            if level:
+                larger = self._sizes[level - 1]
+                low, high = self._resamplings[level - 1].reach(axis, larger, low, high)
         return found[::-1]
 
 

@@ -71,16 +71,10 @@ class Writer:
         return "from"
 
     def taps(self, level: int) -> list[str]:
-        """The parameters of the taps of the resampling that leads on from a level."""
-        types = {
-            "first": "__global const int *restrict",
-            "table": "__global const float *restrict",
-            "count": "uint",
-            "stride": "uint",
-        }
+        """The parameters of the resampling that leads on from a level."""
         return [
             self.parameter(f"tap_{item}", type_, "taps", item=item, number=level)
-            for item, type_ in types.items()
+            for item, type_ in self.plan.resamplings[level].parameters
         ]
 
     def slot(self, number: int, written: bool) -> str:

@@ -15,7 +15,7 @@ from clpipe.images.layers import MOST_PARTS, full_name
 from clpipe.images.openimageio import open_image
 from clpipe.images.pixels import check_size
 from clpipe.images.read import read_samples
-from clpipe.reference.warp import LayerKind, Vector
+from clpipe.reference.carried import LayerKind, Vector
 
 # What layers hold, by their names in Blender, Mitsuba and elsewhere: lower case, letters alone.
 NAMES: dict[LayerKind, tuple[str, ...]] = {

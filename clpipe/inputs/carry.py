@@ -29,8 +29,8 @@ from clpipe.images.passes import (
 )
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import FLIPS
+from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
 from clpipe.reference.geometry import Composition, Geometry, Orientation
-from clpipe.reference.warp import RESAMPLING, Layer, LayerKind, warp
 
 CARRIED = "carried"  # what stands behind an image's name in that of its carried layers
 

@@ -5,10 +5,10 @@ they are, so the field of view does too: place x of ``size`` becomes x * smaller
 pixels from the edge, in depth maps and other companions as well.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 
@@ -21,6 +21,47 @@ PADDING = 16
 # The weight of samples by their distance from the centre of the new pixel, in pixels of the larger
 # image, of which the new pixel is ``ratio`` wide.
 Weight = Callable[[Array, float], Array]
+
+
+Axis = Literal["rows", "columns"]
+
+
+Parameters = tuple[tuple[str, str], ...]
+
+
+class Resampler(Protocol):
+    """How an image is made of another, from which its pixels are gathered.
+
+    What a kernel gets for it has the names and OpenCL types of ``parameters``, in that order.
+    """
+
+    parameters: ClassVar[Parameters]
+
+    @property
+    def scale(self) -> float:
+        """About how many pixels the new image has for each of the old one."""
+        ...
+
+    def resized(self, width: int, height: int) -> tuple[int, int]:
+        """The width and height of the new image, from those of the old one."""
+        ...
+
+    def values(self, width: int, height: int) -> Mapping[str, Any]:
+        """The kernel's values by name, for an old image of that size; arrays are kept objects."""
+        ...
+
+    def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
+        """The old rows or columns, first and behind the last, of which some new ones are made.
+
+        ``size`` is the width and height of the old image.
+        """
+        ...
+
+    def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
+        """The most old rows or columns before and behind a place that new ones are made of, which
+        begin and end at most ``low`` before and ``high`` behind the same place.
+        """
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +99,14 @@ class Resampling:
         support: the largest distance at which ``weight`` is not 0, over the ratio, less 1/2 px.
     """
 
-    axis: Literal["rows", "columns"]
+    parameters: ClassVar[Parameters] = (
+        ("first", "__global const int *restrict"),
+        ("table", "__global const float *restrict"),
+        ("count", "uint"),
+        ("stride", "uint"),
+    )
+
+    axis: Axis
     scale: float
     weight: Weight
     support: float
@@ -80,15 +128,34 @@ class Resampling:
         """What the new rows or columns of an image of ``size`` are made of."""
         return _taps(self, size)
 
-    def needed(self, size: int, start: int, stop: int) -> tuple[int, int]:
-        """The old rows or columns, first and behind the last, of which some new ones are made."""
-        taps = self.taps(size)
+    def resized(self, width: int, height: int) -> tuple[int, int]:
+        """See :meth:`Resampler.resized`."""
+        by_rows = self.axis == "rows"
+        return (width, self.size(height)) if by_rows else (self.size(width), height)
+
+    def values(self, width: int, height: int) -> Mapping[str, Any]:
+        """See :meth:`Resampler.values`."""
+        taps = self.taps(self.along(width, height))
+        counts = {"count": np.uint32(taps.count), "stride": np.uint32(taps.stride)}
+        return {"first": taps.first, "table": taps.table, **counts}
+
+    def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
+        """See :meth:`Resampler.needed`."""
+        if axis != self.axis:
+            return start, stop
+        taps = self.taps(self.along(*size))
         return int(taps.first[start]), int(taps.first[stop - 1]) + taps.count
 
+    def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
+        """See :meth:`Resampler.reach`."""
+        if axis != self.axis:
+            return low, high
+        before = self.along(*size)
+        taps, after = self.taps(before).count + 1, self.size(before)
+        return -(-low * before // after) + taps, -(-high * before // after) + taps
 
-def sizes(
-    resamplings: Iterable[Resampling], width: int, height: int
-) -> tuple[tuple[int, int], ...]:
+
+def sizes(resamplings: Iterable[Resampler], width: int, height: int) -> tuple[tuple[int, int], ...]:
     """The width and height of an image, and after each of these resamplings, one after the other.
 
     >>> halves = [Resampling(axis, 0.5, overlap, 0.5) for axis in ("rows", "columns")]
@@ -97,9 +164,7 @@ def sizes(
     """
     found = [(width, height)]
     for each in resamplings:
-        width, height = found[-1]
-        by_rows = each.axis == "rows"
-        found.append((width, each.size(height)) if by_rows else (each.size(width), height))
+        found.append(each.resized(*found[-1]))
     return tuple(found)
 
 

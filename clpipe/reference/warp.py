@@ -1,184 +1,292 @@
-"""Layers beside a picture, moved as its pixels are: depth, labels, normals, optical flow, colours.
+"""Bent images: each pixel gathered where a lens sees it, with a filter, as the kernel does it.
 
-Places are counted as :mod:`clpipe.reference.geometry` counts them, and exact to float64.
+The map is worked out exactly at the nodes of a grid, and interpolated between them with cubic
+polynomials (Lagrange's, through four nodes), in float32 and in the kernel's order. The grid is as
+coarse as keeps that within :data:`WITHIN` of the map at the middle of its cells.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from functools import cached_property, lru_cache
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from clpipe.base.types import Array
-from clpipe.reference.geometry import Geometry, destinations
+from clpipe.base.errors import ImageError
+from clpipe.base.types import Array, Floats
+from clpipe.reference.image import mirrored
+from clpipe.reference.lens import Lens, Radial
+from clpipe.reference.resample import Axis, Parameters, lanczos3
 
-LayerKind = Literal["depth", "label", "normal", "flow", "colour"]
-
-# How each kind is resampled. Between two surfaces there is neither a depth nor a label, so these
-# are those of one pixel.
-RESAMPLING: dict[LayerKind, str] = {
-    "depth": "nearest",
-    "label": "nearest",
-    "normal": "bilinear, then made as long as 1",
-    "flow": "bilinear, the vectors' ends mapped",
-    "colour": "bilinear",
-}
-
-BLOCK = 1 << 20  # pixels that are moved at a time
-
-# The channels of a vector to the right and down, and the signs of those in the file.
-Vector = tuple[tuple[int, int], tuple[int, int]]
+WITHIN = 0.003  # px, of the map at the middle of a cell
+STEPS = (64, 32, 16, 8, 4, 2, 1)  # px from node to node
+MOST_NODES = 2**22
+FIELDS = 8  # of a node: x and y of red, green and blue, and two that fill it up
 
 
-@dataclass(frozen=True)
-class Layer:
-    """The samples of a layer, and what they are.
+def _catmull_rom() -> Floats:
+    """The four weights as polynomials of the fraction (Catmull and Rom 1974; Keys 1981, a=-1/2)."""
+    halves = [[0, -1, 2, -1], [2, 0, -5, 3], [0, 1, 4, -3], [0, 0, -1, 1]]
+    return np.array(halves, np.float32) / np.float32(2)
 
-    Args:
-        kind: what they are.
-        pixels: the data window, (rows, columns, channel) of any type.
-        x, y: column and row of its first pixel in the image.
-        vectors: of a flow, in px from where a surface is seen to where it is seen in another frame.
+
+def _lanczos3() -> Floats:
+    """The six weights, scaled to the sum 1, as least-squares polynomials of the fraction."""
+    fraction = (1 - np.cos(np.pi * (np.arange(256) + 0.5) / 256)) / 2
+    taps = np.arange(-2, 4)[:, None]
+    weights = lanczos3(fraction - taps, 1.0)
+    weights = weights / weights.sum(0)
+    powers = np.vander(fraction, 8, increasing=True)
+    return np.ascontiguousarray(np.linalg.lstsq(powers, weights.T)[0].T, np.float32)
+
+
+# By name: the polynomials of the weights, (tap, power), of the taps from 1 - count / 2 on.
+FILTERS: dict[str, Floats] = {"bicubic": _catmull_rom(), "lanczos3": _lanczos3()}
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """The map of an image on nodes ``step`` px apart, the first at its first pixel's centre.
+
+    ``nodes`` are (row, column, field) float32: how far, in px, from a pixel to the place that it
+    shows, across and down, of red, green and blue.
     """
 
-    kind: LayerKind
-    pixels: Array
-    x: int = 0
-    y: int = 0
-    vectors: tuple[Vector, ...] = ()
+    step: int
+    nodes: Floats
+
+    @cached_property
+    def flat(self) -> Floats:
+        """The nodes as the kernel reads them."""
+        return np.ascontiguousarray(self.nodes).reshape(-1)
+
+    def at(self, place: Array, axis: int) -> tuple[Array, list[Floats]]:
+        """For rows (axis 0) or columns, the first of the four nodes around, and their weights."""
+        first = np.clip(place // self.step - 1, 0, self.nodes.shape[axis] - 4)
+        t = (place - first * self.step).astype(np.float32) * np.float32(1 / self.step)
+        return first, lagrange(t)
+
+    def fields(self, rows: Array, columns: Array) -> Iterator[Floats]:
+        """Each field at these rows and columns, (row, column) float32, as the kernel has it."""
+        first, weights = self.at(rows, 0)
+        lines = sum_of(w[:, None, None] * self.nodes[first + k] for k, w in enumerate(weights))
+        first, weights = self.at(columns, 1)
+        for field in range(6):
+            own = lines[:, :, field]
+            yield sum_of(w * own[:, first + k] for k, w in enumerate(weights))
 
 
-@dataclass(frozen=True)
-class Move:
-    """Where some pixels of a result come from.
-
-    Args:
-        geometry: how pixels move.
-        width, height: of the image.
-        to: x and y of the pixels.
-        origins: x and y of where they come from in the image.
-    """
-
-    geometry: Geometry
-    width: int
-    height: int
-    to: tuple[Array, Array]
-    origins: tuple[Array, Array]
-
-
-def warp(
-    layers: Sequence[Layer], geometry: Geometry | None, width: int, height: int
-) -> tuple[list[Array], Array]:
-    """Layers as a geometry moves them, and which of their pixels are known.
-
-    Args:
-        layers: of one image.
-        geometry: how its pixels move; None leaves each where it is.
-        width, height: of the image.
-
-    Returns:
-        Each layer, (rows, columns, channel) of its own type, but flow and what is blended of whole
-        numbers as float32. It is 0 outside the image and outside the layer's data window, and a
-        vector of flow is NaN that ends where the result has no place. Beside them a (rows, columns)
-        mask, float16: 1 where all layers are known, else 0.
-    """
-    columns, rows = geometry.size(width, height) if geometry else (width, height)
-    results = [
-        np.empty((rows, columns, layer.pixels.shape[2]), _type_of(layer)) for layer in layers
-    ]
-    valid = np.ones((rows, columns), np.float16)
-    step = max(BLOCK // columns, 1)
-    for top in range(0, rows, step):
-        part = slice(top, min(top + step, rows))
-        y, x = np.mgrid[part, 0:columns] + 0.5
-        at = geometry.origins(x, y, width, height) if geometry else (x, y)
-        inside = _within(at[0], at[1], width, height)
-        at = np.where(inside, at[0], 0), np.where(inside, at[1], 0)
-        for layer, result in zip(layers, results, strict=True):
-            of_layer = at[0] - layer.x, at[1] - layer.y
-            known = inside & _within(
-                of_layer[0], of_layer[1], layer.pixels.shape[1], layer.pixels.shape[0]
-            )
-            if geometry is None or layer.kind in ("depth", "label"):
-                samples = nearest(layer.pixels, *of_layer)
-            else:
-                samples = bilinear(layer.pixels, *of_layer)
-                if layer.kind == "normal":
-                    samples = _as_long_as_1(samples)
-                elif layer.kind == "flow":
-                    move = Move(geometry, width, height, (x, y), at)
-                    samples = mapped(samples, layer.vectors, move)
-            result[part] = np.where(known[..., np.newaxis], samples, 0)
-            valid[part] *= known
-    return results, valid
-
-
-def nearest(pixels: Array, x: Array, y: Array) -> Array:
-    """The pixels, (rows, columns, channel), in which places lie; beyond the edges those at them.
-
-    >>> nearest(np.array([[[1], [2]]]), np.array([0.9, 1.0]), np.array([0.5, 0.5]))[:, 0].tolist()
-    [1, 2]
-    """
-    rows, columns = pixels.shape[:2]
-    right = np.clip(np.floor(x), 0, columns - 1).astype(np.intp)
-    down = np.clip(np.floor(y), 0, rows - 1).astype(np.intp)
-    return np.asarray(pixels[down, right])
-
-
-def bilinear(pixels: Array, x: Array, y: Array) -> Array:
-    """Pixels, (rows, columns, channel), blended between their centres, as float64.
-
-    A pixel without weight does not count, whatever it holds.
-
-    >>> bilinear(np.array([[[1], [2]]]), np.array([0.5, 1.25]), np.array([0.5, 0.5]))[:, 0].tolist()
-    [1.0, 1.75]
-    """
-    left, top = np.floor(x - 0.5), np.floor(y - 0.5)
-    right, down = x - 0.5 - left, y - 0.5 - top
-    total: Array = np.zeros((), np.float64)
-    for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        weight = ((right if dx else 1 - right) * (down if dy else 1 - down))[..., np.newaxis]
-        samples = nearest(pixels, left + dx, top + dy)
-        total = total + np.where(weight > 0, weight * np.where(weight > 0, samples, 0), 0)
+def sum_of(terms: Iterator[Floats]) -> Floats:
+    """Their sum, in order."""
+    total = next(terms)
+    for term in terms:
+        total = total + term
     return total
 
 
-def mapped(samples: Array, vectors: Sequence[Vector], move: Move) -> Array:
-    """Flow between places of an image as flow between the places of its result.
+def lagrange(t: Floats) -> list[Floats]:
+    """The weights of four nodes at 0, 1, 2 and 3 for a place t among them; float32.
 
-    A vector from p to p + v becomes one from where p is seen to where p + v is seen. So the other
-    frame is taken to go through the same geometry.
+    >>> [float(w) for w in lagrange(np.float32(1.5))]
+    [-0.0625, 0.5625, 0.5625, -0.0625]
+    """
+    one, two, three = t - np.float32(1), t - np.float32(2), t - np.float32(3)
+    sixth, half = np.float32(1 / 6), np.float32(0.5)
+    return [
+        one * two * three * -sixth,
+        t * two * three * half,
+        t * one * three * -half,
+        t * one * two * sixth,
+    ]
+
+
+@dataclass(frozen=True)
+class Warp:
+    """A lens as a resampling of the image, see :class:`clpipe.reference.resample.Resampler`.
 
     Args:
-        samples: (..., channel), float64, that of each pixel's origin.
-        vectors: see :class:`Layer`.
-        move: the pixels.
+        lens: the lens.
+        filter: of :data:`FILTERS`.
     """
-    result = samples.copy()
-    for channels in vectors:
-        ends = [
-            at + sign * samples[..., channel]
-            for at, (channel, sign) in zip(move.origins, channels, strict=True)
-        ]
-        there = destinations(move.geometry, (ends[0], ends[1]), move.to, move.width, move.height)
-        for to, end, (channel, sign) in zip(move.to, there, channels, strict=True):
-            result[..., channel] = sign * (end - to)
-    return result
+
+    parameters: ClassVar[Parameters] = (
+        ("nodes", "__global const float *restrict"),
+        ("step", "uint"),
+        ("share", "float"),
+        ("across", "uint"),
+        ("down", "uint"),
+    )
+
+    lens: Lens
+    filter: str
+
+    @property
+    def scale(self) -> float:
+        """See :attr:`Resampler.scale`."""
+        return 1.0
+
+    @property
+    def support(self) -> int:
+        """How many pixels on either side of a place have a weight."""
+        return len(FILTERS[self.filter]) // 2
+
+    def resized(self, width: int, height: int) -> tuple[int, int]:
+        """See :meth:`Resampler.resized`."""
+        return width, height
+
+    def grid(self, width: int, height: int) -> Grid:
+        """The map of an image of that size.
+
+        Raises:
+            ImageError: the lens folds the image over, or nearly.
+        """
+        return _grid(self.lens, width, height)
+
+    def values(self, width: int, height: int) -> Mapping[str, Any]:
+        """See :meth:`Resampler.values`."""
+        grid = self.grid(width, height)
+        down, across = grid.nodes.shape[:2]
+        counts = {"step": grid.step, "across": across, "down": down}
+        numbers = {name: np.uint32(n) for name, n in counts.items()}
+        return {"nodes": grid.flat, "share": np.float32(1 / grid.step), **numbers}
+
+    def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
+        """See :meth:`Resampler.needed`."""
+        first, last = _lines(self, axis, *size)
+        return int(first[start:stop].min()), int(last[start:stop].max()) + 1
+
+    def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
+        """See :meth:`Resampler.reach`."""
+        first, last = _lines(self, axis, *size)
+        line = np.arange(len(first))
+        before, behind = int((line - first).max()), int((last - line).max())
+        return max(low + before, 0), max(high + behind + 1, 0)
+
+    def reference(self, image: Floats) -> Floats:
+        """The bent image, (height, width, 3) float32 in and out; black where the lens sees none."""
+        height, width = image.shape[:2]
+        polynomials, reach = FILTERS[self.filter], self.support
+        around = mirrored(image, reach)
+        fields = self.grid(width, height).fields(np.arange(height), np.arange(width))
+        result = np.empty_like(image)
+        for channel, (dx, dy) in enumerate(zip(fields, fields, strict=True)):
+            column, across = _split(dx, np.arange(width))
+            row, down = _split(dy, np.arange(height)[:, None])
+            inside = _is_inside(column, across, width) & _is_inside(row, down, height)
+            column, row = np.clip(column, -1, width - 1), np.clip(row, -1, height - 1)
+            total = np.zeros((height, width), np.float32)
+            for j, of_row in enumerate(polynomials):
+                line = np.zeros((height, width), np.float32)
+                for k, of_column in enumerate(polynomials):
+                    value = around[row + (j + 1), column + (k + 1), channel]
+                    line = line + _horner(of_column, across) * value
+                total = total + _horner(of_row, down) * line
+            result[..., channel] = np.where(inside, total, np.float32(0))
+        return result
 
 
-def _as_long_as_1(normals: Array) -> Array:
-    """Normals with their first three channels made as long as 1; those of no length stay 0."""
-    length = np.linalg.norm(normals[..., :3], axis=-1, keepdims=True)
-    scaled = normals[..., :3] / np.where(length > 0, length, 1)
-    return np.concatenate([scaled, normals[..., 3:]], axis=-1)
+def _split(distance: Floats, line: Array) -> tuple[Array, Floats]:
+    """The pixel before the place that a distance leads to, and the fraction beyond it."""
+    whole = np.floor(distance)
+    return line + whole.astype(np.int32), distance - whole
 
 
-def _type_of(layer: Layer) -> np.dtype:
-    """The type of a layer's samples when they have been moved."""
-    blended = layer.kind not in ("depth", "label") and layer.pixels.dtype.kind != "f"
-    return np.dtype(np.float32) if blended or layer.kind == "flow" else layer.pixels.dtype
+def _is_inside(pixel: Array, fraction: Floats, size: int) -> Array:
+    """Whether a place lies within the image, up to the edges of its pixels."""
+    low = (pixel >= 0) | ((pixel == -1) & (fraction >= np.float32(0.5)))
+    return low & ((pixel < size - 1) | ((pixel == size - 1) & (fraction <= np.float32(0.5))))
 
 
-def _within(x: Array, y: Array, width: int, height: int) -> Array:
-    """Whether places are in an image; what is not a number is not."""
-    return (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
+def _horner(polynomial: Floats, x: Floats) -> Floats:
+    total = np.full_like(x, polynomial[-1])
+    for coefficient in polynomial[-2::-1]:
+        total = total * x + coefficient
+    return total
+
+
+@lru_cache(maxsize=16)
+def _grid(lens: Lens, width: int, height: int) -> Grid:
+    for step in STEPS:
+        down, across = (max(-(-size // step) + 1, 4) for size in (height, width))
+        if down * across > MOST_NODES:
+            break
+        nodes = np.zeros((down, across, FIELDS), np.float32)
+        rows, columns = np.arange(down) * step, np.arange(across) * step
+        for field, distances in enumerate(_distances(lens, width, height, rows, columns)):
+            nodes[..., field] = distances
+        grid = Grid(step, nodes)
+        if step == 1 or _error(lens, width, height, grid) <= WITHIN:
+            return grid
+    raise ImageError(
+        f"distortion: the map of {width}x{height} pixels bends too sharply to be followed; "
+        "these coefficients nearly fold the image over"
+    )
+
+
+def _distances(lens: Lens, width: int, height: int, rows: Array, columns: Array) -> Iterator[Array]:
+    """The fields of a grid at these rows and columns, exactly: (row, column) float64."""
+    x, y = columns + 0.5, rows[:, None] + 0.5
+    x, y = np.broadcast_arrays(x, y)
+    green: tuple[Array, Array] | None = None
+    for lateral in (lens.red, Radial(), lens.blue):
+        if lateral.is_identity:
+            green = green or lens.seen(x, y, width, height)
+        place = green if lateral.is_identity and green else lens.seen(x, y, width, height, lateral)
+        yield place[0] - x
+        yield place[1] - y
+
+
+def _error(lens: Lens, width: int, height: int, grid: Grid) -> float:
+    """How far, in px, a grid is off in the middle of its cells, where the lens sees the image."""
+    rows, columns = (
+        np.minimum(np.arange(0, size, grid.step) + grid.step // 2, size - 1)
+        for size in (height, width)
+    )
+    exact = _distances(lens, width, height, rows, columns)
+    near = grid.fields(rows, columns)
+    largest = 0.0
+    pairs = zip(exact, near, strict=True)
+    for (dx, near_dx), (dy, near_dy) in zip(pairs, pairs, strict=True):
+        x, y = dx + columns, dy + rows[:, None]
+        seen = (x > -2) & (x < width + 1) & (y > -2) & (y < height + 1)
+        error = np.hypot(near_dx - dx, near_dy - dy)
+        largest = max(largest, float(error[seen].max(initial=0)))
+    return largest
+
+
+# Of cubic interpolation in two dimensions between any four nodes in a row: the sum of the weights'
+# magnitudes is at most 1.632 in each, so a value is at most this far beyond the nodes', over their
+# range.
+OVERSHOOT = (1.632**2 - 1) / 2
+
+
+@lru_cache(maxsize=32)
+def _lines(warp: Warp, axis: Axis, width: int, height: int) -> tuple[Array, Array]:
+    """The first and the last old row, or column, of which each new one is made at most."""
+    grid, support = warp.grid(width, height), warp.support
+    # How far the pixels among each four by four nodes look to either side, of all channels.
+    around = sliding_window_view(grid.nodes[..., :6], (4, 4), (0, 1))
+    low, high = around.min((-2, -1)), around.max((-2, -1))
+    beyond = OVERSHOOT * (high - low) + 0.01
+    low, high = (np.floor(each) for each in (low - beyond, high + beyond))
+    ends = []
+    for number, size in enumerate((width, height)):
+        begin = np.arange(low.shape[1 - number]) * grid.step
+        end = np.minimum(begin + 3 * grid.step, size - 1)
+        shape = (1, -1) if number == 0 else (-1, 1)
+        first = begin.reshape(shape) + low[..., number::2].min(-1)
+        last = end.reshape(shape) + high[..., number::2].max(-1)
+        ends.append((last >= -1) & (first <= size))
+    seen = ends[0] & ends[1]  # the others see nothing of the image
+    number, size = (1, height) if axis == "rows" else (0, width)
+    least = np.where(seen, low[..., number::2].min(-1), np.inf).min(number)
+    most = np.where(seen, high[..., number::2].max(-1), -np.inf).max(number)
+    line = np.arange(size)
+    window = np.clip(line // grid.step - 1, 0, len(least) - 1)
+    first = np.where(np.isinf(least[window]), line, line + least[window] - (support - 1))
+    last = np.where(np.isinf(most[window]), line, line + most[window] + support)
+    # The border mirrors as many lines as the filter has beyond the edge.
+    first = np.clip(np.minimum(first, size - 1 - support), 0, size - 1)
+    last = np.clip(np.maximum(last, support), 0, size - 1)
+    return first.astype(np.int64), last.astype(np.int64)

@@ -15,6 +15,8 @@ from clpipe.stage import Stage
 DEFAULT_CHAIN = (
     "shutter",
     "motion_blur",
+    "distortion",
+    "vignetting",
     "optical_blur",
     "exposure",
     "mosaic",

@@ -1,0 +1,328 @@
+"""How a lens bends a picture: radial models, their inverses, and the place that each pixel shows.
+
+Places are counted as in :mod:`clpipe.reference.geometry`. What a model calls r is the distance from
+the principal point in units of its own: of the focal length, or of half the short side.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Self
+
+import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval
+
+from clpipe.base.errors import ImageError
+from clpipe.base.types import Array
+
+# Newton's method ends where the place that it finds is bent to within this of the place asked for,
+# in the unit of r: 4e-9 px for a focal length of 4000 px.
+RESIDUAL = 1e-12
+SAMPLES = 2049  # of a radial model, between which its inverse is begun
+# Beyond the corner the model still holds for this share of its radius, for what is interpolated
+# there; then it goes on straight.
+BEYOND = 1.25
+
+
+@dataclass(frozen=True)
+class Radial:
+    """r_d = N(r) / M(r), polynomials with their coefficients from the lowest power up.
+
+    With ``of_angle`` they are polynomials of atan(r), the angle to the axis.
+
+    >>> cubic = Radial((0.0, 1.0, 0.0, -0.1))
+    >>> float(cubic.bent(np.array(0.5))), float(cubic.slope(np.array(0.5)))
+    (0.4875, 0.925)
+    """
+
+    numerator: tuple[float, ...] = (0.0, 1.0)
+    denominator: tuple[float, ...] = (1.0,)
+    of_angle: bool = False
+
+    @classmethod
+    def of(cls, *numerator: float, below: tuple[float, ...] = (), of_angle: bool = False) -> Self:
+        """The model N(r) / (1 + M(r)), each polynomial from r^1 up, without zeros at its end.
+
+        >>> Radial.of(1.0, 0.0, 0.0).is_identity
+        True
+        """
+        above, under = (
+            tuple(map(float, np.trim_zeros(c, "b"))) for c in ((0.0, *numerator), (1.0, *below))
+        )
+        return cls(above, under, of_angle)
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether every r_d is r."""
+        return self == Radial()
+
+    def bent(self, r: Array) -> Array:
+        """r_d, the radius in the picture, of r, the radius without the lens; float64."""
+        x = np.arctan(r) if self.of_angle else r
+        return polyval(x, self.numerator) / polyval(x, self.denominator)
+
+    def slope(self, r: Array) -> Array:
+        """The derivative of :meth:`bent`."""
+        x = np.arctan(r) if self.of_angle else r
+        n, m = polyval(x, self.numerator), polyval(x, self.denominator)
+        dn, dm = polyval(x, polyder(self.numerator)), polyval(x, polyder(self.denominator))
+        slope = (dn * m - n * dm) / (m * m)
+        return slope / (1 + r * r) if self.of_angle else slope
+
+    def unbent(self, r_d: Array, farthest: float) -> Array:
+        """r of each r_d, by Newton's method to :data:`RESIDUAL`.
+
+        Args:
+            r_d: radii in the picture.
+            farthest: the radius up to which the model grows and is inverted; beyond its r_d, r goes
+                on straight.
+        """
+        if self.is_identity:
+            return r_d
+        known = np.linspace(0, farthest, SAMPLES)
+        bent = self.bent(known)
+        inside = np.minimum(r_d, bent[-1])
+        r = np.interp(inside, bent, known)
+        for _ in range(20):
+            error = self.bent(r) - inside
+            if np.abs(error).max(initial=0) < RESIDUAL:
+                break
+            r = np.clip(r - error / np.maximum(self.slope(r), 1e-9), 0, farthest)
+        # A slope near 0 would throw what is outside of the image far away.
+        slope = max(float(self.slope(known[-1])), 0.25 * bent[-1] / farthest)
+        return r + (r_d - inside) / slope
+
+
+@lru_cache(maxsize=64)
+def turn(radial: Radial, farthest: float) -> float | None:
+    """The first radius up to ``farthest`` at which r_d no longer grows; None if it always does.
+
+    >>> round(turn(Radial((0.0, 1.0, 0.0, -0.5)), 1.0), 3)
+    0.816
+    """
+    r = np.linspace(0, farthest, SAMPLES)
+    x = np.arctan(r) if radial.of_angle else r
+    with np.errstate(divide="ignore", invalid="ignore"):
+        grows = (radial.slope(r) > 0) & (polyval(x, radial.denominator) > 0)
+    if grows.all():
+        return None
+    first = int(grows.argmin())
+    low, high = float(r[max(first - 1, 0)]), float(r[first])
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if radial.slope(np.array(middle)) > 0 else (low, middle)
+    return high
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A lens as a map of an image: from where each pixel of the picture gets its light.
+
+    Args:
+        radial: the model of green, and of all channels without lateral colour.
+        tangential: p1 and p2 of Brown and Conrady's model.
+        focal: fx and fy in px, in which the model counts.
+        share: without ``focal``, the focal length over the longer side; without either, the model
+            counts in half short sides.
+        centre: the principal point in px from the corner; None, or None of one of them, is the
+            middle.
+        red, blue: lateral colour: r of red, or blue, from r of green, in the picture, both in half
+            short sides.
+        fit: whether the picture is scaled about the principal point so that it shows as much as
+            leaves no void.
+    """
+
+    radial: Radial = Radial()
+    tangential: tuple[float, float] = (0.0, 0.0)
+    focal: tuple[float, float] | None = None
+    share: float | None = None
+    centre: tuple[float | None, float | None] = (None, None)
+    red: Radial = Radial()
+    blue: Radial = Radial()
+    fit: bool = False
+
+    @cached_property
+    def _hash(self) -> int:
+        return hash(
+            (
+                *(self.radial, self.tangential, self.focal, self.share, self.centre),
+                *(self.red, self.blue, self.fit),
+            )
+        )
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether it leaves every image as it is."""
+        models = self.radial, self.red, self.blue
+        return all(each.is_identity for each in models) and not any(self.tangential)
+
+    def unit(self, width: int, height: int) -> tuple[float, float]:
+        """What r = 1 is in an image, in px across and down."""
+        side = self.share * max(width, height) if self.share else min(width, height) / 2
+        return self.focal or (side, side)
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """See :meth:`clpipe.reference.geometry.Geometry.size`."""
+        return width, height
+
+    def origins(self, x: Array, y: Array, width: int, height: int) -> tuple[Array, Array]:
+        """See :meth:`clpipe.reference.geometry.Geometry.origins`."""
+        return self.seen(x, y, width, height)
+
+    def seen(
+        self, x: Array, y: Array, width: int, height: int, lateral: Radial | None = None
+    ) -> tuple[Array, Array]:
+        """The places in the render that places of the picture show, in px, float64.
+
+        Args:
+            x, y: places in the picture; float64, of any shape.
+            width, height: of the image.
+            lateral: the lateral colour of the channel.
+
+        Raises:
+            ImageError: the lens folds the image over, or no scale leaves no void.
+        """
+        scale = fitting_scale(self, width, height) if self.fit else 1.0
+        return _Bend(self, width, height, scale).seen(x, y, lateral or Radial())
+
+    def scale(self, width: int, height: int) -> float:
+        """By how much ``fit`` makes an image's focal length longer; 1 without it.
+
+        Raises:
+            ImageError: as :meth:`seen`.
+        """
+        return fitting_scale(self, width, height) if self.fit else 1.0
+
+
+class _Bend:
+    """A lens before an image of some size, its picture scaled by ``scale``."""
+
+    def __init__(self, lens: Lens, width: int, height: int, scale: float) -> None:
+        self.lens, self.scale, self.side = lens, scale, min(width, height) / 2
+        self.unit = lens.unit(width, height)
+        middle = width / 2, height / 2
+        self.centre = tuple(m if c is None else c for c, m in zip(lens.centre, middle, strict=True))
+        self.size = width, height
+        corners = np.array([(x, y) for x in (0, width) for y in (0, height)], float)
+        away = corners - self.centre
+        self.corner = float(np.hypot(*(away / self.unit).T).max())
+        self.corner_side = float(np.hypot(*(away / self.side).T).max()) / scale
+        self._check(lens.radial, self.corner, "distortion", max(self.unit))
+        for lateral in (lens.red, lens.blue):
+            self._check(lateral, self.corner_side, "lateral colour", self.side)
+
+    def _check(self, radial: Radial, corner: float, what: str, unit: float) -> None:
+        """See that a model does not turn back within the image, where the picture shows it."""
+        at = None if radial.is_identity else turn(radial, corner)
+        if at is not None and not radial.bent(np.array(at)) > corner:
+            raise self.folded(what, at, at * unit)
+
+    def folded(self, what: str, r: float, px: float) -> ImageError:
+        """The error for coefficients that fold the image over at some radius."""
+        width, height = self.size
+        return ImageError(
+            f"distortion: these coefficients fold the image over: the {what} turns back at "
+            f"r = {r:.4g}, {px:.0f} px from the principal point, but the corner of "
+            f"{width}x{height} pixels is at r = {self.corner:.4g}; use coefficients that grow "
+            "up to there, or a longer focal length"
+        )
+
+    def seen(self, x: Array, y: Array, lateral: Radial) -> tuple[Array, Array]:
+        """See :meth:`Lens.seen`."""
+        lens = self.lens
+        dx, dy = (x - self.centre[0]) / self.scale, (y - self.centre[1]) / self.scale
+        # The radius of green where that of the channel is the pixel's.
+        grown = _grown(lateral, np.hypot(dx, dy) / self.side, self.corner_side)
+        dx, dy = dx * grown / self.unit[0], dy * grown / self.unit[1]
+        grown = _grown(lens.radial, np.hypot(dx, dy), self.corner)
+        ux, uy = dx * grown, dy * grown
+        if any(lens.tangential):
+            ux, uy = self._with_tangential(ux, uy, dx, dy)
+        return self.centre[0] + ux * self.unit[0], self.centre[1] + uy * self.unit[1]
+
+    def _with_tangential(self, ux: Array, uy: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
+        """Newton's method in two dimensions, from the inverse of the radial part."""
+        lens, (p1, p2) = self.lens, self.lens.tangential
+        farthest = _farthest(lens.radial, self.corner)
+        begun = ux, uy
+        slope = np.zeros(())
+        for _ in range(50):
+            r = np.maximum(np.hypot(ux, uy), 1e-12)
+            within = np.minimum(r, farthest)
+            bent, slope = lens.radial.bent(within), lens.radial.slope(within)
+            beyond = max(float(lens.radial.slope(np.array(farthest))), 0.25)
+            bent, slope = bent + (r - within) * beyond, np.where(r > farthest, beyond, slope)
+            ratio = bent / r
+            turn = (slope - ratio) / (r * r)  # of the ratio, over r
+            fx = ux * ratio + 2 * p1 * ux * uy + p2 * (r * r + 2 * ux * ux) - dx
+            fy = uy * ratio + p1 * (r * r + 2 * uy * uy) + 2 * p2 * ux * uy - dy
+            xx = ratio + ux * ux * turn + 2 * p1 * uy + 6 * p2 * ux
+            xy = ux * uy * turn + 2 * p1 * ux + 2 * p2 * uy
+            yy = ratio + uy * uy * turn + 6 * p1 * uy + 2 * p2 * ux
+            area = xx * yy - xy * xy
+            safe = np.where(np.abs(area) > 1e-6, area, 1e-6)
+            ux, uy = ux - (yy * fx - xy * fy) / safe, uy - (xx * fy - xy * fx) / safe
+            if max(np.abs(fx).max(initial=0), np.abs(fy).max(initial=0)) < RESIDUAL:
+                break
+        wrong = ~((area > 0) & (np.hypot(fx, fy) < 1e-9))
+        if wrong.any():
+            r = np.hypot(*begun)
+            within = wrong & (r <= self.corner)
+            if within.any():
+                first = float(r[within].min())
+                raise self.folded("distortion", first, first * max(self.unit))
+            ux, uy = np.where(wrong, begun[0], ux), np.where(wrong, begun[1], uy)
+        return ux, uy
+
+
+def _farthest(radial: Radial, corner: float) -> float:
+    """The radius up to which a model is inverted: somewhat beyond the corner."""
+    at = turn(radial, BEYOND * corner)
+    return BEYOND * corner if at is None else max(0.999 * at, min(corner, at))
+
+
+def _grown(radial: Radial, r_d: Array, corner: float) -> Array:
+    """r over r_d, the inverse of a model as a factor."""
+    if radial.is_identity:
+        return np.ones_like(r_d)
+    at_centre = 1 / radial.slope(np.zeros(()))
+    r = radial.unbent(r_d, _farthest(radial, corner))
+    return np.divide(r, r_d, out=np.full_like(r_d, at_centre), where=r_d > 0)
+
+
+@lru_cache(maxsize=256)
+def fitting_scale(lens: Lens, width: int, height: int) -> float:
+    """The scale of the picture at which it shows as much of the render as leaves no void.
+
+    Raises:
+        ImageError: there is none between 1/8 and 8, or the lens folds the image over.
+    """
+    across, down = np.linspace(0, width, 129), np.linspace(0, height, 129)
+    x = np.concatenate([across, across, np.zeros(129), np.full(129, width)])
+    y = np.concatenate([np.zeros(129), np.full(129, height), down, down])
+
+    def is_full(scale: float) -> bool:
+        try:
+            bend = _Bend(lens, width, height, scale)
+            channels = dict.fromkeys((lens.red, Radial(), lens.blue))
+            places = [bend.seen(x, y, each) for each in channels]
+        except ImageError:  # so far out, the lens folds
+            return False
+        return all(
+            u.min() >= 0 and v.min() >= 0 and u.max() <= width and v.max() <= height
+            for u, v in places
+        )
+
+    _Bend(lens, width, height, 1.0)  # refuses a lens that folds the image
+    low, high = 1 / 8, 8.0
+    if not is_full(high):
+        raise ImageError(
+            f"distortion: no scale fits the picture of {width}x{height} pixels into the render; "
+            "see that cx and cy lie in the image, or say fit=false"
+        )
+    for _ in range(26):  # to 1e-7
+        middle = (low * high) ** 0.5
+        low, high = (low, middle) if is_full(middle) else (middle, high)
+    return high

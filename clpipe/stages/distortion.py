@@ -1,0 +1,271 @@
+"""Lens distortion with lateral colour: straight lines bend, and red and blue part from green.
+
+The render is without distortion, and the picture has it. For each pixel of the picture the place
+that it shows is found by inverting the model (:mod:`clpipe.reference.lens`), and each channel is
+gathered there in one resampling (:mod:`clpipe.reference.warp`). Lateral colour and lensfun's models
+are those of lensfun (lensfun.github.io, "Lens correction models"), with r = 1 at half the short
+side of the image.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import Field
+
+from clpipe.base.errors import RequestError
+from clpipe.base.types import Floats
+from clpipe.reference import warp
+from clpipe.reference.lens import Lens, Radial
+from clpipe.stage import (
+    Access,
+    Argument,
+    Context,
+    Frame,
+    Kind,
+    Method,
+    Pass,
+    Stage,
+    Unchanged,
+    parameter,
+)
+from clpipe.stage import Literal as Text
+
+
+class NoDistortion(Unchanged):
+    """No distortion."""
+
+    method: ClassVar = "none"
+    summary: ClassVar = "straight lines stay straight"
+
+
+class Distortion(Method):
+    """A lens's distortion and lateral colour, in one resampling."""
+
+    kernel: ClassVar = "distortion"
+
+    cx: float | None = parameter(
+        None, "Principal point, from the left edge: OpenCV's cx + 0.5.", "px", "the middle"
+    )
+    cy: float | None = parameter(
+        None, "Principal point, from the upper edge: OpenCV's cy + 0.5.", "px", "the middle"
+    )
+    kr: float = parameter(
+        1.0, "Lateral colour, linear: size of red over that of green.", gt=0.5, lt=2
+    )
+    kb: float = parameter(
+        1.0, "Lateral colour, linear: size of blue over that of green.", gt=0.5, lt=2
+    )
+    vr: float = parameter(1.0, "Lateral colour, poly3, red: r (vr + cr r + br r^2).", gt=0.5, lt=2)
+    cr: float = parameter(0.0, "See vr.", ge=-1, le=1)
+    br: float = parameter(0.0, "See vr.", ge=-1, le=1)
+    vb: float = parameter(1.0, "Lateral colour, poly3, blue: r (vb + cb r + bb r^2).", gt=0.5, lt=2)
+    cb: float = parameter(0.0, "See vb.", ge=-1, le=1)
+    bb: float = parameter(0.0, "See vb.", ge=-1, le=1)
+    fit: bool = parameter(
+        False, "Scale the picture so that it shows as much of the render as leaves no void."
+    )
+    filter: Literal["bicubic", "lanczos3"] = parameter(
+        "bicubic",
+        "How pixels are weighted: bicubic (Catmull-Rom), or lanczos3, which is sharper and rings.",
+        structural=True,
+    )
+
+    def radial(self) -> Radial:
+        """The model."""
+        raise NotImplementedError(type(self).__name__)
+
+    def lens(self) -> Lens:
+        """The map of places, of all channels."""
+        return Lens(
+            radial=self.radial(),
+            centre=(self.cx, self.cy),
+            red=Radial.of(self.kr * self.vr, self.kr * self.cr, self.kr * self.br),
+            blue=Radial.of(self.kb * self.vb, self.kb * self.cb, self.kb * self.bb),
+            fit=self.fit,
+        )
+
+    @property
+    def resampling(self) -> warp.Warp:
+        """How the picture is made of the render."""
+        return warp.Warp(self.lens(), self.filter)
+
+    def passes(self) -> tuple[Pass, ...]:
+        resampling = self.resampling
+        if resampling.lens.is_identity:
+            return ()
+        arguments = ("filter", "taps", "powers")
+        return (
+            Pass(
+                "distortion",
+                Access.RESAMPLE,
+                arguments,
+                radius=resampling.support,
+                resampling=resampling,
+            ),
+        )
+
+    def geometry(self) -> Lens | None:
+        return self.lens() if self.passes() else None
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        filter_ = warp.FILTERS[self.filter]
+        taps, powers = filter_.shape
+        return {"filter": filter_, "taps": Text(str(taps)), "powers": Text(str(powers))}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        return self.resampling.reference(image) if self.passes() else image
+
+
+Coefficient = Annotated[float, Field(ge=-1e4, le=1e4)]
+
+
+class InFocalLengths(Distortion):
+    """A model that counts in focal lengths."""
+
+    alternatives: ClassVar = frozenset({"fx", "focal_length"})
+
+    fx: float | None = parameter(None, "Focal length across.", "px", "focal_length", gt=0, le=1e7)
+    fy: float | None = parameter(None, "Focal length down.", "px", "fx", gt=0, le=1e7)
+    focal_length: float | None = parameter(None, "Focal length, without fx.", "mm", gt=0, le=1e4)
+    sensor_width: float | None = parameter(
+        None, "Of the sensor, along the longer side of the image.", "mm", gt=0, le=1e4
+    )
+
+    def resolve(self, context: Context) -> Self:
+        """The method with fy.
+
+        Raises:
+            RequestError: the focal length is not known, or twice. It is refused as late as here
+                because options may choose the method, and each row of a manifest its lens.
+        """
+        if self.fx and self.focal_length:
+            raise RequestError(
+                "distortion: found both fx and focal_length; set fx in px, or focal_length with "
+                "sensor_width in mm"
+            )
+        if not self.fx and not (self.focal_length and self.sensor_width):
+            raise RequestError(
+                f"distortion: {self.method} counts in focal lengths: set fx (px), or focal_length "
+                "and sensor_width (mm)"
+            )
+        return self.filled(fy=self.fx)
+
+    def lens(self) -> Lens:
+        lens = super().lens()
+        if self.fx and self.fy:
+            return replace(lens, focal=(self.fx, self.fy))
+        assert self.focal_length and self.sensor_width
+        return replace(lens, share=self.focal_length / self.sensor_width)
+
+
+class BrownConrady(InFocalLengths):
+    """x_d = x R(r) + 2 p1 x y + p2 (r^2 + 2 x^2), y_d likewise: OpenCV's and COLMAP's model.
+
+    R = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6); x and y count from the
+    principal point in focal lengths (Brown, "Decentering distortion of lenses", 1966; OpenCV,
+    "Camera calibration and 3D reconstruction").
+
+    >>> import numpy as np
+    >>> lens = BrownConrady(fx=100.0, fy=100.0, k1=-0.1).lens()
+    >>> x, y = lens.origins(np.array(148.75), np.array(100.0), 200, 200)
+    >>> round(float(x), 6), float(y)
+    (150.0, 100.0)
+    """
+
+    method: ClassVar = "brown_conrady"
+    summary: ClassVar = "OpenCV's and COLMAP's: radial k1 to k6, tangential p1 and p2"
+    example: ClassVar = {
+        **{"focal_length": 20.0, "sensor_width": 24.0, "k1": -0.2, "k4": 0.05, "p1": 0.002},
+        **{"p2": -0.003, "vr": 1.01, "bb": 0.01},
+    }
+
+    k1: Coefficient = parameter(0.0, "Of r^2.")
+    k2: Coefficient = parameter(0.0, "Of r^4.")
+    k3: Coefficient = parameter(0.0, "Of r^6.")
+    k4: Coefficient = parameter(0.0, "Of r^2 in the denominator.")
+    k5: Coefficient = parameter(0.0, "Of r^4 in the denominator.")
+    k6: Coefficient = parameter(0.0, "Of r^6 in the denominator.")
+    p1: Coefficient = parameter(0.0, "Tangential, down.")
+    p2: Coefficient = parameter(0.0, "Tangential, across.")
+
+    def radial(self) -> Radial:
+        below = (0.0, self.k4, 0.0, self.k5, 0.0, self.k6)
+        return Radial.of(1.0, 0.0, self.k1, 0.0, self.k2, 0.0, self.k3, below=below)
+
+    def lens(self) -> Lens:
+        return replace(super().lens(), tangential=(self.p1, self.p2))
+
+
+class Fisheye(InFocalLengths):
+    """r_d = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8), a = atan(r): OpenCV's fisheye model.
+
+    r counts from the principal point in focal lengths (Kannala and Brandt, PAMI 2006; COLMAP calls
+    it OPENCV_FISHEYE). What is beside the render's own field stays black.
+    """
+
+    method: ClassVar = "fisheye"
+    summary: ClassVar = "OpenCV's fisheye: a polynomial of the angle to the axis"
+    example: ClassVar = {
+        **{"fx": 300.0, "fy": 330.0, "k1": -0.02, "k2": 0.003, "cx": 20.0, "kr": 0.995}
+    }
+
+    k1: Coefficient = parameter(0.0, "Of the angle squared.")
+    k2: Coefficient = parameter(0.0, "Of its fourth power.")
+    k3: Coefficient = parameter(0.0, "Of its sixth power.")
+    k4: Coefficient = parameter(0.0, "Of its eighth power.")
+
+    def radial(self) -> Radial:
+        powers = (1.0, 0.0, self.k1, 0.0, self.k2, 0.0, self.k3, 0.0, self.k4)
+        return Radial.of(*powers, of_angle=True)
+
+
+class Poly3(Distortion):
+    """r_d = r (1 - k1 + k1 r^2), lensfun's model of that name."""
+
+    method: ClassVar = "poly3"
+    summary: ClassVar = "lensfun's: r (1 - k1 + k1 r^2)"
+    example: ClassVar = {"k1": 0.02, "kr": 1.002, "kb": 0.998, "fit": True}
+
+    k1: Coefficient = parameter(0.0, "Above 0 a pincushion, below 0 a barrel.")
+
+    def radial(self) -> Radial:
+        return Radial.of(1 - self.k1, 0.0, self.k1)
+
+
+class Poly5(Distortion):
+    """r_d = r (1 + k1 r^2 + k2 r^4), lensfun's model of that name."""
+
+    method: ClassVar = "poly5"
+    summary: ClassVar = "lensfun's: r (1 + k1 r^2 + k2 r^4)"
+    example: ClassVar = {"k1": 0.03, "k2": 0.001}
+
+    k1: Coefficient = parameter(0.0, "Of r^2.")
+    k2: Coefficient = parameter(0.0, "Of r^4.")
+
+    def radial(self) -> Radial:
+        return Radial.of(1.0, 0.0, self.k1, 0.0, self.k2)
+
+
+class PtLens(Distortion):
+    """r_d = r (a r^3 + b r^2 + c r + 1 - a - b - c), lensfun's and Hugin's model of that name."""
+
+    method: ClassVar = "ptlens"
+    summary: ClassVar = "lensfun's and Hugin's: r (a r^3 + b r^2 + c r + 1 - a - b - c)"
+    example: ClassVar = {"a": 0.001, "b": 0.01, "c": 0.02, "cy": 20.0}
+
+    a: Coefficient = parameter(0.0, "Of r^3.")
+    b: Coefficient = parameter(0.0, "Of r^2.")
+    c: Coefficient = parameter(0.0, "Of r.")
+
+    def radial(self) -> Radial:
+        return Radial.of(1 - self.a - self.b - self.c, self.c, self.b, self.a)
+
+
+STAGE = Stage(
+    "distortion",
+    "Bend the picture as a lens does, and part its colours.",
+    Kind.RGB,
+    Kind.RGB,
+    (NoDistortion, BrownConrady, Fisheye, Poly3, Poly5, PtLens),
+)

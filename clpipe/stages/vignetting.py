@@ -1,0 +1,157 @@
+"""Vignetting: light falls off towards the corners of the picture."""
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from clpipe.base.errors import RequestError
+from clpipe.base.types import Floats
+from clpipe.reference.math import inverse_root
+from clpipe.stage import (
+    Argument,
+    Context,
+    Frame,
+    Kind,
+    Literal,
+    Method,
+    Pass,
+    Stage,
+    Unchanged,
+    parameter,
+)
+
+Coefficient = Annotated[float, Field(ge=-100, le=100)]
+
+
+class NoVignetting(Unchanged):
+    """No vignetting."""
+
+    method: ClassVar = "none"
+    summary: ClassVar = "the corners are as bright as the middle"
+
+
+class Pa(Method):
+    """v * (1 + k1 r^2 + k2 r^4 + k3 r^6), r = 1 at the corner: lensfun's model of that name.
+
+    These are what lensfun's calibrations describe, the lens itself, so k1 is mostly below 0;
+    lensfun divides by it, to take it away. No light is below 0.
+
+    >>> from clpipe.stage import run_reference
+    >>> row = run_reference(Pa(k1=-0.9), np.ones((3, 3, 3), np.float32))[1, :, 0]
+    >>> [round(float(v), 3) for v in row]
+    [0.8, 1.0, 0.8]
+    """
+
+    method: ClassVar = "pa"
+    kernel: ClassVar = "vignetting"
+    summary: ClassVar = "lensfun's: 1 + k1 r^2 + k2 r^4 + k3 r^6"
+    example: ClassVar = {"k1": -0.5, "k2": 0.1, "k3": -0.2}
+
+    k1: Coefficient = parameter(0.0, "Of r^2; below 0, the corners are darker.")
+    k2: Coefficient = parameter(0.0, "Of r^4.")
+    k3: Coefficient = parameter(0.0, "Of r^6.")
+
+    def passes(self) -> tuple[Pass, ...]:
+        if self.k1 == self.k2 == self.k3 == 0:
+            return ()
+        return (Pass("vignetting_pa", arguments=("extent", "k1", "k2", "k3")),)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        ks = {name: np.float32(getattr(self, name)) for name in ("k1", "k2", "k3")}
+        return {"extent": Literal("e"), **ks}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        sides: Floats = np.array(image.shape[:2], np.float32)
+        corner = (sides * sides).sum(keepdims=True) * np.float32(0.25)
+        r2 = _squared_radius(image) * _reciprocal(corner)
+        k1, k2, k3 = map(np.float32, (self.k1, self.k2, self.k3))
+        gain = ((r2 * k3 + k2) * r2 + k1) * r2 + np.float32(1)
+        return image * np.maximum(gain, np.float32(0))[..., None]
+
+
+class CosineFourth(Method):
+    """v * cos^4 of the angle to the optical axis, which leaves the image in its middle.
+
+    What falls on a sensor behind a lens without vignetting of its own, cos^4 = 1 / (1 + r^2)^2 with
+    r in focal lengths (Reiss, "The cos^4 law of illumination", J. Opt. Soc. Am. 1945).
+
+    >>> from clpipe.stage import run_reference
+    >>> white = np.ones((1, 5, 3), np.float32)
+    >>> run_reference(CosineFourth(fx=2.0), white)[0, :, 0].round(3).tolist()
+    [0.25, 0.6399999856948853, 1.0, 0.6399999856948853, 0.25]
+    """
+
+    method: ClassVar = "cosine_fourth"
+    kernel: ClassVar = "vignetting"
+    summary: ClassVar = "the fourth power of the cosine of the angle to the axis"
+    example: ClassVar = {"fx": 40.0}
+    other_examples: ClassVar = ({"fx": None, "focal_length": 20.0, "sensor_width": 36.0},)
+    alternatives: ClassVar = frozenset({"fx", "focal_length"})
+
+    fx: float | None = parameter(None, "Focal length.", "px", "focal_length", gt=0, le=1e7)
+    focal_length: float | None = parameter(None, "Focal length, without fx.", "mm", gt=0, le=1e4)
+    sensor_width: float | None = parameter(
+        None, "Of the sensor, along the longer side of the image.", "mm", gt=0, le=1e4
+    )
+
+    def resolve(self, context: Context) -> Self:
+        """The method, checked.
+
+        Raises:
+            RequestError: the focal length is not known, or twice.
+        """
+        if self.fx and self.focal_length:
+            raise RequestError(
+                "vignetting: found both fx and focal_length; set fx in px, or focal_length with "
+                "sensor_width in mm"
+            )
+        if not self.fx and not (self.focal_length and self.sensor_width):
+            raise RequestError(
+                "vignetting: cosine_fourth counts in focal lengths: set fx (px), or focal_length "
+                "and sensor_width (mm)"
+            )
+        return self
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("vignetting_cosine", arguments=("extent", "per_px", "per_side")),)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        per_px, per_side = self._units()
+        return {"extent": Literal("e"), "per_px": per_px, "per_side": per_side}
+
+    def _units(self) -> tuple[np.float32, np.float32]:
+        """1 over the squared focal length in px, or in longer sides; the other is 0."""
+        if self.fx:
+            return np.float32(self.fx**-2), np.float32(0)
+        assert self.focal_length and self.sensor_width
+        return np.float32(0), np.float32((self.sensor_width / self.focal_length) ** 2)
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        per_px, per_side = self._units()
+        side: Floats = np.full(1, max(image.shape[:2]), np.float32)
+        unit = per_px or per_side * _reciprocal(side * side)
+        cosine = _reciprocal(_squared_radius(image) * unit + np.float32(1))
+        return image * (cosine * cosine)[..., None]
+
+
+def _squared_radius(image: Floats) -> Floats:
+    """The squared distance of each pixel to the middle of the image, in px."""
+    height, width = image.shape[:2]
+    dx, dy = ((np.arange(n) - (n - 1) / 2).astype(np.float32) for n in (width, height))
+    return dx * dx + (dy * dy)[:, None]
+
+
+def _reciprocal(x: Floats) -> Floats:
+    root = inverse_root(x)
+    return root * root
+
+
+STAGE = Stage(
+    "vignetting",
+    "Darken the corners as a lens does.",
+    Kind.RGB,
+    Kind.RGB,
+    (NoVignetting, Pa, CosineFourth),
+)

@@ -1,0 +1,35 @@
+// Light that falls off towards the corners, by the distance to the middle of the image. Only * and +, so
+// that NumPy gives the same bits.
+INLINE vf squared_radius(site at, extent e) {
+    const vf dx = to_float(iota() * 2 + (vi)(2 * (int)at.x + 1 - (int)e.width)) * 0.5f;
+    const float dy = (float)(2 * (int)at.y + 1 - (int)e.height) * 0.5f;
+    return dx * dx + dy * dy;
+}
+
+// 1 / x for x > 0.
+INLINE vf reciprocal(vf x) {
+    const vf root = inverse_root(x);
+    return root * root;
+}
+
+INLINE rgb times(rgb c, vf gain) {
+    const rgb v = {c.r * gain, c.g * gain, c.b * gain};
+    return v;
+}
+
+// r is 1 at the corner.
+INLINE rgb vignetting_pa(rgb c, site at, extent e, float k1, float k2, float k3) {
+    const float width = (float)e.width, height = (float)e.height;
+    const vf corner = (vf)((width * width + height * height) * 0.25f);
+    const vf r2 = squared_radius(at, e) * reciprocal(corner);
+    return times(c, vmax(((r2 * k3 + k2) * r2 + k1) * r2 + 1.0f, (vf)(0.0f)));
+}
+
+// r is the tangent of the angle to the axis, and so 1 / (1 + r^2) its cosine squared. A focal length in
+// px is `per_px`; one that counts in longer sides is `per_side`, and the other is 0.
+INLINE rgb vignetting_cosine(rgb c, site at, extent e, float per_px, float per_side) {
+    const float side = (float)(e.width > e.height ? e.width : e.height);
+    const vf unit = per_px > 0.0f ? (vf)(per_px) : (vf)(per_side) * reciprocal((vf)(side * side));
+    const vf cosine = reciprocal(squared_radius(at, e) * unit + 1.0f);
+    return times(c, cosine * cosine);
+}
