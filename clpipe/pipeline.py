@@ -22,7 +22,7 @@ from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.clipping import MUCH, clipped_share, clipping_text
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Result, Runner
-from clpipe.images.passes import CHANNELS, vectors_of
+from clpipe.images.kinds import CHANNELS, vectors_of
 from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
 from clpipe.stage import Kind
 

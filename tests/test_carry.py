@@ -252,6 +252,10 @@ def test_one_file_for_an_image_and_its_replay(clpipe, render):
         for name in ("frame0", "frame1", "truth")
     }
     assert ["carried" in each for each in listing.values()] == [True, False, False]
+    bracket = ("--truth", "development", "--bracket", "-1,1")
+    clpipe("run", "in", "-o", "bracket", "--device", "numpy", *stages, *bracket, "--carry", "Depth")
+    assert Path("bracket/a.carried.exr").read_bytes() == OUT.read_bytes()
+    assert "carried" in json.loads(Path("bracket/a.ev-1.json").read_text())
     clpipe("run", "--replay", "out/a.frame0.json", "-o", "again", "--device", "numpy")
     assert Path("again/a.carried.exr").read_bytes() == OUT.read_bytes()
     clpipe("run", "--replay", "out/a.frame1.json", "-o", "other", "--device", "numpy")

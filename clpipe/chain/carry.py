@@ -6,7 +6,7 @@ from typing import get_args
 
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
-from clpipe.images.passes import kind_named
+from clpipe.images.kinds import kind_named
 from clpipe.reference.carried import LayerKind
 
 VALID = "valid"  # the channel that says which pixels are known

@@ -1,6 +1,5 @@
 """What a render holds beside its picture: depth, normals, object numbers, motion, in layers."""
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,35 +10,12 @@ import OpenImageIO as oiio
 
 from clpipe.base.steps import Step
 from clpipe.base.types import Array
+from clpipe.images.kinds import kind_named
 from clpipe.images.layers import MOST_PARTS, full_name
 from clpipe.images.openimageio import open_image
 from clpipe.images.pixels import check_size
 from clpipe.images.read import read_samples
-from clpipe.reference.carried import LayerKind, Vector
-
-# What layers hold, by their names in Blender, Mitsuba and elsewhere: lower case, letters alone.
-NAMES: dict[LayerKind, tuple[str, ...]] = {
-    "depth": ("depth", "z", "zdepth", "mist", "distance"),
-    "label": (
-        *("indexob", "indexma", "objectindex", "materialindex", "objectid", "materialid", "id"),
-        *("index", "instance", "instanceid", "label", "labels", "segmentation", "seg", "semantic"),
-        *("mask", "crypto", "cryptoobject", "cryptomaterial", "cryptoasset", "cryptomatte"),
-        *("shapeindex", "primindex", "ids"),
-    ),
-    "normal": ("normal", "normals", "shnormal", "geonormal", "shadingnormal", "denoisingnormal"),
-    "flow": (
-        "vector",
-        "flow",
-        "opticalflow",
-        "motion",
-        "motionvector",
-        "motionvectors",
-        "velocity",
-    ),
-    "colour": ("albedo", "basecolor", "basecolour"),
-}
-
-CHANNELS: dict[LayerKind, int] = {"flow": 2, "normal": 3}  # at least
+from clpipe.reference.carried import LayerKind
 
 CRYPTOMATTE = "cryptomatte/"  # begins the names of attributes that say what its numbers stand for
 
@@ -91,16 +67,6 @@ class LayerLocation:
         return self.name[:-2] if is_rank else self.name
 
 
-def kind_named(name: str) -> LayerKind | None:
-    """What a layer holds, by its name; None where that does not say it.
-
-    >>> kind_named("ViewLayer.CryptoObject00"), kind_named("sh_normal"), kind_named("DiffCol")
-    ('label', 'normal', None)
-    """
-    plain = re.sub(r"[^a-z]", "", name.rpartition(".")[2].lower())
-    return next((kind for kind, names in NAMES.items() if plain in names), None)
-
-
 def kind_of(name: str, location: LayerLocation) -> LayerKind | None:
     """What a layer holds, by the name that it is known by and its channels; None is unknown."""
     if kind := kind_named(name) or kind_named(location.name):
@@ -108,26 +74,6 @@ def kind_of(name: str, location: LayerLocation) -> LayerKind | None:
     if location.type not in FLOATS:
         return "label"
     return "colour" if location.is_colour else None
-
-
-def vectors_of(name: str, channels: tuple[str, ...]) -> tuple[Vector, ...]:
-    """The vectors of a flow: of each the channels to the right and down, and their signs.
-
-    They point right and down, to where a surface is seen in the other frame, but in Blender's
-    Vector, whose Y and W point up: X and Y go to the frame before, Z and W come from the next one.
-
-    Args:
-        name: of the layer.
-        channels: the names of its channels; one alone is no vector.
-
-    >>> vectors_of("Vector", ("X", "Y", "Z", "W"))
-    (((0, 1), (1, -1)), ((2, -1), (3, 1)))
-    >>> vectors_of("flow", ("R", "G", "B"))
-    (((0, 1), (1, 1)),)
-    """
-    if name.rpartition(".")[2].lower() == "vector" and len(channels) == 4:
-        return ((0, 1), (1, -1)), ((2, -1), (3, 1))
-    return tuple(((i, 1), (i + 1, 1)) for i in range(0, len(channels) - 1, 2))
 
 
 def find_layers(path: Path) -> list[LayerLocation]:
@@ -212,7 +158,11 @@ def read_layer(
         pixels = read_samples(path, file, location.part, location.places, type_)
         if pixels.dtype.kind != "f":
             pixels = pixels.astype(np.uint32)
-        return pixels, (spec.x - spec.full_x, spec.y - spec.full_y), (width, height)
+        return (
+            np.ascontiguousarray(pixels),
+            (spec.x - spec.full_x, spec.y - spec.full_y),
+            (width, height),
+        )
 
 
 def cryptomatte_attributes(path: Path, part: int) -> dict[str, str]:

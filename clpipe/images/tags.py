@@ -15,6 +15,7 @@ from clpipe.images.encoding import Output
 
 FILM_DIAGONAL = math.hypot(36, 24)  # mm, of a frame of 35 mm film
 TAG_ATTRIBUTES = ("exif", "orientation")  # the attributes by which an image carries its tags
+DAMAGED = "its attributes clpipe:exif and clpipe:orientation are damaged"
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def from_attributes(attributes: Mapping[str, str], default: Tags) -> tuple[Tags,
         text = attributes.get("exif")
         tags = TypeAdapter(Tags).validate_json(text) if text else default
     except ValueError:
-        raise ImageError("its attribute clpipe:exif is damaged") from None
+        raise ImageError(DAMAGED) from None
     return tags, orientation_of(attributes)
 
 
@@ -107,7 +108,7 @@ def orientation_of(attributes: Mapping[str, str]) -> int:
     """
     orientation = attributes.get("orientation", "1")
     if orientation not in map(str, FLIPS):
-        raise ImageError("its attribute clpipe:orientation is damaged")
+        raise ImageError(DAMAGED)
     return int(orientation)
 
 

@@ -17,15 +17,13 @@ from clpipe.base.text import one_of
 from clpipe.base.types import Array
 from clpipe.chain.carry import Carry
 from clpipe.chain.chain import Chain
+from clpipe.images.kinds import CHANNELS, kind_named, vectors_of
 from clpipe.images.passes import (
-    CHANNELS,
     LayerLocation,
     cryptomatte_attributes,
     find_layers,
-    kind_named,
     kind_of,
     read_layer,
-    vectors_of,
 )
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import FLIPS
