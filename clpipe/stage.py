@@ -148,6 +148,7 @@ class Context:
     headroom: float = 0.0  # stops by which exposure darkened the scene
     colours: Matrix = IDENTITY  # linear sRGB to what red, green and blue are, white-balanced
     noise: NoiseModel | None = None  # of the sensor noise that was added
+    lens: Mapping[str, Mapping[str, Any]] | None = None  # tables of stages, by their names
     clean: bool = False  # the image has no noise, and nothing may follow from what it would have
     black_level: float | None = None  # DN, as quantize used them
     white_level: float | None = None
@@ -220,7 +221,7 @@ class Method(BaseModel):
     # manifest's.
     alternatives: ClassVar[frozenset[str]] = frozenset()
 
-    def resolve(self, context: Context) -> Self:
+    def resolve(self, context: Context) -> "Method":
         """The method with a value for every parameter that was left to the camera or the chain."""
         return self
 
@@ -235,6 +236,10 @@ class Method(BaseModel):
     def geometry(self) -> Geometry | None:
         """How this (resolved) method moves pixels; None if each stays where it is."""
         return None
+
+    def of_size(self, width: int, height: int) -> Mapping[str, float]:
+        """What follows for an image of that size that it reads; a sidecar has it as estimates."""
+        return {}
 
     def without_noise(self) -> "Method | None":
         """This (resolved) method without its noise; None if nothing is left of it."""

@@ -17,9 +17,10 @@ INLINE rgb times(rgb c, vf gain) {
     return v;
 }
 
-// r is 1 at the corner.
+// r is 1 at the last pixel of a corner.
 INLINE rgb vignetting_pa(rgb c, site at, extent e, float k1, float k2, float k3) {
-    const float width = (float)e.width, height = (float)e.height;
+    const float width = e.width > 1 ? (float)(e.width - 1) : 1.0f;
+    const float height = e.height > 1 ? (float)(e.height - 1) : 1.0f;
     const vf corner = (vf)((width * width + height * height) * 0.25f);
     const vf r2 = squared_radius(at, e) * reciprocal(corner);
     return times(c, vmax(((r2 * k3 + k2) * r2 + k1) * r2 + 1.0f, (vf)(0.0f)));

@@ -6,9 +6,11 @@ from functools import cached_property
 
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
+from clpipe.camera.lens import Tables, lens_tables
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.profile import Camera, load_camera
 from clpipe.chain.draws import Draw
+from clpipe.chain.keys import LENS
 from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
@@ -249,7 +251,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     Raises:
         RequestError: image kinds do not fit.
     """
-    context = Context(camera=camera, iso=settings.iso)
+    context = Context(camera=camera, iso=settings.iso, lens=lens_of(settings, camera))
     steps: list[Step] = []
     before = "the input"
     for name in step_names(settings):
@@ -268,6 +270,21 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
         context = after
         kind, before = stage.writes, name
     return steps
+
+
+def lens_of(settings: Settings, camera: Camera) -> Tables | None:
+    """What the lens of settings does to a picture; None where they name none.
+
+    Raises:
+        RequestError: it cannot be found, or set so; or it is set and not named.
+    """
+    focal, aperture, distance = settings.focal_length, settings.aperture, settings.focus_distance
+    if settings.lens:
+        return lens_tables(settings.lens, camera, focal, aperture, distance)
+    for key in LENS[1:]:
+        if getattr(settings, key) is not None:
+            raise KeyedError(key, f"{key}: it is that of a lens, and none is named; set lens")
+    return None
 
 
 def misfit(name: str, stage: Stage, before: str, kind: Kind) -> str:

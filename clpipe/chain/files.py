@@ -10,7 +10,7 @@ from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.reading import parse_toml, read_text
 from clpipe.base.text import one_of
 from clpipe.chain.chain import Chain, Step
-from clpipe.chain.keys import CODE, OUTPUT, names_in
+from clpipe.chain.keys import CODE, LENS, OUTPUT, names_in
 from clpipe.chain.registry import load_stage_file
 from clpipe.chain.settings import Settings, settings_from
 from clpipe.chain.toml import line_of, value_text
@@ -88,6 +88,7 @@ def toml_text(chain: Chain) -> str:
     lines = [
         f"camera = {value_text(draws.get('camera', settings.camera))}",
         f"iso = {value_text(draws.get('iso', settings.iso))}",
+        *(f"{key} = {value_text(v)}" for key, v in settings.record().items() if key in LENS),
         f"seed = {value_text(settings.seed)}",
         *(f"{key} = {value_text(v)}" for key, v in settings.record().items() if key[:4] == "raw_"),
         "stages = [",
@@ -104,12 +105,15 @@ def toml_text(chain: Chain) -> str:
 
 def _step_lines(step: Step, settings: Settings, draws: Mapping[str, Any]) -> list[str]:
     """The method and the parameters of a step, a line each."""
-    method = draws.get(f"{step.name}.method", step.method.method)
+    shown = step.method
+    if not isinstance(shown, type(settings.method(step.name))):  # another has taken its place
+        shown = settings.method(step.name)
+    method = draws.get(f"{step.name}.method", shown.method)
     constants = settings.parameters.get(step.name, {})
     lines = [f"method = {value_text(method)}"]
-    for name, field in type(step.method).model_fields.items():
+    for name, field in type(shown).model_fields.items():
         extra: Any = field.json_schema_extra
-        value = draws.get(f"{step.name}.{name}", getattr(step.method, name))
+        value = draws.get(f"{step.name}.{name}", getattr(shown, name))
         if value is None or (name not in constants and isinstance(method, Mapping)):
             continue  # other methods than the one in the example may not have it
         line = f"{name} = {value_text(value)}"

@@ -7,20 +7,32 @@ from clpipe.base.errors import KeyedError
 
 CODE = "stage_files"  # the key that only a configuration file may have
 
-KEYS = ("camera", "iso", "seed", "noise_key", "raw_size", "raw_type", "stages", "skip", CODE)
+LENS = ("lens", "focal_length", "aperture", "focus_distance")  # how a lens is named and set
+
+KEYS = (
+    *("camera", "iso", *LENS, "seed", "noise_key", "raw_size", "raw_type", "stages", "skip"),
+    CODE,
+)
 
 OUTPUT = "output"  # the one table that belongs to no stage
 
-DRAWABLE = ("iso", "camera")  # of the keys; parameters of stages and of the output can be, too
+DRAWABLE = (
+    "iso",
+    "camera",
+    *LENS,
+)  # of the keys; parameters of stages and of the output can be, too
 
 MAX_ISO = 10**9
+
+MAX_LENGTH = 10**6  # of what a lens is set to, in mm or m
 
 MAX_STAGES = 256  # of a chain; an image can carry one
 
 TYPES: dict[str, tuple[str, Any]] = {
     "iso": ("a number", int | float),
     "seed": ("a whole number", int),
-    **dict.fromkeys(("camera", "noise_key", "raw_size", "raw_type"), ("text", str)),
+    **dict.fromkeys(LENS[1:], ("a number", int | float)),
+    **dict.fromkeys(("camera", "lens", "noise_key", "raw_size", "raw_type"), ("text", str)),
 }
 
 
@@ -33,6 +45,8 @@ def check_type(key: str, value: Any) -> None:
     kind, expected = TYPES.get(key, ("", object))
     if not isinstance(value, expected) or isinstance(value, bool):
         raise KeyedError(key, f"{key}: found {value!r}, but it is {kind}")
+    if key in LENS[1:] and not 0 < value < MAX_LENGTH:
+        raise KeyedError(key, f"{key}: found {value!r}, but it is above 0 and below {MAX_LENGTH:g}")
     if key == "iso" and value > MAX_ISO:
         raise KeyedError(key, f"{key}: found {value!r}, but it is at most {MAX_ISO:g}")
 

@@ -91,6 +91,10 @@ class Request:
         config: str | None = None,
         camera: str | None = None,
         iso: float | None = None,
+        lens: str | None = None,
+        focal_length: float | None = None,
+        aperture: float | None = None,
+        focus_distance: float | None = None,
         seed: int | None = None,
         noise_key: str | None = None,
         assignments: Sequence[str] = (),
@@ -107,6 +111,7 @@ class Request:
         Args:
             config: the name of a built-in configuration, or of a TOML file.
             camera, iso, seed, noise_key, skip, raw_size, raw_type: settings.
+            lens, focal_length, aperture, focus_distance: settings.
             assignments: texts of the form ``stage.parameter=value``.
             stages: names, separated by commas.
             stage_files: as for the class.
@@ -119,6 +124,8 @@ class Request:
         for file in stage_files:
             load_stage_file(file)
         plain = {"camera": camera, "iso": iso, "seed": seed, "noise_key": noise_key}
+        plain |= {"lens": lens, "focal_length": focal_length, "aperture": aperture}
+        plain |= {"focus_distance": focus_distance}
         plain |= {"raw_size": raw_size, "raw_type": raw_type}
         options: dict[str, Any] = {k: v for k, v in plain.items() if v is not None}
         if stages is not None:

@@ -18,7 +18,7 @@ from clpipe.base.text import one_of
 from clpipe.camera.profile import DEFAULT_CAMERA, built_in_name, load_camera
 from clpipe.chain.drawing import draw_of, extremes_of, values_of
 from clpipe.chain.draws import TINY, Choice, Draw, Limits, limits_of
-from clpipe.chain.keys import CODE, KEYS, MAX_STAGES, OUTPUT, check_type, names_in
+from clpipe.chain.keys import CODE, KEYS, LENS, MAX_STAGES, OUTPUT, check_type, names_in
 from clpipe.chain.methods import (
     base_name,
     chosen_method,
@@ -46,6 +46,10 @@ class Settings:
 
     camera: str = DEFAULT_CAMERA
     iso: float = 100.0
+    lens: str = ""  # a name in lensfun's database
+    focal_length: float | None = None  # mm; None is that of a lens that has one alone
+    aperture: float | None = None  # f-number; None is no vignetting
+    focus_distance: float | None = None  # m; None is far away
     seed: int = 0
     noise_key: str = ""  # "" follows from the image and the ISO
     raw_size: str = ""  # of headerless dumps: WIDTHxHEIGHT
@@ -69,6 +73,7 @@ class Settings:
     def record(self) -> dict[str, Any]:
         """The settings as nested JSON values, which :func:`settings_from` reads back."""
         plain: dict[str, Any] = {"camera": self.camera, "iso": self.iso, "seed": self.seed}
+        plain |= {key: value for key in LENS if (value := getattr(self, key))}
         if self.noise_key:
             plain["noise_key"] = self.noise_key
         if self.dump:
@@ -108,7 +113,8 @@ class Settings:
         """The values that are set and not drawn, by their dotted names."""
         tables = {**self.parameters, OUTPUT: self.output.model_dump(exclude_defaults=True)}
         named = {f"{name}.{key}": v for name, table in tables.items() for key, v in table.items()}
-        return {"iso": self.iso, "camera": self.camera, **named}
+        lens = {key: value for key in LENS if (value := getattr(self, key))}
+        return {"iso": self.iso, "camera": self.camera, **lens, **named}
 
     def table(self, step: str) -> dict[str, Any]:
         """The values and draws of a step, or of the output."""
@@ -168,6 +174,8 @@ class Settings:
             KeyedError: its step has no such method.
         """
         step, _, name = key.partition(".")
+        if key in LENS:
+            return None if key == "lens" else Limits(low=TINY)
         if key in ("iso", "camera") or name == "method":
             return isos if key == "iso" else None
         return limits_of(self.models(step)[0], name)
@@ -261,6 +269,7 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
 # A camera has one name, however it is called, so that requests can be compared.
 CONVERSIONS: dict[str, Callable[[Any], Any]] = {
     "iso": float,
+    **dict.fromkeys(LENS[1:], float),
     "camera": lambda name: built_in_name(name) or name,
 }
 

@@ -54,6 +54,15 @@ _CHAIN_OPTIONS = (
     config_option,
     camera_option,
     iso_option,
+    click.option(
+        "--lens",
+        metavar="NAME",
+        help="A lens of lensfun's database: its distortion, lateral colour and vignetting. "
+        "[default: none]",
+    ),
+    click.option("--focal-length", type=float, help="That of a zoom lens, in mm."),
+    click.option("--aperture", type=float, help="Its f-number; without it, no vignetting."),
+    click.option("--focus-distance", type=float, help="In m. [default: far away]"),
     click.option("--seed", type=int, help=f"The seed of the noise. [default: {DEFAULTS.seed}]"),
     click.option(
         "--noise-key",

@@ -247,17 +247,29 @@ class Runner:
         for resampling, size in zip(plan.resamplings, sizes, strict=False):
             resampling.values(*size)  # refuses what an image of that size cannot be made with
         results = self.device.submit(plan, image, bind, *options)
-        return lambda: self._result(plan, results())
+        return lambda: self._result(plan, results(), self._of_size(*image.shape[1::-1]))
+
+    def _of_size(self, width: int, height: int) -> dict[str, dict[str, float]]:
+        """What steps say that follows from the size of their image, by step."""
+        found = {}
+        for step in self.chain.steps:
+            if values := step.method.of_size(width, height):
+                found[step.name] = dict(values)
+            for pass_ in step.method.passes():
+                if pass_.resampling:
+                    width, height = pass_.resampling.resized(width, height)
+        return found
 
     @staticmethod
-    def _result(plan: Plan, output: HostImages) -> Result:
+    def _result(plan: Plan, output: HostImages, of_size: dict[str, dict[str, float]]) -> Result:
         """What the device made of an image, by steps."""
         names = {x.op.step: x.op.pass_.estimates for x in plan.launches if isinstance(x, Finalize)}
         return Result(
             final=output.images.get(plan.final.number) if plan.final else None,
             encoded=output.encoded,
             kept={name: output.images[i.number] for name, i in plan.kept if output.images},
-            estimates={
+            estimates=of_size
+            | {
                 step: dict(zip(names[step], map(float, values), strict=False))
                 for step, values in output.estimates.items()
             },
@@ -288,7 +300,8 @@ class Runner:
         whole = self.encode or self.final
         steps = (self.chain if whole else self.chain.through(self.keep)).steps
         for step in steps:
-            frame = Frame(step.context, streams(self.chain, step, noise_key), {})
+            of_size = dict(step.method.of_size(*image.shape[1::-1]))
+            frame = Frame(step.context, streams(self.chain, step, noise_key), of_size)
             with user_code_errors(f"stage {step.name}", step.stage.folder):
                 image = step.method.reference(image, frame)
             if step.name in self.keep:

@@ -14,6 +14,7 @@ from typing import Any
 
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
+from clpipe.chain.keys import LENS
 from clpipe.chain.toml import toml_value
 
 Record = Callable[[], dict[str, Any]]  # the values of a row by column, or a RequestError
@@ -22,7 +23,7 @@ TEXTS = ("path", "name")  # columns that are text, whatever they look like
 
 OWN = (*TEXTS, "frames")  # columns that are no settings
 
-PLAIN = ("iso", "camera", "seed", "noise_key")  # columns of settings that stand in no table
+PLAIN = ("iso", "camera", *LENS, "seed", "noise_key")  # columns of settings that stand in no table
 
 
 def csv_records(

@@ -122,11 +122,12 @@ class Lens:
         tangential: p1 and p2 of Brown and Conrady's model.
         focal: fx and fy in px, in which the model counts.
         share: without ``focal``, the focal length over the longer side; without either, the model
-            counts in half short sides.
+            counts as lateral colour does.
         centre: the principal point in px from the corner; None, or None of one of them, is the
             middle.
-        red, blue: lateral colour: r of red, or blue, from r of green, in the picture, both in half
-            short sides.
+        red, blue: lateral colour: r of red, or blue, from r of green, in the picture; r = 1 is half
+            the short side.
+        half_diagonals: what r = 1 of lateral colour is instead, in half diagonals of the image.
         fit: whether the picture is scaled about the principal point so that it shows as much as
             leaves no void.
     """
@@ -138,6 +139,7 @@ class Lens:
     centre: tuple[float | None, float | None] = (None, None)
     red: Radial = Radial()
     blue: Radial = Radial()
+    half_diagonals: float | None = None
     fit: bool = False
 
     @cached_property
@@ -145,7 +147,7 @@ class Lens:
         return hash(
             (
                 *(self.radial, self.tangential, self.focal, self.share, self.centre),
-                *(self.red, self.blue, self.fit),
+                *(self.red, self.blue, self.half_diagonals, self.fit),
             )
         )
 
@@ -160,8 +162,15 @@ class Lens:
 
     def unit(self, width: int, height: int) -> tuple[float, float]:
         """What r = 1 is in an image, in px across and down."""
-        side = self.share * max(width, height) if self.share else min(width, height) / 2
+        side = self.share * max(width, height) if self.share else self.side(width, height)
         return self.focal or (side, side)
+
+    def side(self, width: int, height: int) -> float:
+        """What r = 1 of lateral colour is in an image, in px."""
+        across, down = max(width - 1, 1), max(height - 1, 1)  # as lensfun counts
+        if self.half_diagonals:
+            return float(self.half_diagonals * np.hypot(across, down) / 2)
+        return min(across, down) / 2
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """See :meth:`clpipe.reference.geometry.Geometry.size`."""
@@ -200,7 +209,7 @@ class _Bend:
     """A lens before an image of some size, its picture scaled by ``scale``."""
 
     def __init__(self, lens: Lens, width: int, height: int, scale: float) -> None:
-        self.lens, self.scale, self.side = lens, scale, min(width, height) / 2
+        self.lens, self.scale, self.side = lens, scale, lens.side(width, height)
         self.unit = lens.unit(width, height)
         middle = width / 2, height / 2
         self.centre = tuple(m if c is None else c for c, m in zip(lens.centre, middle, strict=True))

@@ -4,7 +4,7 @@ The render is without distortion, and the picture has it. For each pixel of the 
 that it shows is found by inverting the model (:mod:`clpipe.reference.lens`), and each channel is
 gathered there in one resampling (:mod:`clpipe.reference.warp`). Lateral colour and lensfun's models
 are those of lensfun (lensfun.github.io, "Lens correction models"), with r = 1 at half the short
-side of the image.
+side of the image, between the centres of the outermost pixels.
 """
 
 from collections.abc import Mapping
@@ -39,10 +39,8 @@ class NoDistortion(Unchanged):
     summary: ClassVar = "straight lines stay straight"
 
 
-class Distortion(Method):
-    """A lens's distortion and lateral colour, in one resampling."""
-
-    kernel: ClassVar = "distortion"
+class HasPicture(Method):
+    """What is said of the picture, whatever the lens."""
 
     cx: float | None = parameter(
         None, "Principal point, from the left edge: OpenCV's cx + 0.5.", "px", "the middle"
@@ -50,6 +48,37 @@ class Distortion(Method):
     cy: float | None = parameter(
         None, "Principal point, from the upper edge: OpenCV's cy + 0.5.", "px", "the middle"
     )
+    fit: bool = parameter(
+        False, "Scale the picture so that it shows as much of the render as leaves no void."
+    )
+    filter: Literal["bicubic", "lanczos3"] = parameter(
+        "bicubic",
+        "How pixels are weighted: bicubic (Catmull-Rom), or lanczos3, which is sharper and rings.",
+        structural=True,
+    )
+
+
+class FromLens(Unchanged, HasPicture):
+    """What lensfun knows of the lens that ``--lens`` names; without it, no distortion."""
+
+    method: ClassVar = "lens"
+    summary: ClassVar = "that of the lens which --lens names; none without it"
+
+    def resolve(self, context: Context) -> Method:
+        """The model of the lens with its coefficients."""
+        table = context.lens.get("distortion") if context.lens else None
+        if not table:
+            return NoDistortion()
+        own = {name: getattr(self, name) for name in HasPicture.model_fields}
+        values = {name: value for name, value in table.items() if name != "method"}
+        return STAGE.by_name[table["method"]](**own, **values).resolve(context)
+
+
+class Distortion(HasPicture):
+    """A lens's distortion and lateral colour, in one resampling."""
+
+    kernel: ClassVar = "distortion"
+
     kr: float = parameter(
         1.0, "Lateral colour, linear: size of red over that of green.", gt=0.5, lt=2
     )
@@ -62,14 +91,6 @@ class Distortion(Method):
     vb: float = parameter(1.0, "Lateral colour, poly3, blue: r (vb + cb r + bb r^2).", gt=0.5, lt=2)
     cb: float = parameter(0.0, "See vb.", ge=-1, le=1)
     bb: float = parameter(0.0, "See vb.", ge=-1, le=1)
-    fit: bool = parameter(
-        False, "Scale the picture so that it shows as much of the render as leaves no void."
-    )
-    filter: Literal["bicubic", "lanczos3"] = parameter(
-        "bicubic",
-        "How pixels are weighted: bicubic (Catmull-Rom), or lanczos3, which is sharper and rings.",
-        structural=True,
-    )
 
     def radial(self) -> Radial:
         """The model."""
@@ -107,6 +128,10 @@ class Distortion(Method):
 
     def geometry(self) -> Lens | None:
         return self.lens() if self.passes() else None
+
+    def of_size(self, width: int, height: int) -> Mapping[str, float]:
+        """What ``fit`` makes of the focal length: its factor."""
+        return {"focal_length_factor": self.lens().scale(width, height)} if self.fit else {}
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         filter_ = warp.FILTERS[self.filter]
@@ -150,6 +175,15 @@ class InFocalLengths(Distortion):
                 "and sensor_width (mm)"
             )
         return self.filled(fy=self.fx)
+
+    def of_size(self, width: int, height: int) -> Mapping[str, float]:
+        """What ``fit`` makes of the focal length: its factor, and the focal length in px."""
+        found = super().of_size(width, height)
+        if not found:
+            return found
+        unit = self.lens().unit(width, height)
+        fx, fy = (found["focal_length_factor"] * each for each in unit)
+        return {**found, "fx": fx, "fy": fy}
 
     def lens(self) -> Lens:
         lens = super().lens()
@@ -220,7 +254,21 @@ class Fisheye(InFocalLengths):
         return Radial.of(*powers, of_angle=True)
 
 
-class Poly3(Distortion):
+class OfLensfun(Distortion):
+    """A model of lensfun, which counts as its lateral colour does."""
+
+    unit: float | None = parameter(
+        None,
+        "What r = 1 is, in half diagonals of the image, where it is not half the short side.",
+        gt=0.01,
+        le=100,
+    )
+
+    def lens(self) -> Lens:
+        return replace(super().lens(), half_diagonals=self.unit)
+
+
+class Poly3(OfLensfun):
     """r_d = r (1 - k1 + k1 r^2), lensfun's model of that name."""
 
     method: ClassVar = "poly3"
@@ -233,7 +281,7 @@ class Poly3(Distortion):
         return Radial.of(1 - self.k1, 0.0, self.k1)
 
 
-class Poly5(Distortion):
+class Poly5(OfLensfun):
     """r_d = r (1 + k1 r^2 + k2 r^4), lensfun's model of that name."""
 
     method: ClassVar = "poly5"
@@ -247,7 +295,7 @@ class Poly5(Distortion):
         return Radial.of(1.0, 0.0, self.k1, 0.0, self.k2)
 
 
-class PtLens(Distortion):
+class PtLens(OfLensfun):
     """r_d = r (a r^3 + b r^2 + c r + 1 - a - b - c), lensfun's and Hugin's model of that name."""
 
     method: ClassVar = "ptlens"
@@ -267,5 +315,5 @@ STAGE = Stage(
     "Bend the picture as a lens does, and part its colours.",
     Kind.RGB,
     Kind.RGB,
-    (NoDistortion, BrownConrady, Fisheye, Poly3, Poly5, PtLens),
+    (FromLens, NoDistortion, BrownConrady, Fisheye, Poly3, Poly5, PtLens),
 )

@@ -32,16 +32,30 @@ class NoVignetting(Unchanged):
     summary: ClassVar = "the corners are as bright as the middle"
 
 
+class FromLens(Unchanged):
+    """What lensfun knows of the lens that ``--lens`` names, at the f-number of ``--aperture``."""
+
+    method: ClassVar = "lens"
+    summary: ClassVar = "that of the lens which --lens names, at --aperture; none without these"
+
+    def resolve(self, context: Context) -> Method:
+        """The model of the lens with its coefficients."""
+        table = context.lens.get("vignetting") if context.lens else None
+        if not table:
+            return NoVignetting()
+        return Pa(**{name: value for name, value in table.items() if name != "method"})
+
+
 class Pa(Method):
-    """v * (1 + k1 r^2 + k2 r^4 + k3 r^6), r = 1 at the corner: lensfun's model of that name.
+    """v * (1 + k1 r^2 + k2 r^4 + k3 r^6), r = 1 at the last pixel of a corner: lensfun's model of that name.
 
     These are what lensfun's calibrations describe, the lens itself, so k1 is mostly below 0;
     lensfun divides by it, to take it away. No light is below 0.
 
     >>> from clpipe.stage import run_reference
-    >>> row = run_reference(Pa(k1=-0.9), np.ones((3, 3, 3), np.float32))[1, :, 0]
+    >>> row = run_reference(Pa(k1=-0.5), np.ones((3, 3, 3), np.float32))[1, :, 0]
     >>> [round(float(v), 3) for v in row]
-    [0.8, 1.0, 0.8]
+    [0.75, 1.0, 0.75]
     """
 
     method: ClassVar = "pa"
@@ -63,7 +77,7 @@ class Pa(Method):
         return {"extent": Literal("e"), **ks}
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        sides: Floats = np.array(image.shape[:2], np.float32)
+        sides: Floats = np.maximum(np.array(image.shape[:2], np.float32) - 1, 1)
         corner = (sides * sides).sum(keepdims=True) * np.float32(0.25)
         r2 = _squared_radius(image) * _reciprocal(corner)
         k1, k2, k3 = map(np.float32, (self.k1, self.k2, self.k3))
@@ -153,5 +167,5 @@ STAGE = Stage(
     "Darken the corners as a lens does.",
     Kind.RGB,
     Kind.RGB,
-    (NoVignetting, Pa, CosineFourth),
+    (FromLens, NoVignetting, Pa, CosineFourth),
 )

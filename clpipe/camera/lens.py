@@ -1,0 +1,235 @@
+"""Lenses by name, from lensfun's database: what they do to a picture, as parameters of stages."""
+
+import re
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from functools import cache, lru_cache
+from math import hypot
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from clpipe.base.errors import KeyedError, RequestError
+from clpipe.base.text import one_line
+from clpipe.camera.profile import Camera
+
+INSTALL = "pip install 'clpipe[lens]'"
+FAR = 1000.0  # m, at which lensfun's calibrations for infinity stand
+OTHERS = 2  # words of a lens's name, beside the maker, that may be left out
+ASPECT = 1.5  # of the pictures that a lens was calibrated with, where the database says nothing
+
+Tables = Mapping[str, Mapping[str, Any]]
+
+
+def lens_tables(
+    name: str,
+    camera: Camera,
+    focal_length: float | None = None,
+    aperture: float | None = None,
+    focus_distance: float | None = None,
+) -> Tables:
+    """The tables of the stages ``distortion`` and ``vignetting`` that describe a lens.
+
+    Args:
+        name: the model, or a part of it that belongs to no other.
+        camera: where lensfun knows it, the picture is of its sensor's size; else of that of the
+            camera that the lens was calibrated on.
+        focal_length: in mm; None is that of a lens that has one alone.
+        aperture: the f-number; without it there is no vignetting.
+        focus_distance: in m; None is far away.
+
+    Raises:
+        RequestError: lensfunpy is not installed, there is no such lens, or it cannot be set so.
+    """
+    # A camera is no key of a cache.
+    models = camera.make, camera.model, *camera.aliases
+    return _tables(name, models, focal_length, aperture, focus_distance)
+
+
+@lru_cache(maxsize=256)
+def _tables(
+    name: str,
+    models: tuple[str, ...],
+    focal_length: float | None,
+    aperture: float | None,
+    focus_distance: float | None,
+) -> Tables:
+    database = _database()
+    crop = _crop_factor(database, *models)
+    lens = _found(database, name, crop)
+    focal = _focal_length(lens, focal_length)
+    ratio = lens.crop_factor / (crop or lens.crop_factor)
+    tables: dict[str, dict[str, Any]] = {"distortion": {}, "vignetting": {}}
+    if bend := _bend(lens, focal):
+        # lensfun's r = 1 is half the short side of the picture that the lens was calibrated with.
+        tables["distortion"] = bend | {"unit": 1 / (hypot(1, _aspect(lens)) * ratio)}
+    if aperture is not None:
+        _check_aperture(lens, aperture)
+        found = lens.interpolate_vignetting(focal, aperture, focus_distance or FAR)
+        if found and found.model.name == "PA":
+            terms = (term * ratio ** (2 * i) for i, term in enumerate(found.terms, 1))
+            tables["vignetting"] = {"method": "pa"} | dict(
+                zip(("k1", "k2", "k3"), terms, strict=True)
+            )
+    return tables
+
+
+def _bend(lens: Any, focal: float) -> dict[str, Any]:
+    """The method of ``distortion`` and its coefficients; empty where lensfun knows none."""
+    bend = lens.interpolate_distortion(focal)
+    lateral = lens.interpolate_tca(focal)
+    names = {"POLY3": ("k1",), "POLY5": ("k1", "k2"), "PTLENS": ("a", "b", "c")}
+    table: dict[str, Any] = {}
+    if bend and bend.model.name in names:
+        table = {"method": bend.model.name.lower()}
+        table |= dict(zip(names[bend.model.name], bend.terms, strict=False))
+    colours = {"LINEAR": ("kr", "kb"), "POLY3": ("vr", "vb", "cr", "cb", "br", "bb")}
+    if lateral and lateral.model.name in colours:
+        own = dict(zip(colours[lateral.model.name], lateral.terms, strict=False))
+        table = {"method": "poly3", **table, **own}
+    return table
+
+
+def _database() -> Any:
+    try:
+        return _loaded()
+    except ImportError:
+        raise KeyedError(
+            "lens", f"lens: lensfun's database comes with lensfunpy, which is not here; {INSTALL}"
+        ) from None
+
+
+@cache
+def _loaded() -> Any:
+    import lensfunpy
+
+    return lensfunpy.Database()
+
+
+def _words(text: str) -> list[str]:
+    """The words of a lens's name, however they are divided, without mm and f.
+
+    >>> _words("EF 24-70mm f/2.8L"), _words("ef24-70 F2.8 l")
+    (['ef', '24', '70', '2.8', 'l'], ['ef', '24', '70', '2.8', 'l'])
+    """
+    words = re.findall(r"[a-z]+|\d+(?:\.\d+)?", text.lower())
+    return [word for word in words if word not in ("mm", "f")]
+
+
+def _full(lens: Any) -> str:
+    """Maker and model, the maker once."""
+    of_maker = lens.model.lower().startswith(lens.maker.lower())
+    return lens.model if of_maker else f"{lens.maker} {lens.model}"
+
+
+def _found(database: Any, name: str, crop: float | None) -> Any:
+    """The lens of a name: of those that have all its words, the one with the fewest others, and
+    not many (:data:`OTHERS`).
+
+    Of several calibrations of one lens it is that on the largest sensor that is not larger than the
+    camera's, as lensfun chooses.
+
+    Raises:
+        KeyedError: there is no such lens, or several.
+    """
+    wanted = _words(name)
+    having = [
+        (len(words) - len(wanted), lens)
+        for lens in database.lenses
+        if not _missing(wanted, words := _words(_full(lens)))
+    ]
+    if not wanted or not having:
+        names = sorted({_full(lens) for lens in database.lenses})
+        by_lower = {each.lower(): each for each in names}
+        near = [by_lower[each] for each in get_close_matches(name.lower(), by_lower, 3, 0.3)]
+        raise KeyedError(
+            "lens",
+            f"lens: lensfun knows no '{one_line(name)}'; the nearest are {', '.join(near)}",
+        )
+    fewest = min(count for count, _ in having)
+    best = [lens for count, lens in having if count == fewest]
+    models = sorted({_full(lens) for lens in best})
+    others = fewest - len(set(_words(best[0].maker)) - set(wanted))
+    if len(models) > 1 or others > OTHERS:
+        models = sorted({_full(lens) for _, lens in having})
+        more = f" or one of {len(models) - 5} others" if len(models) > 5 else ""
+        raise KeyedError("lens", f"lens: '{one_line(name)}' may be {' or '.join(models[:5])}{more}")
+    smaller = [lens for lens in best if crop and lens.crop_factor <= crop * 1.01]
+    return max(smaller or best, key=lambda lens: lens.crop_factor if smaller else -lens.crop_factor)
+
+
+def _missing(wanted: Sequence[str], words: Sequence[str]) -> bool:
+    """Whether a word is wanted more often than it is there."""
+    return any(words.count(word) < wanted.count(word) for word in wanted)
+
+
+def _crop_factor(database: Any, make: str, *models: str) -> float | None:
+    """The crop factor of a camera, None where lensfun does not know it."""
+    for model in models:
+        for found in database.find_cameras(make, model):
+            return float(found.crop_factor)
+    return None
+
+
+def _focal_length(lens: Any, focal: float | None) -> float:
+    """A focal length that the lens has, in mm.
+
+    Raises:
+        RequestError: it has no such one, or several and none is set; or it is a fisheye.
+    """
+    name, low, high = _full(lens), lens.min_focal, lens.max_focal or lens.min_focal
+    if lens.type.name != "RECTILINEAR":
+        raise KeyedError(
+            "lens",
+            f"lens: {name} is no rectilinear lens, and lensfun describes it as departing from "
+            "another projection than a render's; set distortion.method=fisheye and its k1 to k4",
+        )
+    if focal is None:
+        if low != high:
+            raise RequestError(f"focal_length: {name} is a zoom; set {low:g} to {high:g} mm")
+        return float(low)
+    if not low - 0.05 <= focal <= high + 0.05:
+        raise KeyedError(
+            "focal_length",
+            f"focal_length: found {focal:g} mm, but {name} has {low:g}"
+            + (f" to {high:g} mm" if low != high else " mm alone"),
+        )
+    return focal
+
+
+def _check_aperture(lens: Any, aperture: float) -> None:
+    """See that a lens can be set to an f-number, where lensfun knows its range.
+
+    Raises:
+        KeyedError: it cannot.
+    """
+    low, high = lens.min_aperture, lens.max_aperture
+    if (low and aperture < low - 0.06) or (high > low and aperture > high + 0.06):
+        most = f" to f/{high:g}" if high > low else " and above"
+        raise KeyedError(
+            "aperture", f"aperture: found f/{aperture:g}, but {_full(lens)} has f/{low:g}{most}"
+        )
+
+
+def _aspect(lens: Any) -> float:
+    """The longer side over the shorter of the pictures that a lens was calibrated with."""
+    return _aspects().get((lens.maker, lens.model, round(lens.crop_factor, 3)), ASPECT)
+
+
+@cache
+def _aspects() -> dict[tuple[str, str, float], float]:
+    """The aspect ratios that the database has, by maker, model and crop factor.
+
+    lensfunpy gives all but these, so they are read in its files.
+    """
+    import lensfunpy
+
+    aspects = {}
+    for path in Path(lensfunpy.__file__).parent.glob("db_files/*.xml"):
+        for lens in ElementTree.parse(path).iter("lens"):  # noqa: S314 - a file of the package
+            if text := lens.findtext("aspect-ratio"):
+                width, _, height = text.partition(":")
+                key = lens.findtext("maker", ""), lens.findtext("model", "")
+                crop = round(float(lens.findtext("cropfactor", "1")), 3)
+                aspects[(*key, crop)] = float(width) / float(height or 1)
+    return aspects
