@@ -246,7 +246,7 @@ def test_brooks_2019():
         ("iso = { log_uniform = [0, 100] }", "both ends must be above 0"),
         ("iso = { normal = [800, -1] }", "the standard deviation is 0 or above"),
         ("iso = { uniform = [100, 200], sigma = 2 }", "unknown key of uniform 'sigma'"),
-        ("seed = { choice = [1, 2] }", "line 1: seed: found .*cannot be drawn; iso, camera and"),
+        ("seed = { choice = [1, 2] }", "line 1: seed: found .*cannot be drawn; iso, camera, lens"),
         ("raw_size = { choice = ['8x8'] }", "raw_size: found .*cannot be drawn"),
         ("camera = { uniform = [1, 2] }", "camera: found .*but it is drawn by choice"),
         ("camera = { choice = [3] }", "camera: found 3, but it is text"),

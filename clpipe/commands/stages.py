@@ -83,7 +83,7 @@ def resolved(method: type[Method], context: Context) -> dict[str, str]:
         automatic = [name for name in automatic if name not in method.example]
     except ClpipeError as error:
         return dict.fromkeys(automatic, str(error))
-    return {name: short_text(getattr(values, name)) for name in automatic}
+    return {name: short_text(getattr(values, name, None)) for name in automatic}
 
 
 def context_for(stage: Stage, settings: Settings) -> Context:

@@ -47,7 +47,7 @@ class FromLens(Unchanged):
 
 
 class Pa(Method):
-    """v * (1 + k1 r^2 + k2 r^4 + k3 r^6), r = 1 at the last pixel of a corner: lensfun's model of that name.
+    """v * (1 + k1 r^2 + k2 r^4 + k3 r^6), r = 1 at the last pixel of a corner: lensfun's pa.
 
     These are what lensfun's calibrations describe, the lens itself, so k1 is mostly below 0;
     lensfun divides by it, to take it away. No light is below 0.
