@@ -25,7 +25,7 @@ from clpipe.inputs.carry import Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.renditions import Rendition
-from clpipe.outputs.sidecar import SIDECAR, sidecar, write_sidecar
+from clpipe.outputs.sidecar import SIDECAR, intrinsics_of, sidecar, write_sidecar
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
@@ -201,6 +201,7 @@ class ImageWorker:
             task.status = LEFT_OUT
             return
         self.writer.check_size(loaded.source, loaded.chain)
+        intrinsics_of(loaded.chain, loaded.source)  # or they are refused
         if any(self.writer.carries(job, name) for name in names):
             turn = self.writer.turn_of(loaded.source, loaded.chain)
             task.carried = task.loader.carried(job, loaded, turn)

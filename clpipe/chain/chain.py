@@ -15,6 +15,7 @@ from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
 from clpipe.reference.geometry import Composition
+from clpipe.reference.intrinsics import Intrinsics
 from clpipe.reference.resample import Resampler, sizes
 from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
 
@@ -79,6 +80,19 @@ class Chain:
         """Where the pixels of what comes out come from in what enters; None if each stays."""
         moves = tuple(filter(None, (step.method.geometry() for step in self.steps)))
         return Composition(moves) if moves else None
+
+    def intrinsics(self, width: int, height: int, shot: Mapping[str, float]) -> Intrinsics | None:
+        """The intrinsics of what comes out; None where they are not known.
+
+        Args:
+            width, height: of what enters, in px.
+            shot: what is known of it, see :meth:`Intrinsics.of_render`.
+
+        Raises:
+            RequestError: they contradict those of a lens.
+        """
+        known = Intrinsics.of_render(width, height, shot)
+        return self.geometry.intrinsics(known, width, height) if self.geometry else known
 
     @cached_property
     def _resamplings(self) -> tuple[Resampler, ...]:

@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 SIMULATED = "clpipe "  # prefix of the camera's model in a DNG that clpipe writes
 Length = Annotated[float, Field(gt=0, le=10000, allow_inf_nan=False)]
+Pixels = Annotated[float, Field(gt=0, le=1e7, allow_inf_nan=False)]
 
 
 class Output(BaseModel):
@@ -20,6 +21,12 @@ class Output(BaseModel):
     exposure_time: Annotated[float, Field(gt=0, le=86400, allow_inf_nan=False)] | None = None  # s
     focal_length: Length | None = None  # mm
     sensor_width: Length | None = None  # mm, along the longer side of the image
+    # Of the render, in px, the first pixel's centre at 0.5; None follows from the lengths in mm
+    # and the middle of the image.
+    fx: Pixels | None = None
+    fy: Pixels | None = None
+    cx: float | None = None
+    cy: float | None = None
 
     def filled(self, shot: Mapping[str, float]) -> "Output":
         """A copy in which ``shot``, what a source says of itself, fills the fields that are None.

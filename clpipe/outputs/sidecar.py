@@ -23,6 +23,7 @@ from clpipe.inputs.carry import Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.raw import RawImage
 from clpipe.outputs.renditions import Rendition
+from clpipe.reference.intrinsics import Intrinsics
 
 SIDECAR = "json"  # the ending of its name
 
@@ -104,6 +105,17 @@ def json_text(record: Mapping[str, Any]) -> str:
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
+def intrinsics_of(chain: Chain, source: SourceImage) -> Intrinsics | None:
+    """The intrinsics of an image's picture; None where they are not known.
+
+    Raises:
+        RequestError: what is said of the render contradicts a lens of the chain.
+    """
+    height, width = source.pixels.shape[:2]
+    shot = chain.settings.output.filled(source.shot).model_dump(exclude_none=True)
+    return chain.intrinsics(width, height, shot)
+
+
 def subframe_records(source: SourceImage) -> list[dict[str, str]]:
     """The files that an exposure is the mean of, relative to the folder of the first."""
     return [{"file": name, "sha256": digest} for name, digest in source.subframes]
@@ -140,12 +152,13 @@ def sidecar(
     chain = rendition.whole
     facts = source.facts if isinstance(source, RawImage) else None
     noise = chain.noise if not facts or chain.is_noisy else None
-    size, modified = stamp
+    bytes_, modified = stamp
     width, height = chain.size(*source.pixels.shape[1::-1])
+    intrinsics = intrinsics_of(chain, source)
     return {
         OWN: __version__,
         "input": job.input,
-        "input_size": size,
+        "input_size": bytes_,
         "input_modified": modified,
         "sha256": source.sha256,
         **({"subframes": subframe_records(source)} if source.subframes else {}),
@@ -161,6 +174,7 @@ def sidecar(
         "camera": chain.camera.name,
         "iso": chain.iso,
         "output": chain.settings.output.filled(source.shot).model_dump(),
+        "intrinsics": intrinsics.record() if intrinsics else None,
         "noise": noise.record() if noise else None,
         "starts_on": chain.source.label,
         **({"raw": asdict(facts)} if facts else {}),

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from clpipe.base.types import Array
+from clpipe.reference.intrinsics import Intrinsics
 from clpipe.reference.resample import Resampling, sizes
 
 
@@ -29,6 +30,14 @@ class Geometry(Protocol):
         Args:
             x, y: places in the result.
             width, height: of the image that it gets.
+        """
+        ...
+
+    def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
+        """Those of its result, from those of an image that it gets; None where they are not known.
+
+        Raises:
+            RequestError: they contradict what it does.
         """
         ...
 
@@ -54,6 +63,10 @@ class Scaling:
         """See :meth:`Geometry.origins`."""
         columns, rows = self.size(width, height)
         return x * (width / columns), y * (height / rows)
+
+    def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
+        """See :meth:`Geometry.intrinsics`."""
+        return before and before.scaled(*self.size(width, height))
 
 
 @dataclass(frozen=True)
@@ -85,6 +98,13 @@ class Composition:
             x, y = part.origins(x, y, *size)
         return x, y
 
+    def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
+        """See :meth:`Geometry.intrinsics`."""
+        for part in self.parts:
+            before = part.intrinsics(before, width, height)
+            width, height = part.size(width, height)
+        return before
+
 
 @dataclass(frozen=True)
 class Orientation:
@@ -102,6 +122,10 @@ class Orientation:
         """See :meth:`Geometry.origins`."""
         x, y = (y, x) if self.transposed else (x, y)
         return width - x if self.mirrored else x, height - y if self.upside_down else y
+
+    def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
+        """See :meth:`Geometry.intrinsics`; a turned picture has none of these models."""
+        return None
 
 
 RESIDUAL = 1e-6  # px, in the image that a geometry gets

@@ -11,8 +11,9 @@ from typing import Self
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval
 
-from clpipe.base.errors import ImageError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
+from clpipe.reference.intrinsics import FULL_OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
 
 # Newton's method ends where the place that it finds is bent to within this of the place asked for,
 # in the unit of r: 4e-9 px for a focal length of 4000 px.
@@ -196,6 +197,51 @@ class Lens:
         scale = fitting_scale(self, width, height) if self.fit else 1.0
         return _Bend(self, width, height, scale).seen(x, y, lateral or Radial())
 
+    def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
+        """See :meth:`clpipe.reference.geometry.Geometry.intrinsics`.
+
+        Without those of the render they are what the model counts in, where that is focal lengths.
+        COLMAP's models hold those of Brown and Conrady, the fisheye's, poly3 and poly5, but not
+        ptlens, whose powers are odd.
+        """
+        unit = self.unit(width, height)
+        middle = width / 2, height / 2
+        centre = [m if c is None else c for c, m in zip(self.centre, middle, strict=True)]
+        counts = bool(self.focal or self.share)
+        if before is None:
+            if not counts:
+                return None
+            before = Intrinsics(width, height, *unit, centre[0], centre[1])
+        own = {"cx": centre[0], "cy": centre[1]} | (
+            {"fx": unit[0], "fy": unit[1]} if counts else {}
+        )
+        for name, value in own.items():
+            if not np.isclose(value, known := getattr(before, name), rtol=1e-6):
+                raise RequestError(
+                    f"distortion: its {name} is {value:g} px, but that of the render is {known:g} "
+                    f"px; set output.{name} and distortion to the same, or one of them"
+                )
+        if before.model != PINHOLE or (not counts and before.fx != before.fy):
+            return None
+        above, below = (_even(c) for c in (self.radial.numerator[1:], self.radial.denominator))
+        if above is None or below is None or max(len(above), len(below)) > 5:
+            return None
+        grown = 1.0 if counts else before.fx / unit[0]  # r over the radius in focal lengths
+        first, *others = above
+        k = [c / first * grown ** (2 * i) for i, c in enumerate(others, 1)]
+        longer = first * self.scale(width, height)
+        places = before.fx * longer, before.fy * longer, before.cx, before.cy
+        named = {f"k{i}": value for i, value in enumerate(k, 1)}
+        if self.radial.of_angle:
+            return Intrinsics(width, height, *places, OPENCV_FISHEYE, named)
+        if len(k) > 3 or len(below) > 4:
+            return None
+        under = {f"k{i + 3}": c * grown ** (2 * i) for i, c in enumerate(below) if i}
+        p1, p2 = self.tangential
+        return Intrinsics(
+            width, height, *places, FULL_OPENCV, {**named, **under, "p1": p1, "p2": p2}
+        )
+
     def scale(self, width: int, height: int) -> float:
         """By how much ``fit`` makes an image's focal length longer; 1 without it.
 
@@ -203,6 +249,11 @@ class Lens:
             ImageError: as :meth:`seen`.
         """
         return fitting_scale(self, width, height) if self.fit else 1.0
+
+
+def _even(powers: tuple[float, ...]) -> list[float] | None:
+    """The coefficients of even powers, from the lowest up; None where there are odd ones."""
+    return None if any(powers[1::2]) else list(powers[::2])
 
 
 class _Bend:
