@@ -8,6 +8,8 @@ import pytest
 
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
+from clpipe.images.read import SourceImage
+from clpipe.outputs.sidecar import intrinsics_of
 from clpipe.reference.geometry import destinations
 
 WIDTH, HEIGHT = 640, 420
@@ -71,6 +73,10 @@ def test_what_is_not_known_is_not_told():
     assert (
         told({"method": "ptlens", "a": 0.01, "b": -0.03, **PLACE}, RENDER) is None
     )  # no model of COLMAP's
+    # An image that enters behind the lens may have gone through one.
+    entered = make_chain(settings_from({**HALVED, "distortion": BROWN}), start_at="exposure")
+    image = SourceImage(np.zeros((HEIGHT, WIDTH, 3), np.float32), "", "", (), {}, RENDER)
+    assert intrinsics_of(entered, image) is None
     assert told(BROWN, {}).fx == pytest.approx(600 * 326 / 640)  # the lens knows it
 
 

@@ -106,11 +106,16 @@ def json_text(record: Mapping[str, Any]) -> str:
 
 
 def intrinsics_of(chain: Chain, source: SourceImage) -> Intrinsics | None:
-    """The intrinsics of an image's picture; None where they are not known.
+    """The intrinsics of a render's picture; None where they are not known.
+
+    They are not of a raw, whose lens is not known, and not of an image that enters in the midst of
+    a chain, which may have gone through a lens already.
 
     Raises:
         RequestError: what is said of the render contradicts a lens of the chain.
     """
+    if isinstance(source, RawImage) or chain.steps[0].name != chain.names[0]:
+        return None
     height, width = source.pixels.shape[:2]
     shot = chain.settings.output.filled(source.shot).model_dump(exclude_none=True)
     return chain.intrinsics(width, height, shot)
