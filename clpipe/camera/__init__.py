@@ -1,5 +1,6 @@
-"""What a sensor is: camera profiles and the noise model, with the built-in profiles as TOML.
+"""What a camera is: profiles of sensors and the noise model, and lenses by their names.
 
-Nothing here reads images or knows the chain; a profile answers "what is a and b at this ISO".
+Nothing here reads images or knows the chain; a profile, one of the built-in TOML files or a user's,
+answers "what is a and b at this ISO".
 It imports ``base`` only.
 """

@@ -67,6 +67,16 @@ def is_planar(image: Array) -> bool:
     return image.transpose(2, 0, 1).flags.c_contiguous
 
 
+def check_resamplings(plan: Plan, width: int, height: int) -> None:
+    """See that an image of that size can be resampled as a plan does.
+
+    Raises:
+        ImageError: it cannot, as a lens would fold it over.
+    """
+    for resampling, size in zip(plan.resamplings, plan.sizes(width, height), strict=False):
+        resampling.values(*size)
+
+
 def streams(chain: Chain, step: Step, noise_key: str) -> dict[NoiseScope, Stream]:
     """The random streams of a step for one image.
 
@@ -154,6 +164,10 @@ class Runner:
         if not self.device.is_ready(plan):
             shape = (8, 8, 3)[: 2 if len(self.chain.source.channels) == 1 else 3]
             tiny = np.zeros(shape, np.float16 if plan.half else np.float32)
+            try:
+                check_resamplings(plan, *shape[:2])
+            except ImageError:
+                return  # which larger images need not be refused for
             with announced(self.device.info):
                 self._submit_plan(plan, tiny, "")()
 
@@ -244,8 +258,7 @@ class Runner:
             stream = of[NoiseScope(parameter.item[:-1])]
             return np.uint32(stream.key1 if parameter.item.endswith("1") else stream.key0)
 
-        for resampling, size in zip(plan.resamplings, sizes, strict=False):
-            resampling.values(*size)  # refuses what an image of that size cannot be made with
+        check_resamplings(plan, *image.shape[1::-1])
         results = self.device.submit(plan, image, bind, *options)
         return lambda: self._result(plan, results(), self._of_size(*image.shape[1::-1]))
 
