@@ -23,6 +23,7 @@ from clpipe.engine.clipping import MUCH, clipped_share, clipping_text
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.kinds import CHANNELS, vectors_of
+from clpipe.inputs.depth import depth_of_array, lenses_of, warnings_of, with_depth
 from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
 from clpipe.stage import Kind
 
@@ -80,7 +81,9 @@ class Pipeline(ReadOnly):
         """The steps, each with its resolved parameters."""
         return self._runner.chain
 
-    def process(self, image: Array, key: str, **settings: Any) -> Result:
+    def process(
+        self, image: Array, key: str, depth: Array | None = None, **settings: Any
+    ) -> Result:
         """Run the chain on one image.
 
         Args:
@@ -91,6 +94,8 @@ class Pipeline(ReadOnly):
                 the image holds, and on the ISO. Who wants the same noise in several images, or in
                 one at several ISOs, gives them one ``noise_key``, which replaces these; that of a
                 picture of ``clpipe run`` stands in its sidecar, and repeats its noise.
+            depth: (height, width), for a chain with depth of field: in the unit that defocus says;
+                infinite, 1e9 or more or 0 where there is nothing.
             **settings: values for this image alone, as for the class. Another ISO, gain or noise
                 parameter costs nothing; for another method or size, kernels are compiled.
 
@@ -104,6 +109,12 @@ class Pipeline(ReadOnly):
         """
         runner = self._runner_for(key, settings)
         checked, chain = _checked(image, runner.chain.source), runner.chain
+        if checked.ndim == 3 and lenses_of(chain):
+            far = depth_of_array(depth, *checked.shape[1::-1])
+            for warning in warnings_of(chain, far):
+                warnings.warn(f"{key}: {warning}", stacklevel=2)
+            chain = with_depth(chain, far)
+            runner = runner.of(chain)
         own_key = image_key(key, "" if chain.settings.noise_key else digest_of(checked))
         with self._lock:
             result = runner.run(checked, noise_key(chain.settings, own_key))

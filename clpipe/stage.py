@@ -6,8 +6,9 @@ A stage is declared once, in ``clpipe/stages/<name>.py``, as a :class:`Stage` wi
 """
 
 import typing
+import weakref
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
 from pathlib import Path
@@ -21,6 +22,7 @@ from clpipe.camera.noise import NoiseModel
 from clpipe.camera.profile import DEFAULT_CAMERA, IDENTITY, Camera, Matrix, load_camera
 from clpipe.reference.cfa import PATTERNS, Pattern, red_site
 from clpipe.reference.curve import curve_index
+from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import Geometry
 from clpipe.reference.random import Stream, stream_of
 from clpipe.reference.resample import Resampler
@@ -152,6 +154,8 @@ class Context:
     clean: bool = False  # the image has no noise, and nothing may follow from what it would have
     black_level: float | None = None  # DN, as quantize used them
     white_level: float | None = None
+    # Of the image, which holds it: chains are kept longer. Chains of one structure are alike.
+    depth: weakref.ref[Depth] | None = field(default=None, compare=False, repr=False)
 
     def noise_parameters(self) -> tuple[float, float]:
         """The a and b of the noise that was added, else the camera's; of a clean image, zeros."""
@@ -381,12 +385,12 @@ def variants(method: type[Method]) -> Iterator[dict[str, Any]]:
     other examples. CFA patterns are no variants here, since they go with every variant.
     """
     yield {}
-    for name, field in method.model_fields.items():
-        extra: Any = field.json_schema_extra
-        choices = get_args(field.annotation)
-        named = get_origin(field.annotation) is typing.Literal and choices != PATTERNS
+    for name, declared in method.model_fields.items():
+        extra: Any = declared.json_schema_extra
+        choices = get_args(declared.annotation)
+        named = get_origin(declared.annotation) is typing.Literal and choices != PATTERNS
         if extra["structural"] and named:
-            yield from ({name: choice} for choice in choices if choice != field.default)
+            yield from ({name: choice} for choice in choices if choice != declared.default)
     yield from map(dict, method.other_examples)
 
 

@@ -87,7 +87,7 @@ def replay_of(
         frames = values.get("subframes") or [{"sha256": values["sha256"]}]
         for file, each in zip(replay.job.paths, frames, strict=True):
             files[str(file)] = str(each["sha256"])
-        for layer in values.get("carried", ()):
+        for layer in (*values.get("carried", ()), *values.get("depth", ())):
             files[str(replay.job.path.parent / layer["file"])] = str(layer["sha256"])
     except (KeyError, TypeError, ValueError, AttributeError, RequestError) as error:
         raise RequestError(f"{path}: it is damaged: {error}") from None

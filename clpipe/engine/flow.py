@@ -23,6 +23,8 @@ from clpipe.engine.tiles import Extents, Tiling, source_bytes
 from clpipe.engine.transfers import InPlace, Staged
 from clpipe.engine.writer import Parameter
 
+TABLES = 1 << 26  # bytes of arrays that stay on the device beyond the next image
+
 
 @dataclass(frozen=True)
 class Work:
@@ -122,7 +124,8 @@ class Flow:
 
         Where more than :attr:`depth` parts would be on the way, the oldest ones land.
         """
-        if len(self._tables) > 32:
+        held = sum(table.nbytes for table, _ in self._tables.values())
+        if len(self._tables) > 32 or held > TABLES:
             self._tables.clear()
         tiling = passage.tiling
         self.pool.reserve(self._transfers.needs(tiling.sizes), memory)

@@ -34,6 +34,7 @@ from clpipe.images.pixels import (
     display_window,
     make_finite,
 )
+from clpipe.reference.defocus import Depth
 from clpipe.reference.transfer import inverse_srgb_curve
 from clpipe.stage import Kind
 
@@ -52,6 +53,7 @@ class SourceImage:
     array. ``layer`` is the name of the layer that was read. ``attributes`` are clpipe's own, which
     a kept image has. ``shot`` is what the file says of exposure_time (s), focal_length and
     sensor_width (mm). ``subframes`` are the names and SHA-256 of files that were averaged.
+    ``depth`` is there where the chain needs it.
     """
 
     pixels: Array
@@ -61,6 +63,7 @@ class SourceImage:
     attributes: Mapping[str, str]
     shot: Mapping[str, float] = field(default_factory=dict)
     subframes: tuple[tuple[str, str], ...] = ()
+    depth: Depth | None = None
 
 
 @dataclass(frozen=True)

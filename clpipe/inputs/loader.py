@@ -23,6 +23,7 @@ from clpipe.images.read import (
     read_source,
 )
 from clpipe.inputs.carry import Carried, carry
+from clpipe.inputs.depth import lenses_of, read_depth, warnings_of, with_depth
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import KeptLoader, kind_message
 from clpipe.inputs.manifest import check_rows
@@ -159,9 +160,22 @@ class ImageLoader:
         None for one that was found in a folder of kept images and is not the one to go on from.
 
         Raises:
-            ImageError: it cannot enter there.
+            ImageError: it cannot enter there, or has no depth, which its chain needs.
             RequestError: its chain cannot be made.
         """
+        loaded = self._entered(job, source)
+        if loaded is None or not lenses_of(loaded.chain):
+            return loaded
+        chain, source, request = loaded.chain, loaded.source, self.request
+        most = request.max_pixels or USUAL_MAX_PIXELS
+        width, height = source.pixels.shape[1::-1]
+        depth = read_depth(job.path, chain, width, height, request.companions, most)
+        warnings = (*source.warnings, *warnings_of(chain, depth))
+        source = replace(source, depth=depth, warnings=warnings)
+        return LoadedImage(with_depth(chain, depth), source, loaded.key)
+
+    def _entered(self, job: Job, source: SourceImage) -> LoadedImage | None:
+        """See :meth:`enter`; without depth."""
         key = image_key(job.key, source.sha256)
         if isinstance(source, RawImage):
             chain, source = self.raw.enter(job.path, source)

@@ -122,7 +122,8 @@ def is_current(
     if (is_touched or verify) and values.get("sha256") != _digest_of(job):
         return False
     try:
-        return all(_is_same(job, each, verify) for each in values.get("carried", ()))
+        layers = (*values.get("carried", ()), *values.get("depth", ()))
+        return all(_is_same(job, each, verify) for each in layers)
     except (KeyError, TypeError):  # the sidecar is damaged
         return False
 

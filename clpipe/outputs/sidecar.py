@@ -195,6 +195,7 @@ def sidecar(
             for path, file in outputs.items()
         ],
         **({"carried": [layer.record for layer in carried.layers]} if carried else {}),
+        **({"depth": [source.depth.record]} if source.depth else {}),
         "warnings": list(source.warnings),
         "device": device_record(device),
         "versions": all_versions(),

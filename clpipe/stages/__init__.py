@@ -14,6 +14,7 @@ from clpipe.stage import Stage
 
 DEFAULT_CHAIN = (
     "shutter",
+    "defocus",
     "motion_blur",
     "distortion",
     "vignetting",

@@ -1,0 +1,147 @@
+"""The depth that defocus needs: found in an image's file or beside it, and given to its chain."""
+
+import os
+import weakref
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from clpipe.base.digests import digests, stamp_of
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.reading import unchanged
+from clpipe.base.types import Array, Floats
+from clpipe.chain.carry import Carry
+from clpipe.chain.chain import Chain
+from clpipe.images.passes import read_layer
+from clpipe.inputs.carry import Finder, FoundLayer
+from clpipe.reference.defocus import Depth, checked_depth
+from clpipe.stages.defocus import ThinLens
+
+USUAL = ("Depth", "Z", "ZDepth", "Distance")  # layers, in the order in which they are looked for
+
+
+def lenses_of(chain: Chain) -> dict[str, ThinLens]:
+    """The steps of a chain that need depth, by their names."""
+    return {s.name: s.method for s in chain.steps if isinstance(s.method, ThinLens)}
+
+
+def with_depth(chain: Chain, depth: Depth) -> Chain:
+    """The chain with the depth of an image, which must outlive its use there.
+
+    Plans and kernels stay those of the chain.
+
+    Raises:
+        RequestError: pixels were moved before, and depth was not.
+    """
+    reference = weakref.ref(depth)
+    lenses = lenses_of(chain)
+    names = [step.name for step in chain.steps]
+    for step in chain.steps[: max(map(names.index, lenses))]:
+        if step.method.geometry():
+            raise RequestError(
+                f"stages: {step.name} moves pixels before {[*lenses][-1]}, whose depth stays where "
+                "it is; put it behind"
+            )
+    steps = tuple(
+        replace(step, context=replace(step.context, depth=reference))
+        if step.name in lenses
+        else step
+        for step in chain.steps
+    )
+    return replace(chain, steps=steps)
+
+
+def warnings_of(chain: Chain, depth: Depth) -> list[str]:
+    """What is to be said of an image's discs: how many are larger than they may be."""
+    found = []
+    for name, lens in lenses_of(chain).items():
+        radii = abs(lens.radii(depth.pixels))
+        if count := np.count_nonzero(radii > lens.max_radius):
+            found.append(
+                f"{name}: {count} of {radii.size} pixels are spread over radii up to "
+                f"{radii.max():.1f} px; {name}.max_radius makes them {lens.max_radius} px"
+            )
+    return found
+
+
+def depth_of_array(pixels: Array | None, width: int, height: int) -> Depth:
+    """Depth that somebody gives with an image of that size.
+
+    Raises:
+        ImageError: it is missing, of another size, or no depth.
+    """
+    if pixels is None:
+        raise ImageError("defocus needs depth, (height, width): process(image, key, depth=depth)")
+    found = np.shape(pixels)
+    if found != (height, width):
+        raise ImageError(f"found depth of shape {found}; the image's is {(height, width)}")
+    return Depth(checked_depth(pixels))
+
+
+def read_depth(
+    path: Path, chain: Chain, width: int, height: int, patterns: Sequence[str], max_pixels: int
+) -> Depth:
+    """The depth of an image.
+
+    Args:
+        path: of the image.
+        chain: with a step that needs depth.
+        width: of the image in px, and its height.
+        height: see above.
+        patterns: of the names of companions, as for :func:`clpipe.inputs.carry.carry`.
+        max_pixels: a file that claims more is refused before memory is taken.
+
+    Raises:
+        ImageError: it is missing, damaged, of another size, NaN or negative.
+    """
+    name = next(lens.layer for lens in lenses_of(chain).values())
+    layer = _find(path, name, patterns)
+    with unchanged(layer.file):
+        pixels, (x, y), size = read_layer(layer.file, layer.location, max_pixels)
+        digest = digests([str(layer.file)]).get(str(layer.file), "")
+    if size != (width, height):
+        raise ImageError(
+            f"{layer.file}: its layer {layer.name} has {size[0]}x{size[1]} pixels, but the picture "
+            f"{path} has {width}x{height}; render both at one size"
+        )
+    try:
+        depth = checked_depth(_on_display(pixels[..., 0], x, y, width, height))
+    except ImageError as error:
+        raise ImageError(f"{layer.file}: layer {layer.name}: {error}") from None
+    length, modified = stamp_of(layer.file)
+    record = {
+        "layer": layer.name,
+        "file": os.path.relpath(layer.file, path.parent),
+        "size": length,
+        "modified": modified,
+        "sha256": digest,
+    }
+    return Depth(depth, record)
+
+
+def _find(path: Path, name: str, patterns: Sequence[str]) -> FoundLayer:
+    """The layer of that name; of "" the first of the usual ones that is there."""
+    errors = []
+    for asked in (name,) if name else USUAL:
+        try:
+            return Finder(path, patterns).find(Carry(asked, "depth"))[0]
+        except ImageError as error:
+            errors.append(str(error))
+    usual = "" if name else f" (nor {', '.join(USUAL[1:])})"
+    raise ImageError(
+        f"{errors[0].replace('--carry', 'defocus needs depth')}{usual}; name it with "
+        "defocus.layer, or turn defocus off with defocus.method=none"
+    )
+
+
+def _on_display(pixels: Array, x: int, y: int, width: int, height: int) -> Floats:
+    """A data window's depth on the display window; infinite where there is nothing."""
+    if (x, y, *pixels.shape) == (0, 0, height, width):
+        return pixels
+    whole = np.full((height, width), np.inf, np.float32)
+    top, left = max(y, 0), max(x, 0)
+    part = pixels[top - y : height - y, left - x : width - x]
+    whole[top : top + part.shape[0], left : left + part.shape[1]] = part
+    return whole
