@@ -33,7 +33,8 @@ def host_bytes(
         renditions: how many results there may be of it at a time.
         formats: of the last image, and of the raw.
         keep: steps whose image is written, too.
-        carried: how many layers go along with it, before and after they are moved.
+        carried: how many layers go along with it, before and after they are moved; depth, as it is
+            read and as kernels take it, is one more.
     """
     is_raw = job.path.suffix.lower() in RAW_SUFFIXES
     pixels = None if is_raw else claimed_pixels(job.path)

@@ -232,8 +232,8 @@ class Batch:
         self._begun.set()
         writer = self._worker.writer
         results = min(len(writer.names_of(job)), self.threads + len(self.devices))
-        request = writer.request
-        size = host_bytes(job, results, writer.formats, request.keep, len(request.carry))
+        layers = self._worker.layers
+        size = host_bytes(job, results, writer.formats, writer.request.keep, layers)
         start = time.perf_counter()
         self._room.enter(job.stem, size)
         waits.append(time.perf_counter() - start)

@@ -22,6 +22,7 @@ from clpipe.engine.device import Device, Timing
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import Carried
+from clpipe.inputs.depth import lenses_of
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.renditions import Rendition
@@ -115,6 +116,11 @@ class ImageWorker:
     def reserve(self, count: int) -> None:
         """Keep so many arrays of results for later images."""
         self._spare = SpareArrays(count)
+
+    @property
+    def layers(self) -> int:
+        """How many layers are read beside an image: those that go along with it, and its depth."""
+        return len(self.writer.request.carry) + bool(lenses_of(self._chain))
 
     def runners(self, device: Device | None) -> "Runners":
         """The runners of a device; the kernels of the first chain are compiled here.
