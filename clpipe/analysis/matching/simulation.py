@@ -21,7 +21,8 @@ from clpipe.images.jpeg import through_jpeg
 from clpipe.stage import Frame, Method
 
 UNDONE = ("gamma", "tone_curve")  # by the stage of that name with "inverse_" before it
-SEEN = ("motion_blur", "optical_blur")  # stages that the light of a picture has gone through
+# Stages that the light of a picture has gone through.
+SEEN = ("shutter", "defocus", "motion_blur", "distortion", "vignetting", "optical_blur")
 
 
 class Simulator:
