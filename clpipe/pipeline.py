@@ -16,6 +16,7 @@ from clpipe.base.text import one_of
 from clpipe.base.types import Array
 from clpipe.base.validation import typed
 from clpipe.chain.chain import Chain, make_chain
+from clpipe.chain.depth import depth_of_array, lenses_of, warnings_of, with_depth
 from clpipe.chain.files import load_settings
 from clpipe.chain.identity import image_key, noise_key
 from clpipe.chain.settings import Settings, overlay
@@ -23,7 +24,6 @@ from clpipe.engine.clipping import MUCH, clipped_share, clipping_text
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.kinds import CHANNELS, vectors_of
-from clpipe.inputs.depth import depth_of_array, lenses_of, warnings_of, with_depth
 from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
 from clpipe.stage import Kind
 

@@ -10,10 +10,10 @@ import pytest
 import clpipe as clpipe_api
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.chain import make_chain
+from clpipe.chain.depth import depth_of_array, with_depth
 from clpipe.chain.settings import settings_from
 from clpipe.engine.runner import Runner
 from clpipe.images.read import read_image
-from clpipe.inputs.depth import depth_of_array, with_depth
 from tests.conftest import written
 from tests.test_tiles import in_tiles
 

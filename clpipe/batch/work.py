@@ -16,13 +16,13 @@ from clpipe.base.errors import ImageError, NoPictureError, RequestError
 from clpipe.base.types import Array
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome, Span
 from clpipe.chain.chain import Chain
+from clpipe.chain.depth import lenses_of
 from clpipe.chain.formats import DNG
 from clpipe.engine.clipping import clipped_share
 from clpipe.engine.device import Device, Timing
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import Carried
-from clpipe.inputs.depth import lenses_of
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.renditions import Rendition

@@ -9,6 +9,7 @@ from typing import Any
 from clpipe.base.errors import KindError, NoPictureError, RequestError
 from clpipe.base.reading import unchanged
 from clpipe.chain.chain import Chain, entry
+from clpipe.chain.depth import lenses_of, warnings_of, with_depth
 from clpipe.chain.identity import image_key
 from clpipe.chain.methods import base_name, stage_named
 from clpipe.chain.request import Request
@@ -23,7 +24,7 @@ from clpipe.images.read import (
     read_source,
 )
 from clpipe.inputs.carry import Carried, carry
-from clpipe.inputs.depth import lenses_of, read_depth, warnings_of, with_depth
+from clpipe.inputs.depth import read_depth
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import KeptLoader, kind_message
 from clpipe.inputs.manifest import check_rows

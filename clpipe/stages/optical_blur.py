@@ -11,7 +11,6 @@ from pydantic import field_validator
 
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Doubles, Floats
-from clpipe.images.read import ReadOptions, read_source
 from clpipe.reference.convolve import NEGLIGIBLE, blur, convolve, reach_of, taps_of
 from clpipe.stage import (
     Access,
@@ -101,6 +100,8 @@ def measured(path: str) -> Doubles:
     Raises:
         ValueError: the file cannot be read, or holds no such function.
     """
+    from clpipe.images.read import ReadOptions, read_source  # few need what it imports
+
     try:
         pixels = read_source(Path(path), Kind.RGB, ReadOptions(transfer="linear")).pixels
     except ImageError as error:
