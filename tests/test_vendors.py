@@ -32,14 +32,14 @@ def installed(tmp_path, monkeypatch):
     monkeypatch.setattr(vendors, "FOLDERS", (system, tmp_path / "nowhere"))
     for name in vendors.VARIABLES:
         monkeypatch.delenv(name, raising=False)
-    return SimpleNamespace(library=library, system=system)
+    return SimpleNamespace(runtime=library, system=system)
 
 
 def test_it_is_seen_beside_the_systems(installed):
     with intel_visible():
         folder = Path(os.environ["OCL_ICD_VENDORS"])
         texts = {file.read_text().strip() for file in folder.glob("*.icd")}
-    assert texts == {"libgpu.so", str(installed.library)}
+    assert texts == {"libgpu.so", str(installed.runtime)}
     assert "OCL_ICD_VENDORS" not in os.environ and not folder.exists()
 
 
@@ -53,13 +53,13 @@ def test_a_users_own_choice_stays(installed, monkeypatch, variable):
 
 
 def test_nothing_changes_without_the_package_or_where_it_is_found_anyhow(installed, monkeypatch):
-    (installed.system / "intel.icd").write_text(f"{installed.library}\n")
+    (installed.system / "intel.icd").write_text(f"{installed.runtime}\n")
     with intel_visible():
         assert "OCL_ICD_VENDORS" not in os.environ
     (installed.system / "intel.icd").write_text("/opt/wrong/libintelocl.so\n")
     with intel_visible():
         assert "OCL_ICD_VENDORS" in os.environ
-    installed.library.unlink()
+    installed.runtime.unlink()
     assert intel_library() is None
     with intel_visible():
         assert "OCL_ICD_VENDORS" not in os.environ
