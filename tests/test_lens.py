@@ -282,3 +282,8 @@ def test_kernels_are_not_refused_for_the_image_that_compiles_them(device):
     Runner(chain, device, encode=False, final=True).warm_up()  # 8x8 pixels far from the axis
     with pytest.raises(ImageError, match="the corner of 8x8 pixels"):
         Runner(chain, None, final=True).run(np.ones((8, 8, 3), np.float32), "k")
+
+
+def test_the_table_of_parameters_has_no_message_where_a_focal_length_is_to_be_set(clpipe):
+    shown = clpipe("stages", "distortion").stdout
+    assert "the middle" in shown and "set fx (px)" not in " ".join(shown.split())

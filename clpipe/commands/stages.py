@@ -78,11 +78,12 @@ def resolved(method: type[Method], context: Context) -> dict[str, str]:
     automatic = [name for name, field in method.model_fields.items() if field.default is None]
     try:
         values = method().resolve(context)
-    except ValidationError:  # a parameter has no default
-        values = method.model_validate(method.example).resolve(context)
+    except (ValidationError, ClpipeError):  # a parameter has no default
         automatic = [name for name in automatic if name not in method.example]
-    except ClpipeError as error:
-        return dict.fromkeys(automatic, str(error))
+        try:
+            values = method.model_validate(method.example).resolve(context)
+        except ClpipeError as error:
+            return dict.fromkeys(automatic, str(error))
     return {name: short_text(getattr(values, name, None)) for name in automatic}
 
 
