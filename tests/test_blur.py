@@ -109,6 +109,39 @@ def test_a_streak_is_as_long_and_lies_as_is_said(device):
     assert len(streak(200.0, 45.0)) < 600
 
 
+def test_streaks_in_perspective_follow_the_turned_camera(device):
+    image = np.zeros((121, 161, 3), np.float32)
+    places = [(80, 60), (20, 20), (140, 30), (30, 100)]
+    for x, y in places:
+        image[y, x] = 1
+    turn = {"rotation": 8.0, "angle": 25.0, "focal_length": 90.0}
+    seen = blurred(image, device, motion_blur={"method": "perspective", **turn})[..., 0]
+    a = np.deg2rad(25.0)
+    way = np.array([np.cos(a), -np.sin(a), 0])
+    axis = np.cross(way, [0, 0, 1])
+    for x, y in places:
+        ray = np.array([x + 0.5 - 80.5, y + 0.5 - 60.5, 90.0])
+        angles = np.deg2rad(8.0) * ((np.arange(500) + 0.5) / 500 - 0.5)[:, None]
+        # Rodrigues' formula, the ray turning towards `way`.
+        turned = ray * np.cos(angles) - np.cross(axis, ray) * np.sin(angles)
+        turned += axis * (axis @ ray) * (1 - np.cos(angles))
+        path = turned[:, :2] / turned[:, 2:] * 90.0 - ray[:2]
+        area = (90.0 / turned[:, 2]) ** 3  # of what is a pixel in the middle of the exposure
+        near = seen[y - 18 : y + 19, x - 18 : x + 19]
+        dy, dx = np.indices(near.shape) - 18.0
+        mean = [np.average(each, weights=near) for each in (dx, dy)]
+        assert mean == pytest.approx(np.average(path, 0, area), abs=0.05)
+        seconds = [np.average(each, weights=near) for each in (dx**2, dy**2, dx * dy)]
+        said = [(path[:, 0] ** 2), (path[:, 1] ** 2), path[:, 0] * path[:, 1]]
+        expected = np.average(said, 1, area) + np.array([1 / 6, 1 / 6, 0])  # between pixels
+        assert seconds == pytest.approx(expected, rel=0.02, abs=0.05)
+    straight = {"length": 90 * np.tan(np.deg2rad(8.0)), "angle": 25.0}
+    near = np.s_[45:76, 65:96]
+    assert seen[near] == pytest.approx(
+        blurred(image, motion_blur=straight)[..., 0][near], abs=0.004
+    )
+
+
 @pytest.mark.parametrize("direction", [0.0, 90.0])
 def test_a_streak_along_a_line_stays_on_it(direction):
     seen = blurred(dot(9), motion_blur={"length": 4.0, "angle": direction})[..., 0]
@@ -133,6 +166,10 @@ def test_the_default_has_a_good_lens_and_the_paper_none():
         ({"optical_blur": {"psf": "minus.exr"}}, "minus.exr: light cannot be negative"),
         ({"motion_blur": {"length": 300.0}}, "motion_blur.length.*200"),
         ({"motion_blur": {"rotation": 1.0}}, "rotation needs focal_length"),
+        (
+            {"motion_blur": {"method": "perspective", "rotation": 1.0}},
+            "perspective needs focal_length",
+        ),
         ({"motion_blur": {"rotation": 9.0, "focal_length": 5000.0}}, "a streak of 792 px"),
         (
             {"motion_blur": {"rotation": 1.0, "focal_length": 99.0, "length": 1.0}},

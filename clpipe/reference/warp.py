@@ -166,24 +166,34 @@ class Warp:
     def reference(self, image: Floats) -> Floats:
         """The bent image, (height, width, 3) float32 in and out; black where the lens sees none."""
         height, width = image.shape[:2]
-        polynomials, reach = FILTERS[self.filter], self.support
-        around = mirrored(image, reach)
         fields = self.grid(width, height).fields(np.arange(height), np.arange(width))
         result = np.empty_like(image)
-        for channel, (dx, dy) in enumerate(zip(fields, fields, strict=True)):
-            column, across = _split(dx, np.arange(width))
-            row, down = _split(dy, np.arange(height)[:, None])
-            inside = _is_inside(column, across, width) & _is_inside(row, down, height)
-            column, row = np.clip(column, -1, width - 1), np.clip(row, -1, height - 1)
-            total = np.zeros((height, width), np.float32)
-            for j, of_row in enumerate(polynomials):
-                line = np.zeros((height, width), np.float32)
-                for k, of_column in enumerate(polynomials):
-                    value = around[row + (j + 1), column + (k + 1), channel]
-                    line = line + _horner(of_column, across) * value
-                total = total + _horner(of_row, down) * line
-            result[..., channel] = np.where(inside, total, np.float32(0))
+        for channel, ways in enumerate(zip(fields, fields, strict=True)):
+            result[..., channel] = gather(image[..., channel], *ways, FILTERS[self.filter])
         return result
+
+
+def gather(plane: Floats, across: Floats, down: Floats, polynomials: Floats) -> Floats:
+    """A channel at places between its pixels; 0 where they are outside it.
+
+    Args:
+        plane: (height, width) float32.
+        across, down: how far each pixel of the result is from its place, px; float32.
+        polynomials: of the filter's weights, (tap, power), as in :data:`FILTERS`.
+    """
+    height, width = plane.shape
+    around = mirrored(plane, len(polynomials) // 2)
+    column, across = _split(across, np.arange(width))
+    row, down = _split(down, np.arange(height)[:, None])
+    inside = _is_inside(column, across, width) & _is_inside(row, down, height)
+    column, row = np.clip(column, -1, width - 1), np.clip(row, -1, height - 1)
+    total = np.zeros((height, width), np.float32)
+    for j, of_row in enumerate(polynomials):
+        line = np.zeros((height, width), np.float32)
+        for k, of_column in enumerate(polynomials):
+            line = line + _horner(of_column, across) * around[row + (j + 1), column + (k + 1)]
+        total = total + _horner(of_row, down) * line
+    return np.where(inside, total, np.float32(0))
 
 
 def _split(distance: Floats, line: Array) -> tuple[Array, Floats]:

@@ -7,8 +7,10 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from pydantic import model_validator
 
+from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.reference.convolve import convolve, reach_of, taps_of
+from clpipe.reference.turning import BILINEAR, Turning
 from clpipe.stage import Access, Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
 
 LONGEST = 200.0  # px
@@ -46,7 +48,8 @@ class Linear(Method):
 
     The camera turns evenly, about an axis in the plane of the picture. Away from its centre a real
     streak is longer, by 1 / cos^2 of the angle to the axis of view, and bends; that is left out, as
-    in SyB3R's "linear blur" (Ley, Hänsch and Hellwich, ICCV Workshops 2017).
+    in SyB3R's "linear blur" (Ley, Hänsch and Hellwich, ICCV Workshops 2017); ``perspective`` has
+    it.
 
     >>> from clpipe.stage import run_reference
     >>> dot = np.zeros((1, 7, 3), np.float32)
@@ -128,6 +131,73 @@ class Linear(Method):
         return convolve(image, self.taps) if self.pixels else image
 
 
+class Perspective(Method):
+    """The streaks of a camera that turns, as they are in each place of a picture in perspective.
+
+    It turns evenly about an axis in the plane of its picture, and shows the render as it is in the
+    middle of the exposure. Each pixel is the mean of what it saw, from
+    :class:`clpipe.reference.turning.Turning`.
+
+    >>> from clpipe.stage import run_reference
+    >>> dots = np.zeros((1, 201, 3), np.float32)
+    >>> dots[0, [30, 100]] = 1
+    >>> turning = Perspective(rotation=1.6, focal_length=100.0)
+    >>> streaks = run_reference(turning, dots)[0, :, 0].astype(float)  # 2.8 and 4.2 px long
+    >>> streaks[98:103].round(2).tolist(), streaks[28:33].round(2).tolist()
+    ([0.03, 0.29, 0.36, 0.29, 0.03], [0.14, 0.24, 0.24, 0.24, 0.13])
+    """
+
+    method: ClassVar = "perspective"
+    kernel: ClassVar = "motion_blur"
+    summary: ClassVar = "longer and bent away from the middle, as a turning camera's are"
+    example: ClassVar = {"rotation": 4.0, "angle": 30.0, "focal_length": 90.0}
+    alternatives: ClassVar = frozenset({"focal_length"})
+
+    rotation: float = parameter(
+        0.0, "How far the camera turns while the shutter is open; 0 is off.", "degrees", ge=0, lt=45
+    )
+    angle: float = parameter(
+        0.0,
+        "The way that the middle of the picture takes, from the right upwards.",
+        "degrees",
+        ge=-360,
+        le=360,
+    )
+    focal_length: float | None = parameter(None, "Focal length.", "px", "needed", gt=0, le=1e6)
+
+    def resolve(self, context: Context) -> Self:
+        """The method as it is.
+
+        Raises:
+            RequestError: the focal length is missing.
+        """
+        if self.rotation and self.focal_length is None:
+            raise RequestError("motion_blur: perspective needs focal_length, in px")
+        return self
+
+    @property
+    def turning(self) -> Turning:
+        """How the picture is made of the render."""
+        assert self.focal_length
+        return Turning(self.rotation, self.angle, self.focal_length)
+
+    def passes(self) -> tuple[Pass, ...]:
+        if not self.rotation:
+            return ()
+        turning = self.turning
+        return (Pass("turned", Access.RESAMPLE, ("filter",), radius=1, resampling=turning),)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        return {"filter": BILINEAR} if self.rotation else {}
+
+    def reference(self, image: Floats, frame: Frame) -> Floats:
+        return self.turning.reference(image) if self.rotation else image
+
+
 STAGE = Stage(
-    "motion_blur", "Move the camera while its shutter is open.", Kind.RGB, Kind.RGB, (Linear,)
+    "motion_blur",
+    "Move the camera while its shutter is open.",
+    Kind.RGB,
+    Kind.RGB,
+    (Linear, Perspective),
 )

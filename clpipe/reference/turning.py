@@ -1,0 +1,129 @@
+"""The streaks of a camera that turns: each pixel is the mean of what it saw of a still image."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, ClassVar
+
+import numpy as np
+
+from clpipe.base.errors import ImageError
+from clpipe.base.types import Floats
+from clpipe.reference.resample import Axis, Parameters
+from clpipe.reference.warp import gather
+
+# (tap, power), see :data:`clpipe.reference.warp.FILTERS`
+BILINEAR = np.array([[1, -1], [0, 1]], np.float32)
+SPACING = 0.5  # px at most between the places of which a streak is made
+
+
+@dataclass(frozen=True)
+class Turning:
+    """A camera that turns evenly about an axis in the plane of its picture.
+
+    In the middle of the exposure it shows the image as it is. A point at (u, v), in focal lengths
+    from the middle of the picture along and aside of the way in which that moves, is seen after a
+    turn t at ((u cos t + sin t) / w, v / w), w = cos t - u sin t: the pinhole's homography (Hartley
+    and Zisserman, "Multiple view geometry", 2004, section 8.4). See
+    :class:`clpipe.reference.resample.Resampler`.
+
+    Args:
+        rotation: degrees in all, above 0.
+        angle: the way of the middle of the picture, in degrees, from the right upwards.
+        focal_length: px.
+    """
+
+    parameters: ClassVar[Parameters] = (
+        ("turns", "__global const float *restrict"),
+        ("count", "uint"),
+        ("focal", "float"),
+        ("x", "float"),
+        ("y", "float"),
+    )
+
+    rotation: float
+    angle: float
+    focal_length: float
+
+    @property
+    def scale(self) -> float:
+        """See :attr:`Resampler.scale`."""
+        return 1.0
+
+    def resized(self, width: int, height: int) -> tuple[int, int]:
+        """See :meth:`Resampler.resized`."""
+        return width, height
+
+    def values(self, width: int, height: int) -> Mapping[str, Any]:
+        """See :meth:`Resampler.values`.
+
+        Raises:
+            ImageError: a corner of the image turns out of what a pinhole can show.
+        """
+        turns = _turns(self, 2 * self.farthest(width, height))
+        x, y = math.cos(math.radians(self.angle)), -math.sin(math.radians(self.angle))
+        numbers = {name: np.float32(n) for name, n in (("x", x), ("y", y))}
+        focal = np.float32(self.focal_length)
+        return {"turns": turns, "count": np.uint32(len(turns) // 3), "focal": focal, **numbers}
+
+    def farthest(self, width: int, height: int) -> float:
+        """How far, in px, what a pixel shows is at most from its place in the middle of the turn.
+
+        Raises:
+            ImageError: see :meth:`values`.
+        """
+        turn = math.radians(self.rotation) / 2
+        u = math.hypot(width, height) / 2 / self.focal_length  # of a corner, at most
+        if math.atan(u) + turn > math.radians(85):
+            raise ImageError(
+                f"motion_blur: a turn of {self.rotation:g} degrees at focal_length "
+                f"{self.focal_length:g} takes the corners of {width}x{height} pixels to "
+                f"{math.degrees(math.atan(u) + turn):.0f} degrees from the axis; expected at most "
+                "85; set a smaller rotation or a longer focal length"
+            )
+        w = math.cos(turn) - u * math.sin(turn)
+        along, aside = math.sin(turn) * (1 + u * u) / w, u * (1 / w - 1)
+        return math.hypot(along, aside) * self.focal_length
+
+    def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
+        """See :meth:`Resampler.needed`."""
+        reach = math.ceil(self.farthest(*size)) + 1
+        lines = size[1] if axis == "rows" else size[0]
+        return max(start - reach, 0), min(stop + reach, lines)
+
+    def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
+        """See :meth:`Resampler.reach`."""
+        reach = math.ceil(self.farthest(*size)) + 1
+        return low + reach, high + reach
+
+    def reference(self, image: Floats) -> Floats:
+        """The blurred image, (height, width, 3) float32 in and out."""
+        height, width = image.shape[:2]
+        values = self.values(width, height)
+        focal, x, y = values["focal"], values["x"], values["y"]
+        one, half = np.float32(1), np.float32(0.5)
+        columns = np.arange(width, dtype=np.float32)
+        rows = np.arange(height, dtype=np.float32)[:, None]
+        px = (columns + (half - half * np.float32(width))) / focal
+        py = (rows + (half - half * np.float32(height))) / focal
+        along, aside = px * x + py * y, py * x - px * y
+        total = np.zeros_like(image)
+        turns = values["turns"].reshape(-1, 3)
+        for sine, cosine, versine in turns:
+            scale = focal / (cosine + along * sine)
+            du, dv = -sine * (one + along * along) * scale, aside * (versine - along * sine) * scale
+            across = np.clip(du * x - dv * y, -columns, np.float32(width - 1) - columns)
+            down = np.clip(du * y + dv * x, -rows, np.float32(height - 1) - rows)
+            for c in range(3):
+                total[..., c] += gather(image[..., c], across, down, BILINEAR)
+        return total * (one / np.float32(len(turns)))
+
+
+@lru_cache(maxsize=64)
+def _turns(turning: Turning, length: float) -> Floats:
+    """Sine, cosine and 1 less the cosine, for each moment of which a streak is made."""
+    count = max(math.ceil(length / SPACING), 1)
+    turn = np.deg2rad(turning.rotation) * ((np.arange(count) + 0.5) / count - 0.5)
+    table = np.stack([np.sin(turn), np.cos(turn), 2 * np.sin(turn / 2) ** 2], -1)
+    return np.ascontiguousarray(table, np.float32).reshape(-1)

@@ -1,0 +1,58 @@
+// The mean of an image over a camera's turn. `turns` has three numbers for each moment: the sine, the
+// cosine and 1 less the cosine of how far the camera has turned. `x`, `y` is the way in which the middle of
+// the picture moves. Places beyond the image are moved to its edge.
+#include "lib/gather.h"
+
+// Of a plane where all lanes are as far from their places: `corner` is the pixel before the first one's.
+INLINE vf side_by_side(__global const float *corner, uint pitch, vf u, vf v) {
+    const vf above = (1.0f - u) * load(corner) + u * load(corner + 1);
+    const vf below = (1.0f - u) * load(corner + pitch) + u * load(corner + pitch + 1);
+    return (1.0f - v) * above + v * below;
+}
+
+INLINE rgb turned(site at, __global const float *r, __global const float *g, __global const float *b,
+                  extent from, __global const float *turns, uint count, float focal, float x, float y,
+                  __global const float *filter) {
+    const vf column = to_float(iota() + (vi)((int)at.x));
+    const float row = (float)at.y, right = (float)(from.width - 1), bottom = (float)(from.height - 1);
+    const vf px = (column + (0.5f - 0.5f * (float)from.width)) / focal;
+    const float py = (row + (0.5f - 0.5f * (float)from.height)) / focal;
+    const vf along = px * x + py * y, aside = py * x - px * y;
+    const int border = (int)from.border;
+    rgb sum = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
+#pragma unroll 1
+    for (uint k = 0; k < count; ++k) {
+        const float sine = turns[3 * k], cosine = turns[3 * k + 1], versine = turns[3 * k + 2];
+        const vf scale = focal / (cosine + along * sine);
+        const vf du = -sine * (1.0f + along * along) * scale;
+        const vf dv = aside * (versine - along * sine) * scale;
+        const vf across = vmin(vmax(du * x - dv * y, -column), right - column);
+        const vf down = vmin(vmax(du * y + dv * x, (vf)(-row)), (vf)(bottom - row));
+        vf u, v;
+        const vi to_x = split(across, (vi)((int)at.x), &u), to_y = split(down, (vi)((int)at.y), &v);
+        int firsts_x[LANES], firsts_y[LANES];
+        spill_int(to_x, firsts_x);
+        spill_int(to_y, firsts_y);
+        const int left = firsts_x[0], top = firsts_y[0];
+        if (!any_lane((to_x != left) | (to_y != top)) && left >= (int)from.left - border &&
+            left + LANES < (int)(from.left + from.columns) + border &&
+            top >= (int)from.top - border && top + 1 < (int)(from.top + from.rows) + border) {
+            const long corner = (long)top * (long)from.pitch + left;
+            sum.r += side_by_side(r + corner, from.pitch, u, v);
+            sum.g += side_by_side(g + corner, from.pitch, u, v);
+            sum.b += side_by_side(b + corner, from.pitch, u, v);
+        } else {
+            // A loop, because three copies of what is in it take three times as long to compile.
+            __global const float *planes[3] = {r, g, b};
+            vf channels[3];
+#pragma unroll 1
+            for (int c = 0; c < 3; ++c) channels[c] = bent(at, planes[c], from, across, down, filter, 2, 2);
+            sum.r += channels[0];
+            sum.g += channels[1];
+            sum.b += channels[2];
+        }
+    }
+    const float share = 1.0f / (float)count;
+    const rgb mean = {sum.r * share, sum.g * share, sum.b * share};
+    return mean;
+}
