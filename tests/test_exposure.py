@@ -255,6 +255,22 @@ def test_a_run_takes_the_exposures_that_meter_writes(clpipe, sequence, tmp_path)
     assert own["method"] == "gain" and own["ev"] < 4
 
 
+def test_meter_takes_sub_frames_as_one_exposure(clpipe, sequence, tmp_path):
+    two = ("--set", "shutter.subframes=2")
+    found = json.loads(
+        clpipe(*METER, "-o", "films/exposures.csv", "--smooth", 0, *two, "--json").stdout
+    )
+    assert [frame["frame"] for frame in found["frames"]] == [
+        f"frames/{name}.exr" for name in ("day/0", "day/2", "night/0")
+    ]
+    clpipe("run", "films/exposures.csv", "-o", "out", *NUMPY, *two)
+    clpipe("run", "frames", "-o", "auto", *NUMPY, "--set", "exposure.method=auto", *two)
+    for name in ("day/0", "day/2", "night/0"):
+        mine = exposure_of(tmp_path / f"out/{name}.json")["parameters"]
+        theirs = exposure_of(tmp_path / f"auto/{name}.json")["estimates"]
+        assert mine["ev"] == pytest.approx(theirs["metered_ev"], abs=1e-4)
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

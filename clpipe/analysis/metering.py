@@ -113,14 +113,19 @@ def write_exposures(path: Path, found: Sequence[Exposure]) -> None:
     Raises:
         ImageError: it cannot be written.
     """
-    write_new(path, manifest_text(path.parent, [_row(path.parent, each) for each in found]))
+    rows = [row for each in found for row in _rows(path.parent, each)]
+    write_new(path, manifest_text(path.parent, rows))
 
 
-def _row(folder: Path, exposure: Exposure) -> Row:
+def _rows(folder: Path, exposure: Exposure) -> Iterator[Row]:
+    """A row for each file of an exposure, with the same values."""
     job = exposure.job
     name = job.name or (job.stem if key_of(folder, job.path) != job.key else "")
     own = {"method": "gain", "ev": round(exposure.ev, DIGITS) + 0.0}
     if exposure.headroom != Auto.model_fields["headroom"].default:
         own["headroom"] = exposure.headroom
     values = {**job.values, EXPOSURE: own}
-    return Row(job.path, job.key, name, values, job.frames, job.place)
+    yield Row(job.path, job.key, name, values, job.frames, job.place)
+    for path in job.subframes:
+        other = f"{name}.{path.stem}" if name else ""
+        yield Row(path, "", other, values, job.frames, job.place)

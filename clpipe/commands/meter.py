@@ -79,7 +79,9 @@ def meter(
     metering = ("exposure.method=auto", *assignments)
     request = Request.from_options(assignments=metering, until="exposure", **options)
     loader = ImageLoader(request)
-    jobs = to_meter(find_jobs(frames, Path(os.devnull), loader.endings(), exclude))
+    jobs = to_meter(
+        loader.exposures(find_jobs(frames, Path(os.devnull), loader.endings(), exclude))
+    )
     check_request(loader, jobs)
     found = []
     for each in exposures(loader, jobs, open_device(selector), smooth):
