@@ -50,10 +50,26 @@ set_option = click.option(
     "'{uniform=[1, 2]}' as the value draws one for each image.",
 )
 
+_SERIES_OPTIONS = (
+    click.option(
+        "--camera",
+        "cameras",
+        multiple=True,
+        metavar="NAME|FILE",
+        shell_complete=cameras,
+        help="A built-in camera, by name or model, or a profile (.toml); several go to folders of "
+        f"their own, OUT/CAMERA/NAME.jpg. [default: {DEFAULTS.camera}]",
+    ),
+    click.option(
+        "--iso",
+        "isos",
+        metavar="ISO,ISO,...",
+        help="The ISO; noise and denoising follow from it. Several go to folders of their own, "
+        f"OUT/iso800/NAME.jpg. [default: {DEFAULTS.iso:g}]",
+    ),
+)
+
 _CHAIN_OPTIONS = (
-    config_option,
-    camera_option,
-    iso_option,
     click.option(
         "--lens",
         metavar="NAME",
@@ -97,7 +113,16 @@ _CHAIN_OPTIONS = (
 
 def chain_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """The options that say which chain to run."""
-    for option in reversed(_CHAIN_OPTIONS):
+    return _with(function, config_option, camera_option, iso_option, *_CHAIN_OPTIONS)
+
+
+def series_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The options that say which chains to run, of several cameras and ISOs."""
+    return _with(function, config_option, *_SERIES_OPTIONS, *_CHAIN_OPTIONS)
+
+
+def _with(function: Callable[..., Any], *options: Callable[..., Any]) -> Callable[..., Any]:
+    for option in reversed(options):
         function = option(function)
     return function
 

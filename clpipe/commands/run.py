@@ -28,11 +28,11 @@ from clpipe.chain.request import Request
 from clpipe.chain.truth import TRUTHS
 from clpipe.commands.chain_options import (
     carry_option,
-    chain_options,
     companion_option,
     depth_png_option,
     format_option,
     keep_option,
+    series_options,
 )
 from clpipe.commands.input_options import (
     exclude_option,
@@ -46,6 +46,7 @@ from clpipe.engine.device import Device, open_devices
 from clpipe.images.read import PICTURE_SUFFIXES
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
+from clpipe.inputs.series import Series, parse_isos
 from clpipe.outputs.folder import output_folder, remove_unfinished
 from clpipe.outputs.renditions import parse_bracket
 from clpipe.outputs.writer import OutputWriter
@@ -65,7 +66,7 @@ if TYPE_CHECKING:
     metavar="OUT",
     help="The output folder; it is made where it is missing.",
 )
-@chain_options
+@series_options
 @click.option(
     "--frames",
     type=click.IntRange(1, MAX_FRAMES),
@@ -166,6 +167,8 @@ if TYPE_CHECKING:
 def run(
     inputs: tuple[str, ...],
     output: Path,
+    cameras: tuple[str, ...],
+    isos: str | None,
     max_pixels: int,
     exclude: tuple[str, ...],
     keep_suffix: bool,
@@ -220,15 +223,15 @@ def run(
         except RequestError as error:
             raise RequestError(f"{replay}: {error}") from None
     else:
-        request = Request.from_options(max_pixels=max_pixels, **options)
+        series = Series(cameras, parse_isos(isos) if isos is not None else ())
+        request = Request.from_options(
+            camera=series.camera, iso=series.iso, max_pixels=max_pixels, **options
+        )
         loader = ImageLoader(request)
         found = find_jobs(inputs, output, loader.endings(), exclude, keep_suffix)
-        jobs = loader.exposures(found)
-        if per_tar:
-            tars = shard.take(cut(jobs, per_tar, output))
-            jobs = [job for tar in tars for job in tar.jobs]
-        else:
-            jobs = shard.take(jobs)
+        jobs = series.jobs(loader.exposures(found), loader.settings)
+        tars = shard.take(cut(jobs, per_tar, output)) if per_tar else []
+        jobs = [job for tar in tars for job in tar.jobs] if per_tar else shard.take(jobs)
         if not jobs:
             click.echo(f"shard {shard.number} of {shard.of} has no images", err=True)
             return

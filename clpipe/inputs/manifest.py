@@ -168,7 +168,11 @@ def check_rows(
     steps = step_names(settings)
     faults: list[str] = []
     checked: list[Settings] = []
+    known: dict[int, Settings] = {}  # rows may share their values
     for row in rows:
+        if shared := known.get(id(row.values)):
+            checked.append(shared)
+            continue
         try:
             own = overlay(settings, row.values)
             if not carries(row.path):
@@ -177,6 +181,7 @@ def check_rows(
                     if step not in (*PLAIN, OUTPUT, *steps):
                         raise RequestError(one_of("stage in this chain", step, steps))
             checked.append(own)
+            known[id(row.values)] = own
         except RequestError as error:
             faults.append(f"{row.place}: {error}")
     _report(faults)

@@ -1,0 +1,117 @@
+"""Series: each image with several cameras and ISOs, each in a folder of its own."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from clpipe.base.errors import RequestError
+from clpipe.camera.profile import load_camera
+from clpipe.chain.settings import Settings, overlay
+from clpipe.inputs.find import Job
+
+
+@dataclass(frozen=True)
+class Series:
+    """Cameras and ISOs, each with each; fewer than two of either are no series of it.
+
+    Args:
+        cameras: names or profiles.
+        isos: sensitivities.
+
+    >>> Series(("sony-a7r2",), (100.0, 800.0)).folders
+    ('iso100', 'iso800')
+    """
+
+    cameras: tuple[str, ...] = ()
+    isos: tuple[float, ...] = ()
+
+    @property
+    def camera(self) -> str | None:
+        """The camera of all images, where there is one."""
+        return self.cameras[0] if len(self.cameras) == 1 else None
+
+    @property
+    def iso(self) -> float | None:
+        """The ISO of all images, where there is one."""
+        return self.isos[0] if len(self.isos) == 1 else None
+
+    @property
+    def folders(self) -> tuple[str, ...]:
+        """Where its pictures go, below the output folder; ("",) is no series.
+
+        Raises:
+            RequestError: two cameras have the same name.
+        """
+        return tuple(folder for folder, _ in self._members())
+
+    def jobs(self, jobs: Sequence[Job], settings: Settings) -> list[Job]:
+        """Each job once for each camera and ISO, one after the other.
+
+        Args:
+            jobs: the images.
+            settings: of all of them.
+
+        Raises:
+            RequestError: a camera does not exist, is there twice or has not an ISO, or a row of a
+                manifest says what a series is of.
+        """
+        members = list(self._members())
+        if members == [("", {})]:
+            return list(jobs)
+        for _, values in members:
+            overlay(settings, values).check_cameras()
+        for job in jobs:
+            for key in members[0][1]:
+                if key in job.values:
+                    raise RequestError(
+                        f"{job.label}: it says its {key}, and --{key} has several; leave one out"
+                    )
+        return [
+            replace(
+                job,
+                name=f"{folder}/{job.stem}",
+                values={**job.values, **values} if job.values else values,  # shared
+            )
+            for job in jobs
+            for folder, values in members
+        ]
+
+    def _members(self) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Folders, and the settings of what is in them."""
+        cameras: list[tuple[str, dict[str, Any]]] = [("", {})]
+        if len(self.cameras) > 1:
+            names = [load_camera(camera).name for camera in self.cameras]
+            for name in names:
+                if names.count(name) > 1:
+                    raise RequestError(f"--camera: found {name} twice; give it once")
+            cameras = [
+                (f"{name}/", {"camera": camera})
+                for name, camera in zip(names, self.cameras, strict=True)
+            ]
+        isos = [(f"iso{iso:g}", {"iso": iso}) for iso in self.isos] if len(self.isos) > 1 else []
+        for folder, camera in cameras:
+            for name, iso in isos or [("", {})]:
+                yield (folder + name).rstrip("/"), {**camera, **iso}
+
+
+def parse_isos(text: str) -> tuple[float, ...]:
+    """Sensitivities with commas between.
+
+    >>> parse_isos("100, 3200")
+    (100.0, 3200.0)
+
+    Raises:
+        RequestError: one is no number above 0, or is there twice.
+    """
+    try:
+        isos = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        isos = ()
+    if not isos or not all(math.isfinite(iso) and iso > 0 for iso in isos):
+        raise RequestError(f"--iso: found {text!r}; expected numbers above 0, such as 100,800,3200")
+    names = [f"{iso:g}" for iso in isos]
+    for name in names:
+        if names.count(name) > 1:
+            raise RequestError(f"--iso: found {text!r}, with {name} twice; give it once")
+    return isos
