@@ -7,7 +7,7 @@ import os
 import shutil
 import tarfile
 import threading
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -205,7 +205,7 @@ class TarBatch(Batch):
         worker = TarWorker(self._packers, loader, staged, chain, overwrite, verify, trace)
         super().__init__(worker, devices, threads)
 
-    def run(self, jobs: Sequence[Job]) -> Generator[Outcome, None, None]:
+    def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
         """Do every job, as the base does; a tar is packed while the next one is made.
 
         What a killed run left is removed first.

@@ -10,7 +10,7 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -93,7 +93,7 @@ class Batch:
         self.in_flight = results + 1
         self._worker = worker
         worker.reserve(results)
-        self._waiting: deque[Job] = deque()
+        self._waiting: Iterator[Job] = iter(())
         self._admitted = 0
         self._developing = len(self.devices)
         self._failure: Exception | None = None
@@ -101,6 +101,7 @@ class Batch:
         self._broken = self._closing = False
         self._begun = threading.Event()  # there is something to develop
         self._lock = threading.Lock()
+        self._taking = threading.Lock()  # held while a job is waited for
         self._places = threading.Semaphore(self.in_flight)
         self._room = Room(usual_room() if room is None else room)
         self._results = threading.Semaphore(results)
@@ -113,19 +114,24 @@ class Batch:
         """Let no more images in; those in flight are finished."""
         self._stopping.set()
 
-    def run(self, jobs: Sequence[Job]) -> Generator[Outcome, None, None]:
+    def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
         """Do every job; one that fails is reported and the others go on. A batch runs once.
 
         Outcomes come as jobs are finished, in any order.
+
+        Args:
+            jobs: the images. What is no list is asked for each when there is a place for it; it may
+                take its time, and what it raises ends the run.
 
         Raises:
             OutputError: nothing can be written any more. What was in flight is reported before.
             DeviceError: on no device is work possible any more. Where some can still be used, the
                 others' work is theirs.
         """
-        at_a_time = min(self.threads, max(len(jobs), 1))
+        count = len(jobs) if isinstance(jobs, Sized) else self.threads
+        at_a_time = min(self.threads, max(count, 1))
         set_codec_threads(max(available_processors() // at_a_time, 1))
-        self._waiting.extend(jobs)
+        self._waiting = iter(jobs)
         numbers = range(self.threads)
         decoders = [self._start(f"decode {i}", self._decode_all) for i in numbers]
         developers = [
@@ -201,11 +207,14 @@ class Batch:
     def _next(self) -> Job | None:
         """The next job, once there is a place for it; None where none is to come."""
         self._places.acquire()
-        with self._lock:
-            if not self._waiting or self._stopping.is_set():
+        with self._taking:
+            if self._stopping.is_set():
+                return None
+            job = next(self._waiting, None)
+            if job is None or self._stopping.is_set():
                 return None
             self._admitted += 1
-            return self._waiting.popleft()
+            return job
 
     def _decode_all(self) -> None:
         while job := self._next():
