@@ -1,0 +1,169 @@
+"""Renders scenes in a Blender of its own process: bpy of this Python, or an installed program."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import IO, Any, Self
+
+from clpipe.base.errors import ClpipeError, RequestError
+from clpipe.base.files import write_new
+
+SCRIPT = Path(__file__).with_name("blender_script.py")
+ASKED = ".rendering.json"  # what is asked, in the folder of the renders
+MARK = "@clpipe "  # before each line that the script says to us
+LAST_LINES = 12  # of Blender's own, which are shown when it ends unexpectedly
+
+
+class RenderError(ClpipeError):
+    """Blender ended before everything was rendered."""
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What is asked of Blender.
+
+    Args:
+        scene: the .blend file.
+        folder: where NAME.exr of each view is written; those that are there stay.
+        views: which: ``{"frames": [numbers]}``, ``{"cameras": [records]}``, or ``{"path": "orbit",
+            "count": N, "seed": S, "box": None}``, where a box is six numbers.
+        resolution: width and height in px; None is the scene's.
+        samples: of light paths for each pixel.
+        time_limit: seconds for each view; None has none.
+        denoise: whether the renderer takes its own noise away.
+        seed: of the light paths.
+    """
+
+    scene: Path
+    folder: Path
+    views: Mapping[str, Any]
+    resolution: tuple[int, int] | None
+    samples: int
+    time_limit: float | None
+    denoise: bool
+    seed: int
+
+    def record(self) -> dict[str, Any]:
+        """It as JSON values."""
+        return {**asdict(self), "scene": str(self.scene), "folder": str(self.folder)}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What Blender says of a scene before it renders.
+
+    Args:
+        blender: its version.
+        views: a record for each view: file, width, height, K, R and t, as in a ``cameras.json``.
+        objects: the names of objects by their index.
+        unit_metres: how long a unit is; None where the scene does not say.
+    """
+
+    blender: str
+    views: tuple[Mapping[str, Any], ...]
+    objects: Mapping[str, list[str]]
+    unit_metres: float | None
+
+
+def blender_command(program: str | None) -> list[str]:
+    """What runs a script in Blender.
+
+    Args:
+        program: an installed Blender; None is the package bpy.
+
+    Raises:
+        RequestError: there is neither.
+    """
+    if program is not None:
+        return [program, "--background", "--factory-startup", "--python-exit-code", "1", "--python"]
+    if importlib.util.find_spec("bpy") is None:
+        raise RequestError(
+            "a .blend is rendered by Blender, and none is here: pip install 'clpipe[blender]', or "
+            "name an installed one with --blender PATH"
+        )
+    return [sys.executable]
+
+
+class Renderer(AbstractContextManager["Renderer"]):
+    """A Blender that renders views in the background; it ends with the context.
+
+    Args:
+        rendering: what is asked.
+        program: see :func:`blender_command`.
+
+    Raises:
+        RequestError: there is no Blender, or it cannot be started.
+    """
+
+    def __init__(self, rendering: Rendering, program: str | None = None) -> None:
+        command = blender_command(program)
+        asked = rendering.folder / ASKED
+        write_new(asked, json.dumps(rendering.record()).encode())
+        arguments = ["--", str(asked)] if program is not None else [str(asked)]
+        self._path = rendering.scene
+        self._latest: deque[str] = deque(maxlen=LAST_LINES)
+        try:
+            self._process = subprocess.Popen(  # noqa: S603 - the user's own Blender
+                [*command, str(SCRIPT), *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                errors="replace",
+            )
+        except OSError as error:
+            raise RequestError(f"--blender: {program}: {error.strerror}") from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.stop()
+        self._process.wait()
+
+    def stop(self) -> None:
+        """End it; what it had begun is lost, and done again by the next one."""
+        self._process.terminate()
+
+    def scene(self) -> Scene:
+        """What is to be rendered, once Blender has read the file.
+
+        Raises:
+            RequestError: the scene cannot be rendered.
+            RenderError: Blender ended.
+        """
+        values = self._event("scene")
+        views = tuple(values["views"])
+        return Scene(values["blender"], views, values["objects"], values["unit_metres"])
+
+    def rendered(self, scene: Scene) -> Iterator[tuple[str, float]]:
+        """The name of each view as soon as it is there, and the seconds that it took.
+
+        Raises:
+            RenderError: Blender ended.
+        """
+        for _ in scene.views:
+            values = self._event("rendered")
+            yield values["name"], values["seconds"]
+
+    def _event(self, kind: str) -> Mapping[str, Any]:
+        output: IO[str] | None = self._process.stdout
+        assert output
+        for line in output:
+            if not line.startswith(MARK):
+                self._latest.append(line.rstrip())
+                continue
+            values: dict[str, Any] = json.loads(line[len(MARK) :])
+            if values["event"] == "refused":
+                raise RequestError(f"{self._path}: {values['message']}")
+            if values["event"] == kind:
+                return values
+        status = self._process.wait()
+        said = "\n  ".join(self._latest)
+        raise RenderError(f"{self._path}: Blender ended with status {status}; it said:\n  {said}")
