@@ -1,0 +1,58 @@
+"""Contact sheets: small pictures in rows and columns, with their names."""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from PIL import Image, ImageDraw, ImageFont
+
+from clpipe.base.errors import ImageError
+
+THUMBNAIL = 240  # px, the longer side
+TEXT = 14  # px high
+GAP = 6  # px
+BACKGROUND, INK = (250, 250, 250), (30, 30, 30)
+
+
+def contact_sheet(
+    rows: Sequence[Sequence[Path]], names: Sequence[str], titles: Sequence[str]
+) -> bytes:
+    """A JPEG of pictures.
+
+    Args:
+        rows: pictures of 8 bits, as many in each row; each stands in the same column.
+        names: of the rows.
+        titles: of the columns.
+
+    Raises:
+        ImageError: a picture cannot be read.
+    """
+    small = [[_thumbnail(path) for path in row] for row in rows]
+    width = max(each.width for row in small for each in row)
+    height = max(each.height for row in small for each in row)
+    across, down = width + GAP, height + TEXT + 2 * GAP
+    size = GAP + across * len(titles), TEXT + 2 * GAP + down * len(rows)
+    sheet = Image.new("RGB", size, BACKGROUND)
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(TEXT)
+    for column, title in enumerate(titles):
+        draw.text((GAP + column * across, GAP), title, INK, font)
+    for number, (row, name) in enumerate(zip(small, names, strict=True)):
+        top = TEXT + 2 * GAP + number * down
+        for column, each in enumerate(row):
+            sheet.paste(each, (GAP + column * across, top))
+        draw.text((GAP, top + height + GAP / 2), name, INK, font)
+    data = io.BytesIO()
+    sheet.save(data, "JPEG", quality=90)
+    return data.getvalue()
+
+
+def _thumbnail(path: Path) -> Image.Image:
+    try:
+        with Image.open(path) as picture:
+            picture.draft("RGB", (2 * THUMBNAIL, 2 * THUMBNAIL))
+            small = picture.convert("RGB")
+            small.thumbnail((THUMBNAIL, THUMBNAIL), Image.Resampling.LANCZOS)
+            return small
+    except (OSError, ValueError) as error:
+        raise ImageError(f"{path}: cannot be shown: {error}") from None
