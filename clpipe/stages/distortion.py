@@ -78,6 +78,7 @@ class Distortion(HasPicture):
     """A lens's distortion and lateral colour, in one resampling."""
 
     kernel: ClassVar = "distortion"
+    overscan: ClassVar = True
 
     kr: float = parameter(
         1.0, "Lateral colour, linear: size of red over that of green.", gt=0.5, lt=2
@@ -104,6 +105,7 @@ class Distortion(HasPicture):
             red=Radial.of(self.kr * self.vr, self.kr * self.cr, self.kr * self.br),
             blue=Radial.of(self.kb * self.vb, self.kb * self.cb, self.kb * self.bb),
             fit=self.fit,
+            margins=self.margins,
         )
 
     @property
@@ -181,7 +183,8 @@ class InFocalLengths(Distortion):
         found = super().of_size(width, height)
         if not found:
             return found
-        unit = self.lens().unit(width, height)
+        lens = self.lens()
+        unit = lens.unit(*lens.size(width, height))
         fx, fy = (found["focal_length_factor"] * each for each in unit)
         return {**found, "fx": fx, "fy": fy}
 

@@ -60,6 +60,7 @@ class Linear(Method):
 
     method: ClassVar = "linear"
     kernel: ClassVar = "convolve"
+    overscan: ClassVar = True
     summary: ClassVar = "a straight streak, the same everywhere"
     example: ClassVar = {"length": 5.3, "angle": 30.0}
     alternatives: ClassVar = frozenset({"length", "rotation"})
