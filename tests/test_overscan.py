@@ -154,6 +154,20 @@ def test_stages_before_the_lens_see_the_overscan():
     assert apart[1].max() > 0.01 and apart[2].max() > 0.01  # mirrored at the picture's edge
 
 
+def test_a_camera_turns_about_the_middle_of_the_picture():
+    turn = {"method": "perspective", "rotation": 3.0, "angle": 20.0, "focal_length": FX}
+    image = light(*places(WIDTH, HEIGHT, AROUND))
+
+    def kept(image, margins):
+        chain = chain_of(margins, stages=["motion_blur", "distortion"], motion_blur=turn)
+        runner = Runner(chain, None, ("motion_blur",), encode=False)
+        return runner.run(image, "k").kept["motion_blur"]
+
+    wide, narrow = kept(image, AROUND), kept(AROUND.cropped(image), NO_MARGINS)
+    inside = np.s_[5:-5, 5:-5]
+    assert AROUND.cropped(wide)[inside] == pytest.approx(narrow[inside], abs=1e-4)
+
+
 def test_where_it_is_of_use():
     def count(**settings):
         return steps_of_overscan(make_chain(settings_from(settings)))
