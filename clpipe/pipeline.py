@@ -118,7 +118,7 @@ class Pipeline(ReadOnly):
         """
         runner = self._runner_for(key, settings)
         checked, chain = _checked(image, runner.chain.source), runner.chain
-        margins = margins_of_array(overscan, *checked.shape[1::-1])
+        margins = margins_of_array(overscan, checked)
         if margins and steps_of_overscan(chain):
             chain = with_overscan(chain, margins)
             runner = runner.of(chain)
@@ -175,7 +175,7 @@ class Pipeline(ReadOnly):
             raise ImageError(f"found {pixels.shape[2]} channels; {kind} has {least} or more")
         vectors = vectors_of("", ("",) * pixels.shape[2]) if kind == "flow" else ()
         chain = self._runner_for(key, settings).chain
-        margins = margins_of_array(overscan, *layer.shape[1::-1])
+        margins = margins_of_array(overscan, layer)
         if margins and steps_of_overscan(chain):
             chain = with_overscan(chain, margins)
         else:

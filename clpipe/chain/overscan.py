@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from clpipe.base.errors import ImageError
+from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
 from clpipe.reference.geometry import NO_MARGINS, Margins
 
@@ -35,17 +36,19 @@ def with_overscan(chain: Chain, margins: Margins) -> Chain:
     return replace(chain, steps=steps, margins=margins)
 
 
-def margins_of_array(overscan: Sequence[int], width: int, height: int) -> Margins:
-    """The margins that somebody gives with an image of that size.
+def margins_of_array(overscan: Sequence[int], image: Array) -> Margins:
+    """The margins that somebody gives with an image, (height, width[, channel]).
 
     Raises:
         ImageError: they are no margins, or leave no picture.
     """
-    if len(overscan) == len(NO_MARGINS) and min(overscan) >= 0:
+    if not any(overscan):
+        return NO_MARGINS
+    if len(overscan) == len(NO_MARGINS) and min(overscan) >= 0 and image.ndim > 1:
         margins = Margins(*map(int, overscan))
-        if min(margins.inside(width, height)) > 0:
+        if min(margins.inside(*image.shape[1::-1])) > 0:
             return margins
     raise ImageError(
         f"found overscan {tuple(overscan)}; expected px to the left, at the top, to the right and "
-        f"at the bottom, which leave something of an image of {width}x{height} pixels"
+        f"at the bottom, which leave something of an image of shape {image.shape}"
     )
