@@ -277,9 +277,7 @@ def test_datasets_and_pipelines(write_exr, tmp_path):
     assert np.array_equal(one, plain.process(read_image(path).pixels, "a").image)
     assert plain.carry(x, "depth", overscan=AROUND)[0].shape == (HEIGHT, WIDTH)
     for wrong in ((1, 2, 3), (50, 0, 46, 0), (0, 0, 0, -1)):
-        with pytest.raises(
-            ImageError, match=r"found overscan \(.* of shape \(71, 96"
-        ):
+        with pytest.raises(ImageError, match=r"found overscan \(.* of shape \(71, 96"):
             pipe.process(image, "a", overscan=wrong)
 
 
