@@ -19,12 +19,14 @@ from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.depth import depth_of_array, lenses_of, warnings_of, with_depth
 from clpipe.chain.files import load_settings
 from clpipe.chain.identity import image_key, noise_key
+from clpipe.chain.overscan import margins_of_array, steps_of_overscan, with_overscan
 from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.clipping import MUCH, clipped_share, clipping_text
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.kinds import CHANNELS, vectors_of
 from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
+from clpipe.reference.geometry import NO_MARGINS
 from clpipe.stage import Kind
 
 
@@ -82,7 +84,12 @@ class Pipeline(ReadOnly):
         return self._runner.chain
 
     def process(
-        self, image: Array, key: str, depth: Array | None = None, **settings: Any
+        self,
+        image: Array,
+        key: str,
+        depth: Array | None = None,
+        overscan: tuple[int, int, int, int] = NO_MARGINS,
+        **settings: Any,
     ) -> Result:
         """Run the chain on one image.
 
@@ -96,6 +103,8 @@ class Pipeline(ReadOnly):
                 picture of ``clpipe run`` stands in its sidecar, and repeats its noise.
             depth: (height, width), for a chain with depth of field: in the unit that defocus says;
                 infinite, 1e9 or more or 0 where there is nothing.
+            overscan: how far, in px, image and depth go on beyond the picture: to the left, at the
+                top, to the right and at the bottom. A lens shows what it sees of that.
             **settings: values for this image alone, as for the class. Another ISO, gain or noise
                 parameter costs nothing; for another method or size, kernels are compiled.
 
@@ -109,6 +118,13 @@ class Pipeline(ReadOnly):
         """
         runner = self._runner_for(key, settings)
         checked, chain = _checked(image, runner.chain.source), runner.chain
+        margins = margins_of_array(overscan, checked)
+        if margins and steps_of_overscan(chain):
+            chain = with_overscan(chain, margins)
+            runner = runner.of(chain)
+        elif margins:
+            checked = np.ascontiguousarray(margins.cropped(checked))
+            depth = None if depth is None else margins.cropped(np.asarray(depth))
         if checked.ndim == 3 and lenses_of(chain):
             far = depth_of_array(depth, *checked.shape[1::-1])
             for warning in warnings_of(chain, far):
@@ -124,7 +140,12 @@ class Pipeline(ReadOnly):
         return result
 
     def carry(
-        self, layer: Array, kind: LayerKind, key: str = "", **settings: Any
+        self,
+        layer: Array,
+        kind: LayerKind,
+        key: str = "",
+        overscan: tuple[int, int, int, int] = NO_MARGINS,
+        **settings: Any,
     ) -> tuple[Array, Array]:
         """Move a layer that goes along with an image as :meth:`process` moves its pixels.
 
@@ -134,6 +155,7 @@ class Pipeline(ReadOnly):
                 then as long as 1; so is a "flow", whose vectors in px to the right and down are
                 mapped at both ends; "colour" is blended.
             key: the image's name, on which draws depend.
+            overscan: as for :meth:`process`.
             **settings: as for :meth:`process`.
 
         Returns:
@@ -152,9 +174,14 @@ class Pipeline(ReadOnly):
         if pixels.shape[2] < (least := CHANNELS.get(kind, 1)):
             raise ImageError(f"found {pixels.shape[2]} channels; {kind} has {least} or more")
         vectors = vectors_of("", ("",) * pixels.shape[2]) if kind == "flow" else ()
-        geometry = self._runner_for(key, settings).chain.geometry
-        height, width = layer.shape[:2]
-        (moved,), valid = warp([Layer(kind, pixels, vectors=vectors)], geometry, width, height)
+        chain = self._runner_for(key, settings).chain
+        margins = margins_of_array(overscan, layer)
+        if margins and steps_of_overscan(chain):
+            chain = with_overscan(chain, margins)
+        else:
+            pixels = margins.cropped(pixels)
+        along = Layer(kind, pixels, vectors=vectors)
+        (moved,), valid = warp([along], chain.geometry, *pixels.shape[1::-1])
         return moved if layer.ndim == 3 else moved[..., 0], valid
 
     def _runner_for(self, key: str, settings: Mapping[str, Any]) -> Runner:

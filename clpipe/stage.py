@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Self, get_args, get_origin
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, JsonValue
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, PrivateAttr
 
 from clpipe.base.types import Array, Floats
 from clpipe.camera.noise import NoiseModel
@@ -23,7 +23,7 @@ from clpipe.camera.profile import DEFAULT_CAMERA, IDENTITY, Camera, Matrix, load
 from clpipe.reference.cfa import PATTERNS, Pattern, red_site
 from clpipe.reference.curve import curve_index
 from clpipe.reference.defocus import Depth
-from clpipe.reference.geometry import Geometry
+from clpipe.reference.geometry import NO_MARGINS, Geometry, Margins
 from clpipe.reference.random import Stream, stream_of
 from clpipe.reference.resample import Resampler
 
@@ -224,6 +224,22 @@ class Method(BaseModel):
     # Parameters of which one may be set: a configuration's gives way to an option's, and that to a
     # manifest's.
     alternatives: ClassVar[frozenset[str]] = frozenset()
+    # Whether its image may go on beyond the picture: it does the same everywhere, or counts places
+    # from the picture, which ``margins`` says.
+    overscan: ClassVar[bool] = False
+
+    _margins: Margins = PrivateAttr(NO_MARGINS)
+
+    @property
+    def margins(self) -> Margins:
+        """How far the image that it reads goes on beyond the picture."""
+        return self._margins
+
+    def around(self, margins: Margins) -> Self:
+        """This (resolved) method for an image that goes on beyond the picture."""
+        other = self.model_copy()
+        other._margins = margins
+        return other
 
     def resolve(self, context: Context) -> "Method":
         """The method with a value for every parameter that was left to the camera or the chain."""

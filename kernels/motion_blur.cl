@@ -1,6 +1,7 @@
 // The mean of an image over a camera's turn. `turns` has three numbers for each moment: the sine, the
 // cosine and 1 less the cosine of how far the camera has turned. `x`, `y` is the way in which the middle of
-// the picture moves. Places beyond the image are moved to its edge.
+// the picture moves; `middle_x`, `middle_y` is how far it is from the centre of the image's first pixel.
+// Places beyond the image are moved to its edge.
 #include "lib/gather.h"
 
 // Of a plane where all lanes are as far from their places: `corner` is the pixel before the first one's.
@@ -12,11 +13,11 @@ INLINE vf side_by_side(__global const float *corner, uint pitch, vf u, vf v) {
 
 INLINE rgb turned(site at, __global const float *r, __global const float *g, __global const float *b,
                   extent from, __global const float *turns, uint count, float focal, float x, float y,
-                  __global const float *filter) {
+                  float middle_x, float middle_y, __global const float *filter) {
     const vf column = to_float(iota() + (vi)((int)at.x));
     const float row = (float)at.y, right = (float)(from.width - 1), bottom = (float)(from.height - 1);
-    const vf px = (column + (0.5f - 0.5f * (float)from.width)) / focal;
-    const float py = (row + (0.5f - 0.5f * (float)from.height)) / focal;
+    const vf px = (column - middle_x) / focal;
+    const float py = (row - middle_y) / focal;
     const vf along = px * x + py * y, aside = py * x - px * y;
     const int border = (int)from.border;
     rgb sum = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};

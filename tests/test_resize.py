@@ -39,6 +39,17 @@ def size_of(path):
         return picture.size
 
 
+@pytest.mark.parametrize(("name", "most"), [("area", 0.09), ("lanczos3", 0.02)])
+def test_slopes_stay_in_their_place(name, most):
+    for scale in (0.75, 0.7, 0.5, 0.4):
+        ramp = np.arange(1000)[None] + 0.5
+        smaller = resample(ramp, Resampling("columns", scale, *FILTERS[name]))[0]
+        places = (np.arange(smaller.size) + 0.5) * 1000 / smaller.size
+        apart = (smaller - places)[10:-10]
+        assert np.abs(apart).max() < (most if scale != 0.5 else 1e-3)
+        assert abs(apart.mean()) < 1e-3
+
+
 @pytest.mark.parametrize("scale", [1 / 8, 0.3, 0.5, 0.77, 1])
 @pytest.mark.parametrize("name", FILTERS)
 def test_every_tap_lies_in_the_image_and_weights_sum_to_one(name, scale):

@@ -14,7 +14,7 @@ from clpipe.chain.keys import LENS
 from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
-from clpipe.reference.geometry import Composition
+from clpipe.reference.geometry import NO_MARGINS, Composition, Margins
 from clpipe.reference.intrinsics import Intrinsics
 from clpipe.reference.resample import Resampler, sizes
 from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
@@ -46,6 +46,7 @@ class Chain:
     settings: Settings
     names: tuple[str, ...]  # of all steps, with those before start_at and after until
     draws: Mapping[str, Draw] = field(default_factory=dict)  # the settings are an example of these
+    margins: Margins = NO_MARGINS  # of what enters, beyond the picture
 
     def __repr__(self) -> str:
         return f"Chain({self.settings.label}, {self.label})"
@@ -86,12 +87,12 @@ class Chain:
 
         Args:
             width, height: of what enters, in px.
-            shot: what is known of it, see :meth:`Intrinsics.of_render`.
+            shot: what is known of it without its margins, see :meth:`Intrinsics.of_render`.
 
         Raises:
             RequestError: they contradict those of a lens.
         """
-        known = Intrinsics.of_render(width, height, shot)
+        known = Intrinsics.of_render(*self.margins.inside(width, height), shot)
         return self.geometry.intrinsics(known, width, height) if self.geometry else known
 
     @cached_property
@@ -137,7 +138,8 @@ class Chain:
             name, folder = step.name, step.stage.folder
             method, context = self.settings.method(name), replace(step.context, clean=True)
             with validation_errors(name, type(method)), user_code_errors(f"stage {name}", folder):
-                left.append((step, method.where_clean(context)))
+                own = method.where_clean(context)
+                left.append((step, own and own.around(step.method.margins)))
         return self._with(left, clean=True)
 
     def _with(self, methods: Sequence[tuple[Step, Method | None]], clean: bool) -> "Chain":

@@ -162,10 +162,11 @@ class Runner:
         """
         assert self.device
         if not self.device.is_ready(plan):
-            shape = (8, 8, 3)[: 2 if len(self.chain.source.channels) == 1 else 3]
+            width, height = self.chain.margins.around(8, 8)
+            shape = (height, width, 3)[: 2 if len(self.chain.source.channels) == 1 else 3]
             tiny = np.zeros(shape, np.float16 if plan.half else np.float32)
             try:
-                check_resamplings(plan, *shape[:2])
+                check_resamplings(plan, width, height)
             except ImageError:
                 return  # which larger images need not be refused for
             with announced(self.device.info):

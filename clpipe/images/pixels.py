@@ -1,6 +1,6 @@
 """Arrays of pixels as files hold them: sizes, data windows, and values that are not finite."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 from clpipe.base.errors import ImageError
 from clpipe.base.steps import Step
 from clpipe.base.types import Array
+from clpipe.reference.geometry import NO_MARGINS, Margins
 
 MAX_PIXELS = 1_000_000_000  # the largest --max-pixels
 USUAL_MAX_PIXELS = 200_000_000  # its default: what a file may claim
@@ -26,6 +27,22 @@ def check_size(path: Path, width: int, height: int, max_pixels: int) -> None:
         raise ImageError(
             f"{path}: {width}x{height} pixels; at most {max_pixels} are read (--max-pixels)"
         )
+
+
+def margins_of(x: int, y: int, data: Sequence[int], display: Sequence[int]) -> Margins:
+    """How far a data window goes on beyond the display window; nowhere where they do not meet.
+
+    Args:
+        x, y: the column and row of the display window in which the data window begins.
+        data, display: the width and height of each.
+
+    >>> tuple(margins_of(-2, 1, (10, 6), (7, 7))), tuple(margins_of(7, 0, (3, 3), (7, 7)))
+    ((2, 0, 1, 0), (0, 0, 0, 0))
+    """
+    (width, height), (right, bottom) = display, (x + data[0], y + data[1])
+    if min(right, bottom) <= 0 or x >= width or y >= height:
+        return NO_MARGINS
+    return Margins(*(max(each, 0) for each in (-x, -y, right - width, bottom - height)))
 
 
 @Step("convert")

@@ -33,8 +33,10 @@ from clpipe.images.pixels import (
     clip_to_half,
     display_window,
     make_finite,
+    margins_of,
 )
 from clpipe.reference.defocus import Depth
+from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.transfer import inverse_srgb_curve
 from clpipe.stage import Kind
 
@@ -53,7 +55,8 @@ class SourceImage:
     array. ``layer`` is the name of the layer that was read. ``attributes`` are clpipe's own, which
     a kept image has. ``shot`` is what the file says of exposure_time (s), focal_length and
     sensor_width (mm). ``subframes`` are the names and SHA-256 of files that were averaged.
-    ``depth`` is there where the chain needs it.
+    ``depth`` is there where the chain needs it. ``margins`` say how far ``pixels``, and depth, go
+    on beyond the picture.
     """
 
     pixels: Array
@@ -64,6 +67,12 @@ class SourceImage:
     shot: Mapping[str, float] = field(default_factory=dict)
     subframes: tuple[tuple[str, str], ...] = ()
     depth: Depth | None = None
+    margins: Margins = NO_MARGINS
+
+    def cropped(self) -> "SourceImage":
+        """The picture alone."""
+        pixels = np.ascontiguousarray(self.margins.cropped(self.pixels))
+        return replace(self, pixels=pixels, margins=NO_MARGINS)
 
 
 @dataclass(frozen=True)
@@ -77,6 +86,7 @@ class _Decoded:
     shot: Mapping[str, float]
     chromaticities: Any  # as the file states them; None: linear sRGB's
     neutral: Any  # OpenEXR's adoptedNeutral, as the file states it
+    margins: Margins
 
 
 def read_image(
@@ -84,6 +94,7 @@ def read_image(
     mosaic: bool = False,
     layer: str | None = None,
     max_pixels: int = USUAL_MAX_PIXELS,
+    overscan: bool = False,
 ) -> SourceImage:
     """Read the picture of a file as linear sRGB, in its display window, with finite samples.
 
@@ -98,6 +109,7 @@ def read_image(
         layer: the layer or part that is the picture; None chooses, see
             :data:`clpipe.images.layers.PICTURE_LAYERS`.
         max_pixels: a file that claims more is refused before memory is allocated.
+        overscan: read what the data window has beyond the display window, too, as margins.
 
     Raises:
         ImageError: the file is missing, empty, damaged, not an image, not linear float, deep, a
@@ -105,11 +117,11 @@ def read_image(
             names the file and the reason.
     """
     try:
-        decoded = _decode(path, mosaic, layer, max_pixels)
+        decoded = _decode(path, mosaic, layer, max_pixels, overscan)
     except SubsampledError:
         if mosaic or layer is not None:
             raise
-        decoded = _decode_luminance_chroma(path, max_pixels)
+        decoded = _decode_luminance_chroma(path, max_pixels, overscan)
     warnings = []
     pixels = decoded.pixels
     if count := make_finite(pixels):
@@ -127,7 +139,13 @@ def read_image(
     if not mosaic and pixels.dtype == np.float32 and (beyond := clip_to_half(pixels)):
         warnings.append(f"{beyond} samples beyond {HALF_MAX:g}, the range of half, were clipped")
     return SourceImage(
-        pixels, decoded.sha256, decoded.layer, tuple(warnings), decoded.attributes, decoded.shot
+        pixels,
+        decoded.sha256,
+        decoded.layer,
+        tuple(warnings),
+        decoded.attributes,
+        decoded.shot,
+        margins=decoded.margins,
     )
 
 
@@ -139,15 +157,17 @@ TRANSFERS: dict[str, Callable[[Doubles], Doubles]] = {
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """The user's choices for reading files.
+    """How files are read.
 
-    ``layer`` and ``max_pixels`` are those of :func:`read_image`. ``transfer``, one of
-    :data:`TRANSFERS`, is how renders in whole numbers (PNG, TIFF) are encoded; None refuses them.
+    ``layer``, ``max_pixels`` and, for linear RGB, ``overscan`` are those of :func:`read_image`.
+    ``transfer``, one of :data:`TRANSFERS`, is how renders in whole numbers (PNG, TIFF) are encoded;
+    None refuses them.
     """
 
     layer: str | None = None
     max_pixels: int = USUAL_MAX_PIXELS
     transfer: str | None = None
+    overscan: bool = False
 
 
 def read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
@@ -165,7 +185,8 @@ def read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
         return replace(finished, pixels=linear.astype(np.float32))
     if kind is not Kind.DISPLAY:
         mosaic = len(kind.channels) == 1
-        return read_image(path, mosaic, options.layer, options.max_pixels)
+        overscan = options.overscan and kind is Kind.RGB
+        return read_image(path, mosaic, options.layer, options.max_pixels, overscan)
     if finished := read_finished(path, options.max_pixels):
         return finished
     image = read_image(path, False, options.layer, options.max_pixels)
@@ -210,7 +231,9 @@ def holds_mosaic(path: Path) -> bool:
 
 
 @Step("decode")
-def _decode(path: Path, mosaic: bool, layer: str | None, max_pixels: int) -> _Decoded:
+def _decode(
+    path: Path, mosaic: bool, layer: str | None, max_pixels: int, overscan: bool
+) -> _Decoded:
     """The picture of a file that OpenImageIO reads; arguments and errors as :func:`read_image`.
 
     Raises:
@@ -219,8 +242,11 @@ def _decode(path: Path, mosaic: bool, layer: str | None, max_pixels: int) -> _De
     with open_image(path) as file:
         location = find_picture(path, file, mosaic, layer)
         spec = file.spec()
+        data, display = (spec.width, spec.height), (spec.full_width, spec.full_height)
+        x, y = spec.x - spec.full_x, spec.y - spec.full_y
+        margins = margins_of(x, y, data, display) if overscan else NO_MARGINS
         pixels, digest = _with_digest(
-            path, lambda: _read_part(path, file, location, mosaic, max_pixels)
+            path, lambda: _read_part(path, file, location, mosaic, max_pixels, margins)
         )
         return _Decoded(
             pixels,
@@ -230,17 +256,23 @@ def _decode(path: Path, mosaic: bool, layer: str | None, max_pixels: int) -> _De
             shot_attributes(spec),
             CIE_XYZ if location.xyz else spec.getattribute("chromaticities"),
             spec.getattribute("adoptedNeutral"),
+            margins,
         )
 
 
 @Step("decode")
-def _decode_luminance_chroma(path: Path, max_pixels: int) -> _Decoded:
+def _decode_luminance_chroma(path: Path, max_pixels: int, overscan: bool) -> _Decoded:
     """The picture of a file whose chroma is subsampled."""
     window = read_luminance_chroma(path, max_pixels)
-    pixels = display_window(window.pixels, window.x, window.y, window.width, window.height)
+    data, display = window.pixels.shape[1::-1], (window.width, window.height)
+    margins = margins_of(window.x, window.y, data, display) if overscan else NO_MARGINS
+    width, height = margins.around(*display)
+    check_size(path, width, height, max_pixels)
+    place = window.x + margins.left, window.y + margins.top
+    pixels = display_window(window.pixels, *place, width, height)
     header = window.attributes
     chromaticities, neutral = header.get("chromaticities"), header.get("adoptedNeutral")
-    return _Decoded(pixels, _digest(path), "", {}, {}, chromaticities, neutral)
+    return _Decoded(pixels, _digest(path), "", {}, {}, chromaticities, neutral, margins)
 
 
 def _with_digest(path: Path, read: Callable[[], Array]) -> tuple[Array, str]:
@@ -284,9 +316,14 @@ def _srgb_matrix(path: Path, decoded: _Decoded) -> Array | None:
 
 
 def _read_part(
-    path: Path, file: Any, location: PictureLocation, mosaic: bool, max_pixels: int
+    path: Path,
+    file: Any,
+    location: PictureLocation,
+    mosaic: bool,
+    max_pixels: int,
+    margins: Margins,
 ) -> Array:
-    """Three channels of one part, or one, in its display window: (height, width[, 3]).
+    """Three channels of one part, or one, in its display window with margins: (height, width[, 3]).
 
     Raises:
         ImageError: the samples are not linear float (those of a mosaic may be whole numbers), too
@@ -301,7 +338,7 @@ def _read_part(
             f"{path}: holds {spec.format} samples, not linear float ones; "
             "give an OpenEXR file, or say --transfer linear or srgb; a photograph: -c unprocess"
         )
-    width, height = spec.full_width, spec.full_height
+    width, height = margins.around(spec.full_width, spec.full_height)
     check_size(path, width, height, max_pixels)
     check_size(path, spec.width, spec.height, max_pixels)
     # Whole numbers are read as they are: as float, OpenImageIO would scale them to 0..1.
@@ -314,9 +351,9 @@ def _read_part(
         pixels = read_samples(path, file, location.part, channels, type_)
     if whole:
         pixels = pixels.astype(np.float32)
-    x, y = spec.x - spec.full_x, spec.y - spec.full_y
-    if (x, y, spec.width, spec.height) != (0, 0, width, height):
-        pixels = display_window(pixels, x, y, width, height)
+    place = spec.x - spec.full_x + margins.left, spec.y - spec.full_y + margins.top
+    if (*place, spec.width, spec.height) != (0, 0, width, height):
+        pixels = display_window(pixels, *place, width, height)
     return pixels if len(channels) > 1 else np.ascontiguousarray(pixels[..., 0])
 
 

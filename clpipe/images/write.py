@@ -24,6 +24,7 @@ from clpipe.images.openexr import write_channels
 from clpipe.images.openimageio import error_text
 from clpipe.images.pixels import HALF_MAX
 from clpipe.images.tags import Tags, exif
+from clpipe.reference.geometry import NO_MARGINS, Margins
 
 JPEG_MAX_SIDE = 65500
 PNG_LEVEL = 4  # of noisy pictures, 6 takes twice as long and leaves 1.5 % less
@@ -85,6 +86,7 @@ def write_exr(
     channels: Sequence[str],
     attributes: Mapping[str, str],
     half: bool = False,
+    margins: Margins = NO_MARGINS,
 ) -> Stored:
     """Write a float image, (height, width[, channel]), as OpenEXR with ZIP compression.
 
@@ -94,12 +96,15 @@ def write_exr(
         channels: the names of the channels.
         attributes: clpipe's own; their names get clpipe's prefix in the file.
         half: as half floats: 11 bits, clipped to -65504..65504.
+        margins: how far the image goes on beyond the picture, which is the display window.
 
     Raises:
         ImageError: the file cannot be written.
     """
     height, width = pixels.shape[:2]
     spec = oiio.ImageSpec(width, height, len(channels), oiio.HALF if half else oiio.FLOAT)
+    spec.x, spec.y = -margins.left, -margins.top
+    spec.full_width, spec.full_height = margins.inside(width, height)
     spec.channelnames = tuple(channels)
     spec.attribute("compression", "zip")
     spec.attribute("DateTime", NO_TIME)

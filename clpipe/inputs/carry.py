@@ -114,7 +114,8 @@ def carry(
         ImageError: a layer or a companion is missing or damaged, is not as large as the image, or
             does not say what it holds.
     """
-    height, width = source.pixels.shape[:2]
+    whole = source.pixels.shape[1::-1]
+    width, height = source.margins.inside(*whole)
     found = [each for layer in layers for each in Finder(path, patterns).find(layer)]
     _check_names(path, found)
     read: list[Layer] = []
@@ -131,8 +132,9 @@ def carry(
                 f"picture {path} has {width}x{height}; render both at one size"
             )
         vectors = vectors_of(each.location.name or each.name, each.location.channels)
+        x, y = x + source.margins.left, y + source.margins.top
         read.append(Layer(each.kind, pixels, x, y, vectors if each.kind == "flow" else ()))
-    moved, valid = warp(read, geometry_of(chain, orientation), width, height)
+    moved, valid = warp(read, geometry_of(chain, orientation), *whole)
     carried = tuple(
         CarriedLayer(each.name, each.kind, each.channels, pixels, _record(path, each, sums))
         for each, pixels in zip(found, moved, strict=True)

@@ -14,6 +14,7 @@ from clpipe.chain.carry import Carry
 from clpipe.chain.chain import Chain
 from clpipe.chain.depth import lenses_of
 from clpipe.images.passes import read_layer
+from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import Finder, FoundLayer
 from clpipe.reference.defocus import Depth, checked_depth
 
@@ -21,15 +22,14 @@ USUAL = ("Depth", "Z", "ZDepth", "Distance")  # layers, in the order in which th
 
 
 def read_depth(
-    path: Path, chain: Chain, width: int, height: int, patterns: Sequence[str], max_pixels: int
+    path: Path, source: SourceImage, chain: Chain, patterns: Sequence[str], max_pixels: int
 ) -> Depth:
     """The depth of an image.
 
     Args:
         path: of the image.
+        source: the image.
         chain: with a step that needs depth.
-        width: of the image in px, and its height.
-        height: see above.
         patterns: of the names of companions, as for :func:`clpipe.inputs.carry.carry`.
         max_pixels: a file that claims more is refused before memory is taken.
 
@@ -38,6 +38,8 @@ def read_depth(
     """
     name = next(lens.layer for lens in lenses_of(chain).values())
     layer = _find(path, name, patterns)
+    whole = source.pixels.shape[1::-1]
+    width, height = source.margins.inside(*whole)
     with unchanged(layer.file):
         pixels, (x, y), size = read_layer(layer.file, layer.location, max_pixels)
         digest = digests([str(layer.file)]).get(str(layer.file), "")
@@ -47,7 +49,8 @@ def read_depth(
             f"{path} has {width}x{height}; render both at one size"
         )
     try:
-        depth = checked_depth(_on_display(pixels[..., 0], x, y, width, height))
+        place = x + source.margins.left, y + source.margins.top
+        depth = checked_depth(_on_image(pixels[..., 0], *place, *whole))
     except ImageError as error:
         raise ImageError(f"{layer.file}: layer {layer.name}: {error}") from None
     length, modified = stamp_of(layer.file)
@@ -76,8 +79,8 @@ def _find(path: Path, name: str, patterns: Sequence[str]) -> FoundLayer:
     )
 
 
-def _on_display(pixels: Array, x: int, y: int, width: int, height: int) -> Floats:
-    """A data window's depth on the display window; infinite where there is nothing."""
+def _on_image(pixels: Array, x: int, y: int, width: int, height: int) -> Floats:
+    """A data window's depth at a place of an image; infinite where there is nothing."""
     if (x, y, *pixels.shape) == (0, 0, height, width):
         return pixels
     whole = np.full((height, width), np.inf, np.float32)

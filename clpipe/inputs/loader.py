@@ -12,6 +12,7 @@ from clpipe.chain.chain import Chain, entry
 from clpipe.chain.depth import lenses_of, warnings_of, with_depth
 from clpipe.chain.identity import image_key
 from clpipe.chain.methods import base_name, stage_named
+from clpipe.chain.overscan import steps_of_overscan, with_overscan
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
 from clpipe.images.pixels import USUAL_MAX_PIXELS
@@ -150,8 +151,9 @@ class ImageLoader:
         if self.raw.takes(path):
             return self.raw.read(path)
         request = self.request
+        overscan = self.kept is not None or steps_of_overscan(self.chain) > 0
         options = ReadOptions(
-            request.layer, request.max_pixels or USUAL_MAX_PIXELS, request.transfer
+            request.layer, request.max_pixels or USUAL_MAX_PIXELS, request.transfer, overscan
         )
         return read_source(path, self.reads, options)
 
@@ -165,12 +167,13 @@ class ImageLoader:
             RequestError: its chain cannot be made.
         """
         loaded = self._entered(job, source)
+        if loaded and loaded.source.margins:
+            loaded = _with_overscan(loaded)
         if loaded is None or not lenses_of(loaded.chain):
             return loaded
         chain, source, request = loaded.chain, loaded.source, self.request
         most = request.max_pixels or USUAL_MAX_PIXELS
-        width, height = source.pixels.shape[1::-1]
-        depth = read_depth(job.path, chain, width, height, request.companions, most)
+        depth = read_depth(job.path, source, chain, request.companions, most)
         warnings = (*source.warnings, *warnings_of(chain, depth))
         source = replace(source, depth=depth, warnings=warnings)
         return LoadedImage(with_depth(chain, depth), source, loaded.key)
@@ -220,3 +223,11 @@ class ImageLoader:
     def __getstate__(self) -> dict[str, Any]:
         # Cached values stay with the process: they may hold classes of stage files.
         return {each.name: getattr(self, each.name) for each in fields(self)}
+
+
+def _with_overscan(loaded: LoadedImage) -> LoadedImage:
+    """An image with overscan, and the chain for it; cropped where that is of no use."""
+    chain, source = loaded.chain, loaded.source
+    if not steps_of_overscan(chain):
+        return replace(loaded, source=source.cropped())
+    return replace(loaded, chain=with_overscan(chain, source.margins))

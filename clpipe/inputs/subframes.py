@@ -11,11 +11,12 @@ import numpy as np
 from clpipe.base.digests import joint_digest
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import unchanged
-from clpipe.base.types import Doubles, Floats
+from clpipe.base.types import Array, Doubles, Floats
 from clpipe.chain.chain import step_names
 from clpipe.chain.settings import Settings
 from clpipe.images.read import SourceImage
 from clpipe.inputs.find import Job
+from clpipe.reference.geometry import Margins
 from clpipe.stages.shutter import Rows
 
 SHUTTER = "shutter"
@@ -92,13 +93,12 @@ def average(job: Job, read: Callable[[Path], SourceImage], shutter: Rows) -> Sou
         if pixels.ndim != 3:
             raise ImageError(f"{path}: a mosaic; shutter.subframes averages renders")
         if not found:
-            weights = shutter.weights(len(job.paths), pixels.shape[0])
+            weights = weights_of(shutter, len(job.paths), pixels.shape[0], source.margins)
             total = np.zeros(pixels.shape, np.float32)
-        elif pixels.shape != total.shape:
-            height, width = total.shape[:2]
+        elif (pixels.shape, source.margins) != (total.shape, found[0].margins):
             raise ImageError(
-                f"{path}: it is {pixels.shape[1]}x{pixels.shape[0]}, and {job.path}, a part of the "
-                f"same exposure, {width}x{height}"
+                f"{path}: it is {_size(source, pixels)}, and {job.path}, a part of the same "
+                f"exposure, {_size(found[0], total)}"
             )
         seen = np.flatnonzero(weights[number])
         if seen.size:
@@ -114,6 +114,23 @@ def average(job: Job, read: Callable[[Path], SourceImage], shutter: Rows) -> Sou
         warnings=tuple(dict.fromkeys(_warnings(job, found))),
         subframes=tuple(zip(names, digests, strict=True)),
     )
+
+
+def weights_of(shutter: Rows, frames: int, rows: int, margins: Margins) -> Doubles:
+    """The weights of frames for each row, (frame, row).
+
+    Rows beyond the picture are exposed with its first or its last one, as frames last no longer.
+    """
+    _, height = margins.inside(0, rows)
+    in_picture = np.clip(np.arange(rows) - margins.top, 0, height - 1)
+    return shutter.weights(frames, height)[:, in_picture]
+
+
+def _size(source: SourceImage, pixels: Array) -> str:
+    """The size of a picture in words, with what its image has beyond it."""
+    width, height = source.margins.inside(*pixels.shape[1::-1])
+    beyond = f" with {tuple(source.margins)} px of overscan" if source.margins else ""
+    return f"{width}x{height}{beyond}"
 
 
 def _warnings(job: Job, sources: Sequence[SourceImage]) -> Iterator[str]:

@@ -196,6 +196,7 @@ def sidecar(
         ],
         **({"carried": [layer.record for layer in carried.layers]} if carried else {}),
         **({"depth": [source.depth.record]} if source.depth else {}),
+        **({"overscan": source.margins._asdict()} if source.margins else {}),
         "warnings": list(source.warnings),
         "device": device_record(device),
         "versions": all_versions(),

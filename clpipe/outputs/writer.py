@@ -30,6 +30,7 @@ from clpipe.outputs.renditions import FLOAT_MOSAICS, Rendition, RenditionPlan, t
 from clpipe.outputs.results import results_of
 from clpipe.outputs.sidecar import SIDECAR
 from clpipe.reference.curve import to_16_bit
+from clpipe.reference.geometry import NO_MARGINS
 from clpipe.stage import Kind
 
 
@@ -245,7 +246,10 @@ class OutputWriter:
             path = self.path(job, f"{step.name}.exr", rendition.name)
             attributes = attributes_of(step, chain, *whose) | tag_attributes
             channels = step.stage.writes.channels
-            outputs[path] = write_exr(path, result.kept[step.name], channels, attributes)
+            beyond = NO_MARGINS if step.method.geometry() else step.method.margins
+            outputs[path] = write_exr(
+                path, result.kept[step.name], channels, attributes, margins=beyond
+            )
         for format_ in self.formats_of(rendition.name):
             path = self.path(job, ending_of(format_), rendition.name)
             if rendition.noise:

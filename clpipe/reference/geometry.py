@@ -5,13 +5,45 @@ pixel is at (0.5, 0.5), as COLMAP counts; OpenCV's first centre is (0, 0).
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from clpipe.base.types import Array
 from clpipe.reference.intrinsics import Intrinsics
 from clpipe.reference.resample import Resampling, sizes
+
+
+class Margins(NamedTuple):
+    """How far an image goes on beyond the picture, in px: overscan.
+
+    >>> Margins(3, 2, 1, 0).inside(10, 8), bool(NO_MARGINS)
+    ((6, 6), False)
+    """
+
+    left: int = 0
+    top: int = 0
+    right: int = 0
+    bottom: int = 0
+
+    def __bool__(self) -> bool:
+        return any(self)
+
+    def inside(self, width: int, height: int) -> tuple[int, int]:
+        """The width and height of the picture, from those of the image."""
+        return width - self.left - self.right, height - self.top - self.bottom
+
+    def around(self, width: int, height: int) -> tuple[int, int]:
+        """The width and height of the image, from those of the picture."""
+        return width + self.left + self.right, height + self.top + self.bottom
+
+    def cropped(self, image: Array) -> Array:
+        """The picture in an image, (height, width[, channel]): a view."""
+        height, width = image.shape[:2]
+        return image[self.top : height - self.bottom, self.left : width - self.right]
+
+
+NO_MARGINS = Margins()
 
 
 class Geometry(Protocol):

@@ -4,7 +4,7 @@ Places are counted as in :mod:`clpipe.reference.geometry`. What a model calls r 
 the principal point in units of its own: of the focal length, or of half the short side.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Self
 
@@ -13,6 +13,7 @@ from numpy.polynomial.polynomial import polyder, polyval
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
+from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.intrinsics import FULL_OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
 
 # Newton's method ends where the place that it finds is bent to within this of the place asked for,
@@ -131,6 +132,8 @@ class Lens:
         half_diagonals: what r = 1 of lateral colour is instead, in half diagonals of the image.
         fit: whether the picture is scaled about the principal point so that it shows as much as
             leaves no void.
+        margins: how far the image goes on beyond what the picture would be without the lens. The
+            image's width and height are with them; ``centre`` and all units are without.
     """
 
     radial: Radial = Radial()
@@ -142,13 +145,14 @@ class Lens:
     blue: Radial = Radial()
     half_diagonals: float | None = None
     fit: bool = False
+    margins: Margins = NO_MARGINS
 
     @cached_property
     def _hash(self) -> int:
         return hash(
             (
                 *(self.radial, self.tangential, self.focal, self.share, self.centre),
-                *(self.red, self.blue, self.half_diagonals, self.fit),
+                *(self.red, self.blue, self.half_diagonals, self.fit, self.margins),
             )
         )
 
@@ -162,12 +166,12 @@ class Lens:
         return all(each.is_identity for each in models) and not any(self.tangential)
 
     def unit(self, width: int, height: int) -> tuple[float, float]:
-        """What r = 1 is in an image, in px across and down."""
+        """What r = 1 is in a picture of that size, in px across and down."""
         side = self.share * max(width, height) if self.share else self.side(width, height)
         return self.focal or (side, side)
 
     def side(self, width: int, height: int) -> float:
-        """What r = 1 of lateral colour is in an image, in px."""
+        """What r = 1 of lateral colour is in a picture of that size, in px."""
         across, down = max(width - 1, 1), max(height - 1, 1)  # as lensfun counts
         if self.half_diagonals:
             return float(self.half_diagonals * np.hypot(across, down) / 2)
@@ -175,7 +179,7 @@ class Lens:
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """See :meth:`clpipe.reference.geometry.Geometry.size`."""
-        return width, height
+        return self.margins.inside(width, height)
 
     def origins(self, x: Array, y: Array, width: int, height: int) -> tuple[Array, Array]:
         """See :meth:`clpipe.reference.geometry.Geometry.origins`."""
@@ -194,16 +198,20 @@ class Lens:
         Raises:
             ImageError: the lens folds the image over, or no scale leaves no void.
         """
-        scale = fitting_scale(self, width, height) if self.fit else 1.0
-        return _Bend(self, width, height, scale).seen(x, y, lateral or Radial())
+        scale = self.scale(width, height)
+        bend = _Bend(self, *self.size(width, height), scale)
+        u, v = bend.seen(x, y, lateral or Radial())
+        return u + self.margins.left, v + self.margins.top
 
     def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
         """See :meth:`clpipe.reference.geometry.Geometry.intrinsics`.
 
-        Without those of the render they are what the model counts in, where that is focal lengths.
-        COLMAP's models hold those of Brown and Conrady, the fisheye's, poly3 and poly5, but not
-        ptlens, whose powers are odd.
+        Those of the render are of its part without margins. Where they are not known, they are what
+        the model counts in, if that is focal lengths. COLMAP's models hold those of Brown and
+        Conrady, the fisheye's, poly3 and poly5, but not ptlens, whose powers are odd.
         """
+        longer = self.scale(width, height)
+        width, height = self.size(width, height)
         unit = self.unit(width, height)
         middle = width / 2, height / 2
         centre = [m if c is None else c for c, m in zip(self.centre, middle, strict=True)]
@@ -229,7 +237,7 @@ class Lens:
         grown = 1.0 if counts else before.fx / unit[0]  # r over the radius in focal lengths
         first, *others = above
         k = [c / first * grown ** (2 * i) for i, c in enumerate(others, 1)]
-        longer = first * self.scale(width, height)
+        longer *= first
         places = before.fx * longer, before.fy * longer, before.cx, before.cy
         named = {f"k{i}": value for i, value in enumerate(k, 1)}
         if self.radial.of_angle:
@@ -245,10 +253,22 @@ class Lens:
     def scale(self, width: int, height: int) -> float:
         """By how much ``fit`` makes an image's focal length longer; 1 without it.
 
+        With margins the picture shows no more of them than fills it: the focal length becomes no
+        shorter than it is, or than it becomes without them.
+
         Raises:
             ImageError: as :meth:`seen`.
         """
-        return fitting_scale(self, width, height) if self.fit else 1.0
+        if not self.fit:
+            return 1.0
+        scale = fitting_scale(self, *self.size(width, height))
+        if self.margins and scale < 1:
+            scale = max(scale, min(1.0, self._without_margins.scale(*self.size(width, height))))
+        return scale
+
+    @property
+    def _without_margins(self) -> "Lens":
+        return replace(self, margins=NO_MARGINS)
 
 
 def _even(powers: tuple[float, ...]) -> list[float] | None:
@@ -257,7 +277,7 @@ def _even(powers: tuple[float, ...]) -> list[float] | None:
 
 
 class _Bend:
-    """A lens before an image of some size, its picture scaled by ``scale``."""
+    """A lens and a picture of some size, scaled by ``scale``; margins are beside it."""
 
     def __init__(self, lens: Lens, width: int, height: int, scale: float) -> None:
         self.lens, self.scale, self.side = lens, scale, lens.side(width, height)
@@ -265,28 +285,44 @@ class _Bend:
         middle = width / 2, height / 2
         self.centre = tuple(m if c is None else c for c, m in zip(lens.centre, middle, strict=True))
         self.size = width, height
-        corners = np.array([(x, y) for x in (0, width) for y in (0, height)], float)
-        away = corners - self.centre
+        left, top, right, bottom = lens.margins
+        away = self._corners(0, 0, width, height)
         self.corner = float(np.hypot(*(away / self.unit).T).max())
         self.corner_side = float(np.hypot(*(away / self.side).T).max()) / scale
-        self._check(lens.radial, self.corner, "distortion", max(self.unit))
+        away = self._corners(-left, -top, width + right, height + bottom)
+        self.farthest = float(np.hypot(*(away / self.unit).T).max())  # of the image
+        self._check(lens.radial, self.farthest, self.corner, "distortion", max(self.unit))
         for lateral in (lens.red, lens.blue):
-            self._check(lateral, self.corner_side, "lateral colour", self.side)
+            self._check(lateral, self.corner_side, self.corner_side, "lateral colour", self.side)
 
-    def _check(self, radial: Radial, corner: float, what: str, unit: float) -> None:
-        """See that a model does not turn back within the image, where the picture shows it."""
-        at = None if radial.is_identity else turn(radial, corner)
+    def _corners(self, left: int, top: int, right: int, bottom: int) -> Array:
+        """The ways from the principal point to the corners of a rectangle, (corner, 2) in px."""
+        return np.array([(x, y) for x in (left, right) for y in (top, bottom)], float) - self.centre
+
+    def _check(
+        self, radial: Radial, farthest: float, corner: float, what: str, unit: float
+    ) -> None:
+        """See that a model does not turn back within the image, where the picture shows it.
+
+        Args:
+            radial: the model.
+            farthest: r of the farthest corner of the image.
+            corner: r_d of that of the picture.
+            what, unit: for the message.
+        """
+        at = None if radial.is_identity else turn(radial, farthest)
         if at is not None and not radial.bent(np.array(at)) > corner:
             raise self.folded(what, at, at * unit)
 
     def folded(self, what: str, r: float, px: float) -> ImageError:
         """The error for coefficients that fold the image over at some radius."""
-        width, height = self.size
+        width, height = self.lens.margins.around(*self.size)
+        less = ", or less overscan" if self.lens.margins else ""
         return ImageError(
             f"distortion: these coefficients fold the image over: the {what} turns back at "
             f"r = {r:.4g}, {px:.0f} px from the principal point, but the corner of "
-            f"{width}x{height} pixels is at r = {self.corner:.4g}; use coefficients that grow "
-            "up to there, or a longer focal length"
+            f"{width}x{height} pixels is at r = {self.farthest:.4g}; use coefficients that grow "
+            f"up to there, or a longer focal length{less}"
         )
 
     def seen(self, x: Array, y: Array, lateral: Radial) -> tuple[Array, Array]:
@@ -296,7 +332,7 @@ class _Bend:
         # The radius of green where that of the channel is the pixel's.
         grown = _grown(lateral, np.hypot(dx, dy) / self.side, self.corner_side)
         dx, dy = dx * grown / self.unit[0], dy * grown / self.unit[1]
-        grown = _grown(lens.radial, np.hypot(dx, dy), self.corner)
+        grown = _grown(lens.radial, np.hypot(dx, dy), self.farthest)
         ux, uy = dx * grown, dy * grown
         if any(lens.tangential):
             ux, uy = self._with_tangential(ux, uy, dx, dy)
@@ -305,7 +341,7 @@ class _Bend:
     def _with_tangential(self, ux: Array, uy: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
         """Newton's method in two dimensions, from the inverse of the radial part."""
         lens, (p1, p2) = self.lens, self.lens.tangential
-        farthest = _farthest(lens.radial, self.corner)
+        farthest = _farthest(lens.radial, self.farthest)
         begun = ux, uy
         slope = np.zeros(())
         for _ in range(50):
@@ -329,7 +365,7 @@ class _Bend:
         wrong = ~((area > 0) & (np.hypot(fx, fy) < 1e-9))
         if wrong.any():
             r = np.hypot(*begun)
-            within = wrong & (r <= self.corner)
+            within = wrong & (r <= self.farthest)
             if within.any():
                 first = float(r[within].min())
                 raise self.folded("distortion", first, first * max(self.unit))
@@ -356,10 +392,15 @@ def _grown(radial: Radial, r_d: Array, corner: float) -> Array:
 def fitting_scale(lens: Lens, width: int, height: int) -> float:
     """The scale of the picture at which it shows as much of the render as leaves no void.
 
+    Args:
+        lens: the lens, with the margins of the render.
+        width, height: of the picture.
+
     Raises:
         ImageError: there is none between 1/8 and 8, or the lens folds the image over.
     """
     across, down = np.linspace(0, width, 129), np.linspace(0, height, 129)
+    left, top, right, bottom = lens.margins
     x = np.concatenate([across, across, np.zeros(129), np.full(129, width)])
     y = np.concatenate([np.zeros(129), np.full(129, height), down, down])
 
@@ -371,7 +412,10 @@ def fitting_scale(lens: Lens, width: int, height: int) -> float:
         except ImageError:  # so far out, the lens folds
             return False
         return all(
-            u.min() >= 0 and v.min() >= 0 and u.max() <= width and v.max() <= height
+            u.min() >= -left
+            and v.min() >= -top
+            and u.max() <= width + right
+            and v.max() <= height + bottom
             for u, v in places
         )
 

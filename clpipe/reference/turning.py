@@ -10,6 +10,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Floats
+from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.resample import Axis, Parameters
 from clpipe.reference.warp import gather
 
@@ -32,6 +33,7 @@ class Turning:
         rotation: degrees in all, above 0.
         angle: the way of the middle of the picture, in degrees, from the right upwards.
         focal_length: px.
+        margins: how far the image goes on beyond the picture, about whose middle it turns.
     """
 
     parameters: ClassVar[Parameters] = (
@@ -40,11 +42,14 @@ class Turning:
         ("focal", "float"),
         ("x", "float"),
         ("y", "float"),
+        ("middle_x", "float"),
+        ("middle_y", "float"),
     )
 
     rotation: float
     angle: float
     focal_length: float
+    margins: Margins = NO_MARGINS
 
     @property
     def scale(self) -> float:
@@ -63,9 +68,16 @@ class Turning:
         """
         turns = _turns(self, 2 * self.farthest(width, height))
         x, y = math.cos(math.radians(self.angle)), -math.sin(math.radians(self.angle))
-        numbers = {name: np.float32(n) for name, n in (("x", x), ("y", y))}
+        across, down = self.middle(width, height)
+        places = {"x": x, "y": y, "middle_x": across - 0.5, "middle_y": down - 0.5}
+        numbers = {name: np.float32(n) for name, n in places.items()}
         focal = np.float32(self.focal_length)
         return {"turns": turns, "count": np.uint32(len(turns) // 3), "focal": focal, **numbers}
+
+    def middle(self, width: int, height: int) -> tuple[float, float]:
+        """That of the picture, from the image's corner, px."""
+        across, down = self.margins.inside(width, height)
+        return self.margins.left + across / 2, self.margins.top + down / 2
 
     def farthest(self, width: int, height: int) -> float:
         """How far, in px, what a pixel shows is at most from its place in the middle of the turn.
@@ -74,7 +86,8 @@ class Turning:
             ImageError: see :meth:`values`.
         """
         turn = math.radians(self.rotation) / 2
-        u = math.hypot(width, height) / 2 / self.focal_length  # of a corner, at most
+        x, y = self.middle(width, height)
+        u = math.hypot(max(x, width - x), max(y, height - y)) / self.focal_length  # of a corner
         if math.atan(u) + turn > math.radians(85):
             raise ImageError(
                 f"motion_blur: a turn of {self.rotation:g} degrees at focal_length "
@@ -102,11 +115,10 @@ class Turning:
         height, width = image.shape[:2]
         values = self.values(width, height)
         focal, x, y = values["focal"], values["x"], values["y"]
-        one, half = np.float32(1), np.float32(0.5)
+        one = np.float32(1)
         columns = np.arange(width, dtype=np.float32)
         rows = np.arange(height, dtype=np.float32)[:, None]
-        px = (columns + (half - half * np.float32(width))) / focal
-        py = (rows + (half - half * np.float32(height))) / focal
+        px, py = (columns - values["middle_x"]) / focal, (rows - values["middle_y"]) / focal
         along, aside = px * x + py * y, py * x - px * y
         total = np.zeros_like(image)
         turns = values["turns"].reshape(-1, 3)

@@ -47,10 +47,10 @@ FILTERS: dict[str, Floats] = {"bicubic": _catmull_rom(), "lanczos3": _lanczos3()
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """The map of an image on nodes ``step`` px apart, the first at its first pixel's centre.
+    """The map of a picture on nodes ``step`` px apart, the first at its first pixel's centre.
 
-    ``nodes`` are (row, column, field) float32: how far, in px, from a pixel to the place that it
-    shows, across and down, of red, green and blue.
+    ``nodes`` are (row, column, field) float32: how far, in px, from a pixel to the place in the
+    image that it shows, across and down, of red, green and blue.
     """
 
     step: int
@@ -133,7 +133,7 @@ class Warp:
 
     def resized(self, width: int, height: int) -> tuple[int, int]:
         """See :meth:`Resampler.resized`."""
-        return width, height
+        return self.lens.size(width, height)
 
     def grid(self, width: int, height: int) -> Grid:
         """The map of an image of that size.
@@ -159,15 +159,20 @@ class Warp:
     def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
         """See :meth:`Resampler.reach`."""
         first, last = _lines(self, axis, *size)
-        line = np.arange(len(first))
-        before, behind = int((line - first).max()), int((last - line).max())
+        number = 1 if axis == "rows" else 0
+        of_image, of_picture = size[number], self.resized(*size)[number]
+        line = np.arange(of_picture) * of_image
+        before = int((-(-line // of_picture) - first).max())
+        behind = int((last - line // of_picture).max())
+        low, high = (-(-each * of_image // of_picture) for each in (low, high))
         return max(low + before, 0), max(high + behind + 1, 0)
 
     def reference(self, image: Floats) -> Floats:
         """The bent image, (height, width, 3) float32 in and out; black where the lens sees none."""
         height, width = image.shape[:2]
-        fields = self.grid(width, height).fields(np.arange(height), np.arange(width))
-        result = np.empty_like(image)
+        columns, rows = self.resized(width, height)
+        fields = self.grid(width, height).fields(np.arange(rows), np.arange(columns))
+        result = np.empty((rows, columns, 3), np.float32)
         for channel, ways in enumerate(zip(fields, fields, strict=True)):
             result[..., channel] = gather(image[..., channel], *ways, FILTERS[self.filter])
         return result
@@ -182,14 +187,15 @@ def gather(plane: Floats, across: Floats, down: Floats, polynomials: Floats) -> 
         polynomials: of the filter's weights, (tap, power), as in :data:`FILTERS`.
     """
     height, width = plane.shape
+    rows, columns = across.shape
     around = mirrored(plane, len(polynomials) // 2)
-    column, across = _split(across, np.arange(width))
-    row, down = _split(down, np.arange(height)[:, None])
+    column, across = _split(across, np.arange(columns))
+    row, down = _split(down, np.arange(rows)[:, None])
     inside = _is_inside(column, across, width) & _is_inside(row, down, height)
     column, row = np.clip(column, -1, width - 1), np.clip(row, -1, height - 1)
-    total = np.zeros((height, width), np.float32)
+    total = np.zeros((rows, columns), np.float32)
     for j, of_row in enumerate(polynomials):
-        line = np.zeros((height, width), np.float32)
+        line = np.zeros((rows, columns), np.float32)
         for k, of_column in enumerate(polynomials):
             line = line + _horner(of_column, across) * around[row + (j + 1), column + (k + 1)]
         total = total + _horner(of_row, down) * line
@@ -218,7 +224,7 @@ def _horner(polynomial: Floats, x: Floats) -> Floats:
 @lru_cache(maxsize=16)
 def _grid(lens: Lens, width: int, height: int) -> Grid:
     for step in STEPS:
-        down, across = (max(-(-size // step) + 1, 4) for size in (height, width))
+        down, across = (max(-(-size // step) + 1, 4) for size in lens.size(width, height)[::-1])
         if down * across > MOST_NODES:
             break
         nodes = np.zeros((down, across, FIELDS), np.float32)
@@ -251,7 +257,7 @@ def _error(lens: Lens, width: int, height: int, grid: Grid) -> float:
     """How far, in px, a grid is off in the middle of its cells, where the lens sees the image."""
     rows, columns = (
         np.minimum(np.arange(0, size, grid.step) + grid.step // 2, size - 1)
-        for size in (height, width)
+        for size in lens.size(width, height)[::-1]
     )
     exact = _distances(lens, width, height, rows, columns)
     near = grid.fields(rows, columns)
@@ -275,6 +281,7 @@ OVERSHOOT = (1.632**2 - 1) / 2
 def _lines(warp: Warp, axis: Axis, width: int, height: int) -> tuple[Array, Array]:
     """The first and the last old row, or column, of which each new one is made at most."""
     grid, support = warp.grid(width, height), warp.support
+    sizes = warp.resized(width, height)
     # How far the pixels among each four by four nodes look to either side, of all channels.
     around = sliding_window_view(grid.nodes[..., :6], (4, 4), (0, 1))
     low, high = around.min((-2, -1)), around.max((-2, -1))
@@ -283,7 +290,7 @@ def _lines(warp: Warp, axis: Axis, width: int, height: int) -> tuple[Array, Arra
     ends = []
     for number, size in enumerate((width, height)):
         begin = np.arange(low.shape[1 - number]) * grid.step
-        end = np.minimum(begin + 3 * grid.step, size - 1)
+        end = np.minimum(begin + 3 * grid.step, sizes[number] - 1)
         shape = (1, -1) if number == 0 else (-1, 1)
         first = begin.reshape(shape) + low[..., number::2].min(-1)
         last = end.reshape(shape) + high[..., number::2].max(-1)
@@ -292,10 +299,11 @@ def _lines(warp: Warp, axis: Axis, width: int, height: int) -> tuple[Array, Arra
     number, size = (1, height) if axis == "rows" else (0, width)
     least = np.where(seen, low[..., number::2].min(-1), np.inf).min(number)
     most = np.where(seen, high[..., number::2].max(-1), -np.inf).max(number)
-    line = np.arange(size)
+    line = np.arange(sizes[number])
     window = np.clip(line // grid.step - 1, 0, len(least) - 1)
-    first = np.where(np.isinf(least[window]), line, line + least[window] - (support - 1))
-    last = np.where(np.isinf(most[window]), line, line + most[window] + support)
+    same = line + (warp.lens.margins.top if axis == "rows" else warp.lens.margins.left)
+    first = np.where(np.isinf(least[window]), same, line + least[window] - (support - 1))
+    last = np.where(np.isinf(most[window]), same, line + most[window] + support)
     # The border mirrors as many lines as the filter has beyond the edge.
     first = np.clip(np.minimum(first, size - 1 - support), 0, size - 1)
     last = np.clip(np.maximum(last, support), 0, size - 1)

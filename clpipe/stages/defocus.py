@@ -46,6 +46,7 @@ class ThinLens(Method):
 
     method: ClassVar = "thin_lens"
     kernel: ClassVar = "defocus"
+    overscan: ClassVar = True
     summary: ClassVar = "a thin lens, by a depth channel"
     tolerance: ClassVar = 1e-5
     example: ClassVar = {"max_radius": 3}
@@ -58,7 +59,7 @@ class ThinLens(Method):
     )
     depth_scale: float = parameter(1.0, "Metres in a unit of the depth.", "m", gt=0, le=1e6)
     sensor_width: float | None = parameter(
-        None, "Width of the sensor, all of which the image shows.", "mm", "none", gt=0, le=1000
+        None, "Width of the sensor, all of which the picture shows.", "mm", "none", gt=0, le=1000
     )
     pixel_pitch: float | None = parameter(
         None,
@@ -119,11 +120,8 @@ class ThinLens(Method):
             depth: (height, width) of the whole image, above 0; it may be infinite.
         """
         focus, metre = self.focus_distance * self.depth_scale * 1000, 1000.0
-        pitch = (
-            self.sensor_width / depth.shape[1]
-            if self.sensor_width
-            else (self.pixel_pitch or 0.0) / 1000
-        )
+        width, _ = self.margins.inside(depth.shape[1], depth.shape[0])
+        pitch = self.sensor_width / width if self.sensor_width else (self.pixel_pitch or 0.0) / 1000
         widest = self.focal_length**2 / (self.f_number * (focus - self.focal_length)) / pitch / 2
         nearness = np.float32(focus / (self.depth_scale * metre)) / depth
         return np.asarray(np.float32(widest) * (1 - nearness))

@@ -2,9 +2,10 @@
 
 The render is without distortion, and the picture has it. For each pixel of the picture the place
 that it shows is found by inverting the model (:mod:`clpipe.reference.lens`), and each channel is
-gathered there in one resampling (:mod:`clpipe.reference.warp`). Lateral colour and lensfun's models
-are those of lensfun (lensfun.github.io, "Lens correction models"), with r = 1 at half the short
-side of the image, between the centres of the outermost pixels.
+gathered there in one resampling (:mod:`clpipe.reference.warp`), also from beyond the picture where
+the render goes on there (:mod:`clpipe.chain.overscan`). Lateral colour and lensfun's models are
+those of lensfun (lensfun.github.io, "Lens correction models"), with r = 1 at half the short side of
+the picture, between the centres of the outermost pixels.
 """
 
 from collections.abc import Mapping
@@ -78,6 +79,7 @@ class Distortion(HasPicture):
     """A lens's distortion and lateral colour, in one resampling."""
 
     kernel: ClassVar = "distortion"
+    overscan: ClassVar = True
 
     kr: float = parameter(
         1.0, "Lateral colour, linear: size of red over that of green.", gt=0.5, lt=2
@@ -104,6 +106,7 @@ class Distortion(HasPicture):
             red=Radial.of(self.kr * self.vr, self.kr * self.cr, self.kr * self.br),
             blue=Radial.of(self.kb * self.vb, self.kb * self.cb, self.kb * self.bb),
             fit=self.fit,
+            margins=self.margins,
         )
 
     @property
@@ -181,7 +184,8 @@ class InFocalLengths(Distortion):
         found = super().of_size(width, height)
         if not found:
             return found
-        unit = self.lens().unit(width, height)
+        lens = self.lens()
+        unit = lens.unit(*lens.size(width, height))
         fx, fy = (found["focal_length_factor"] * each for each in unit)
         return {**found, "fx": fx, "fy": fy}
 
@@ -235,7 +239,7 @@ class Fisheye(InFocalLengths):
     """r_d = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8), a = atan(r): OpenCV's fisheye model.
 
     r counts from the principal point in focal lengths (Kannala and Brandt, PAMI 2006; COLMAP calls
-    it OPENCV_FISHEYE). What is beside the render's own field stays black.
+    it OPENCV_FISHEYE). What is beside the render's own field, with its overscan, stays black.
     """
 
     method: ClassVar = "fisheye"

@@ -60,6 +60,7 @@ class Linear(Method):
 
     method: ClassVar = "linear"
     kernel: ClassVar = "convolve"
+    overscan: ClassVar = True
     summary: ClassVar = "a straight streak, the same everywhere"
     example: ClassVar = {"length": 5.3, "angle": 30.0}
     alternatives: ClassVar = frozenset({"length", "rotation"})
@@ -149,6 +150,7 @@ class Perspective(Method):
 
     method: ClassVar = "perspective"
     kernel: ClassVar = "motion_blur"
+    overscan: ClassVar = True
     summary: ClassVar = "longer and bent away from the middle, as a turning camera's are"
     example: ClassVar = {"rotation": 4.0, "angle": 30.0, "focal_length": 90.0}
     alternatives: ClassVar = frozenset({"focal_length"})
@@ -179,7 +181,7 @@ class Perspective(Method):
     def turning(self) -> Turning:
         """How the picture is made of the render."""
         assert self.focal_length
-        return Turning(self.rotation, self.angle, self.focal_length)
+        return Turning(self.rotation, self.angle, self.focal_length, self.margins)
 
     def passes(self) -> tuple[Pass, ...]:
         if not self.rotation:

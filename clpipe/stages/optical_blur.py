@@ -183,6 +183,7 @@ class Lens(Method):
 
     method: ClassVar = "lens"
     kernel: ClassVar = "convolve"
+    overscan: ClassVar = True
     summary: ClassVar = "a good lens; diffraction, a low-pass filter or a measured function"
     example: ClassVar = {"sigma": 0.7}
     other_examples: ClassVar = (

@@ -24,6 +24,7 @@ class Rows(Method):
 
     method: ClassVar = "rows"
     kernel: ClassVar = "shutter"
+    overscan: ClassVar = True
     summary: ClassVar = "rows one after the other, or all at once"
     tolerance: ClassVar = 1e-5
     example: ClassVar = {"flicker_depth": 0.4, "line_time": 1e-3, "exposure_time": 4e-3}
@@ -91,7 +92,8 @@ class Rows(Method):
     def start(self) -> np.float32:
         """The light's phase in the middle of the first row's exposure, in periods."""
         middle = self.flicker_frequency * self.exposure_time / 2
-        return np.float32((middle + self.flicker_phase / 360) % 1)
+        before = self.margins.top * float(self.cycles)  # the picture's first row
+        return np.float32((middle + self.flicker_phase / 360 - before) % 1)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"cycles": self.cycles, "start": self.start, "swing": self.swing}

@@ -78,6 +78,7 @@ class Auto(Gain):
 
     method: ClassVar = "auto"
     kernel: ClassVar = "exposure_auto"
+    overscan: ClassVar = False  # it meters the picture
     summary: ClassVar = "meter the image, and bring its luminance to a target"
     example: ClassVar = {"metering": "centre_weighted"}
 

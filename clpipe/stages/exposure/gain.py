@@ -23,6 +23,7 @@ class Gain(Method):
 
     method: ClassVar = "gain"
     kernel: ClassVar = "exposure"
+    overscan: ClassVar = True
     summary: ClassVar = "multiply linear light by 2^(ev - headroom)"
     example: ClassVar = {"ev": 0.7}
 
