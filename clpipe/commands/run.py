@@ -38,17 +38,21 @@ from clpipe.commands.input_options import (
     exclude_option,
     layer_option,
     max_pixels_option,
+    poses_option,
     transfer_option,
 )
 from clpipe.commands.options import Command, raw_size_option, raw_type_option
+from clpipe.commands.poses import lines_of
 from clpipe.commands.progress import Reporter
 from clpipe.engine.device import Device, open_devices
 from clpipe.images.read import PICTURE_SUFFIXES
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
+from clpipe.inputs.poses import with_views
 from clpipe.inputs.series import Series, parse_isos
 from clpipe.outputs.folder import output_folder, remove_unfinished
 from clpipe.outputs.renditions import parse_bracket
+from clpipe.outputs.views import check_view_files, write_views
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
@@ -95,6 +99,7 @@ if TYPE_CHECKING:
 @layer_option
 @max_pixels_option
 @exclude_option
+@poses_option
 @keep_option
 @carry_option
 @companion_option
@@ -171,6 +176,7 @@ def run(
     isos: str | None,
     max_pixels: int,
     exclude: tuple[str, ...],
+    poses: Path | None,
     keep_suffix: bool,
     selectors: tuple[str, ...],
     memory: str | None,
@@ -229,7 +235,8 @@ def run(
         )
         loader = ImageLoader(request)
         found = find_jobs(inputs, output, loader.endings(), exclude, keep_suffix)
-        jobs = series.jobs(loader.exposures(found), loader.settings)
+        found = loader.exposures(found)
+        jobs = series.jobs(with_views(found, poses, loader.settings.output), loader.settings)
         tars = shard.take(cut(jobs, per_tar, output)) if per_tar else []
         jobs = [job for tar in tars for job in tar.jobs] if per_tar else shard.take(jobs)
         if not jobs:
@@ -241,6 +248,9 @@ def run(
         request = request.with_outputs(chain)
     writer = OutputWriter(output, request)
     writer.check(chain, jobs)
+    writes_views = bool(poses) and not tars and shard.of == 1
+    if writes_views:
+        check_view_files(output)
     if trace:
         check_trace(trace)
     budget = parse_size(memory) if memory else None
@@ -266,6 +276,10 @@ def run(
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
         with closing(RunLog(output / log_name(shard), start)) as log:
             follow(batch, jobs, summary, reporter, log, timeline)
+        if writes_views and not summary.interrupted:
+            written = write_views(output)
+            for line in lines_of(output, written) if written.files and not quiet else ():
+                click.echo(line, err=True)
     if summary.interrupted:
         sys.exit(130)
     sys.exit(1 if summary.failures or summary.is_fruitless else 0)

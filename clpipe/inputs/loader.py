@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.errors import KindError, NoPictureError, RequestError
+from clpipe.base.errors import ImageError, KindError, NoPictureError, RequestError
 from clpipe.base.reading import unchanged
 from clpipe.chain.chain import Chain, entry
 from clpipe.chain.depth import lenses_of, warnings_of, with_depth
@@ -55,7 +55,16 @@ class ImageLoader:
     folder: Path | None = None
 
     def for_job(self, job: Job) -> "ImageLoader":
-        """The loader for one job; the same one where the job has no values of its own."""
+        """The loader for one job; the same one where the job has no values of its own.
+
+        Raises:
+            ImageError: the job cannot be made.
+        """
+        if job.problem:
+            raise ImageError(f"{job.label}: {job.problem}")
+        return self._for_values(job)
+
+    def _for_values(self, job: Job) -> "ImageLoader":
         if not job.values and not self.has_draws:
             return self
         return ImageLoader(self.request.for_image(job.key, job.values), self.folder)
@@ -110,7 +119,7 @@ class ImageLoader:
         Raises:
             RequestError: it cannot be made.
         """
-        loader, path = self.for_job(jobs[0]), jobs[0].path
+        loader, path = self._for_values(jobs[0]), jobs[0].path
         takes = self.raw.takes
         if all(takes(job.path) for job in jobs):
             return loader.raw.first_chain(path)
@@ -138,13 +147,22 @@ class ImageLoader:
         """The image of a job.
 
         Raises:
-            ImageError: it cannot be read, is of another kind, or is written to at the same time.
+            ImageError: it cannot be read, is of another kind or size, or is written to at the same
+                time.
         """
         shutter = shutter_of(self.settings) if job.subframes else None
         if shutter:
-            return average(job, self._read, shutter)
-        with unchanged(job.path):
-            return self._read(job.path)
+            source = average(job, self._read, shutter)
+        else:
+            with unchanged(job.path):
+                source = self._read(job.path)
+        height, width = source.pixels.shape[:2]
+        if job.size and job.size != (width, height):
+            raise ImageError(
+                f"{job.path}: has {width}x{height} pixels, but its camera in --poses is of "
+                f"{job.size[0]}x{job.size[1]}; render it at that size, or give the camera of this size"
+            )
+        return source
 
     def _read(self, path: Path) -> SourceImage:
         if self.raw.takes(path):
