@@ -1,13 +1,16 @@
 """``clpipe poses``: the cameras of the pictures of a folder, for COLMAP, nerfstudio and others."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import click
 
 from clpipe.base.errors import RequestError
+from clpipe.batch.run_log import Summary
 from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show_json
-from clpipe.outputs.views import Written, write_views
+from clpipe.outputs.views import Written, check_view_files, write_views
 
 
 @click.command("poses", cls=Command)
@@ -30,9 +33,10 @@ def poses(folder: Path, as_json: bool) -> None:
         raise RequestError(f"{folder}: there is no such folder; name the output folder of a run")
     written = write_views(folder)
     if not written.files:
+        reasons = "; ".join(written.left_out) or "found no sidecar of one"
         raise RequestError(
-            f"{folder}: has no picture whose intrinsics are known; run with --poses FILE, or set "
-            "output.focal_length and output.sensor_width, or output.fx"
+            f"{folder}: has no picture whose intrinsics are known: {reasons}; run with --poses "
+            "FILE, or set output.focal_length and output.sensor_width, or output.fx"
         )
     if as_json:
         named = {"files": written.files, "pictures": written.pictures, "warnings": written.left_out}
@@ -42,8 +46,26 @@ def poses(folder: Path, as_json: bool) -> None:
         click.echo(line)
 
 
+@contextmanager
+def views_behind(folder: Path, summary: Summary, quiet: bool) -> Iterator[None]:
+    """Write the views of a run's folder behind the run, unless it was interrupted.
+
+    Raises:
+        ImageError: a file cannot be written or, before the run, is somebody else's.
+    """
+    check_view_files(folder)
+    yield
+    if not summary.interrupted:
+        lines = lines_of(folder, write_views(folder))
+        for line in () if quiet else lines:
+            click.echo(line, err=True)
+
+
 def lines_of(folder: Path, written: Written) -> list[str]:
     """What was written, and what was left out, for people."""
+    warnings = [f"warning: {each}" for each in written.left_out]
+    if not written.files:
+        return warnings
     files = ", ".join(str(folder / name) for name in written.files)
     pictures = f"{written.pictures} picture{'s' * (written.pictures != 1)}"
-    return [f"wrote {files}: {pictures}", *(f"warning: {each}" for each in written.left_out)]
+    return [f"wrote {files}: {pictures}", *warnings]

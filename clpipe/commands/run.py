@@ -42,7 +42,7 @@ from clpipe.commands.input_options import (
     transfer_option,
 )
 from clpipe.commands.options import Command, raw_size_option, raw_type_option
-from clpipe.commands.poses import lines_of
+from clpipe.commands.poses import views_behind
 from clpipe.commands.progress import Reporter
 from clpipe.engine.device import Device, open_devices
 from clpipe.images.read import PICTURE_SUFFIXES
@@ -52,7 +52,6 @@ from clpipe.inputs.poses import with_views
 from clpipe.inputs.series import Series, parse_isos
 from clpipe.outputs.folder import output_folder, remove_unfinished
 from clpipe.outputs.renditions import parse_bracket
-from clpipe.outputs.views import check_view_files, write_views
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
@@ -235,8 +234,8 @@ def run(
         )
         loader = ImageLoader(request)
         found = find_jobs(inputs, output, loader.endings(), exclude, keep_suffix)
-        found = loader.exposures(found)
-        jobs = series.jobs(with_views(found, poses, loader.settings.output), loader.settings)
+        jobs = with_views(loader.exposures(found), poses, loader.settings.output)
+        jobs = series.jobs(jobs, loader.settings)
         tars = shard.take(cut(jobs, per_tar, output)) if per_tar else []
         jobs = [job for tar in tars for job in tar.jobs] if per_tar else shard.take(jobs)
         if not jobs:
@@ -248,17 +247,13 @@ def run(
         request = request.with_outputs(chain)
     writer = OutputWriter(output, request)
     writer.check(chain, jobs)
-    writes_views = bool(poses) and not tars and shard.of == 1
-    if writes_views:
-        check_view_files(output)
     if trace:
         check_trace(trace)
-    budget = parse_size(memory) if memory else None
     spec = RunSpec(
         request,
         output,
         selectors,
-        budget,
+        parse_size(memory) if memory else None,
         threads,
         overwrite,
         verify,
@@ -269,17 +264,19 @@ def run(
     summary = Summary(len(jobs))  # counts seconds from here on
     reporter = Reporter(summary, writer, Console(stderr=True), quiet)
     events = Trace(trace) if trace else nullcontext()
-    with opened as batch, output_folder(output, shard), events as timeline:
+    has_views = poses and not tars and shard.of == 1
+    with (
+        opened as batch,
+        output_folder(output, shard),
+        views_behind(output, summary, quiet) if has_views else nullcontext(),
+        events as timeline,
+    ):
         if replay and isinstance(batch, Batch):
             warn_of_changes(replay, again, batch.devices[0])
         remove_unfinished(output, jobs)
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
         with closing(RunLog(output / log_name(shard), start)) as log:
             follow(batch, jobs, summary, reporter, log, timeline)
-        if writes_views and not summary.interrupted:
-            written = write_views(output)
-            for line in lines_of(output, written) if written.files and not quiet else ():
-                click.echo(line, err=True)
     if summary.interrupted:
         sys.exit(130)
     sys.exit(1 if summary.failures or summary.is_fruitless else 0)

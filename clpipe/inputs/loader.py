@@ -160,7 +160,7 @@ class ImageLoader:
         if job.size and job.size != (width, height):
             raise ImageError(
                 f"{job.path}: has {width}x{height} pixels, but its camera in --poses is of "
-                f"{job.size[0]}x{job.size[1]}; render it at that size, or give the camera of this size"
+                f"{job.size[0]}x{job.size[1]}; render it at that size, or give the camera of this"
             )
         return source
 

@@ -20,7 +20,7 @@ from clpipe.inputs.views import View, read_views
 ENDING = re.compile(r"\.[A-Za-z]\w{1,4}$")  # of an image's name; frame.0001 has none
 
 
-def with_views(jobs: Sequence[Job], path: Path, settings: Output) -> list[Job]:
+def with_views(jobs: Sequence[Job], path: Path | None, settings: Output) -> list[Job]:
     """The jobs of a run, each with the camera that a file has for it.
 
     A view and a render belong together where their paths are equal but for their endings, that of
@@ -30,13 +30,15 @@ def with_views(jobs: Sequence[Job], path: Path, settings: Output) -> list[Job]:
 
     Args:
         jobs: all of the run.
-        path: the file, or COLMAP's folder.
+        path: the file, or COLMAP's folder; None leaves the jobs as they are.
         settings: what holds for all renders.
 
     Raises:
         RequestError: the file cannot be read, or is of none of the forms, or has a view for no job.
     """
-    views = Views(path, read_views(path))
+    if path is None:
+        return list(jobs)
+    views = Views(read_views(path))
     called = Counter(PurePosixPath(_stem(job.key)).name for job in jobs)
     given = []
     for job in jobs:
@@ -80,15 +82,16 @@ def _with_view(job: Job, view: View, settings: Output) -> Job:
 class Views:
     """The views of a file, to be found by the paths of renders without their endings."""
 
-    def __init__(self, path: Path, views: Sequence[View]) -> None:
-        self._path = path
+    def __init__(self, views: Sequence[View]) -> None:
         self._by_path: dict[str, list[View]] = defaultdict(list)
-        self._by_name: dict[str, list[str]] = defaultdict(list)
         for view in views:
             self._by_path[_stem(view.name)].append(view)
+        self._by_end: dict[str, list[str]] = defaultdict(list)
         for stem in self._by_path:
-            self._by_name[PurePosixPath(stem).name].append(stem)
-        self._names = sorted(self._by_name)
+            parts = stem.split("/")
+            for first in range(len(parts)):
+                self._by_end["/".join(parts[first:])].append(stem)
+        self._ends = sorted(self._by_end)
 
     def find(self, stem: str, called: Mapping[str, int]) -> View:
         """The view of a render, by its path without its ending.
@@ -101,32 +104,27 @@ class Views:
             RequestError: there is none, or there are several.
         """
         name = PurePosixPath(stem).name
-        alike = self._by_name.get(name, [])
-        found = [each for each in alike if each == stem]
-        found = found or [each for each in alike if each.endswith(f"/{stem}")]
-        found = found or alike
+        is_named = stem not in self._by_path and (stem == name or stem not in self._by_end)
+        found = [stem] if stem in self._by_path else self._by_end.get(name if is_named else stem)
         if not found:
-            place = bisect_left(self._names, name)
-            near = [each for n in self._names[max(place - 1, 0) : place + 2] for each in self._by_name[n]]
-            raise RequestError(f"has no view {stem}; the nearest are {', '.join(near[:3])}")
+            place = bisect_left(self._ends, name)
+            ends = self._ends[max(place - 2, 0) : place + 2]
+            near = dict.fromkeys(self._by_end[end][0] for end in ends)
+            raise RequestError(f"has no view {stem}; the nearest are {', '.join(near)}")
         if len(found) > 1:
             raise RequestError(
                 f"{stem} may be any of the views {', '.join(found[:3])}; name the input folder so "
                 "that paths below it are theirs"
             )
-        if found == alike and not _ends_alike(found[0], stem) and called[name] > 1:
+        if is_named and called[name] > 1:
             raise RequestError(
                 f"has no view {stem}, and {called[name]} images are called {name}, so that its "
-                f"view {found[0]} may be either's"
+                f"view {found[0]} may be another's"
             )
         views = self._by_path[found[0]]
         if any(view != views[0] for view in views):
             raise RequestError(f"view {views[0].name} is there {len(views)} times, each another")
         return views[0]
-
-
-def _ends_alike(view: str, stem: str) -> bool:
-    return f"/{view}".endswith(f"/{stem}")
 
 
 def _stem(name: str) -> str:
@@ -136,5 +134,3 @@ def _stem(name: str) -> str:
     ('images/frame.0001', 'a/b', '../x/c')
     """
     return ENDING.sub("", os.path.normpath(name.replace("\\", "/")))
-
-

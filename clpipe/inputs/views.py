@@ -67,7 +67,9 @@ def read_views(path: Path) -> list[View]:
     for key, parse in FORMS.items():
         listed = values.get(key) if isinstance(values, dict) else None
         if isinstance(listed, list) and listed:
-            return [_parsed(path, number, each, values, parse) for number, each in enumerate(listed)]
+            return [
+                _parsed(path, number, each, values, parse) for number, each in enumerate(listed)
+            ]
     raise RequestError(
         f"--poses {path}: has neither a list 'views', as a cameras.json, nor 'frames', as a "
         "transforms.json"
@@ -84,9 +86,7 @@ def _read(path: Path) -> bytes:
 Parser = Callable[[Mapping[str, Any], Mapping[str, Any]], View]
 
 
-def _parsed(
-    path: Path, number: int, record: Any, common: Mapping[str, Any], parse: Parser
-) -> View:
+def _parsed(path: Path, number: int, record: Any, common: Mapping[str, Any], parse: Parser) -> View:
     """A view of a JSON.
 
     Raises:
@@ -113,14 +113,22 @@ def _from_view(view: Mapping[str, Any], common: Mapping[str, Any]) -> View:
     if "K" in own:
         k = numbers("K", own["K"], (3, 3))
         if k[0, 1] or k[1, 0] or k[2].tolist() != [0, 0, 1]:
-            raise ValueError(f"K: found {k.tolist()}, but it is [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-        values = dict(zip(("fx", "fy", "cx", "cy"), k[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True))
-    if "R" in own or "t" in own:
-        values["rotation"] = numbers("R", own.get("R"), (3, 3)).tolist()
-        values["translation"] = numbers("t", own.get("t"), (3,)).tolist()
+            raise ValueError(
+                f"K: found {k.tolist()}, but it is [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+            )
+        values = dict(
+            zip(("fx", "fy", "cx", "cy"), k[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True)
+        )
+    if ("R" in own) != ("t" in own):
+        raise ValueError("R and t belong together, and one of them is missing")
+    if "R" in own:
+        values["rotation"] = numbers("R", own["R"], (3, 3)).tolist()
+        values["translation"] = numbers("t", own["t"], (3,)).tolist()
     coefficients = own.get("distortion") or {}
     if not isinstance(coefficients, dict):
-        raise ValueError(f"distortion: found {coefficients!r}, but it is coefficients by their names")
+        raise ValueError(
+            f"distortion: found {coefficients!r}, but it is coefficients by their names"
+        )
     _check_pinhole(str(own.get("model") or "PINHOLE"), coefficients)
     return View("", values, _size(own, "width", "height"))
 
@@ -157,7 +165,9 @@ def _from_colmap(folder: Path) -> Iterator[View]:
     Raises:
         RequestError: it cannot be read.
     """
-    places = [place for place in (folder, folder / "sparse" / "0") if (place / "images.txt").exists()]
+    places = [
+        place for place in (folder, folder / "sparse" / "0") if (place / "images.txt").exists()
+    ]
     if not places:
         raise RequestError(
             f"--poses {folder}: has no images.txt, nor has its sparse/0; of a binary model, write "
@@ -214,7 +224,9 @@ def _from_image(name: str, pose: Sequence[str], camera: Sequence[str]) -> View:
     names = FOCAL_LENGTHS.get(model, ())
     parameters = numbers("PARAMS", [_number(text) for text in texts], None).tolist()
     if names and len(parameters) < len(names):
-        raise ValueError(f"its camera has {len(parameters)} parameters; {model} has {' '.join(names)}")
+        raise ValueError(
+            f"its camera has {len(parameters)} parameters; {model} has {' '.join(names)}"
+        )
     rest = {f"parameter {i + 1}": value for i, value in enumerate(parameters) if i >= len(names)}
     _check_pinhole(model, rest)
     values: dict[str, Any] = dict(zip(names, parameters, strict=False))
@@ -238,14 +250,14 @@ def numbers(name: str, value: Any, shape: tuple[int, ...] | None) -> Array:
         ValueError: it is something else; the message names it.
     """
     try:
-        array = np.array(value, np.float64) if value is not None else np.empty(0)
+        array = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError):
         array = np.full(1, np.nan)
     if (array.ndim != 1 if shape is None else array.shape != shape) or not np.isfinite(array).all():
-        kinds = {None: "numbers", (): "a number", (3,): "3 numbers"}
-        kind = kinds.get(shape) or f"{shape[0]} rows of {shape[1]} numbers"  # type: ignore[index]
+        size = "numbers" if shape is None else " rows of ".join(map(str, shape)) + " numbers"
         found = repr(value)
-        raise ValueError(f"{name}: found {found[:200]}{'...' * (len(found) > 200)}, but it is {kind}")
+        shown = f"{found[:200]}..." if len(found) > 200 else found
+        raise ValueError(f"{name}: found {shown}, but it is {'a number' if shape == () else size}")
     return array
 
 
@@ -259,7 +271,9 @@ def _size(values: Mapping[str, Any], *names: str) -> tuple[int, int] | None:
         return None
     width, height = (numbers(name, values[name], ()).item() for name in names)
     if not (width == int(width) > 0 and height == int(height) > 0):
-        raise ValueError(f"found {width:g}x{height:g} pixels, but a size is of whole numbers above 0")
+        raise ValueError(
+            f"found {width:g}x{height:g} pixels, but a size is of whole numbers above 0"
+        )
     return int(width), int(height)
 
 

@@ -4,24 +4,26 @@ nerfstudio's transforms.json.
 The pictures are sorted by their names, so the same sidecars make the same bytes in any order.
 """
 
-import json
 import os
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter
+
 from clpipe.base.about import __version__
-from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.errors import ImageError
 from clpipe.base.files import keep_names, make_folder_of, write_whole
 from clpipe.chain.formats import DNG, ending_of
+from clpipe.images.encoding import Matrix, Vector
 from clpipe.outputs.existing import is_marked
 from clpipe.outputs.renditions import truth_named
 from clpipe.outputs.sidecar import BEGINNING, SIDECAR, json_text, outputs_in, read_sidecar
 from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
-from clpipe.reference.pose import Matrix, Vector, to_opengl, to_quaternion
+from clpipe.reference.pose import to_opengl, to_quaternion
 
 CAMERAS, TRANSFORMS, COLMAP = "cameras.json", "transforms.json", "sparse/0"
 
@@ -34,6 +36,13 @@ NOTE = (
     f"clpipe {__version__}: K in px, the first pixel's centre at (0.5, 0.5); "
     "x_cam = R X + t, OpenCV's axes; models and coefficients are COLMAP's"
 )
+
+OPENGL_NOTE = (
+    f"clpipe {__version__}: camera to world, OpenGL's axes; the first pixel's centre at (0.5, 0.5)"
+)
+
+CAMERA = TypeAdapter(Intrinsics)
+POSE: TypeAdapter[tuple[Matrix, Vector]] = TypeAdapter(tuple[Matrix, Vector])
 
 NERFSTUDIO = {OPENCV: ("k1", "k2", "k3", "p1", "p2"), OPENCV_FISHEYE: ("k1", "k2", "k3", "k4")}
 
@@ -87,7 +96,7 @@ def write_views(folder: Path) -> Written:
     found = sorted(photographs(folder, left_out), key=lambda each: each.file)
     posed = [each for each in found if each.pose]
     if posed:
-        left_out[f"no pose, so not in {TRANSFORMS} and images.txt"] = [
+        left_out[f"have no pose and are not in {TRANSFORMS} and images.txt"] = [
             each.file for each in found if not each.pose
         ]
     texts = {CAMERAS: cameras_json(found), **colmap(found, posed, left_out)} if found else {}
@@ -99,10 +108,10 @@ def write_views(folder: Path) -> Written:
             make_folder_of(path)
             write_whole(path, texts[name].encode())
             keep_names(path.parent)
-        else:
+        elif texts:
             path.unlink(missing_ok=True)  # of pictures that have gone
     sentences = tuple(
-        f"{len(files)} picture{'s have' if len(files) > 1 else ' has'} {why}: such as {files[0]}"
+        f"{len(files)} of the pictures {why}, such as {min(files)}"
         for why, files in left_out.items()
         if files
     )
@@ -130,21 +139,33 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
                 continue
             try:
                 values = read_sidecar(path)
-            except FileNotFoundError:  # cut off by a loss of power, or removed just now
-                continue
-            formats = [each for each in values["request"]["formats"] if each != DNG]
-            if truth_named(values["picture"]) or not formats:
-                continue
-            file = path.with_name(f"{name.removesuffix(SIDECAR)}{ending_of(formats[0])}")
-            if file.name not in outputs_in(values) or not file.exists():
-                continue
-            shown = file.relative_to(folder).as_posix()
-            if values.get("intrinsics") is None:
-                left_out["no known intrinsics"].append(shown)
-                continue
-            pose = values.get("pose")
-            r_and_t = (pose["R"], pose["t"]) if pose else None
-            yield Photograph(shown, simplest(Intrinsics(**values["intrinsics"])), r_and_t)
+                file = _picture(path, values)
+                if not file:
+                    continue
+                shown = file.relative_to(folder).as_posix()
+                if values["intrinsics"] is None:
+                    left_out["have no known intrinsics and are in none of the files"].append(shown)
+                    continue
+                camera = CAMERA.validate_python(values["intrinsics"])
+                pose = values["pose"]
+                r_and_t = pose and POSE.validate_python((pose["R"], pose["t"]))
+                yield Photograph(shown, simplest(camera), r_and_t)
+            except (FileNotFoundError, KeyError, TypeError, ValueError, StopIteration):
+                shown = path.relative_to(folder).as_posix()
+                left_out["have a sidecar that is damaged or of another version"].append(shown)
+
+
+def _picture(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
+    """The picture of a sidecar; None where it is a truth's, or there is none.
+
+    Raises:
+        KeyError, TypeError: the values are damaged.
+    """
+    formats = [each for each in values["request"]["formats"] if each != DNG]
+    if truth_named(str(values["picture"])) or not formats:
+        return None
+    file = sidecar.with_name(f"{sidecar.name.removesuffix(SIDECAR)}{ending_of(formats[0])}")
+    return file if file.name in outputs_in(values) and file.exists() else None
 
 
 def _is_sidecar(path: Path) -> bool:
@@ -159,18 +180,18 @@ def _is_sidecar(path: Path) -> bool:
 def simplest(camera: Intrinsics) -> Intrinsics:
     """The same camera by the simplest of COLMAP's models that holds it.
 
+    Raises:
+        KeyError, StopIteration: there is no such model, or it has not these coefficients.
+
     >>> camera = Intrinsics(4, 3, 5, 5, 2, 1.5, "FULL_OPENCV", {"k1": 0.1, "k2": 0.0, "k4": 0.0})
     >>> simplest(camera).model, simplest(camera).distortion["k1"]
     ('OPENCV', 0.1)
     """
-    if camera.model == OPENCV_FISHEYE:
-        return camera
     bent = {name for name, value in camera.distortion.items() if value}
-    for model in (PINHOLE, OPENCV):
-        if bent <= set(COEFFICIENTS[model]):
-            own = {name: camera.distortion.get(name, 0.0) for name in COEFFICIENTS[model]}
-            return replace(camera, model=model, distortion=own)
-    return camera
+    models = (camera.model,) if camera.model == OPENCV_FISHEYE else (PINHOLE, OPENCV, camera.model)
+    model = next(each for each in models if bent <= {*COEFFICIENTS[each]})
+    own = {name: camera.distortion.get(name, 0.0) for name in COEFFICIENTS[model]}
+    return replace(camera, model=model, distortion=own)
 
 
 def cameras_json(pictures: Sequence[Photograph]) -> str:
@@ -203,7 +224,13 @@ def colmap(
     of_file = {}
     for each in pictures:
         camera, names = each.camera, COEFFICIENTS[each.camera.model]
-        values = (camera.fx, camera.fy, camera.cx, camera.cy, *(camera.distortion[n] for n in names))
+        values = (
+            camera.fx,
+            camera.fy,
+            camera.cx,
+            camera.cy,
+            *(camera.distortion[n] for n in names),
+        )
         size = f"{camera.width} {camera.height}"
         of_file[each.file] = numbers[f"{camera.model} {size} {_text(values)}"]
     cameras = [f"{number} {text}" for text, number in numbers.items()]
@@ -212,7 +239,9 @@ def colmap(
         images = []
         for number, each in enumerate(posed, 1):
             if any(letter.isspace() for letter in each.file):
-                left_out["a blank in its name, which images.txt cannot hold"].append(each.file)
+                left_out["have a blank in their names, which images.txt cannot hold"].append(
+                    each.file
+                )
                 continue
             assert each.pose
             r, t = each.pose
@@ -249,7 +278,7 @@ def nerfstudio(pictures: Sequence[Photograph], left_out: Mapping[str, list[str]]
         camera = each.camera
         bent = {name for name, value in camera.distortion.items() if value}
         if (camera.model == OPENCV_FISHEYE) != is_fisheye or not bent <= {*NERFSTUDIO[model]}:
-            left_out[f"a lens that {TRANSFORMS} cannot hold"].append(each.file)
+            left_out[f"have a lens that {TRANSFORMS} cannot hold"].append(each.file)
             continue
         assert each.pose
         sizes = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
@@ -261,9 +290,4 @@ def nerfstudio(pictures: Sequence[Photograph], left_out: Mapping[str, list[str]]
     shared = cameras[0] if all(each == cameras[0] for each in cameras) else {}
     if not shared:
         frames = [{**frame, **camera} for frame, camera in zip(frames, cameras, strict=True)]
-    return json_text({"note": NOTE_NERF, "camera_model": model, **shared, "frames": frames})
-
-
-NOTE_NERF = (
-    f"clpipe {__version__}: camera to world, OpenGL's axes; the first pixel's centre at (0.5, 0.5)"
-)
+    return json_text({"note": OPENGL_NOTE, "camera_model": model, **shared, "frames": frames})

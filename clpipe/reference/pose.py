@@ -33,8 +33,8 @@ def rotation(rows: Matrix) -> Matrix:
     if not off <= TOLERANCE:
         lengths = ", ".join(f"{length:.4g}" for length in np.sqrt((r * r).sum(1)))
         raise ValueError(
-            f"it is no rotation: its rows have the lengths {lengths}, and R R^T is off by {off:.2g} "
-            "from 1; take scale and shear out of it"
+            f"it is no rotation: its rows have the lengths {lengths}, and R R^T is off by "
+            f"{off:.2g} from 1; take scale and shear out of it"
         )
     if determinant < 0:
         raise ValueError("it is no rotation but mirrors: its determinant is -1; flip one axis")
