@@ -32,6 +32,7 @@ class Intrinsics:
         cx, cy: the principal point in px from the upper left corner.
         model: of :data:`COEFFICIENTS`.
         distortion: the coefficients by their names; those of green where colours part.
+        residual: by how far points may be elsewhere, in px, where the model is fitted to a lens.
     """
 
     width: int
@@ -42,6 +43,7 @@ class Intrinsics:
     cy: float
     model: str = PINHOLE
     distortion: Mapping[str, float] = field(default_factory=dict)
+    residual: float = 0.0
 
     @classmethod
     def of_render(cls, width: int, height: int, shot: Mapping[str, float]) -> "Intrinsics | None":
@@ -80,7 +82,8 @@ class Intrinsics:
         """Those of the picture made another size, its edges staying where they are."""
         x, y = width / self.width, height / self.height
         places = self.fx * x, self.fy * y, self.cx * x, self.cy * y
-        return Intrinsics(width, height, *places, self.model, self.distortion)
+        residual = self.residual * max(x, y)
+        return Intrinsics(width, height, *places, self.model, self.distortion, residual)
 
     def record(self) -> dict[str, Any]:
         """All of them as JSON values; coefficients that are not given are 0."""
