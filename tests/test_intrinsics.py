@@ -94,7 +94,7 @@ def test_the_sidecar_has_them(clpipe, write_exr, tmp_path, monkeypatch):
         **{"width": 30, "height": 20, "fx": 45.0, "fy": 45.0, "cx": 14.0, "cy": 10.0},
         **{"model": "PINHOLE", "distortion": {}, "residual": 0.0},
     }
-    contradictory = [f"distortion.{k}={v}" for k, v in BROWN.items()]
+    contradictory = [f"distortion.{k}={v}" for k, v in (BROWN | {"fx": 45.0, "cx": 15.0}).items()]
     sets = [x for each in contradictory for x in ("--set", each)]
     told = clpipe("run", "list.csv", "-o", "p", "--device", "numpy", *sets, status=1).stderr
     assert "distortion: its cx is 15 px, but that of the render is 14 px" in told

@@ -52,6 +52,11 @@ class Output(BaseModel):
             return None
         return {"R": [list(row) for row in self.rotation], "t": list(self.translation)}
 
+    @property
+    def camera(self) -> dict[str, float]:
+        """What is set of the render's camera, by the names of the fields."""
+        return self.model_dump(include=CAMERA, exclude_none=True)
+
     def filled(self, shot: Mapping[str, float]) -> "Output":
         """A copy in which ``shot``, what a source says of itself, fills the fields that are None.
 
@@ -67,4 +72,5 @@ class Output(BaseModel):
 
 
 SHOT = {"exposure_time", "focal_length", "sensor_width"}
+CAMERA = {"fx", "fy", "cx", "cy", "focal_length", "sensor_width"}
 POSE = {"rotation", "translation"}

@@ -119,7 +119,8 @@ class ImageLoader:
         Raises:
             RequestError: it cannot be made.
         """
-        loader, path = self._for_values(jobs[0]), jobs[0].path
+        first = next((job for job in jobs if not job.problem), jobs[0])
+        loader, path = self._for_values(first), first.path
         takes = self.raw.takes
         if all(takes(job.path) for job in jobs):
             return loader.raw.first_chain(path)
