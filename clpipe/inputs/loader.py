@@ -11,6 +11,7 @@ from clpipe.base.reading import unchanged
 from clpipe.chain.chain import Chain, entry
 from clpipe.chain.depth import lenses_of, warnings_of, with_depth
 from clpipe.chain.identity import image_key
+from clpipe.chain.keys import OUTPUT
 from clpipe.chain.methods import base_name, stage_named
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
@@ -140,7 +141,8 @@ class ImageLoader:
         Raises:
             RequestError: they are not; the message says in which row.
         """
-        if rows := [job for job in jobs if job.values]:
+        # What is only of a camera's file was checked when it was found there.
+        if rows := [job for job in jobs if job.place or job.values.keys() - {OUTPUT}]:
             carries = self.raw.takes if self.kept is None else lambda path: True
             check_rows(rows, self.settings, carries)
 

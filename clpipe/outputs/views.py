@@ -150,7 +150,7 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
                 pose = values["pose"]
                 r_and_t = pose and POSE.validate_python((pose["R"], pose["t"]))
                 yield Photograph(shown, simplest(camera), r_and_t)
-            except (FileNotFoundError, KeyError, TypeError, ValueError, StopIteration):
+            except (FileNotFoundError, KeyError, TypeError, ValueError):
                 shown = path.relative_to(folder).as_posix()
                 left_out["have a sidecar that is damaged or of another version"].append(shown)
 
@@ -181,15 +181,15 @@ def simplest(camera: Intrinsics) -> Intrinsics:
     """The same camera by the simplest of COLMAP's models that holds it.
 
     Raises:
-        KeyError, StopIteration: there is no such model, or it has not these coefficients.
+        KeyError: there is no such model.
 
     >>> camera = Intrinsics(4, 3, 5, 5, 2, 1.5, "FULL_OPENCV", {"k1": 0.1, "k2": 0.0, "k4": 0.0})
     >>> simplest(camera).model, simplest(camera).distortion["k1"]
     ('OPENCV', 0.1)
     """
     bent = {name for name, value in camera.distortion.items() if value}
-    models = (camera.model,) if camera.model == OPENCV_FISHEYE else (PINHOLE, OPENCV, camera.model)
-    model = next(each for each in models if bent <= {*COEFFICIENTS[each]})
+    simple = () if camera.model == OPENCV_FISHEYE else (PINHOLE, OPENCV)
+    model = next((each for each in simple if bent <= {*COEFFICIENTS[each]}), camera.model)
     own = {name: camera.distortion.get(name, 0.0) for name in COEFFICIENTS[model]}
     return replace(camera, model=model, distortion=own)
 
@@ -224,13 +224,8 @@ def colmap(
     of_file = {}
     for each in pictures:
         camera, names = each.camera, COEFFICIENTS[each.camera.model]
-        values = (
-            camera.fx,
-            camera.fy,
-            camera.cx,
-            camera.cy,
-            *(camera.distortion[n] for n in names),
-        )
+        values = [camera.fx, camera.fy, camera.cx, camera.cy]
+        values += [camera.distortion[name] for name in names]
         size = f"{camera.width} {camera.height}"
         of_file[each.file] = numbers[f"{camera.model} {size} {_text(values)}"]
     cameras = [f"{number} {text}" for text, number in numbers.items()]
@@ -239,9 +234,8 @@ def colmap(
         images = []
         for number, each in enumerate(posed, 1):
             if any(letter.isspace() for letter in each.file):
-                left_out["have a blank in their names, which images.txt cannot hold"].append(
-                    each.file
-                )
+                why = "have a blank in their names, which images.txt cannot hold"
+                left_out[why].append(each.file)
                 continue
             assert each.pose
             r, t = each.pose
