@@ -205,6 +205,7 @@ class Lens:
         COLMAP's models hold those of Brown and Conrady, the fisheye's, poly3 and poly5. ptlens,
         whose powers are odd, is fitted by theirs.
         """
+        longer = self.scale(width, height)
         unit = self.unit(width, height)
         middle = width / 2, height / 2
         centre = [m if c is None else c for c, m in zip(self.centre, middle, strict=True)]
@@ -223,7 +224,7 @@ class Lens:
                     f"px; set output.{name} and distortion to the same, or one of them"
                 )
         is_square = counts or np.isclose(before.fx, before.fy, rtol=1e-4)
-        model = self._even_model(width, height)
+        model = self._even_model(width, height, longer)
         if before.model != PINHOLE or not is_square or model is None:
             return None
         above, below, residual = model
@@ -232,7 +233,7 @@ class Lens:
         grown = 1.0 if counts else before.fx / unit[0]  # r over the radius in focal lengths
         first, *others = above
         k = [c / first * grown ** (2 * i) for i, c in enumerate(others, 1)]
-        longer = first * self.scale(width, height)
+        longer *= first
         places = before.fx * longer, before.fy * longer, before.cx, before.cy
         named = {f"k{i}": value for i, value in enumerate(k, 1)}
         if self.radial.of_angle:
@@ -242,18 +243,20 @@ class Lens:
         named |= {**under, "p1": p1, "p2": p2}
         return Intrinsics(width, height, *places, FULL_OPENCV, named, residual)
 
-    def _even_model(self, width: int, height: int) -> tuple[list[float], list[float], float] | None:
+    def _even_model(
+        self, width: int, height: int, scale: float
+    ) -> tuple[list[float], list[float], float] | None:
         """The radial model's coefficients of even powers, and by how much it is off, in px.
 
-        Where it has odd ones, those of a fit up to the radius that the picture's corner shows; None
-        where there is none.
+        Where it has odd ones, those of a fit up to the radius that the corner of a picture of that
+        size shows, with a focal length ``scale`` times as long; None where there is none.
         """
         above, below = (_even(c) for c in (self.radial.numerator[1:], self.radial.denominator))
         if above is not None and below is not None:
             return above, below, 0.0
-        bend = _Bend(self, width, height, self.scale(width, height))
-        fit = None if self.radial.of_angle else _fitted(self.radial, bend.corner, bend.scale)
-        return fit and (*fit[:2], fit[2] * max(self.unit(width, height)) * bend.scale)
+        corner = _Bend(self, width, height, scale).corner
+        fit = None if self.radial.of_angle else _fitted(self.radial, corner, scale)
+        return fit and (*fit[:2], fit[2] * max(self.unit(width, height)) * scale)
 
     def scale(self, width: int, height: int) -> float:
         """By how much ``fit`` makes an image's focal length longer; 1 without it.
