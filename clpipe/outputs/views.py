@@ -63,7 +63,7 @@ class Written:
     Args:
         files: by their paths in the folder; none where no picture's intrinsics are known.
         pictures: how many are in the first of them.
-        left_out: what is not in all of them, as sentences.
+        left_out: what is not in all of them and why, as texts.
     """
 
     files: tuple[str, ...]
@@ -96,7 +96,7 @@ def write_views(folder: Path) -> Written:
     found = sorted(photographs(folder, left_out), key=lambda each: each.file)
     posed = [each for each in found if each.pose]
     if posed:
-        left_out[f"have no pose and are not in {TRANSFORMS} and images.txt"] = [
+        left_out[f"no pose, so not in {TRANSFORMS} and images.txt"] = [
             each.file for each in found if not each.pose
         ]
     texts = {CAMERAS: cameras_json(found), **colmap(found, posed, left_out)} if found else {}
@@ -110,12 +110,12 @@ def write_views(folder: Path) -> Written:
             keep_names(path.parent)
         elif texts:
             path.unlink(missing_ok=True)  # of pictures that have gone
-    sentences = tuple(
-        f"{len(files)} of the pictures {why}, such as {min(files)}"
+    reasons = tuple(
+        f"{why}: {len(files)} picture{'s' * (len(files) > 1)}, such as {min(files)}"
         for why, files in left_out.items()
         if files
     )
-    return Written(tuple(name for name in FILES if name in texts), len(found), sentences)
+    return Written(tuple(name for name in FILES if name in texts), len(found), reasons)
 
 
 def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Photograph]:
@@ -144,7 +144,7 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
                     continue
                 shown = file.relative_to(folder).as_posix()
                 if values["intrinsics"] is None:
-                    left_out["have no known intrinsics and are in none of the files"].append(shown)
+                    left_out["no known intrinsics, so in none of the files"].append(shown)
                     continue
                 camera = CAMERA.validate_python(values["intrinsics"])
                 pose = values["pose"]
@@ -152,7 +152,7 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
                 yield Photograph(shown, simplest(camera), r_and_t)
             except (FileNotFoundError, KeyError, TypeError, ValueError):
                 shown = path.relative_to(folder).as_posix()
-                left_out["have a sidecar that is damaged or of another version"].append(shown)
+                left_out["a sidecar that is damaged or of another version"].append(shown)
 
 
 def _picture(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
@@ -234,7 +234,7 @@ def colmap(
         images = []
         for number, each in enumerate(posed, 1):
             if any(letter.isspace() for letter in each.file):
-                why = "have a blank in their names, which images.txt cannot hold"
+                why = "a blank in the name, which images.txt cannot hold"
                 left_out[why].append(each.file)
                 continue
             assert each.pose
@@ -272,7 +272,7 @@ def nerfstudio(pictures: Sequence[Photograph], left_out: Mapping[str, list[str]]
         camera = each.camera
         bent = {name for name, value in camera.distortion.items() if value}
         if (camera.model == OPENCV_FISHEYE) != is_fisheye or not bent <= {*NERFSTUDIO[model]}:
-            left_out[f"have a lens that {TRANSFORMS} cannot hold"].append(each.file)
+            left_out[f"a lens that {TRANSFORMS} cannot hold"].append(each.file)
             continue
         assert each.pose
         sizes = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
