@@ -151,6 +151,8 @@ class Context:
     colours: Matrix = IDENTITY  # linear sRGB to what red, green and blue are, white-balanced
     noise: NoiseModel | None = None  # of the sensor noise that was added
     lens: Mapping[str, Mapping[str, Any]] | None = None  # tables of stages, by their names
+    # Of the render's camera: what [output] says, as Intrinsics.of_render takes it.
+    render: Mapping[str, float] = field(default_factory=dict, compare=False, repr=False)
     clean: bool = False  # the image has no noise, and nothing may follow from what it would have
     black_level: float | None = None  # DN, as quantize used them
     white_level: float | None = None

@@ -137,7 +137,8 @@ class Cluster:
         """See that all workers have one environment, and see the same files as this machine."""
         takes = ImageLoader(self._spec.request).raw.takes
         # The chain of a raw is compiled only where all inputs are raws, as in first_chain().
-        first = next((job for job in jobs if not takes(job.path)), jobs[0])
+        able = [job for job in jobs if not job.problem] or jobs
+        first = next((job for job in able if not takes(job.path)), able[0])
         spec = replace(self._spec, first=first)
         size = first.path.stat().st_size if first.path.is_file() else None
         probe = spec.output / f".clpipe.{spec.run}"

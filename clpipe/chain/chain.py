@@ -267,7 +267,8 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     Raises:
         RequestError: image kinds do not fit.
     """
-    context = Context(camera=camera, iso=settings.iso, lens=lens_of(settings, camera))
+    lens, render = lens_of(settings, camera), settings.output.camera
+    context = Context(camera=camera, iso=settings.iso, lens=lens, render=render)
     steps: list[Step] = []
     before = "the input"
     for name in step_names(settings):

@@ -1,5 +1,7 @@
 """Options that say which images are read, and how."""
 
+from pathlib import Path
+
 import click
 
 from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS
@@ -22,6 +24,15 @@ max_pixels_option = click.option(
     type=click.IntRange(1, MAX_PIXELS),
     metavar="N",
     help="Refuse larger images, before memory is taken.",
+)
+
+poses_option = click.option(
+    "--poses",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="The camera and the pose of each render: a cameras.json, a transforms.json (NeRF, "
+    "nerfstudio), or a folder with COLMAP's text model. Those of the pictures are written to "
+    "OUT/cameras.json, OUT/transforms.json and OUT/sparse/0; see clpipe poses.",
 )
 
 exclude_option = click.option(

@@ -38,14 +38,17 @@ from clpipe.commands.input_options import (
     exclude_option,
     layer_option,
     max_pixels_option,
+    poses_option,
     transfer_option,
 )
 from clpipe.commands.options import Command, raw_size_option, raw_type_option
+from clpipe.commands.poses import views_behind
 from clpipe.commands.progress import Reporter
 from clpipe.engine.device import Device, open_devices
 from clpipe.images.read import PICTURE_SUFFIXES
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
+from clpipe.inputs.poses import with_views
 from clpipe.inputs.series import Series, parse_isos
 from clpipe.outputs.folder import output_folder, remove_unfinished
 from clpipe.outputs.renditions import parse_bracket
@@ -95,6 +98,7 @@ if TYPE_CHECKING:
 @layer_option
 @max_pixels_option
 @exclude_option
+@poses_option
 @keep_option
 @carry_option
 @companion_option
@@ -171,6 +175,7 @@ def run(
     isos: str | None,
     max_pixels: int,
     exclude: tuple[str, ...],
+    poses: Path | None,
     keep_suffix: bool,
     selectors: tuple[str, ...],
     memory: str | None,
@@ -229,7 +234,8 @@ def run(
         )
         loader = ImageLoader(request)
         found = find_jobs(inputs, output, loader.endings(), exclude, keep_suffix)
-        jobs = series.jobs(loader.exposures(found), loader.settings)
+        jobs = with_views(loader.exposures(found), poses, loader.settings.output)
+        jobs = series.jobs(jobs, loader.settings)
         tars = shard.take(cut(jobs, per_tar, output)) if per_tar else []
         jobs = [job for tar in tars for job in tar.jobs] if per_tar else shard.take(jobs)
         if not jobs:
@@ -243,12 +249,11 @@ def run(
     writer.check(chain, jobs)
     if trace:
         check_trace(trace)
-    budget = parse_size(memory) if memory else None
     spec = RunSpec(
         request,
         output,
         selectors,
-        budget,
+        parse_size(memory) if memory else None,
         threads,
         overwrite,
         verify,
@@ -259,7 +264,13 @@ def run(
     summary = Summary(len(jobs))  # counts seconds from here on
     reporter = Reporter(summary, writer, Console(stderr=True), quiet)
     events = Trace(trace) if trace else nullcontext()
-    with opened as batch, output_folder(output, shard), events as timeline:
+    has_views = poses and not tars and shard.of == 1
+    with (
+        opened as batch,
+        output_folder(output, shard),
+        views_behind(output, summary, quiet) if has_views else nullcontext(),
+        events as timeline,
+    ):
         if replay and isinstance(batch, Batch):
             warn_of_changes(replay, again, batch.devices[0])
         remove_unfinished(output, jobs)

@@ -1,13 +1,19 @@
 """How pictures are encoded and tagged: the ``[output]`` table of a configuration."""
 
+import math
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from clpipe.reference.pose import rotation
 
 SIMULATED = "clpipe "  # prefix of the camera's model in a DNG that clpipe writes
 Length = Annotated[float, Field(gt=0, le=10000, allow_inf_nan=False)]
 Pixels = Annotated[float, Field(gt=0, le=1e7, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Vector = Annotated[tuple[Finite, Finite, Finite], Field(strict=False)]  # or a list
+Matrix = Annotated[tuple[Vector, Vector, Vector], Field(strict=False), AfterValidator(rotation)]
 
 
 class Output(BaseModel):
@@ -25,8 +31,31 @@ class Output(BaseModel):
     # and the middle of the image.
     fx: Pixels | None = None
     fy: Pixels | None = None
-    cx: float | None = None
-    cy: float | None = None
+    cx: Finite | None = None
+    cy: Finite | None = None
+    # Radians, across the width of the render, as transforms.json has it.
+    camera_angle_x: Annotated[float, Field(gt=0, lt=math.pi)] | None = None
+    # From the world to the camera, in OpenCV's axes: x_cam = rotation x + translation.
+    rotation: Matrix | None = None
+    translation: Vector | None = None
+
+    @model_validator(mode="after")
+    def _check_pose(self) -> Self:
+        if (self.rotation is None) != (self.translation is None):
+            raise ValueError("rotation and translation belong together; give both, or neither")
+        return self
+
+    @property
+    def pose(self) -> dict[str, Any] | None:
+        """R and t of x_cam = R X + t; None where they are not known."""
+        if self.rotation is None or self.translation is None:
+            return None
+        return {"R": [list(row) for row in self.rotation], "t": list(self.translation)}
+
+    @property
+    def camera(self) -> dict[str, float]:
+        """What is set of the render's camera, by the names of the fields."""
+        return self.model_dump(include=CAMERA, exclude_none=True)
 
     def filled(self, shot: Mapping[str, float]) -> "Output":
         """A copy in which ``shot``, what a source says of itself, fills the fields that are None.
@@ -43,3 +72,5 @@ class Output(BaseModel):
 
 
 SHOT = {"exposure_time", "focal_length", "sensor_width"}
+CAMERA = {"fx", "fy", "cx", "cy", "focal_length", "sensor_width"}
+POSE = {"rotation", "translation"}

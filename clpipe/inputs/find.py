@@ -37,6 +37,8 @@ class Job:
         pictures: names of the renditions to make; None is all.
         written: the path as the user wrote it, where ``path`` has been made absolute.
         subframes: further files of the same exposure.
+        size: the width and height in px that it must have; None is any.
+        problem: why it cannot be made, as far as that is known before it is read.
     """
 
     path: Path
@@ -49,6 +51,8 @@ class Job:
     pictures: tuple[str, ...] | None = None
     written: str = ""
     subframes: tuple[Path, ...] = ()
+    size: tuple[int, int] | None = None
+    problem: str = ""
 
     @property
     def paths(self) -> tuple[Path, ...]:

@@ -6,11 +6,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.errors import KindError, NoPictureError, RequestError
+from clpipe.base.errors import ImageError, KindError, NoPictureError, RequestError
 from clpipe.base.reading import unchanged
 from clpipe.chain.chain import Chain, entry
 from clpipe.chain.depth import lenses_of, warnings_of, with_depth
 from clpipe.chain.identity import image_key
+from clpipe.chain.keys import OUTPUT
 from clpipe.chain.methods import base_name, stage_named
 from clpipe.chain.overscan import steps_of_overscan, with_overscan
 from clpipe.chain.request import Request
@@ -56,7 +57,16 @@ class ImageLoader:
     folder: Path | None = None
 
     def for_job(self, job: Job) -> "ImageLoader":
-        """The loader for one job; the same one where the job has no values of its own."""
+        """The loader for one job; the same one where the job has no values of its own.
+
+        Raises:
+            ImageError: the job cannot be made.
+        """
+        if job.problem:
+            raise ImageError(f"{job.label}: {job.problem}")
+        return self._for_values(job)
+
+    def _for_values(self, job: Job) -> "ImageLoader":
         if not job.values and not self.has_draws:
             return self
         return ImageLoader(self.request.for_image(job.key, job.values), self.folder)
@@ -111,7 +121,8 @@ class ImageLoader:
         Raises:
             RequestError: it cannot be made.
         """
-        loader, path = self.for_job(jobs[0]), jobs[0].path
+        first = next((job for job in jobs if not job.problem), jobs[0])
+        loader, path = self._for_values(first), first.path
         takes = self.raw.takes
         if all(takes(job.path) for job in jobs):
             return loader.raw.first_chain(path)
@@ -131,7 +142,8 @@ class ImageLoader:
         Raises:
             RequestError: they are not; the message says in which row.
         """
-        if rows := [job for job in jobs if job.values]:
+        # What is only of a camera's file was checked when it was found there.
+        if rows := [job for job in jobs if job.place or job.values.keys() - {OUTPUT}]:
             carries = self.raw.takes if self.kept is None else lambda path: True
             check_rows(rows, self.settings, carries)
 
@@ -139,13 +151,22 @@ class ImageLoader:
         """The image of a job.
 
         Raises:
-            ImageError: it cannot be read, is of another kind, or is written to at the same time.
+            ImageError: it cannot be read, is of another kind or size, or is written to at the same
+                time.
         """
         shutter = shutter_of(self.settings) if job.subframes else None
         if shutter:
-            return average(job, self._read, shutter)
-        with unchanged(job.path):
-            return self._read(job.path)
+            source = average(job, self._read, shutter)
+        else:
+            with unchanged(job.path):
+                source = self._read(job.path)
+        height, width = source.pixels.shape[:2]
+        if job.size and job.size != (width, height):
+            raise ImageError(
+                f"{job.path}: has {width}x{height} pixels, but its camera in --poses is of "
+                f"{job.size[0]}x{job.size[1]}; render it at that size, or give the camera of this"
+            )
+        return source
 
     def _read(self, path: Path) -> SourceImage:
         if self.raw.takes(path):

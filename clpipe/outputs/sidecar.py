@@ -17,6 +17,7 @@ from clpipe.base.reading import parse_json, read_bytes
 from clpipe.chain.chain import Chain
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
+from clpipe.images.encoding import POSE
 from clpipe.images.read import SourceImage
 from clpipe.images.write import versions
 from clpipe.inputs.carry import Carried
@@ -178,8 +179,9 @@ def sidecar(
         "height": height,
         "camera": chain.camera.name,
         "iso": chain.iso,
-        "output": chain.settings.output.filled(source.shot).model_dump(),
+        "output": chain.settings.output.filled(source.shot).model_dump(exclude=POSE),
         "intrinsics": intrinsics.record() if intrinsics else None,
+        "pose": chain.settings.output.pose,
         "noise": noise.record() if noise else None,
         "starts_on": chain.source.label,
         **({"raw": asdict(facts)} if facts else {}),

@@ -3,16 +3,23 @@
 The first pixel's centre is at (0.5, 0.5); OpenCV's cx and cy are smaller by 0.5.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-PINHOLE, FULL_OPENCV, OPENCV_FISHEYE = "PINHOLE", "FULL_OPENCV", "OPENCV_FISHEYE"
+from clpipe.base.errors import RequestError
+
+PINHOLE, OPENCV, FULL_OPENCV = "PINHOLE", "OPENCV", "FULL_OPENCV"
+OPENCV_FISHEYE = "OPENCV_FISHEYE"
 COEFFICIENTS = {
     PINHOLE: (),
+    OPENCV: ("k1", "k2", "p1", "p2"),
     FULL_OPENCV: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     OPENCV_FISHEYE: ("k1", "k2", "k3", "k4"),
 }
+
+AGREEMENT = 0.01  # of focal lengths; those in mm are often rounded
 
 
 @dataclass(frozen=True)
@@ -25,6 +32,7 @@ class Intrinsics:
         cx, cy: the principal point in px from the upper left corner.
         model: of :data:`COEFFICIENTS`.
         distortion: the coefficients by their names; those of green where colours part.
+        residual: by how far points may be elsewhere, in px, where the model is fitted to a lens.
     """
 
     width: int
@@ -35,6 +43,7 @@ class Intrinsics:
     cy: float
     model: str = PINHOLE
     distortion: Mapping[str, float] = field(default_factory=dict)
+    residual: float = 0.0
 
     @classmethod
     def of_render(cls, width: int, height: int, shot: Mapping[str, float]) -> "Intrinsics | None":
@@ -43,16 +52,29 @@ class Intrinsics:
         Args:
             width, height: in px.
             shot: what is known: fx, fy, cx, cy in px, or focal_length and sensor_width in mm, the
-                latter along the longer side.
+                latter along the longer side, or camera_angle_x in radians.
+
+        Raises:
+            RequestError: the focal length is known in several ways, which contradict each other.
 
         >>> Intrinsics.of_render(400, 300, {"focal_length": 50.0, "sensor_width": 40.0}).fx
         500.0
         """
-        fx = shot.get("fx")
-        if fx is None and {"focal_length", "sensor_width"} <= shot.keys():
-            fx = shot["focal_length"] / shot["sensor_width"] * max(width, height)
-        if fx is None:
+        found = {"fx": shot["fx"]} if "fx" in shot else {}
+        if "camera_angle_x" in shot:
+            found["camera_angle_x"] = width / 2 / math.tan(shot["camera_angle_x"] / 2)
+        if {"focal_length", "sensor_width"} <= shot.keys():
+            per_mm = max(width, height) / shot["sensor_width"]
+            found["focal_length and sensor_width"] = shot["focal_length"] * per_mm
+        if not found:
             return None
+        (first, fx), *others = found.items()
+        for other, length in others:
+            if abs(length - fx) > AGREEMENT * fx:
+                raise RequestError(
+                    f"output.{first} makes the focal length of this render of {width}x{height} "
+                    f"pixels {fx:g} px, but {other} {length:g} px; correct one, or leave it out"
+                )
         cx, cy = shot.get("cx", width / 2), shot.get("cy", height / 2)
         return cls(width, height, fx, shot.get("fy", fx), cx, cy)
 
@@ -60,7 +82,8 @@ class Intrinsics:
         """Those of the picture made another size, its edges staying where they are."""
         x, y = width / self.width, height / self.height
         places = self.fx * x, self.fy * y, self.cx * x, self.cy * y
-        return Intrinsics(width, height, *places, self.model, self.distortion)
+        residual = self.residual * max(x, y)
+        return Intrinsics(width, height, *places, self.model, self.distortion, residual)
 
     def record(self) -> dict[str, Any]:
         """All of them as JSON values; coefficients that are not given are 0."""

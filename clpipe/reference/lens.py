@@ -15,6 +15,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.intrinsics import FULL_OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
+from clpipe.reference.rational import fit_even
 
 # Newton's method ends where the place that it finds is bent to within this of the place asked for,
 # in the unit of r: 4e-9 px for a focal length of 4000 px.
@@ -208,7 +209,7 @@ class Lens:
 
         Those of the render are of its part without margins. Where they are not known, they are what
         the model counts in, if that is focal lengths. COLMAP's models hold those of Brown and
-        Conrady, the fisheye's, poly3 and poly5, but not ptlens, whose powers are odd.
+        Conrady, the fisheye's, poly3 and poly5. ptlens, whose powers are odd, is fitted by theirs.
         """
         longer = self.scale(width, height)
         width, height = self.size(width, height)
@@ -229,10 +230,12 @@ class Lens:
                     f"distortion: its {name} is {value:g} px, but that of the render is {known:g} "
                     f"px; set output.{name} and distortion to the same, or one of them"
                 )
-        if before.model != PINHOLE or (not counts and before.fx != before.fy):
+        is_square = counts or np.isclose(before.fx, before.fy, rtol=1e-4)
+        model = self._even_model(width, height, longer)
+        if before.model != PINHOLE or not is_square or model is None:
             return None
-        above, below = (_even(c) for c in (self.radial.numerator[1:], self.radial.denominator))
-        if above is None or below is None or max(len(above), len(below)) > 5:
+        above, below, residual = model
+        if len(above) > (5 if self.radial.of_angle else 4) or len(below) > 4:
             return None
         grown = 1.0 if counts else before.fx / unit[0]  # r over the radius in focal lengths
         first, *others = above
@@ -242,13 +245,25 @@ class Lens:
         named = {f"k{i}": value for i, value in enumerate(k, 1)}
         if self.radial.of_angle:
             return Intrinsics(width, height, *places, OPENCV_FISHEYE, named)
-        if len(k) > 3 or len(below) > 4:
-            return None
         under = {f"k{i + 3}": c * grown ** (2 * i) for i, c in enumerate(below) if i}
         p1, p2 = self.tangential
-        return Intrinsics(
-            width, height, *places, FULL_OPENCV, {**named, **under, "p1": p1, "p2": p2}
-        )
+        named |= {**under, "p1": p1, "p2": p2}
+        return Intrinsics(width, height, *places, FULL_OPENCV, named, residual)
+
+    def _even_model(
+        self, width: int, height: int, scale: float
+    ) -> tuple[list[float], list[float], float] | None:
+        """The radial model's coefficients of even powers, and by how much it is off, in px.
+
+        Where it has odd ones, those of a fit up to the radius that the corner of a picture of that
+        size shows, with a focal length ``scale`` times as long; None where there is none.
+        """
+        above, below = (_even(c) for c in (self.radial.numerator[1:], self.radial.denominator))
+        if above is not None and below is not None:
+            return above, below, 0.0
+        corner = _Bend(self, width, height, scale).corner
+        fit = None if self.radial.of_angle else _fitted(self.radial, corner, scale)
+        return fit and (*fit[:2], fit[2] * max(self.unit(width, height)) * scale)
 
     def scale(self, width: int, height: int) -> float:
         """By how much ``fit`` makes an image's focal length longer; 1 without it.
@@ -274,6 +289,17 @@ class Lens:
 def _even(powers: tuple[float, ...]) -> list[float] | None:
     """The coefficients of even powers, from the lowest up; None where there are odd ones."""
     return None if any(powers[1::2]) else list(powers[::2])
+
+
+@lru_cache(maxsize=64)
+def _fitted(
+    radial: Radial, corner: float, scale: float
+) -> tuple[list[float], list[float], float] | None:
+    """:func:`fit_even` of a model up to the radius that a picture's corner shows."""
+    farthest = _farthest(radial, corner)
+    r_max = min(float(radial.unbent(np.array([corner / scale]), farthest)[0]), farthest)
+    r = r_max * (1 - np.cos(np.linspace(0, np.pi, 201))) / 2  # close together at both ends
+    return fit_even(r, radial.bent(r))
 
 
 class _Bend:

@@ -44,10 +44,16 @@ class HasPicture(Method):
     """What is said of the picture, whatever the lens."""
 
     cx: float | None = parameter(
-        None, "Principal point, from the left edge: OpenCV's cx + 0.5.", "px", "the middle"
+        None,
+        "Principal point, from the left edge: OpenCV's cx + 0.5.",
+        "px",
+        "output.cx, the middle",
     )
     cy: float | None = parameter(
-        None, "Principal point, from the upper edge: OpenCV's cy + 0.5.", "px", "the middle"
+        None,
+        "Principal point, from the upper edge: OpenCV's cy + 0.5.",
+        "px",
+        "output.cy, the middle",
     )
     fit: bool = parameter(
         False, "Scale the picture so that it shows as much of the render as leaves no void."
@@ -93,6 +99,10 @@ class Distortion(HasPicture):
     vb: float = parameter(1.0, "Lateral colour, poly3, blue: r (vb + cb r + bb r^2).", gt=0.5, lt=2)
     cb: float = parameter(0.0, "See vb.", ge=-1, le=1)
     bb: float = parameter(0.0, "See vb.", ge=-1, le=1)
+
+    def resolve(self, context: Context) -> Self:
+        """The method with the render's principal point, where that is known."""
+        return self.filled(cx=context.render.get("cx"), cy=context.render.get("cy"))
 
     def radial(self) -> Radial:
         """The model."""
@@ -161,7 +171,7 @@ class InFocalLengths(Distortion):
     )
 
     def resolve(self, context: Context) -> Self:
-        """The method with fy.
+        """The method with fy; where it has no focal length, with the render's.
 
         Raises:
             RequestError: the focal length is not known, or twice. It is refused as late as here
@@ -172,12 +182,16 @@ class InFocalLengths(Distortion):
                 "distortion: found both fx and focal_length; set fx in px, or focal_length with "
                 "sensor_width in mm"
             )
-        if not self.fx and not (self.focal_length and self.sensor_width):
+        own, render = super().resolve(context), context.render
+        if not own.fx and not own.focal_length:
+            names = ("fx", "fy") if "fx" in render else ("focal_length", "sensor_width")
+            own = own.filled(**{name: render.get(name) for name in names})
+        if not own.fx and not (own.focal_length and own.sensor_width):
             raise RequestError(
                 f"distortion: {self.method} counts in focal lengths: set fx (px), or focal_length "
-                "and sensor_width (mm)"
+                "and sensor_width (mm), here or those of the render in output"
             )
-        return self.filled(fy=self.fx)
+        return own.filled(fy=own.fx)
 
     def of_size(self, width: int, height: int) -> Mapping[str, float]:
         """What ``fit`` makes of the focal length: its factor, and the focal length in px."""

@@ -1,0 +1,71 @@
+"""``clpipe poses``: the cameras of the pictures of a folder, for COLMAP, nerfstudio and others."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+
+from clpipe.base.errors import RequestError
+from clpipe.batch.run_log import Summary
+from clpipe.commands.options import Command, json_option
+from clpipe.commands.printing import show_json
+from clpipe.outputs.views import Written, check_view_files, write_views
+
+
+@click.command("poses", cls=Command)
+@click.argument("folder", metavar="OUT", type=click.Path(path_type=Path))
+@json_option
+def poses(folder: Path, as_json: bool) -> None:
+    """Write the cameras and poses of a run's pictures, for COLMAP, nerfstudio and other programs.
+
+    OUT is the output folder of clpipe run, finished or not. From its sidecars alone this writes
+    OUT/cameras.json, OUT/transforms.json (NeRF's and nerfstudio's) and OUT/sparse/0 (COLMAP's text
+    model): the cameras as they are after distortion and resizing. clpipe run --poses does so by
+    itself, but for tars, and for the parts of a run (--shard).
+
+    \b
+    clpipe run renders/ -o out --poses renders/cameras.json --shard 1/2
+    clpipe run renders/ -o out --poses renders/cameras.json --shard 2/2
+    clpipe poses out
+    """
+    if not folder.is_dir():
+        raise RequestError(f"{folder}: there is no such folder; name the output folder of a run")
+    written = write_views(folder)
+    if not written.files:
+        reasons = "; ".join(written.left_out) or "found no sidecar of one"
+        raise RequestError(
+            f"{folder}: has no picture whose intrinsics are known: {reasons}; run with --poses "
+            "FILE, or set output.focal_length and output.sensor_width, or output.fx"
+        )
+    if as_json:
+        named = {"files": written.files, "pictures": written.pictures, "warnings": written.left_out}
+        show_json({"folder": str(folder), **named})
+        return
+    for line in lines_of(folder, written):
+        click.echo(line)
+
+
+@contextmanager
+def views_behind(folder: Path, summary: Summary, quiet: bool) -> Iterator[None]:
+    """Write the views of a run's folder behind the run, unless it was interrupted.
+
+    Raises:
+        ImageError: a file cannot be written or, before the run, is somebody else's.
+    """
+    check_view_files(folder)
+    yield
+    if not summary.interrupted:
+        lines = lines_of(folder, write_views(folder))
+        for line in () if quiet else lines:
+            click.echo(line, err=True)
+
+
+def lines_of(folder: Path, written: Written) -> list[str]:
+    """What was written, and what was left out, for people."""
+    warnings = [f"warning: {each}" for each in written.left_out]
+    if not written.files:
+        return warnings
+    files = ", ".join(str(folder / name) for name in written.files)
+    pictures = f"{written.pictures} picture{'s' * (written.pictures != 1)}"
+    return [f"wrote {files}: {pictures}", *warnings]

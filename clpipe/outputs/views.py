@@ -1,0 +1,287 @@
+"""The views of an output folder, from its sidecars: cameras.json, COLMAP's text model and
+nerfstudio's transforms.json.
+
+The pictures are sorted by their names, so the same sidecars make the same bytes in any order.
+"""
+
+import os
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter
+
+from clpipe.base.about import __version__
+from clpipe.base.errors import ImageError
+from clpipe.base.files import keep_names, make_folder_of, write_whole
+from clpipe.chain.formats import DNG, ending_of
+from clpipe.images.encoding import Matrix, Vector
+from clpipe.outputs.existing import is_marked
+from clpipe.outputs.renditions import truth_named
+from clpipe.outputs.sidecar import BEGINNING, SIDECAR, json_text, outputs_in, read_sidecar
+from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
+from clpipe.reference.pose import to_opengl, to_quaternion
+
+CAMERAS, TRANSFORMS, COLMAP = "cameras.json", "transforms.json", "sparse/0"
+
+FILES = (
+    *(CAMERAS, TRANSFORMS),
+    *(f"{COLMAP}/cameras.txt", f"{COLMAP}/images.txt", f"{COLMAP}/points3D.txt"),
+)
+
+NOTE = (
+    f"clpipe {__version__}: K in px, the first pixel's centre at (0.5, 0.5); "
+    "x_cam = R X + t, OpenCV's axes; models and coefficients are COLMAP's"
+)
+
+OPENGL_NOTE = (
+    f"clpipe {__version__}: camera to world, OpenGL's axes; the first pixel's centre at (0.5, 0.5)"
+)
+
+CAMERA = TypeAdapter(Intrinsics)
+POSE: TypeAdapter[tuple[Matrix, Vector]] = TypeAdapter(tuple[Matrix, Vector])
+
+NERFSTUDIO = {OPENCV: ("k1", "k2", "k3", "p1", "p2"), OPENCV_FISHEYE: ("k1", "k2", "k3", "k4")}
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A picture of an output folder: its path there, its camera, and R and t, where known."""
+
+    file: str
+    camera: Intrinsics
+    pose: tuple[Matrix, Vector] | None
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was written of a folder's views.
+
+    Args:
+        files: by their paths in the folder; none where no picture's intrinsics are known.
+        pictures: how many are in the first of them.
+        left_out: what is not in all of them and why, as texts.
+    """
+
+    files: tuple[str, ...]
+    pictures: int
+    left_out: tuple[str, ...]
+
+
+def check_view_files(folder: Path) -> None:
+    """See that the files of a folder's views may be written.
+
+    Raises:
+        ImageError: one of their names is somebody else's.
+    """
+    for path in (folder / name for name in FILES):
+        if os.path.lexists(path) and not is_marked(path):
+            raise ImageError(
+                f"{path}: clpipe did not write this file, and would overwrite it with the cameras "
+                "of this folder's pictures; move it, or choose another output folder"
+            )
+
+
+def write_views(folder: Path) -> Written:
+    """Write the views of an output folder, as its sidecars say them.
+
+    Raises:
+        ImageError: a sidecar cannot be read, or a file cannot be written or is somebody else's.
+    """
+    check_view_files(folder)
+    left_out: dict[str, list[str]] = defaultdict(list)
+    found = sorted(photographs(folder, left_out), key=lambda each: each.file)
+    posed = [each for each in found if each.pose]
+    if posed:
+        left_out[f"no pose, so not in {TRANSFORMS} and images.txt"] = [
+            each.file for each in found if not each.pose
+        ]
+    texts = {CAMERAS: cameras_json(found), **colmap(found, posed, left_out)} if found else {}
+    if nerf := nerfstudio(posed, left_out):
+        texts[TRANSFORMS] = nerf
+    for name in FILES:
+        path = folder / name
+        if name in texts:
+            make_folder_of(path)
+            write_whole(path, texts[name].encode())
+            keep_names(path.parent)
+        elif texts:
+            path.unlink(missing_ok=True)  # of pictures that have gone
+    reasons = tuple(
+        f"{why}: {len(files)} picture{'s' * (len(files) > 1)}, such as {min(files)}"
+        for why, files in left_out.items()
+        if files
+    )
+    return Written(tuple(name for name in FILES if name in texts), len(found), reasons)
+
+
+def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Photograph]:
+    """The pictures that sidecars of a folder list, in the first format that is no raw.
+
+    Frames of bursts and exposures of brackets are among them; truths are not, for they are what a
+    model made of the pictures is compared with.
+
+    Args:
+        folder: the output folder.
+        left_out: gets the names of those whose camera is not known, by the reason.
+
+    Raises:
+        ImageError: a sidecar cannot be read.
+    """
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for name in names:
+            path = Path(place, name)
+            if not name.endswith(f".{SIDECAR}") or name.startswith(".") or not _is_sidecar(path):
+                continue
+            try:
+                values = read_sidecar(path)
+                file = _picture(path, values)
+                if not file:
+                    continue
+                shown = file.relative_to(folder).as_posix()
+                if values["intrinsics"] is None:
+                    left_out["no known intrinsics, so in none of the files"].append(shown)
+                    continue
+                camera = CAMERA.validate_python(values["intrinsics"])
+                pose = values["pose"]
+                r_and_t = pose and POSE.validate_python((pose["R"], pose["t"]))
+                yield Photograph(shown, simplest(camera), r_and_t)
+            except (FileNotFoundError, KeyError, TypeError, ValueError):
+                shown = path.relative_to(folder).as_posix()
+                left_out["a sidecar that is damaged or of another version"].append(shown)
+
+
+def _picture(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
+    """The picture of a sidecar; None where it is a truth's, or there is none.
+
+    Raises:
+        KeyError, TypeError: the values are damaged.
+    """
+    formats = [each for each in values["request"]["formats"] if each != DNG]
+    if truth_named(str(values["picture"])) or not formats:
+        return None
+    file = sidecar.with_name(f"{sidecar.name.removesuffix(SIDECAR)}{ending_of(formats[0])}")
+    return file if file.name in outputs_in(values) and file.exists() else None
+
+
+def _is_sidecar(path: Path) -> bool:
+    """Whether a JSON is clpipe's, by how it begins."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(BEGINNING)) == BEGINNING
+    except OSError:
+        return False
+
+
+def simplest(camera: Intrinsics) -> Intrinsics:
+    """The same camera by the simplest of COLMAP's models that holds it.
+
+    Raises:
+        KeyError: there is no such model.
+
+    >>> camera = Intrinsics(4, 3, 5, 5, 2, 1.5, "FULL_OPENCV", {"k1": 0.1, "k2": 0.0, "k4": 0.0})
+    >>> simplest(camera).model, simplest(camera).distortion["k1"]
+    ('OPENCV', 0.1)
+    """
+    bent = {name for name, value in camera.distortion.items() if value}
+    simple = () if camera.model == OPENCV_FISHEYE else (PINHOLE, OPENCV)
+    model = next((each for each in simple if bent <= {*COEFFICIENTS[each]}), camera.model)
+    own = {name: camera.distortion.get(name, 0.0) for name in COEFFICIENTS[model]}
+    return replace(camera, model=model, distortion=own)
+
+
+def cameras_json(pictures: Sequence[Photograph]) -> str:
+    """A cameras.json, which ``--poses`` reads, too."""
+    views = []
+    for each in pictures:
+        camera = each.camera
+        k = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
+        view = {"file": each.file, "width": camera.width, "height": camera.height, "K": k}
+        view |= dict(zip("Rt", each.pose, strict=True)) if each.pose else {}
+        views.append({**view, "model": camera.model, "distortion": dict(camera.distortion)})
+    return json_text({"note": NOTE, "views": views})
+
+
+def colmap(
+    pictures: Sequence[Photograph],
+    posed: Sequence[Photograph],
+    left_out: Mapping[str, list[str]],
+) -> dict[str, str]:
+    """COLMAP's text model by the paths of its files; only the cameras where no pose is known.
+
+    https://colmap.github.io/format.html. Pictures with the same camera share it.
+
+    Args:
+        pictures: all.
+        posed: those whose pose is known.
+        left_out: gets the names that the format cannot hold, by the reason.
+    """
+    numbers: dict[str, int] = defaultdict(count(1).__next__)
+    of_file = {}
+    for each in pictures:
+        camera, names = each.camera, COEFFICIENTS[each.camera.model]
+        values = [camera.fx, camera.fy, camera.cx, camera.cy]
+        values += [camera.distortion[name] for name in names]
+        size = f"{camera.width} {camera.height}"
+        of_file[each.file] = numbers[f"{camera.model} {size} {_text(values)}"]
+    cameras = [f"{number} {text}" for text, number in numbers.items()]
+    files = {"cameras.txt": ("CAMERA_ID MODEL WIDTH HEIGHT PARAMS", cameras)}
+    if posed:
+        images = []
+        for number, each in enumerate(posed, 1):
+            if any(letter.isspace() for letter in each.file):
+                why = "a blank in the name, which images.txt cannot hold"
+                left_out[why].append(each.file)
+                continue
+            assert each.pose
+            r, t = each.pose
+            placed = f"{number} {_text([*to_quaternion(r), *t])}"
+            images.append(f"{placed} {of_file[each.file]} {each.file}\n")
+        files["images.txt"] = ("IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and points", images)
+        files["points3D.txt"] = ("none", [])
+    return {
+        f"{COLMAP}/{name}": "\n".join([f"# clpipe {__version__}: {what}", *lines, ""])
+        for name, (what, lines) in files.items()
+    }
+
+
+def _text(values: Sequence[float]) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+def nerfstudio(pictures: Sequence[Photograph], left_out: Mapping[str, list[str]]) -> str:
+    """A transforms.json of nerfstudio's; "" where no picture can be in it.
+
+    https://docs.nerf.studio/quickstart/data_conventions.html. It counts pixels as COLMAP does. Its
+    k4 is none of OpenCV's, and all pictures are of one model: of more than one, fisheye pictures
+    are left out. A camera that all share stands above the frames, where other readers look for it.
+
+    Args:
+        pictures: those whose pose is known.
+        left_out: gets the names that the format cannot hold, by the reason.
+    """
+    fisheyes = [each for each in pictures if each.camera.model == OPENCV_FISHEYE]
+    is_fisheye = len(fisheyes) == len(pictures)
+    model = OPENCV_FISHEYE if is_fisheye else OPENCV
+    cameras, frames = [], []
+    for each in pictures:
+        camera = each.camera
+        bent = {name for name, value in camera.distortion.items() if value}
+        if (camera.model == OPENCV_FISHEYE) != is_fisheye or not bent <= {*NERFSTUDIO[model]}:
+            left_out[f"a lens that {TRANSFORMS} cannot hold"].append(each.file)
+            continue
+        assert each.pose
+        sizes = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
+        own = {name: camera.distortion.get(name, 0.0) for name in NERFSTUDIO[model]}
+        cameras.append({**sizes, "cx": camera.cx, "cy": camera.cy, **own})
+        frames.append({"file_path": each.file, "transform_matrix": to_opengl(*each.pose).tolist()})
+    if not frames:
+        return ""
+    shared = cameras[0] if all(each == cameras[0] for each in cameras) else {}
+    if not shared:
+        frames = [{**frame, **camera} for frame, camera in zip(frames, cameras, strict=True)]
+    return json_text({"note": OPENGL_NOTE, "camera_model": model, **shared, "frames": frames})

@@ -1,0 +1,350 @@
+"""Cameras and poses of a folder: read from each form, written in each, and where points are seen.
+
+COLMAP's and NeRF's files are read here with readers of their own, written after their formats.
+"""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from clpipe.base.errors import RequestError
+from clpipe.reference.intrinsics import Intrinsics
+from clpipe.reference.pose import from_quaternion, rotation, to_quaternion
+
+WIDTH, HEIGHT = 240, 160
+FX, FY, CX, CY = 230.0, 232.0, 121.5, 79.0
+POINTS = np.array([[x, y, 0.1 * x * y] for x in (-1.6, -0.5, 0.6, 1.5) for y in (-0.9, 0.1, 1.0)])
+RUN = ("--device", "numpy", "--format", "exr", "--stages")
+BENT = {"method": "brown_conrady", "fit": "true"}  # in the focal lengths of each render
+BENT |= {"k1": -0.15, "k2": 0.03, "p1": 0.002, "p2": -0.001}
+
+
+def turned(x, y, z):
+    """A rotation by angles in radians about x, then y, then z."""
+    (cx, cy, cz), (sx, sy, sz) = np.cos([x, y, z]), np.sin([x, y, z])
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    return np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]]) @ about_y @ about_x
+
+
+POSES = {
+    "a": (turned(0.1, 0.15, 0.05), np.array([0.1, 0.0, 4.0])),
+    "b": (turned(-0.1, -0.2, 2.9), np.array([-0.1, 0.2, 4.4])),
+}
+
+
+@pytest.fixture
+def renders(write_exr):
+    """Renders with a spot at each point, and their cameras in each form."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    views, frames, images = [], [], []
+    for number, (name, (r, t)) in enumerate(POSES.items(), 1):
+        px, py, pz = (POINTS @ r.T + t).T
+        image = np.zeros((HEIGHT, WIDTH))
+        for u, v in zip(FX * px / pz + CX, FY * py / pz + CY, strict=True):
+            image += np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 1.5**2))
+        write_exr(f"renders/{name}.exr", np.repeat(image[..., None], 3, 2), half=False)
+        k = [[FX, 0, CX], [0, FY, CY], [0, 0, 1]]
+        views.append({"file": f"{name}.exr", "K": k, "R": r.tolist(), "t": t.tolist()})
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = r.T * [1, -1, -1], -r.T @ t
+        frames.append({"file_path": f"./images/{name}", "transform_matrix": matrix.tolist()})
+        q = " ".join(map(repr, map(float, to_quaternion(r))))
+        images += [f"{number} {q} {' '.join(map(str, t))} 7 {name}.png", "1.0 2.0 -1"]
+    Path("cameras.json").write_text(
+        json.dumps({"width": WIDTH, "height": HEIGHT, "views": views, "note": "another's"})
+    )
+    own = {"fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "w": WIDTH, "h": HEIGHT}
+    Path("transforms.json").write_text(json.dumps({**own, "frames": frames}))
+    Path("model/sparse/0").mkdir(parents=True)
+    camera = f"# a comment\n7 PINHOLE {WIDTH} {HEIGHT} {FX} {FY} {CX} {CY}\n"
+    Path("model/sparse/0/cameras.txt").write_text(camera)
+    Path("model/sparse/0/images.txt").write_text("\n".join(["# a comment", *images, ""]))
+    return Path("renders")
+
+
+def changed(**changes):
+    """A cameras.json in which the view of a.exr, or what holds for all, is different."""
+    values = json.loads(Path("cameras.json").read_text())
+    common = {"width", "height"} & changes.keys()
+    values |= {name: changes[name] for name in common}
+    values["views"][0] |= {k: v for k, v in changes.items() if k not in common}
+    Path("changed.json").write_text(json.dumps(values))
+    return "changed.json"
+
+
+def rotated(w, x, y, z):
+    """The rotation of a unit quaternion, as the Rodrigues formula has it."""
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2 * w * cross + 2 * cross @ cross
+
+
+def bent(x, y, k):
+    """Brown and Conrady's formula, as OpenCV's documentation has it."""
+    r2 = x * x + y * y
+    grown = 1 + k.get("k1", 0) * r2 + k.get("k2", 0) * r2**2 + k.get("k3", 0) * r2**3
+    p1, p2 = k.get("p1", 0), k.get("p2", 0)
+    dx, dy = 2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return x * grown + dx, y * grown + dy
+
+
+def places(r, t, fx, fy, cx, cy, k):
+    x, y, z = (POINTS @ np.array(r).T + t).T
+    x, y = bent(x / z, y / z, k)
+    return np.stack([fx * x + cx, fy * y + cy], 1)
+
+
+def told(folder):
+    """Where each file of a folder says that the points are, by the name of the picture."""
+    by_form = {"cameras": {}, "nerf": {}, "colmap": {}}
+    for view in json.loads((folder / "cameras.json").read_text())["views"]:
+        (fx, _, cx), (_, fy, cy), _ = view["K"]
+        where = places(view["R"], view["t"], fx, fy, cx, cy, view["distortion"])
+        by_form["cameras"][view["file"]] = where
+    nerf = json.loads((folder / "transforms.json").read_text())
+    for frame in nerf["frames"]:
+        own = {**nerf, **frame}
+        matrix = np.array(own["transform_matrix"]) @ np.diag([1, -1, -1, 1])
+        r, t = matrix[:3, :3].T, -matrix[:3, :3].T @ matrix[:3, 3]
+        camera = [own[name] for name in ("fl_x", "fl_y", "cx", "cy")]
+        by_form["nerf"][own["file_path"]] = places(r, t, *camera, own)
+    cameras = {}
+    for line in (folder / "sparse/0/cameras.txt").read_text().splitlines()[1:]:
+        number, model, _, _, *values = line.split()
+        names = {"PINHOLE": (), "OPENCV": ("k1", "k2", "p1", "p2")}[model]
+        values = [float(value) for value in values]
+        cameras[number] = (*values[:4], dict(zip(names, values[4:], strict=True)))
+    lines = (folder / "sparse/0/images.txt").read_text().splitlines()[1:]
+    assert not any(lines[1::2])
+    for line in lines[::2]:
+        _, *numbers, camera, name = line.split(" ")
+        q, t = np.split(np.array(numbers, float), [4])
+        by_form["colmap"][name] = places(rotated(*q), t, *cameras[camera])
+    return by_form
+
+
+def seen(path, near):
+    """Where the spots of a picture are: the centroid about each place nearby."""
+    image = oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT)[..., 1].astype(float)
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
+    found = []
+    for at in near:
+        weights = image * ((x - at[0]) ** 2 + (y - at[1]) ** 2 < 6**2)
+        found.append([(weights * x).sum() / weights.sum(), (weights * y).sum() / weights.sum()])
+    return np.array(found)
+
+
+def sets(table, **parameters):
+    return [text for k, v in parameters.items() for text in ("--set", f"{table}.{k}={v}")]
+
+
+@pytest.mark.parametrize("is_bent", [False, True])
+def test_points_are_where_each_file_says(clpipe, renders, is_bent):
+    stages, options = "exposure", []
+    if is_bent:
+        stages, options = "distortion,resize", [*sets("distortion", **BENT)]
+        options += sets("resize", scale=0.75)
+    clpipe("run", renders, "-o", "o", "--poses", "cameras.json", *RUN, stages, *options)
+    for by_name in told(Path("o")).values():
+        assert by_name.keys() == {"a.exr", "b.exr"}
+        for name, where in by_name.items():
+            assert np.abs(seen(f"o/{name}", where) - where).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    "form", ["transforms.json", "model", "model/sparse/0", "o", "o/cameras.json"]
+)
+def test_each_form_says_the_same(clpipe, renders, form):
+    clpipe("run", renders, "-o", "o", "--poses", "cameras.json", *RUN, "exposure")
+    clpipe("run", renders, "-o", "p", "--poses", form, *RUN, "exposure")
+    for name, (r, t) in POSES.items():
+        made = json.loads(Path("p", f"{name}.json").read_text())
+        assert made["intrinsics"] | {"model": ""} == {
+            **{"width": WIDTH, "height": HEIGHT, "fx": FX, "fy": FY, "cx": CX, "cy": CY},
+            **{"model": "", "distortion": {}, "residual": 0.0},
+        }
+        assert np.allclose(made["pose"]["R"], r, atol=1e-12)
+        assert np.allclose(made["pose"]["t"], t, atol=1e-12)
+
+
+def test_an_angle_of_view_and_a_row_of_a_manifest(clpipe, renders):
+    values = json.loads(Path("transforms.json").read_text())
+    angle = 2 * math.atan(WIDTH / 2 / FX)
+    frames = {"camera_angle_x": angle, "frames": values["frames"]}  # as NeRF's Blender scenes have
+    Path("nerf.json").write_text(json.dumps(frames))
+    clpipe("run", renders, "-o", "o", "--poses", "nerf.json", *RUN, "exposure")
+    made = json.loads(Path("o/a.json").read_text())
+    assert made["intrinsics"]["fx"] == pytest.approx(FX)
+    assert made["intrinsics"]["fy"] == pytest.approx(FX)
+    r = POSES["a"][0].tolist()
+    row = {"output": {"fx": 9, "rotation": r, "translation": [1, 2, 3]}}
+    Path("list.jsonl").write_text(json.dumps({"path": "renders/a.exr", "name": "a", **row}))
+    clpipe("run", "list.jsonl", "-o", "p", *RUN, "exposure")
+    assert json.loads(Path("p/a.json").read_text())["pose"] == {"R": r, "t": [1, 2, 3]}
+    assert "1 picture" in clpipe("poses", "p").stdout
+
+
+def test_a_run_in_parts_makes_the_same_bytes(clpipe, renders):
+    run = ("run", renders, "--poses", "cameras.json", *RUN, "exposure")
+    clpipe(*run, "-o", "o")
+    files = [
+        "cameras.json",
+        "transforms.json",
+        *(f"sparse/0/{n}.txt" for n in ("cameras", "images")),
+    ]
+    clpipe(*run, "-o", "p", "--shard", "2/2")
+    assert not Path("p/cameras.json").exists()
+    clpipe("poses", "p")
+    half = json.loads(Path("p/cameras.json").read_text())
+    assert [view["file"] for view in half["views"]] == ["b.exr"]
+    clpipe(*run, "-o", "p", "--shard", "1/2")
+    clpipe("poses", "p")
+    assert all(Path("o", f).read_bytes() == Path("p", f).read_bytes() for f in files)
+    # A second run makes nothing but the files; another pose makes its picture again.
+    assert "(2 of them were there already)" in clpipe(*run, "-o", "o").stderr
+    again = clpipe("run", renders, "-o", "o", "--poses", changed(t=[0, 0, 9.0]), *RUN, "exposure")
+    assert "(1 of them were there already)" in again.stderr
+    assert json.loads(Path("o/cameras.json").read_text())["views"][0]["t"] == [0, 0, 9.0]
+
+
+def test_photographs_are_in_it_and_truths_are_not(clpipe, write_exr):
+    write_exr("in/x/a b.exr", np.full((6, 8, 3), 0.2))
+    write_exr("in/x/c.exr", np.full((6, 8, 3), 0.2))
+    lens = sets("output", fx=9)
+    pose = sets("output", rotation="[[1, 0, 0], [0, 1, 0], [0, 0, 1]]", translation="[0, 0, 1]")
+    run = ("run", "in", "-o", "o", "--device", "numpy", "--frames", 2, "--bracket=-1,0", *lens)
+    clpipe(*run, "--format", "dng", "--format", "png", "--truth", "clean")
+    told = clpipe("poses", "o", "--json").stdout
+    assert json.loads(told)["files"] == ["cameras.json", "sparse/0/cameras.txt"]  # without poses
+    clpipe(*run, *pose, "--format", "dng", "--format", "png")
+    told = clpipe("poses", "o").stdout
+    assert (
+        "a blank in the name, which images.txt cannot hold: 4 pictures" in told
+        and "x/a b.ev+0.frame0" in told
+    )
+    views = json.loads(Path("o/cameras.json").read_text())["views"]
+    names = [
+        f"x/{n}.ev{e}.frame{f}.png" for n in ("a b", "c") for e in ("+0", "-1") for f in (0, 1)
+    ]
+    assert [view["file"] for view in views] == names
+    assert [
+        line.split(" ")[9] for line in Path("o/sparse/0/images.txt").read_text().splitlines()[1::2]
+    ] == names[4:]
+    assert Path("o/sparse/0/cameras.txt").read_text().count("\n") == 2  # all share one
+    # Where no picture has a pose any more, nothing is left of those files.
+    clpipe(*run, "--format", "dng", "--format", "png")
+    clpipe("poses", "o")
+    assert not Path("o/transforms.json").exists() and not Path("o/sparse/0/images.txt").exists()
+
+
+def test_a_lens_that_nerfstudio_cannot_hold(clpipe, renders):
+    lens = sets("distortion", **BENT | {"k4": 0.01})
+    told = clpipe("run", renders, "-o", "o", "--poses", "cameras.json", *RUN, "distortion", *lens)
+    assert "a lens that transforms.json cannot hold: 2 pictures, such as a.exr" in told.stderr
+    assert not Path("o/transforms.json").exists()
+    assert "FULL_OPENCV" in Path("o/sparse/0/cameras.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"file": "ab.exr"}, "has no view a; the nearest are ab, b"),
+        ({"R": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}, "its rows have the lengths 2, 2, 2"),
+        ({"R": [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]}, "its determinant is -1"),
+        ({"t": [1, 2]}, "t: found [1, 2], but it is 3 numbers"),
+        ({"t": [1, 2, float("nan")]}, "but it is 3 numbers"),
+        ({"K": [[9, 1, 3], [0, 9, 3], [0, 0, 1]]}, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"),
+        ({"K": [[-9, 0, 3], [0, 9, 3], [0, 0, 1]]}, "output.fx: found -9.0"),
+        ({"distortion": {"k1": 0.1}}, "has distortion (k1 0.1), but a render is straight"),
+        ({"model": "OPENCV_FISHEYE"}, "is of the model OPENCV_FISHEYE"),
+        ({"width": WIDTH / 2, "height": HEIGHT / 2}, "its camera in --poses is of 120x80"),
+    ],
+)
+def test_a_view_that_is_wrong_fails_alone(clpipe, renders, changes, message):
+    poses = changed(**changes)
+    is_alone = "width" not in changes
+    run = (
+        "run",
+        renders,
+        "-o",
+        "o",
+        "--poses",
+        poses,
+        *RUN,
+        "distortion",
+        *sets("distortion", **BENT),
+    )
+    told = clpipe(*run, status=1).stderr
+    assert message in told
+    assert Path("o/b.exr").exists() == is_alone
+    assert not Path("o/a.exr").exists()
+
+
+def test_what_is_wrong_with_all_is_refused(clpipe, renders):
+    run = ("run", renders, "-o", "o", *RUN, "exposure", "--poses")
+
+    def refused(*arguments, status=2):
+        return clpipe(*run, *arguments, status=status).stderr
+
+    told = refused("cameras.json", *sets("output", fx=1000))
+    assert f"has fx {FX}, but the configuration has output.fx 1000" in told
+    told = refused("cameras.json", *sets("output", focal_length=50, sensor_width=36), status=1)
+    assert "output.fx makes the focal length of this render of 240x160 pixels 230 px" in told
+    assert "no such file" in refused("missing.json").lower()
+    assert "has no images.txt" in refused("renders")
+    Path("other.json").write_text('{"frames": 3}')
+    assert "has neither a list 'views'" in refused("other.json")
+    Path("model/sparse/0/images.txt").write_text("1 0 0 0 0 0 0 0 7 a.exr\n\n1 2 3\n")
+    assert "found the line '1 2 3'" in refused("model")
+    Path("o").mkdir(exist_ok=True)
+    Path("o/transforms.json").write_text("{}")
+    assert "transforms.json: clpipe did not write this file" in refused("cameras.json", status=1)
+    assert Path("o/transforms.json").read_text() == "{}"
+
+
+def test_views_are_found_by_paths_and_by_names_that_are_unique(clpipe, write_exr):
+    for name in ("a/1", "b/1", "b/2"):
+        write_exr(f"in/{name}.exr", np.full((6, 8, 3), 0.2))
+
+    def found(*names, status=0):
+        k = [[9, 0, 4], [0, 9, 3], [0, 0, 1]]
+        r = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+        views = [{"file": n, "K": k, "R": r, "t": [i, 0, 0]} for i, n in enumerate(names)]
+        Path("v.json").write_text(json.dumps({"views": views}))
+        told = clpipe(
+            "run", "in", "-o", "o", "--poses", "v.json", *RUN, "exposure", status=status
+        ).stderr
+        made = json.loads(Path("o/cameras.json").read_text())["views"]
+        return {view["file"]: view["t"][0] for view in made}, told
+
+    all_found = {"a/1.exr": 1, "b/1.exr": 0, "b/2.exr": 2}
+    assert found("b/1.png", "a/1.png", "2")[0] == all_found
+    assert found("x/y/b/1", "./x/y/a/1", "elsewhere/2.0.png", "c/2.exr")[0] == all_found | {
+        "b/2.exr": 3
+    }
+    _, told = found("1.png", "b/2.exr", status=1)
+    assert "in/a/1.exr: --poses v.json: has no view a/1, and 2 images are called 1" in told
+    _, told = found("b/1", "a/1", "c/2", "d/2", status=1)
+    assert "b/2 may be any of the views c/2, d/2" in told
+
+
+def test_focal_lengths_that_contradict_each_other():
+    shot = {"fx": 500.0, "focal_length": 50.0, "sensor_width": 40.0}
+    assert Intrinsics.of_render(400, 300, shot).fx == 500
+    with pytest.raises(RequestError, match="px, but camera_angle_x 200 px"):
+        Intrinsics.of_render(400, 300, {**shot, "camera_angle_x": math.pi / 2})
+
+
+@given(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 1e-3))
+def test_quaternions_are_those_of_rotations(q):
+    unit = np.array(q) / np.linalg.norm(q)
+    r = from_quaternion(q)
+    assert np.allclose(r, rotated(*unit), atol=1e-12)
+    again = to_quaternion(rotation(r.tolist()))
+    assert again[0] >= 0 and np.allclose(np.abs(again @ unit), 1, atol=1e-12)
