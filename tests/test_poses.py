@@ -334,6 +334,20 @@ def test_views_are_found_by_paths_and_by_names_that_are_unique(clpipe, write_exr
     assert "b/2 may be any of the views c/2, d/2" in told
 
 
+def test_the_size_of_a_render_with_overscan_is_without_it(clpipe, write_exr):
+    around = {"x": -2, "y": -3, "full_x": 0, "full_y": 0, "full_width": 8, "full_height": 6}
+    write_exr("in/a.exr", np.full((12, 12, 3), 0.2), **around)
+    view = {"file": "a", "K": [[9, 0, 4], [0, 9, 3], [0, 0, 1]], "width": 8, "height": 6}
+    Path("v.json").write_text(json.dumps({"views": [view]}))
+    lens = sets("distortion", method="brown_conrady", k1=-0.1)
+    clpipe("run", "in", "-o", "o", "--poses", "v.json", *RUN, "distortion", *lens)
+    made = json.loads(Path("o/a.json").read_text())
+    assert made["overscan"] and (made["intrinsics"]["width"], made["intrinsics"]["height"]) == (
+        8,
+        6,
+    )
+
+
 def test_focal_lengths_that_contradict_each_other():
     shot = {"fx": 500.0, "focal_length": 50.0, "sensor_width": 40.0}
     assert Intrinsics.of_render(400, 300, shot).fx == 500

@@ -160,7 +160,7 @@ class ImageLoader:
         else:
             with unchanged(job.path):
                 source = self._read(job.path)
-        height, width = source.pixels.shape[:2]
+        width, height = source.margins.inside(*source.pixels.shape[1::-1])
         if job.size and job.size != (width, height):
             raise ImageError(
                 f"{job.path}: has {width}x{height} pixels, but its camera in --poses is of "
