@@ -16,7 +16,7 @@ from clpipe.chain.settings import settings_from
 from clpipe.engine.check import example
 from clpipe.engine.runner import Runner
 from clpipe.engine.tiles import buffer_sizes, tiling_of, whole_image
-from clpipe.reference.lens import Radial
+from clpipe.reference.radial import Radial
 from clpipe.reference.warp import FILTERS, Warp
 from clpipe.stage import Kind
 from clpipe.stages.distortion import BrownConrady, Fisheye, PtLens

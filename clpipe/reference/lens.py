@@ -6,114 +6,22 @@ the principal point in units of its own: of the focal length, or of half the sho
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Self
 
 import numpy as np
-from numpy.polynomial.polynomial import polyder, polyval
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.intrinsics import FULL_OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
-from clpipe.reference.rational import fit_even
-
-# Newton's method ends where the place that it finds is bent to within this of the place asked for,
-# in the unit of r: 4e-9 px for a focal length of 4000 px.
-RESIDUAL = 1e-12
-SAMPLES = 2049  # of a radial model, between which its inverse is begun
-# Beyond the corner the model still holds for this share of its radius, for what is interpolated
-# there; then it goes on straight.
-BEYOND = 1.25
-
-
-@dataclass(frozen=True)
-class Radial:
-    """r_d = N(r) / M(r), polynomials with their coefficients from the lowest power up.
-
-    With ``of_angle`` they are polynomials of atan(r), the angle to the axis.
-
-    >>> cubic = Radial((0.0, 1.0, 0.0, -0.1))
-    >>> float(cubic.bent(np.array(0.5))), float(cubic.slope(np.array(0.5)))
-    (0.4875, 0.925)
-    """
-
-    numerator: tuple[float, ...] = (0.0, 1.0)
-    denominator: tuple[float, ...] = (1.0,)
-    of_angle: bool = False
-
-    @classmethod
-    def of(cls, *numerator: float, below: tuple[float, ...] = (), of_angle: bool = False) -> Self:
-        """The model N(r) / (1 + M(r)), each polynomial from r^1 up, without zeros at its end.
-
-        >>> Radial.of(1.0, 0.0, 0.0).is_identity
-        True
-        """
-        above, under = (
-            tuple(map(float, np.trim_zeros(c, "b"))) for c in ((0.0, *numerator), (1.0, *below))
-        )
-        return cls(above, under, of_angle)
-
-    @property
-    def is_identity(self) -> bool:
-        """Whether every r_d is r."""
-        return self == Radial()
-
-    def bent(self, r: Array) -> Array:
-        """r_d, the radius in the picture, of r, the radius without the lens; float64."""
-        x = np.arctan(r) if self.of_angle else r
-        return polyval(x, self.numerator) / polyval(x, self.denominator)
-
-    def slope(self, r: Array) -> Array:
-        """The derivative of :meth:`bent`."""
-        x = np.arctan(r) if self.of_angle else r
-        n, m = polyval(x, self.numerator), polyval(x, self.denominator)
-        dn, dm = polyval(x, polyder(self.numerator)), polyval(x, polyder(self.denominator))
-        slope = (dn * m - n * dm) / (m * m)
-        return slope / (1 + r * r) if self.of_angle else slope
-
-    def unbent(self, r_d: Array, farthest: float) -> Array:
-        """r of each r_d, by Newton's method to :data:`RESIDUAL`.
-
-        Args:
-            r_d: radii in the picture.
-            farthest: the radius up to which the model grows and is inverted; beyond its r_d, r goes
-                on straight.
-        """
-        if self.is_identity:
-            return r_d
-        known = np.linspace(0, farthest, SAMPLES)
-        bent = self.bent(known)
-        inside = np.minimum(r_d, bent[-1])
-        r = np.interp(inside, bent, known)
-        for _ in range(20):
-            error = self.bent(r) - inside
-            if np.abs(error).max(initial=0) < RESIDUAL:
-                break
-            r = np.clip(r - error / np.maximum(self.slope(r), 1e-9), 0, farthest)
-        # A slope near 0 would throw what is outside of the image far away.
-        slope = max(float(self.slope(known[-1])), 0.25 * bent[-1] / farthest)
-        return r + (r_d - inside) / slope
-
-
-@lru_cache(maxsize=64)
-def turn(radial: Radial, farthest: float) -> float | None:
-    """The first radius up to ``farthest`` at which r_d no longer grows; None if it always does.
-
-    >>> round(turn(Radial((0.0, 1.0, 0.0, -0.5)), 1.0), 3)
-    0.816
-    """
-    r = np.linspace(0, farthest, SAMPLES)
-    x = np.arctan(r) if radial.of_angle else r
-    with np.errstate(divide="ignore", invalid="ignore"):
-        grows = (radial.slope(r) > 0) & (polyval(x, radial.denominator) > 0)
-    if grows.all():
-        return None
-    first = int(grows.argmin())
-    low, high = float(r[max(first - 1, 0)]), float(r[first])
-    for _ in range(40):
-        middle = (low + high) / 2
-        low, high = (middle, high) if radial.slope(np.array(middle)) > 0 else (low, middle)
-    return high
+from clpipe.reference.radial import (
+    RESIDUAL,
+    STRAIGHT,
+    Radial,
+    even_powers,
+    farthest_of,
+    grown_by,
+    turn,
+)
 
 
 @dataclass(frozen=True)
@@ -137,13 +45,13 @@ class Lens:
             image's width and height are with them; ``centre`` and all units are without.
     """
 
-    radial: Radial = Radial()
+    radial: Radial = STRAIGHT
     tangential: tuple[float, float] = (0.0, 0.0)
     focal: tuple[float, float] | None = None
     share: float | None = None
     centre: tuple[float | None, float | None] = (None, None)
-    red: Radial = Radial()
-    blue: Radial = Radial()
+    red: Radial = STRAIGHT
+    blue: Radial = STRAIGHT
     half_diagonals: float | None = None
     fit: bool = False
     margins: Margins = NO_MARGINS
@@ -201,7 +109,7 @@ class Lens:
         """
         scale = self.scale(width, height)
         bend = _Bend(self, *self.size(width, height), scale)
-        u, v = bend.seen(x, y, lateral or Radial())
+        u, v = bend.seen(x, y, lateral or STRAIGHT)
         return u + self.margins.left, v + self.margins.top
 
     def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
@@ -209,7 +117,7 @@ class Lens:
 
         Those of the render are of its part without margins. Where they are not known, they are what
         the model counts in, if that is focal lengths. COLMAP's models hold those of Brown and
-        Conrady, the fisheye's, poly3 and poly5. ptlens, whose powers are odd, is fitted by theirs.
+        Conrady, the fisheye's, poly3 and poly5; ptlens, whose powers are odd, is fitted by theirs.
         """
         longer = self.scale(width, height)
         width, height = self.size(width, height)
@@ -231,15 +139,17 @@ class Lens:
                     f"px; set output.{name} and distortion to the same, or one of them"
                 )
         is_square = counts or np.isclose(before.fx, before.fy, rtol=1e-4)
-        model = self._even_model(width, height, longer)
+        bend = _Bend(self, width, height, longer)
+        model = even_powers(self.radial, bend.corner / longer, bend.farthest)
         if before.model != PINHOLE or not is_square or model is None:
             return None
-        above, below, residual = model
+        above, below, off = model
         if len(above) > (5 if self.radial.of_angle else 4) or len(below) > 4:
             return None
         grown = 1.0 if counts else before.fx / unit[0]  # r over the radius in focal lengths
         first, *others = above
         k = [c / first * grown ** (2 * i) for i, c in enumerate(others, 1)]
+        residual = off * max(unit) * longer
         longer *= first
         places = before.fx * longer, before.fy * longer, before.cx, before.cy
         named = {f"k{i}": value for i, value in enumerate(k, 1)}
@@ -249,21 +159,6 @@ class Lens:
         p1, p2 = self.tangential
         named |= {**under, "p1": p1, "p2": p2}
         return Intrinsics(width, height, *places, FULL_OPENCV, named, residual)
-
-    def _even_model(
-        self, width: int, height: int, scale: float
-    ) -> tuple[list[float], list[float], float] | None:
-        """The radial model's coefficients of even powers, and by how much it is off, in px.
-
-        Where it has odd ones, those of a fit up to the radius that the corner of a picture of that
-        size shows, with a focal length ``scale`` times as long; None where there is none.
-        """
-        above, below = (_even(c) for c in (self.radial.numerator[1:], self.radial.denominator))
-        if above is not None and below is not None:
-            return above, below, 0.0
-        corner = _Bend(self, width, height, scale).corner
-        fit = None if self.radial.of_angle else _fitted(self.radial, corner, scale)
-        return fit and (*fit[:2], fit[2] * max(self.unit(width, height)) * scale)
 
     def scale(self, width: int, height: int) -> float:
         """By how much ``fit`` makes an image's focal length longer; 1 without it.
@@ -284,22 +179,6 @@ class Lens:
     @property
     def _without_margins(self) -> "Lens":
         return replace(self, margins=NO_MARGINS)
-
-
-def _even(powers: tuple[float, ...]) -> list[float] | None:
-    """The coefficients of even powers, from the lowest up; None where there are odd ones."""
-    return None if any(powers[1::2]) else list(powers[::2])
-
-
-@lru_cache(maxsize=64)
-def _fitted(
-    radial: Radial, corner: float, scale: float
-) -> tuple[list[float], list[float], float] | None:
-    """:func:`fit_even` of a model up to the radius that a picture's corner shows."""
-    farthest = _farthest(radial, corner)
-    r_max = min(float(radial.unbent(np.array([corner / scale]), farthest)[0]), farthest)
-    r = r_max * (1 - np.cos(np.linspace(0, np.pi, 201))) / 2  # close together at both ends
-    return fit_even(r, radial.bent(r))
 
 
 class _Bend:
@@ -356,9 +235,9 @@ class _Bend:
         lens = self.lens
         dx, dy = (x - self.centre[0]) / self.scale, (y - self.centre[1]) / self.scale
         # The radius of green where that of the channel is the pixel's.
-        grown = _grown(lateral, np.hypot(dx, dy) / self.side, self.corner_side)
+        grown = grown_by(lateral, np.hypot(dx, dy) / self.side, self.corner_side)
         dx, dy = dx * grown / self.unit[0], dy * grown / self.unit[1]
-        grown = _grown(lens.radial, np.hypot(dx, dy), self.farthest)
+        grown = grown_by(lens.radial, np.hypot(dx, dy), self.farthest)
         ux, uy = dx * grown, dy * grown
         if any(lens.tangential):
             ux, uy = self._with_tangential(ux, uy, dx, dy)
@@ -367,7 +246,7 @@ class _Bend:
     def _with_tangential(self, ux: Array, uy: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
         """Newton's method in two dimensions, from the inverse of the radial part."""
         lens, (p1, p2) = self.lens, self.lens.tangential
-        farthest = _farthest(lens.radial, self.farthest)
+        farthest = farthest_of(lens.radial, self.farthest)
         begun = ux, uy
         slope = np.zeros(())
         for _ in range(50):
@@ -399,21 +278,6 @@ class _Bend:
         return ux, uy
 
 
-def _farthest(radial: Radial, corner: float) -> float:
-    """The radius up to which a model is inverted: somewhat beyond the corner."""
-    at = turn(radial, BEYOND * corner)
-    return BEYOND * corner if at is None else max(0.999 * at, min(corner, at))
-
-
-def _grown(radial: Radial, r_d: Array, corner: float) -> Array:
-    """r over r_d, the inverse of a model as a factor."""
-    if radial.is_identity:
-        return np.ones_like(r_d)
-    at_centre = 1 / radial.slope(np.zeros(()))
-    r = radial.unbent(r_d, _farthest(radial, corner))
-    return np.divide(r, r_d, out=np.full_like(r_d, at_centre), where=r_d > 0)
-
-
 @lru_cache(maxsize=256)
 def fitting_scale(lens: Lens, width: int, height: int) -> float:
     """The scale of the picture at which it shows as much of the render as leaves no void.
@@ -433,7 +297,7 @@ def fitting_scale(lens: Lens, width: int, height: int) -> float:
     def is_full(scale: float) -> bool:
         try:
             bend = _Bend(lens, width, height, scale)
-            channels = dict.fromkeys((lens.red, Radial(), lens.blue))
+            channels = dict.fromkeys((lens.red, STRAIGHT, lens.blue))
             places = [bend.seen(x, y, each) for each in channels]
         except ImageError:  # so far out, the lens folds
             return False

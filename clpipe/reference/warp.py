@@ -16,7 +16,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.reference.image import mirrored
-from clpipe.reference.lens import Lens, Radial
+from clpipe.reference.lens import Lens
+from clpipe.reference.radial import Radial
 from clpipe.reference.resample import Axis, Parameters, lanczos3
 
 WITHIN = 0.003  # px, of the map at the middle of a cell

@@ -17,7 +17,8 @@ from pydantic import Field
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.reference import warp
-from clpipe.reference.lens import Lens, Radial
+from clpipe.reference.lens import Lens
+from clpipe.reference.radial import Radial
 from clpipe.stage import (
     Access,
     Argument,
