@@ -1,6 +1,6 @@
 """``clpipe poses``: the cameras of the pictures of a folder, for COLMAP, nerfstudio and others."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -47,16 +47,17 @@ def poses(folder: Path, as_json: bool) -> None:
 
 
 @contextmanager
-def views_behind(folder: Path, summary: Summary, quiet: bool) -> Iterator[None]:
-    """Write the views of a run's folder behind the run, unless it was interrupted.
+def views_behind(folders: Sequence[Path], summary: Summary, quiet: bool) -> Iterator[None]:
+    """Write the views of a run's folders behind the run, unless it was interrupted.
 
     Raises:
         ImageError: a file cannot be written or, before the run, is somebody else's.
     """
-    check_view_files(folder)
+    for folder in folders:
+        check_view_files(folder)
     yield
     if not summary.interrupted:
-        lines = lines_of(folder, write_views(folder))
+        lines = [line for each in folders for line in lines_of(each, write_views(each))]
         for line in () if quiet else lines:
             click.echo(line, err=True)
 

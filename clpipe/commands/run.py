@@ -2,26 +2,22 @@
 
 import logging
 import sys
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, closing, nullcontext
+from contextlib import closing, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 from click.core import ParameterSource
 from rich.console import Console
 
-from clpipe.base.errors import OutputError, RequestError
+from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
 from clpipe.batch.dask_worker import RunSpec
-from clpipe.batch.interrupt import interruptible
 from clpipe.batch.replay import Replay, replay_of
 from clpipe.batch.run_log import RunLog, Summary, log_name
-from clpipe.batch.tar_batch import TarBatch
 from clpipe.batch.tars import Tar, cut
 from clpipe.batch.threads import Batch
 from clpipe.batch.trace import Trace, check_trace
-from clpipe.batch.work import ImageWorker
 from clpipe.chain.chain import Chain
 from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.request import Request
@@ -44,9 +40,10 @@ from clpipe.commands.input_options import (
 from clpipe.commands.options import Command, raw_size_option, raw_type_option
 from clpipe.commands.poses import views_behind
 from clpipe.commands.progress import Reporter
-from clpipe.engine.device import Device, open_devices
+from clpipe.commands.running import batch_of, follow
+from clpipe.engine.device import Device
 from clpipe.images.read import PICTURE_SUFFIXES
-from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
+from clpipe.inputs.find import Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.poses import with_views
 from clpipe.inputs.series import Series, parse_isos
@@ -54,9 +51,6 @@ from clpipe.outputs.folder import output_folder, remove_unfinished
 from clpipe.outputs.renditions import parse_bracket
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
-
-if TYPE_CHECKING:
-    from clpipe.batch.dask_client import Cluster
 
 
 @click.command("run", cls=Command)
@@ -217,6 +211,7 @@ def run(
     if quiet:
         logging.getLogger("clpipe").setLevel(logging.WARNING)
     tars: list[Tar] = []
+    series = Series(cameras, parse_isos(isos) if isos is not None else ())
     if replay:
         check_beside_replay()
         paths = [Path(path) for path in inputs]
@@ -228,7 +223,6 @@ def run(
         except RequestError as error:
             raise RequestError(f"{replay}: {error}") from None
     else:
-        series = Series(cameras, parse_isos(isos) if isos is not None else ())
         request = Request.from_options(
             camera=series.camera, iso=series.iso, max_pixels=max_pixels, **options
         )
@@ -268,7 +262,7 @@ def run(
     with (
         opened as batch,
         output_folder(output, shard),
-        views_behind(output, summary, quiet) if has_views else nullcontext(),
+        views_behind(series.under(output), summary, quiet) if has_views else nullcontext(),
         events as timeline,
     ):
         if replay and isinstance(batch, Batch):
@@ -282,41 +276,6 @@ def run(
     sys.exit(1 if summary.failures or summary.is_fruitless else 0)
 
 
-def follow(
-    batch: "Batch | Cluster",
-    jobs: Sequence[Job],
-    summary: Summary,
-    reporter: Reporter,
-    log: RunLog,
-    events: Trace | None,
-) -> None:
-    """Run jobs, and note and print the outcome of each as it comes.
-
-    Raises:
-        ClpipeError: the run cannot go on; what is finished is noted.
-    """
-    unlogged: OutputError | None = None
-    with closing(batch.run(jobs)) as outcomes, interruptible(batch.stop), reporter:
-        try:
-            for outcome in outcomes:
-                summary.add(outcome)
-                if not unlogged:
-                    try:
-                        log.add(outcome)
-                    except OutputError as error:
-                        unlogged = error  # what is in flight is finished, and counted
-                        batch.stop()
-                reporter.report(outcome)
-                if events:
-                    events.add(outcome)
-            if unlogged:
-                raise unlogged
-        finally:
-            summary.interrupted = summary.finished < summary.total
-            if not unlogged:
-                log.end(summary)
-
-
 def check_read_options(request: Request, chain: Chain) -> None:
     """See that options about renders are not set for other images.
 
@@ -328,37 +287,6 @@ def check_read_options(request: Request, chain: Chain) -> None:
             raise RequestError(
                 f"{option}: it is for renders, but the chain reads {chain.source.label}"
             )
-
-
-def batch_of(
-    spec: RunSpec, loader: ImageLoader, chain: Chain, tars: Sequence[Tar], dask: str | None
-) -> "AbstractContextManager[Batch | Cluster]":
-    """What does the jobs: this machine, with or without tars, or a cluster.
-
-    Args:
-        spec: the run.
-        loader: of its request.
-        chain: of the first image.
-        tars: what is made, or none.
-        dask: the address of a scheduler, or None.
-
-    Raises:
-        RequestError: both tars and a cluster are asked for, or the cluster cannot be used.
-        DeviceError: there is no usable device.
-    """
-    if dask is not None:
-        if tars:
-            raise RequestError("--dask: it makes no tars; use --webdataset with --shard")
-        from clpipe.batch.dask_client import connected
-
-        return connected(dask, spec)
-    devices: list[Device | None] = [*open_devices(spec.selectors, spec.memory)] or [None]
-    writer = OutputWriter(spec.output, spec.request)
-    if tars:
-        options = (spec.threads, spec.overwrite, spec.verify, spec.trace)
-        return nullcontext(TarBatch(tars, loader, writer, chain, devices, *options))
-    worker = ImageWorker(loader, writer, chain, spec.overwrite, spec.verify, spec.trace)
-    return nullcontext(Batch(worker, devices, spec.threads))
 
 
 def warn_of_changes(sidecar: Path, replay: Replay, device: Device | None) -> None:

@@ -8,6 +8,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from clpipe.base.errors import ImageError
 
+SHOWN = (".jpg", ".png", ".tif")  # endings of pictures that can be on a sheet
+
 THUMBNAIL = 240  # px, the longer side
 TEXT = 14  # px high
 GAP = 6  # px

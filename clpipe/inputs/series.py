@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import RequestError
@@ -19,8 +20,6 @@ class Series:
         cameras: names or profiles.
         isos: sensitivities.
 
-    >>> Series(("sony-a7r2",), (100.0, 800.0)).folders
-    ('iso100', 'iso800')
     """
 
     cameras: tuple[str, ...] = ()
@@ -36,14 +35,16 @@ class Series:
         """The ISO of all images, where there is one."""
         return self.isos[0] if len(self.isos) == 1 else None
 
-    @property
-    def folders(self) -> tuple[str, ...]:
-        """Where its pictures go, below the output folder; ("",) is no series.
+    def under(self, output: Path) -> list[Path]:
+        """The folders that its pictures go to, the output folder itself where there is no series.
+
+        >>> Series(("sony-a7r2",), (100.0, 800.0)).under(Path("out"))
+        [PosixPath('out/iso100'), PosixPath('out/iso800')]
 
         Raises:
             RequestError: two cameras have the same name.
         """
-        return tuple(folder for folder, _ in self._members())
+        return [output / folder for folder, _ in self._members()]
 
     def jobs(self, jobs: Sequence[Job], settings: Settings) -> list[Job]:
         """Each job once for each camera and ISO, one after the other.

@@ -7,7 +7,7 @@ import sys
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import IO, Any, Self
 
@@ -62,12 +62,14 @@ class Scene:
         blender: its version.
         views: a record for each view: file, width, height, K, R and t, as in a ``cameras.json``.
         objects: the names of objects by their index.
+        layers: the names of depth, normals and object numbers in its EXRs.
         unit_metres: how long a unit is; None where the scene does not say.
     """
 
     blender: str
-    views: tuple[Mapping[str, Any], ...]
-    objects: Mapping[str, list[str]]
+    views: list[dict[str, Any]]
+    objects: dict[str, list[str]]
+    layers: list[str]
     unit_metres: float | None
 
 
@@ -125,7 +127,8 @@ class Renderer(AbstractContextManager["Renderer"]):
 
     def __exit__(self, *error: object) -> None:
         self.stop()
-        self._process.wait()
+        with self._process:  # closes what it says, and waits
+            pass
 
     def stop(self) -> None:
         """End it; what it had begun is lost, and done again by the next one."""
@@ -139,16 +142,15 @@ class Renderer(AbstractContextManager["Renderer"]):
             RenderError: Blender ended.
         """
         values = self._event("scene")
-        views = tuple(values["views"])
-        return Scene(values["blender"], views, values["objects"], values["unit_metres"])
+        return Scene(**{field.name: values[field.name] for field in fields(Scene)})
 
-    def rendered(self, scene: Scene) -> Iterator[tuple[str, float]]:
-        """The name of each view as soon as it is there, and the seconds that it took.
+    def rendered(self, count: int) -> Iterator[tuple[str, float]]:
+        """The name of each view as soon as it is there, and the seconds that it took, or 0.
 
         Raises:
-            RenderError: Blender ended.
+            RenderError: one cannot be rendered, or Blender ended.
         """
-        for _ in scene.views:
+        for _ in range(count):
             values = self._event("rendered")
             yield values["name"], values["seconds"]
 
@@ -161,7 +163,8 @@ class Renderer(AbstractContextManager["Renderer"]):
                 continue
             values: dict[str, Any] = json.loads(line[len(MARK) :])
             if values["event"] == "refused":
-                raise RequestError(f"{self._path}: {values['message']}")
+                refused = RequestError if kind == "scene" else RenderError
+                raise refused(f"{self._path}: {values['message']}")
             if values["event"] == kind:
                 return values
         status = self._process.wait()

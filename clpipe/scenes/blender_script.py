@@ -21,6 +21,7 @@ from mathutils import Matrix, Vector
 MARK = "@clpipe "
 OLDEST = (4, 2)
 FLIP = Matrix(((1, 0, 0), (0, -1, 0), (0, 0, -1)))  # from Blender's camera axes to OpenCV's
+UNFINISHED = ".unfinished.exr"
 GEOMETRY = {"MESH", "CURVE", "CURVES", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD"}
 SPAN = math.radians(60)  # of an arc
 TIMES = re.compile(rb"(cycles\.[^\0]*_time\0string\0.{4})([0-9:.]{8})", re.DOTALL)
@@ -204,27 +205,23 @@ def paths(scene: Any, asked: Mapping[str, Any]) -> Iterator[Any]:
     draw = random.Random(asked["seed"])  # noqa: S311 - places, no secrets
     reach = (start.translation - target).length / 4
     middle = start.translation
-    low, high = asked["box"] or ([c - reach for c in middle], [c + reach for c in middle])
+    box = asked["box"] or [c - reach for c in middle] + [c + reach for c in middle]
     for _ in range(count):
-        place = Vector([draw.uniform(a, b) for a, b in zip(low, high, strict=True)])
+        place = Vector([draw.uniform(a, b) for a, b in zip(box[:3], box[3:], strict=True)])
         turned = (target - place).to_track_quat("-Z", "Y")
         yield Matrix.Translation(place) @ turned.to_matrix().to_4x4()
 
 
-def views_of(scene: Any, asked: Mapping[str, Any]) -> Iterator[tuple[str, Callable[[], None]]]:
-    """The views to render: the name of each, and what sets the scene up for it.
-
-    Raises:
-        RefusedError: frames are not the scene's.
-    """
+def views_of(scene: Any, asked: Mapping[str, Any]) -> Iterator[tuple[str, int, Callable[[], None]]]:
+    """The views to render: the name and number of each, and what sets the scene up for it."""
     views = asked["views"]
     if "frames" in views:
         digits = max(4, len(str(max(views["frames"]))))
         for frame in views["frames"]:
-            yield f"frame_{frame:0{digits}d}", partial(scene.frame_set, frame)
+            yield f"frame_{frame:0{digits}d}", frame, partial(scene.frame_set, frame)
     elif "cameras" in views:
-        for record in views["cameras"]:
-            yield record["name"], partial(set_camera, scene, record)
+        for number, record in enumerate(views["cameras"]):
+            yield record["name"], number, partial(set_camera, scene, record)
     else:
         matrices = list(paths(scene, views))
         camera = scene.camera
@@ -233,7 +230,11 @@ def views_of(scene: Any, asked: Mapping[str, Any]) -> Iterator[tuple[str, Callab
         camera.parent = None
         digits = max(3, len(str(len(matrices) - 1)))
         for number, matrix in enumerate(matrices):
-            yield f"view_{number:0{digits}d}", partial(setattr, camera, "matrix_world", matrix)
+            yield (
+                f"view_{number:0{digits}d}",
+                number,
+                partial(setattr, camera, "matrix_world", matrix),
+            )
 
 
 def sees_something(scene: Any, record: Mapping[str, Any]) -> bool:
@@ -252,11 +253,23 @@ def sees_something(scene: Any, record: Mapping[str, Any]) -> bool:
 
 
 def render_view(scene: Any, folder: str, name: str, number: int, seed: int) -> None:
-    """Render a view into NAME.exr, which is there whole or not at all."""
-    unfinished = os.path.join(folder, f".{name}.unfinished.exr")
+    """Render a view into NAME.exr, which is there whole or not at all.
+
+    Raises:
+        RefusedError: it cannot be rendered or written.
+    """
+    unfinished = os.path.join(folder, f".{name}.{os.getpid()}{UNFINISHED}")
+    settings = scene.render.image_settings
+    if hasattr(settings, "use_exr_interleave"):
+        # Blender 5.0 cannot write parts of pixels that are not square.
+        is_square = scene.render.pixel_aspect_x == scene.render.pixel_aspect_y
+        settings.use_exr_interleave = not is_square
     scene.cycles.seed = (seed + number) % 2**31
     scene.render.filepath = unfinished
-    bpy.ops.render.render(write_still=True)
+    try:
+        bpy.ops.render.render(write_still=True)
+    except RuntimeError as error:
+        raise RefusedError(f"view {name}: {' '.join(str(error).split())}") from None
     forget_times(unfinished)
     os.replace(unfinished, os.path.join(folder, f"{name}.exr"))
 
@@ -277,7 +290,7 @@ def main(asked: Mapping[str, Any]) -> None:
     prepare(scene, asked)
     objects = number_objects(scene)
     views, cameras, blind = list(views_of(scene, asked)), [], []
-    for name, set_up in views:
+    for name, _, set_up in views:
         set_up()
         bpy.context.view_layer.update()
         cameras.append(camera_of(scene, name))
@@ -293,14 +306,20 @@ def main(asked: Mapping[str, Any]) -> None:
         blender=bpy.app.version_string,
         views=cameras,
         objects=objects,
+        layers=["Depth", "Normal", "Object Index" if bpy.app.version >= (5, 0) else "IndexOB"],
         unit_metres=unit.scale_length if unit.system != "NONE" else None,
     )
-    for number, (name, set_up) in enumerate(views):
-        began = time.perf_counter()
+    for name in os.listdir(asked["folder"]):
+        if name.endswith(UNFINISHED):  # of a Blender that was killed
+            os.remove(os.path.join(asked["folder"], name))
+    for name, number, set_up in views:
+        seconds = 0.0
         if not os.path.exists(os.path.join(asked["folder"], f"{name}.exr")):
+            began = time.perf_counter()
             set_up()
             render_view(scene, asked["folder"], name, number, asked["seed"])
-        tell("rendered", name=name, seconds=time.perf_counter() - began)
+            seconds = time.perf_counter() - began
+        tell("rendered", name=name, seconds=seconds)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,250 @@
+"""``clpipe dataset``: a scene or a folder of renders becomes a dataset."""
+
+import logging
+import sys
+from collections.abc import Mapping
+from contextlib import ExitStack, closing, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+from click.core import ParameterSource
+from rich.console import Console
+
+from clpipe.base.errors import RequestError
+from clpipe.batch.dask_worker import RunSpec
+from clpipe.batch.run_log import RunLog, Summary, log_name
+from clpipe.chain.request import Request
+from clpipe.chain.truth import CLEAN, TRUTHS
+from clpipe.commands.chain_options import carry_option, format_option, series_options
+from clpipe.commands.input_options import poses_option
+from clpipe.commands.options import Command, device_option
+from clpipe.commands.poses import views_behind
+from clpipe.commands.progress import Reporter
+from clpipe.commands.running import batch_of, follow
+from clpipe.inputs.find import Shard, find_jobs
+from clpipe.inputs.loader import ImageLoader
+from clpipe.inputs.poses import with_views
+from clpipe.inputs.series import Series, parse_isos
+from clpipe.outputs.folder import output_folder, remove_unfinished
+from clpipe.outputs.writer import OutputWriter
+from clpipe.scenes.blender import Rendering
+from clpipe.scenes.card import write_card
+from clpipe.scenes.source import RENDERS, Source, from_folder, from_scene
+from clpipe.scenes.views import PATHS, asked_views, parse_box, parse_frames, parse_resolution
+
+# Options that are for a scene alone.
+VIEW_OPTIONS = ("views", "path", "box", "frames")
+RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit", "blender")
+
+
+@click.command("dataset", cls=Command)
+@click.argument("source", type=click.Path(path_type=Path), metavar="SCENE.blend|FOLDER")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=click.Path(path_type=Path),
+    metavar="DS",
+    help="The folder of the dataset; it is made where it is missing.",
+)
+@click.option(
+    "--views",
+    type=click.IntRange(1, 100_000),
+    metavar="N",
+    help="Render N views on a path about what the scene's camera looks at. [default: 24]",
+)
+@click.option(
+    "--path",
+    type=click.Choice(PATHS),
+    help="Where views are: once around (orbit), 60 degrees about the scene's camera (arc), or "
+    "anywhere in a box about it (random). [default: orbit]",
+)
+@click.option(
+    "--box",
+    metavar="X,Y,Z,X,Y,Z",
+    callback=lambda _context, _option, text: None if text is None else parse_box(text),
+    help="Two corners of the box of --path random. [default: half as wide as the way to what the "
+    "camera looks at]",
+)
+@click.option(
+    "--frames",
+    metavar="A-B",
+    callback=lambda _context, _option, text: None if text is None else parse_frames(text),
+    help="Render these frames of the scene, by its own camera: 1-24, or 1,5,9.",
+)
+@poses_option
+@click.option(
+    "--resolution",
+    metavar="WxH",
+    callback=lambda _context, _option, text: None if text is None else parse_resolution(text),
+    help="Of the renders. [default: the scene's]",
+)
+@click.option(
+    "--samples",
+    default=128,
+    show_default=True,
+    type=click.IntRange(1, 2**24),
+    help="Light paths for each pixel.",
+)
+@click.option(
+    "--denoise/--no-denoise",
+    default=True,
+    show_default=True,
+    help="Have Blender remove the noise of its light paths, which is no camera's.",
+)
+@click.option(
+    "--time-limit",
+    type=click.FloatRange(0, min_open=True),
+    metavar="SECONDS",
+    help="Stop a view's rendering after that time; other machines then make other pictures.",
+)
+@click.option(
+    "--blender",
+    metavar="PATH",
+    help="An installed Blender, 4.2 or newer. [default: the Python package bpy]",
+)
+@series_options
+@click.option(
+    "--truth",
+    "truths",
+    multiple=True,
+    default=(CLEAN,),
+    show_default=True,
+    type=click.Choice(TRUTHS),
+    help="Write beside each picture its truth, as clpipe run does; may be repeated.",
+)
+@carry_option
+@format_option
+@device_option
+@click.option("--quiet", is_flag=True, help="Print failures only.")
+def dataset(
+    source: Path,
+    output: Path,
+    cameras: tuple[str, ...],
+    isos: str | None,
+    poses: Path | None,
+    selector: str | None,
+    quiet: bool,
+    **options: Any,
+) -> None:
+    """Make a dataset of a Blender scene, or of a folder of renders that exist.
+
+    Renders a scene's views to DS/renders, linear EXRs with depth, normals, object numbers and, for
+    frames, flow; develops them as clpipe run does, for each camera and ISO, while the next ones are
+    rendered; and writes the cameras of the pictures (cameras.json, transforms.json, COLMAP's
+    sparse/0), manifest.csv, train.txt and val.txt, a contact sheet and a README.
+
+    A folder of renders is taken as it is, with the cameras.json or transforms.json in it.
+
+    The same command goes on where it was interrupted. It makes other ISOs and cameras of the same
+    views without rendering them again.
+
+    \b
+    clpipe dataset scene.blend -o set --iso 100,800,3200 --views 24
+    clpipe dataset scene.blend -o film --frames 1-48 --iso 1600
+    clpipe dataset renders/ -o set --iso 100,800 --camera sony-a7r2 --camera canon-5d2
+    """
+    if quiet:
+        logging.getLogger("clpipe").setLevel(logging.WARNING)
+    series = Series(cameras, parse_isos(isos) if isos is not None else ())
+    rendering = {name: options.pop(name) for name in RENDER_OPTIONS}
+    request = Request.from_options(camera=series.camera, iso=series.iso, **options)
+    series.jobs((), request.settings())  # refuses what is wrong before anything is rendered
+    with ExitStack() as stack:
+        if source.suffix.lower() == ".blend":
+            request.chain()
+            program = rendering.pop("blender")
+            asked = rendering_of(source, output, poses, request.settings().seed, rendering)
+            renders = from_scene(stack, asked, output, program)
+        else:
+            refuse_rendering()
+            renders = from_folder(source, output, poses)
+        request = replace(request, carry=request.carry or renders.layers)
+        summary = develop(renders, request, output, series, selector, quiet)
+    if renders.failure:
+        raise renders.failure
+    if summary.interrupted:
+        sys.exit(130)
+    sys.exit(1 if summary.failures or summary.is_fruitless else 0)
+
+
+def rendering_of(
+    scene: Path, output: Path, poses: Path | None, seed: int, options: Mapping[str, Any]
+) -> Rendering:
+    """What Blender is asked.
+
+    Raises:
+        RequestError: the options contradict each other.
+    """
+    own = dict(options)
+    named = {name: own.pop(name) for name in VIEW_OPTIONS}
+    views = asked_views(**named, poses=poses, seed=seed)
+    # Blender has a working directory of its own.
+    return Rendering(scene.absolute(), (output / RENDERS).absolute(), views, **own, seed=seed)
+
+
+def refuse_rendering() -> None:
+    """See that no option is set that is for a scene alone.
+
+    Raises:
+        RequestError: one is.
+    """
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        name = str(parameter.name)
+        is_set = context.get_parameter_source(name) is not ParameterSource.DEFAULT
+        if is_set and name in RENDER_OPTIONS:
+            raise RequestError(
+                f"{parameter.opts[0]}: it is for a .blend, not for renders that exist"
+            )
+
+
+def develop(
+    renders: Source,
+    request: Request,
+    output: Path,
+    series: Series,
+    selector: str | None,
+    quiet: bool,
+) -> Summary:
+    """Develop the renders as they come, and write the dataset's card behind them.
+
+    Raises:
+        ClpipeError: the run cannot go on.
+    """
+    loader = ImageLoader(request)
+    found = renders.jobs() or loader.exposures(find_jobs(renders.inputs, output, loader.endings()))
+    given = with_views(found, renders.poses, loader.settings.output) if renders.poses else found
+    jobs = series.jobs(given, loader.settings)
+    loader.check(jobs)
+    chain = loader.first_chain(jobs)
+    request = request.with_outputs(chain)
+    writer = OutputWriter(output, request)
+    writer.check(chain, jobs)
+    selectors = () if selector is None else (selector,)
+    spec = RunSpec(request, output, selectors, None, None, False, False, False, first=jobs[0])
+    summary = Summary(len(jobs))
+    reporter = Reporter(summary, writer, Console(stderr=True), quiet)
+    tell = (lambda text: None) if quiet else reporter.print
+    folders = series.under(output)
+    with (
+        batch_of(spec, loader, chain, [], None) as batch,
+        output_folder(output, Shard()),
+        views_behind(folders, summary, quiet) if renders.poses else nullcontext(),
+    ):
+        remove_unfinished(output, jobs)
+
+        def stop() -> None:
+            batch.stop()
+            renders.stop()
+
+        start = {"arguments": sys.argv[1:], "images": len(jobs)}
+        with closing(RunLog(output / log_name(Shard()), start)) as log:
+            coming = renders.as_rendered(jobs, tell)
+            follow(batch, coming, summary, reporter, log, stop=stop)
+    if not summary.interrupted:
+        written = write_card(writer, jobs, sys.argv[1:], renders.about)
+        tell(f"wrote {', '.join(map(str, written))}")
+    return summary

@@ -1,0 +1,208 @@
+"""The card of a dataset: README, contact sheet, manifest, and which views are for training."""
+
+import csv
+import io
+import os
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from clpipe.base.about import __version__
+from clpipe.base.files import write_new
+from clpipe.images.sheet import SHOWN, contact_sheet
+from clpipe.inputs.find import Job
+from clpipe.outputs.sidecar import SIDECAR, read_sidecar
+from clpipe.outputs.views import FILES
+from clpipe.outputs.writer import OutputWriter
+from clpipe.scenes.record import RECORD
+
+SHEET, MANIFEST, README = "contact_sheet.jpg", "manifest.csv", "README.md"
+MOST_ROWS = 12  # of the contact sheet
+PICTURE, CARRIED = "picture", "carried"
+
+
+@dataclass(frozen=True)
+class Member:
+    """What was made of one view with one camera and ISO.
+
+    Args:
+        view: the name of its render, without its ending.
+        folder: below the dataset's, by camera and ISO; "" is the dataset's own.
+        files: paths below the dataset's folder: "picture", "truth_clean" and so on, "carried".
+        record: the picture's sidecar.
+        render: what it was made of, below the dataset's folder where it lies there.
+    """
+
+    view: str
+    folder: str
+    files: Mapping[str, str]
+    record: Mapping[str, Any]
+    render: str
+
+
+def split_of(number: int) -> str:
+    """What a view is for: every eighth for validation, from the fourth on; the rest for training.
+
+    >>> [number for number in range(24) if split_of(number) == "val"]
+    [3, 11, 19]
+    """
+    return "val" if number % 8 == 3 else "train"
+
+
+def write_card(
+    writer: OutputWriter, jobs: Sequence[Job], words: Sequence[str], about: Mapping[str, str]
+) -> list[Path]:
+    """Write the card of a dataset, from its sidecars.
+
+    Args:
+        writer: of its pictures.
+        jobs: all of them, those of a view one after the other.
+        words: the command.
+        about: what else its README says: texts by their titles.
+
+    Returns:
+        The files.
+
+    Raises:
+        ImageError: a file cannot be read or written.
+    """
+    folder = writer.folder
+    members = [member for job in jobs if (member := _member(writer, job))]
+    views = dict.fromkeys(_view(job) for job in jobs)
+    splits = {view: split_of(number) for number, view in enumerate(views)}
+    texts = {
+        f"{split}.txt": "".join(f"{view}\n" for view in views if splits[view] == split)
+        for split in ("train", "val")
+    }
+    texts[MANIFEST] = _manifest(members, splits)
+    texts[README] = _readme(folder.resolve().name, members, splits, words, about)
+    written = [folder / name for name in texts]
+    for path, text in zip(written, texts.values(), strict=True):
+        write_new(path, text.encode())
+    if sheet := _sheet(folder, members):
+        write_new(folder / SHEET, sheet)
+        written.append(folder / SHEET)
+    return written
+
+
+def _view(job: Job) -> str:
+    return Path(job.key).with_suffix("").as_posix()
+
+
+def _member(writer: OutputWriter, job: Job) -> Member | None:
+    """What was made of a job; None where something of it failed."""
+    files: dict[str, str] = {}
+    records = []
+    for name in writer.names_of(job):
+        path = writer.path(job, SIDECAR, name)
+        try:
+            records.append(read_sidecar(path))
+        except FileNotFoundError:
+            return None
+        place = path.parent.relative_to(writer.folder)
+        made = [(place / each["name"]).as_posix() for each in records[-1]["outputs"]]
+        files.setdefault(name.removeprefix(".") or PICTURE, made[0])
+        for each in made:
+            if each.endswith(f".{CARRIED}.exr"):
+                files[CARRIED] = each
+    own = job.stem.removesuffix(_view(job)).rstrip("/")
+    below = os.path.relpath(job.path, writer.folder)
+    render = job.input if below.startswith("..") else below
+    return Member(_view(job), own, files, records[0], render)
+
+
+def _manifest(members: Sequence[Member], splits: Mapping[str, str]) -> str:
+    """A table of all pictures, with their files and what they were made with."""
+    kinds = dict.fromkeys(kind for member in members for kind in member.files)
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["view", "split", "camera", "iso", *kinds, "render"])
+    for member in members:
+        facts = member.record["camera"], f"{member.record['iso']:g}"
+        files = [member.files.get(kind, "") for kind in kinds]
+        table.writerow([member.view, splits[member.view], *facts, *files, member.render])
+    return text.getvalue()
+
+
+def _sheet(folder: Path, members: Sequence[Member]) -> bytes | None:
+    """The contact sheet; None where the pictures are of no kind that is shown."""
+    by_view: dict[str, dict[str, Member]] = {}
+    for member in members:
+        by_view.setdefault(member.view, {})[member.folder] = member
+    columns = max((list(row) for row in by_view.values()), key=len, default=[])
+    whole = {view: row for view, row in by_view.items() if len(row) == len(columns)}
+    step = -(-len(whole) // MOST_ROWS) or 1
+    rows = list(whole.items())[::step]
+    pictures = [
+        [folder / member.files[PICTURE] for member in row.values()]
+        + [folder / path for path in _truths(next(iter(row.values())))]
+        for _, row in rows
+    ]
+    if not rows or not all(path.suffix in SHOWN for row in pictures for path in row):
+        return None
+    titles = [column or PICTURE for column in columns] + list(_truths(rows[0][1][columns[0]], True))
+    return contact_sheet(pictures, [view for view, _ in rows], titles)
+
+
+def _truths(member: Member, names: bool = False) -> list[str]:
+    """A view's picture without noise, where there is one; its path or its name."""
+    found = [(name, path) for name, path in member.files.items() if name == "truth_clean"]
+    return [name if names else path for name, path in found]
+
+
+def _readme(
+    title: str,
+    members: Sequence[Member],
+    splits: Mapping[str, str],
+    words: Sequence[str],
+    about: Mapping[str, str],
+) -> str:
+    """The README of a dataset, in Markdown."""
+    shown = list(splits.values())
+    rows = []
+    for member in {each.folder: each for each in reversed(members)}.values():
+        noise = (member.record["noise"] or {}).get("signal", {"a": 0.0, "b": 0.0})
+        count = sum(each.folder == member.folder for each in members)
+        camera, iso = member.record["camera"], f"{member.record['iso']:g}"
+        size = f"{member.record['width']}x{member.record['height']}"
+        law = f"{noise['a']:.3g} y + {noise['b']:.3g}"
+        rows.append(f"| `{member.folder or '.'}/` | {camera} | {iso} | {count} | {size} | {law} |")
+    facts = "\n".join(f"- **{name}:** {text}" for name, text in about.items())
+    kinds = dict.fromkeys(kind for member in members for kind in member.files)
+    cameras = ", ".join(f"`{name}`" for name in FILES)
+    return f"""# {title}
+
+Made by clpipe {__version__}: renders as a camera takes them, with its noise.
+
+![Contact sheet]({SHEET})
+
+{facts}
+- **Views:** {len(shown)}: {shown.count("train")} for training (`train.txt`) and \
+{shown.count("val")} for validation (`val.txt`), every eighth.
+
+| folder | camera | ISO | pictures | size | variance of the raw's noise |
+|---|---|---|---|---|---|
+{chr(10).join(reversed(rows))}
+
+y is the raw's signal, 1 at the white level.
+
+## Files
+
+- `{MANIFEST}`: a row for each picture, with its files ({", ".join(kinds)}), camera, ISO and split.
+- `NAME.json` beside each picture: everything that it was made with. \
+`clpipe run --replay NAME.json` makes it again, byte for byte.
+- {cameras} in each folder, where the cameras are known: intrinsics and poses for COLMAP and \
+nerfstudio.
+- `{RECORD}`: what the renders were made of. `run.jsonl`: the log.
+
+## Made by
+
+```sh
+{shlex.join(["clpipe", *words])}
+```
+
+The same command makes the same pictures again on the same kind of device, and goes on where it \
+was interrupted.
+"""

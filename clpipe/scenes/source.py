@@ -1,0 +1,154 @@
+"""Where a dataset's renders come from: Blender, while they are developed, or a folder."""
+
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from clpipe.base.digests import digests
+from clpipe.base.errors import RequestError
+from clpipe.base.files import write_new
+from clpipe.inputs.find import Job
+from clpipe.scenes.blender import Renderer, RenderError, Rendering, Scene
+from clpipe.scenes.record import read_record, write_record
+from clpipe.scenes.views import made_by
+
+RENDERS = "renders"
+CAMERAS = "cameras.json"
+FLOW = "Vector"  # the layer that has it, of frames
+
+
+@dataclass
+class Source:
+    """The renders of a dataset.
+
+    Args:
+        inputs: what they are found by, as clpipe run takes them.
+        poses: the file of their cameras; None where they are not known.
+        layers: that go along with the pictures.
+        about: what the dataset's card says of them, by its titles.
+        renderer: what makes them; None where all of them are there.
+        names: of the views, in their order, where they are made.
+        failure: why rendering ended early.
+    """
+
+    inputs: list[str]
+    poses: Path | None
+    layers: tuple[str, ...] = ()
+    about: Mapping[str, str] = field(default_factory=dict)
+    renderer: Renderer | None = None
+    names: Sequence[str] = ()
+    failure: RenderError | None = None
+    _is_stopped: bool = False
+
+    def jobs(self) -> list[Job] | None:
+        """The renders that are made; None where they are to be found."""
+        (folder,) = self.inputs
+        named = [f"{name}.exr" for name in self.names]
+        return [Job(Path(folder) / name, name, listed=False) for name in named] or None
+
+    def stop(self) -> None:
+        """Render no more."""
+        self._is_stopped = True
+        if self.renderer:
+            self.renderer.stop()
+
+    def as_rendered(self, jobs: Sequence[Job], tell: Callable[[str], None]) -> Iterator[Job]:
+        """The jobs, each as soon as its render is there; ``failure`` says why the rest is missing.
+
+        Args:
+            jobs: those of a render one after the other.
+            tell: prints a line.
+        """
+        if not self.renderer:
+            yield from jobs
+            return
+        of_view: dict[str, list[Job]] = {}
+        for job in jobs:
+            of_view.setdefault(job.key, []).append(job)
+        try:
+            for number, (name, seconds) in enumerate(self.renderer.rendered(len(self.names)), 1):
+                if seconds > 0:
+                    tell(f"rendered {name}  {number} of {len(self.names)}  {seconds:.1f} s")
+                yield from of_view[f"{name}.exr"]
+        except RenderError as error:
+            self.failure = None if self._is_stopped else error
+
+
+def from_folder(folder: Path, output: Path, poses: Path | None) -> Source:
+    """Renders that exist, with the cameras that are asked for or lie among them.
+
+    Raises:
+        RequestError: there is no such folder, or the output folder has another dataset.
+    """
+    if not folder.is_dir():
+        raise RequestError(f"{folder}: expected a .blend, or a folder of renders")
+    made_of = {"renders": folder.resolve().name}
+    read_record(output, made_of)
+    own = [path for name in (CAMERAS, "transforms.json") if (path := folder / name).is_file()]
+    write_record(output, made_of, {})
+    return Source([str(folder)], poses or next(iter(own), None), about={"Renders": f"`{folder}`"})
+
+
+def from_scene(stack: ExitStack, rendering: Rendering, output: Path, program: str | None) -> Source:
+    """Renders of a scene, which a Blender begins to make; none where all of them are there.
+
+    Args:
+        stack: ends Blender.
+        rendering: what is asked, of the folder ``renders`` in the output folder.
+        output: the folder of the dataset.
+        program: an installed Blender; None is the package bpy.
+
+    Raises:
+        RequestError: the scene cannot be rendered, there is no Blender, or the output folder has
+            another dataset.
+    """
+    asked = rendering.record()
+    path, views = rendering.scene, asked.pop("views")
+    sha256 = digests([str(path)]).get(str(path))
+    if sha256 is None:
+        raise RequestError(f"{path}: no such file")
+    del asked["folder"]
+    made_of = {**asked, "scene": path.name, "sha256": sha256, "views": made_by(views)}
+    made_of = json.loads(json.dumps(made_of))
+    known = read_record(output, made_of)
+    renderer = None
+    if known.get("views") == views and _are_there(rendering.folder, known["scene"]):
+        scene = Scene(**known["scene"])
+    else:
+        renderer = stack.enter_context(Renderer(rendering, program))
+        scene = renderer.scene()
+        write_record(output, made_of, {"views": views, "scene": asdict(scene)})
+        cameras = {"views": scene.views}
+        write_new(rendering.folder / CAMERAS, json.dumps(cameras, indent=1).encode())
+    layers = (*scene.layers, *([FLOW] if "frames" in views else []))
+    names = [Path(view["file"]).stem for view in scene.views]
+    folder = output / RENDERS
+    about = _about(rendering, scene)
+    return Source([str(folder)], folder / CAMERAS, layers, about, renderer, names)
+
+
+def _are_there(folder: Path, scene: Mapping[str, Any]) -> bool:
+    names = [view["file"] for view in scene["views"]]
+    return os.path.isfile(folder / CAMERAS) and all(os.path.isfile(folder / n) for n in names)
+
+
+def _about(rendering: Rendering, scene: Scene) -> dict[str, str]:
+    """What the card says of the renders."""
+    limit = f", at most {rendering.time_limit:g} s a view" if rendering.time_limit else ""
+    unit = f"{scene.unit_metres:g} m" if scene.unit_metres else "not said by the scene"
+    objects = ", ".join(f"{number} {' + '.join(n)}" for number, n in scene.objects.items())
+    denoised = "denoised by Open Image Denoise" if rendering.denoise else "not denoised"
+    limits = "; a time limit makes other pictures on other machines" if rendering.time_limit else ""
+    return {
+        "Scene": f"`{rendering.scene.name}`, rendered by Blender {scene.blender}",
+        "Renders": f"`{RENDERS}/`, Cycles, {rendering.samples} samples{limit}, {denoised}; "
+        "linear Rec. 709, half floats; depth, normals and object numbers beside",
+        "Unit of depth and poses": unit,
+        "Objects": objects or "none",
+        "Reproducible": "the same Blender on the same kind of processor renders the same pixels"
+        + limits,
+    }

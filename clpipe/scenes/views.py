@@ -1,0 +1,133 @@
+"""Which views of a scene are rendered, as the command line says it and as Blender is asked."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from clpipe.base.errors import RequestError
+from clpipe.inputs.views import read_views
+
+PATHS = ("orbit", "arc", "random")
+USUAL_VIEWS = 24
+LARGEST = 2**16  # px, the longer side of a render
+
+
+def asked_views(
+    views: int | None,
+    path: str | None,
+    box: Sequence[float] | None,
+    frames: Sequence[int] | None,
+    poses: Path | None,
+    seed: int,
+) -> dict[str, Any]:
+    """What Blender is asked for, see :class:`clpipe.scenes.blender.Rendering`.
+
+    Args:
+        views: how many are generated; None is :data:`USUAL_VIEWS` where nothing else is asked for.
+        path: of :data:`PATHS`; None is the first.
+        box: two corners, of a path in a box.
+        frames: of the scene.
+        poses: a file with cameras.
+        seed: of places in a box.
+
+    Raises:
+        RequestError: two of them are asked for, or a file of cameras is wrong.
+    """
+    generated = views is not None or path is not None or box is not None
+    kinds = {"--views, --path and --box": generated, "--frames": frames, "--poses": poses}
+    if len(asked := [name for name, is_asked in kinds.items() if is_asked]) > 1:
+        raise RequestError(f"found {' and '.join(asked)}; each says which views there are: use one")
+    if box is not None and path != "random":
+        raise RequestError("--box: it is for --path random")
+    if frames:
+        return {"frames": list(frames)}
+    if poses:
+        return {"cameras": cameras_of(poses)}
+    box = None if box is None else list(box)
+    return {"path": path or PATHS[0], "count": views or USUAL_VIEWS, "seed": seed, "box": box}
+
+
+def cameras_of(poses: Path) -> list[dict[str, Any]]:
+    """A record for each view of a file: name, width, height, K, R and t.
+
+    Raises:
+        RequestError: it cannot be read, or a view is not known fully, or two have one name.
+    """
+    records: dict[str, dict[str, Any]] = {}
+    for view in read_views(poses):
+        values, name = view.values, PurePosixPath(view.name.replace("\\", "/")).stem
+        if view.problem:
+            raise RequestError(f"--poses {poses}: view {view.name}: {view.problem}")
+        if view.size is None or not {"fx", "rotation"} <= values.keys():
+            raise RequestError(
+                f"--poses {poses}: view {view.name}: to be rendered, it must have width, height, "
+                "focal length and pose"
+            )
+        if name in records:
+            raise RequestError(f"--poses {poses}: two views are called {name}")
+        width, height = view.size
+        fx = values["fx"]
+        fy, cx = values.get("fy", fx), values.get("cx", width / 2)
+        matrix = [[fx, 0.0, cx], [0.0, fy, values.get("cy", height / 2)], [0.0, 0.0, 1.0]]
+        place = {"R": values["rotation"], "t": values["translation"]}
+        records[name] = {"name": name, "width": width, "height": height, "K": matrix, **place}
+    return list(records.values())
+
+
+def made_by(views: Mapping[str, Any]) -> Any:
+    """What the renders of views depend on; those of a frame do not depend on the other frames."""
+    return "frames" if "frames" in views else views
+
+
+def parse_frames(text: str) -> list[int]:
+    """Numbers of frames.
+
+    >>> parse_frames("1-4, 9")
+    [1, 2, 3, 4, 9]
+
+    Raises:
+        RequestError: it says none.
+    """
+    frames: dict[int, None] = {}
+    for part in text.split(","):
+        first, _, last = part.strip().partition("-")
+        if not first.isdecimal() or not (last or first).isdecimal():
+            raise RequestError(f"--frames: found {text!r}; expected frames, such as 1-24 or 1,5,9")
+        frames |= dict.fromkeys(range(int(first), int(last or first) + 1))
+    if not frames:
+        raise RequestError(f"--frames: found {text!r}, which is no frame; expected such as 1-24")
+    return list(frames)
+
+
+def parse_resolution(text: str) -> tuple[int, int]:
+    """A width and a height in px.
+
+    >>> parse_resolution("960x640")
+    (960, 640)
+
+    Raises:
+        RequestError: it is none.
+    """
+    sides = [int(side) for side in text.lower().split("x") if side.isdecimal()]
+    if len(sides) != 2 or text.lower().count("x") != 1 or not all(0 < s <= LARGEST for s in sides):
+        raise RequestError(f"--resolution: found {text!r}; expected WIDTHxHEIGHT, such as 960x640")
+    return sides[0], sides[1]
+
+
+def parse_box(text: str) -> list[float]:
+    """Two corners of a box: the lowest x, y and z, and the highest.
+
+    >>> parse_box("-1,-1,0, 1,1,2")
+    [-1.0, -1.0, 0.0, 1.0, 1.0, 2.0]
+
+    Raises:
+        RequestError: it is none.
+    """
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 6 or not all(map(math.isfinite, values)):
+        raise RequestError(f"--box: found {text!r}; expected two corners, such as -1,-1,0,1,1,2")
+    return values

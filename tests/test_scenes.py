@@ -1,0 +1,213 @@
+"""``clpipe dataset``: scenes and folders of renders become datasets; resumed, they are the same."""
+
+import csv
+import io
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clpipe.scenes.card import split_of
+from tests.conftest import ROOT, written
+
+NUMPY = ("--device", "numpy", "-c", "paper")
+
+
+@pytest.fixture
+def blender(tmp_path):
+    """A stand-in for an installed Blender; see tests/fake_blender.py."""
+    program = tmp_path / "blender"
+    script = ROOT / "tests" / "fake_blender.py"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{script}" "$@"\n')
+    program.chmod(0o755)
+    return ("--blender", program)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "room.blend"
+    path.write_text("a room")
+    return path
+
+
+def contents(folder):
+    return {name: (folder / name).read_bytes() for name in written(folder)}
+
+
+def test_a_scene_becomes_a_dataset(clpipe, scene, blender, tmp_path):
+    said = clpipe("dataset", scene, "-o", "set", *blender, *NUMPY, "--views", 5, "--iso", "100,400")
+    assert "rendered view_004  5 of 5" in said.stderr
+    assert "10 of 10 images done, 0 failed" in said.stderr
+    made = tmp_path / "set"
+    each = ("jpg", "json", "truth_clean.jpg", "truth_clean.json", "carried.exr")
+    models = ("cameras.json", "transforms.json")
+    models += tuple(f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D"))
+    assert set(written(made)) == {
+        *(f"iso{iso}/view_00{n}.{end}" for iso in (100, 400) for n in range(5) for end in each),
+        *(f"iso{iso}/{name}" for iso in (100, 400) for name in models),
+        *(f"renders/view_00{n}.exr" for n in range(5)),
+        *("renders/cameras.json", "renders/.rendering.json", "dataset.json", "manifest.csv"),
+        *("README.md", "contact_sheet.jpg", "train.txt", "val.txt"),
+    }
+    # Pictures are those of clpipe run, and the cameras those of the renders.
+    clpipe(
+        "run",
+        "set/renders",
+        "-o",
+        "out",
+        *NUMPY,
+        "--iso",
+        400,
+        "--poses",
+        "set/renders/cameras.json",
+    )
+    assert (tmp_path / "out/view_003.jpg").read_bytes() == (
+        made / "iso400/view_003.jpg"
+    ).read_bytes()
+    (view,) = (
+        v
+        for v in json.loads((made / "iso400/cameras.json").read_text())["views"]
+        if v["file"] == "view_003.jpg"
+    )
+    assert (view["t"], view["K"][0]) == ([3, 0, 2], [40, 0, 12])
+    rows = list(csv.DictReader(io.StringIO((made / "manifest.csv").read_text())))
+    assert [row["split"] for row in rows] == [split_of(n) for n in range(5) for _ in range(2)]
+    assert rows[7] == {
+        **{"view": "view_003", "split": "val", "camera": "sony-a7r2", "iso": "400"},
+        "picture": "iso400/view_003.jpg",
+        "carried": "iso400/view_003.carried.exr",
+        "truth_clean": "iso400/view_003.truth_clean.jpg",
+        "render": "renders/view_003.exr",
+    }
+    assert (made / "val.txt").read_text() == "view_003\n"
+    readme = (made / "README.md").read_text()
+    assert "1 floor, 2 ball + ball.001" in readme
+    assert "| `iso400/` | sony-a7r2 | 400 | 5 | 24x16 |" in readme
+    with Image.open(made / "contact_sheet.jpg") as sheet:
+        assert sheet.width > 3 * 24
+        assert np.asarray(sheet).std() > 20
+
+
+def test_it_goes_on_where_it_was_and_makes_the_same(clpipe, scene, blender, tmp_path):
+    command = ("dataset", scene, *blender, *NUMPY, "--path", "arc", "--views", 4, "--iso", 800)
+    clpipe(*command, "-o", "whole")
+    scene.write_text("die after 2")
+    said = clpipe(*command, "-o", "set", status=2).stderr
+    assert "Blender ended with status 11; it said:" in said
+    assert "Segmentation fault (not really)" in said
+    assert "2 of 4 images done, 0 failed, 2 not begun" in said
+    assert not (tmp_path / "set/README.md").exists()
+    record = tmp_path / "set/dataset.json"
+    record.write_text(record.read_text().replace(_sha256(scene), "0" * 64))
+    assert "holds a dataset with sha256" in clpipe(*command, "-o", "set", status=2).stderr
+    scene.write_text("a room")
+    record.write_text(record.read_text().replace("0" * 64, _sha256(scene)))
+    assert (
+        "4 of 4 images done (2 of them were there already)" in clpipe(*command, "-o", "set").stderr
+    )
+    whole, resumed = contents(tmp_path / "whole"), contents(tmp_path / "set")
+    assert whole.keys() == resumed.keys()
+    pictures = [name for name in whole if name.endswith((".jpg", ".exr", ".txt", "cameras.json"))]
+    assert all(whole[name] == resumed[name] for name in pictures)
+    # Where all renders are there, other ISOs need no Blender.
+    gone = ("--blender", tmp_path / "gone")
+    clpipe(*command[:2], *gone, *command[4:-1], "100,800", "-o", "set")
+    assert (tmp_path / "set/iso100/view_003.jpg").exists()
+
+
+def _sha256(path):
+    import hashlib
+
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_frames_have_flow_and_may_become_more(clpipe, scene, blender, tmp_path):
+    command = ("dataset", scene, "-o", "set", *blender, *NUMPY)
+    clpipe(*command, "--frames", "1,3")
+    again = clpipe(*command, "--frames", "1-3").stderr
+    assert "rendered frame_0002  2 of 3" in again
+    assert "rendered frame_0001" not in again
+    layers = json.loads((tmp_path / "set/frame_0002.json").read_text())["carried"]
+    assert [each["layer"] for each in layers] == ["Depth", "Normal", "IndexOB", "Vector"]
+    assert 'with views "frames"' in clpipe(*command, "--views", 2, status=2).stderr
+
+
+def test_cameras_of_a_file_are_rendered(clpipe, scene, blender, tmp_path):
+    clpipe("dataset", scene, "-o", "a", *blender, *NUMPY, "--views", 2)
+    poses = tmp_path / "a/renders/cameras.json"
+    clpipe("dataset", scene, "-o", "b", *blender, *NUMPY, "--poses", poses)
+    asked = json.loads((tmp_path / "b/renders/.rendering.json").read_text())["views"]["cameras"]
+    view = json.loads(poses.read_text())["views"][1]
+    assert asked[1] == {"name": "view_001", **{k: v for k, v in view.items() if k != "file"}}
+
+
+def test_renders_that_exist_become_a_dataset(clpipe, write_exr, tmp_path):
+    for name in ("a", "sub/b"):
+        write_exr(f"renders/{name}.exr", np.full((12, 16, 3), 0.3, np.float32))
+    cameras = {
+        "K": [[20, 0, 8], [0, 20, 6], [0, 0, 1]],
+        **{"R": np.eye(3).tolist(), "t": [0, 0, 1], "width": 16, "height": 12},
+    }
+    views = [{"file": name, **cameras} for name in ("a.exr", "sub/b.exr")]
+    (tmp_path / "renders/cameras.json").write_text(json.dumps({"views": views}))
+    clpipe("dataset", "renders", "-o", "set", *NUMPY, "--truth", "development", "--format", "png")
+    made = written(tmp_path / "set")
+    assert {"a.png", "sub/b.truth.png", "cameras.json", "README.md", "contact_sheet.jpg"} <= {*made}
+    assert (tmp_path / "set/train.txt").read_text() == "a\nsub/b\n"
+    write_exr("others/a.exr", np.zeros((12, 16, 3), np.float32))
+    said = clpipe("dataset", "others", "-o", "set", *NUMPY, status=2).stderr
+    assert 'holds a dataset with renders "renders", and "others" is asked for' in said
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--views", 3, "--frames", "1-3"], "each says which views there are: use one"),
+        (["--frames", "3-1"], "which is no frame"),
+        (["--frames", "a"], "--frames: found 'a'; expected frames, such as 1-24"),
+        (["--resolution", "96"], "--resolution: found '96'; expected WIDTHxHEIGHT"),
+        (["--box", "1,2,3"], "--box: found '1,2,3'; expected two corners"),
+        (["--box", "0,0,0,1,1,1"], "--box: it is for --path random"),
+        (["--iso", "1"], "camera sony-a7r2 goes from 100 to 25600"),
+        (["--poses", "cameras.json"], "must have width, height, focal length and pose"),
+    ],
+)
+def test_what_is_refused(clpipe, scene, blender, tmp_path, options, message):
+    (tmp_path / "cameras.json").write_text('{"views": [{"file": "a.exr"}]}')
+    said = clpipe("dataset", scene, "-o", "set", *blender, *options, status=2).stderr
+    assert message in said
+    assert not (tmp_path / "set/dataset.json").exists()
+
+
+def test_scenes_that_cannot_be_rendered(clpipe, scene, blender, tmp_path, monkeypatch):
+    scene.write_text("refuse: it has no camera; add one")
+    said = clpipe("dataset", scene, "-o", "set", *blender, status=2).stderr
+    assert said == f"clpipe: {scene}: it has no camera; add one\n"
+    assert "no such file" in clpipe("dataset", "no.blend", "-o", "set", *blender, status=2).stderr
+    assert "expected a .blend, or a folder" in clpipe("dataset", "no", "-o", "s", status=2).stderr
+    monkeypatch.setitem(sys.modules, "bpy", None)
+    said = clpipe("dataset", scene, "-o", "set", status=2).stderr
+    assert "pip install 'clpipe[blender]', or name an installed one with --blender PATH" in said
+    none = ("--blender", tmp_path / "none")
+    assert "No such file" in clpipe("dataset", scene, "-o", "set", *none, status=2).stderr
+    (tmp_path / "renders").mkdir()
+    said = clpipe("dataset", "renders", "-o", "set", "--samples", 3, status=2).stderr
+    assert "--samples: it is for a .blend, not for renders that exist" in said
+
+
+def test_blender_itself_renders_a_scene(clpipe, tmp_path):
+    """Its depth, cameras and object numbers agree with each other, and it makes the same again."""
+    pytest.importorskip("bpy")
+    script = ROOT / "tools" / "examples" / "room_scene.py"
+    subprocess.run([sys.executable, script, "room.blend"], cwd=tmp_path, check=True)
+    small = ("--resolution", "48x32", "--samples", 4, "--device", "numpy", "--path", "arc")
+    for name in ("one", "two"):
+        clpipe("dataset", "room.blend", "-o", name, "--views", 2, *small)
+    one, two = (contents(Path(name) / "renders") for name in ("one", "two"))
+    assert {k: v for k, v in one.items() if k[0] != "."} == {
+        k: v for k, v in two.items() if k[0] != "."
+    }
