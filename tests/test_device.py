@@ -18,10 +18,10 @@ from clpipe.commands.devices import device_rows
 from clpipe.engine import hardware
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.discovery import choose, choose_all, find_devices, lanes_for
+from clpipe.engine.extents import Extent
 from clpipe.engine.flow import Flow
 from clpipe.engine.hardware import Hardware, hardware_of
 from clpipe.engine.runner import Runner
-from clpipe.engine.tiles import Extent
 
 
 @pytest.fixture

@@ -14,8 +14,9 @@ from clpipe.camera.profile import load_camera
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.check import example
+from clpipe.engine.extents import whole_image
 from clpipe.engine.runner import Runner
-from clpipe.engine.tiles import buffer_sizes, tiling_of, whole_image
+from clpipe.engine.tiles import buffer_sizes, tiling_of
 from clpipe.reference.radial import Radial
 from clpipe.reference.warp import FILTERS, Warp
 from clpipe.stage import Kind

@@ -11,8 +11,9 @@ from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.check import example
 from clpipe.engine.codegen import write_kernel
+from clpipe.engine.extents import whole_image
 from clpipe.engine.runner import Runner
-from clpipe.engine.tiles import buffer_sizes, halos_of, tiling_of, whole_image
+from clpipe.engine.tiles import buffer_sizes, halos_of, tiling_of
 from clpipe.images.read import read_image
 from clpipe.reference.resample import Resampling, lanczos3, overlap, resample
 from clpipe.stage import Kind

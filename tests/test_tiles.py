@@ -11,8 +11,9 @@ from clpipe.chain.chain import make_chain
 from clpipe.chain.registry import all_stages, load_stage_file
 from clpipe.chain.settings import Settings, settings_from
 from clpipe.engine.check import NOISE, chain_for, example
+from clpipe.engine.extents import Box, whole_image
 from clpipe.engine.plan import Plan
-from clpipe.engine.runner import Result, Runner
+from clpipe.engine.runner import Result, Runner, cut_out
 from clpipe.engine.tiles import (
     LARGEST_TILE,
     buffer_sizes,
@@ -20,7 +21,6 @@ from clpipe.engine.tiles import (
     halos_of,
     phases_of,
     tiling_of,
-    whole_image,
 )
 from clpipe.reference.cfa import PATTERNS
 from clpipe.stage import Kind
@@ -60,7 +60,10 @@ def same(one: Result, two: Result) -> None:
 def in_tiles(
     runner: Runner, image: np.ndarray, columns: int, rows: int, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[Result, int]:
-    """The result of an image, which is the same in tiles of about that size, and their number."""
+    """The result of an image, which is the same in tiles of about that size, and their number.
+
+    So are patches of it, made alone.
+    """
     device = runner.device
     plan = runner.plan(image.dtype == np.float16, fold=min(image.shape[:2]) > 1)
     memory = memory_for(plan, columns, rows, device.info.lanes)
@@ -71,7 +74,28 @@ def in_tiles(
         parts = runner.run(image, "k")
         assert device.bytes_held <= memory
     same(whole, parts)
+    boxes = patches_in(whole)
+    same(cut(whole, boxes), runner.submit(image, "k", boxes=boxes)())
     return whole, len(tiling.tiles)
+
+
+def patches_in(whole: Result) -> list[Box]:
+    """Two patches of one size: one at an odd place, and one that ends with the image."""
+    images = [x for x in (whole.final, whole.encoded, *whole.kept.values()) if x is not None]
+    height, width = images[0].shape[:2]
+    high, wide = min(height, 31), min(width, 37)
+    places = ((width - wide) // 2 | 1, (height - high) // 2 | 1), (width - wide, height - high)
+    left_top = [(min(x, width - wide), min(y, height - high)) for x, y in places]
+    return [Box(x, y, x + wide, y + high) for x, y in left_top]
+
+
+def cut(whole: Result, boxes: list[Box]) -> Result:
+    """The result with parts of its images, behind each other."""
+    final, encoded = (
+        None if image is None else cut_out(image, boxes) for image in (whole.final, whole.encoded)
+    )
+    kept = {name: cut_out(image, boxes) for name, image in whole.kept.items()}
+    return Result(final, encoded, kept, whole.estimates)
 
 
 @pytest.mark.parametrize(("stage", "method"), METHODS)

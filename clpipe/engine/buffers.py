@@ -1,6 +1,6 @@
 """Memory of a run: buffers on the device, and arrays on the host for what comes back."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
 from typing import Any
@@ -9,8 +9,8 @@ import numpy as np
 
 from clpipe.base.types import Array
 from clpipe.engine.codegen import border_left
+from clpipe.engine.extents import Box, Extent
 from clpipe.engine.plan import Finalize, Plan
-from clpipe.engine.tiles import Extent
 from clpipe.engine.writer import Parameter
 from clpipe.stage import Kind
 
@@ -20,7 +20,8 @@ class HostImages:
     """The results of a run on the host.
 
     ``images`` are float images by their number in the plan, (height, width[, channel]);
-    ``encoded`` are eight-bit pixels of the same shape; ``estimates`` are four floats a step.
+    ``encoded`` are eight-bit pixels of the same shape; ``estimates`` are four floats a step. Images
+    of patches are (patch, height, width[, channel]).
     """
 
     images: dict[int, Array]
@@ -44,7 +45,9 @@ def aligned_empty(shape: tuple[int, ...], dtype: Any) -> Array:
     return room[start : start + size].view(dtype).reshape(shape)
 
 
-def room_for(plan: Plan, width: int, height: int, into: Array | None) -> HostImages:
+def room_for(
+    plan: Plan, width: int, height: int, into: Array | None, boxes: Sequence[Box] = ()
+) -> HostImages:
     """Empty arrays for all results of a plan.
 
     Args:
@@ -52,17 +55,19 @@ def room_for(plan: Plan, width: int, height: int, into: Array | None) -> HostIma
         width: of the source in pixels, and its height.
         height: see above.
         into: an array to use for the eight-bit pixels.
+        boxes: the patches that are made of the results, all of one size; () is all of them.
 
     Raises:
-        ValueError: ``into`` has another shape or type.
+        ValueError: ``into`` has another shape or type, or patches differ in size.
     """
-
+    shapes = {(box.height, box.width) for box in boxes}
+    if len(shapes) > 1:
+        raise ValueError(f"patches of {sorted(shapes)}; expected one size")
     sizes = plan.sizes(width, height)
 
     def shape(kind: Kind, level: int) -> tuple[int, ...]:
-        columns, rows = sizes[level]
-        channels = len(kind.channels)
-        return (rows, columns) if channels == 1 else (rows, columns, channels)
+        size = (len(boxes), *min(shapes)) if shapes else sizes[level][::-1]
+        return size if len(kind.channels) == 1 else (*size, len(kind.channels))
 
     images = [image for _, image in plan.kept] + ([plan.final] if plan.final else [])
     encoded = None
@@ -80,28 +85,31 @@ def room_for(plan: Plan, width: int, height: int, into: Array | None) -> HostIma
     )
 
 
-def copy_encoded(extent: Extent, pixels: Array, whole: Array) -> None:
-    """Copy the core of a tile's eight-bit pixels into the whole image, unless they are its own."""
-    if not np.may_share_memory(pixels, whole):
+def core_of(extent: Extent, whole: Array) -> Array:
+    """The part of an image, (height, width[, channel]), that a tile makes."""
+    core = extent.core
+    return whole[core.top : core.bottom, core.left : core.right]
+
+
+def copy_encoded(extent: Extent, pixels: Array, room: Array) -> None:
+    """Copy the core of a tile's eight-bit pixels, unless they are there already."""
+    if not np.may_share_memory(pixels, room):
         core, stored = extent.core, extent.stored
-        part = pixels.reshape(stored.height, stored.width, -1)
+        part = pixels.reshape(stored.height, stored.width, *room.shape[2:])
         rows = slice(core.top - stored.top, core.bottom - stored.top)
         columns = slice(core.left - stored.left, core.right - stored.left)
-        image = whole.reshape(extent.height, extent.width, -1)
-        image[core.top : core.bottom, core.left : core.right] = part[rows, columns]
+        room[:] = part[rows, columns]
 
 
-def copy_plane(extent: Extent, plane: Array, whole: Array, channel: int) -> None:
-    """Copy the core of a tile's plane into a channel of the whole image."""
+def copy_plane(extent: Extent, plane: Array, room: Array, channel: int) -> None:
+    """Copy the core of a tile's plane into a channel of (height, width[, channel])."""
     core, stored, border = extent.core, extent.stored, extent.border
     height = extent.padded_height + 2 * border
     top = border + core.top - stored.top
     left = border_left(border, extent.lanes) + core.left - stored.left
     rows = plane[: height * extent.pitch].reshape(height, extent.pitch)
-    image = whole.reshape(extent.height, extent.width, -1)
-    image[core.top : core.bottom, core.left : core.right, channel] = rows[
-        top : top + core.height, left : left + core.width
-    ]
+    image = room if room.ndim == 2 else room[..., channel]
+    image[:] = rows[top : top + core.height, left : left + core.width]
 
 
 class Pool:

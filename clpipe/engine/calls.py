@@ -15,8 +15,8 @@ from clpipe.engine.codegen import (
     round_up,
     summed_together,
 )
+from clpipe.engine.extents import Extent, Extents
 from clpipe.engine.plan import Finalize, Histogram, Launch, Lines, Reduce
-from clpipe.engine.tiles import Extent, Extents
 from clpipe.engine.writer import Parameter
 
 Bind = Callable[[Parameter], Any]

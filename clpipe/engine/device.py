@@ -22,7 +22,9 @@ from clpipe.engine.discovery import (
     shared_out,
     usable_memory,
 )
+from clpipe.engine.extents import Box
 from clpipe.engine.flow import Flow, Passage, Work
+from clpipe.engine.patches import with_patches
 from clpipe.engine.plan import Launch, Plan
 from clpipe.engine.programs import forget_programs, programs_of
 from clpipe.engine.tiles import Tiling, tiling_of
@@ -146,6 +148,7 @@ class Device:
         download: bool = True,
         into: Array | None = None,
         unchanged: bool = False,
+        boxes: Sequence[Box] = (),
     ) -> Callable[[], HostImages]:
         """Begin to put one image through a plan, in tiles if it does not fit into the memory.
 
@@ -164,6 +167,8 @@ class Device:
                 C-contiguous; a used one saves the time that new memory takes.
             unchanged: the source, if it is the last image's array, still has the same pixels, and
                 need not be sent again.
+            boxes: the parts of the results that are made, all of one size, in their pixels; () is
+                all of them. Results are then stacks of patches.
 
         Returns:
             What waits for the results and gives them, called once and in the order of images. If
@@ -178,8 +183,8 @@ class Device:
             ImageError: the image does not fit into the device's memory, not even in tiles.
             DeviceError: a kernel does not compile.
         """
-        output = room_for(plan, source.shape[1], source.shape[0], into)
-        work = Work(plan, source, bind, output, download, unchanged)
+        output = room_for(plan, source.shape[1], source.shape[0], into, boxes)
+        work = Work(plan, source, bind, output, boxes, download, unchanged)
         begun = self._begin(work, self.memory)
         return partial(self._result, work, begun, self._generation, timings)
 
@@ -190,7 +195,11 @@ class Device:
     def _tiling(self, work: Work, memory: int) -> Tiling:
         height, width = work.source.shape[:2]
         largest = min(memory, self.info.max_buffer)
-        return tiling_of(work.plan, width, height, self.info.lanes, memory, largest, self.depth)
+        lanes = self.info.lanes
+        tiling = tiling_of(work.plan, width, height, lanes, memory, largest, self.depth)
+        if not work.boxes:
+            return tiling
+        return with_patches(work.plan, work.boxes, tiling, lanes, memory, self.depth)
 
     def _begin(self, work: Work, memory: int) -> Passage | Exception:
         """Enqueue an image; what the device raises is returned."""

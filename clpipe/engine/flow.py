@@ -16,10 +16,11 @@ import numpy as np
 
 from clpipe.base.steps import Step
 from clpipe.base.types import Array
-from clpipe.engine.buffers import HostImages, Pool, copy_encoded, copy_plane
+from clpipe.engine.buffers import HostImages, Pool, copy_encoded, copy_plane, core_of
 from clpipe.engine.calls import Bind, Call, index_space
+from clpipe.engine.extents import Box, Extent, Extents
 from clpipe.engine.plan import Launch, Plan
-from clpipe.engine.tiles import Extents, Tiling, source_bytes
+from clpipe.engine.tiles import Tiling, source_bytes
 from clpipe.engine.transfers import InPlace, Staged
 from clpipe.engine.writer import Parameter
 
@@ -35,6 +36,7 @@ class Work:
         source: the image, (height, width[, channel]).
         bind: the value of a "value", "key" or "table8" parameter: a NumPy scalar or array.
         output: where the results go.
+        boxes: the patches of the results that are made; () is all of them.
         download: whether they do.
         unchanged: whether the source, if it is the array that was sent last, holds the same pixels.
     """
@@ -43,6 +45,7 @@ class Work:
     source: Array
     bind: Bind
     output: HostImages
+    boxes: Sequence[Box]
     download: bool
     unchanged: bool
 
@@ -69,7 +72,7 @@ class Passage:
     @property
     def is_whole(self) -> bool:
         """Whether the image goes through in one piece."""
-        return len(self.tiling.tiles) == 1
+        return len(self.tiling.tiles) == 1 and not self.tiling.patches
 
 
 @dataclass(frozen=True)
@@ -130,13 +133,14 @@ class Flow:
         tiling = passage.tiling
         self.pool.reserve(self._transfers.needs(tiling.sizes), memory)
         for phase in tiling.phases:
-            self._launch(passage, phase.first, 0, {}, [])
-            for tile in range(len(tiling.tiles)):
+            tiles = tiling.tiles_of(phase)
+            self._launch(passage, phase.first, tiles[0], 0, {}, [])
+            for tile, extents in enumerate(tiles):
                 while len(self._parts) >= self.depth:
                     self._land()
                 is_last = phase is tiling.phases[-1]
-                self._pass(passage, phase.each, tile, passage.work.download and is_last)
-            self._launch(passage, phase.last, 0, {}, [])
+                self._pass(passage, phase.each, extents, tile, passage.work.download and is_last)
+            self._launch(passage, phase.last, tiles[0], 0, {}, [])
 
     def finish(self, passage: Passage) -> None:
         """Wait until all parts of an image have landed, and any that were started before it.
@@ -167,9 +171,11 @@ class Flow:
             with suppress(self._cl.Error):
                 release()
 
-    def _pass(self, passage: Passage, numbers: Sequence[int], tile: int, fetches: bool) -> None:
+    def _pass(
+        self, passage: Passage, numbers: Sequence[int], extents: Extents, tile: int, fetches: bool
+    ) -> None:
         """Send a tile, launch kernels on it, and fetch what they made of it."""
-        plan, extents = passage.work.plan, passage.tiling.tiles[tile]
+        plan = passage.work.plan
         sent = self._send(passage, extents)
         whole = passage.work.output.encoded if fetches and passage.is_whole else None
         size = extents[-1].stored.width * extents[-1].stored.height
@@ -178,11 +184,11 @@ class Flow:
         if size:
             ends["dst"] = self._transfers.target(size, whole)
         wait, self._reads = [*sent[1], *self._reads], []
-        self._launch(passage, numbers, tile, ends, wait)
+        self._launch(passage, numbers, extents, tile, ends, wait)
         last = [event for _, event in passage.events[-1:]]
         part = Part(passage, [*wait, *last], [])
         if fetches:
-            self._fetch(part, tile, ends, size, last)
+            self._fetch(part, extents, tile, ends, size, last)
         passage.parts += 1
         self._parts.append(part)
         self._transfers.flush()
@@ -210,12 +216,12 @@ class Flow:
         self,
         passage: Passage,
         numbers: Sequence[int],
+        extents: Extents,
         tile: int,
         ends: dict[str, Any],
         wait: list[Any],
     ) -> None:
         """Launch kernels of a plan on a tile, the first of them after the events ``wait``."""
-        extents = passage.tiling.tiles[tile]
 
         def value_of(parameter: Parameter) -> Any:
             value = passage.work.bind(parameter)
@@ -242,12 +248,18 @@ class Flow:
             passage.events.append((launch.name, events[0]))  # nothing waits for borders
 
     def _fetch(
-        self, part: Part, tile: int, ends: dict[str, Any], size: int, after: list[Any]
+        self,
+        part: Part,
+        extents: Extents,
+        tile: int,
+        ends: dict[str, Any],
+        size: int,
+        after: list[Any],
     ) -> None:
         """Fetch a tile's results, and with the last tile what was estimated from the image."""
         passage, transfers, held = part.passage, self._transfers, self.pool.held
         plan, output = passage.work.plan, passage.work.output
-        extents = passage.tiling.tiles[tile]
+        patches = passage.tiling.patches
 
         def fetch(name: str, buffer: Any, size: int) -> Array:
             array, event = transfers.fetch(name, buffer, size, after)
@@ -257,9 +269,13 @@ class Flow:
                 self._reads.append(event)
             return array
 
+        def room(image: Array, extent: Extent) -> Array:
+            return image[tile] if patches else core_of(extent, image)
+
         if output.encoded is not None and not extents[-1].core.is_empty:
             pixels = fetch("dst", ends["dst"], size)
-            part.copies.append(partial(copy_encoded, extents[-1], pixels, output.encoded))
+            encoded = room(output.encoded, extents[-1])
+            part.copies.append(partial(copy_encoded, extents[-1], pixels, encoded))
         for number, image in output.images.items():
             extent = extents[plan.level_of(number)]
             if extent.core.is_empty:
@@ -267,8 +283,9 @@ class Flow:
             for channel, slot in enumerate(plan.slots[number]):
                 name = f"slot{slot}"
                 plane = fetch(name, held[name], extent.plane_bytes).view(np.float32)
-                part.copies.append(partial(copy_plane, extent, plane, image, channel))
-        if tile == len(passage.tiling.tiles) - 1:
+                to = room(image, extent)
+                part.copies.append(partial(copy_plane, extent, plane, to, channel))
+        if tile == len(patches or passage.tiling.tiles) - 1:
             for step, values in output.estimates.items():
                 name = f"estimates.{step}"
                 found = fetch(name, held[name], values.nbytes).view(values.dtype)

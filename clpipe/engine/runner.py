@@ -13,6 +13,7 @@ from clpipe.chain.chain import Chain, Step
 from clpipe.chain.registry import user_code_errors
 from clpipe.engine.buffers import HostImages
 from clpipe.engine.device import Device, Timing
+from clpipe.engine.extents import Box
 from clpipe.engine.ops import chain_ops
 from clpipe.engine.plan import Finalize, Plan, make_plan
 from clpipe.engine.programs import announced
@@ -28,8 +29,8 @@ class Result:
 
     ``final`` is the last image in float32, ``encoded`` the same in eight bits; both are (height,
     width[, channel]), and None where not requested. ``kept`` has the images of the steps to keep,
-    float32, by step. ``estimates`` has the numbers that stages estimated from the image, such as
-    gains, by step and name.
+    float32, by step. Those of patches are (patch, height, width[, channel]). ``estimates`` has the
+    numbers that stages estimated from the image, such as gains, by step and name.
     """
 
     final: Floats | None
@@ -65,6 +66,11 @@ def is_planar(image: Array) -> bool:
     if image.ndim != 3 or image.flags.c_contiguous:
         return False
     return image.transpose(2, 0, 1).flags.c_contiguous
+
+
+def cut_out(image: Array, boxes: Sequence[Box]) -> Array:
+    """Parts of an image, all of one size, behind each other: (patch, height, width[, channel])."""
+    return np.stack([image[box.top : box.bottom, box.left : box.right] for box in boxes])
 
 
 def check_resamplings(plan: Plan, width: int, height: int) -> None:
@@ -191,6 +197,7 @@ class Runner:
         download: bool = True,
         into: Array | None = None,
         unchanged: bool = False,
+        boxes: Sequence[Box] = (),
     ) -> Callable[[], Result]:
         """Begin to put one image through; see :meth:`clpipe.engine.device.Device.submit`.
 
@@ -203,6 +210,8 @@ class Runner:
             into: an array to use for the eight-bit pixels (devices only), of their shape; a used
                 one saves the time that new memory takes.
             unchanged: the image, if it is the same array as that before, has the same pixels still.
+            boxes: the parts of the results that are made, all of one size, in their pixels; () is
+                all of them. The images of the result are then stacks of patches.
 
         Returns:
             What waits for the result and gives it; it raises ImageError, DeviceFailedError and
@@ -223,7 +232,7 @@ class Runner:
         if not (self.encode or self.final or self.keep):
             return lambda: Result(None, None, {}, {})
         if not self.device:
-            return partial(self._run_numpy, np.asarray(image, np.float32), noise_key)
+            return partial(self._run_numpy, np.asarray(image, np.float32), noise_key, boxes)
         smallest = min(self.chain.size(*image.shape[1::-1]))
         plan = self.plan(image.dtype == np.float16, smallest > 1, is_planar(image))
         try:
@@ -232,7 +241,8 @@ class Runner:
             raise
         except ImageError:
             pass  # the tiny image is too large; the one below says it of this image
-        return self._submit_plan(plan, image, noise_key, timings, download, into, unchanged)
+        options = timings, download, into, unchanged, boxes
+        return self._submit_plan(plan, image, noise_key, *options)
 
     def _submit_plan(
         self, plan: Plan, image: Array, noise_key: str, *options: Any
@@ -308,7 +318,7 @@ class Runner:
             self._tables[key] = curves, composed
         return self._tables[key][1]
 
-    def _run_numpy(self, image: Floats, noise_key: str) -> Result:
+    def _run_numpy(self, image: Floats, noise_key: str, boxes: Sequence[Box]) -> Result:
         kept: dict[str, Floats] = {}
         estimates: dict[str, dict[str, float]] = {}
         whole = self.encode or self.final
@@ -322,6 +332,9 @@ class Runner:
                 kept[step.name] = image
             if frame.estimates:
                 estimates[step.name] = frame.estimates
+        if boxes:
+            image, *parts = (cut_out(each, boxes) for each in (image, *kept.values()))
+            kept = dict(zip(kept, parts, strict=True))
         return Result(
             final=image if self.final or steps[-1].name in self.keep else None,
             encoded=to_8_bit(image) if self.encode else None,

@@ -10,15 +10,14 @@ it stores of a level is enough for its core there and for what it stores of the 
 
 import math
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-
-import numpy as np
+from functools import lru_cache
 
 from clpipe.base.errors import ImageError
 from clpipe.base.memory import in_words
-from clpipe.engine.codegen import PARTIALS, RUN, border_left, columns_of, round_up, summed_together
+from clpipe.engine.codegen import PARTIALS, RUN, columns_of, round_up
+from clpipe.engine.extents import Box, Extent, Extents, whole_image
 from clpipe.engine.ops import Op
 from clpipe.engine.plan import (
     AnyLaunch,
@@ -35,114 +34,6 @@ from clpipe.reference.resample import Axis
 # Larger ones are no faster, and memory that is new to a process costs time: 600 megapixels took
 # 28 s in tiles of 1 GiB and 39 s in tiles of 4 GiB (PoCL, two busy cores).
 LARGEST_TILE = 2**30  # bytes
-
-
-@dataclass(frozen=True)
-class Box:
-    """A part of an image: the columns from ``left`` to before ``right``, and rows likewise."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
-
-    @property
-    def width(self) -> int:
-        """How many columns."""
-        return self.right - self.left
-
-    @property
-    def height(self) -> int:
-        """How many rows."""
-        return self.bottom - self.top
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether it has no pixels."""
-        return self.width <= 0 or self.height <= 0
-
-
-@dataclass(frozen=True)
-class Extent:
-    """An image, or a tile of it with its halo, and the size of its planes on a device."""
-
-    width: int  # of the image
-    height: int
-    lanes: int
-    border: int
-    core: Box
-    stored: Box  # core and halo
-
-    @classmethod
-    def whole(cls, width: int, height: int, lanes: int, border: int) -> "Extent":
-        """An image in one piece."""
-        box = Box(0, 0, width, height)
-        return cls(width, height, lanes, border, box, box)
-
-    @cached_property
-    def pitch(self) -> int:
-        """Floats from one row of a plane to the next."""
-        pitch = self.padded_width + 2 * border_left(self.border, self.lanes)
-        # Rows a multiple of 4 KiB apart would fall into the same cache sets.
-        return pitch + self.lanes * (pitch % 1024 == 0)
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether nothing is stored, because nothing is needed."""
-        return self.stored.is_empty
-
-    @property
-    def is_small(self) -> bool:
-        """Whether stores leave a part of the border to be filled, see ``kernels/lib/image.h``."""
-        return min(self.stored.width, self.stored.height) <= 2 * self.border + 1
-
-    @property
-    def padded_width(self) -> int:
-        """The width of the planes, in whole blocks."""
-        return round_up(self.stored.width, self.lanes)
-
-    @property
-    def padded_height(self) -> int:
-        """The height of the planes, in whole blocks of four rows."""
-        return round_up(self.stored.height, 4)
-
-    @property
-    def blocks(self) -> int:
-        """The number of blocks, four rows high, each of which has sums of its own."""
-        across = -(-self.padded_width // (self.lanes * summed_together(self.lanes)))
-        return across * (self.padded_height // 4)
-
-    @property
-    def plane_bytes(self) -> int:
-        """The bytes of a plane with its border, and a margin that the last block's loads need."""
-        return ((self.padded_height + 2 * self.border) * self.pitch + 5 * self.lanes) * 4
-
-    @cached_property
-    def numbers(self) -> dict[str, np.uint32]:
-        """The values of the kernel parameters that describe it, by name."""
-        core = {f"core_{side}": value for side, value in vars(self.core).items()}
-        numbers = {
-            "width": self.width,
-            "height": self.height,
-            "pitch": self.pitch,
-            "left": self.stored.left // self.lanes,
-            "top": self.stored.top // 4,
-            "columns": self.stored.width,
-            "rows": self.stored.height,
-            "border": self.border,
-            "blocks": self.blocks,
-            **core,
-        }
-        return {name: np.uint32(value) for name, value in numbers.items()}
-
-
-# An image or a tile on each level of a plan.
-Extents = tuple[Extent, ...]
-
-
-def whole_image(plan: Plan, width: int, height: int, lanes: int) -> Extents:
-    """An image in one piece, from the width and height of the source."""
-    return tuple(Extent.whole(*size, lanes, plan.border) for size in plan.sizes(width, height))
 
 
 def source_bytes(plan: Plan, extent: Extent) -> int:
@@ -194,11 +85,19 @@ class Phase:
 
 @dataclass(frozen=True)
 class Tiling:
-    """How an image goes through a plan: its tiles, in which phases, and the bytes it takes."""
+    """How an image goes through a plan: its tiles, in which phases, and the bytes it takes.
+
+    Where only ``patches`` of the result are made, these are the tiles of the last phase.
+    """
 
     tiles: tuple[Extents, ...]
     phases: tuple[Phase, ...]
     sizes: dict[str, int]
+    patches: tuple[Extents, ...] = ()
+
+    def tiles_of(self, phase: Phase) -> tuple[Extents, ...]:
+        """The tiles that go through a phase."""
+        return self.patches if self.patches and phase is self.phases[-1] else self.tiles
 
     @property
     def bytes(self) -> int:
@@ -269,8 +168,8 @@ def halos_of(plan: Plan) -> tuple[int, ...]:
     return tuple(halos)
 
 
-class _Cutter:
-    """Cuts an image into tiles whose cores begin at multiples of ``across`` and of 4."""
+class Cutter:
+    """Cuts an image into tiles that begin at multiples of ``across`` and of 4."""
 
     def __init__(self, plan: Plan, width: int, height: int, lanes: int) -> None:
         self.whole = whole_image(plan, width, height, lanes)
@@ -290,14 +189,24 @@ class _Cutter:
         """
         step = self.across if axis == "columns" else 4
         sizes = [e.width if axis == "columns" else e.height for e in self.whole]
+        # Rounded up, so that the first tile has a core on every level.
+        cores = [
+            (
+                min(round_up(-(-begin * size // sizes[0]), step), size),
+                min(round_up(-(-end * size // sizes[0]), step), size),
+            )
+            for size in sizes
+        ]
+        return self.spans_of(axis, cores)
+
+    def spans_of(self, axis: Axis, cores: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
+        """As :meth:`spans`, of a tile whose core on each level begins and ends anywhere."""
+        step = self.across if axis == "columns" else 4
+        sizes = [e.width if axis == "columns" else e.height for e in self.whole]
         spans: list[tuple[int, ...]] = []
         low = high = 0  # what the next level needs of this one
         for level in reversed(range(len(sizes))):
-            size, halo = sizes[level], self._halos[level]
-            # Rounded up, so that the first tile has a core on every level.
-            core = [
-                min(round_up(-(-place * size // sizes[0]), step), size) for place in (begin, end)
-            ]
+            size, halo, core = sizes[level], self._halos[level], cores[level]
             if core[0] < core[1]:
                 low, high = (min(low, core[0]), max(high, core[1])) if low < high else core
             if low < high:
@@ -313,6 +222,18 @@ class _Cutter:
         width, height = self.whole[0].width, self.whole[0].height
         across = self.spans("columns", left, min(left + columns, width))
         down = self.spans("rows", top, min(top + rows, height))
+        return self._extents(across, down)
+
+    def patch(self, box: Box, levels: Set[int]) -> Extents:
+        """The tile that makes a part of the images of these levels, and nothing else."""
+        every = range(len(self.whole))
+        across = [(box.left, box.right) if level in levels else (0, 0) for level in every]
+        down = [(box.top, box.bottom) if level in levels else (0, 0) for level in every]
+        return self._extents(self.spans_of("columns", across), self.spans_of("rows", down))
+
+    def _extents(
+        self, across: Sequence[tuple[int, ...]], down: Sequence[tuple[int, ...]]
+    ) -> Extents:
         return tuple(
             replace(
                 extent,
@@ -348,6 +269,12 @@ class _Cutter:
 
 
 @lru_cache(maxsize=64)
+def cutter_of(plan: Plan, width: int, height: int, lanes: int) -> Cutter:
+    """What cuts an image of that size, for a plan and a device of so many lanes."""
+    return Cutter(plan, width, height, lanes)
+
+
+@lru_cache(maxsize=64)
 def tiling_of(
     plan: Plan, width: int, height: int, lanes: int, memory: int, largest: int, ends: int = 1
 ) -> Tiling:
@@ -367,7 +294,7 @@ def tiling_of(
     Raises:
         ImageError: not even the smallest tile fits; the message says what it needs.
     """
-    cut = _Cutter(plan, width, height, lanes)
+    cut = cutter_of(plan, width, height, lanes)
     whole, across = cut.whole, cut.across
 
     def fits(extents: Extents, memory: int) -> bool:

@@ -163,7 +163,7 @@ class Staged:
         buffer = self._pool.held[f"src{self._source}"]
         sent = buffer, [self._cl.enqueue_copy(self._up, buffer, data, is_blocking=False)]
         self._up.flush()
-        self._sent = weakref.ref(source), sent
+        self._sent = (weakref.ref(source), sent) if pixels.size == source.size else None
         return sent
 
     def again(self, source: Array) -> Sent | None:

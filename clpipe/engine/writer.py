@@ -17,7 +17,7 @@ LARGER = (
 class Parameter:
     """One kernel parameter: its OpenCL declaration, and what is bound to it.
 
-    ``role`` is one of tile (a number of :class:`clpipe.engine.tiles.Extent`, or the tile's own
+    ``role`` is one of tile (a number of :class:`clpipe.engine.extents.Extent`, or the tile's own
     number), source, slot, encoded, table8 (the composed curve), value, key, lines, estimates, sums,
     partials, counts, histogram, taps (of the resampling that leads on from the level ``number``).
     ``step``, ``item`` and ``number`` say which one of that role; they are not part of the text.

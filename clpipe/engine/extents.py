@@ -1,0 +1,117 @@
+"""Where an image, or a tile of it, lies, and how large its planes are on a device. Pure."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from clpipe.engine.codegen import border_left, round_up, summed_together
+from clpipe.engine.plan import Plan
+
+
+@dataclass(frozen=True)
+class Box:
+    """A part of an image: the columns from ``left`` to before ``right``, and rows likewise."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @property
+    def width(self) -> int:
+        """How many columns."""
+        return self.right - self.left
+
+    @property
+    def height(self) -> int:
+        """How many rows."""
+        return self.bottom - self.top
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether it has no pixels."""
+        return self.width <= 0 or self.height <= 0
+
+
+@dataclass(frozen=True)
+class Extent:
+    """An image, or a tile of it with its halo, and the size of its planes on a device."""
+
+    width: int  # of the image
+    height: int
+    lanes: int
+    border: int
+    core: Box
+    stored: Box  # core and halo
+
+    @classmethod
+    def whole(cls, width: int, height: int, lanes: int, border: int) -> "Extent":
+        """An image in one piece."""
+        box = Box(0, 0, width, height)
+        return cls(width, height, lanes, border, box, box)
+
+    @cached_property
+    def pitch(self) -> int:
+        """Floats from one row of a plane to the next."""
+        pitch = self.padded_width + 2 * border_left(self.border, self.lanes)
+        # Rows a multiple of 4 KiB apart would fall into the same cache sets.
+        return pitch + self.lanes * (pitch % 1024 == 0)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing is stored, because nothing is needed."""
+        return self.stored.is_empty
+
+    @property
+    def is_small(self) -> bool:
+        """Whether stores leave a part of the border to be filled, see ``kernels/lib/image.h``."""
+        return min(self.stored.width, self.stored.height) <= 2 * self.border + 1
+
+    @property
+    def padded_width(self) -> int:
+        """The width of the planes, in whole blocks."""
+        return round_up(self.stored.width, self.lanes)
+
+    @property
+    def padded_height(self) -> int:
+        """The height of the planes, in whole blocks of four rows."""
+        return round_up(self.stored.height, 4)
+
+    @property
+    def blocks(self) -> int:
+        """The number of blocks, four rows high, each of which has sums of its own."""
+        across = -(-self.padded_width // (self.lanes * summed_together(self.lanes)))
+        return across * (self.padded_height // 4)
+
+    @property
+    def plane_bytes(self) -> int:
+        """The bytes of a plane with its border, and a margin that the last block's loads need."""
+        return ((self.padded_height + 2 * self.border) * self.pitch + 5 * self.lanes) * 4
+
+    @cached_property
+    def numbers(self) -> dict[str, np.uint32]:
+        """The values of the kernel parameters that describe it, by name."""
+        core = {f"core_{side}": value for side, value in vars(self.core).items()}
+        numbers = {
+            "width": self.width,
+            "height": self.height,
+            "pitch": self.pitch,
+            "left": self.stored.left // self.lanes,
+            "top": self.stored.top // 4,
+            "columns": self.stored.width,
+            "rows": self.stored.height,
+            "border": self.border,
+            "blocks": self.blocks,
+            **core,
+        }
+        return {name: np.uint32(value) for name, value in numbers.items()}
+
+
+# An image or a tile on each level of a plan.
+Extents = tuple[Extent, ...]
+
+
+def whole_image(plan: Plan, width: int, height: int, lanes: int) -> Extents:
+    """An image in one piece, from the width and height of the source."""
+    return tuple(Extent.whole(*size, lanes, plan.border) for size in plan.sizes(width, height))

@@ -1,0 +1,65 @@
+"""Parts of an image's result, made alone: each is a tile of its own. Pure.
+
+A patch is stored from whole blocks on, as every tile is, wherever it begins. So it has the bits
+that the whole result has there.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from clpipe.base.errors import ImageError
+from clpipe.base.memory import in_words
+from clpipe.engine.extents import Box
+from clpipe.engine.plan import Plan
+from clpipe.engine.tiles import Tiling, buffer_sizes, cutter_of, phases_of
+
+
+def with_patches(
+    plan: Plan, boxes: Sequence[Box], whole: Tiling, lanes: int, memory: int, ends: int = 1
+) -> Tiling:
+    """How only parts of an image's result are made.
+
+    Numbers that are estimated from the whole image are still estimated from all of its tiles, in
+    the phases before the last.
+
+    Args:
+        plan: the plan.
+        boxes: the parts, in pixels of the results.
+        whole: how the whole image goes through the plan.
+        lanes: of the device.
+        memory: bytes that all buffers together may take.
+        ends: as for :func:`~clpipe.engine.tiles.tiling_of`.
+
+    Raises:
+        ImageError: a part is not inside the result, the results differ in size, or a part does not
+            fit into the memory.
+    """
+    source = whole.tiles[0][0]
+    cut = cutter_of(plan, source.width, source.height, lanes)
+    width, height = cut.whole[-1].width, cut.whole[-1].height
+    levels = {image.level for _, image in plan.kept} | {len(cut.whole) - 1}
+    for name, image in plan.kept:
+        size = cut.whole[image.level].width, cut.whole[image.level].height
+        if size != (width, height):
+            raise ImageError(
+                f"the image of {name} has {size[0]}x{size[1]} pixels, but the last one "
+                f"{width}x{height}; patches are of images of one size"
+            )
+    for box in boxes:
+        if box.left < 0 or box.top < 0 or box.right > width or box.bottom > height:
+            raise ImageError(
+                f"found a patch of {box.width}x{box.height} pixels at {box.left},{box.top}; "
+                f"the picture has {width}x{height}"
+            )
+    patches = tuple(cut.patch(box, levels) for box in boxes)
+    phases = phases_of(plan)
+    sizes = dict(whole.sizes) if len(phases) > 1 else {}
+    for extents in patches:
+        for name, size in buffer_sizes(plan, extents, ends).items():
+            sizes[name] = max(size, sizes.get(name, 0))
+    if sum(sizes.values()) > memory:
+        raise ImageError(
+            f"a patch needs {in_words(sum(sizes.values()))} of device memory; "
+            f"allowed are {in_words(memory)}"
+        )
+    return replace(whole, phases=phases, sizes=sizes, patches=patches)
