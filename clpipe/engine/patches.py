@@ -39,10 +39,10 @@ def with_patches(
     width, height = cut.whole[-1].width, cut.whole[-1].height
     levels = {image.level for _, image in plan.kept} | {len(cut.whole) - 1}
     for name, image in plan.kept:
-        size = cut.whole[image.level].width, cut.whole[image.level].height
-        if size != (width, height):
+        own = cut.whole[image.level]
+        if (own.width, own.height) != (width, height):
             raise ImageError(
-                f"the image of {name} has {size[0]}x{size[1]} pixels, but the last one "
+                f"the image of {name} has {own.width}x{own.height} pixels, but the last one "
                 f"{width}x{height}; patches are of images of one size"
             )
     for box in boxes:

@@ -1,0 +1,403 @@
+"""Training data straight from renders: each sample is developed when it is needed."""
+
+import copy
+import hashlib
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from clpipe.base.errors import RequestError
+from clpipe.base.memory import parse_size
+from clpipe.base.processors import available_processors
+from clpipe.base.readonly import ReadOnly
+from clpipe.base.text import one_of
+from clpipe.base.validation import typed
+from clpipe.chain.request import Request
+from clpipe.chain.truth import DEVELOPMENT, adds_noise
+from clpipe.dataset.arrays import Form, dtype_named
+from clpipe.dataset.developer import Sample, Wanted
+from clpipe.dataset.patches import Numbering, Patches
+from clpipe.dataset.samples import Maker, Work
+from clpipe.images.openimageio import set_codec_threads
+from clpipe.images.read import TRANSFERS
+from clpipe.inputs.find import Job, find_jobs
+from clpipe.inputs.loader import ImageLoader, LoadedImage
+from clpipe.pipeline import plain
+
+NOWHERE = Path(os.devnull)  # nothing is written
+
+
+class Dataset(ReadOnly):
+    """Renders as a camera sees them, sample by sample, with new noise in each epoch.
+
+    Iterate over it, or index it: ``torch.utils.data.DataLoader`` takes it as it is. A sample is a
+    dict of
+
+    - "image": (height, width, 3) uint8 where the chain ends in display values, else float32,
+    - "truth", with ``truth``: the same without noise; images of ``keep`` by the names of their
+      steps, and "truth.NAME" for each of them without noise; float32,
+    - "raw", with ``raw``, and "truth.raw": the mosaic, uint16 in DN; or in signal, see ``dtype``,
+    - "variance", with ``variance``: that of the noise in each pixel of the mosaic, in signal
+      squared, float32, in the form of the raw,
+    - "carried.NAME" for each layer of ``carry``, (height, width, channel) as the picture is, and
+      "carried.valid", (height, width): 1 where the render has something, else 0,
+    - "key": the name of the render, its path below the folder that was given; "epoch", "seed",
+    - "camera", "iso", and "a" and "b": the sensor noise that was added, Var[y] = a*y + b in signal
+      units (1 is the white level), zeros where none was,
+    - where the chain makes a raw: "cfa", such as "RGGB"; "black_level" and "white_level" in DN;
+      "gains", the white balance of red, green and blue; "xyz_to_camera", 3x3, from CIE XYZ (D65) to
+      the raw's colours, as a DNG's ColorMatrix,
+    - of a patch, "place": its first column and row in the picture, and "turn": how it was turned
+      then, one of EXIF's orientations (1 is not at all).
+
+    All arrays are C-contiguous and writable, in the sensor's orientation. The noise of an image in
+    epoch E is that of frame E of ``clpipe run --frames``. So a sample depends on its render, the
+    settings and the epoch alone, and not on order, sharding, workers or restarts. Draws are made
+    again in each epoch; kept images keep theirs.
+
+    With ``patch``, samples are square parts of pictures, and only they are developed, each from as
+    much of the render as it needs: a patch has the bits that the whole picture has there. It begins
+    where its mosaic, turned, has the camera's CFA pattern. Places and turns are drawn for each key,
+    epoch and seed. Turned by 90 degrees, what a sensor does to its rows is done to columns.
+
+    The device is opened by the process that first makes a sample. OpenCL does not survive a fork:
+    workers of a process that has used it must be spawned (``multiprocessing_context="spawn"``).
+
+    Args:
+        inputs: files, folders, globs and manifests, as ``clpipe run`` takes them.
+        config: as for :class:`~clpipe.Pipeline`; None is the settings that a kept image carries,
+            else the default.
+        device: as for :class:`~clpipe.Pipeline`.
+        keep: steps whose image a sample has, too, or "all".
+        start_at: the first step to run; inputs are then images that were kept before it.
+        until: the last step to run.
+        truth: whether a sample has its image without noise, too. "clean" is the picture to train
+            on; "development", or True, is denoised as strongly as the noisy one is. None is "clean"
+            with ``patch``, where the chain adds noise, else False.
+        carry: layers that go along with the picture, such as "Depth" or "nn:normal", as ``--carry``
+            of ``clpipe run``.
+        companions: where they are, as ``--companion``.
+        layer: the layer of an EXR that is the picture; None chooses.
+        transfer: the transfer curve of renders in whole numbers: "srgb" or "linear".
+        exclude: patterns of files that are not taken from folders and globs, such as depth.
+        patch: the sides of patches, in px; None is whole pictures.
+        patches_per_image: how many, at random places; "grid" is all side by side that cover each
+            picture (but for a last odd column or row), the last ones overlapping.
+        augment: whether patches are flipped and turned by 90 degrees, at random.
+        raw: whether a sample has its raw, too: "mosaic" is (height, width), "packed" is its planes,
+            (4, height/2, width/2) in R, Gr, Gb, B, whatever the pattern.
+        variance: whether a sample has the variance of its noise, in the form of ``raw``, else as a
+            mosaic.
+        dtype: of pictures and raws. None is as above. "float16" and "float32": display values from
+            0 to 1, not rounded to eight bits, and raws in signal, 0 at black and 1 at white.
+            "uint16": display values from 0 to 65535, and raws in DN.
+        channels_first: whether arrays of three dimensions are (channel, height, width).
+        cache: bytes of decoded renders that are kept in memory for further patches and epochs, in
+            each process; also as a text, such as "4G".
+        epoch: the number of the first epoch.
+        epochs: how many epochs there are; None is no end.
+        threads: how many images are decoded at once; None is one for each processor.
+        **settings: what a configuration file may hold, over ``config``.
+
+    Raises:
+        RequestError: a name or value that is not allowed, a missing input, a folder without images,
+            two images of one name, a truth of a chain without noise, a raw or a variance that it
+            has not, a type that does not hold its values.
+    """
+
+    @typed
+    def __init__(
+        self,
+        inputs: str | Path | Sequence[str | Path],
+        config: str | Path | None = None,
+        *,
+        device: str | int | None = None,
+        keep: str | Sequence[str] = (),
+        start_at: str | None = None,
+        until: str | None = None,
+        truth: bool | Literal["development", "clean"] | None = None,
+        carry: str | Sequence[str] = (),
+        companions: str | Sequence[str] = (),
+        layer: str | None = None,
+        transfer: str | None = None,
+        exclude: str | Sequence[str] = (),
+        patch: int | None = None,
+        patches_per_image: int | Literal["grid"] = 16,
+        augment: bool = False,
+        raw: Literal["packed", "mosaic"] | None = None,
+        variance: bool = False,
+        dtype: Any = None,
+        channels_first: bool = False,
+        cache: int | str = "1G",
+        epoch: int = 0,
+        epochs: int | None = 1,
+        threads: int | None = None,
+        **settings: Any,
+    ) -> None:
+        if transfer is not None and transfer not in TRANSFERS:
+            raise RequestError(one_of("transfer", transfer, TRANSFERS))
+        limited = {"epochs": epochs, "threads": threads, "patch": patch}
+        for name, number in limited.items():
+            if number is not None and number < 1:
+                raise RequestError(f"found {name} {number}; expected 1 or more, or None")
+        self._patches = _patches(patch, patches_per_image, augment, raw)
+        request = Request.from_options(
+            config=None if config is None else str(config),
+            values=plain(settings),
+            start_at=start_at,
+            until=until,
+            layer=layer,
+            transfer=transfer,
+            carry=(carry,) if isinstance(carry, str) else tuple(carry),
+            companions=(companions,) if isinstance(companions, str) else tuple(companions),
+        )
+        loader = ImageLoader(request)
+        several = [inputs] if isinstance(inputs, str | Path) else inputs
+        patterns = [exclude] if isinstance(exclude, str) else exclude
+        named = [str(i) for i in several]
+        found = find_jobs(named, NOWHERE, loader.endings(), patterns)
+        self._jobs = loader.exposures(found)
+        loader.check(self._jobs)
+        _check_files(self._jobs)
+        _check_keys(self._jobs)
+        chain = loader.first_chain(self._jobs)
+        if truth is None and patch and any(map(adds_noise, chain.steps)):
+            truth = "clean"
+        wanted = Wanted(
+            form=Form(dtype_named(dtype), channels_first, raw),
+            keep=chain.select([keep] if isinstance(keep, str) else keep),
+            truth=DEVELOPMENT if truth is True else truth or None,
+            variance=variance,
+        )
+        wanted.check(chain)
+        selector = None if device is None else str(device)
+        self._maker = Maker(loader, wanted, self._patches, _cache_size(cache), selector)
+        self._label = loader.settings.label
+        self._epochs = epochs
+        self._threads = threads or available_processors()
+        self._numbered: Numbering | None = None
+        self.set_epoch(epoch)
+
+    def __repr__(self) -> str:
+        epochs = "endless epochs" if self._epochs is None else f"{self._epochs} epochs"
+        return f"Dataset({len(self._jobs)} images, {epochs}, {self._label})"
+
+    def set_epoch(self, epoch: int) -> None:
+        """Begin with this epoch, from the next sample on; use it to resume a training run.
+
+        Raises:
+            RequestError: it is negative.
+        """
+        if epoch < 0:
+            raise RequestError(f"found epoch {epoch}; expected 0 or more")
+        self._epoch = epoch
+        self._first = self._next = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where iteration is: what :meth:`load_state_dict` takes, as plain values."""
+        return {"epoch": self._epoch, "sample": self._next, "images": self._digest()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Have the next iteration go on behind the last sample of the one that a state is of.
+
+        Raises:
+            RequestError: the state is of other images or other patches.
+        """
+        if state.get("images") != self._digest():
+            raise RequestError(
+                "the state is of a dataset of other images, or of other patches of them; make the "
+                "dataset as it was when the state was taken"
+            )
+        self.set_epoch(state["epoch"])
+        self._first = self._next = state["sample"]
+
+    def shard(self, index: int, of: int) -> Self:
+        """A part for one of several workers: every ``of``-th image, from the ``index``-th on.
+
+        Indices count from 0.
+
+        Raises:
+            RequestError: there is no such part.
+        """
+        if not 0 <= index < of:
+            raise RequestError(f"found shard {index} of {of}; expected 0 to {of - 1}")
+        part = copy.copy(self)
+        part._jobs = self._jobs[index::of]
+        part._numbered = None
+        return part
+
+    def __len__(self) -> int:
+        """How many samples there are, over all epochs.
+
+        Raises:
+            TypeError: epochs are endless.
+            ImageError: the size of an image is needed for a grid, and cannot be read.
+        """
+        if self._epochs is None:
+            raise TypeError("a dataset of endless epochs has no length; set epochs=N")
+        return self._numbering().of_epoch * self._epochs
+
+    def __getitem__(self, index: int) -> Sample:
+        """A sample; those of an image follow each other, and those of the second epoch the first's.
+
+        Raises:
+            IndexError: there is none of that number.
+            ImageError: its image cannot be read or processed.
+            DeviceError: there is no usable device.
+        """
+        return self.__getitems__([index])[0]
+
+    def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
+        """Samples by their numbers, those of one image developed together.
+
+        PyTorch's ``DataLoader`` asks so for the samples of a batch. Errors as :meth:`__getitem__`.
+        """
+        places = [self._place(index) for index in indices]
+        groups: dict[tuple[int, ...], list[int]] = {}
+        for i, place in enumerate(places):
+            # A whole picture is all that an image has; asked for twice, it is made twice.
+            groups.setdefault(place[:2] if self._patches else (i,), []).append(i)
+        samples: list[Sample] = [{}] * len(places)
+        for group in groups.values():
+            epoch, image, _ = places[group[0]]
+            numbers = [places[i][2] for i in group]
+            work = Work(self._jobs[image], self._epoch + epoch, numbers)
+            made = self._maker.begin(work, *self._maker.read(work))()
+            for i, sample in zip(group, made, strict=True):
+                samples[i] = sample
+        return samples
+
+    def __iter__(self) -> Iterator[Sample]:
+        """Every sample in order; images are decoded and developed ahead, a few at a time.
+
+        Raises:
+            ImageError: an image cannot be read or processed.
+            DeviceError: there is no usable device.
+        """
+        set_codec_threads(max(available_processors() // self._threads, 1))
+        ahead: deque[Future[Callable[[], list[Sample]]]] = deque()
+        decoders = ThreadPoolExecutor(self._threads, "decode")
+        developer = ThreadPoolExecutor(1, "device")
+        self._next, self._first = self._first, 0
+        try:
+            for work in self._work(self._next):
+                read = decoders.submit(self._maker.read, work)
+                ahead.append(developer.submit(self._begin_read, work, read))
+                if len(ahead) > self._threads + 1:
+                    yield from self._counted(ahead.popleft().result()())
+            while ahead:
+                yield from self._counted(ahead.popleft().result()())
+        finally:
+            decoders.shutdown(cancel_futures=True)
+            developer.shutdown(cancel_futures=True)
+            self._maker.drain()
+
+    def _begin_read(
+        self, work: Work, read: Future[tuple[LoadedImage, Sample]]
+    ) -> Callable[[], list[Sample]]:
+        return self._maker.begin(work, *read.result())
+
+    def _counted(self, samples: Sequence[Sample]) -> Iterator[Sample]:
+        for sample in samples:
+            self._next += 1
+            yield sample
+
+    def _numbering(self) -> Numbering:
+        """How samples are numbered.
+
+        Raises:
+            ImageError: the size of an image is needed, and cannot be read.
+        """
+        if self._numbered is None:
+            self._numbered = Numbering([self._maker.count(job, self._epoch) for job in self._jobs])
+        return self._numbered
+
+    def _place(self, index: int) -> tuple[int, int, int]:
+        """Epoch, image, and number within the image of a sample.
+
+        Raises:
+            IndexError: there is none of that number.
+        """
+        number = index + len(self) if index < 0 else index
+        if number < 0 or not self._jobs or (self._epochs is not None and number >= len(self)):
+            raise IndexError(f"found sample {index}; there are {len(self)}")
+        return self._numbering().place(number)
+
+    def _work(self, first: int) -> Iterator[Work]:
+        """What is to be developed, image by image, from a sample on."""
+        if self._jobs:
+            for epoch, image, numbers in self._numbering().groups(first):
+                if epoch == self._epochs:
+                    return
+                yield Work(self._jobs[image], self._epoch + epoch, numbers)
+
+    def _digest(self) -> str:
+        """What tells the images and patches of one dataset from those of another."""
+        named = [self._patches, *(job.key for job in self._jobs)]
+        return hashlib.sha256(repr(named).encode()).hexdigest()
+
+
+def _patches(
+    size: int | None, per_image: int | Literal["grid"], augment: bool, raw: str | None
+) -> Patches | None:
+    """Which patches are asked for; None is whole pictures.
+
+    Raises:
+        RequestError: what is asked for cannot be.
+    """
+    if per_image != "grid" and per_image < 1:
+        raise RequestError(f"found patches_per_image {per_image}; expected 1 or more, or 'grid'")
+    if size is None:
+        if augment:
+            raise RequestError("augment: it flips and turns patches; set patch=SIZE as well")
+        return None
+    if raw == "packed" and size % 2:
+        raise RequestError(
+            f"found patch {size}; a packed raw has planes of half the size, so give an even one"
+        )
+    return Patches(size, per_image, augment)
+
+
+def _cache_size(cache: int | str) -> int:
+    """The bytes of a number, or of a text with a unit.
+
+    Raises:
+        RequestError: it is neither.
+    """
+    try:
+        size = parse_size(cache) if isinstance(cache, str) else cache
+    except RequestError:
+        size = -1
+    if size < 0:
+        raise RequestError(f"found cache {cache!r}; expected bytes, or a size such as 512M or 4G")
+    return size
+
+
+def _check_files(jobs: Sequence[Job]) -> None:
+    """See that the files that are named exist; those of a folder were found there.
+
+    Raises:
+        RequestError: one does not.
+    """
+    for job in jobs:
+        if job.listed and not job.path.exists():
+            raise RequestError(f"{job.label}: no such file or folder")
+
+
+def _check_keys(jobs: Sequence[Job]) -> None:
+    """See that no two images have the same name, and so the same draws.
+
+    Raises:
+        RequestError: two have.
+    """
+    owners: dict[str, Job] = {}
+    for job in jobs:
+        other = owners.setdefault(job.key, job)
+        if other is not job:
+            raise RequestError(
+                f"{other.label} and {job.label} are both called {job.key}, and what is drawn for "
+                "them would be the same; give the folder that both are in"
+            )

@@ -1,0 +1,272 @@
+"""Samples, developed on a device: pictures with their truth, raws, and the variance of noise."""
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from operator import itemgetter
+from typing import Any
+
+import numpy as np
+
+from clpipe.base.errors import RequestError
+from clpipe.base.types import Array
+from clpipe.chain.chain import Chain, Step
+from clpipe.chain.truth import noisy_mosaic, picture_without_noise, signal_and_noise, variance_of
+from clpipe.dataset.arrays import Form
+from clpipe.dataset.patches import Patch
+from clpipe.dataset.recent import Recent
+from clpipe.engine.device import Device
+from clpipe.engine.runner import Result, Runner
+from clpipe.outputs.negative import negative_of
+from clpipe.reference.cfa import Pattern
+from clpipe.stage import Access, Kind
+
+Sample = dict[str, Any]
+PREPARED = 256  # chains whose runners are kept, since patches of one image may come at any time
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a sample has.
+
+    Args:
+        form: how its arrays look.
+        keep: steps whose image it has.
+        truth: which picture without noise it has, as :func:`picture_without_noise` takes it.
+        variance: whether it has the variance of the noise in its mosaic.
+    """
+
+    form: Form
+    keep: tuple[str, ...]
+    truth: str | None
+    variance: bool
+
+    def check(self, chain: Chain) -> None:
+        """See that a chain makes it.
+
+        Raises:
+            RequestError: it does not.
+        """
+        self.form.check(chain.result)
+        if self.truth:
+            picture_without_noise(self.truth, chain)  # refuses a chain that adds no noise
+        if self.form.raw:
+            raw_step(chain, self.form)
+        if self.variance:
+            variance_steps(chain)
+
+
+def raw_step(chain: Chain, form: Form) -> str:
+    """The step whose image is the raw: the last one in DN, or the noisy mosaic in signal.
+
+    Raises:
+        RequestError: there is none.
+    """
+    if not form.is_in_dn:
+        return noisy_mosaic(chain).steps[-1].name
+    names = [step.name for step in chain.steps if step.stage.writes is Kind.RAW]
+    if not names:
+        raise RequestError(
+            f"the chain {chain.label} makes no raw in DN, which quantize does; put that stage in, "
+            "or say dtype='float32' for a raw in signal"
+        )
+    return names[-1]
+
+
+def variance_steps(chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
+    """See :func:`signal_and_noise`; the steps are of single pixels, so that patches have it, too.
+
+    Raises:
+        RequestError: as there, or a step reads the pixels around each.
+    """
+    signal, noise = signal_and_noise(chain)
+    for step in noise:
+        if any(pass_.access is Access.STENCIL for pass_ in step.method.passes()):
+            raise RequestError(
+                f"variance: {step.name} mixes the noise of neighbours; move it before the noise or "
+                "behind the raw"
+            )
+    return signal, noise
+
+
+def pattern_of(chain: Chain) -> Pattern:
+    """The CFA pattern of a chain's mosaic."""
+    last = chain.steps[-1]
+    return last.method.after(last.context).pattern
+
+
+def facts_of(chain: Chain) -> Sample:
+    """What a sample says of its camera and its raw."""
+    facts: Sample = {"camera": chain.camera.name, "seed": chain.seed}
+    try:
+        raw = negative_of(chain)
+    except RequestError:  # there is no raw
+        return facts
+    return facts | {
+        "cfa": raw.pattern,
+        "black_level": float(raw.black_level),
+        "white_level": float(raw.white_level),
+        "gains": np.array([raw.gains[0], 1, raw.gains[1]], np.float32),
+        "xyz_to_camera": raw.xyz_to_camera.astype(np.float32),
+    }
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A chain, ready to run: what makes "image" and "truth", and the names of their raws."""
+
+    chain: Chain
+    runners: dict[str, Runner]
+    raws: dict[str, str]
+    noise: tuple[Step, ...]  # of the variance
+    facts: Sample
+
+
+class Developer:
+    """Develops images on a device, in the order in which they are begun.
+
+    Args:
+        device: where; None is NumPy.
+        wanted: what of each.
+    """
+
+    def __init__(self, device: Device | None, wanted: Wanted) -> None:
+        self.process = os.getpid()
+        self._device = device
+        self._wanted = wanted
+        self._lock = threading.Lock()
+        self._prepared: Recent[Prepared] = Recent(PREPARED)
+        self._latest: dict[str, Runner] = {}
+
+    def begin(
+        self, chain: Chain, pixels: Array, noise_key: str, patches: Sequence[Patch]
+    ) -> Callable[[], list[Sample]]:
+        """Begin with the arrays and facts of samples of one image.
+
+        Args:
+            chain: how it is developed.
+            pixels: the image.
+            noise_key: what its noise is made of.
+            patches: the parts of the picture that are samples; () is one sample, all of it.
+
+        Returns:
+            What waits for them and gives them; it raises the same errors.
+
+        Raises:
+            ImageError, RequestError, MemoryError: the image cannot be developed.
+        """
+        boxes = [patch.box for patch in patches]
+        with self._lock:
+            prepared = self._prepared.get(chain, lambda: self._prepare(chain))
+            begun = {
+                name: runner.submit(pixels, noise_key, unchanged=True, boxes=boxes)
+                for name, runner in prepared.runners.items()
+            }
+
+        def finish() -> list[Sample]:
+            results = {}
+            for name, wait in begun.items():
+                with self._lock:
+                    results[name] = wait()
+            if not patches:
+                return [self._sample(prepared, results, None, lambda image: image)]
+            return [
+                self._sample(prepared, results, patch, itemgetter(i))
+                for i, patch in enumerate(patches)
+            ]
+
+        return finish
+
+    def drain(self) -> None:
+        """Wait for what was begun."""
+        with self._lock:
+            if self._device:
+                self._device.drain()
+
+    def _sample(
+        self,
+        prepared: Prepared,
+        results: dict[str, Result],
+        patch: Patch | None,
+        part: Callable[[Array], Array],
+    ) -> Sample:
+        """The sample of an image, or of a patch: ``part`` gives that of an image of a result."""
+        form, chain = self._wanted.form, prepared.chain
+        pattern = pattern_of(chain)
+
+        def turned(image: Array) -> Array:
+            return patch.turned(part(image)) if patch else image
+
+        sample: Sample = {}
+        for name in ("image", "truth") if self._wanted.truth else ("image",):
+            result, prefix = results[name], "" if name == "image" else f"{name}."
+            for step, image in result.kept.items():
+                if step in self._wanted.keep:
+                    sample[prefix + step] = form.ordered(turned(image))
+            sample[name] = form.picture(turned(result.image), chain.result)
+            if form.raw:
+                raw = result.kept[prepared.raws[name]]
+                sample[f"{prefix}raw"] = form.mosaic(turned(raw), pattern)
+        if self._wanted.variance:
+            variance = variance_at(prepared.noise, part(results["signal"].image), patch)
+            variance = patch.turned(variance) if patch else variance
+            sample["variance"] = form.variance(variance, pattern)
+        if patch:
+            sample |= {"place": np.array([patch.left, patch.top]), "turn": patch.turn}
+        return sample | deepcopy(prepared.facts)
+
+    def _prepare(self, chain: Chain) -> Prepared:
+        """What runs a chain."""
+        wanted = self._wanted
+        chains = {"image": chain}
+        if wanted.truth:
+            chains["truth"] = picture_without_noise(wanted.truth, chain)
+        raws = {}
+        if wanted.form.raw:
+            last = raw_step(chain, wanted.form)
+            raws = {name: last_until(each, chain, last) for name, each in chains.items()}
+        encode = chain.result is Kind.DISPLAY and wanted.form.dtype is None
+        runners = {
+            name: self._runner(name, each, (*wanted.keep, *filter(None, [raws.get(name)])), encode)
+            for name, each in chains.items()
+        }
+        noise: tuple[Step, ...] = ()
+        if wanted.variance:
+            signal, noise = variance_steps(chain)
+            runners["signal"] = self._runner("signal", signal, (), encode=False)
+        return Prepared(chain, runners, raws, noise, facts_of(chain))
+
+    def _runner(self, name: str, chain: Chain, keep: Sequence[str], encode: bool) -> Runner:
+        kept = tuple(step.name for step in chain.steps if step.name in keep)
+        latest = self._latest.get(name)
+        if latest and latest.keep == kept and latest.encode == encode:
+            runner = latest.of(chain)  # shares its plans
+        else:
+            runner = Runner(chain, self._device, kept, encode, final=not encode)
+        self._latest[name] = runner
+        return runner
+
+
+def last_until(truth: Chain, chain: Chain, name: str) -> str:
+    """The last step of a truth up to a step of its chain, which the truth may do without."""
+    names = [step.name for step in chain.steps]
+    until = names[: names.index(name) + 1]
+    return [step.name for step in truth.steps if step.name in until][-1]
+
+
+def variance_at(noise: Sequence[Step], signal: Array, patch: Patch | None) -> Array:
+    """See :func:`variance_of`, of a patch of an image.
+
+    Args:
+        noise: the steps.
+        signal: what enters them, of the patch or of the whole image.
+        patch: where it is.
+    """
+    if patch is None:
+        return variance_of(noise, signal)
+    # A row and a column more, so that the first pixel has the colour of an image's first one.
+    x, y = patch.left % 2, patch.top % 2
+    padded = np.pad(signal, ((y, 0), (x, 0), (0, 0))[: signal.ndim], mode="edge")
+    return variance_of(noise, padded)[y:, x:]

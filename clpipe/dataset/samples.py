@@ -1,0 +1,196 @@
+"""Samples of an image: it is read, or is in memory still, and is developed."""
+
+import os
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+from clpipe.base.digests import stamp_of
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.chain.carry import VALID
+from clpipe.chain.identity import noise_key, of_frame
+from clpipe.dataset.developer import Developer, Sample, Wanted, pattern_of
+from clpipe.dataset.patches import Cutting, Patch, Patches
+from clpipe.dataset.recent import Recent
+from clpipe.engine.device import open_device
+from clpipe.images.read import SourceImage
+from clpipe.inputs.carry import Carried
+from clpipe.inputs.find import Job
+from clpipe.inputs.loader import ImageLoader, LoadedImage
+from clpipe.inputs.raw import RawImage
+
+DRAWN = 256  # images whose draws are kept, since patches of one image may be asked for at any time
+
+_opening = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Work:
+    """Samples of one image that are developed together: the image, the epoch, their numbers."""
+
+    job: Job
+    epoch: int
+    numbers: Sequence[int]
+
+
+def pixel_bytes(source: SourceImage) -> int:
+    """The memory that an image takes."""
+    return source.pixels.nbytes
+
+
+class Maker:
+    """Makes the samples of images, in the order in which they are begun.
+
+    Args:
+        loader: how images enter.
+        wanted: what samples have.
+        patches: which patches they are; None is whole pictures.
+        cache: bytes that decoded images may take.
+        device: as for :func:`open_device`. The process that first makes a sample opens it.
+    """
+
+    def __init__(
+        self,
+        loader: ImageLoader,
+        wanted: Wanted,
+        patches: Patches | None,
+        cache: int,
+        device: str | None,
+    ) -> None:
+        self.patches = patches
+        self.renders: Recent[SourceImage] = Recent(cache, pixel_bytes)
+        self._loader = loader
+        self._loaders: Recent[ImageLoader] = Recent(DRAWN)
+        self._wanted = wanted
+        self._device = device
+        self._opened: Developer | None = None
+
+    def __getstate__(self) -> Mapping[str, Any]:
+        return {**self.__dict__, "_opened": None}  # a device stays with its process
+
+    def drain(self) -> None:
+        """Wait for what was begun."""
+        if self._opened:
+            self._opened.drain()
+
+    def count(self, job: Job, epoch: int) -> int:
+        """How many samples there are of an image; for a grid, the image is read.
+
+        Raises:
+            ImageError: it cannot be read, or is smaller than a patch.
+        """
+        if self.patches is None:
+            return 1
+        if self.patches.per_image != "grid":
+            return self.patches.per_image
+        with self._errors_of(job):
+            return self._cutting(self.patches, self.read(Work(job, epoch, ()))[0]).count
+
+    def read(self, work: Work) -> tuple[LoadedImage, Sample]:
+        """An image, and the layers that go along with its picture."""
+        job, epoch = work.job, work.epoch
+        loader = self._loader
+        carried: Sample = {}
+        try:
+            loader = self._loaders.get(
+                (job.key, epoch),
+                lambda: self._loader.for_job(replace(job, key=of_frame(job.key, epoch or None))),
+            )
+            loaded = loader.enter(job, self._source(job, loader))
+            if loaded and loader.request.carry:
+                along = loader.carried(job, loaded)
+                named = {**along.arrays(), VALID: along.valid}
+                carried = {f"carried.{name}": array for name, array in named.items()}
+                if self.patches and self.patches.augment:
+                    check_turns(along)
+        except (ImageError, RequestError, MemoryError) as error:
+            raise ImageError(loader.error_text(job, error)) from None
+        if loaded is None:
+            raise ImageError(
+                f"{job.path}: was kept after another step than the one before "
+                f"{loader.request.start_at}; name the images to go on from by a glob"
+            )
+        for warning in loaded.source.warnings:
+            warnings.warn(f"{job.path}: {warning}", stacklevel=2)
+        return loaded, carried
+
+    def _source(self, job: Job, loader: ImageLoader) -> SourceImage:
+        """The image of a job, as it is held where its pixels are those of its files."""
+        if job.subframes:  # which a shutter averages that may be drawn
+            return loader.read(job)
+        return self.renders.get((job.key, stamp_of(job.path)), lambda: loader.read(job))
+
+    def begin(self, work: Work, loaded: LoadedImage, carried: Sample) -> Callable[[], list[Sample]]:
+        """Begin to develop samples of an image; what is returned waits for them."""
+        job, chain = work.job, loaded.chain
+        key = noise_key(chain.settings, loaded.key, work.epoch)
+        patches: list[Patch] = []
+        with self._errors_of(job):
+            if self.patches:
+                cutting = self._cutting(self.patches, loaded)
+                owner = f"patch:{chain.seed}:{job.key}:{work.epoch}"
+                patches = [self.patches.patch(cutting, n, f"{owner}:{n}") for n in work.numbers]
+            begun = self._developer().begin(chain, loaded.source.pixels, key, patches)
+
+        def finish() -> list[Sample]:
+            with self._errors_of(job):
+                samples = begun()
+            form, facts = self._wanted.form, self._facts(work, loaded)
+            for i, sample in enumerate(samples):
+                for name, layer in carried.items():
+                    sample[name] = form.ordered(patches[i].cut_out(layer) if patches else layer)
+                sample.update(facts)
+            return samples
+
+        return finish
+
+    @contextmanager
+    def _errors_of(self, job: Job) -> Iterator[None]:
+        """Errors within say which image they are of."""
+        try:
+            yield
+        except (ImageError, RequestError, MemoryError) as error:
+            raise ImageError(self._loader.error_text(job, error)) from None
+
+    @staticmethod
+    def _facts(work: Work, loaded: LoadedImage) -> Sample:
+        """What a sample has beside its arrays, of its image."""
+        chain = loaded.chain
+        adds_noise = chain.is_noisy or not isinstance(loaded.source, RawImage)
+        noise = chain.noise if adds_noise else None
+        a, b = (noise.a, noise.b) if noise else (0.0, 0.0)
+        return {"key": work.job.key, "epoch": work.epoch, "iso": chain.iso, "a": a, "b": b}
+
+    def _developer(self) -> Developer:
+        """The developer of this process.
+
+        Raises:
+            DeviceError: there is no usable device, or another process had opened it.
+        """
+        with _opening:
+            if self._opened is None or self._opened.process != os.getpid():
+                self._opened = Developer(open_device(self._device), self._wanted)
+            return self._opened
+
+    @staticmethod
+    def _cutting(patches: Patches, loaded: LoadedImage) -> Cutting:
+        chain = loaded.chain
+        size = chain.size(*loaded.source.pixels.shape[1::-1])
+        return patches.cutting(*size, pattern_of(chain))
+
+
+def check_turns(carried: Carried) -> None:
+    """See that layers can be flipped and turned, which vectors are not by moving their pixels.
+
+    Raises:
+        RequestError: one holds vectors.
+    """
+    for layer in carried.layers:
+        if layer.kind in ("normal", "flow"):
+            raise RequestError(
+                f"--carry {layer.name}: augment flips and turns patches, but not the directions "
+                f"that a layer of {layer.kind} holds; leave one of them out"
+            )
