@@ -98,7 +98,7 @@ class Form:
     def variance(self, variance: Array, pattern: Pattern) -> Array:
         """A variance of each pixel, (height, width), as a sample has it: float32."""
         variance = packed(variance, pattern) if self.raw == "packed" else variance
-        return np.require(variance, requirements="CW")
+        return np.require(variance, requirements=("C", "W"))
 
     def ordered(self, image: Array) -> Array:
         """An image, (height, width[, channel]), in the order of its channels; C-contiguous."""

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from clpipe.base.types import Array
 from clpipe.engine.buffers import Pool, buffer_name
 from clpipe.engine.codegen import (
     PARTIALS,
@@ -46,10 +47,7 @@ def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[
 
 
 class Call:
-    """A compiled kernel that remembers its arguments.
-
-    Setting an argument takes time, and most stay the same from image to image.
-    """
+    """A compiled kernel with its arguments, most of which stay from launch to launch."""
 
     def __init__(self, kernel: Kernel, compiled: Any) -> None:
         self.kernel = kernel
@@ -58,42 +56,55 @@ class Call:
         names = [(i, buffer_name(p)) for i, p in numbered]
         self._ends = [(i, name) for i, name in names if name in ("src", "dst")]
         self._buffers = [(i, name) for i, name in names if name and name not in ("src", "dst")]
-        self._numbers = [(i, p.item) for i, p in numbered if p.role == "tile"]
+        tiles = [(i, p.item) for i, p in numbered if p.role == "tile"]
+        self._tile = [i for i, name in tiles if name == "tile"]
+        self._larger = [(i, name[5:]) for i, name in tiles if name.startswith("from_")]
+        others = {*self._tile, *(i for i, _ in self._larger)}
+        self._own = [(i, name) for i, name in tiles if i not in others]
         self._values = [(i, p) for i, p in numbered if p.role in ("value", "key", "table8", "taps")]
-        self._last: list[Any] = [None] * len(numbered)
-        self._place: tuple[Any, ...] = ()
+        self._arguments: list[Any] = [None] * len(numbered)
+        self._extents: Extents = ()
+        self._bound: tuple[Any, ...] = ()
 
     def set_arguments(
-        self, pool: Pool, ends: Mapping[str, Any], extents: Extents, tile: int, bind: Bind
+        self,
+        pool: Pool,
+        ends: Mapping[str, Any],
+        extents: Extents,
+        tile: int,
+        bind: Bind,
+        table: Callable[[Array], Any],
     ) -> None:
-        """Set the arguments that differ from the last launch: buffers, a tile's numbers, values.
+        """Set the arguments of the next launch.
 
-        ``ends`` are the buffers "src" and "dst", which are an image's own.
+        Args:
+            pool: the buffers that stay.
+            ends: the buffers "src" and "dst", which are an image's own.
+            extents: the tile's.
+            tile: its number.
+            bind: the value of a parameter, always the same one.
+            table: a buffer that holds an array.
         """
+        arguments = self._arguments
         for i, name in self._ends:
-            self.compiled.set_arg(i, ends[name])
-        place = pool.generation, extents, tile
-        if place != self._place:
+            arguments[i] = ends[name]
+        for i in self._tile:
+            arguments[i] = np.uint32(tile)
+        if extents is not self._extents:
             level = self.kernel.launch.level
-            larger = extents[max(level - 1, 0)].numbers
-            numbers = {
-                **extents[level].numbers,
-                **{f"from_{name}": number for name, number in larger.items()},
-                "tile": np.uint32(tile),
-            }
+            for names, of in ((self._own, level), (self._larger, max(level - 1, 0))):
+                for i, name in names:
+                    arguments[i] = extents[of].numbers[name]
+            self._extents = extents
+        if (pool.generation, bind) != self._bound:
             for i, name in self._buffers:
-                self.compiled.set_arg(i, pool.held[name])
-            for i, name in self._numbers:
-                self.compiled.set_arg(i, numbers[name])
-            self._place = place
-        for i, parameter in self._values:
-            value, last = bind(parameter), self._last[i]
-            if value is not last and not same_bits(value, last):
-                self.compiled.set_arg(i, value)
-                self._last[i] = value
-
-
-def same_bits(one: Any, two: Any) -> bool:
-    """Whether two NumPy scalars have the same bits, which 0 and -0 do not."""
-    scalars = isinstance(one, np.generic) and isinstance(two, np.generic)
-    return scalars and one.tobytes() == two.tobytes()
+                arguments[i] = pool.held[name]
+            for i, parameter in self._values:
+                value = bind(parameter)
+                arguments[i] = table(value) if isinstance(value, np.ndarray) else value
+            if not self._bound:  # without types, PyOpenCL finds out that of each number each time
+                self.compiled.set_arg_types([getattr(each, "dtype", None) for each in arguments])
+            self._bound = pool.generation, bind
+        self.compiled.set_args(*arguments)
+        for i, _ in self._ends:
+            arguments[i] = None  # which would hold an image

@@ -22,7 +22,6 @@ from clpipe.engine.extents import Box, Extent, Extents
 from clpipe.engine.plan import Launch, Plan
 from clpipe.engine.tiles import Tiling, source_bytes
 from clpipe.engine.transfers import InPlace, Staged
-from clpipe.engine.writer import Parameter
 
 TABLES = 1 << 26  # bytes of arrays that stay on the device beyond the next image
 
@@ -222,11 +221,6 @@ class Flow:
         wait: list[Any],
     ) -> None:
         """Launch kernels of a plan on a tile, the first of them after the events ``wait``."""
-
-        def value_of(parameter: Parameter) -> Any:
-            value = passage.work.bind(parameter)
-            return self._table(value) if isinstance(value, np.ndarray) else value
-
         for number in numbers:
             launch = passage.calls[number].kernel.launch
             extent = extents[launch.level]
@@ -237,7 +231,7 @@ class Flow:
                 calls += passage.borders(launch)
             events = []
             for call in calls:
-                call.set_arguments(self.pool, ends, extents, tile, value_of)
+                call.set_arguments(self.pool, ends, extents, tile, passage.work.bind, self._table)
                 sizes = index_space(call.kernel, extent)
                 events.append(
                     self._cl.enqueue_nd_range_kernel(
