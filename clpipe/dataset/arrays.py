@@ -92,8 +92,8 @@ class Form:
 
     def mosaic(self, mosaic: Array, pattern: Pattern) -> Array:
         """A raw, (height, width) in DN or in signal, as a sample has it."""
-        mosaic = packed(mosaic, pattern) if self.raw == "packed" else mosaic
-        return self._typed(mosaic, self.dtype or "uint16")
+        mosaic = self._typed(mosaic, self.dtype or "uint16")
+        return packed(mosaic, pattern) if self.raw == "packed" else mosaic
 
     def variance(self, variance: Array, pattern: Pattern) -> Array:
         """A variance of each pixel, (height, width), as a sample has it: float32."""

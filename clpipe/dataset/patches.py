@@ -90,32 +90,49 @@ class Cutting:
     pattern: Pattern
     augment: bool
 
-    def drawn(self, owner: str) -> Patch:
-        """A patch at a random place; ``owner`` is what it belongs to, see :func:`uniforms`."""
-        numbers = uniforms(owner, ("turn", "left", "top"))
-        turn = self._turn(numbers["turn"])
-        x, y = first_place(self.pattern, turn, self.size)
-        left = x + 2 * int(numbers["left"] * ((self.width - self.size - x) // 2 + 1))
-        top = y + 2 * int(numbers["top"] * ((self.height - self.size - y) // 2 + 1))
-        return Patch(left, top, self.size, turn)
+    def drawn(self, numbers: Sequence[int], owner: str) -> list[Patch]:
+        """Patches at random places, by their numbers.
+
+        ``owner`` is what they belong to, see :func:`~clpipe.chain.drawing.uniforms`.
+        """
+        draws = self._draws(numbers, owner, ("turn", "left", "top"))
+        patches = []
+        for u_turn, u_left, u_top in draws:
+            turn = self._turn(u_turn)
+            x, y = first_place(self.pattern, turn, self.size)
+            left = x + 2 * int(u_left * ((self.width - self.size - x) // 2 + 1))
+            top = y + 2 * int(u_top * ((self.height - self.size - y) // 2 + 1))
+            patches.append(Patch(left, top, self.size, turn))
+        return patches
 
     @property
     def count(self) -> int:
         """How many patches side by side cover a picture, but for a last odd column and row."""
         return self._columns * -(-self.height // self.size)
 
-    def in_grid(self, number: int, owner: str) -> Patch:
-        """One of these, row by row; the last of a row or column ends with the picture.
+    def in_grid(self, numbers: Sequence[int], owner: str) -> list[Patch]:
+        """Some of these, by their numbers, row by row; the last of a row or column ends with it.
 
-        It is moved by up to a pixel where its turn wants that. ``owner`` as for :meth:`drawn`.
+        They are moved by up to a pixel where their turns want that. ``owner`` as for :meth:`drawn`.
         """
-        row, column = divmod(number, self._columns)
-        turn = self._turn(uniforms(owner, ("turn",))["turn"])
-        x, y = first_place(self.pattern, turn, self.size)
-        left = min(column * self.size, self.width - self.size)
-        top = min(row * self.size, self.height - self.size)
-        left, top = max(left - (left - x) % 2, x), max(top - (top - y) % 2, y)
-        return Patch(left, top, self.size, turn)
+        patches = []
+        for number, (u_turn,) in zip(numbers, self._draws(numbers, owner, ("turn",)), strict=True):
+            row, column = divmod(number, self._columns)
+            turn = self._turn(u_turn)
+            x, y = first_place(self.pattern, turn, self.size)
+            left = min(column * self.size, self.width - self.size)
+            top = min(row * self.size, self.height - self.size)
+            left, top = max(left - (left - x) % 2, x), max(top - (top - y) % 2, y)
+            patches.append(Patch(left, top, self.size, turn))
+        return patches
+
+    @staticmethod
+    def _draws(
+        numbers: Sequence[int], owner: str, names: Sequence[str]
+    ) -> Iterator[tuple[float, ...]]:
+        """Numbers from 0 to 1 for each patch, by its number and their names."""
+        drawn = uniforms(owner, [f"{number}.{name}" for number in numbers for name in names])
+        return zip(*[iter(drawn.values())] * len(names), strict=True)
 
     @property
     def _columns(self) -> int:
@@ -161,11 +178,10 @@ class Patches:
             )
         return Cutting(self.size, width, height, pattern, self.augment)
 
-    def patch(self, cutting: Cutting, number: int, owner: str) -> Patch:
-        """One of them, by its number; ``owner`` is what it belongs to, see :func:`uniforms`."""
-        if self.per_image == "grid":
-            return cutting.in_grid(number, owner)
-        return cutting.drawn(owner)
+    def cut(self, cutting: Cutting, numbers: Sequence[int], owner: str) -> list[Patch]:
+        """Some of them, by their numbers; ``owner`` as for :meth:`Cutting.drawn`."""
+        cut = cutting.in_grid if self.per_image == "grid" else cutting.drawn
+        return cut(numbers, owner)
 
 
 class Numbering:

@@ -132,7 +132,7 @@ class Maker:
             if self.patches:
                 cutting = self._cutting(self.patches, loaded)
                 owner = f"patch:{chain.seed}:{job.key}:{work.epoch}"
-                patches = [self.patches.patch(cutting, n, f"{owner}:{n}") for n in work.numbers]
+                patches = self.patches.cut(cutting, work.numbers, owner)
             begun = self._developer().begin(chain, loaded.source.pixels, key, patches)
 
         def finish() -> list[Sample]:

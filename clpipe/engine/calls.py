@@ -89,7 +89,7 @@ class Call:
         for i, name in self._ends:
             arguments[i] = ends[name]
         for i in self._tile:
-            arguments[i] = np.uint32(tile)
+            arguments[i] = tile
         if extents is not self._extents:
             level = self.kernel.launch.level
             for names, of in ((self._own, level), (self._larger, max(level - 1, 0))):
@@ -103,8 +103,13 @@ class Call:
                 value = bind(parameter)
                 arguments[i] = table(value) if isinstance(value, np.ndarray) else value
             if not self._bound:  # without types, PyOpenCL finds out that of each number each time
-                self.compiled.set_arg_types([getattr(each, "dtype", None) for each in arguments])
+                self.compiled.set_arg_types([type_of(each) for each in arguments])
             self._bound = pool.generation, bind
         self.compiled.set_args(*arguments)
         for i, _ in self._ends:
             arguments[i] = None  # which would hold an image
+
+
+def type_of(argument: Any) -> Any:
+    """The NumPy type of a kernel argument; None for a buffer. Numbers of a tile are uints."""
+    return np.uint32 if isinstance(argument, int) else getattr(argument, "dtype", None)

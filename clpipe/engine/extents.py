@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-
 from clpipe.engine.codegen import border_left, round_up, summed_together
 from clpipe.engine.plan import Plan
 
@@ -90,10 +88,10 @@ class Extent:
         return ((self.padded_height + 2 * self.border) * self.pitch + 5 * self.lanes) * 4
 
     @cached_property
-    def numbers(self) -> dict[str, np.uint32]:
-        """The values of the kernel parameters that describe it, by name."""
-        core = {f"core_{side}": value for side, value in vars(self.core).items()}
-        numbers = {
+    def numbers(self) -> dict[str, int]:
+        """The values of the kernel parameters that describe it, by name; each is a uint."""
+        core = self.core
+        return {
             "width": self.width,
             "height": self.height,
             "pitch": self.pitch,
@@ -103,9 +101,11 @@ class Extent:
             "rows": self.stored.height,
             "border": self.border,
             "blocks": self.blocks,
-            **core,
+            "core_left": core.left,
+            "core_top": core.top,
+            "core_right": core.right,
+            "core_bottom": core.bottom,
         }
-        return {name: np.uint32(value) for name, value in numbers.items()}
 
 
 # An image or a tile on each level of a plan.

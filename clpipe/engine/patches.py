@@ -54,7 +54,8 @@ def with_patches(
     patches = tuple(cut.patch(box, levels) for box in boxes)
     phases = phases_of(plan)
     sizes = dict(whole.sizes) if len(phases) > 1 else {}
-    for extents in patches:
+    by_size = {tuple((e.stored.width, e.stored.height) for e in tile): tile for tile in patches}
+    for extents in by_size.values():
         for name, size in buffer_sizes(plan, extents, ends).items():
             sizes[name] = max(size, sizes.get(name, 0))
     if sum(sizes.values()) > memory:

@@ -235,8 +235,11 @@ class Cutter:
         self, across: Sequence[tuple[int, ...]], down: Sequence[tuple[int, ...]]
     ) -> Extents:
         return tuple(
-            replace(
-                extent,
+            Extent(
+                extent.width,
+                extent.height,
+                extent.lanes,
+                extent.border,
                 core=Box(x[0], y[0], x[1], y[1]),
                 stored=Box(x[2], y[2], x[3], y[3]),
             )
