@@ -14,6 +14,7 @@ from PIL import Image
 
 import clpipe as api
 from clpipe.base.errors import DeviceError, ImageError, RequestError
+from clpipe.dataset.samples import Maker
 
 ISO = 3200  # a chain that other tests compile too
 
@@ -117,13 +118,13 @@ def test_parts_for_workers(dataset):
 
 
 def test_only_a_few_are_ahead(dataset, monkeypatch):
-    read, real = [], api.Dataset._read
+    read, real = [], Maker.read
 
-    def reading(self, job, epoch):
-        read.append(job.key)
-        return real(self, job, epoch)
+    def reading(self, work):
+        read.append(work.job.key)
+        return real(self, work)
 
-    monkeypatch.setattr(api.Dataset, "_read", reading)
+    monkeypatch.setattr(Maker, "read", reading)
     endless = api.Dataset("in", iso=ISO, epochs=None, threads=2)
     before = threading.active_count()
     samples = iter(endless)
@@ -211,9 +212,10 @@ class Loader:
             yield from pool.map(self.dataset.__getitem__, range(len(self.dataset)))
 
 
-def test_workers_that_are_spawned_make_the_same(dataset):
-    whole = list(dataset)
-    for one, two in zip(Loader(dataset, 1, "spawn"), whole, strict=True):
+def test_workers_that_are_spawned_make_the_same(renders):
+    patches = api.Dataset(renders, iso=ISO, patch=16, patches_per_image=2, truth=False)
+    whole = list(patches)
+    for one, two in zip(Loader(patches, 1, "spawn"), whole, strict=True):
         same(one, two)
 
 
@@ -228,7 +230,7 @@ def test_a_worker_that_is_forked_says_so_and_does_not_hang(dataset):
 def test_it_pickles_before_and_after_it_was_used(dataset):
     before = pickle.dumps(dataset)
     one = dataset[1]
-    assert dataset._opened and dataset._opened.process == os.getpid()
+    assert dataset._maker._opened.process == os.getpid()
     for data in (before, pickle.dumps(dataset)):
         same(pickle.loads(data)[1], one)
 

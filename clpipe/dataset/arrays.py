@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from clpipe.base.errors import RequestError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.text import one_of
 from clpipe.base.types import Array
 from clpipe.reference.cfa import Pattern, red_site
@@ -82,6 +82,18 @@ class Form:
             raise RequestError(
                 "dtype float16: the chain ends in DN, which it does not hold exactly; use uint16 "
                 "or float32, or end the chain with normalize"
+            )
+
+    def check_size(self, width: int, height: int) -> None:
+        """See that the raw of a whole picture can be packed, if it is.
+
+        Raises:
+            ImageError: it cannot.
+        """
+        if self.raw == "packed" and (width % 2 or height % 2):
+            raise ImageError(
+                f"its picture has {width}x{height} pixels, an odd width or height, and a packed "
+                "raw has planes of half the size; cut patches, or say raw='mosaic'"
             )
 
     def picture(self, image: Array, kind: Kind) -> Array:

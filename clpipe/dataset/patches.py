@@ -132,7 +132,7 @@ class Cutting:
     ) -> Iterator[tuple[float, ...]]:
         """Numbers from 0 to 1 for each patch, by its number and their names."""
         drawn = uniforms(owner, [f"{number}.{name}" for number in numbers for name in names])
-        return zip(*[iter(drawn.values())] * len(names), strict=True)
+        return (tuple(drawn[f"{number}.{name}"] for name in names) for number in numbers)
 
     @property
     def _columns(self) -> int:

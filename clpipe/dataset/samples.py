@@ -133,6 +133,8 @@ class Maker:
                 cutting = self._cutting(self.patches, loaded)
                 owner = f"patch:{chain.seed}:{job.key}:{work.epoch}"
                 patches = self.patches.cut(cutting, work.numbers, owner)
+            else:
+                self._wanted.form.check_size(*chain.size(*loaded.source.pixels.shape[1::-1]))
             begun = self._developer().begin(chain, loaded.source.pixels, key, patches)
 
         def finish() -> list[Sample]:

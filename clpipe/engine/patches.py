@@ -24,33 +24,18 @@ def with_patches(
 
     Args:
         plan: the plan.
-        boxes: the parts, in pixels of the results.
+        boxes: the parts, in pixels of the results, which are all of one size.
         whole: how the whole image goes through the plan.
         lanes: of the device.
         memory: bytes that all buffers together may take.
         ends: as for :func:`~clpipe.engine.tiles.tiling_of`.
 
     Raises:
-        ImageError: a part is not inside the result, the results differ in size, or a part does not
-            fit into the memory.
+        ImageError: a part does not fit into the memory.
     """
     source = whole.tiles[0][0]
     cut = cutter_of(plan, source.width, source.height, lanes)
-    width, height = cut.whole[-1].width, cut.whole[-1].height
     levels = {image.level for _, image in plan.kept} | {len(cut.whole) - 1}
-    for name, image in plan.kept:
-        own = cut.whole[image.level]
-        if (own.width, own.height) != (width, height):
-            raise ImageError(
-                f"the image of {name} has {own.width}x{own.height} pixels, but the last one "
-                f"{width}x{height}; patches are of images of one size"
-            )
-    for box in boxes:
-        if box.left < 0 or box.top < 0 or box.right > width or box.bottom > height:
-            raise ImageError(
-                f"found a patch of {box.width}x{box.height} pixels at {box.left},{box.top}; "
-                f"the picture has {width}x{height}"
-            )
     patches = tuple(cut.patch(box, levels) for box in boxes)
     phases = phases_of(plan)
     sizes = dict(whole.sizes) if len(phases) > 1 else {}

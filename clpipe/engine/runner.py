@@ -229,12 +229,14 @@ class Runner:
                 f"found an image of shape {image.shape}, but the chain starts on "
                 f"{self.chain.source.label} with {channels} channel(s)"
             )
+        if boxes:
+            self._check_sizes(*image.shape[1::-1])
         if not (self.encode or self.final or self.keep):
             return lambda: Result(None, None, {}, {})
         if not self.device:
             return partial(self._run_numpy, np.asarray(image, np.float32), noise_key, boxes)
-        smallest = min(self.chain.size(*image.shape[1::-1]))
-        plan = self.plan(image.dtype == np.float16, smallest > 1, is_planar(image))
+        size = self.chain.size(*image.shape[1::-1])
+        plan = self.plan(image.dtype == np.float16, min(size) > 1, is_planar(image))
         try:
             self._make_ready(plan)
         except DeviceFailedError:
@@ -243,6 +245,21 @@ class Runner:
             pass  # the tiny image is too large; the one below says it of this image
         options = timings, download, into, unchanged, boxes
         return self._submit_plan(plan, image, noise_key, *options)
+
+    def _check_sizes(self, width: int, height: int) -> None:
+        """See that all images of an image's result are of one size, so that patches are, too.
+
+        Raises:
+            ImageError: they are not.
+        """
+        last = self.chain.size(width, height)
+        for name in self.keep:
+            own = self.chain.through([name]).size(width, height)
+            if own != last:
+                raise ImageError(
+                    f"the image of {name} has {own[0]}x{own[1]} pixels, but the last one "
+                    f"{last[0]}x{last[1]}; patches are cut of images of one size"
+                )
 
     def _submit_plan(
         self, plan: Plan, image: Array, noise_key: str, *options: Any

@@ -1,0 +1,343 @@
+"""Patches for training: the bits of whole pictures, wherever they are cut and however turned."""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clpipe as api
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.dataset.arrays import packed
+from clpipe.dataset.patches import Cutting, Numbering, first_place
+from clpipe.dataset.recent import Recent
+from clpipe.images.tags import FLIPS, upright
+from clpipe.reference.cfa import PATTERNS
+
+ISO = 3200  # a chain that other tests compile too
+
+
+@pytest.fixture
+def renders(write_exr, tmp_path, monkeypatch):
+    """Three renders of two sizes, one of them odd."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    for i in range(3):
+        size = (41, 57) if i % 2 else (48, 64)
+        write_exr(f"in/r{i}.exr", rng.random((*size, 3)).astype(np.float32) * 0.6)
+    return Path("in")
+
+
+def arrays(sample):
+    """The images of a sample."""
+    return {name: v for name, v in sample.items() if np.ndim(v) > 1 and name != "xyz_to_camera"}
+
+
+def same(one, two):
+    assert one.keys() == two.keys()
+    assert all(np.array_equal(one[name], two[name]) for name in one)
+
+
+def check_against_whole(whole, patches):
+    """Fail unless patches are parts of a whole sample, turned, and of the same camera."""
+    turns = set()
+    for patch in patches:
+        (left, top), turn = patch["place"], patch["turn"]
+        images = arrays(patch)
+        for name, image in images.items():
+            size = image.shape[0]
+            part = whole[name][top : top + size, left : left + size]
+            assert np.array_equal(image, upright(part, turn)), name
+            assert image.flags.c_contiguous and image.flags.writeable
+        assert images.keys() == arrays(whole).keys()
+        shift = first_place(whole["cfa"], turn, size)
+        assert (left % 2, top % 2) == shift
+        turns.add(turn)
+    return turns
+
+
+def test_all_that_a_sample_has_is_that_of_the_whole_picture(renders):
+    given = {"iso": ISO, "truth": "clean", "raw": "mosaic", "keep": "exposure"}
+    for number, key in ((0, "r0.exr"), (1, "r1.exr")):
+        (whole,) = api.Dataset(f"in/{key}", **given)
+        patches = api.Dataset(
+            renders, **given, patch=24, patches_per_image=60, augment=True
+        ).__getitems__(range(60 * number, 60 * number + 60))
+        assert {patch["key"] for patch in patches} == {key}
+        assert check_against_whole(whole, patches) == set(FLIPS)
+        assert {"image", "truth", "raw", "truth.raw", "exposure"} <= patches[0].keys()
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_each_pattern_and_the_variance(renders, pattern):
+    given = {
+        "device": "numpy",
+        "iso": ISO,
+        "raw": "mosaic",
+        "variance": True,
+        "until": "normalize",
+        "truth": "clean",
+        "stages": ["mosaic", "sensor_noise", "inverse_white_balance", "quantize", "normalize"],
+        "mosaic": {"pattern": pattern},
+    }
+    (whole,) = api.Dataset("in/r1.exr", **given)
+    assert whole["cfa"] == pattern and whole["variance"].dtype == np.float32
+    patches = api.Dataset("in/r1.exr", patch=17, patches_per_image=60, augment=True, **given)
+    assert len(check_against_whole(whole, patches)) == 8
+
+
+@pytest.mark.parametrize("size", [6, 7])
+def test_turned_patches_have_the_pattern(size):
+    for pattern, turn in itertools.product(PATTERNS, FLIPS):
+        cell = np.array(list(pattern)).reshape(2, 2)
+        x, y = first_place(pattern, turn, size)
+        turned = upright(np.tile(cell, (6, 6))[y : y + size, x : x + size], turn)
+        assert (turned == np.tile(cell, (6, 6))[:size, :size]).all()
+
+
+def test_packed_planes():
+    # By the colours' letters, the second green in lower case where it is in blue's rows.
+    for pattern, cell in (("RGGB", "RGgB"), ("BGGR", "BgGR"), ("GRBG", "GRBg"), ("GBRG", "gBRG")):
+        mosaic = np.tile(np.array(list(cell)).reshape(2, 2), (3, 4))
+        planes = packed(mosaic, pattern)
+        assert planes.shape == (4, 3, 4)
+        assert ["".join(np.unique(plane)) for plane in planes] == ["R", "G", "g", "B"]
+
+
+def test_places_are_everywhere_and_fit():
+    cutting = Cutting(8, 21, 16, "RGGB", augment=True)
+    patches = cutting.drawn(range(400), "owner")
+    assert {p.left for p in patches} == set(range(14)) and {p.top for p in patches} == set(range(9))
+    assert cutting.drawn([7], "owner") == patches[7:8] != cutting.drawn([7], "other")
+    for edge in (cutting, Cutting(16, 16, 16, "RGGB", augment=True)):
+        for patch in edge.drawn(range(50), "owner"):
+            assert patch.left + patch.size <= edge.width and patch.top + patch.size <= edge.height
+    plain = Cutting(8, 21, 16, "RGGB", augment=False).drawn(range(50), "owner")
+    assert {(p.left % 2, p.top % 2, p.turn) for p in plain} == {(0, 0, 1)}
+
+
+@pytest.mark.parametrize("augment", [False, True])
+def test_a_grid_covers_the_picture(augment):
+    cutting = Cutting(8, 37, 24, "RGGB", augment)
+    covered = np.zeros((24, 37), int)
+    for patch in cutting.in_grid(range(cutting.count), "owner"):
+        covered[patch.top : patch.top + 8, patch.left : patch.left + 8] += 1
+    assert cutting.count == 15
+    assert augment or (covered[:, :36].all() and not covered[:, 36].any())
+
+
+def test_a_grid_over_images_of_several_sizes(renders):
+    grid = api.Dataset(renders, device="numpy", patch=16, patches_per_image="grid", until="mosaic")
+    assert len(grid) == 12 + 3 * 4 + 12
+    places = [(s["key"], *s["place"]) for s in grid]
+    assert len(set(places)) == len(grid)
+    assert places[23] == ("r1.exr", 40, 24)  # where 57x41 ends, at an even place
+
+
+def test_numbers_of_samples():
+    numbering = Numbering([3, 1, 130])
+    listed = [
+        (epoch, image, n)
+        for epoch, image, numbers in itertools.islice(numbering.groups(2), 8)
+        for n in numbers
+    ]
+    assert listed == [numbering.place(2 + i) for i in range(len(listed))]
+    assert len(listed) == 1 + 1 + (64 + 64 + 2) + 3 + 1 + 64
+
+
+def test_samples_do_not_depend_on_order_shards_and_epochs(renders):
+    made = api.Dataset(renders, iso=ISO, patch=16, patches_per_image=3, epochs=2)
+    assert len(made) == 18
+    listed = list(made)
+    for i in (17, 4, -18):
+        same(made[i], listed[i])
+    for one, i in zip(made.__getitems__([5, 3, 9, 5]), (5, 3, 9, 5), strict=True):
+        same(one, listed[i])
+    for i, part in enumerate([made.shard(0, 2), made.shard(1, 2)]):
+        own = [s for s in listed if s["key"] in (("r0.exr", "r2.exr"), ("r1.exr",))[i]]
+        for one, two in zip(part, own, strict=True):
+            same(one, two)
+    later = api.Dataset(renders, iso=ISO, patch=16, patches_per_image=3, epoch=1)
+    for one, two in zip(later, listed[9:], strict=True):
+        same(one, two)
+    places = [tuple(s["place"]) for s in listed]
+    assert len(set(places)) > 12 and places[:9] != places[9:]
+    other = api.Dataset(renders, iso=ISO, patch=16, patches_per_image=3, seed=1)
+    assert [tuple(s["place"]) for s in other] != places[:9]
+
+
+def test_training_goes_on_where_it_was(renders):
+    def dataset(**changes):
+        given = {"device": "numpy", "until": "mosaic", "patch": 16, "patches_per_image": 4}
+        return api.Dataset(renders, epochs=2, **{**given, **changes})
+
+    whole = list(dataset())
+    first = dataset()
+    begun = [sample for _, sample in zip(range(7), first, strict=False)]
+    state = first.state_dict()
+    second = dataset()
+    second.load_state_dict(state)
+    assert second.state_dict() == state
+    rest = list(second)
+    for one, two in zip([*begun, *rest], whole, strict=True):
+        same(one, two)
+    assert len(list(second)) == len(whole)  # another iteration begins at the start
+    third = dataset()
+    third.load_state_dict(second.state_dict())
+    assert list(third) == []  # nothing is left of that one
+    third.set_epoch(1)
+    same(next(iter(third)), whole[12])
+    for other in (dataset(patch=8), dataset(patches_per_image=5), first.shard(0, 2)):
+        with pytest.raises(RequestError, match="of other images, or of other patches"):
+            other.load_state_dict(state)
+
+
+def test_decoded_renders_are_kept_while_they_fit(renders, write_exr, monkeypatch):
+    from clpipe.inputs.loader import ImageLoader
+
+    read, real = [], ImageLoader.read
+    monkeypatch.setattr(ImageLoader, "read", lambda s, job: read.append(job.key) or real(s, job))
+
+    def names_read(cache):
+        read.clear()
+        made = api.Dataset(
+            renders, device="numpy", until="mosaic", patch=8, epochs=2, threads=1, cache=cache
+        )
+        order = [i * 16 for i in (0, 1, 0, 1, 2, 3, 4)]
+        made.__getitems__(order[:2])
+        for i in order[2:]:
+            made[i]
+        assert made._maker.renders.taken <= 2**20
+        return "".join(name[1] for name in read)
+
+    one = 48 * 64 * 6  # bytes, half
+    assert names_read("1M") == "012"
+    assert names_read(2 * one) == "01201"
+    assert names_read(0) == "0101201"
+    made = api.Dataset("in/r0.exr", device="numpy", until="mosaic", patch=8)
+    before = made[0]["image"]
+    write_exr("in/r0.exr", np.ones((48, 64, 3), np.float32))
+    assert not np.array_equal(made[0]["image"], before)  # the file has changed
+
+
+def test_what_is_larger_than_the_room_is_not_kept():
+    kept = Recent(3, len)
+    assert [kept.get(text, lambda text=text: text) for text in ("ab", "long", "c")]
+    assert kept.taken == 3
+    kept.get("de", lambda: "de")
+    assert kept.taken == 3 and kept.get("ab", lambda: "new") == "new"
+
+
+def test_types_and_orders(renders):
+    def first(**changes):
+        return api.Dataset("in/r0.exr", iso=ISO, patch=16, raw="mosaic", **changes)[0]
+
+    plain = first(keep=["normalize"])
+    assert (plain["image"].dtype, plain["raw"].dtype) == (np.uint8, np.uint16)
+    real = first(dtype=np.float32, channels_first=True, keep=["normalize"])
+    assert real["image"].shape == (3, 16, 16) and real["image"].dtype == np.float32
+    assert np.array_equal(np.rint(real["image"] * 255).transpose(1, 2, 0), plain["image"])
+    for prefix in ("", "truth."):
+        assert np.array_equal(real[prefix + "raw"], plain[prefix + "normalize"])
+        dn = plain[prefix + "raw"].astype(float) - plain["black_level"]
+        signal = dn / (plain["white_level"] - plain["black_level"])
+        assert np.abs(real[prefix + "raw"] - signal).max() < 1e-6
+    half = first(dtype="float16")
+    assert np.array_equal(half["raw"], real["raw"].astype(np.float16))
+    whole = first(dtype="uint16")
+    assert np.array_equal(whole["raw"], plain["raw"])
+    pixels = real["truth"].transpose(1, 2, 0)
+    assert np.array_equal(whole["truth"], np.rint(pixels * np.float32(65535)))
+
+
+def test_facts_of_a_sample(renders):
+    sample = api.Dataset(renders, iso=ISO, patch=16, raw="packed", seed=3)[5]
+    camera = api.load_camera("sony-a7r2")
+    assert (sample["camera"], sample["iso"], sample["seed"]) == (camera.name, ISO, 3)
+    assert sample["a"] == camera.noise(ISO).a
+    assert (sample["black_level"], sample["white_level"]) == (512, 16383)
+    assert np.allclose(sample["gains"][::2], camera.white_balance_gains)
+    assert sample["raw"].shape == sample["truth.raw"].shape == (4, 8, 8)
+    assert sample["truth"].shape == (16, 16, 3)  # without asking
+
+
+def test_the_variance_is_that_of_the_noise(write_exr, tmp_path):
+    write_exr("flat.exr", np.full((200, 200, 3), 0.3, np.float32))
+    made = api.Dataset(
+        tmp_path / "flat.exr",
+        device="numpy",
+        iso=ISO,
+        until="normalize",
+        raw="packed",
+        variance=True,
+        dtype="float32",
+        patch=180,
+        patches_per_image=1,
+        skip=["row_noise"],
+    )
+    (sample,) = made
+    error = sample["raw"] - sample["truth.raw"]
+    assert sample["variance"].shape == error.shape == (4, 90, 90)
+    for plane, variance in zip(error, sample["variance"], strict=True):
+        assert plane.var() == pytest.approx(variance.mean(), rel=0.06)
+
+
+def test_layers_go_along(write_exr, tmp_path):
+    rng = np.random.default_rng(0)
+    pixels = rng.random((40, 48, 4)).astype(np.float32)
+    write_exr("a.exr", pixels, "R,G,B,Z", half=False)
+    given = {"device": "numpy", "until": "mosaic", "carry": "Z:depth"}
+    (whole,) = api.Dataset(tmp_path / "a.exr", **given)
+    for s in api.Dataset(tmp_path / "a.exr", patch=16, augment=True, **given):
+        left, top = s["place"]
+        part = whole["carried.Z"][top : top + 16, left : left + 16]
+        assert np.array_equal(s["carried.Z"], upright(part, s["turn"]))
+        assert s["carried.valid"].shape == (16, 16)
+    given["carry"] = "Z:normal"
+    write_exr("a.exr", rng.random((40, 48, 6)), "R,G,B,Z.X,Z.Y,Z.Z", half=False)
+    with pytest.raises(ImageError, match=r"a\.exr: .*Z: augment flips and turns patches, but not"):
+        api.Dataset(tmp_path / "a.exr", patch=16, augment=True, **given)[0]
+
+
+def test_what_is_refused(renders):
+    mosaic = {"until": "normalize"}
+    for wrong, message in (
+        ({"patch": 0}, "found patch 0; expected 1 or more"),
+        ({"patch": 9, "raw": "packed"}, "found patch 9; a packed raw has planes of half the size"),
+        ({"augment": True}, "augment: .* set patch=SIZE"),
+        ({"patch": 8, "patches_per_image": 0}, "found patches_per_image 0; expected 1 or more"),
+        (
+            {"patch": 8, "patches_per_image": "all"},
+            "found patches_per_image 'all'; exp.*grid",
+        ),
+        ({"dtype": "int8"}, "unknown dtype 'int8'.*; allowed: float16, float32, uint16"),
+        ({"dtype": "half float"}, "unknown dtype 'half float'"),
+        ({"dtype": "uint16", **mosaic}, "dtype uint16: the chain ends in mosaic"),
+        ({"dtype": "float16", "until": "quantize"}, "dtype float16: the chain ends in DN"),
+        ({"raw": "bayer"}, "found raw 'bayer'; expected .*'packed', 'mosaic'"),
+        ({"raw": "mosaic", "until": "exposure"}, "makes no raw in DN, which quantize does"),
+        ({"raw": "mosaic", "dtype": "float32", "until": "quantize"}, "ends in DN, at quantize"),
+        ({"variance": True, "until": "exposure"}, "no stage of this chain adds noise"),
+        ({"cache": "much"}, "found cache 'much'; expected bytes, or a size such as 512M"),
+        ({"cache": -1}, "found cache -1"),
+    ):
+        with pytest.raises(RequestError, match=message):
+            api.Dataset(renders, device="numpy", **wrong)
+    with pytest.raises(ImageError, match=r"in/r1\.exr: .*57x41 pixels, .* 48x48; make them smal"):
+        list(api.Dataset(renders, device="numpy", patch=48, until="mosaic"))
+    with pytest.raises(ImageError, match=r"in/r1\.exr: .*57x41 .*an odd width or height"):
+        list(api.Dataset(renders, device="numpy", raw="packed", until="quantize"))
+
+
+@pytest.mark.parametrize("device", [None, "numpy"])
+def test_images_of_two_sizes_cannot_both_be_cut(renders, device):
+    stages = ["exposure", "mosaic", "sensor_noise", "quantize", "normalize", "demosaic", "resize"]
+    small = {"stages": stages, "demosaic": {"method": "bilinear"}, "resize": {"scale": 0.5}}
+    made = api.Dataset(renders, device=device, iso=ISO, patch=8, raw="mosaic", **small)
+    with pytest.raises(ImageError, match=r"r0\.exr: the image of quantize has 64x48 .* 32x24"):
+        made[0]
+
+
+def test_a_chain_without_noise_has_no_truth_by_itself(renders):
+    made = api.Dataset(renders, device="numpy", patch=8, until="mosaic")
+    assert "truth" not in made[0] and made[0]["image"].shape == (8, 8)
