@@ -34,8 +34,9 @@ def picture_without_noise(truth: str, chain: Chain) -> Chain:
     Raises:
         RequestError: the chain adds no noise.
     """
-    without = chain.without_noise()
-    return chain.cleaned() if truth == CLEAN else without
+    if truth == CLEAN and any(map(adds_noise, chain.steps)):
+        return chain.cleaned()
+    return chain.without_noise()
 
 
 def noisy_mosaic(chain: Chain) -> Chain:

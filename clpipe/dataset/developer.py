@@ -24,7 +24,7 @@ from clpipe.reference.cfa import Pattern
 from clpipe.stage import Access, Kind
 
 Sample = dict[str, Any]
-PREPARED = 256  # chains whose runners are kept, since patches of one image may come at any time
+KEPT = 1024  # chains, of 50 KB each, since patches of one image may be asked for at any time
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Developer:
         self._device = device
         self._wanted = wanted
         self._lock = threading.Lock()
-        self._prepared: Recent[Prepared] = Recent(PREPARED)
+        self._prepared: Recent[Prepared] = Recent(KEPT)
         self._latest: dict[str, Runner] = {}
 
     def begin(

@@ -12,7 +12,7 @@ from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.carry import VALID
 from clpipe.chain.identity import noise_key, of_frame
-from clpipe.dataset.developer import Developer, Sample, Wanted, pattern_of
+from clpipe.dataset.developer import KEPT, Developer, Sample, Wanted, pattern_of
 from clpipe.dataset.patches import Cutting, Patch, Patches
 from clpipe.dataset.recent import Recent
 from clpipe.engine.device import open_device
@@ -21,8 +21,6 @@ from clpipe.inputs.carry import Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.inputs.raw import RawImage
-
-DRAWN = 256  # images whose draws are kept, since patches of one image may be asked for at any time
 
 _opening = threading.Lock()
 
@@ -63,7 +61,7 @@ class Maker:
         self.patches = patches
         self.renders: Recent[SourceImage] = Recent(cache, pixel_bytes)
         self._loader = loader
-        self._loaders: Recent[ImageLoader] = Recent(DRAWN)
+        self._loaders: Recent[ImageLoader] = Recent(KEPT)
         self._wanted = wanted
         self._device = device
         self._opened: Developer | None = None
