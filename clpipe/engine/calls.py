@@ -22,6 +22,8 @@ from clpipe.engine.writer import Parameter
 
 Bind = Callable[[Parameter], Any]
 
+MANY = 4  # launches, after which there will be more
+
 
 def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """The global and the local size of a kernel, in work items."""
@@ -65,6 +67,7 @@ class Call:
         self._arguments: list[Any] = [None] * len(numbered)
         self._extents: Extents = ()
         self._bound: tuple[Any, ...] = ()
+        self._launches = 0
 
     def set_arguments(
         self,
@@ -89,7 +92,7 @@ class Call:
         for i, name in self._ends:
             arguments[i] = ends[name]
         for i in self._tile:
-            arguments[i] = tile
+            arguments[i] = np.uint32(tile)
         if extents is not self._extents:
             level = self.kernel.launch.level
             for names, of in ((self._own, level), (self._larger, max(level - 1, 0))):
@@ -102,14 +105,11 @@ class Call:
             for i, parameter in self._values:
                 value = bind(parameter)
                 arguments[i] = table(value) if isinstance(value, np.ndarray) else value
-            if not self._bound:  # without types, PyOpenCL finds out that of each number each time
-                self.compiled.set_arg_types([type_of(each) for each in arguments])
             self._bound = pool.generation, bind
+        # PyOpenCL takes 11 us to find out the type of a number, or 2 ms to be told all types.
+        self._launches += 1
+        if self._launches == MANY:
+            self.compiled.set_arg_types([getattr(each, "dtype", None) for each in arguments])
         self.compiled.set_args(*arguments)
         for i, _ in self._ends:
             arguments[i] = None  # which would hold an image
-
-
-def type_of(argument: Any) -> Any:
-    """The NumPy type of a kernel argument; None for a buffer. Numbers of a tile are uints."""
-    return np.uint32 if isinstance(argument, int) else getattr(argument, "dtype", None)

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from clpipe.engine.codegen import border_left, round_up, summed_together
 from clpipe.engine.plan import Plan
 
@@ -88,10 +90,10 @@ class Extent:
         return ((self.padded_height + 2 * self.border) * self.pitch + 5 * self.lanes) * 4
 
     @cached_property
-    def numbers(self) -> dict[str, int]:
-        """The values of the kernel parameters that describe it, by name; each is a uint."""
+    def numbers(self) -> dict[str, np.uint32]:
+        """The values of the kernel parameters that describe it, by name."""
         core = self.core
-        return {
+        numbers = {
             "width": self.width,
             "height": self.height,
             "pitch": self.pitch,
@@ -106,6 +108,7 @@ class Extent:
             "core_right": core.right,
             "core_bottom": core.bottom,
         }
+        return {name: np.uint32(value) for name, value in numbers.items()}
 
 
 # An image or a tile on each level of a plan.
