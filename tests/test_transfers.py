@@ -14,7 +14,8 @@ from clpipe.chain.settings import settings_from
 from clpipe.engine import programs
 from clpipe.engine.check import example
 from clpipe.engine.device import Device, Timing
-from clpipe.engine.runner import Runner
+from clpipe.engine.extents import Box
+from clpipe.engine.runner import Runner, cut_out
 from clpipe.stage import Kind
 
 IMAGES = [example(Kind.RGB, (40, 48), half=True, seed=seed) for seed in range(5)]
@@ -105,6 +106,9 @@ def test_both_ways_give_the_same(device, type_, memory):
         expected, found = one.run(image, "k"), two.run(image, "k")
         for name in ("final", "encoded", "kept", "estimates"):
             np.testing.assert_equal(getattr(found, name), getattr(expected, name))
+        boxes = [Box(x, 2 * x, x + 20, 2 * x + 16) for x in (0, 7, 25)]
+        patches = two.submit(image, "k", boxes=boxes)()
+        np.testing.assert_equal(patches.encoded, cut_out(expected.encoded, boxes))
 
 
 def queued(device: Device, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
@@ -156,6 +160,14 @@ def test_transfers_of_an_image_run_beside_the_kernels_of_its_neighbours(gpu_runn
     assert [np.array_equal(wait().encoded, e) for wait, e in zip(waits, expected, strict=True)] == [
         True
     ] * 5
+
+
+def test_images_that_are_only_floats_do_not_mix(gpu_runner):
+    runner = Runner(gpu_runner.chain, gpu_runner.device, encode=False, final=True)
+    expected = [runner.run(image, "k").final for image in IMAGES]
+    waits = [runner.submit(image, "k") for image in IMAGES]
+    for wait, image in zip(waits, expected, strict=True):
+        assert np.array_equal(wait().final, image)
 
 
 def test_a_source_that_is_there_is_not_sent_again(gpu_runner):

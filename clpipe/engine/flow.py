@@ -179,9 +179,7 @@ class Flow:
         whole = passage.work.output.encoded if fetches and passage.is_whole else None
         size = extents[-1].stored.width * extents[-1].stored.height
         size *= len(plan.encoded.channels) if plan.encoded else 0
-        ends = {"src": sent[0]}
-        if size:
-            ends["dst"] = self._transfers.target(size, whole)
+        ends = {"src": sent[0], "dst": self._transfers.target(size, whole)}
         wait, self._reads = [*sent[1], *self._reads], []
         self._launch(passage, numbers, extents, tile, ends, wait)
         last = [event for _, event in passage.events[-1:]]

@@ -83,7 +83,12 @@ class InPlace:
         return None
 
     def target(self, size: int, whole: Array | None) -> Any:
-        """A buffer for eight-bit pixels: the array ``whole``, where it is the result of one run."""
+        """A buffer for eight-bit pixels: the array ``whole``, where it is the result of one run.
+
+        None where there are none, of size 0. It is called once for each image or tile.
+        """
+        if not size:
+            return None
         data = self._room("dst", size) if whole is None else whole
         return self._end(self._cl.mem_flags.READ_WRITE, data)
 
