@@ -61,7 +61,9 @@ class Dataset(ReadOnly):
     With ``patch``, samples are square parts of pictures, and only they are developed, each from as
     much of the render as it needs: a patch has the bits that the whole picture has there. It begins
     where its mosaic, turned, has the camera's CFA pattern. Places and turns are drawn for each key,
-    epoch and seed. Turned by 90 degrees, what a sensor does to its rows is done to columns.
+    epoch and seed. Turned by 90 degrees, what a sensor does to its rows is done to columns. What a
+    chain estimates from the whole picture (``gray_world``, ``auto`` exposure) it still does, once
+    for the patches of an image that are asked for together.
 
     The device is opened by the process that first makes a sample. OpenCL does not survive a fork:
     workers of a process that has used it must be spawned (``multiprocessing_context="spawn"``).

@@ -119,7 +119,9 @@ class Maker:
         """The image of a job, as it is held where its pixels are those of its files."""
         if job.subframes:  # which a shutter averages that may be drawn
             return loader.read(job)
-        return self.renders.get((job.key, stamp_of(job.path)), lambda: loader.read(job))
+        overscan = not loader.raw.takes(job.path) and loader.reads_overscan
+        key = job.key, stamp_of(job.path), overscan
+        return self.renders.get(key, lambda: loader.read(job))
 
     def begin(self, work: Work, loaded: LoadedImage, carried: Sample) -> Callable[[], list[Sample]]:
         """Begin to develop samples of an image; what is returned waits for them."""

@@ -104,6 +104,11 @@ class ImageLoader:
         return None if self.request.start_at is None else KeptLoader(self.request, self.folder)
 
     @property
+    def reads_overscan(self) -> bool:
+        """Whether what a render has beyond its picture is read, too."""
+        return self.kept is not None or steps_of_overscan(self.chain) > 0
+
+    @property
     def raw(self) -> RawLoader:
         """How raws and dumps enter."""
         return RawLoader(self.request, self.settings.dump)
@@ -172,9 +177,11 @@ class ImageLoader:
         if self.raw.takes(path):
             return self.raw.read(path)
         request = self.request
-        overscan = self.kept is not None or steps_of_overscan(self.chain) > 0
         options = ReadOptions(
-            request.layer, request.max_pixels or USUAL_MAX_PIXELS, request.transfer, overscan
+            request.layer,
+            request.max_pixels or USUAL_MAX_PIXELS,
+            request.transfer,
+            self.reads_overscan,
         )
         return read_source(path, self.reads, options)
 
