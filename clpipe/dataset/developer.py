@@ -3,7 +3,6 @@
 import os
 import threading
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
@@ -215,7 +214,8 @@ class Developer:
             sample["variance"] = form.variance(variance, pattern)
         if patch:
             sample |= {"place": np.array([patch.left, patch.top]), "turn": patch.turn}
-        return sample | deepcopy(prepared.facts)
+        facts = prepared.facts.items()
+        return sample | {name: v.copy() if isinstance(v, np.ndarray) else v for name, v in facts}
 
     def _prepare(self, chain: Chain) -> Prepared:
         """What runs a chain."""
