@@ -69,9 +69,16 @@ def is_missing(data: Any) -> bool:
 
 
 def prepare(scene: Any, asked: Mapping[str, Any]) -> None:
-    """Set up rendering: Cycles, its passes, linear EXR, the same bytes each time."""
+    """Set up rendering: Cycles, its passes, linear EXR, the same bytes each time.
+
+    Raises:
+        RefusedError: this Blender was built without Cycles or its denoiser.
+    """
     render, layer = scene.render, bpy.context.view_layer
-    render.engine = "CYCLES"
+    try:
+        render.engine = "CYCLES"
+    except TypeError:
+        raise RefusedError("this Blender has no Cycles; use one from blender.org, or bpy") from None
     if asked["resolution"]:
         render.resolution_x, render.resolution_y = asked["resolution"]
         render.resolution_percentage = 100
@@ -83,7 +90,10 @@ def prepare(scene: Any, asked: Mapping[str, Any]) -> None:
     cycles.samples, cycles.time_limit = asked["samples"], asked["time_limit"] or 0
     cycles.use_denoising = asked["denoise"]
     if asked["denoise"]:
-        cycles.denoiser = "OPENIMAGEDENOISE"
+        try:
+            cycles.denoiser = "OPENIMAGEDENOISE"
+        except TypeError:
+            raise RefusedError("this Blender has no denoiser; say --no-denoise") from None
     cycles.seed, cycles.use_animated_seed = asked["seed"], False
     for each in scene.view_layers:
         each.use = each == layer
