@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
@@ -199,14 +200,54 @@ def test_scenes_that_cannot_be_rendered(clpipe, scene, blender, tmp_path, monkey
     assert "--samples: it is for a .blend, not for renders that exist" in said
 
 
+def example(folder, name, *words):
+    """Run one of tools/examples in a folder."""
+    script = ROOT / "tools" / "examples" / name
+    subprocess.run([sys.executable, script, *words], cwd=folder, check=True)
+
+
+def test_views_of_mitsuba_become_a_dataset(clpipe, tmp_path):
+    """A floor seen twice: its points are where the other view's depth and camera say."""
+    pytest.importorskip("mitsuba")
+    example(
+        tmp_path,
+        "mitsuba_views.py",
+        "renders",
+        *["--views", "2", "--size", "48", "32", "--samples", "8"],
+    )
+    clpipe("dataset", "renders", "-o", "set", "--device", "numpy", "--carry", "Depth")
+    views = json.loads((tmp_path / "set/cameras.json").read_text())["views"]
+    assert seen_again(tmp_path / "set", *views) > 0.6  # the rest is hidden
+
+
+def seen_again(folder, one, two):
+    """The share of one view's points that the other view sees at the depth where they are."""
+    depths = []
+    for view in (one, two):
+        with OpenEXR.File(str(folder / view["file"].replace(".jpg", ".carried.exr"))) as file:
+            (depth,) = (c for name, c in file.channels().items() if name.endswith("Depth.Z"))
+            depths.append(depth.pixels.astype(float))
+    y, x = np.indices(depths[0].shape) + 0.5
+    places = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(one["K"]).T
+    with np.errstate(invalid="ignore"):
+        points = (places * depths[0][..., None] - one["t"]) @ np.array(one["R"])
+        seen = points @ np.array(two["R"]).T + two["t"]
+        u, v, z = np.moveaxis(seen @ np.array(two["K"]).T, -1, 0)
+        u, v = u / z, v / z
+    inside = (u >= 0) & (u < x.shape[1]) & (v >= 0) & (v < x.shape[0])
+    found = depths[1][v[inside].astype(int), u[inside].astype(int)]
+    return np.mean(abs(found / z[inside] - 1) < 0.03)
+
+
 def test_blender_itself_renders_a_scene(clpipe, tmp_path):
     """Its depth, cameras and object numbers agree with each other, and it makes the same again."""
     pytest.importorskip("bpy")
-    script = ROOT / "tools" / "examples" / "room_scene.py"
-    subprocess.run([sys.executable, script, "room.blend"], cwd=tmp_path, check=True)
+    example(tmp_path, "room_scene.py", "room.blend")
     small = ("--resolution", "48x32", "--samples", 4, "--device", "numpy", "--path", "arc")
     for name in ("one", "two"):
         clpipe("dataset", "room.blend", "-o", name, "--views", 2, *small)
+    views = json.loads(Path("one/cameras.json").read_text())["views"]
+    assert seen_again(Path("one"), *views) > 0.5  # an arc's ends are far apart
     one, two = (contents(Path(name) / "renders") for name in ("one", "two"))
     assert {k: v for k, v in one.items() if k[0] != "."} == {
         k: v for k, v in two.items() if k[0] != "."

@@ -1,15 +1,15 @@
 """Render views of a small scene with Mitsuba 3: half EXR with depth and normals, and cameras.
 
     pip install mitsuba numpy
-    python tools/examples/mitsuba_views.py renders 8
+    python tools/examples/mitsuba_views.py renders --views 8
     clpipe dataset renders -o set --iso 100,3200
 
-The number is how many views there are, on an arc. Depth is along the axis of view, as clpipe and
+The views are on an arc. Depth is along the axis of view, as clpipe and
 COLMAP count it; Mitsuba's own is along each ray.
 """
 
+import argparse
 import json
-import sys
 from pathlib import Path
 
 import mitsuba as mi
@@ -18,7 +18,7 @@ import numpy as np
 mi.set_variant("scalar_rgb")
 T = mi.ScalarTransform4f
 WARM_AND_COLD = ([6, 4.5, 3], [1, 1.2, 1.5])
-SIZE, FOV, SAMPLES = (480, 320), 40.0, 128
+FOV = 40.0  # degrees, across
 
 
 def surface(kind, place, colour, **more):
@@ -57,38 +57,38 @@ def scene():
     }
 
 
-def camera(turn):
+def camera(turn, size, samples):
     """A sensor that looks at the middle, `turn` degrees around it."""
     place = T().rotate([0, 0, 1], turn) @ mi.ScalarPoint3f(0, -4.5, 1.6)
     film = {
-        **{"type": "hdrfilm", "width": SIZE[0], "height": SIZE[1], "pixel_format": "rgb"},
+        **{"type": "hdrfilm", "width": size[0], "height": size[1], "pixel_format": "rgb"},
         "rfilter": {"type": "box"},
     }
     view = T().look_at(origin=place, target=[0, 0, 0.5], up=[0, 0, 1])
-    sampler = {"type": "independent", "sample_count": SAMPLES}
+    sampler = {"type": "independent", "sample_count": samples}
     return {"type": "perspective", "fov": FOV, "to_world": view, "film": film, "sampler": sampler}
 
 
-def pinhole(name, sensor):
+def pinhole(name, sensor, size):
     """A view of cameras.json: x = K (R X + t) with OpenCV's axes; Mitsuba reverses x and y."""
-    focal = SIZE[0] / 2 / np.tan(np.deg2rad(FOV / 2))
+    focal = size[0] / 2 / np.tan(np.deg2rad(FOV / 2))
     place = np.array(sensor["to_world"].matrix, float)
     rotation = np.diag([-1.0, -1.0, 1.0]) @ place[:3, :3].T
     return {
         "file": name,
-        "K": [[focal, 0, SIZE[0] / 2], [0, focal, SIZE[1] / 2], [0, 0, 1]],
+        "K": [[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]],
         "R": rotation.tolist(),
         "t": (-rotation @ place[:3, 3]).tolist(),
     }
 
 
-def main(folder, count):
+def main(folder, count, size, samples):
     """Render the views into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     world, views = mi.load_dict(scene()), []
     for number, turn in enumerate(np.linspace(-25, 25, count)):
-        sensor, name = camera(float(turn)), f"view_{number:03d}.exr"
-        views.append(pinhole(name, sensor))
+        sensor, name = camera(float(turn), size, samples), f"view_{number:03d}.exr"
+        views.append(pinhole(name, sensor, size))
         pixels = np.array(mi.render(world, sensor=mi.load_dict(sensor), seed=number))
         colour, places, normals = pixels[..., :3], pixels[..., 3:6], pixels[..., 6:9]
         depth = places @ np.array(views[-1]["R"])[2] + views[-1]["t"][2]
@@ -97,9 +97,15 @@ def main(folder, count):
         channels = ["R", "G", "B", "Depth.Z", "Normal.X", "Normal.Y", "Normal.Z"]
         bitmap = mi.Bitmap(layers, mi.Bitmap.PixelFormat.MultiChannel, channels)
         bitmap.write(str(folder / name))
-    cameras = {"width": SIZE[0], "height": SIZE[1], "views": views}
+    cameras = {"width": size[0], "height": size[1], "views": views}
     (folder / "cameras.json").write_text(json.dumps(cameras, indent=1), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]))
+    parser = argparse.ArgumentParser(description="Render views of a small scene with Mitsuba 3.")
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--views", type=int, default=8)
+    parser.add_argument("--size", type=int, nargs=2, default=(480, 320), metavar=("W", "H"))
+    parser.add_argument("--samples", type=int, default=128)
+    asked = parser.parse_args()
+    main(asked.folder, asked.views, asked.size, asked.samples)
