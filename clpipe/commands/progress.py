@@ -96,7 +96,8 @@ class Reporter:
         summary = self._summary
         failed = summary.counts[FAILED]
         speed = summary.megapixels / max(summary.elapsed, 1e-9)
-        return f"{speed:.0f} MP/s  {summary.shares()}" + f"  {failed} failed" * bool(failed)
+        text = f"{speed:.0f}" if speed >= 10 else f"{speed:.2g}"
+        return f"{text} MP/s  {summary.shares()}" + f"  {failed} failed" * bool(failed)
 
     def _clipping(self) -> str:
         """What is said of images that are clipped much."""
