@@ -8,7 +8,8 @@ handlers run in the thread that renders; pictures are loaded by a timer, in the 
 import json
 import os
 import re
-from collections.abc import Iterator
+import textwrap
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,10 +24,17 @@ CHOICES = json.loads(Path(__file__).with_name("choices.json").read_text("utf-8")
 IMAGE = "clpipe"  # the image that shows the latest picture
 FOLDER = "clpipe"  # of the pictures, beside the render's own files
 LINEAR = "linear"  # of the linear renders, in it
-EXR = {"file_format": "OPEN_EXR", "color_mode": "RGB", "color_depth": "16", "exr_codec": "ZIP"}
+SPACE = "Linear Rec.709"  # what clpipe takes an EXR to be in
+EXR = {
+    "file_format": "OPEN_EXR",
+    "color_mode": "RGB",
+    "color_depth": "16",
+    "exr_codec": "ZIP",
+    "color_management": "OVERRIDE",
+}
 SECONDS = 0.25  # between two looks at what has been developed
 
-# Attributes in an EXR that differ each time: dates, and the time and the memory that it took.
+# Attributes in an EXR that differ each time: the date, and the time and memory that it took.
 PASSING = re.compile(rb"(?:Date|RenderTime|Memory|cycles\.[^\0]*_time)\0string\0(.{4})", re.DOTALL)
 
 development = Development()
@@ -78,28 +86,36 @@ def settings_of(scene: Any) -> Settings:
 
 
 @contextmanager
-def linear_exr(scene: Any) -> Iterator[None]:
-    """Let a scene write half EXR in linear Rec. 709, whatever it writes else."""
-    image = scene.render.image_settings
-    management = image.color_management
-    names = [*EXR]
-    if hasattr(image, "media_type"):  # from Blender 5.0 on; it decides which formats there are
-        names.insert(0, "media_type")
-    before = [(name, getattr(image, name)) for name in names]
-    space = image.linear_colorspace_settings
-    space_before = space.name if management == "OVERRIDE" else ""
+def changed(thing: Any, values: Mapping[str, Any]) -> Iterator[None]:
+    """Let something of Blender's have other values for a while."""
+    before = {name: getattr(thing, name) for name in values}
     try:
-        for name in names:
-            setattr(image, name, EXR.get(name, "IMAGE"))
-        image.color_management = "OVERRIDE"
-        space.name = "Linear Rec.709"
+        for name, value in values.items():
+            setattr(thing, name, value)
         yield
     finally:
-        for name, value in before:
-            setattr(image, name, value)
-        if space_before:
-            space.name = space_before
-        image.color_management = management
+        for name, value in before.items():
+            setattr(thing, name, value)
+
+
+@contextmanager
+def linear_exr(scene: Any) -> Iterator[None]:
+    """Let a scene write half EXR in linear Rec. 709, whatever it writes else.
+
+    Raises:
+        DevelopmentError: a colour configuration of the user's own lacks that space.
+    """
+    image = scene.render.image_settings
+    space = image.linear_colorspace_settings
+    own = {"name": space.name} if image.color_management == "OVERRIDE" else {}
+    media = {"media_type": "IMAGE"} if hasattr(image, "media_type") else {}  # from Blender 5.0 on
+    with changed(image, media | EXR), changed(space, own):
+        try:
+            space.name = SPACE
+        except TypeError:
+            message = f"the OpenColorIO configuration has no colour space {SPACE}"
+            raise DevelopmentError(message) from None
+        yield
 
 
 def forget_passing(path: Path) -> None:
@@ -219,9 +235,11 @@ class RENDER_PT_clpipe(bpy.types.Panel):  # noqa: N801 - Blender's way to name a
         if waiting := len(development):
             layout.label(text=f"{waiting} to develop", icon="SORTTIME")
         if development.message:
-            row = layout.row()
-            row.alert = True
-            row.label(text=development.message, icon="ERROR")
+            column = layout.column(align=True)
+            column.alert = True
+            width = context.region.width // 8  # a letter has about as many pixels
+            for number, line in enumerate(textwrap.wrap(development.message, max(width, 20))):
+                column.label(text=line, icon="BLANK1" if number else "ERROR")
 
 
 CLASSES = (ClpipeSettings, RENDER_PT_clpipe)
