@@ -103,7 +103,8 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
 @click.option(
     "--blender",
     metavar="PATH",
-    help="An installed Blender, 4.2 or newer. [default: the Python package bpy]",
+    help="An installed Blender, 4.2 or newer, or a Python that has the package bpy. [default: this "
+    "Python]",
 )
 @series_options
 @click.option(

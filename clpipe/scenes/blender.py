@@ -73,23 +73,25 @@ class Scene:
     unit_metres: float | None
 
 
-def blender_command(program: str | None) -> list[str]:
-    """What runs a script in Blender.
+def blender_command(program: str | None, asked: Path) -> list[str]:
+    """What runs our script in Blender.
 
     Args:
-        program: an installed Blender; None is the package bpy.
+        program: an installed Blender, or a Python that has the package bpy; None is this Python.
+        asked: the file that says what is asked.
 
     Raises:
-        RequestError: there is neither.
+        RequestError: this Python has no bpy.
     """
-    if program is not None:
-        return [program, "--background", "--factory-startup", "--python-exit-code", "1", "--python"]
-    if importlib.util.find_spec("bpy") is None:
+    if program is None and importlib.util.find_spec("bpy") is None:
         raise RequestError(
-            "a .blend is rendered by Blender, and none is here: pip install 'clpipe[blender]', or "
-            "name an installed one with --blender PATH"
+            "a .blend is rendered by Blender, and none is here: name an installed one with "
+            "--blender PATH, or a Python that has the package bpy"
         )
-    return [sys.executable]
+    if program is None or Path(program).name.startswith("python"):
+        return [program or sys.executable, str(SCRIPT), str(asked)]
+    quiet = ("--background", "--factory-startup", "--python-exit-code", "1")
+    return [program, *quiet, "--python", str(SCRIPT), "--", str(asked)]
 
 
 class Renderer(AbstractContextManager["Renderer"]):
@@ -104,15 +106,14 @@ class Renderer(AbstractContextManager["Renderer"]):
     """
 
     def __init__(self, rendering: Rendering, program: str | None = None) -> None:
-        command = blender_command(program)
         asked = rendering.folder / ASKED
+        command = blender_command(program, asked)
         write_new(asked, json.dumps(rendering.record()).encode())
-        arguments = ["--", str(asked)] if program is not None else [str(asked)]
         self._path = rendering.scene
         self._latest: deque[str] = deque(maxlen=LAST_LINES)
         try:
             self._process = subprocess.Popen(  # noqa: S603 - the user's own Blender
-                [*command, str(SCRIPT), *arguments],
+                command,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,

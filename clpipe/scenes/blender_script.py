@@ -24,7 +24,7 @@ FLIP = Matrix(((1, 0, 0), (0, -1, 0), (0, 0, -1)))  # from Blender's camera axes
 UNFINISHED = ".unfinished.exr"
 GEOMETRY = {"MESH", "CURVE", "CURVES", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD"}
 SPAN = math.radians(60)  # of an arc
-TIMES = re.compile(rb"(cycles\.[^\0]*_time\0string\0.{4})([0-9:.]{8})", re.DOTALL)
+TIMES = re.compile(rb"(cycles\.[^\0]*_time\0string\0.{4})([0-9:.]+)", re.DOTALL)
 
 
 class RefusedError(Exception):
@@ -289,7 +289,7 @@ def forget_times(path: str) -> None:
     with open(path, "r+b") as file:
         head = file.read(2**17)
         file.seek(0)
-        file.write(TIMES.sub(rb"\g<1>00:00.00", head))
+        file.write(TIMES.sub(lambda found: found[1] + re.sub(rb"[0-9]", b"0", found[2]), head))
 
 
 def main(asked: Mapping[str, Any]) -> None:
