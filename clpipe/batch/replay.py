@@ -14,7 +14,7 @@ from clpipe.chain.request import Request
 from clpipe.engine.device import Device
 from clpipe.inputs.find import Job
 from clpipe.inputs.manifest import check_output_name
-from clpipe.outputs.renditions import RenditionPlan, bracket_in, truth_named
+from clpipe.outputs.renditions import RenditionPlan, baseline_named, bracket_in, truth_named
 from clpipe.outputs.sidecar import all_versions, device_record, read_sidecar
 
 CODE = (".py", ".cl")  # the endings of files that are run
@@ -138,12 +138,14 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
         raise RequestError(f"found frames {frames}")
     truths = tuple(filter(None, [truth_named(picture)]))
     bracket = bracket_in(picture)
-    if picture not in RenditionPlan(frames, truths, bracket).names():
+    baselines = tuple(filter(None, [baseline_named(picture)]))
+    if picture not in RenditionPlan(frames, truths, bracket, baselines).names():
         raise RequestError(f"found picture {picture!r}")
     request = Request.from_record(values["request"])
     if not request.formats:
         raise RequestError("found no formats")
     request = replace(request, max_pixels=max_pixels, frames=frames, truths=truths, bracket=bracket)
+    request = replace(request, baselines=baselines)
     path = inputs[0] if inputs else Path(values["input"])
     others = tuple(path.parent / str(each["file"]) for each in values.get("subframes", ())[1:])
     job = Job(

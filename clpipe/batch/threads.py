@@ -242,7 +242,9 @@ class Batch:
         writer = self._worker.writer
         results = min(len(writer.names_of(job)), self.threads + len(self.devices))
         layers = self._worker.layers
-        size = host_bytes(job, results, writer.formats, writer.request.keep, layers)
+        # Baselines are measured on floats.
+        formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
+        size = host_bytes(job, results, formats, writer.request.keep, layers)
         start = time.perf_counter()
         self._room.enter(job.stem, size)
         waits.append(time.perf_counter() - start)
@@ -296,14 +298,18 @@ class Batch:
             DeviceError: the device cannot be used any more; what it did not finish is left.
         """
         task, left = decoded
-        for rendition in tuple(left):
+        for asked in tuple(left):
             while not self._results.acquire(blocking=not begun):
                 self._finish(begun, device)
             if self._broken:
                 return
             finish: Callable[[], Result | None] = no_result
+            while asked.spread and begun:  # its noise is measured on those before it
+                self._finish(begun, device)
+            rendition = asked
             try:
                 if not task.error:
+                    rendition = self._worker.measured(task, asked)
                     finish = self._worker.begin(task, rendition, runners.of(rendition))
             except DeviceError:
                 self._results.release()

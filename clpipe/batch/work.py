@@ -15,6 +15,7 @@ from clpipe.base.digests import stamp_of_all
 from clpipe.base.errors import ImageError, NoPictureError, RequestError
 from clpipe.base.types import Array
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome, Span
+from clpipe.chain.baseline import with_noise
 from clpipe.chain.chain import Chain
 from clpipe.chain.depth import lenses_of
 from clpipe.chain.formats import DNG
@@ -174,11 +175,13 @@ class ImageWorker:
         names = self.writer.names_of(task.job)
         if self._overwrite:
             return list(names)
-        return [
+        missing = [
             name
             for name in names
             if not self.is_done(task.job, name, self.writer.record_of(task.job, task.request, name))
         ]
+        needed = self.writer.plan_of(task.job).needed(missing)
+        return [name for name in self.writer.plan_of(task.job).names() if name in needed]
 
     def is_done(self, job: Job, name: str, request: Mapping[str, Any]) -> bool:
         """Whether a rendition is there already, made by the same request.
@@ -216,6 +219,16 @@ class ImageWorker:
         task.renditions = [rendition for rendition in renditions if rendition.name in names]
         task.unwritten = len(task.renditions)
 
+    @staticmethod
+    def measured(task: Task, rendition: Rendition) -> Rendition:
+        """A rendition with its noise, where that is measured on the results of those before it."""
+        if not rendition.spread:
+            return rendition
+        method = rendition.spread.method(rendition.baseline)
+        known = replace(rendition, chain=with_noise(rendition.chain, method), spread=None)
+        task.renditions[task.renditions.index(rendition)] = known
+        return known
+
     def develop(self, task: Task, rendition: Rendition, runner: Runner) -> Result | None:
         """Develop one rendition; None where it fails."""
         return self.begin(task, rendition, runner)()
@@ -239,6 +252,9 @@ class ImageWorker:
         def finish() -> Result | None:
             result = self._tried(task, wait) if wait else None
             task.note("device", start)
+            if result and result.final is not None:
+                for spread in {each.spread for each in task.renditions if each.spread}:
+                    spread.take(rendition.name, result.final)
             name = threading.current_thread().name
             task.spans += [Span(t.name, name, t.start, t.seconds) for t in timings or []]
             if result and rendition is task.renditions[-1] and DNG not in self.writer.formats:

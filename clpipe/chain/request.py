@@ -62,6 +62,7 @@ class Request:
             ``keep``. See :meth:`with_outputs`.
         bracket: what is added to the exposure's EV, for each exposure that is made of each image;
             () is one exposure.
+        baselines: which of :data:`clpipe.chain.baseline.BASELINES` are made beside each picture.
     """
 
     config: Mapping[str, Any] | None = None
@@ -83,6 +84,7 @@ class Request:
     truths: tuple[str, ...] = ()
     truth_keep: tuple[str, ...] | None = None
     bracket: tuple[float, ...] = ()
+    baselines: tuple[str, ...] = ()
 
     @classmethod
     def from_options(

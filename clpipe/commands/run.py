@@ -18,6 +18,7 @@ from clpipe.batch.run_log import RunLog, Summary, log_name
 from clpipe.batch.tars import Tar, cut
 from clpipe.batch.threads import Batch
 from clpipe.batch.trace import Trace, check_trace
+from clpipe.chain.baseline import BASELINES
 from clpipe.chain.chain import Chain
 from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.request import Request
@@ -85,6 +86,15 @@ from clpipe.stage import Kind
     help="Write beside each picture its truth: the same development without noise, the clean "
     "picture (without noise and denoising), its mosaic without noise, or the variance of the noise "
     "in the mosaic; may be repeated.",
+)
+@click.option(
+    "--baseline",
+    "baselines",
+    multiple=True,
+    type=click.Choice(BASELINES),
+    help="Write beside each picture the clean one with independent noise of the same strength, "
+    "the same everywhere (iid) or following intensity; and the truths that it is made of. May be "
+    "repeated.",
 )
 @raw_size_option
 @raw_type_option

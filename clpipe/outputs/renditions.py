@@ -5,10 +5,12 @@ A bracket has all of these at each of its exposures.
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from clpipe.base.errors import KeyedError, RequestError
+from clpipe.chain.baseline import BASELINES, Spread, baseline_of
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.identity import noise_key, of_bracket
 from clpipe.chain.settings import overlay
@@ -16,6 +18,7 @@ from clpipe.chain.truth import (
     CLEAN,
     DEVELOPMENT,
     MOSAIC,
+    PICTURES,
     TRUTHS,
     VARIANCE,
     noisy_mosaic,
@@ -48,6 +51,8 @@ class Rendition:
         frame: its number in a burst; None is no frame.
         noise: for a variance map, the steps whose noise has this variance in the chain's last
             image, see :func:`clpipe.chain.truth.variance_of`; else ().
+        baseline: of :data:`clpipe.chain.baseline.BASELINES`; "" is none.
+        spread: what its noise is measured on, of a baseline; the chain has it when that is known.
     """
 
     name: str
@@ -55,6 +60,8 @@ class Rendition:
     key: str
     frame: int | None = None
     noise: tuple[Step, ...] = ()
+    baseline: str = ""
+    spread: Spread | None = None
 
     @property
     def noise_key(self) -> str:
@@ -77,11 +84,14 @@ class RenditionPlan:
         frames: how many frames; None is one picture. A burst has the truth of its development, too.
         truths: which of :data:`clpipe.chain.truth.TRUTHS`.
         bracket: what is added to the exposure's EV, for each exposure; () is the exposure alone.
+        baselines: which of :data:`clpipe.chain.baseline.BASELINES`; they bring the truths that are
+            pictures along.
     """
 
     frames: int | None = None
     truths: tuple[str, ...] = ()
     bracket: tuple[float, ...] = ()
+    baselines: tuple[str, ...] = ()
 
     def names(self) -> tuple[str, ...]:
         """The name of each rendition.
@@ -91,8 +101,22 @@ class RenditionPlan:
         >>> RenditionPlan(truths=("clean",), bracket=(-2, 0.5)).names()
         ('.ev-2', '.ev-2.truth_clean', '.ev+0.5', '.ev+0.5.truth_clean')
         """
-        own = (*self._frame_names(), *(SUFFIXES[truth] for truth in self._all_truths()))
+        truths = [SUFFIXES[truth] for truth in self._all_truths()]
+        own = (*self._frame_names(), *truths, *map(baseline_name, self._all_baselines()))
         return tuple(exposure + name for exposure in self._exposures() for name in own)
+
+    def needed(self, names: Sequence[str]) -> set[str]:
+        """These renditions, with those that a baseline among them is measured on."""
+        needed = set(names)
+        for name in names:
+            if baseline := baseline_named(name):
+                exposure = name.removesuffix(baseline_name(baseline))
+                needed |= {exposure + own for own in self._measured()}
+        return needed
+
+    def _measured(self) -> tuple[str, str, str]:
+        """The names of what baselines are measured on: the noisy picture, and its truths."""
+        return self._frame_names()[0], SUFFIXES[DEVELOPMENT], SUFFIXES[CLEAN]
 
     def _exposures(self) -> dict[str, float | None]:
         """The EV of each exposure, by the name that stands before those of its renditions.
@@ -109,7 +133,12 @@ class RenditionPlan:
 
     def _all_truths(self) -> list[str]:
         truths = (*self.truths, *([DEVELOPMENT] if self.frames else []))
+        if self.baselines:
+            truths += PICTURES
         return [truth for truth in TRUTHS if truth in truths]
+
+    def _all_baselines(self) -> list[str]:
+        return [each for each in BASELINES if each in self.baselines]
 
     def renditions(self, chain: Chain, key: str) -> list[Rendition]:
         """The renditions of an image, in the order of :meth:`names`.
@@ -129,6 +158,11 @@ class RenditionPlan:
             renditions += [Rendition(exposure + name, own, own_key, n) for name, n in named]
             for truth in (truth_of(each, own) for each in self._all_truths()):
                 renditions.append(replace(truth, name=exposure + truth.name, key=own_key))
+            spread = Spread(tuple(exposure + name for name in self._measured()))
+            for each in self._all_baselines():
+                name = exposure + baseline_name(each)
+                baseline = Rendition(name, baseline_of(own), own_key, None, (), each, spread)
+                renditions.append(baseline)
         return renditions
 
 
@@ -198,6 +232,20 @@ def exposed(chain: Chain, ev: float) -> Chain:
     method = settings.method(EXPOSURE).resolve(step.context)
     steps = (*chain.steps[:place], replace(step, method=method), *chain.steps[place + 1 :])
     return replace(chain, steps=steps, settings=settings)
+
+
+def baseline_name(baseline: str) -> str:
+    """What is put behind the image's name for a baseline.
+
+    >>> baseline_name("iid"), baseline_named(".ev+2.iid"), baseline_named(".truth")
+    ('.iid', 'iid', '')
+    """
+    return f".{baseline}"
+
+
+def baseline_named(name: str) -> str:
+    """Which baseline a rendition is, by its name; "" is none."""
+    return next((each for each in BASELINES if name.endswith(baseline_name(each))), "")
 
 
 def truth_named(name: str) -> str | None:

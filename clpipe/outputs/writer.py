@@ -26,7 +26,13 @@ from clpipe.outputs.carried import write_carried
 from clpipe.outputs.existing import Existing
 from clpipe.outputs.folder import RESUMABLE, write_problem
 from clpipe.outputs.negative import negative_of
-from clpipe.outputs.renditions import FLOAT_MOSAICS, Rendition, RenditionPlan, truth_named
+from clpipe.outputs.renditions import (
+    FLOAT_MOSAICS,
+    Rendition,
+    RenditionPlan,
+    baseline_named,
+    truth_named,
+)
 from clpipe.outputs.results import results_of
 from clpipe.outputs.sidecar import SIDECAR
 from clpipe.reference.curve import to_16_bit
@@ -54,7 +60,8 @@ class OutputWriter:
     def plan_of(self, job: Job) -> RenditionPlan:
         """Which renditions are made of a job's image."""
         frames = self.request.frames if job.frames is None else job.frames
-        return RenditionPlan(frames, self.request.truths, self.request.bracket)
+        asked = self.request.truths, self.request.bracket, self.request.baselines
+        return RenditionPlan(frames, *asked)
 
     def names_of(self, job: Job) -> tuple[str, ...]:
         """The name of each rendition that is made of a job's image."""
@@ -65,15 +72,19 @@ class OutputWriter:
         """A runner that makes all of a rendition that is written, and nothing else."""
         formats, keep = self.formats_of(rendition.name), self.keep_of(rendition.name)
         results = results_of(rendition.chain, formats, keep)
+        if self.request.baselines:
+            results = results._replace(final=True)  # to measure its noise
         return Runner(rendition.chain, device, *results)
 
     def formats_of(self, name: str) -> tuple[str, ...]:
         """The formats of a rendition, by its name."""
+        if baseline_named(name):  # it has no raw
+            return tuple(format_ for format_ in self.formats if format_ != DNG)
         return ("exr",) if truth_named(name) in FLOAT_MOSAICS else self.formats
 
     def keep_of(self, name: str) -> tuple[str, ...]:
         """The steps whose image is written beside a rendition, by its name, where it has them."""
-        if truth_named(name) in FLOAT_MOSAICS:
+        if truth_named(name) in FLOAT_MOSAICS or baseline_named(name):
             return ()
         if truth_named(name) in PICTURES and self.request.truth_keep is not None:
             return self.request.truth_keep
