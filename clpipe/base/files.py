@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import os
 import secrets
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,12 +51,25 @@ def shortened(name: str) -> str:
     return name
 
 
+_passing = threading.local()  # has "files" in a thread that writes passing files
+
+
+@contextlib.contextmanager
+def passing_files() -> Iterator[None]:
+    """Files that this thread writes inside need not outlive a loss of power, which saves time."""
+    _passing.files = True
+    try:
+        yield
+    finally:
+        del _passing.files
+
+
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[BinaryIO]:
     """A file to write to, which takes the place of ``path`` when all of it is on the disk.
 
     It is new, so it follows no link. Where it cannot be written, or the body raises, ``path`` stays
-    as it was.
+    as it was. See :func:`passing_files`, too.
 
     Raises:
         ImageError: the file cannot be written.
@@ -66,7 +80,8 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
         with open(beside, "xb") as file:
             yield file
             file.flush()
-            os.fsync(file.fileno())  # else a loss of power leaves an empty file under its name
+            if not hasattr(_passing, "files"):
+                os.fsync(file.fileno())  # else a loss of power leaves an empty file under its name
         beside.replace(path)
     except OSError as error:
         raise ImageError(f"{path}: cannot be written: {error.strerror or error}") from None
@@ -121,6 +136,8 @@ def write_new(path: Path, data: bytes) -> Stored:
 
 def keep_names(folder: Path) -> None:
     """Have the names of a folder outlive a loss of power, as far as its file system can."""
+    if hasattr(_passing, "files"):
+        return
     with contextlib.suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:

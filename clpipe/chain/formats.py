@@ -21,8 +21,10 @@ FORMATS = {  # of the last image
     "tif32": Format("tif", 32, floats=True),
     "exr": Format("exr", 32, floats=True),
     "exr16": Format("exr", 16, floats=True),
+    "npy": Format("npy", 16, floats=True),
 }
 
+NPY = "npy"  # of NumPy: of images of steps, too
 DNG = "dng"  # of the raw
 
 EVERY_FORMAT = (*FORMATS, DNG)

@@ -20,6 +20,7 @@ from clpipe.base.files import Stored, write_whole
 from clpipe.base.steps import Step
 from clpipe.base.types import Array, Floats
 from clpipe.images.attributes import PREFIX
+from clpipe.images.encoding import Output
 from clpipe.images.openexr import write_channels
 from clpipe.images.openimageio import error_text
 from clpipe.images.pixels import HALF_MAX
@@ -27,8 +28,6 @@ from clpipe.images.tags import Tags, exif
 from clpipe.reference.geometry import NO_MARGINS, Margins
 
 JPEG_MAX_SIDE = 65500
-PNG_LEVEL = 4  # of noisy pictures, 6 takes twice as long and leaves 1.5 % less
-
 # Without it, OpenImageIO puts in the time of writing, and no two runs make the same bytes.
 NO_TIME = "1970:01:01 00:00:00"
 
@@ -45,7 +44,7 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> Stored:
     """Write a picture, (height, width[, 3]), as JPEG, PNG or TIFF, with EXIF.
 
     Whole numbers of 8 or 16 bits get an sRGB profile; float samples (TIFF) do not. ``tags.output``
-    says how a JPEG is encoded. The EXIF of a TIFF lacks the ISO, which OpenImageIO cannot write.
+    says how a JPEG and a PNG are encoded. The EXIF of a TIFF lacks the ISO, which OpenImageIO cannot write.
 
     Raises:
         ImageError: the file cannot be written.
@@ -57,7 +56,7 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> Stored:
     output = tags.output
     jpeg = path.suffix == ".jpg"
     spec.attribute("compression", f"jpeg:{output.jpeg_quality}" if jpeg else "zip")
-    spec.attribute("png:compressionLevel", PNG_LEVEL)
+    spec.attribute("png:compressionLevel", output.png_compression)
     if jpeg:
         spec.attribute("jpeg:subsampling", output.jpeg_subsampling)
         spec.attribute("jpeg:progressive", int(output.jpeg_progressive))
@@ -114,6 +113,22 @@ def write_exr(
     return _write(path, spec, data.reshape(height, width, len(channels)))
 
 
+def write_npy(path: Path, array: Array) -> Stored:
+    """Write an array as NumPy's ``.npy``, version 1.0 (NEP 1), C-contiguous.
+
+    Behind the header's dictionary, which Python reads, a comment says that clpipe wrote it.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    array = np.ascontiguousarray(array)
+    text = repr(np.lib.format.header_data_from_array_1_0(array)) + f"  # clpipe {__version__}"
+    before = len(np.lib.format.MAGIC_PREFIX) + 4  # the version, and the length of the header
+    padded = text + " " * (-(before + len(text) + 1) % 64) + "\n"
+    header = np.lib.format.magic(1, 0) + len(padded).to_bytes(2, "little") + padded.encode()
+    return write_whole(path, header, memoryview(array).cast("B"))
+
+
 def write_planes(path: Path, planes: Mapping[str, Array], attributes: Mapping[str, str]) -> Stored:
     """Write channels as OpenEXR with ZIP compression, each in its own type.
 
@@ -139,7 +154,7 @@ def write_grey_png(path: Path, pixels: Array) -> Stored:
         ImageError: the file cannot be written.
     """
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 1, pixels.dtype.name)
-    spec.attribute("png:compressionLevel", PNG_LEVEL)
+    spec.attribute("png:compressionLevel", Output().png_compression)
     spec.attribute("Software", f"clpipe {__version__}")
     return _write(path, spec, pixels[..., np.newaxis])
 

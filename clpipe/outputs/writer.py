@@ -6,11 +6,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from clpipe.base.errors import ImageError, OutputError, RequestError
 from clpipe.base.files import Stored, keep_names
-from clpipe.base.types import Array
+from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain
-from clpipe.chain.formats import DNG, FORMATS, Format, ending_of
+from clpipe.chain.formats import DNG, FORMATS, NPY, Format, ending_of
 from clpipe.chain.request import CARRY, Request
 from clpipe.chain.truth import PICTURES, variance_of
 from clpipe.engine.device import Device
@@ -18,7 +20,7 @@ from clpipe.engine.runner import Result, Runner
 from clpipe.images.dng import write_dng
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import TAG_ATTRIBUTES, Tags, from_attributes, orientation_of, upright
-from clpipe.images.write import JPEG_MAX_SIDE, write_display, write_exr
+from clpipe.images.write import JPEG_MAX_SIDE, write_display, write_exr, write_npy
 from clpipe.inputs.carry import CARRIED, Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import attributes_of
@@ -80,7 +82,12 @@ class OutputWriter:
         """The formats of a rendition, by its name."""
         if baseline_named(name):  # it has no raw
             return tuple(format_ for format_ in self.formats if format_ != DNG)
-        return ("exr",) if truth_named(name) in FLOAT_MOSAICS else self.formats
+        return (self.kept_format,) if truth_named(name) in FLOAT_MOSAICS else self.formats
+
+    @property
+    def kept_format(self) -> str:
+        """The format of images of steps, and of mosaics of floats."""
+        return NPY if NPY in self.formats else "exr"
 
     def keep_of(self, name: str) -> tuple[str, ...]:
         """The steps whose image is written beside a rendition, by its name, where it has them."""
@@ -126,11 +133,11 @@ class OutputWriter:
         Raises:
             RequestError: they cannot, or a result would overwrite an input or another result.
         """
-        too_small = [f for f in self.formats if f != DNG and FORMATS[f].bits < 32]
+        too_small = [f for f in self.formats if f not in (DNG, NPY) and FORMATS[f].bits < 32]
         if too_small and chain.result is Kind.RAW:
             raise RequestError(
                 f"the chain ends in DN, which {too_small[0]} cannot hold; "
-                "end it with normalize or a later stage, or use --format dng or exr"
+                "end it with normalize or a later stage, or use --format dng, npy or exr"
             )
         if DNG in self.formats:
             negative_of(chain)  # refuses a chain without a raw
@@ -193,7 +200,8 @@ class OutputWriter:
         """
         pictures = [self.path(job, ending_of(format_), name) for format_ in self.formats_of(name)]
         pictures += self._carried_files(job, name).values()
-        kept = [self.path(job, f"{step}.exr", name) for step in self.keep_of(name)]
+        endings = (f"{step}.{self.kept_format}" for step in self.keep_of(name))
+        kept = [self.path(job, ending, name) for ending in endings]
         return Existing(self.path(job, SIDECAR, name), pictures, kept)
 
     def check_folder(self) -> None:
@@ -254,7 +262,10 @@ class OutputWriter:
         outputs: dict[Path, Stored] = {}
         whose = rendition.key, rendition.frame
         for step in (chain.step_named(name) for name in self._kept_steps(rendition)):
-            path = self.path(job, f"{step.name}.exr", rendition.name)
+            path = self.path(job, f"{step.name}.{self.kept_format}", rendition.name)
+            if self.kept_format == NPY:
+                outputs[path] = write_npy(path, typed(result.kept[step.name], step.stage.writes))
+                continue
             attributes = attributes_of(step, chain, *whose) | tag_attributes
             channels = step.stage.writes.channels
             beyond = NO_MARGINS if step.method.geometry() else step.method.margins
@@ -266,8 +277,15 @@ class OutputWriter:
             if rendition.noise:
                 assert result.final is not None
                 variance = variance_of(rendition.noise, result.final)
+                if format_ == NPY:
+                    outputs[path] = write_npy(path, variance)
+                    continue
                 attributes = variance_attributes(rendition)
                 outputs[path] = write_exr(path, variance, ("Y",), attributes)
+            elif format_ == NPY:
+                assert result.final is not None
+                image = upright(result.final, turn)
+                outputs[path] = write_npy(path, typed(image, chain.result))
             elif format_ == DNG:
                 negative = negative_of(chain)
                 raw = result.kept[negative.step] if negative.step else source.pixels
@@ -315,6 +333,17 @@ def samples(result: Result, format_: Format) -> Array:
         return result.encoded
     assert result.final is not None
     return result.final if format_.floats else to_16_bit(result.final)
+
+
+def typed(image: Floats, kind: Kind) -> Array:
+    """An image as ``.npy`` holds it: uint16 in DN, float16 of display values, else float32.
+
+    >>> typed(np.array([[511.0, 7e4]]), Kind.RAW)
+    array([[  511, 65535]], dtype=uint16)
+    """
+    if kind is Kind.RAW:
+        return np.clip(np.rint(image), 0, 65535).astype(np.uint16)
+    return image.astype(np.float16 if kind is Kind.DISPLAY else np.float32, copy=False)
 
 
 def variance_attributes(rendition: Rendition) -> dict[str, str]:
