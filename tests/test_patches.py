@@ -9,9 +9,10 @@ import pytest
 import clpipe as api
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.dataset.arrays import packed
-from clpipe.dataset.patches import Cutting, Numbering, first_place
+from clpipe.dataset.numbering import Numbering
 from clpipe.dataset.recent import Recent
 from clpipe.images.tags import FLIPS, upright
+from clpipe.outputs.patches import Cutting, first_place
 from clpipe.reference.cfa import PATTERNS
 
 ISO = 3200  # a chain that other tests compile too

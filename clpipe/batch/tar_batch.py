@@ -11,13 +11,14 @@ from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.base.errors import ImageError, OutputError
 from clpipe.base.files import keep_names, passing_files, whole_file
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, Outcome
-from clpipe.batch.tars import STAGING, Members, Tar, prepare
+from clpipe.batch.tars import OF_PATCHES, STAGING, Members, Tar, prepare
 from clpipe.batch.threads import Batch
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.chain import Chain
@@ -26,8 +27,11 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.existing import is_current
 from clpipe.outputs.folder import RESUMABLE
-from clpipe.outputs.sidecar import SIDECAR, outputs_in, read_sidecar
+from clpipe.outputs.sidecar import SIDECAR, outputs_in, patch_text, read_sidecar
 from clpipe.outputs.writer import OutputWriter
+
+# Where the bytes of a member are: in a file, or at an offset and size in the old tar; or they.
+Source = Path | tuple[int, int] | bytes
 
 COPIED = 1 << 20  # bytes at a time; tarfile's 16 KiB take three times as long
 
@@ -38,9 +42,10 @@ class StagedWriter(OutputWriter):
 
     folders: Mapping[str, str] = field(default_factory=dict)  # by the stem of a job
 
-    def path(self, job: Job, ending: str, name: str = "") -> Path:
+    def path(self, job: Job, ending: str, name: str = "", patch: int | None = None) -> Path:
         """The file of a job with an ending, until it is packed."""
-        return self.folder / self.folders[job.stem] / f"{job.stem}{name}.{ending}"
+        path = super().path(job, ending, name, patch).relative_to(self.folder)
+        return self.folder / self.folders[job.stem] / path
 
 
 class Packer:
@@ -58,7 +63,11 @@ class Packer:
         return Members(self._tar.path)
 
     def _member(self, job: Job, name: str) -> str:
-        path = self._writer.path(job, SIDECAR, name)
+        """The name of a rendition's sidecar in the tar."""
+        folder = OF_PATCHES if self._writer.patches else ""
+        return folder + self._packed_as(self._writer.path(job, SIDECAR, name))
+
+    def _packed_as(self, path: Path) -> str:
         return path.relative_to(self._tar.staging).as_posix()
 
     def has(self, job: Job, name: str, request: Mapping[str, Any], verify: bool) -> bool:
@@ -74,7 +83,8 @@ class Packer:
         pictures = {path.name for path in self._writer.existing(job, name).pictures}
         if not pictures <= listed.keys() or not is_current(values, job, request, verify):
             return False
-        files = {str(PurePosixPath(member).with_name(n)): was for n, was in listed.items()}
+        beside = PurePosixPath(member.removeprefix(OF_PATCHES))
+        files = {str(beside.with_name(n)): was for n, was in listed.items()}
         if any(self._old.sha256(file) != was["sha256"] for file, was in files.items()):
             return False
         self._reused[member] = list(files)
@@ -111,25 +121,46 @@ class Packer:
             raise OutputError(f"{error.filename}: has gone; {RESUMABLE}") from None
         shutil.rmtree(self._tar.staging, ignore_errors=True)
 
-    def _members(self) -> Iterator[tuple[str, Path | tuple[int, int]]]:
-        """The members of the tar, in order: the name of each, and where its bytes are, in a file or
-        at an offset and size in the old tar.
-        """
+    def _members(self) -> Iterator[tuple[str, Source]]:
+        """The members of the tar, in order."""
         for job in self._tar.jobs:
-            if self._statuses[job.stem] not in (DONE, SKIPPED):
-                continue
-            for name in self._writer.names_of(job):
-                member = self._member(job, name)
-                if files := self._reused.get(member):
-                    for file in (*files, member):
-                        yield file, self._old.places[file]
-                    continue
-                sidecar = self._writer.path(job, SIDECAR, name)
-                paths = [sidecar.with_name(n) for n in outputs_in(read_sidecar(sidecar))]
-                for path in (*paths, sidecar):
-                    yield path.relative_to(self._tar.staging).as_posix(), path
+            if self._statuses[job.stem] in (DONE, SKIPPED):
+                members = self._members_of(job)
+                yield from self._by_patch(job, members) if self._writer.patches else members
 
-    def _write(self, members: Sequence[tuple[str, Path | tuple[int, int]]]) -> None:
+    def _members_of(self, job: Job) -> Iterator[tuple[str, Source]]:
+        for name in self._writer.names_of(job):
+            member = self._member(job, name)
+            if files := self._reused.get(member):
+                for file in (*files, member):
+                    yield file, self._old.places[file]
+                continue
+            sidecar = self._writer.path(job, SIDECAR, name)
+            for path in (sidecar.with_name(n) for n in outputs_in(read_sidecar(sidecar))):
+                yield self._packed_as(path), path
+            yield member, sidecar
+
+    def _by_patch(
+        self, job: Job, members: Iterator[tuple[str, Source]]
+    ) -> Iterator[tuple[str, Source]]:
+        """The same with the files of each patch together, and what is said of it behind them."""
+        first, *_ = names = [self._member(job, name) for name in self._writer.names_of(job)]
+        samples: dict[str, list[tuple[str, Source]]] = {}
+        for member, source in members:
+            if member in names:
+                yield member, source
+            else:
+                key = member[: member.index(".", member.rfind("/") + 1)]
+                samples.setdefault(key, []).append((member, source))
+        if first in self._reused:
+            values = self._old.sidecar(first)
+        else:
+            values = read_sidecar(self._writer.path(job, SIDECAR, self._writer.names_of(job)[0]))
+        for number, (key, files) in enumerate(samples.items()):
+            yield from files
+            yield f"{key}.{SIDECAR}", patch_text(values, number).encode()
+
+    def _write(self, members: Sequence[tuple[str, Source]]) -> None:
         with (
             whole_file(self._tar.path) as file,
             tarfile.TarFile(
@@ -142,6 +173,10 @@ class Packer:
         ):
             for name, source in members:
                 info = tarfile.TarInfo(name)  # mtime, uid and gid are 0, the mode is 0644
+                if isinstance(source, bytes):
+                    info.size = len(source)
+                    tar.addfile(info, BytesIO(source))
+                    continue
                 with open(source if isinstance(source, Path) else self._tar.path, "rb") as data:
                     if isinstance(source, Path):
                         info.size = os.fstat(data.fileno()).st_size

@@ -23,6 +23,8 @@ NUMBERED = re.compile(rf"({re.escape(STAGING)})?(\d{{6,}})\.tar")
 # What tarfile raises for a damaged tar; a header may claim more bytes than a number or memory has.
 DAMAGED = (OSError, tarfile.TarError, ValueError, OverflowError, MemoryError)
 
+OF_PATCHES = "__clpipe__/"  # the folder for the sidecars of images whose samples are patches
+
 HIDDEN_BY_READERS = re.compile("__[^/]*__/")  # the webdataset package skips such folders
 
 

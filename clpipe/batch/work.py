@@ -21,11 +21,13 @@ from clpipe.chain.depth import lenses_of
 from clpipe.chain.formats import DNG
 from clpipe.engine.clipping import clipped_share
 from clpipe.engine.device import Device, Timing
+from clpipe.engine.extents import Box
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
+from clpipe.outputs.patches import Patch, every_patch
 from clpipe.outputs.renditions import Rendition
 from clpipe.outputs.sidecar import SIDECAR, intrinsics_of, sidecar, write_sidecar
 from clpipe.outputs.writer import OutputWriter
@@ -53,6 +55,7 @@ class Task:
     outputs: list[str] = field(default_factory=list)
     carried: Carried | None = None  # until it is written
     clipped: float = 0.0  # the share of clipped pixels, of the rendition that has most
+    patches: list[Patch] = field(default_factory=list)  # that are made in place of pictures
 
     @contextmanager
     def timed(self, step: str) -> Iterator[None]:
@@ -211,6 +214,9 @@ class ImageWorker:
             return
         self.writer.check_size(loaded.source, loaded.chain)
         intrinsics_of(loaded.chain, loaded.source)  # or they are refused
+        if patches := self.writer.patches:
+            height, width = loaded.source.pixels.shape[:2]
+            task.patches = every_patch(patches, loaded.chain, width, height, job.key)
         if any(self.writer.carries(job, name) for name in names):
             turn = self.writer.turn_of(loaded.source, loaded.chain)
             task.carried = task.loader.carried(job, loaded, turn)
@@ -247,7 +253,9 @@ class ImageWorker:
         assert task.source
         start, pixels = time.perf_counter(), task.source.pixels
         timings: list[Timing] | None = [] if self._trace and runner.device else None
-        wait = self._tried(task, partial(self._submit, pixels, rendition, runner, timings))
+        boxes = [patch.box for patch in task.patches]
+        work = partial(self._submit, pixels, rendition, runner, timings, boxes)
+        wait = self._tried(task, work)
 
         def finish() -> Result | None:
             result = self._tried(task, wait) if wait else None
@@ -267,14 +275,20 @@ class ImageWorker:
         return finish
 
     def _submit(
-        self, pixels: Array, rendition: Rendition, runner: Runner, timings: list[Timing] | None
+        self,
+        pixels: Array,
+        rendition: Rendition,
+        runner: Runner,
+        timings: list[Timing] | None,
+        boxes: Sequence[Box],
     ) -> Callable[[], Result]:
         """Have a runner begin with an image, whose pixels nobody changes."""
         width, height = runner.chain.size(*pixels.shape[1::-1])
         shape = (height, width, *pixels.shape[2:])
-        into = self._spare.take(shape) if runner.encode and runner.device else None
+        reused = runner.encode and runner.device and not boxes
+        into = self._spare.take(shape) if reused else None
         key = rendition.noise_key
-        return runner.submit(pixels, key, timings, into=into, unchanged=True)
+        return runner.submit(pixels, key, timings, into=into, unchanged=True, boxes=boxes)
 
     @staticmethod
     def _tried(task: Task, work: Callable[[], T]) -> T | None:
@@ -300,7 +314,7 @@ class ImageWorker:
                 carried = None
                 if writer.carries(job, rendition.name):
                     carried, task.carried = task.carried, None
-                files = writer.write(job, rendition, task.source, result, carried)
+                files = writer.write(job, rendition, task.source, result, carried, task.patches)
                 clipped = None if rendition.noise else clipped_share(result, rendition.chain)
                 task.clipped = max(task.clipped, clipped or 0.0)
                 path = writer.path(job, SIDECAR, rendition.name)
@@ -316,13 +330,14 @@ class ImageWorker:
                     files,
                     clipped,
                     carried,
+                    task.patches,
                 )
                 write_sidecar(path, record)
                 task.outputs += [str(f.relative_to(writer.folder)) for f in (*files, path)]
             except (ImageError, MemoryError) as error:
                 writer.check_folder()
                 task.error = task.loader.error_text(job, error)
-        if result.encoded is not None and device:
+        if result.encoded is not None and device and not task.patches:
             self._spare.give(result.encoded)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
@@ -31,7 +31,7 @@ LISTS = ("stage_files", "formats", "keep", "carry", "companions")  # of texts
 # What decides about the bytes of a picture. The rest decides which pictures are made, or whether.
 RECORDED = (
     *("config", "options", "image", "start_at", "until", "stage_files", "image_name"),
-    *("layer", "transfer", "formats", "keep", *CARRY),
+    *("layer", "transfer", "formats", "keep", "patch", "patches_per_image", "augment", *CARRY),
 )
 
 
@@ -63,6 +63,9 @@ class Request:
         bracket: what is added to the exposure's EV, for each exposure that is made of each image;
             () is one exposure.
         baselines: which of :data:`clpipe.chain.baseline.BASELINES` are made beside each picture.
+        patch: the sides of patches in px, which are written in place of pictures; None is pictures.
+        patches_per_image: how many of each picture, at random places, or "grid"; 0 without patches.
+        augment: whether patches are flipped and turned.
     """
 
     config: Mapping[str, Any] | None = None
@@ -85,6 +88,9 @@ class Request:
     truth_keep: tuple[str, ...] | None = None
     bracket: tuple[float, ...] = ()
     baselines: tuple[str, ...] = ()
+    patch: int | None = None
+    patches_per_image: int | Literal["grid"] = 0
+    augment: bool = False
 
     @classmethod
     def from_options(
@@ -171,7 +177,10 @@ class Request:
         are_texts = all(
             isinstance(text, str) for text in (request.image_name, *filter(None, texts))
         )
-        if not are_texts or not all(isinstance(table, Mapping) for table in tables):
+        numbers = request.patch or 1, request.patches_per_image or 1
+        are_numbers = all((type(n) is int and n > 0) or n == "grid" for n in numbers)
+        are_tables = all(isinstance(table, Mapping) for table in tables)
+        if not (are_texts and are_numbers and are_tables):
             raise RequestError("the request in it is damaged: a value is of the wrong type")
         request.carried()  # refuses what is wrong
         return request

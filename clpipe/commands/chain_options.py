@@ -5,6 +5,7 @@ from typing import Any
 
 import click
 
+from clpipe.base.errors import RequestError
 from clpipe.chain.files import built_in_configs
 from clpipe.chain.formats import EVERY_FORMAT
 from clpipe.chain.request import DEFAULTS
@@ -17,6 +18,7 @@ from clpipe.commands.completion import (
     steps_or_all,
 )
 from clpipe.commands.options import stage_file_option
+from clpipe.outputs.patches import MOST, PER_IMAGE
 from clpipe.reference.carried import RESAMPLING
 
 camera_option = click.option(
@@ -134,6 +136,47 @@ keep_option = click.option(
     shell_complete=steps_or_all,
     help="Write the image of a stage, too, as float EXR; may be repeated.",
 )
+
+_PATCH_OPTIONS = (
+    click.option(
+        "--patch",
+        type=click.IntRange(1),
+        metavar="SIZE",
+        help="Write square patches, SIZE px a side, in place of pictures, OUT/NAME_0000.jpg and "
+        "so on, with the bits that the picture has there. Images of --keep are .npy.",
+    ),
+    click.option(
+        "--patches-per-image",
+        callback=lambda _context, _option, text: None if text is None else patch_count(text),
+        metavar="N|grid",
+        help="How many, at random places, or all side by side that cover the picture. "
+        f"[default: {PER_IMAGE}]",
+    ),
+    click.option(
+        "--augment",
+        is_flag=True,
+        help="Flip patches and turn them by 90 degrees, at random; the CFA pattern stays.",
+    ),
+)
+
+
+def patch_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The options that say which patches are written."""
+    return _with(function, *_PATCH_OPTIONS)
+
+
+def patch_count(text: str) -> int | str:
+    """How many patches of an image: a number, or "grid".
+
+    Raises:
+        RequestError: it is neither.
+    """
+    if text == "grid":
+        return text
+    if text.isascii() and text.isdigit() and 0 < int(text) <= MOST:
+        return int(text)
+    raise RequestError(f"--patches-per-image: found {text!r}; expected 1 to {MOST}, or grid")
+
 
 carry_option = click.option(
     "--carry",

@@ -8,7 +8,6 @@ from rich.console import Console
 from clpipe.base.text import one_line
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
 from clpipe.batch.run_log import Summary
-from clpipe.chain.formats import ending_of
 from clpipe.engine.clipping import clipping_text
 from clpipe.outputs.writer import OutputWriter
 
@@ -86,7 +85,7 @@ class Reporter:
 
     def _files(self, outcome: Outcome) -> str:
         first, *others = self._writer.names_of(outcome.job)
-        text = str(self._writer.path(outcome.job, ending_of(self._writer.formats[0]), first))
+        text = str(self._writer.existing(outcome.job, first).pictures[0])
         if others:
             text += f" and {len(others)} more"
         seconds = sum(outcome.seconds(step) for step in self._summary.seconds)

@@ -2,6 +2,7 @@
 
 import logging
 import sys
+from collections.abc import Mapping
 from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from clpipe.commands.chain_options import (
     depth_png_option,
     format_option,
     keep_option,
+    patch_options,
     series_options,
 )
 from clpipe.commands.input_options import (
@@ -49,6 +51,7 @@ from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.poses import with_views
 from clpipe.inputs.series import Series, parse_isos
 from clpipe.outputs.folder import output_folder, remove_unfinished
+from clpipe.outputs.patches import PER_IMAGE
 from clpipe.outputs.renditions import parse_bracket
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
@@ -108,6 +111,7 @@ from clpipe.stage import Kind
 @companion_option
 @depth_png_option
 @format_option
+@patch_options
 @click.option(
     "--keep-suffix",
     is_flag=True,
@@ -233,6 +237,7 @@ def run(
         except RequestError as error:
             raise RequestError(f"{replay}: {error}") from None
     else:
+        options |= {"patches_per_image": patch_count_of(options)}
         request = Request.from_options(
             camera=series.camera, iso=series.iso, max_pixels=max_pixels, **options
         )
@@ -284,6 +289,19 @@ def run(
     if summary.interrupted:
         sys.exit(130)
     sys.exit(1 if summary.failures or summary.is_fruitless else 0)
+
+
+def patch_count_of(options: Mapping[str, Any]) -> Any:
+    """How many patches of an image, or "grid"; 0 is none.
+
+    Raises:
+        RequestError: they are set, but no patches are asked for.
+    """
+    patch, count, augment = (options[n] for n in ("patch", "patches_per_image", "augment"))
+    if patch is None and (count is not None or augment):
+        option = "--augment" if augment else "--patches-per-image"
+        raise RequestError(f"{option}: it is about patches; say --patch SIZE as well")
+    return 0 if patch is None else count or PER_IMAGE
 
 
 def check_read_options(request: Request, chain: Chain) -> None:

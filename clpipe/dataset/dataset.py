@@ -19,12 +19,13 @@ from clpipe.chain.request import Request
 from clpipe.chain.truth import DEVELOPMENT, adds_noise
 from clpipe.dataset.arrays import Form, dtype_named
 from clpipe.dataset.developer import Sample, Wanted
-from clpipe.dataset.patches import Numbering, Patches
+from clpipe.dataset.numbering import Numbering
 from clpipe.dataset.samples import Maker, Work
 from clpipe.images.openimageio import set_codec_threads
 from clpipe.images.read import TRANSFERS
 from clpipe.inputs.find import Job, find_jobs
 from clpipe.inputs.loader import ImageLoader, LoadedImage
+from clpipe.outputs.patches import PER_IMAGE, Patches
 from clpipe.pipeline import plain
 
 NOWHERE = Path(os.devnull)  # nothing is written
@@ -127,7 +128,7 @@ class Dataset(ReadOnly):
         transfer: str | None = None,
         exclude: str | Sequence[str] = (),
         patch: int | None = None,
-        patches_per_image: int | Literal["grid"] = 16,
+        patches_per_image: int | Literal["grid"] = PER_IMAGE,
         augment: bool = False,
         raw: Literal["packed", "mosaic"] | None = None,
         variance: bool = False,

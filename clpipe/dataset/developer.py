@@ -12,15 +12,13 @@ import numpy as np
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, Step
-from clpipe.chain.truth import noisy_mosaic, picture_without_noise, signal_and_noise, variance_of
+from clpipe.chain.truth import noisy_mosaic, picture_without_noise
 from clpipe.dataset.arrays import Form
-from clpipe.dataset.patches import Patch
 from clpipe.dataset.recent import Recent
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
-from clpipe.outputs.negative import negative_of
-from clpipe.reference.cfa import Pattern
-from clpipe.stage import Access, Kind
+from clpipe.outputs.patches import Patch, facts_of, pattern_of, variance_at, variance_steps
+from clpipe.stage import Kind
 
 Sample = dict[str, Any]
 KEPT = 1024  # chains, of 50 KB each, since patches of one image may be asked for at any time
@@ -72,44 +70,6 @@ def raw_step(chain: Chain, form: Form) -> str:
             "or say dtype='float32' for a raw in signal"
         )
     return names[-1]
-
-
-def variance_steps(chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
-    """See :func:`signal_and_noise`; the steps are of single pixels, so that patches have it, too.
-
-    Raises:
-        RequestError: as there, or a step reads the pixels around each.
-    """
-    signal, noise = signal_and_noise(chain)
-    for step in noise:
-        if any(pass_.access is Access.STENCIL for pass_ in step.method.passes()):
-            raise RequestError(
-                f"variance: {step.name} mixes the noise of neighbours; move it before the noise or "
-                "behind the raw"
-            )
-    return signal, noise
-
-
-def pattern_of(chain: Chain) -> Pattern:
-    """The CFA pattern of a chain's mosaic."""
-    last = chain.steps[-1]
-    return last.method.after(last.context).pattern
-
-
-def facts_of(chain: Chain) -> Sample:
-    """What a sample says of its camera and its raw."""
-    facts: Sample = {"camera": chain.camera.name, "seed": chain.seed}
-    try:
-        raw = negative_of(chain)
-    except RequestError:  # there is no raw
-        return facts
-    return facts | {
-        "cfa": raw.pattern,
-        "black_level": float(raw.black_level),
-        "white_level": float(raw.white_level),
-        "gains": np.array([raw.gains[0], 1, raw.gains[1]], np.float32),
-        "xyz_to_camera": raw.xyz_to_camera.astype(np.float32),
-    }
 
 
 @dataclass(frozen=True)
@@ -254,19 +214,3 @@ def last_until(truth: Chain, chain: Chain, name: str) -> str:
     names = [step.name for step in chain.steps]
     until = names[: names.index(name) + 1]
     return [step.name for step in truth.steps if step.name in until][-1]
-
-
-def variance_at(noise: Sequence[Step], signal: Array, patch: Patch | None) -> Array:
-    """See :func:`variance_of`, of a patch of an image.
-
-    Args:
-        noise: the steps.
-        signal: what enters them, of the patch or of the whole image.
-        patch: where it is.
-    """
-    if patch is None:
-        return variance_of(noise, signal)
-    # A row and a column more, so that the first pixel has the colour of an image's first one.
-    x, y = patch.left % 2, patch.top % 2
-    padded = np.pad(signal, ((y, 0), (x, 0), (0, 0))[: signal.ndim], mode="edge")
-    return variance_of(noise, padded)[y:, x:]

@@ -12,8 +12,7 @@ from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.carry import VALID
 from clpipe.chain.identity import noise_key, of_frame
-from clpipe.dataset.developer import KEPT, Developer, Sample, Wanted, pattern_of
-from clpipe.dataset.patches import Cutting, Patch, Patches
+from clpipe.dataset.developer import KEPT, Developer, Sample, Wanted
 from clpipe.dataset.recent import Recent
 from clpipe.engine.device import open_device
 from clpipe.images.read import SourceImage
@@ -21,6 +20,7 @@ from clpipe.inputs.carry import Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.inputs.raw import RawImage
+from clpipe.outputs.patches import Patch, Patches
 
 _opening = threading.Lock()
 
@@ -85,7 +85,8 @@ class Maker:
         if self.patches.per_image != "grid":
             return self.patches.per_image
         with self._errors_of(job):
-            return self._cutting(self.patches, self.read(Work(job, epoch, ()))[0]).count
+            loaded, _ = self.read(Work(job, epoch, ()))
+            return self.patches.cutting(loaded.chain, *loaded.source.pixels.shape[1::-1]).count
 
     def read(self, work: Work) -> tuple[LoadedImage, Sample]:
         """An image, and the layers that go along with its picture."""
@@ -130,9 +131,9 @@ class Maker:
         patches: list[Patch] = []
         with self._errors_of(job):
             if self.patches:
-                cutting = self._cutting(self.patches, loaded)
-                owner = f"patch:{chain.seed}:{job.key}:{work.epoch}"
-                patches = self.patches.cut(cutting, work.numbers, owner)
+                size = loaded.source.pixels.shape[1::-1]
+                cutting = self.patches.cutting(chain, *size)
+                patches = self.patches.cut(cutting, work.numbers, chain, job.key, work.epoch)
             else:
                 self._wanted.form.check_size(*chain.size(*loaded.source.pixels.shape[1::-1]))
             begun = self._developer().begin(chain, loaded.source.pixels, key, patches)
@@ -176,12 +177,6 @@ class Maker:
             if self._opened is None or self._opened.process != os.getpid():
                 self._opened = Developer(open_device(self._device), self._wanted)
             return self._opened
-
-    @staticmethod
-    def _cutting(patches: Patches, loaded: LoadedImage) -> Cutting:
-        chain = loaded.chain
-        size = chain.size(*loaded.source.pixels.shape[1::-1])
-        return patches.cutting(*size, pattern_of(chain))
 
 
 def check_turns(carried: Carried) -> None:

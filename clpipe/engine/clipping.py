@@ -14,7 +14,7 @@ COUNTED = 1 << 18  # pixels, at least, where an image has as many; all would tak
 
 
 def clipped_share(result: Result, chain: Chain) -> float | None:
-    """The share of clipped pixels in the last image of a chain, 0 to 1.
+    """The share of clipped pixels in the last image of a chain, or in its patches, 0 to 1.
 
     A pixel is clipped where any of its channels is at the upper end: that of display values, or the
     white level of a raw. Of large images, pixels on a grid are counted.
@@ -37,6 +37,8 @@ def clipped_share(result: Result, chain: Chain) -> float | None:
         top = last.method.after(last.context).white_level
     if image is None or top is None:
         return None
+    has_channels = len(kind.channels) > 1
+    image = image.reshape(-1, *image.shape[-1 - has_channels :])  # patches below each other
     step = max(math.isqrt(image.shape[0] * image.shape[1] // COUNTED), 1)
     counted = image[::step, ::step]
     channels = counted.reshape(*counted.shape[:2], -1)

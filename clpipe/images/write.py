@@ -44,7 +44,8 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> Stored:
     """Write a picture, (height, width[, 3]), as JPEG, PNG or TIFF, with EXIF.
 
     Whole numbers of 8 or 16 bits get an sRGB profile; float samples (TIFF) do not. ``tags.output``
-    says how a JPEG and a PNG are encoded. The EXIF of a TIFF lacks the ISO, which OpenImageIO cannot write.
+    says how a JPEG and a PNG are encoded. The EXIF of a TIFF lacks the ISO, which OpenImageIO
+    cannot write.
 
     Raises:
         ImageError: the file cannot be written.
@@ -126,7 +127,7 @@ def write_npy(path: Path, array: Array) -> Stored:
     before = len(np.lib.format.MAGIC_PREFIX) + 4  # the version, and the length of the header
     padded = text + " " * (-(before + len(text) + 1) % 64) + "\n"
     header = np.lib.format.magic(1, 0) + len(padded).to_bytes(2, "little") + padded.encode()
-    return write_whole(path, header, memoryview(array).cast("B"))
+    return write_whole(path, header, array.data.cast("B"))
 
 
 def write_planes(path: Path, planes: Mapping[str, Array], attributes: Mapping[str, str]) -> Stored:

@@ -3,7 +3,7 @@
 import json
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, lru_cache
 from importlib.metadata import version
@@ -23,12 +23,17 @@ from clpipe.images.write import versions
 from clpipe.inputs.carry import Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.raw import RawImage
+from clpipe.outputs.patches import Patch, facts_of
 from clpipe.outputs.renditions import Rendition
 from clpipe.reference.intrinsics import Intrinsics
 
 SIDECAR = "json"  # the ending of its name
 
 OWN = "clpipe"  # the first key of every sidecar
+
+FACTS, PATCHES = "facts", "patches"  # keys of a sidecar of patches
+
+SAID = ("image_key", "noise_key", "iso", "noise")  # keys of a sidecar that its patches have, too
 
 BEGINNING = f'{{\n  "{OWN}": '.encode()
 
@@ -139,6 +144,7 @@ def sidecar(
     outputs: Mapping[Path, Stored],
     clipped: float | None,
     carried: Carried | None = None,
+    patches: Sequence[Patch] = (),
 ) -> dict[str, Any]:
     """Everything that is needed to make the files of a rendition again, as JSON values.
 
@@ -154,6 +160,7 @@ def sidecar(
         outputs: the files.
         clipped: the share of clipped pixels, 0 to 1; None where the image has no upper end.
         carried: layers that were written beside it.
+        patches: that were written in place of the picture.
     """
     chain = rendition.whole
     facts = source.facts if isinstance(source, RawImage) else None
@@ -191,6 +198,7 @@ def sidecar(
             else each
             for each in stage_records(chain)
         ],
+        **(patch_records(chain, patches) if patches else {}),
         "clipped": clipped if clipped is None else round(clipped, 4),
         "outputs": [
             {"name": path.name, "size": file.size, "sha256": file.sha256}
@@ -204,6 +212,23 @@ def sidecar(
         "versions": all_versions(),
         "request": request,
     }
+
+
+def patch_records(chain: Chain, patches: Sequence[Patch]) -> dict[str, Any]:
+    """What a sidecar says of patches, as JSON values: of the raw of all, and where each is."""
+    facts = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in facts_of(chain).items()}
+    places = [{"place": [patch.left, patch.top], "turn": patch.turn} for patch in patches]
+    return {FACTS: facts, PATCHES: places}
+
+
+def patch_text(values: Mapping[str, Any], number: int) -> str:
+    """What is said of one patch, by its number, in the sidecar's values, as JSON.
+
+    Raises:
+        KeyError, TypeError, IndexError: the values are damaged.
+    """
+    said = {key: values[key] for key in SAID}
+    return json_text({OWN: values[OWN], **said, **values[FACTS], **values[PATCHES][number]})
 
 
 @lru_cache(maxsize=8)

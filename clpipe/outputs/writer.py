@@ -1,8 +1,9 @@
 """Writes the pictures of a run: which files, under which names, in which formats."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain
 from clpipe.chain.formats import DNG, FORMATS, NPY, Format, ending_of
 from clpipe.chain.request import CARRY, Request
-from clpipe.chain.truth import PICTURES, variance_of
+from clpipe.chain.truth import PICTURES, VARIANCE
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.dng import write_dng
@@ -28,6 +29,7 @@ from clpipe.outputs.carried import write_carried
 from clpipe.outputs.existing import Existing
 from clpipe.outputs.folder import RESUMABLE, write_problem
 from clpipe.outputs.negative import negative_of
+from clpipe.outputs.patches import Patch, Patches, patch_name, variance_at, variance_steps
 from clpipe.outputs.renditions import (
     FLOAT_MOSAICS,
     Rendition,
@@ -87,7 +89,15 @@ class OutputWriter:
     @property
     def kept_format(self) -> str:
         """The format of images of steps, and of mosaics of floats."""
-        return NPY if NPY in self.formats else "exr"
+        return NPY if NPY in self.formats or self.patches else "exr"
+
+    @property
+    def patches(self) -> Patches | None:
+        """Which patches are written in place of pictures."""
+        request = self.request
+        if request.patch is None:
+            return None
+        return Patches(request.patch, request.patches_per_image, request.augment)
 
     def keep_of(self, name: str) -> tuple[str, ...]:
         """The steps whose image is written beside a rendition, by its name, where it has them."""
@@ -143,6 +153,8 @@ class OutputWriter:
             negative_of(chain)  # refuses a chain without a raw
         for plan in {self.plan_of(job) for job in jobs}:
             plan.renditions(chain, "")  # refuses a chain that has no such truth
+        if self.patches:
+            self._check_patches(chain)
         endings: dict[str, str] = {}
         for format_ in self.formats:
             other = endings.setdefault(ending_of(format_), format_)
@@ -152,6 +164,26 @@ class OutputWriter:
                     "run them into different folders"
                 )
         self._check_paths(jobs)
+
+    def _check_patches(self, chain: Chain) -> None:
+        """See that patches of a chain's pictures can be written.
+
+        Raises:
+            RequestError: they cannot.
+        """
+        for format_ in self.formats:
+            if format_ == DNG or FORMATS[format_].ending == "exr":
+                raise RequestError(
+                    f"--patch: {format_} holds whole images; write patches with --format npy, png, "
+                    "tif or jpg"
+                )
+        if self.request.carry:
+            raise RequestError(
+                "--patch: no layers go along with patches in files; leave --carry out, or use "
+                "clpipe.Dataset"
+            )
+        if VARIANCE in self.request.truths:
+            variance_steps(chain)  # refuses steps that mix the noise of neighbours
 
     def _check_paths(self, jobs: Sequence[Job]) -> None:
         """See that no file that may be written is an input or the file of another job.
@@ -180,9 +212,12 @@ class OutputWriter:
                         )
                     makers[path] = job
 
-    def path(self, job: Job, ending: str, name: str = "") -> Path:
-        """The file of a job with an ending; ``name`` is that of the rendition."""
-        return self.folder / f"{job.stem}{name}.{ending}"
+    def path(self, job: Job, ending: str, name: str = "", patch: int | None = None) -> Path:
+        """The file of a job with an ending.
+
+        ``name`` is that of the rendition, ``patch`` the number of a patch of it.
+        """
+        return self.folder / f"{job.stem}{patch_name(patch)}{name}.{ending}"
 
     def check_size(self, source: SourceImage, chain: Chain) -> None:
         """See that what a chain makes of an image fits into the formats.
@@ -196,12 +231,16 @@ class OutputWriter:
 
     def existing(self, job: Job, name: str) -> Existing:
         """The files of a rendition, by its name. A kept image of a step before ``start_at`` is
-        never written, so kept images need not be there.
+        never written, so kept images need not be there. Of a grid of patches, whose number follows
+        from the image, the first is named.
         """
-        pictures = [self.path(job, ending_of(format_), name) for format_ in self.formats_of(name)]
+        count = self.patches.least if self.patches else 0
+        numbers = range(count) if self.patches else (None,)
+        endings = [ending_of(format_) for format_ in self.formats_of(name)]
+        pictures = [self.path(job, ending, name, n) for n in numbers for ending in endings]
         pictures += self._carried_files(job, name).values()
-        endings = (f"{step}.{self.kept_format}" for step in self.keep_of(name))
-        kept = [self.path(job, ending, name) for ending in endings]
+        endings = [f"{step}.{self.kept_format}" for step in self.keep_of(name)]
+        kept = [self.path(job, ending, name, n) for n in numbers for ending in endings]
         return Existing(self.path(job, SIDECAR, name), pictures, kept)
 
     def check_folder(self) -> None:
@@ -231,8 +270,9 @@ class OutputWriter:
         source: SourceImage,
         result: Result,
         carried: Carried | None = None,
+        patches: Sequence[Patch] = (),
     ) -> dict[Path, Stored]:
-        """Write the images of one rendition.
+        """Write the images of one rendition, or of patches of it.
 
         Args:
             job: the image.
@@ -240,6 +280,7 @@ class OutputWriter:
             source: the image, as it was loaded.
             result: what the rendition's :meth:`runner` made of it.
             carried: layers that are written beside it.
+            patches: of which the result is; () is all of the picture.
 
         Returns:
             The files.
@@ -249,20 +290,37 @@ class OutputWriter:
             OutputError: the output folder has gone.
         """
         self._make_folder_of(job)
+        outputs: dict[Path, Stored] = {}
+        for number, part in parts_of(rendition, result, patches):
+            outputs |= self._write(job, rendition, source, part, number)
+        if carried:
+            for layer, path in self._carried_files(job, rendition.name).items():
+                outputs[path] = write_carried(path, carried, layer)
+        return outputs
+
+    def _write(
+        self, job: Job, rendition: Rendition, source: SourceImage, result: Result, patch: int | None
+    ) -> dict[Path, Stored]:
+        """Write the images of one rendition, or of a patch of it, by its number; see :meth:`write`.
+
+        The last image of a variance map is the variance.
+        """
         chain, camera = rendition.chain, rendition.chain.camera
         tags, orientation = from_attributes(
             source.attributes, Tags(camera.make, camera.model, chain.iso)
         )
         output = chain.settings.output.filled({**source.shot, **tags.shot})
+        if patch is not None:  # which has not the width of the sensor
+            output = output.model_copy(update={"sensor_width": None})
         tags = replace(tags, output=output)
         tag_attributes = {
             name: source.attributes[name] for name in TAG_ATTRIBUTES if name in source.attributes
         }
-        turn = self.turn_of(source, chain)
+        turn = self.turn_of(source, chain) if patch is None else 1
         outputs: dict[Path, Stored] = {}
         whose = rendition.key, rendition.frame
         for step in (chain.step_named(name) for name in self._kept_steps(rendition)):
-            path = self.path(job, f"{step.name}.{self.kept_format}", rendition.name)
+            path = self.path(job, f"{step.name}.{self.kept_format}", rendition.name, patch)
             if self.kept_format == NPY:
                 outputs[path] = write_npy(path, typed(result.kept[step.name], step.stage.writes))
                 continue
@@ -273,15 +331,11 @@ class OutputWriter:
                 path, result.kept[step.name], channels, attributes, margins=beyond
             )
         for format_ in self.formats_of(rendition.name):
-            path = self.path(job, ending_of(format_), rendition.name)
-            if rendition.noise:
+            path = self.path(job, ending_of(format_), rendition.name, patch)
+            if rendition.noise and format_ != NPY:
                 assert result.final is not None
-                variance = variance_of(rendition.noise, result.final)
-                if format_ == NPY:
-                    outputs[path] = write_npy(path, variance)
-                    continue
                 attributes = variance_attributes(rendition)
-                outputs[path] = write_exr(path, variance, ("Y",), attributes)
+                outputs[path] = write_exr(path, result.final, ("Y",), attributes)
             elif format_ == NPY:
                 assert result.final is not None
                 image = upright(result.final, turn)
@@ -301,9 +355,6 @@ class OutputWriter:
             else:
                 pixels = upright(samples(result, FORMATS[format_]), turn)
                 outputs[path] = write_display(path, pixels, tags)
-        if carried:
-            for layer, path in self._carried_files(job, rendition.name).items():
-                outputs[path] = write_carried(path, carried, layer)
         return outputs
 
     def _make_folder_of(self, job: Job) -> None:
@@ -324,6 +375,38 @@ class OutputWriter:
                 keep_names(self.folder / place)
         except OSError as error:
             raise ImageError(f"{folder}: cannot be made: {error.strerror}") from None
+
+
+def parts_of(
+    rendition: Rendition, result: Result, patches: Sequence[Patch]
+) -> Iterator[tuple[int | None, Result]]:
+    """What is written of a result: all of it, or each of its patches, turned, with its number.
+
+    The last image of a variance map becomes the variance.
+    """
+    if not patches:
+        yield None, with_variance(result, rendition, None)
+    for number, patch in enumerate(patches):
+        part = with_variance(mapped(result, itemgetter(number)), rendition, patch)
+        yield number, mapped(part, patch.turned)
+
+
+def with_variance(result: Result, rendition: Rendition, patch: Patch | None) -> Result:
+    """A result whose last image is the variance of the noise, if the rendition is a map of it."""
+    if not rendition.noise:
+        return result
+    assert result.final is not None
+    return replace(result, final=variance_at(rendition.noise, result.final, patch))
+
+
+def mapped(result: Result, change: Callable[[Array], Array]) -> Result:
+    """A result whose images are changed."""
+    return Result(
+        None if result.final is None else change(result.final),
+        None if result.encoded is None else change(result.encoded),
+        {name: change(image) for name, image in result.kept.items()},
+        result.estimates,
+    )
 
 
 def samples(result: Result, format_: Format) -> Array:

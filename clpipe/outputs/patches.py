@@ -1,22 +1,26 @@
-"""Where in a picture patches are cut, how they are turned, and how samples are numbered. Pure."""
+"""Where in a picture patches are cut, and how they are turned; what is said of them. Pure."""
 
-from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import accumulate
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from clpipe.base.errors import ImageError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
+from clpipe.chain.chain import Chain, Step
 from clpipe.chain.drawing import uniforms
+from clpipe.chain.truth import signal_and_noise, variance_of
 from clpipe.engine.extents import Box
 from clpipe.images.tags import FLIPS, upright
+from clpipe.outputs.negative import negative_of
 from clpipe.reference.cfa import Pattern
+from clpipe.stage import Access
 
-TOGETHER = 64  # patches of an image that are developed at a time
+PER_IMAGE = 16  # patches, unless another number is asked for
+
+MOST = 9999  # files of an image, whose names have four digits
 
 
 @dataclass(frozen=True)
@@ -165,62 +169,105 @@ class Patches:
     per_image: int | Literal["grid"]
     augment: bool
 
-    def cutting(self, width: int, height: int, pattern: Pattern) -> Cutting:
-        """How they are cut of a picture.
+    def cutting(self, chain: Chain, width: int, height: int) -> Cutting:
+        """How they are cut of the picture that a chain makes of an image of a size.
 
         Raises:
             ImageError: it is smaller than a patch.
         """
+        width, height = chain.size(width, height)
         if self.size > min(width, height):
             raise ImageError(
                 f"its picture has {width}x{height} pixels, and patches are to have "
                 f"{self.size}x{self.size}; make them smaller, or leave the image out"
             )
-        return Cutting(self.size, width, height, pattern, self.augment)
+        return Cutting(self.size, width, height, pattern_of(chain), self.augment)
 
-    def cut(self, cutting: Cutting, numbers: Sequence[int], owner: str) -> list[Patch]:
-        """Some of them, by their numbers; ``owner`` as for :meth:`Cutting.drawn`."""
+    @property
+    def least(self) -> int:
+        """How many there are of any picture."""
+        return 1 if self.per_image == "grid" else self.per_image
+
+    def cut(
+        self, cutting: Cutting, numbers: Sequence[int], chain: Chain, key: str, epoch: int = 0
+    ) -> list[Patch]:
+        """Some of them, by their numbers, as they are for a chain's seed and an image's key."""
+        owner = f"patch:{chain.seed}:{key}:{epoch}"
         cut = cutting.in_grid if self.per_image == "grid" else cutting.drawn
         return cut(numbers, owner)
 
 
-class Numbering:
-    """The numbers of samples: image after image, epoch after epoch.
+def patch_name(number: int | None) -> str:
+    """What is put behind the image's name for a patch, by its number; None is none.
+
+    It has no dot, so that each is a sample of WebDataset.
+
+    >>> patch_name(7), patch_name(None)
+    ('_0007', '')
+    """
+    return "" if number is None else f"_{number:04}"
+
+
+def pattern_of(chain: Chain) -> Pattern:
+    """The CFA pattern of a chain's mosaic."""
+    last = chain.steps[-1]
+    return last.method.after(last.context).pattern
+
+
+def every_patch(patches: Patches, chain: Chain, width: int, height: int, key: str) -> list[Patch]:
+    """All patches of the picture that a chain makes of an image of a size.
+
+    Raises:
+        ImageError: it is smaller than a patch.
+    """
+    cutting = patches.cutting(chain, width, height)
+    count = cutting.count if patches.per_image == "grid" else patches.per_image
+    return patches.cut(cutting, range(count), chain, key)
+
+
+def variance_steps(chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
+    """See :func:`signal_and_noise`; the steps are of single pixels, so that patches have it, too.
+
+    Raises:
+        RequestError: as there, or a step reads the pixels around each.
+    """
+    signal, noise = signal_and_noise(chain)
+    for step in noise:
+        if any(pass_.access is Access.STENCIL for pass_ in step.method.passes()):
+            raise RequestError(
+                f"variance: {step.name} mixes the noise of neighbours; move it before the noise or "
+                "behind the raw"
+            )
+    return signal, noise
+
+
+def variance_at(noise: Sequence[Step], signal: Array, patch: Patch | None) -> Array:
+    """See :func:`variance_of`, of a patch of an image.
 
     Args:
-        counts: how many samples there are of each image.
-
-    >>> numbering = Numbering([2, 3])
-    >>> numbering.place(4), numbering.place(5), next(numbering.groups(1))
-    ((0, 1, 2), (1, 0, 0), (0, 0, range(1, 2)))
+        noise: the steps.
+        signal: what enters them, of the patch or of the whole image.
+        patch: where it is.
     """
+    if patch is None:
+        return variance_of(noise, signal)
+    # A row and a column more, so that the first pixel has the colour of an image's first one.
+    x, y = patch.left % 2, patch.top % 2
+    padded = np.pad(signal, ((y, 0), (x, 0), (0, 0))[: signal.ndim], mode="edge")
+    return variance_of(noise, padded)[y:, x:]
 
-    def __init__(self, counts: Sequence[int]) -> None:
-        self._ends = list(accumulate(counts, initial=0))
 
-    @property
-    def of_epoch(self) -> int:
-        """How many samples an epoch has."""
-        return self._ends[-1]
-
-    def place(self, number: int) -> tuple[int, int, int]:
-        """Epoch, image, and number within the image of a sample; each counts from 0."""
-        epoch, rest = divmod(number, self.of_epoch)
-        image = bisect_right(self._ends, rest) - 1
-        return epoch, image, rest - self._ends[image]
-
-    def groups(self, first: int) -> Iterator[tuple[int, int, range]]:
-        """All samples from a number on, those of an image at most :data:`TOGETHER` at a time.
-
-        It does not end.
-        """
-        epoch, image, begin = self.place(first)
-        while True:
-            count = self._ends[image + 1] - self._ends[image]
-            if begin < count:
-                yield epoch, image, range(begin, min(begin + TOGETHER, count))
-                begin += TOGETHER
-            else:
-                begin, image = 0, image + 1
-                if image == len(self._ends) - 1:
-                    epoch, image = epoch + 1, 0
+def facts_of(chain: Chain) -> dict[str, Any]:
+    """What a patch or a sample says of its camera and its raw."""
+    facts: dict[str, Any] = {"camera": chain.camera.name, "seed": chain.seed}
+    try:
+        raw = negative_of(chain)
+    except RequestError:  # there is no raw
+        return facts
+    return facts | {
+        "cfa": raw.pattern,
+        "black_level": float(raw.black_level),
+        "white_level": float(raw.white_level),
+        "gains": np.array([raw.gains[0], 1, raw.gains[1]], np.float32),
+        "xyz_to_camera": raw.xyz_to_camera.astype(np.float32),
+    }
