@@ -59,6 +59,39 @@ def test_every_format_holds_the_same_picture(scene, tmp_path):
     assert np.array_equal(found, exact.astype(np.float16))
 
 
+def test_npy_holds_the_same_values(scene, tmp_path):
+    options = ("--keep", "quantize", "--keep", "demosaic", "--truth", "mosaic")
+    for name in ("exr", "npy"):
+        clpipe("run", scene, "-o", tmp_path / name, "--format", name, *options)
+    kinds = {
+        "scene": np.float16,
+        "scene.quantize": np.uint16,
+        "scene.demosaic": np.float32,
+        "scene.truth_mosaic": np.float32,
+    }
+    for name, kind in kinds.items():
+        found = np.load(tmp_path / "npy" / f"{name}.npy", allow_pickle=False)
+        _, exact = pixels(tmp_path / "exr" / f"{name}.exr", oiio.FLOAT)
+        assert found.dtype == kind
+        assert np.array_equal(found, np.squeeze(exact).astype(kind))
+    made = tmp_path / "npy" / "scene.npy"
+    whole = made.read_bytes()
+    (tmp_path / "npy" / "scene.json").unlink()  # as a kill may leave it
+    clpipe("run", scene, "-o", tmp_path / "npy", "--format", "npy", *options)
+    assert made.read_bytes() == whole
+
+
+def test_how_well_a_png_is_compressed(scene, tmp_path):
+    sizes = []
+    for level in (0, 9):
+        folder = tmp_path / str(level)
+        options = ("--format", "png", "--set", f"output.png_compression={level}")
+        clpipe("run", scene, "-o", folder, *options)
+        sizes.append((folder / "scene.png").stat().st_size)
+    assert sizes[0] > sizes[1]
+    assert np.array_equal(*(pixels(tmp_path / n / "scene.png", oiio.UINT8)[1] for n in ("0", "9")))
+
+
 def test_several_at_once_are_the_same_as_one_by_one(scene, tmp_path):
     several = ("jpg", "png16", "tif", "exr")
     options = [o for name in several for o in ("--format", name)]
@@ -91,6 +124,7 @@ def test_light_beyond_half_is_clipped_in_half(write_exr, tmp_path):
     [
         (("--format", "png", "--format", "png16"), r"png and png16 would both write NAME\.png"),
         (("--format", "exr16", "--until", "quantize"), "ends in DN, which exr16 cannot hold"),
+        (("--set", "output.png_compression=10"), "output.png_compression: found 10: .* than or eq"),
         (("--set", "output.jpeg_quality=101"), "output.jpeg_quality: found 101: .* less than or"),
         (("--set", "output.jpeg_qualty=9"), "unknown key of output 'jpeg_qualty'.*jpeg_quality"),
         (("--set", "output.jpeg_subsampling=4:1:1"), "found '4:1:1': .*'4:4:4', '4:2:2' or"),

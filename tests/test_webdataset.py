@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import clpipe as api
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.batch import tar_batch
 from clpipe.batch.run_log import read_log
@@ -358,3 +359,92 @@ def test_what_is_left_of_a_kill_while_packing_goes(clpipe, renders):
     clpipe("run", "in", *RUN)
     assert contents("out") == whole and sorted(os.listdir("out")) == ["000000.tar", "run.jsonl"]
     assert stamps("out")["000000.tar"] == before
+
+
+PATCHES = ("--patch", 12, "--augment", "--patches-per-image", 3, "--keep", "quantize")
+
+
+def test_patches_are_samples_as_dataset_makes_them(clpipe, renders):
+    options = (*PATCHES, "--truth", "clean", "--format", "npy")
+    clpipe("run", renders(3), *RUN, *options)
+    found = [s for s in samples("out/000000.tar") if not s["__key__"].startswith("__clpipe__/")]
+    keys = [f"r_00{i}_000{n}" for i in range(3) for n in range(3)]
+    assert [s.pop("__key__") for s in found] == keys
+    given = {"iso": 3200, "patch": 12, "patches_per_image": 3, "augment": True, "truth": "clean"}
+    floats = api.Dataset("in", **given, dtype="float16")
+    raws = api.Dataset("in", **given, raw="mosaic")
+    for sample, pictures, made in zip(found, floats, raws, strict=True):
+        said = json.loads(sample.pop("json"))
+        arrays = {name: np.load(io.BytesIO(data)) for name, data in sample.items()}
+        expected = {
+            "npy": pictures["image"],
+            "truth_clean.npy": pictures["truth"],
+            "quantize.npy": made["raw"],
+            "truth_clean.quantize.npy": made["truth.raw"],
+        }
+        assert arrays.keys() == expected.keys()
+        for name, array in expected.items():
+            assert arrays[name].dtype == array.dtype
+            assert np.array_equal(arrays[name], array)
+        assert (said["place"], said["turn"]) == (made["place"].tolist(), made["turn"])
+        assert said["noise"]["signal"] == {"a": made["a"], "b": made["b"]}
+        for name in ("camera", "iso", "seed", "cfa", "black_level", "white_level"):
+            assert said[name] == made[name]
+
+
+def test_tars_of_patches_resume(clpipe, renders):
+    run = (*RUN, *PATCHES)
+    clpipe("run", renders(6), *run)
+    whole, before = contents("out"), stamps("out")
+    clpipe("run", "in", "-o", "b", *run[2:], "--jobs", 1)
+    assert contents("b") == whole
+    clpipe("run", "in", *run)
+    assert stamps("out") == before
+    path = OUT / "000000.tar"
+    path.write_bytes(whole[path.name][: len(whole[path.name]) // 2])
+    clpipe("run", "in", *run)
+    assert contents("out") == whole
+    assert 0 < list(statuses("out").values()).count("done") < 4
+
+
+def test_patches_in_a_folder(clpipe, renders):
+    run = ("run", renders(2), "-o", "plain", "--iso", 3200, *PATCHES, "--format", "png")
+    clpipe(*run)
+    assert "r.000_0002.png" in written(Path("plain"))
+    assert "r.001_0000.quantize.npy" in written(Path("plain"))
+    whole = contents("plain")
+    Path("plain/r.001_0001.png").unlink()
+    clpipe(*run)
+    assert list(statuses("plain").values()).count("skipped") == 1
+    assert contents("plain") == whole
+    clpipe("run", "--replay", "plain/r.000.json", "-o", "again")
+    assert contents("again") == {n: whole[n] for n in whole if n.startswith("r.000")}
+
+
+def test_the_variance_of_patches(clpipe, renders):
+    given = {"iso": 3200, "until": "normalize", "device": "numpy"}
+    options = [o for name, value in given.items() for o in (f"--{name}", value)]
+    clpipe("run", renders(1), "-o", "v", *options, "--patch", 11, "--truth", "variance")
+    for number, sample in enumerate(api.Dataset("in", **given, patch=11, variance=True)):
+        for name, ending in (("image", ""), ("variance", ".truth_variance")):
+            assert np.array_equal(np.load(f"v/r.000_{number:04}{ending}.npy"), sample[name])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--patch", 12, "--format", "dng"), "--patch: dng holds whole images"),
+        (("--patch", 12, "--patches-per-image", "grit"), "found 'grit'; expected 1 to 9999, or"),
+        (("--patch", 12, "--carry", "Depth"), "--patch: no layers go along"),
+        (("--augment",), "--augment: it is about patches; say --patch SIZE"),
+    ],
+)
+def test_patches_that_cannot_be(clpipe, renders, options, message):
+    assert message in clpipe("run", renders(1), *RUN, *options, status=2).stderr
+
+
+def test_a_patch_larger_than_an_image_fails_that_image(clpipe, renders):
+    result = clpipe("run", renders(2), *RUN, "--patch", 20, "--patches-per-image", "grid", status=1)
+    assert "in/r.000.exr: its picture has 40x17 pixels" in result.stderr
+    keys = [s["__key__"] for s in samples("out/000000.tar")][1:]
+    assert keys == [f"r_001_000{n}" for n in range(4)]

@@ -13,7 +13,7 @@ from clpipe.base.text import one_of
 from clpipe.chain.carry import Carry, check_companion, parse_carry
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.files import load_config
-from clpipe.chain.formats import EVERY_FORMAT
+from clpipe.chain.formats import EVERY_FORMAT, NPY
 from clpipe.chain.keys import KEYS, OUTPUT
 from clpipe.chain.registry import code_files, load_stage_file
 from clpipe.chain.settings import Settings, overlay
@@ -193,14 +193,15 @@ class Request:
         """The request with every output named, as a chain has them.
 
         The format, where none is chosen, is JPEG; where ``until`` ends the chain before it comes to
-        display values, EXR. The truth of the mosaic is not kept a second time beside that of the
-        development.
+        display values, EXR, or of patches ``.npy``. The truth of the mosaic is not kept a second
+        time beside that of the development.
 
         Raises:
             RequestError: the chain has not a step of ``keep``, or no mosaic that is asked for.
         """
         is_whole = self.until is None or chain.result is Kind.DISPLAY
-        formats = tuple(dict.fromkeys(self.formats)) or (("jpg",) if is_whole else ("exr",))
+        usual = "jpg" if is_whole else "exr" if self.patch is None else NPY
+        formats = tuple(dict.fromkeys(self.formats)) or (usual,)
         keep = chain.select(self.keep)
         own = noisy_mosaic(chain).steps[-1].name if MOSAIC in self.truths else ""
         truth_keep = tuple(step for step in keep if step != own)

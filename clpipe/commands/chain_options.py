@@ -209,5 +209,6 @@ format_option = click.option(
     multiple=True,
     type=click.Choice(EVERY_FORMAT),
     help="The format of the last image, or dng for the raw that quantize makes; may be repeated. "
-    "[default: jpg; exr where --until ends the chain earlier]",
+    "npy holds float16, DN as uint16, and makes those of --keep .npy, too. "
+    "[default: jpg; exr, or npy of patches, where --until ends the chain earlier]",
 )
