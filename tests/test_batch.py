@@ -412,7 +412,13 @@ def test_halves_of_a_killed_run_are_removed(tmp_path):
     for name in (*ours, *others):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-    remove_unfinished(tmp_path, [Job(Path("a.exr"), "a.exr"), Job(Path("b"), "sub/b.c.exr")])
+    patches = (".a_0001.0123abcd.part.npy", "sub/.b.c_0002.normalize.0123abcd.part.npy")
+    for name in patches:
+        (tmp_path / name).touch()
+    jobs = [Job(Path("a.exr"), "a.exr"), Job(Path("b"), "sub/b.c.exr")]
+    remove_unfinished(tmp_path, jobs)
+    assert written(tmp_path) == sorted((*others, *patches))
+    remove_unfinished(tmp_path, jobs, patches=True)
     assert written(tmp_path) == sorted(others)
 
 

@@ -180,7 +180,8 @@ class Cluster:
         except GeneratorExit:
             self._finish()
             raise
-        remove_unfinished(self._spec.output, jobs)  # by workers that died
+        patches = self._spec.request.patch is not None
+        remove_unfinished(self._spec.output, jobs, patches)  # by workers that died
         if failure:
             raise failure
 

@@ -282,7 +282,7 @@ def run(
     ):
         if replay and isinstance(batch, Batch):
             warn_of_changes(replay, again, batch.devices[0])
-        remove_unfinished(output, jobs)
+        remove_unfinished(output, jobs, request.patch is not None)
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
         with closing(RunLog(output / log_name(shard), start)) as log:
             follow(batch, jobs, summary, reporter, log, timeline)

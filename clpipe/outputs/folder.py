@@ -13,6 +13,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.files import shortened
 from clpipe.base.memory import in_words
 from clpipe.inputs.find import Job, Shard
+from clpipe.outputs.patches import without_patch
 
 RESUMABLE = "what is finished is there, and the same command goes on"
 
@@ -96,14 +97,18 @@ def _locked(path: Path, length: int, first: int) -> int:
         os.close(lock)  # its last holder has removed it in between
 
 
-def remove_unfinished(folder: Path, jobs: Iterable[Job]) -> None:
-    """Remove the unfinished files that a killed run left of these jobs."""
+def remove_unfinished(folder: Path, jobs: Iterable[Job], patches: bool = False) -> None:
+    """Remove the unfinished files that a killed run left of these jobs, or of their patches."""
     stems = {str(Path(job.stem).with_name(shortened(Path(job.stem).name))) for job in jobs}
+
+    def is_ours(stem: str) -> bool:
+        return stem in stems or (patches and without_patch(stem) in stems)
+
     for place, _, names in os.walk(folder):
         for match in filter(None, map(UNFINISHED.fullmatch, names)):
             stem = os.path.relpath(os.path.join(place, match[1]), folder)
-            while stem not in stems and "." in os.path.basename(stem):
+            while not is_ours(stem) and "." in os.path.basename(stem):
                 stem = stem.rpartition(".")[0]
-            if stem in stems:
+            if is_ours(stem):
                 with contextlib.suppress(OSError):
                     os.unlink(os.path.join(place, match[0]))

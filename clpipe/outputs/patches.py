@@ -1,5 +1,6 @@
 """Where in a picture patches are cut, and how they are turned; what is said of them. Pure."""
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -206,6 +207,15 @@ def patch_name(number: int | None) -> str:
     ('_0007', '')
     """
     return "" if number is None else f"_{number:04}"
+
+
+def without_patch(name: str) -> str:
+    """A name without what :func:`patch_name` put behind it.
+
+    >>> without_patch("frame_12_0007"), without_patch("frame_12")
+    ('frame_12', 'frame_12')
+    """
+    return re.sub(r"_\d{4,}$", "", name)
 
 
 def pattern_of(chain: Chain) -> Pattern:
