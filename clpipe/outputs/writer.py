@@ -1,19 +1,15 @@
 """Writes the pictures of a run: which files, under which names, in which formats."""
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from clpipe.base.errors import ImageError, OutputError, RequestError
 from clpipe.base.files import Stored, keep_names
-from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain
-from clpipe.chain.formats import DNG, FORMATS, NPY, Format, ending_of
+from clpipe.chain.formats import DNG, FORMATS, NPY, ending_of
 from clpipe.chain.request import CARRY, Request
 from clpipe.chain.truth import PICTURES, VARIANCE
 from clpipe.engine.device import Device
@@ -29,7 +25,8 @@ from clpipe.outputs.carried import write_carried
 from clpipe.outputs.existing import Existing
 from clpipe.outputs.folder import RESUMABLE, write_problem
 from clpipe.outputs.negative import negative_of
-from clpipe.outputs.patches import Patch, Patches, patch_name, variance_at, variance_steps
+from clpipe.outputs.parts import parts_of, samples, typed
+from clpipe.outputs.patches import Patch, Patches, patch_name, variance_steps
 from clpipe.outputs.renditions import (
     FLOAT_MOSAICS,
     Rendition,
@@ -39,7 +36,6 @@ from clpipe.outputs.renditions import (
 )
 from clpipe.outputs.results import results_of
 from clpipe.outputs.sidecar import SIDECAR
-from clpipe.reference.curve import to_16_bit
 from clpipe.reference.geometry import NO_MARGINS
 from clpipe.stage import Kind
 
@@ -181,6 +177,11 @@ class OutputWriter:
             raise RequestError(
                 "--patch: no layers go along with patches in files; leave --carry out, or use "
                 "clpipe.Dataset"
+            )
+        if self.request.baselines:
+            raise RequestError(
+                "--patch: the noise of a baseline is measured on whole pictures; leave one of "
+                "--patch and --baseline out"
             )
         if VARIANCE in self.request.truths:
             variance_steps(chain)  # refuses steps that mix the noise of neighbours
@@ -375,58 +376,6 @@ class OutputWriter:
                 keep_names(self.folder / place)
         except OSError as error:
             raise ImageError(f"{folder}: cannot be made: {error.strerror}") from None
-
-
-def parts_of(
-    rendition: Rendition, result: Result, patches: Sequence[Patch]
-) -> Iterator[tuple[int | None, Result]]:
-    """What is written of a result: all of it, or each of its patches, turned, with its number.
-
-    The last image of a variance map becomes the variance.
-    """
-    if not patches:
-        yield None, with_variance(result, rendition, None)
-    for number, patch in enumerate(patches):
-        part = with_variance(mapped(result, itemgetter(number)), rendition, patch)
-        yield number, mapped(part, patch.turned)
-
-
-def with_variance(result: Result, rendition: Rendition, patch: Patch | None) -> Result:
-    """A result whose last image is the variance of the noise, if the rendition is a map of it."""
-    if not rendition.noise:
-        return result
-    assert result.final is not None
-    return replace(result, final=variance_at(rendition.noise, result.final, patch))
-
-
-def mapped(result: Result, change: Callable[[Array], Array]) -> Result:
-    """A result whose images are changed."""
-    return Result(
-        None if result.final is None else change(result.final),
-        None if result.encoded is None else change(result.encoded),
-        {name: change(image) for name, image in result.kept.items()},
-        result.estimates,
-    )
-
-
-def samples(result: Result, format_: Format) -> Array:
-    """The last image as a format for display holds it: uint8, uint16 or float32."""
-    if format_.bits == 8:
-        assert result.encoded is not None
-        return result.encoded
-    assert result.final is not None
-    return result.final if format_.floats else to_16_bit(result.final)
-
-
-def typed(image: Floats, kind: Kind) -> Array:
-    """An image as ``.npy`` holds it: uint16 in DN, float16 of display values, else float32.
-
-    >>> typed(np.array([[511.0, 7e4]]), Kind.RAW)
-    array([[  511, 65535]], dtype=uint16)
-    """
-    if kind is Kind.RAW:
-        return np.clip(np.rint(image), 0, 65535).astype(np.uint16)
-    return image.astype(np.float16 if kind is Kind.DISPLAY else np.float32, copy=False)
 
 
 def variance_attributes(rendition: Rendition) -> dict[str, str]:
