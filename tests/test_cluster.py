@@ -180,7 +180,7 @@ def test_interrupted_it_finishes_what_is_in_flight(clpipe, renders, address, mon
         report(self, outcome)
         stops[0]()  # as Ctrl-C does
 
-    monkeypatch.setattr("clpipe.commands.run.interruptible", interruptible)
+    monkeypatch.setattr("clpipe.commands.running.interruptible", interruptible)
     monkeypatch.setattr(Reporter, "report", interrupting)
     told = clpipe("run", "in", "-o", "out", "--dask", address, status=130)
     assert "not begun" in told.stderr

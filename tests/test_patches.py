@@ -50,6 +50,7 @@ def check_against_whole(whole, patches):
             part = whole[name][top : top + size, left : left + size]
             assert np.array_equal(image, upright(part, turn)), name
             assert image.flags.c_contiguous and image.flags.writeable
+            assert np.shares_memory(np.from_dlpack(image), image)
         assert images.keys() == arrays(whole).keys()
         shift = first_place(whole["cfa"], turn, size)
         assert (left % 2, top % 2) == shift
