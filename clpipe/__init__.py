@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from clpipe.base.errors import ClpipeError, DeviceError, ImageError, RequestError
     from clpipe.camera.noise import NoiseModel
     from clpipe.camera.profile import Camera, built_in_cameras, load_camera
-    from clpipe.dataset import Dataset
+    from clpipe.dataset import Dataset, RawNoise
     from clpipe.engine.runner import Result
     from clpipe.pipeline import Pipeline
 
@@ -25,6 +25,7 @@ _MODULES = {
     "ImageError": "clpipe.base.errors",
     "NoiseModel": "clpipe.camera.noise",
     "Pipeline": "clpipe.pipeline",
+    "RawNoise": "clpipe.dataset",
     "RequestError": "clpipe.base.errors",
     "Result": "clpipe.engine.runner",
     "built_in_cameras": "clpipe.camera.profile",
@@ -39,6 +40,7 @@ __all__ = [
     "ImageError",
     "NoiseModel",
     "Pipeline",
+    "RawNoise",
     "RequestError",
     "Result",
     "__version__",

@@ -1,8 +1,9 @@
-"""Training data straight from renders: samples, and patches of them, developed when needed.
+"""Training data: samples and patches of renders, developed when needed; noise for clean raws.
 
 Nothing is written. It imports ``pipeline`` and below, but not ``batch`` and ``analysis``.
 """
 
 from clpipe.dataset.dataset import Dataset
+from clpipe.dataset.raw_noise import RawNoise
 
-__all__ = ["Dataset"]
+__all__ = ["Dataset", "RawNoise"]

@@ -42,9 +42,26 @@ def packed(mosaic: Array, pattern: Pattern) -> Array:
     >>> packed(np.array([[1, 2], [3, 4]]), "GRBG").ravel().tolist()
     [2, 1, 4, 3]
     """
+    return np.stack([mosaic[row::2, column::2] for column, row in _sites(pattern)])
+
+
+def unpacked(planes: Array, pattern: Pattern) -> Array:
+    """The mosaic of planes, as :func:`packed` makes them.
+
+    >>> unpacked(np.array([2, 1, 4, 3]).reshape(4, 1, 1), "GRBG").tolist()
+    [[1, 2], [3, 4]]
+    """
+    _, height, width = planes.shape
+    mosaic = np.empty((2 * height, 2 * width), planes.dtype)
+    for plane, (column, row) in zip(planes, _sites(pattern), strict=True):
+        mosaic[row::2, column::2] = plane
+    return mosaic
+
+
+def _sites(pattern: Pattern) -> tuple[tuple[int, int], ...]:
+    """Column and row of R, Gr, Gb and B in the 2x2 cell."""
     x, y = red_site(pattern)
-    sites = ((x, y), (1 - x, y), (x, 1 - y), (1 - x, 1 - y))
-    return np.stack([mosaic[row::2, column::2] for column, row in sites])
+    return ((x, y), (1 - x, y), (x, 1 - y), (1 - x, 1 - y))
 
 
 @dataclass(frozen=True)
