@@ -6,8 +6,9 @@ import sys
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from tests.conftest import ROOT
+from tests.conftest import ROOT, STILL_LIFE
 
 EXAMPLES = ROOT / "tools" / "examples"
 
@@ -34,7 +35,7 @@ def start(write_exr, tmp_path):
             capture_output=True,
             text=True,
         )
-        return done.stderr
+        return done.stdout + done.stderr
 
     return run
 
@@ -63,3 +64,30 @@ def test_slurm_and_dask_make_what_one_machine_makes(start, tmp_path):
     told = start(sys.executable, EXAMPLES / "dask_local.py", "in", "-o", "dask")
     assert "5 of 5 images done" in told
     assert pictures(tmp_path / "dask") == whole
+
+
+def figures(told):
+    """PSNR and SSIM of the table that train_denoiser.py prints."""
+    rows = [line.split() for line in told.splitlines()]
+    names = ("noisy", "IID", "clpipe")
+    return {row[0]: list(map(float, row[1:])) for row in rows if len(row) == 3 and row[0] in names}
+
+
+def test_denoisers_learn(start, tmp_path):
+    pytest.importorskip("torch")
+    iso = ("--iso", "25600")
+    start(
+        *("clpipe", "run", STILL_LIFE, "-o", ".", *iso),
+        *("--format", "png", "--truth", "development"),
+    )
+    pair = ("still_life.png", "still_life.truth.png")
+    for held_out in (["--test", STILL_LIFE], ["--real", *pair]):
+        told = start(
+            *(sys.executable, EXAMPLES / "train_denoiser.py", STILL_LIFE, *held_out),
+            *(*iso, "--steps", "80", "--size", "32", "-o", "crops.png"),
+        )
+        table = figures(told)
+        for name in ("IID", "clpipe"):
+            assert all(np.greater(table[name], table["noisy"])), table
+        with Image.open(tmp_path / "crops.png") as crops:
+            assert np.ptp(np.asarray(crops)) > 100
