@@ -84,7 +84,7 @@ def test_denoisers_learn(start, tmp_path):
     for held_out in (["--test", STILL_LIFE], ["--real", *pair]):
         told = start(
             *(sys.executable, EXAMPLES / "train_denoiser.py", STILL_LIFE, *held_out),
-            *(*iso, "--steps", "80", "--size", "32", "-o", "crops.png"),
+            *(*iso, "--steps", "300", "--size", "32", "-o", "crops.png"),
         )
         table = figures(told)
         for name in ("IID", "clpipe"):

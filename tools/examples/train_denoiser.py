@@ -5,10 +5,10 @@
     python tools/examples/train_denoiser.py renders/ -c canon-5d3-jpeg --real noisy.png mean.png
 
 Both networks are the same U-Net (Ronneberger et al., 2015), begin with the same weights and see the
-same patches. One gets them with the noise of clpipe's camera; for the other as much noise, patch by
-patch, is IID and Gaussian. With --test they denoise raws, and are judged on one of a render that
-was held out. With --real they denoise finished pictures, and are judged on one of a real camera,
-whose truth is the mean of many of the same scene. The table and a picture of crops are the result.
+same patches. One gets them with the noise of clpipe's camera, the other with IID Gaussian noise of
+the same variance over each batch. With --test they denoise raws, and are judged on that of a render
+that was held out. With --real they denoise finished pictures, and are judged on one of a real
+camera, whose truth is the mean of many of the same scene. A table and a picture of crops come out.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from torch.utils.data import DataLoader
 
 import clpipe
 
-BATCH = 16
+BATCH = 4  # small, for as many steps as there is time for
 WIDTHS = (16, 32, 64)  # channels of the levels
 MULTIPLE = 2 ** (len(WIDTHS) - 1)
 SCALE = 16  # noise is a few hundredths, and networks learn faster from numbers near 1
@@ -65,9 +65,8 @@ def block(inputs, outputs):
 
 
 def iid(noisy, clean):
-    """Clean patches with IID Gaussian noise, of each patch as much as the noisy one has."""
-    deviation = (noisy - clean).square().mean((1, 2, 3), keepdim=True).sqrt()
-    return clean + deviation * torch.randn(clean.shape)
+    """Clean patches with IID Gaussian noise, as much as there is in the noisy ones."""
+    return clean + (noisy - clean).square().mean().sqrt() * torch.randn(clean.shape)
 
 
 class Learner:
@@ -97,7 +96,7 @@ def train(patches, names, channels, steps):
     for step, sample in zip(range(1, steps + 1), loader, strict=False):
         noisy, clean = (sample[name] for name in names)
         losses = camera.learn(noisy, clean), gaussian.learn(iid(noisy, clean), clean)
-        if step % 50 == 0 or step == steps:
+        if step % 200 == 0 or step == steps:
             told = "clpipe {:.5f}, IID {:.5f}".format(*losses)
             print(f"step {step}, {time.monotonic() - began:.0f} s, loss: {told}", flush=True)
     return camera.network, gaussian.network
@@ -156,8 +155,8 @@ def main():
     parser.add_argument("-c", "--config", help="configuration of clpipe")
     parser.add_argument("--camera")
     parser.add_argument("--iso", type=float)
-    parser.add_argument("--steps", type=int, default=600, help="of training [600]")
-    parser.add_argument("--size", type=int, default=128, help="of patches in px [128]")
+    parser.add_argument("--steps", type=int, default=2000, help="of training [2000]")
+    parser.add_argument("--size", type=int, default=96, help="of patches in px [96]")
     parser.add_argument("-o", "--output", default="denoised.png", help="[denoised.png]")
     given = parser.parse_args()
 
