@@ -159,6 +159,8 @@ def main():
     parser.add_argument("--size", type=int, default=96, help="of patches in px [96]")
     parser.add_argument("-o", "--output", default="denoised.png", help="[denoised.png]")
     given = parser.parse_args()
+    if given.steps < 1:
+        parser.error(f"--steps: found {given.steps}; expected 1 or more")
 
     torch.manual_seed(1)
     settings = {name: v for name in ("camera", "iso") if (v := getattr(given, name)) is not None}
