@@ -12,7 +12,7 @@ from clpipe.base.readonly import ReadOnly
 from clpipe.base.types import Array
 from clpipe.base.validation import typed
 from clpipe.dataset.arrays import packed, unpacked
-from clpipe.dataset.developer import pattern_of
+from clpipe.outputs.patches import pattern_of
 from clpipe.pipeline import Pipeline
 
 FIRST, LAST = "prnu", "normalize"  # what a chain does between the clean mosaic and the noisy one
