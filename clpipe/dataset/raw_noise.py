@@ -51,6 +51,9 @@ class RawNoise(ReadOnly):
         device: str | int | None = None,
         **settings: Any,
     ) -> None:
+        for name in ("start_at", "until"):
+            if name in settings:
+                raise RequestError(f"RawNoise: found {name}, but it runs from {FIRST} to {LAST}")
         self._settings = {**settings, "camera": str(camera), "iso": iso, "seed": seed or 0}
         self._seed = seed
         self._device = device
