@@ -78,4 +78,5 @@ def main():
         tell("rendered", name=each["file"].removesuffix(".exr"), seconds=seconds)
 
 
-main()
+if __name__ == "__main__":
+    main()

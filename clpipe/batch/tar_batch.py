@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.base.errors import ImageError, OutputError
-from clpipe.base.files import keep_names, passing_files, whole_file
+from clpipe.base.files import Stored, keep_names, passing_files, whole_file
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, Outcome
 from clpipe.batch.tars import OF_PATCHES, STAGING, Members, Tar, prepare
 from clpipe.batch.threads import Batch
@@ -25,7 +25,7 @@ from clpipe.chain.chain import Chain
 from clpipe.engine.device import Device
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.existing import is_current
+from clpipe.outputs.existing import Existing, is_current
 from clpipe.outputs.folder import RESUMABLE
 from clpipe.outputs.sidecar import SIDECAR, outputs_in, patch_text, read_sidecar
 from clpipe.outputs.writer import OutputWriter
@@ -46,6 +46,16 @@ class StagedWriter(OutputWriter):
         """The file of a job with an ending, until it is packed."""
         path = super().path(job, ending, name, patch).relative_to(self.folder)
         return self.folder / self.folders[job.stem] / path
+
+    def existing(self, job: Job, name: str) -> Existing:
+        """The files of a rendition, in a folder that is clpipe's own."""
+        # One that was passing at a loss of power may not even say whose it is.
+        return replace(super().existing(job, name), is_ours=True)
+
+    def write(self, *arguments: Any) -> dict[Path, Stored]:
+        """Write the images of one rendition, which pass into the tar; its sidecar is to last."""
+        with passing_files():
+            return super().write(*arguments)
 
 
 class Packer:
@@ -199,11 +209,6 @@ class TarWorker(ImageWorker):
         packed = self._packers.of(job).has(job, name, request, self._verify)
         # After a loss of power a passing file may have its size and time, but not its bytes.
         return packed or self.writer.existing(job, name).is_done(job, request, verify=True)
-
-    def encode(self, *arguments: Any) -> None:
-        """Write one rendition and its sidecar, which pass into the tar."""
-        with passing_files():
-            super().encode(*arguments)
 
 
 class Packers:

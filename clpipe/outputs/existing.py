@@ -32,11 +32,13 @@ class Existing:
         sidecar: the path of its sidecar.
         pictures: those that every such rendition has.
         others: further files that may be written.
+        is_ours: whether they lie in a folder of clpipe's own, where nobody else has files.
     """
 
     sidecar: Path
     pictures: Sequence[Path]
     others: Sequence[Path] = ()
+    is_ours: bool = False
 
     def is_done(self, job: Job, request: Mapping[str, Any], verify: bool = False) -> bool:
         """Whether all is there, unchanged, made of the same input by the same request.
@@ -88,7 +90,7 @@ class Existing:
         Raises:
             ImageError: a file is somebody else's.
         """
-        for path in (*self.pictures, *self.others):
+        for path in () if self.is_ours else (*self.pictures, *self.others):
             if path.name not in intact and os.path.lexists(path) and not is_marked(path):
                 raise ImageError(
                     f"{path}: clpipe did not write this file, or it was changed since, and would "
