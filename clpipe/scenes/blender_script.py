@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from operator import attrgetter
 from typing import Any
 
 import bpy
@@ -21,6 +22,7 @@ from mathutils import Matrix, Vector
 MARK = "@clpipe "
 OLDEST = (4, 2)
 FLIP = Matrix(((1, 0, 0), (0, -1, 0), (0, 0, -1)))  # from Blender's camera axes to OpenCV's
+OWNER = attrgetter("library")  # of what comes from another .blend
 UNFINISHED = ".unfinished.exr"
 GEOMETRY = {"MESH", "CURVE", "CURVES", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD"}
 SPAN = math.radians(60)  # of an arc
@@ -50,7 +52,7 @@ def open_scene(path: str) -> Any:
     except RuntimeError as error:
         raise RefusedError(f"Blender cannot read it: {str(error).strip()}") from None
     missing = [
-        f"{kind} {each.name}: {bpy.path.abspath(each.filepath, library=each.library)}"
+        f"{kind} {each.name}: {file_of(each)}"
         for kind, files in (("texture", bpy.data.images), ("library", bpy.data.libraries))
         for each in files
         if is_missing(each)
@@ -64,8 +66,12 @@ def is_missing(data: Any) -> bool:
     """Whether an image or a library is used, and its file is not there."""
     if not data.filepath or data.packed_file or getattr(data, "source", "FILE") != "FILE":
         return False
-    path = bpy.path.abspath(data.filepath, library=data.library)
-    return data.users > 0 and not os.path.exists(path)
+    return data.users > 0 and not os.path.exists(file_of(data))
+
+
+def file_of(data: Any) -> str:
+    """The path of an image or a library; a relative one counts from the .blend that says it."""
+    return bpy.path.abspath(data.filepath, library=OWNER(data))
 
 
 def prepare(scene: Any, asked: Mapping[str, Any]) -> None:
