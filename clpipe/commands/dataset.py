@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-from click.core import ParameterSource
 from rich.console import Console
 
 from clpipe.base.errors import RequestError
@@ -19,7 +18,7 @@ from clpipe.chain.request import Request
 from clpipe.chain.truth import CLEAN, TRUTHS
 from clpipe.commands.chain_options import carry_option, format_option, series_options
 from clpipe.commands.input_options import poses_option
-from clpipe.commands.options import Command, device_option
+from clpipe.commands.options import Command, device_option, options_set
 from clpipe.commands.poses import views_behind
 from clpipe.commands.progress import Reporter
 from clpipe.commands.running import batch_of, follow
@@ -192,14 +191,9 @@ def refuse_rendering() -> None:
     Raises:
         RequestError: one is.
     """
-    context = click.get_current_context()
-    for parameter in context.command.params:
-        name = str(parameter.name)
-        is_set = context.get_parameter_source(name) is not ParameterSource.DEFAULT
-        if is_set and name in RENDER_OPTIONS:
-            raise RequestError(
-                f"{parameter.opts[0]}: it is for a .blend, not for renders that exist"
-            )
+    for name, option in options_set().items():
+        if name in RENDER_OPTIONS:
+            raise RequestError(f"{option}: it is for a .blend, not for renders that exist")
 
 
 def develop(

@@ -6,6 +6,7 @@ Options that need the stages are in chain_options.
 from pathlib import Path
 
 import click
+from click.core import ParameterSource
 
 from clpipe.base.errors import RequestError
 from clpipe.images.dump import TYPES
@@ -53,3 +54,13 @@ raw_size_option = click.option(
 raw_type_option = click.option(
     "--raw-type", type=click.Choice(list(TYPES)), help="How headerless dumps store a sample."
 )
+
+
+def options_set() -> dict[str, str]:
+    """The options that are set on the command line, by the names of their parameters."""
+    context = click.get_current_context()
+    return {
+        str(parameter.name): parameter.opts[0]
+        for parameter in context.command.params
+        if context.get_parameter_source(str(parameter.name)) is not ParameterSource.DEFAULT
+    }

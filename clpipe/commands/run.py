@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-from click.core import ParameterSource
 from rich.console import Console
 
 from clpipe.base.errors import RequestError
@@ -40,7 +39,7 @@ from clpipe.commands.input_options import (
     poses_option,
     transfer_option,
 )
-from clpipe.commands.options import Command, raw_size_option, raw_type_option
+from clpipe.commands.options import Command, options_set, raw_size_option, raw_type_option
 from clpipe.commands.poses import views_behind
 from clpipe.commands.progress import Reporter
 from clpipe.commands.running import batch_of, follow
@@ -352,9 +351,6 @@ def check_beside_replay() -> None:
     Raises:
         RequestError: one is.
     """
-    context = click.get_current_context()
-    for parameter in context.command.params:
-        name = str(parameter.name)
-        is_set = context.get_parameter_source(name) is not ParameterSource.DEFAULT
-        if is_set and name not in BESIDE_REPLAY:
-            raise RequestError(f"{parameter.opts[0]}: the sidecar says it; --replay repeats that")
+    for name, option in options_set().items():
+        if name not in BESIDE_REPLAY:
+            raise RequestError(f"{option}: the sidecar says it; --replay repeats that")
