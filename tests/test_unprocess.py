@@ -1,13 +1,20 @@
 """From a finished picture back to a raw, and through another camera."""
 
+import json
+import re
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from PIL import Image
+from PIL.ExifTags import IFD, Base
+from PIL.TiffImagePlugin import IFDRational
 
 from clpipe import Pipeline
 from clpipe.base.errors import RequestError
 from clpipe.commands.main import main
+from clpipe.images.read import read_finished
+from clpipe.images.tags import orientation_of
 from clpipe.reference.curve import curve_index
 from clpipe.stage import run_reference
 from clpipe.stages.gamma import Power, Srgb
@@ -104,6 +111,53 @@ def test_pictures_from_the_command_line(tmp_path):
     assert written(out) == ["one.jpg", "one.json", "two.jpg", "two.json"]
 
 
+def photograph(path, focal_length=35.0, equivalent=56, orientation=1) -> None:
+    """A picture with the EXIF of a camera."""
+    tags = Image.Exif()
+    tags[Base.Make], tags[Base.Model], tags[Base.Orientation] = "Canon", "EOS 7D", orientation
+    shot = tags.get_ifd(IFD.Exif)
+    shot[Base.ExposureTime], shot[Base.FNumber] = IFDRational(1, 125), IFDRational(28, 5)
+    shot[Base.FocalLength] = IFDRational(round(focal_length * 10), 10)
+    shot[Base.FocalLengthIn35mmFilm], shot[Base.ISOSpeedRatings] = equivalent, 200
+    shot[Base.DateTimeOriginal] = "2020:01:02 03:04:05"
+    Image.fromarray(smooth()).save(path, exif=tags, quality=95)
+
+
+@pytest.mark.parametrize("ending", ["jpg", "png"])
+def test_what_a_photograph_says_of_its_shot_stays(tmp_path, ending):
+    photograph(tmp_path / f"photo.{ending}", orientation=6)
+    arguments = ["-o", str(tmp_path / "out"), "-c", "unprocess", "--iso", "1600"]
+    arguments = ["run", str(tmp_path / f"photo.{ending}"), *arguments, "--format", "jpg"]
+    result = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    with Image.open(tmp_path / "out" / "photo.jpg") as picture:
+        assert picture.size == (96, 128)  # upright
+        top_right = np.asarray(picture)[20:50, -45:-25].mean()
+        tags = picture.getexif()
+        shot = tags.get_ifd(IFD.Exif)
+    assert top_right > 230  # the white patch, top left before
+    assert (tags[Base.Make], tags[Base.Model]) == ("Sony", "ILCE-7RM2")
+    assert Base.Orientation not in tags or tags[Base.Orientation] == 1
+    assert shot[Base.ISOSpeedRatings] == 1600
+    assert shot[Base.FocalLength] == 35 and shot[Base.FocalLengthIn35mmFilm] == 56
+    assert float(shot[Base.ExposureTime]) == pytest.approx(1 / 125)
+    assert float(shot[Base.FNumber]) == pytest.approx(5.6)
+    assert shot[Base.DateTimeOriginal] == "2020:01:02 03:04:05"
+    sidecar = json.loads((tmp_path / "out" / "photo.json").read_text())
+    intrinsics = sidecar["intrinsics"]
+    assert (intrinsics["width"], intrinsics["height"]) == (96, 128)
+    # On film, 56 mm and a diagonal of 43.27 mm; here a diagonal of 160 px.
+    assert intrinsics["fx"] == pytest.approx(56 * 160 / np.hypot(36, 24), rel=1e-6)
+
+
+def test_a_photograph_that_says_nonsense_of_its_shot_says_nothing(tmp_path):
+    photograph(tmp_path / "photo.jpg", focal_length=0, equivalent=0, orientation=9)
+    source = read_finished(tmp_path / "photo.jpg")
+    assert "focal_length" not in source.shot and "sensor_width" not in source.shot
+    assert source.shot["exposure_time"] == pytest.approx(1 / 125)
+    assert orientation_of(source.attributes) == 1
+
+
 def test_each_chain_wants_its_own_kind(tmp_path, write_exr):
     render = write_exr("render.exr", smooth() / 255)
     Image.fromarray(smooth()).save(tmp_path / "photo.png")
@@ -115,6 +169,15 @@ def test_each_chain_wants_its_own_kind(tmp_path, write_exr):
         result = CliRunner().invoke(main, arguments, catch_exceptions=False)
         assert result.exit_code == 1
         assert message in result.output
+
+
+def test_a_camera_without_a_matrix_says_what_can_be_set():
+    with pytest.raises(RequestError, match="no xyz_to_camera") as error:
+        Pipeline("unprocess", camera="oppo-reno-10x")
+    settings = re.findall(r"(color_matrix\w*)\.(method)=(\w+)", str(error.value))
+    parameters = {stage: {name: value} for stage, name, value in settings}
+    chain = Pipeline("unprocess", camera="oppo-reno-10x", **parameters).chain
+    assert len(parameters) == 2 and chain.camera.name == "oppo-reno-10x"
 
 
 def test_a_chain_that_does_not_fit_a_picture():

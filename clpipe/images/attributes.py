@@ -1,12 +1,15 @@
 """Attributes in the headers of image files: clpipe's own, and OpenEXR's standard ones."""
 
 import contextlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import ImageError
 from clpipe.images.openimageio import open_image
+from clpipe.images.tags import DATE, FLIPS, sensor_width, shot_to_attributes
 
+SHOT_OF_TAGS = {"exposure_time": "exposure", "focal_length": "focal_length"}
 PREFIX = "clpipe:"  # of the names of clpipe's own attributes
 
 
@@ -39,4 +42,38 @@ def shot_attributes(spec: Any) -> dict[str, float]:
         or spec.getattribute("nominalFocalLength"),
         "sensor_width": max(size) if isinstance(size, tuple) else None,
     }
+    return _plausible(values)
+
+
+def photograph_attributes(spec: Any) -> tuple[dict[str, str], dict[str, float]]:
+    """What the EXIF of a finished picture says of the shot; values that cannot be are left out.
+
+    The camera and its ISO are not among it: the picture goes through another one.
+
+    Returns:
+        The attributes by which an image carries its tags and its orientation, and what they say of
+        the shot as :func:`shot_attributes` has it. The sensor's width is there where the equivalent
+        focal length on 35 mm film is.
+    """
+    named = {
+        "exposure": spec.getattribute("ExposureTime"),
+        "aperture": spec.getattribute("FNumber"),
+        "focal_length": spec.getattribute("Exif:FocalLength"),
+    }
+    values = _plausible(named)
+    shot = {name: values[key] for name, key in SHOT_OF_TAGS.items() if key in values}
+    equivalent = spec.getattribute("Exif:FocalLengthIn35mmFilm")
+    if isinstance(equivalent, int) and 0 < equivalent <= 10_000 and "focal_length" in values:
+        length = values["focal_length"]
+        shot["sensor_width"] = sensor_width(length, equivalent, spec.height, spec.width)
+    taken = str(spec.getattribute("Exif:DateTimeOriginal") or "")
+    said: dict[str, float | str] = {**values}
+    if DATE.fullmatch(taken):
+        said["taken"] = taken
+    orientation = spec.getattribute("Orientation")
+    turned = orientation if orientation in FLIPS else 1
+    return shot_to_attributes(said, turned), shot
+
+
+def _plausible(values: Mapping[str, Any]) -> dict[str, float]:
     return {k: v for k, v in values.items() if isinstance(v, float) and 0 < v <= 10_000}

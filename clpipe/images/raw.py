@@ -6,7 +6,6 @@ This is the only module that imports rawpy and exifread.
 import io
 import logging
 import math
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from clpipe.camera.profile import SRGB_TO_XYZ, Matrix
 from clpipe.images.dng import D65
 from clpipe.images.encoding import SIMULATED
 from clpipe.images.pixels import USUAL_MAX_PIXELS, check_size
+from clpipe.images.tags import DATE
 from clpipe.reference.cfa import PATTERNS, Pattern
 
 RAW_SUFFIXES = (
@@ -42,7 +42,6 @@ PARTS = ("EXIF", "Image")  # exifread's prefixes of tags, in order of preference
 EXIF_BYTES = 1 << 20  # the most that a tag has, and where in a file that is no TIFF a mark stands
 MOST_READS = 200_000  # by exifread, which reads each of a tag's values by itself; usual are 1,000
 DATE_TAGS = ("DateTimeOriginal", "DateTime")
-DATE = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")
 COLOR_MATRICES = {"0xC622": "0xC65B", "0xC621": "0xC65A"}  # a DNG's, and their illuminants
 DUMP_HINT = "a dump of samples, not a camera's raw, is read with --raw-size and --raw-type"
 OTHERS = {b"\xff\xd8\xff": "a JPEG", b"\x89PNG": "a PNG", b"v/1\x01": "an OpenEXR image"}

@@ -14,7 +14,7 @@ from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.base.steps import Step
 from clpipe.base.types import Array, Doubles
-from clpipe.images.attributes import own_attributes, shot_attributes
+from clpipe.images.attributes import own_attributes, photograph_attributes, shot_attributes
 from clpipe.images.colour import CIE_XYZ, SRGB, to_linear_srgb
 from clpipe.images.layers import (
     MOST_PARTS,
@@ -53,8 +53,9 @@ class SourceImage:
     ``pixels`` is (height, width, 3) linear RGB or a (height, width) mosaic, float16 or float32,
     finite. It is C-contiguous, or planar: a transposed view of a C-contiguous (3, height, width)
     array. ``layer`` is the name of the layer that was read. ``attributes`` are clpipe's own, which
-    a kept image has. ``shot`` is what the file says of exposure_time (s), focal_length and
-    sensor_width (mm). ``subframes`` are the names and SHA-256 of files that were averaged.
+    a kept image has, and a photograph's tags. ``shot`` is what the file says of exposure_time (s),
+    focal_length and sensor_width (mm). ``subframes`` are the names and SHA-256 of files that were
+    averaged.
     ``depth`` is there where the chain needs it. ``margins`` say how far ``pixels``, and depth, go
     on beyond the picture.
     """
@@ -214,7 +215,8 @@ def read_finished(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> SourceImage
             return None
         check_size(path, spec.width, spec.height, max_pixels)
         rgb = read_samples(path, file, 0, picture[1], oiio.FLOAT)  # scales whole numbers to 0..1
-        return SourceImage(np.ascontiguousarray(rgb), _digest(path), "", (), {})
+        attributes, shot = photograph_attributes(spec)
+        return SourceImage(np.ascontiguousarray(rgb), _digest(path), "", (), attributes, shot)
 
 
 def holds_mosaic(path: Path) -> bool:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 
@@ -15,6 +16,7 @@ from clpipe.images.encoding import Output
 
 FILM_DIAGONAL = math.hypot(36, 24)  # mm, of a frame of 35 mm film
 TAG_ATTRIBUTES = ("exif", "orientation")  # the attributes by which an image carries its tags
+DATE = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")  # as EXIF has it
 DAMAGED = "its attributes clpipe:exif and clpipe:orientation are damaged"
 
 
@@ -83,21 +85,40 @@ def exif(tags: Tags, height: int, width: int) -> dict[str, float | str]:
 def to_attributes(tags: Tags, orientation: int) -> dict[str, str]:
     """The attributes by which an image carries its tags and its orientation (EXIF's, 1 to 8)."""
     values = {name: value for name, value in asdict(tags).items() if name != "output"}
-    return {"exif": json.dumps(values), "orientation": str(orientation)}
+    return shot_to_attributes(values, orientation)
+
+
+def shot_to_attributes(shot: Mapping[str, float | str], orientation: int) -> dict[str, str]:
+    """As :func:`to_attributes`, of those fields of :class:`Tags` that the image says itself."""
+    return {"exif": json.dumps(shot), "orientation": str(orientation)}
 
 
 def from_attributes(attributes: Mapping[str, str], default: Tags) -> tuple[Tags, int]:
-    """The tags and the orientation that an image carries, else ``default`` and 1 (upright).
+    """The tags and the orientation that an image carries.
+
+    What it does not say is that of ``default``, and upright.
 
     Raises:
         ImageError: the attributes are damaged.
     """
     try:
-        text = attributes.get("exif")
-        tags = TypeAdapter(Tags).validate_json(text) if text else default
-    except ValueError:
+        own = json.loads(attributes.get("exif", "{}"))
+        tags = TypeAdapter(Tags).validate_python({**vars(default), **own})
+    except (ValueError, TypeError):
         raise ImageError(DAMAGED) from None
     return tags, orientation_of(attributes)
+
+
+def sensor_width(focal_length: float, equivalent: float, height: int, width: int) -> float:
+    """The longer side of a sensor, in mm, from a focal length and what it is on 35 mm film.
+
+    The equivalent is by the ratio of diagonals, as in :func:`exif`.
+
+    >>> round(sensor_width(24.0, 36.0, 4000, 6000), 1)
+    24.0
+    """
+    diagonal = FILM_DIAGONAL * focal_length / equivalent
+    return diagonal * max(height, width) / math.hypot(height, width)
 
 
 def orientation_of(attributes: Mapping[str, str]) -> int:

@@ -19,6 +19,7 @@ from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.images.encoding import POSE
 from clpipe.images.read import SourceImage
+from clpipe.images.tags import FLIPS, orientation_of
 from clpipe.images.write import versions
 from clpipe.inputs.carry import Carried
 from clpipe.inputs.find import Job
@@ -112,10 +113,11 @@ def json_text(record: Mapping[str, Any]) -> str:
 
 
 def intrinsics_of(chain: Chain, source: SourceImage) -> Intrinsics | None:
-    """The intrinsics of a render's picture; None where they are not known.
+    """The intrinsics of a render's or a photograph's picture; None where they are not known.
 
-    They are not of a raw, whose lens is not known, and not of an image that enters in the midst of
-    a chain, which may have gone through a lens already.
+    A photograph's are those of the picture turned upright. They are not of a raw, whose lens is not
+    known, and not of an image that enters in the midst of a chain, which may have gone through a
+    lens already.
 
     Raises:
         RequestError: what is said of the render contradicts a lens of the chain.
@@ -123,6 +125,9 @@ def intrinsics_of(chain: Chain, source: SourceImage) -> Intrinsics | None:
     if isinstance(source, RawImage) or chain.steps[0].name != chain.names[0]:
         return None
     height, width = source.pixels.shape[:2]
+    *_, is_transposed = FLIPS[orientation_of(source.attributes)]
+    if is_transposed:
+        width, height = height, width
     shot = chain.settings.output.filled(source.shot).model_dump(exclude_none=True)
     return chain.intrinsics(width, height, shot)
 
