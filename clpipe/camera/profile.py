@@ -171,10 +171,7 @@ class Camera(BaseModel):
             RequestError: the profile has no ``xyz_to_camera``.
         """
         if self.xyz_to_camera is None:
-            raise RequestError(
-                f"camera {self.name}: its profile has no xyz_to_camera matrix, which this needs; "
-                "add it to the profile or choose another camera"
-            )
+            raise RequestError(f"camera {self.name}: its profile has no xyz_to_camera matrix")
         matrix = np.array(self.xyz_to_camera) @ SRGB_TO_XYZ
         return matrix / matrix.sum(1, keepdims=True)
 

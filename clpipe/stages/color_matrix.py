@@ -7,8 +7,9 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from pydantic import BeforeValidator, field_validator
 
-from clpipe.base.types import Floats
-from clpipe.camera.profile import IDENTITY, Matrix
+from clpipe.base.errors import RequestError
+from clpipe.base.types import Doubles, Floats
+from clpipe.camera.profile import IDENTITY, Camera, Matrix
 from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, Unchanged, parameter
 
 NAMES = tuple(f"{row}_{column}" for row in "rgb" for column in "rgb")
@@ -35,6 +36,22 @@ def apply_matrix(image: Floats, matrix: Floats) -> Floats:
     """
     red, green, blue = np.moveaxis(image, -1, 0)
     return np.stack([r * red + g * green + b * blue for r, g, b in matrix], axis=-1)
+
+
+def srgb_to_camera(camera: Camera) -> Doubles:
+    """A camera's matrix, :meth:`clpipe.camera.profile.Camera.srgb_to_camera`, (3, 3).
+
+    Raises:
+        RequestError: the camera has none; the message says what can be set.
+    """
+    try:
+        return camera.srgb_to_camera()
+    except RequestError as error:
+        raise RequestError(
+            f"{error}, from which color_matrix has its own; leave colours as they are with --set "
+            "color_matrix.method=none (and color_matrix_2.method=none where the chain has two), "
+            "add the matrix to a profile of your own, or choose another camera"
+        ) from None
 
 
 class NoMatrix(Unchanged):
@@ -101,7 +118,7 @@ class CameraToSrgb(FixedMatrix):
     def resolve(self, context: Context) -> "CameraToSrgb":
         if self.matrix is not None:
             return self
-        inverse = np.linalg.inv(context.camera.srgb_to_camera())
+        inverse = np.linalg.inv(srgb_to_camera(context.camera))
         return self.filled(matrix=_as_tuples(inverse.tolist()))
 
 
@@ -121,7 +138,7 @@ class SrgbToCamera(FixedMatrix):
     def resolve(self, context: Context) -> "SrgbToCamera":
         if self.matrix is not None:
             return self
-        return self.filled(matrix=_as_tuples(context.camera.srgb_to_camera().tolist()))
+        return self.filled(matrix=_as_tuples(srgb_to_camera(context.camera).tolist()))
 
 
 STAGE = Stage(
