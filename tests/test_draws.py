@@ -227,6 +227,23 @@ def test_brooks_2019():
         )
 
 
+def test_syb3r():
+    dark = np.full((40, 60, 3), 0.02, np.float32)
+    noisy = clpipe.Pipeline("syb3r", device="numpy", iso=1600, until="sensor_noise")
+    clean = clpipe.Pipeline("syb3r", device="numpy", skip=["sensor_noise"], until="mosaic")
+    signal = clean.process(dark, "a").image
+    assert signal.mean() == pytest.approx(0.18 / 2, rel=0.01)  # auto exposure, with its headroom
+    noise = noisy.process(dark, "a").image - signal
+    law = noisy.chain.noise
+    assert noise.var() == pytest.approx(law.a * signal.mean() + law.b, rel=0.1)
+    line = dark.copy()
+    line[:, 30] = 1.0
+    shots = [clean.process(line, key).image for key in "abc"]
+    assert not np.allclose(shots[0], shots[1]) and not np.allclose(shots[1], shots[2])
+    finished = clpipe.Pipeline("syb3r", device="numpy", iso=1600).process(dark, "a").image
+    assert finished.shape == dark.shape and finished.std((0, 1)).min() > 0
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
