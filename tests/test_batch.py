@@ -296,6 +296,7 @@ def test_the_log_says_what_was_done_when(clpipe, renders):
     assert image["outputs"] == [Path(image["input"]).stem + e for e in (".jpg", ".json")]
     assert all(image[f"{step}_seconds"] > 0 for step in ("decode", "device", "encode"))
     assert lines[3]["done"] == 2 and lines[3]["images"] == 2 and not lines[3]["interrupted"]
+    assert lines[3]["peak_memory"] > 20 << 20
 
 
 def test_quiet_and_stdout(clpipe, renders):

@@ -47,9 +47,22 @@ def available_memory(root: Path = Path("/")) -> int | None:
     return min((size for size in limits if size is not None), default=None)
 
 
+def peak_memory(root: Path = Path("/")) -> int | None:
+    """The most bytes that this process has held at a time; None outside Linux.
+
+    The system's ru_maxrss goes on from the process that started this one.
+    """
+    return _listed(root / "proc/self/status", "VmHWM")
+
+
 def _available(meminfo: Path) -> int | None:
+    return _listed(meminfo, "MemAvailable")
+
+
+def _listed(path: Path, name: str) -> int | None:
+    """The bytes of an entry of one of the system's lists, which has KiB."""
     try:
-        match = re.search(r"^MemAvailable:\s+(\d+) kB", meminfo.read_text("utf-8"), re.MULTILINE)
+        match = re.search(rf"^{name}:\s+(\d+) kB", path.read_text("utf-8"), re.MULTILINE)
     except OSError:
         return None
     return int(match[1]) * 1024 if match else None

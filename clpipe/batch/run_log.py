@@ -14,6 +14,7 @@ from typing import Any
 
 from clpipe.base.about import __version__
 from clpipe.base.errors import OutputError
+from clpipe.base.memory import peak_memory
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS, Outcome
 from clpipe.engine.clipping import MUCH
 from clpipe.inputs.find import Shard
@@ -94,6 +95,7 @@ class Summary:
             "interrupted": self.interrupted,
             "megapixels": round(self.megapixels, 3),
             "seconds": round(self.elapsed, 3),
+            "peak_memory": peak_memory(),
             **{f"{step}_seconds": round(t, 3) for step, t in self.seconds.items()},
         }
 

@@ -22,6 +22,7 @@ COMMANDS = (
     "run",
     "dataset",
     "poses",
+    "report",
     "plan",
     "stages",
     "cameras",

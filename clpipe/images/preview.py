@@ -1,12 +1,21 @@
-"""Small pictures of images, for notebooks."""
+"""Pictures to be looked at, in notebooks and in reports: small, or of eight bits."""
 
 import io
+import tempfile
+from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
+from clpipe.images.read import holds_mosaic, read_image
 from clpipe.reference.curve import to_8_bit
+from clpipe.reference.transfer import srgb_curve
+from clpipe.stage import Kind
+
+# What Pillow raises for a file that is damaged, or claims to be very large.
+DAMAGED = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
 
 
 def png_bytes(pixels: Array, side: int = 1024) -> bytes:
@@ -26,3 +35,82 @@ def png_bytes(pixels: Array, side: int = 1024) -> bytes:
     file = io.BytesIO()
     picture.save(file, "PNG")
     return file.getvalue()
+
+
+def jpeg_bytes(pixels: Array, quality: int = 93) -> bytes:
+    """A JPEG, whose chroma is not subsampled, of (height, width, 3) uint8."""
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "JPEG", quality=quality, subsampling=0)
+    return file.getvalue()
+
+
+def thumbnail_bytes(data: bytes, name: str, side: int) -> bytes:
+    """A small JPEG of a picture, at most ``side`` pixels wide and high.
+
+    Args:
+        data: the bytes of its file; see :func:`decoded`.
+        name: of the file.
+        side: in px.
+
+    Raises:
+        ImageError: it cannot be read.
+    """
+    if name.endswith(".jpg"):
+        try:
+            with Image.open(io.BytesIO(data)) as picture:
+                picture.draft("RGB", (2 * side, 2 * side))
+                small = picture.convert("RGB")
+        except DAMAGED as error:
+            raise ImageError(f"{name}: cannot be shown: {error}") from None
+    else:
+        small = Image.fromarray(decoded(data, name))
+    small.thumbnail((side, side), Image.Resampling.LANCZOS)
+    file = io.BytesIO()
+    small.save(file, "JPEG", quality=80)
+    return file.getvalue()
+
+
+def decoded(data: bytes, name: str) -> Array:
+    """A picture as eight bits a channel, (height, width, 3).
+
+    Linear light is encoded by sRGB's curve, and so are mosaics, whose brightest sample is white.
+
+    Args:
+        data: the bytes of a JPEG, PNG, TIFF, OpenEXR or ``.npy`` that clpipe wrote.
+        name: of the file, for its ending and for messages.
+
+    Raises:
+        ImageError: it cannot be read, or is of another kind.
+    """
+    try:
+        if name.endswith(".exr"):
+            return _decoded_exr(data)
+        if name.endswith(".npy"):
+            array = np.load(io.BytesIO(data), allow_pickle=False)
+            return _shown(array, np.issubdtype(array.dtype, np.float16))
+        with Image.open(io.BytesIO(data)) as picture:
+            return np.asarray(picture.convert("RGB"))
+    except ImageError as error:
+        raise ImageError(f"{name}: {str(error).partition(': ')[2]}") from None
+    except DAMAGED as error:
+        raise ImageError(f"{name}: cannot be shown: {error}") from None
+
+
+def _decoded_exr(data: bytes) -> Array:
+    with tempfile.NamedTemporaryFile(suffix=".exr") as file:
+        file.write(data)
+        file.flush()
+        path = Path(file.name)
+        image = read_image(path, holds_mosaic(path))
+    return _shown(image.pixels, image.attributes.get("kind") == Kind.DISPLAY.label)
+
+
+def _shown(array: Array, is_display: bool) -> Array:
+    """An image as eight bits; see :func:`decoded`."""
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3):
+        raise ValueError(f"it is an array of shape {array.shape}")
+    values = np.nan_to_num(array.astype(np.float64))
+    if array.ndim == 2:
+        values = np.stack([values / max(float(values.max(initial=0)), 1e-9)] * 3, axis=-1)
+    light = np.clip(values, 0, 1)
+    return to_8_bit((light if is_display else srgb_curve(light)).astype(np.float32))

@@ -1,0 +1,220 @@
+"""Drawings for web pages, as SVG: lines, histograms and noise, in the colours of the page.
+
+Text stays text, in the page's font, and axes have the page's colour (``currentColor``), so that a
+drawing is readable on light and on dark ground, and in print.
+"""
+
+import io
+import re
+import zlib
+from collections.abc import Mapping, Sequence
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+from clpipe.analysis.plot import INK, MAPS, SITE_MAPS, draw_tails, peak
+from clpipe.analysis.report import UNITS, NoiseReport
+from clpipe.analysis.spatial import LAGS
+
+NEUTRAL = INK["mosaic"]  # in :mod:`clpipe.analysis.plot`
+PAGE = "#010203"  # stands for the page's colour until the drawing is text
+COLOURS = ("#1f8a8a", "#d9822b", "#7a5bb5", "#c8102e")
+SETTINGS = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "clpipe",
+    "font.family": "sans-serif",
+    "font.size": 11,
+    "axes.edgecolor": PAGE,
+    "axes.labelcolor": PAGE,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": PAGE,
+    "grid.alpha": 0.15,
+    "legend.frameon": False,
+    "text.color": PAGE,
+    "xtick.color": PAGE,
+    "ytick.color": PAGE,
+}
+
+
+def _figure(width: float, height: float, right: float = 0.2) -> Figure:
+    """A figure without ground, in inches; ``right`` is free on that side.
+
+    The room around is fixed: to fit it to the texts takes Matplotlib three times as long.
+    """
+    figure = Figure(figsize=(width, height))
+    room = {"left": 0.75 / width, "right": 1 - right / width}
+    figure.subplots_adjust(
+        **room, bottom=0.55 / height, top=1 - 0.3 / height, wspace=0.3, hspace=0.5
+    )
+    FigureCanvasSVG(figure)
+    figure.patch.set_alpha(0)
+    return figure
+
+
+def _text(figure: Figure, title: str) -> str:
+    """A figure as an ``<svg>`` element that takes the width that there is."""
+    for axes in figure.axes:
+        axes.patch.set_alpha(0)
+    file = io.StringIO()
+    figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
+    text = file.getvalue()
+    text = text[text.index("<svg") :]
+    for ink in (PAGE, NEUTRAL):
+        text = text.replace(ink, "currentColor")
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    # Ids are the page's, where there may be several drawings.
+    own = f"d{zlib.crc32(text.encode()):x}"
+    text = re.sub(r'(id="|url\(#|href="#)', rf"\g<1>{own}", text)
+    text = re.sub(r'width="[\d.]+pt" height="[\d.]+pt"', 'width="100%"', text, count=1)
+    label = title.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
+    return text.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)
+
+
+def lines_svg(
+    x: Sequence[float], lines: Mapping[str, Sequence[float]], labels: tuple[str, str], title: str
+) -> str:
+    """Lines over x, from 0 on.
+
+    Args:
+        x: values.
+        lines: as many values each, by their names.
+        labels: of the axes.
+        title: for those who cannot see it.
+    """
+    with mpl.rc_context(SETTINGS):
+        figure = _figure(7, 2.6)
+        axes = figure.add_subplot()
+        for colour, (name, values) in zip(COLOURS, lines.items(), strict=False):
+            axes.plot(x, values, color=colour, label=name, linewidth=1.8)
+        axes.set_ylim(bottom=0)
+        axes.set_xlabel(labels[0])
+        axes.set_ylabel(labels[1])
+        if len(lines) > 1:
+            axes.legend()
+        return _text(figure, title)
+
+
+def shares_svg(
+    x: Sequence[float], shares: Mapping[str, Sequence[float]], label: str, title: str
+) -> str:
+    """Shares that are 1 together, one above the other, over x."""
+    with mpl.rc_context(SETTINGS):
+        figure = _figure(7, 2.6, right=1.1)
+        axes = figure.add_subplot()
+        used = COLOURS[: len(shares)]
+        axes.stackplot(x, *shares.values(), labels=list(shares), colors=used, alpha=0.8)
+        axes.set_ylim(0, 1)
+        axes.set_xlabel(label)
+        axes.yaxis.set_major_formatter("{x:.0%}")
+        axes.set_ylabel("share of the time")
+        axes.legend(loc="center left", bbox_to_anchor=(1, 0.5))
+        return _text(figure, title)
+
+
+def histogram_svg(values: Sequence[float], label: str) -> str:
+    """How often values occur; bins are even in the logarithm where values span a factor of 30."""
+    data = np.asarray(values, float)
+    low, high = float(data.min()), float(data.max())
+    logarithmic = low > 0 and high / low > 30
+    count = min(max(int(len(data) ** 0.5), 5), 30)
+    edges = np.geomspace(low, high, count + 1) if logarithmic else np.linspace(low, high, count + 1)
+    with mpl.rc_context(SETTINGS):
+        figure = _figure(3.4, 1.9)
+        axes = figure.add_subplot()
+        axes.hist(data, list(edges), color=COLOURS[0])
+        if logarithmic:
+            axes.set_xscale("log")
+            axes.xaxis.set_minor_formatter("")
+        axes.set_xlabel(label)
+        axes.locator_params(axis="y", nbins=4, integer=True)
+        return _text(figure, f"Histogram of {label}")
+
+
+def noise_svg(report: NoiseReport) -> str:
+    """Sigma over intensity, autocorrelation, power spectrum and tails of finished pictures."""
+    with mpl.rc_context(SETTINGS):
+        figure = _figure(11, 5.6)
+        above, below = figure.subplots(2, 3)
+        _draw_variance(above[0], report)
+        _draw_lags(above[1], report)
+        _draw_spectrum(above[2], report)
+        draw_tails(below[0], report)
+        below[0].set_title("Tails", fontsize=11)
+        if legend := below[0].get_legend():  # the other drawings have one
+            legend.remove()
+        _draw_map(below[1], report)
+        _draw_correlations(below[2], report)
+        return _text(figure, "Noise by intensity, its autocorrelation, spectrum, tails and colours")
+
+
+def _draw_variance(axes: Axes, report: NoiseReport) -> None:
+    for one in report.channels:
+        dashes = "--" if one.name in ("Y", "Cb", "Cr") else "-"
+        axes.plot(one.curve.mean, one.curve.sigma**2, dashes, color=INK[one.name], label=one.name)
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel(f"intensity ({UNITS[report.kind]})")
+    axes.set_ylabel("variance")
+    axes.ticklabel_format(axis="y", scilimits=(0, 0))
+    axes.legend(fontsize=8, ncols=2)
+
+
+def _draw_lags(axes: Axes, report: NoiseReport) -> None:
+    for one in report.channels:
+        if one.name in MAPS.get(report.kind, SITE_MAPS):
+            right = one.autocorrelation[LAGS, LAGS:]
+            axes.plot(
+                range(LAGS + 1), right, "-o", markersize=3, color=INK[one.name], label=one.name
+            )
+    axes.axhline(0, color=PAGE, linewidth=0.8)
+    axes.set_xlabel("lag to the right, px")
+    axes.set_ylabel("autocorrelation")
+    axes.legend(fontsize=8)
+
+
+def _draw_spectrum(axes: Axes, report: NoiseReport) -> None:
+    """The power spectrum along rows: the Fourier transform of the autocorrelation, with a window.
+
+    A Hann window over the known lags keeps it from ringing; white noise is 1 everywhere.
+    """
+    frequency = np.linspace(0, 0.5, 65)
+    lags = np.arange(1, LAGS + 1)
+    window = 0.5 + 0.5 * np.cos(np.pi * lags / (LAGS + 1))
+    waves = np.cos(2 * np.pi * np.outer(frequency, lags))
+    for one in report.channels:
+        if one.name in MAPS.get(report.kind, SITE_MAPS):
+            right = np.nan_to_num(one.autocorrelation[LAGS, LAGS + 1 :])
+            axes.plot(
+                frequency, 1 + 2 * waves @ (window * right), color=INK[one.name], label=one.name
+            )
+    axes.axhline(1, color=PAGE, linewidth=0.8, linestyle=":")
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("frequency along rows, cycles/px")
+    axes.set_ylabel("power; white noise is 1")
+    axes.legend(fontsize=8)
+
+
+def _draw_map(axes: Axes, report: NoiseReport) -> None:
+    name = MAPS.get(report.kind, SITE_MAPS)[0]
+    one = next(each for each in report.channels if each.name == name)
+    table = one.autocorrelation.copy()
+    table[LAGS, LAGS] = np.nan
+    limit = float(np.clip(peak(one), 0.05, 1.0))
+    extent = (-LAGS - 0.5, LAGS + 0.5, LAGS + 0.5, -LAGS - 0.5)
+    picture = axes.imshow(table, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=extent)
+    axes.grid(visible=False)
+    axes.set_title(f"autocorrelation of {name}", fontsize=11)
+    axes.figure.colorbar(picture, ax=axes, shrink=0.8)
+
+
+def _draw_correlations(axes: Axes, report: NoiseReport) -> None:
+    pairs = [pair for pair in report.correlations if set(pair) <= {"R", "G", "B"}]
+    pairs = pairs or list(report.correlations)
+    values = [float(np.nan_to_num(report.correlations[pair])) for pair in pairs]
+    axes.barh(["-".join(pair) for pair in pairs], values, color=COLOURS[2])
+    axes.set_xlim(min(0, *values), 1)
+    axes.set_title("correlation between channels", fontsize=11)

@@ -1,0 +1,47 @@
+"""``clpipe report``: what a run made, as one HTML file to look at."""
+
+from pathlib import Path
+
+import click
+
+from clpipe.base.errors import RequestError
+from clpipe.base.extras import require
+from clpipe.base.files import write_new
+from clpipe.commands.options import Command
+
+
+@click.command("report", cls=Command)
+@click.argument(
+    "folders", metavar="OUT [OUT2]", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
+@click.option(
+    "--output",
+    "-o",
+    type=click.Path(path_type=Path),
+    metavar="FILE.html",
+    help="The file. [default: OUT/report.html]",
+)
+def report(folders: tuple[Path, ...], output: Path | None) -> None:
+    """Look at a run: its figures, pictures, noise and settings, in one HTML file.
+
+    OUT is the output folder of clpipe run, finished or not, with tars or without. The file opens
+    from the disk in any browser, without a network: a contact sheet that filters, a slider between
+    pictures and their truths with enlarged crops, noise against what was asked, the chain with its
+    parameters, what was drawn, failures and warnings. Of two folders, the report compares the runs.
+
+    \b
+    clpipe report out
+    clpipe report out other -o both.html
+    """
+    if len(folders) > 2:
+        raise RequestError(f"found {len(folders)} folders; one is reported on, or two are compared")
+    path = output or folders[0] / "report.html"
+    if path.suffix != ".html":
+        raise RequestError(f"-o: found {path}; expected a name that ends in .html")
+    require("clpipe report", "report", "jinja2", "matplotlib")
+    from clpipe.reports.page import html
+    from clpipe.reports.run import read_run
+
+    page = html([read_run(folder) for folder in folders]).encode()
+    size = write_new(path, page).size
+    click.echo(f"wrote {path} ({size / 2**20:.1f} MiB)")

@@ -1,0 +1,280 @@
+"""The figures of a run: what became of its images, how long it took, and what was drawn."""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from clpipe.base.memory import in_words
+from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS
+from clpipe.engine.clipping import MUCH
+from clpipe.reports.run import Made, Run
+
+TIMES = 60  # pieces of a run's time, at most
+DISTINCT = 12  # values of a parameter that are listed
+
+
+@dataclass(frozen=True)
+class Session:
+    """One start of the program, by its log: the lines of its images and its end."""
+
+    start: Mapping[str, Any]
+    images: Sequence[Mapping[str, Any]]
+    end: Mapping[str, Any]  # empty where it was cut off
+
+    @property
+    def command(self) -> Sequence[str]:
+        """The words of the command."""
+        words = self.start.get("arguments")
+        return [str(word) for word in words] if isinstance(words, list) else []
+
+    @property
+    def state(self) -> str:
+        """How it ended, in a word."""
+        if not self.end:
+            return "cut off, or still going"
+        return "interrupted" if self.end.get("interrupted") else "finished"
+
+    def count(self, status: str) -> int:
+        """How many images have a status."""
+        return sum(line.get("status") == status for line in self.images)
+
+    @property
+    def megapixels(self) -> float:
+        """Of what was done."""
+        return sum(number(line.get("megapixels")) for line in self.images)
+
+    @property
+    def seconds(self) -> float:
+        """From the start to the end, or to the last image that was begun."""
+        if self.end:
+            return number(self.end.get("seconds"))
+        moments = [moment(line) for line in self.images]
+        return max(moments, default=0.0) - moment(self.start) if moments else 0.0
+
+    def pace(self) -> list[dict[str, float]]:
+        """How fast it was over its time: seconds since the start, MP/s, and shares of the steps.
+
+        An image counts where the last of its steps ends, as near as the log tells: when it was
+        begun, and the time of its steps.
+        """
+        done = [line for line in self.images if line.get("status") == DONE]
+        if not done or self.seconds <= 0:
+            return []
+        begun = moment(self.start)
+        width = self.seconds / min(TIMES, max(len(done) // 4, 1))
+        pieces: dict[int, list[Mapping[str, Any]]] = {}
+        for line in done:
+            ends = moment(line) - begun + sum(number(line.get(f"{step}_seconds")) for step in STEPS)
+            pieces.setdefault(int(min(max(ends, 0), self.seconds * 0.9999) / width), []).append(
+                line
+            )
+        rows = []
+        for i in range(max(pieces) + 1):
+            lines = pieces.get(i, [])
+            spent = {s: sum(number(x.get(f"{s}_seconds")) for x in lines) for s in STEPS}
+            whole = sum(spent.values()) or 1.0
+            speed = sum(number(line.get("megapixels")) for line in lines) / width
+            shares = {step: spent[step] / whole for step in STEPS}
+            rows.append({"seconds": (i + 0.5) * width, "speed": speed, **shares})
+        return rows
+
+
+def sessions(logs: Iterable[Mapping[str, Any]]) -> list[Session]:
+    """The starts of the program that logs tell of, in the order of the lines."""
+    found: list[Session] = []
+    images: list[Mapping[str, Any]] = []
+    for line in logs:
+        match line.get("event"):
+            case "start":
+                images = []
+                found.append(Session(line, images, {}))
+            case "image":
+                images.append(line)
+            case "end" if found:
+                found[-1] = Session(found[-1].start, images, line)
+    return found
+
+
+def number(value: Any) -> float:
+    """A value as a number; what is none counts as 0."""
+    return float(value) if isinstance(value, int | float) else 0.0
+
+
+def moment(line: Mapping[str, Any]) -> float:
+    """When a line of a log was, in seconds since 1970; 0 where it does not say."""
+    try:
+        return datetime.fromisoformat(str(line.get("at"))).timestamp()
+    except ValueError:
+        return 0.0
+
+
+def last_failures(found: Sequence[Session]) -> list[str]:
+    """The errors of images that failed and were not done since."""
+    errors: dict[str, str] = {}
+    for session in found:
+        for line in session.images:
+            key = str(line.get("name"))
+            if line.get("status") == FAILED:
+                errors[key] = str(line.get("error"))
+            elif line.get("status") in (DONE, SKIPPED):
+                errors.pop(key, None)
+    return list(errors.values())
+
+
+def totals(run: Run, found: Sequence[Session]) -> list[tuple[str, str]]:
+    """The figures that stand on top, by their names."""
+    pictures = run.pictures
+    others = len(run.made) - len(pictures)
+    megapixels = sum(number(p.value("width")) * number(p.value("height")) for p in pictures) / 1e6
+    last = found[-1] if found else None
+    rows = [
+        ("pictures", f"{len(pictures):,}"),
+        ("truths, frames, baselines", f"{others:,}"),
+        ("megapixels", f"{megapixels:,.1f}"),
+        ("failed", f"{len(last_failures(found)):,}"),
+    ]
+    if last:
+        left_out = last.count(LEFT_OUT)
+        rows += [("left out", f"{left_out:,}")] if left_out else []
+        if last.seconds > 0:
+            rows += [
+                ("time of the last run", clock(last.seconds)),
+                ("speed of the last run", f"{last.megapixels / last.seconds:.3g} MP/s"),
+            ]
+        if peak := number(last.end.get("peak_memory")):
+            rows.append(("most memory", in_words(peak)))
+    return rows
+
+
+def clock(seconds: float) -> str:
+    """A length of time for people.
+
+    >>> clock(5.21), clock(83), clock(7265)
+    ('5.2 s', '1 min 23 s', '2 h 01 min')
+    """
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02} s"
+    return f"{minutes // 60} h {minutes % 60:02} min"
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """The values of a parameter over the pictures of a run."""
+
+    name: str
+    values: Counter[Any]  # JSON values, lists as their text
+
+    @property
+    def varies(self) -> bool:
+        """Whether pictures differ in it."""
+        return len(self.values) > 1
+
+    @property
+    def numbers(self) -> list[float]:
+        """All values that are numbers, each as often as it occurs."""
+        return [
+            float(value)
+            for value, count in self.values.items()
+            if isinstance(value, int | float) and not isinstance(value, bool)
+            for _ in range(count)
+        ]
+
+    @property
+    def text(self) -> str:
+        """The value, or what values there are."""
+        if self.varies and len(numbers := self.numbers) == self.values.total():
+            return f"{min(numbers):.6g} to {max(numbers):.6g}"
+        listed = [text_of(value) for value, _ in self.values.most_common(DISTINCT)]
+        more = len(self.values) - len(listed)
+        return ", ".join(listed) + (f" and {more} more" if more > 0 else "")
+
+
+def text_of(value: Any) -> str:
+    """A value of a sidecar for people."""
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "-"}[value]
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of the chains of a run: its methods, and the values of their parameters."""
+
+    name: str
+    methods: Counter[str]
+    parameters: Sequence[Parameter]
+    pictures: int  # that have it
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether it does nothing to any picture."""
+        return set(self.methods) == {"none"}
+
+
+def steps_of(pictures: Sequence[Made]) -> list[Step]:
+    """The steps of the chains of pictures, in the order of the longest chain."""
+    order: list[str] = []
+    methods: dict[str, Counter[str]] = {}
+    values: dict[tuple[str, str], Counter[Any]] = {}
+    for made in pictures:
+        records = made.value("stages")
+        steps = [s for s in records if isinstance(s, Mapping)] if isinstance(records, list) else []
+        names = [str(step.get("name")) for step in steps]
+        if len(names) > len(order):
+            order = names + [name for name in order if name not in names]
+        for name, step in zip(names, steps, strict=True):
+            if name not in order:
+                order.append(name)
+            methods.setdefault(name, Counter())[str(step.get("method"))] += 1
+            parameters = step.get("parameters")
+            for key, value in parameters.items() if isinstance(parameters, Mapping) else ():
+                plain = value if isinstance(value, int | float | str | None) else str(value)
+                values.setdefault((name, str(key)), Counter())[plain] += 1
+    return [
+        Step(
+            name,
+            methods[name],
+            [Parameter(key, each) for (step, key), each in values.items() if step == name],
+            methods[name].total(),
+        )
+        for name in order
+    ]
+
+
+def drawn(pictures: Sequence[Made], steps: Sequence[Step]) -> list[Parameter]:
+    """What differs from picture to picture: camera, ISO, noise and parameters."""
+    facts = [
+        Parameter("camera", Counter(text_of(made.value("camera")) for made in pictures)),
+        Parameter("ISO", Counter(made.value("iso") for made in pictures)),
+        Parameter("noise a", Counter(made.value("noise", "signal", "a") for made in pictures)),
+        Parameter("noise b", Counter(made.value("noise", "signal", "b") for made in pictures)),
+        Parameter("clipped share", Counter(made.value("clipped") for made in pictures)),
+    ]
+    repeated = {("sensor_noise", "a"), ("sensor_noise", "b")}
+    facts += [
+        Parameter(f"{step.name}.{each.name}", each.values)
+        for step in steps
+        for each in step.parameters
+        if (step.name, each.name) not in repeated
+    ]
+    return [fact for fact in facts if fact.varies]
+
+
+def warnings_of(made: Made) -> list[str]:
+    """The warnings of a picture."""
+    found = made.value("warnings")
+    return [str(each) for each in found] if isinstance(found, list) else []
+
+
+def oddities(made: Made) -> list[str]:
+    """What is unusual with a picture: files that are gone or changed, clipping, warnings."""
+    found = [blob.problem for blob in made.files.values() if blob.problem]
+    clipped = number(made.value("clipped"))
+    if clipped >= MUCH:
+        found.append(f"{clipped:.0%} of its pixels are clipped")
+    return found + warnings_of(made)

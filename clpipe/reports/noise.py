@@ -1,0 +1,180 @@
+"""The noise of pictures against their truth, and against the law that was asked."""
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from clpipe.analysis.measure import measure
+from clpipe.analysis.pictures import load_picture
+from clpipe.analysis.report import NoiseReport
+from clpipe.analysis.svg import noise_svg
+from clpipe.base.errors import ClpipeError
+from clpipe.chain.truth import DEVELOPMENT, MOSAIC
+from clpipe.outputs.renditions import SUFFIXES
+from clpipe.reports.figures import number
+from clpipe.reports.run import Blob, Made, Run
+from clpipe.reports.shown import checked, picture_file
+
+JUDGED = 12  # images whose raw is held against the law
+LIMIT = 5.0  # standard errors
+NORMALIZED = "normalize.exr"  # the mosaic in signal, as the law is
+
+
+@dataclass(frozen=True)
+class Law:
+    """The variance of one raw, as measured and as asked: a y + b."""
+
+    name: str
+    a: float
+    b: float
+    a_error: float
+    b_error: float
+    asked_a: float
+    asked_b: float
+
+    @property
+    def errors(self) -> float:
+        """By how many standard errors the further of the two is away."""
+        return max(
+            abs(self.a - self.asked_a) / max(self.a_error, 1e-12),
+            abs(self.b - self.asked_b) / max(self.b_error, 1e-12),
+        )
+
+    @property
+    def leaves(self) -> bool:
+        """Whether the raw leaves the law."""
+        return self.errors > LIMIT
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The noise of one picture, drawn."""
+
+    name: str
+    against: str
+    iso: float
+    svg: str
+    sigma: str
+    left: float  # share of luma's variance that averaging 2x2 leaves
+    correlation: float  # of luma, one pixel to the right
+
+
+def measured(files: Sequence[Blob]) -> NoiseReport:
+    """The noise of the first file against the second.
+
+    Raises:
+        ClpipeError: they cannot be read or compared.
+    """
+    with ExitStack() as stack:
+        paths = []
+        for blob in files:
+            data = checked(blob)
+            ending = Path(blob.name).suffix
+            file = stack.enter_context(tempfile.NamedTemporaryFile(suffix=ending))
+            file.write(data)
+            file.flush()
+            paths.append(Path(file.name))
+        picture, truth = (load_picture(path) for path in paths)
+        return measure([picture], truth)
+
+
+def noises(run: Run, pictures: Sequence[Made], problems: list[str], most: int) -> list[Noise]:
+    """The noise of some pictures against the truth of their development, where there is one.
+
+    Args:
+        run: that they are of.
+        pictures: the first of them with a truth are measured.
+        problems: gets what cannot be measured, and why.
+        most: how many are.
+    """
+    found: list[Noise] = []
+    for made in pictures:
+        exposure = made.rendition.partition(".frame")[0]
+        truth = run.of_image(made.image).get(exposure + SUFFIXES[DEVELOPMENT])
+        pair = picture_file(made), truth and picture_file(truth)
+        if len(found) == most or not pair[0] or not pair[1]:
+            continue
+        try:
+            report = measured([pair[0], pair[1]])
+        except ClpipeError as error:
+            problems.append(f"{made.name}: its noise cannot be measured: {error}")
+            continue
+        by_name = {one.name: one for one in report.channels}
+        luma = by_name["Y"]
+        middle = luma.autocorrelation.shape[0] // 2
+        found.append(
+            Noise(
+                made.name,
+                pair[1].name,
+                number(made.value("iso")),
+                noise_svg(report),
+                ", ".join(f"{name} {by_name[name].sigma * 255:.2f}" for name in "RGB"),
+                luma.energy_left,
+                float(luma.autocorrelation[middle, middle + 1]),
+            )
+        )
+    return found
+
+
+def laws(run: Run, problems: list[str]) -> list[Law]:
+    """Raws against the law that was asked, where the mosaic after normalize and its truth are kept.
+
+    Each site's law is fitted; that of all four is the mean of theirs, weighted by their errors.
+    """
+    found = []
+    pictures = [made for made in run.pictures if NORMALIZED in made.files]
+    step = max(len(pictures) // JUDGED, 1)
+    for made in pictures[::step][:JUDGED]:
+        exposure = made.rendition.partition(".frame")[0]
+        truth = run.of_image(made.image).get(exposure + SUFFIXES[MOSAIC])
+        asked = made.value("noise", "signal")
+        is_known = truth and "exr" in truth.files and isinstance(asked, dict)
+        if not truth or not is_known or parameters_of(made, "prnu").get("sigma"):
+            continue  # PRNU is no line over intensity
+        try:
+            report = measured([made.files[NORMALIZED], truth.files["exr"]])
+        except ClpipeError as error:
+            problems.append(f"{made.name}: its raw cannot be measured: {error}")
+            continue
+        fits = [one.law for one in report.channels if one.law and one.name != "mosaic"]
+        if not fits:
+            continue
+        a, a_error = _pooled([(fit.a, fit.a_error) for fit in fits])
+        b, b_error = _pooled([(fit.b, fit.b_error) for fit in fits])
+        asked_a, asked_b = number(asked.get("a")), number(asked.get("b")) + other_noise(made)
+        found.append(Law(made.name, a, b, a_error, b_error, asked_a, asked_b))
+    return found
+
+
+def _pooled(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """The mean of values, weighted by their standard errors, and its own."""
+    weights = [1 / max(error, 1e-30) ** 2 for _, error in values]
+    whole = sum(weights)
+    mean = sum(w * value for w, (value, _) in zip(weights, values, strict=True)) / whole
+    return float(mean), float(whole**-0.5)
+
+
+def parameters_of(made: Made, step: str) -> Mapping[str, Any]:
+    """The parameters of a step of a picture's chain; none where it has no such step."""
+    stages = made.value("stages")
+    for each in stages if isinstance(stages, list) else []:
+        if isinstance(each, dict) and each.get("name") == step:
+            parameters = each.get("parameters")
+            return parameters if isinstance(parameters, dict) else {}
+    return {}
+
+
+def other_noise(made: Made) -> float:
+    """The variance that a mosaic has besides that of shot and read noise, in signal squared.
+
+    It is that of rows, columns and dark signals, and of rounding to whole DN: 1/12 of their square,
+    twice, since the truth is rounded as well.
+    """
+    lines = ("row_noise", "column_noise", "dsnu")
+    variance = sum(number(parameters_of(made, step).get("sigma")) ** 2 for step in lines)
+    digital = parameters_of(made, "quantize")
+    step = number(digital.get("white_level")) - number(digital.get("black_level"))
+    return variance + (2 / (12 * step**2) if step > 0 else 0.0)

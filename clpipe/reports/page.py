@@ -1,0 +1,214 @@
+"""One HTML file of one or two runs: everything is in it, so that it opens without a network."""
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from clpipe.analysis.svg import histogram_svg, lines_svg, shares_svg
+from clpipe.base.about import __version__
+from clpipe.batch.outcome import DONE, FAILED, SKIPPED, STEPS
+from clpipe.reports import figures
+from clpipe.reports.figures import Parameter, Session, Step
+from clpipe.reports.noise import LIMIT, laws, noises
+from clpipe.reports.run import Made, Run
+from clpipe.reports.shown import BUDGET, Budget, Large, chosen, contact_sheet, large
+
+TEMPLATES = Path(__file__).parent / "page"
+LISTED = 40  # failures, warnings, problems
+HISTOGRAMS = 12
+DRAWN = 3  # pictures whose noise is drawn
+SESSIONS = 12  # starts of the program, the latest
+
+# Of real cameras' own pictures at native size, a 5D Mark III's and a D800's at ISO 1600 and 3200
+# (Nam et al., CVPR 2016), measured by clpipe.analysis.signature; see docs/validation.md: the share
+# of luma's variance that averaging 2x2 leaves, and luma's correlation one pixel to the right.
+REAL_LEFT = (0.57, 0.63)
+REAL_RIGHT = (0.51, 0.59)
+
+
+@dataclass(frozen=True)
+class Listed:
+    """Texts, of which only the first are shown."""
+
+    shown: Sequence[str]
+    more: int
+
+
+def listed(texts: Sequence[str]) -> Listed:
+    """Texts, at most so many as are read."""
+    return Listed(texts[:LISTED], max(len(texts) - LISTED, 0))
+
+
+def html(runs: Sequence[Run]) -> str:
+    """The report of a run, or of two runs beside each other.
+
+    Args:
+        runs: one or two.
+    """
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    first, *others = runs
+    labels = labels_of(runs)
+    every = [figures.sessions(run.logs) for run in runs]
+    steps = [figures.steps_of(run.pictures) for run in runs]
+    drawn = figures.drawn(first.pictures, steps[0]) if not others else []
+    problems = [text for run in runs for text in run.problems]
+    judged = [law for run in runs for law in laws(run, problems)]
+    picked = chosen(first, {law.name for law in judged if law.leaves})
+    budget = Budget(BUDGET)
+    noise = [
+        (label, each)
+        for label, run in zip(labels, runs, strict=True)
+        for each in noises(run, same(run, picked), problems, DRAWN // len(runs))
+    ]
+    for _, drawing in noise:
+        budget.take(drawing.svg)
+    sheets = [contact_sheet(run, budget, label) for label, run in zip(labels, runs, strict=True)]
+    problems += [text for sheet in sheets for text in sheet.problems]
+    entries = [entry for sheet in sheets for entry in sheet.entries]
+    found_large = (large(runs, labels, made, budget, problems) for made in picked)
+    shown = [each for each in found_large if each]
+    totals = [figures.totals(run, found) for run, found in zip(runs, every, strict=True)]
+    names = list(dict.fromkeys(name for rows in totals for name, _ in rows))
+    found = [session for each in every for session in each]
+    return environment.get_template("report.html").render(
+        title=" and ".join(dict.fromkeys(run.folder.resolve().name for run in runs)),
+        version=__version__,
+        labels=labels,
+        totals=[(name, [dict(rows).get(name, "-") for rows in totals]) for name in names],
+        sessions=[session_row(session) for session in found[-SESSIONS:]],
+        failures=listed([text for each in every for text in figures.last_failures(each)]),
+        warnings=listed([text for run in runs for text in warnings(run)]),
+        problems=listed(list(dict.fromkeys(problems))),
+        pace=pace_drawings(found),
+        facts=machine_facts([made for run in runs for made in run.pictures]),
+        steps=steps[0],
+        differences=differences(*steps) if others else [],
+        drawn=drawings_of(drawn),
+        pictures=sum(sheet.pictures for sheet in sheets),
+        shown_pictures=len(entries),
+        entries=script_json(entries),
+        large=shown,
+        views=script_json([view_record(each) for each in shown]),
+        noise=noise,
+        real_left=REAL_LEFT,
+        real_right=REAL_RIGHT,
+        laws=judged,
+        limit=LIMIT,
+        style=(TEMPLATES / "report.css").read_text(),
+        script=(TEMPLATES / "report.js").read_text(),
+    )
+
+
+def labels_of(runs: Sequence[Run]) -> list[str]:
+    """What tells the runs apart: the names of their folders, or their paths; "" of a single one."""
+    if len(runs) == 1:
+        return [""]
+    names = [run.folder.resolve().name for run in runs]
+    return names if len(set(names)) == len(names) else [str(run.folder) for run in runs]
+
+
+def same(run: Run, pictures: Sequence[Made]) -> list[Made]:
+    """The pictures of a run with the names of those of another."""
+    return [own for made in pictures if (own := run.picture_of(made.image))]
+
+
+def warnings(run: Run) -> list[str]:
+    """The warnings of all pictures, with their names."""
+    return [f"{made.name}: {text}" for made in run.pictures for text in figures.warnings_of(made)]
+
+
+def differences(first: Sequence[Step], second: Sequence[Step]) -> list[tuple[str, str, str]]:
+    """What the chains of two runs differ in: methods and values, by their names."""
+    tables = []
+    for steps in (first, second):
+        rows = {f"{step.name}.method": ", ".join(step.methods) for step in steps}
+        rows |= {f"{s.name}.{each.name}": each.text for s in steps for each in s.parameters}
+        tables.append(rows)
+    one, two = tables
+    return [
+        (name, one.get(name, "-"), two.get(name, "-"))
+        for name in dict.fromkeys([*one, *two])
+        if one.get(name) != two.get(name)
+    ]
+
+
+def script_json(value: Any) -> str:
+    """JSON that can stand in a ``<script>``, whatever its texts hold."""
+    text = json.dumps(value, separators=(",", ":"))
+    for character in "<>&\u2028\u2029":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return text
+
+
+def view_record(each: Large) -> Mapping[str, Any]:
+    """What the script needs of a large picture."""
+    return {"name": each.name, "views": each.views, "width": each.width}
+
+
+def session_row(session: Session) -> Mapping[str, str]:
+    """A start of the program, as a row of a table."""
+    speed = session.megapixels / session.seconds if session.seconds > 0 else 0.0
+    return {
+        "command": shlex.join(["clpipe", *session.command]),
+        "at": str(session.start.get("at", ""))[:19].replace("T", " "),
+        "state": session.state,
+        "done": f"{session.count(DONE):,}",
+        "skipped": f"{session.count(SKIPPED):,}",
+        "failed": f"{session.count(FAILED):,}",
+        "time": figures.clock(session.seconds),
+        "speed": f"{speed:.3g} MP/s",
+    }
+
+
+def pace_drawings(found: Sequence[Session]) -> list[str]:
+    """How fast the last run with pictures was, and its steps' shares, over its time."""
+    for session in reversed(found):
+        rows = session.pace()
+        if len(rows) < 3:
+            continue
+        x = [row["seconds"] for row in rows]
+        speed = {"MP/s": [row["speed"] for row in rows]}
+        shares = {step: [row[step] for row in rows] for step in STEPS}
+        label = "seconds since the start"
+        return [
+            lines_svg(x, speed, (label, "MP/s"), "Speed over the time of the run"),
+            shares_svg(x, shares, label, "Shares of the steps over the time of the run"),
+        ]
+    return []
+
+
+def machine_facts(pictures: Sequence[Made]) -> list[tuple[str, str]]:
+    """On what pictures were made, and with which versions."""
+    rows: dict[str, dict[str, None]] = {}
+    for made in pictures:
+        device = made.value("device")
+        if isinstance(device, Mapping):
+            text = f"{device.get('name')}, {device.get('version')}"
+            rows.setdefault("device", {})[text] = None
+        rows.setdefault("clpipe", {})[str(made.value("clpipe"))] = None
+        versions = made.value("versions")
+        for name, version in versions.items() if isinstance(versions, Mapping) else ():
+            rows.setdefault(str(name), {})[str(version)] = None
+    return [(name, "; ".join(texts)) for name, texts in rows.items()]
+
+
+def drawings_of(drawn: Sequence[Parameter]) -> list[tuple[Parameter, str]]:
+    """What was drawn, with a histogram where it is numbers."""
+    found: list[tuple[Parameter, str]] = []
+    for fact in drawn:
+        numbers = fact.numbers
+        is_drawn = len(numbers) == fact.values.total() and len(fact.values) > 2
+        is_drawn = is_drawn and len(found) < HISTOGRAMS
+        found.append((fact, histogram_svg(numbers, fact.name) if is_drawn else ""))
+    return found

@@ -1,0 +1,229 @@
+"""What an output folder has: its pictures by their sidecars, in the folder and in its tars, and its
+logs."""
+
+import os
+import tarfile
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from clpipe.base.errors import RequestError
+from clpipe.base.reading import TEXT_BYTES, parse_json, read_bytes
+from clpipe.batch.run_log import read_log
+from clpipe.batch.tars import DAMAGED
+from clpipe.outputs.sidecar import BEGINNING, SIDECAR, outputs_in
+
+TAR = ".tar"
+LOGS = "run*.jsonl"
+
+
+@dataclass(frozen=True)
+class Blob:
+    """A file, or a member of a tar, and what its sidecar says of it."""
+
+    path: Path
+    name: str  # below the output folder; of a member, behind the tar's
+    said: Mapping[str, Any]  # its size and SHA-256
+    offset: int | None = None  # of a tar's member
+    size: int = -1  # that it has; -1: there is none
+
+    def read(self) -> bytes:
+        """The bytes.
+
+        Raises:
+            OSError: they cannot be read.
+        """
+        with self.path.open("rb") as file:
+            file.seek(self.offset or 0)
+            return file.read(self.size)
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with it, as far as its size tells; "" is nothing."""
+        if self.size < 0:
+            return f"{self.name}: is gone"
+        if self.size != self.said["size"]:
+            return f"{self.name}: has {self.size} bytes, not the {self.said['size']} of its sidecar"
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """One picture of a run, by its sidecar: of an image, a frame, a truth, a baseline."""
+
+    image: str  # the name of what it was made of, without ending; with folders of a series
+    rendition: str  # what is behind that name, such as ".truth"; "" is the picture itself
+    record: Mapping[str, Any]  # the sidecar
+    files: Mapping[str, Blob]  # by what is behind the picture's name: "jpg", "demosaic.exr"
+
+    @property
+    def name(self) -> str:
+        """The name of the picture, without ending."""
+        return self.image + self.rendition
+
+    def value(self, *keys: str) -> Any:
+        """A value of the sidecar, by the keys on the way to it; None where it is not there."""
+        found: Any = self.record
+        for key in keys:
+            found = found.get(key) if isinstance(found, Mapping) else None
+        return found
+
+
+@dataclass
+class Run:
+    """An output folder."""
+
+    folder: Path
+    made: list[Made] = field(default_factory=list)
+    logs: list[Mapping[str, Any]] = field(default_factory=list)  # lines, of all logs
+    problems: list[str] = field(default_factory=list)  # of sidecars, tars and logs
+
+    @property
+    def pictures(self) -> Sequence[Made]:
+        """The pictures themselves, in the order of their names; first frames of bursts."""
+        return [each for each in self.made if each.rendition in PICTURES]
+
+    def of_image(self, image: str) -> Mapping[str, Made]:
+        """All pictures of an image, by their rendition."""
+        return self._by_image.get(image, {})
+
+    def picture_of(self, image: str) -> Made | None:
+        """The picture of an image, or its first frame."""
+        found = self.of_image(image)
+        return next((found[name] for name in PICTURES if name in found), None)
+
+    def __post_init__(self) -> None:
+        self._by_image: dict[str, dict[str, Made]] = {}
+
+    def add(self, made: Made) -> None:
+        """Add a picture."""
+        self.made.append(made)
+        self._by_image.setdefault(made.image, {})[made.rendition] = made
+
+
+# The renditions that count as the picture of an image: itself, or the first frame of its burst.
+PICTURES = ("", *(f".frame{'0' * digits}" for digits in range(1, 7)))
+
+
+def read_run(folder: Path) -> Run:
+    """What an output folder has, finished or not.
+
+    Raises:
+        RequestError: it is no folder, or has no sidecar of clpipe's.
+    """
+    if not folder.is_dir():
+        raise RequestError(f"{folder}: there is no such folder; name the output folder of a run")
+    run = Run(folder)
+    found = sorted(_in_folder(run), key=lambda made: (made.image, made.rendition))
+    for made in found:
+        run.add(made)
+    for path in sorted(folder.glob(LOGS)):
+        try:
+            run.logs += read_log(path)
+        except (OSError, ValueError) as error:
+            run.problems.append(f"{path.name}: cannot be read: {error}")
+    if not run.made and not run.logs:
+        raise RequestError(
+            f"{folder}: has no picture of clpipe's with its sidecar (NAME.json), and no log "
+            "(run.jsonl); name the output folder of clpipe run"
+        )
+    return run
+
+
+def _in_folder(run: Run) -> Iterator[Made]:
+    """The pictures of a folder, and of the tars in it."""
+    for place, folders, names in os.walk(run.folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        below = Path(place).relative_to(run.folder).as_posix()
+        beside: dict[str, Blob] = {}
+        for name in sorted(names):
+            path = Path(place, name)
+            if name.startswith("."):
+                continue
+            if name.endswith(TAR):
+                yield from _in_tar(run, path)
+            elif name.endswith(f".{SIDECAR}"):
+                try:
+                    data = read_bytes(path)
+                except OSError as error:
+                    run.problems.append(f"{_joined(below, name)}: cannot be read: {error}")
+                    continue
+                beside = beside or _files(place, below)
+                yield from _made(run, below, name, data, beside)
+
+
+def _files(folder: str, below: str) -> dict[str, Blob]:
+    """A folder's files by their names."""
+    with os.scandir(folder) as entries:
+        return {
+            entry.name: Blob(
+                Path(entry.path), _joined(below, entry.name), {}, None, entry.stat().st_size
+            )
+            for entry in entries
+            if entry.is_file()
+        }
+
+
+def _in_tar(run: Run, path: Path) -> Iterator[Made]:
+    """The pictures of a tar."""
+    label = path.relative_to(run.folder).as_posix()
+    beside: dict[str, dict[str, Blob]] = defaultdict(dict)  # by folder and name
+    sidecars: list[tuple[str, str, bytes]] = []
+    try:
+        with tarfile.open(path, "r:") as tar:
+            for member in tar:
+                if not member.isfile():
+                    continue
+                name, below = (
+                    PurePosixPath(member.name).name,
+                    str(PurePosixPath(member.name).parent),
+                )
+                place = member.offset_data, member.size
+                beside[below][name] = Blob(path, f"{label}/{member.name}", {}, *place)
+                is_text = name.endswith(f".{SIDECAR}") and member.size <= TEXT_BYTES
+                if is_text and (file := tar.extractfile(member)):
+                    sidecars.append((below, name, file.read()))
+    except DAMAGED as error:
+        run.problems.append(f"{label}: cannot be read to its end: {error}")
+    for below, name, data in sidecars:
+        yield from _made(run, below, name, data, beside[below])
+
+
+def _made(
+    run: Run, below: str, name: str, data: bytes, beside: Mapping[str, Blob]
+) -> Iterator[Made]:
+    """The picture of a sidecar; nothing of what is none of clpipe's or is damaged.
+
+    Args:
+        run: gets the problem.
+        below: the sidecar's folder, below the output folder or in the tar.
+        name: of its file.
+        data: its bytes.
+        beside: the files of its folder by their names.
+    """
+    if not data.startswith(BEGINNING):
+        return
+    try:
+        record = parse_json(data)
+    except ValueError:
+        run.problems.append(f"{_joined(below, name)}: is cut off or damaged")
+        return
+    rendition = record.get("picture")
+    stem = name.removesuffix(f".{SIDECAR}")
+    if not isinstance(rendition, str) or not stem.endswith(rendition):
+        run.problems.append(f"{_joined(below, name)}: is damaged, or of another version")
+        return
+    files = {}
+    for file, said in outputs_in(record).items():
+        label = _joined(below, file)
+        there = beside.get(file, Blob(run.folder, label, {}))
+        files[file.removeprefix(f"{stem}.")] = Blob(
+            there.path, there.name, said, there.offset, there.size
+        )
+    yield Made(_joined(below, stem.removesuffix(rendition)), rendition, record, files)
+
+
+def _joined(below: str, name: str) -> str:
+    return name if below == "." else f"{below}/{name}"

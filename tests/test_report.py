@@ -1,0 +1,295 @@
+"""``clpipe report``: what its page says of runs, and what it does in a browser."""
+
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from clpipe.commands.main import main
+from clpipe.images.write import write_exr as write
+from clpipe.reports.figures import sessions
+from clpipe.reports.run import read_run
+from tests.conftest import ROOT
+
+pytest.importorskip("jinja2")
+
+HOSTILE = "<img src=x onerror=alert(1)>&amp;"
+NUMPY = ("--device", "numpy")
+
+
+class Page(HTMLParser):
+    """The tags of a page, and the texts of its data and of its other elements."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.text = path.read_text("utf-8")
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self.data: dict[str, object] = {}
+        self._in: str | None = None
+        self.feed(self.text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        self._in = dict(attrs).get("id") if tag == "script" else None
+
+    def handle_data(self, data):
+        if self._in:
+            self.data[self._in] = json.loads(data)
+            self._in = None
+        else:
+            self.words.append(data)
+
+    @property
+    def said(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+def clpipe(*arguments, status=0) -> str:
+    result = CliRunner().invoke(main, [str(each) for each in arguments], catch_exceptions=False)
+    assert result.exit_code == status, result.output
+    return result.output
+
+
+def report(*arguments) -> Page:
+    page = Path(arguments[0], "report.html")
+    clpipe("report", *arguments, "-o", page)
+    return Page(page)
+
+
+@pytest.fixture(scope="module")
+def renders(tmp_path_factory):
+    """Three small renders, one with a hostile name, and one that is damaged."""
+    folder = tmp_path_factory.mktemp("report") / "renders"
+    folder.mkdir()
+    y, x = np.mgrid[0:96, 0:160] / 160
+    for i, name in enumerate(("a", "b", HOSTILE)):
+        picture = np.stack([0.2 + 0.5 * x, 0.6 - 0.5 * y, 0.3 + 0.2 * np.sin(9 * x + i)], -1)
+        write(folder / f"{name}.exr", picture.astype(np.float32), ("R", "G", "B"), {})
+    (folder / "cut.exr").write_bytes((folder / "a.exr").read_bytes()[:600])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(renders):
+    """A run of them with truths and kept raws."""
+    out = renders.parent / "out"
+    arguments = ("--iso", 1600, "--truth", "development", "--truth", "mosaic")
+    draw = ("--set", "exposure.ev={uniform=[-1, 1]}", "--keep", "normalize")
+    clpipe("run", renders, "-o", out, *NUMPY, *arguments, *draw, status=1)
+    return out
+
+
+@pytest.fixture
+def out(made, tmp_path):
+    """A copy of that run."""
+    return Path(shutil.copytree(made, tmp_path / "out"))
+
+
+def test_figures_pictures_and_failures(out):
+    page = report(out)
+    assert "pictures 3" in page.said and "failed 1" in page.said
+    assert "cut.exr" in page.said
+    entries = page.data["sheet-data"]
+    assert [entry["name"] for entry in entries] == [HOSTILE, "a", "b"]
+    assert all(entry["image"].startswith("data:image/jpeg;base64,") for entry in entries)
+    assert {entry["iso"] for entry in entries} == {1600}
+    large = page.data["look-data"]
+    assert [view["label"] for view in large[0]["views"]] == ["picture", "truth"]
+    assert "exposure.ev : " in page.said.replace("exposure.ev:", "exposure.ev :")
+    assert "sensor_noise gaussian" in page.said
+    assert "finished" in page.said
+
+
+def test_it_is_one_file_in_which_nothing_is_markup_but_ours(out):
+    page = report(out)
+    assert ("img", {"src": "x", "onerror": "alert(1)"}) not in page.tags
+    assert not any("onerror" in attributes for _, attributes in page.tags)
+    addresses = [
+        attributes[name]
+        for tag, attributes in page.tags
+        for name in ("src", "href", "xlink:href")
+        if attributes.get(name)
+    ]
+    assert all(each.startswith(("data:", "#")) for each in addresses)
+    assert "url(http" not in page.text and "@import" not in page.text
+    ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    assert len(page.text) < 15 << 20
+
+
+def test_the_law_is_held_against_raws(out):
+    page = report(out)
+    assert "Raws against the law that was asked" in page.said
+    assert "leaves the law" not in page.said
+    sidecar = out / "a.json"
+    record = json.loads(sidecar.read_text())
+    asked = record["noise"]["signal"]["a"]
+    text = sidecar.read_text().replace(f'"a": {asked}, "b"', f'"a": {asked * 1.5}, "b"')
+    sidecar.write_text(text)
+    page = report(out)
+    assert page.said.count("leaves the law") == 1
+    assert page.data["look-data"][0]["name"] == "a"  # it is shown first
+
+
+def test_files_that_are_gone_or_changed_are_named(out):
+    (out / "a.jpg").unlink()
+    changed = bytearray((out / "b.jpg").read_bytes())
+    changed[-3] ^= 1
+    (out / "b.jpg").write_bytes(changed)
+    (out / "b.normalize.exr").write_bytes(b"short")
+    page = report(out)
+    assert "a.jpg: is gone" in page.said
+    assert "b.jpg: was changed since; its SHA-256" in page.said
+    assert "b.normalize.exr: has 5 bytes, not the " in page.said
+    by_name = {entry["name"]: entry for entry in page.data["sheet-data"]}
+    assert not by_name["a"]["image"] and not by_name["b"]["image"] and by_name[HOSTILE]["image"]
+    assert by_name["a"]["odd"] and not by_name[HOSTILE]["odd"]
+
+
+def test_half_a_run_and_a_log_that_is_cut_off(out):
+    log = out / "run.jsonl"
+    lines = log.read_bytes().splitlines(keepends=True)
+    log.write_bytes(b"".join(lines[:-1]) + lines[-1][:20])
+    (out / "b.json").write_text((out / "b.json").read_text()[:200])
+    (out / "notes.json").write_text('{"mine": 1}')
+    page = report(out)
+    assert "cut off, or still going" in page.said
+    assert "b.json: is cut off or damaged" in page.said and "notes" not in page.said
+    assert [entry["name"] for entry in page.data["sheet-data"]] == [HOSTILE, "a"]
+
+
+def test_hostile_sidecars(out):
+    record = json.loads((out / "a.json").read_text())
+    record |= {
+        "warnings": ["</script><script>alert(1)</script>"],
+        "camera": "<b>x",
+        "clipped": None,
+    }
+    record["stages"] = [{"name": "</style>", "method": [], "parameters": {"<i>": {"a": 1}}}, 3]
+    record["noise"], record["device"], record["versions"] = 7, "none", [1]
+    beginning = '{\n  "clpipe": "0.1.0",\n  '
+    rest = json.dumps({key: value for key, value in record.items() if key != "clpipe"})
+    (out / "a.json").write_text(beginning + rest[1:])
+    page = report(out)
+    assert "</script><script>alert(1)" not in page.text
+    assert "</script><script>alert(1)</script>" in page.said
+    assert [tag for tag, _ in page.tags if tag in ("b", "i")].count("i") == 0
+    assert page.text.count("</style>") == page.text.count("<style")
+
+
+def test_tars_and_series_are_read(renders, tmp_path):
+    out = tmp_path / "out"
+    arguments = ("--iso", "100,1600", "--truth", "development")
+    clpipe("run", renders / "a.exr", renders / "b.exr", "-o", out / "s", *NUMPY, *arguments)
+    arguments = ("--iso", 1600, "--webdataset", 2, "--truth", "clean")
+    clpipe("run", renders / "a.exr", renders / "b.exr", "-o", out / "t", *NUMPY, *arguments)
+    page = report(out / "s")
+    names = {entry["name"]: entry["iso"] for entry in page.data["sheet-data"]}
+    assert names == {"iso100/a": 100, "iso100/b": 100, "iso1600/a": 1600, "iso1600/b": 1600}
+    assert "ISO 100 to 1600" in page.said
+    page = report(out / "t")
+    assert [entry["name"] for entry in page.data["sheet-data"]] == ["a", "b"]
+    assert all(entry["image"] for entry in page.data["sheet-data"])
+    views = [view["label"] for view in page.data["look-data"][0]["views"]]
+    assert views == ["picture", "truth_clean"]
+    tar = out / "t" / "000000.tar"
+    tar.write_bytes(tar.read_bytes()[:3000])
+    assert "000000.tar: cannot be read to its end" in report(out / "t").said
+
+
+def test_two_runs_are_compared(out, renders, tmp_path):
+    other = tmp_path / "other"
+    more = ("--iso", 400, "--set", "denoise.luma_strength=2", "--truth", "development")
+    clpipe("run", renders / "a.exr", "-o", other, *NUMPY, *more)
+    page = report(out, other)
+    assert "denoise.luma_strength 1 2" in page.said
+    large = {each["name"]: each for each in page.data["look-data"]}
+    labels = [view["label"] for view in large["a"]["views"]]
+    assert labels[:2] == ["out picture", "other picture"]
+    names = [entry["name"] for entry in page.data["sheet-data"]]
+    assert "out: a" in names and "other: a" in names and "other: b" not in names
+
+
+def test_many_pictures_are_sampled_within_the_budget(out, monkeypatch):
+    monkeypatch.setattr("clpipe.reports.page.BUDGET", 20_000)
+    page = report(out)
+    assert len(page.data["sheet-data"]) < 3
+    assert re.search(r"\d of 3 pictures: unusual ones", page.said)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "nowhere: there is no such folder"),
+        (["."], "has no picture of clpipe's with its sidecar"),
+        ([".", "-o", "x.pdf"], "-o: found x.pdf; expected a name that ends in .html"),
+        ([".", ".", "."], "found 3 folders; one is reported on, or two are compared"),
+    ],
+)
+def test_bad_input(tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    assert message in clpipe("report", *arguments, status=2)
+
+
+def test_the_pace_of_a_run():
+    start = {"event": "start", "at": "2026-01-01T00:00:00+00:00", "arguments": ["run"]}
+    image = {"event": "image", "status": "done", "megapixels": 2.0, "decode_seconds": 1.0}
+    images = [{**image, "at": f"2026-01-01T00:00:{i:02}+00:00"} for i in range(40)]
+    (session,) = sessions([start, *images, {"event": "end", "seconds": 40.0}])
+    pace = session.pace()
+    assert len(pace) == 10
+    assert sum(row["speed"] for row in pace) / 10 == pytest.approx(2.0, rel=0.01)
+    assert all(row["decode"] == 1 for row in pace)
+    (cut,) = sessions([start, *images])
+    assert cut.seconds == 39 and cut.state.startswith("cut off")
+
+
+def test_in_a_browser(out):
+    """The slider moves, filters filter, pages turn, and the console stays empty."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if not chromium:
+        pytest.skip("there is no Chromium")
+    report(out)
+    with playwright.sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 400, "height": 800})
+        said: list[str] = []
+        page.on("console", lambda message: said.append(message.text))
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.goto((out / "report.html").as_uri())
+        assert page.locator("#sheet-list li").count() == 3
+        page.fill("#filter-name", "b")
+        assert page.locator("#sheet-list li").count() == 1
+        page.fill("#filter-name", "")
+        page.select_option("#filter-iso", "1600")
+        assert page.locator("#sheet-list li").count() == 3
+        page.focus("#look-split")
+        before = page.evaluate("getComputedStyle(slider).getPropertyValue('--split')")
+        page.keyboard.press("ArrowRight")
+        after = page.evaluate("getComputedStyle(slider).getPropertyValue('--split')")
+        assert (before, after) == ("50%", "50.5%")
+        crop = "document.getElementById('loupe-left-4').toDataURL()"
+        first = page.evaluate(crop)
+        page.mouse.move(*(page.locator("#slider").bounding_box()[side] + 9 for side in "xy"))
+        assert page.evaluate(crop) != first
+        page.select_option("#look-image", "1")
+        assert page.evaluate("document.documentElement.scrollWidth") == 400
+        page.click("#theme")
+        assert page.evaluate("document.documentElement.dataset.theme") in ("dark", "light")
+        assert said == []
+        browser.close()
+
+
+def test_a_run_is_read_from_its_sidecars(out):
+    run = read_run(out)
+    assert [made.name for made in run.pictures] == [HOSTILE, "a", "b"]
+    assert sorted(run.of_image("a")) == ["", ".truth", ".truth_mosaic"]
+    assert run.of_image("a")[""].files.keys() == {"jpg", "normalize.exr"}
+    assert (ROOT / "clpipe/reports/page/report.html").is_file()
