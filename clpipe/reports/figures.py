@@ -60,10 +60,10 @@ class Session:
         begun, and the time of its steps.
         """
         done = [line for line in self.images if line.get("status") == DONE]
-        if not done or self.seconds <= 0:
+        begun, length = moment(self.start), self.seconds
+        if not done or length <= 0:
             return []
-        begun = moment(self.start)
-        width = self.seconds / min(TIMES, max(len(done) // 4, 1))
+        width = length / min(TIMES, max(len(done) // 4, 1))
         pieces: dict[int, list[Mapping[str, Any]]] = {}
         for line in done:
             ends = moment(line) - begun + sum(number(line.get(f"{step}_seconds")) for step in STEPS)
