@@ -28,8 +28,13 @@ SIZE, SMALL = 7, 6  # points
 LINE, LETTER = (each * DPI / 72 for each in (1.25, 0.64))
 
 SUFFIXES = (".png", ".pdf", ".svg")
-# Text stays text; files are the same whenever they are made.
-STYLE = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "clpipe"}
+# Text stays text, each crop an image; files are the same whenever they are made.
+STYLE = {
+    "image.composite_image": False,
+    "pdf.fonttype": 42,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "clpipe",
+}
 METADATA = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 
 
@@ -78,9 +83,11 @@ def draw(comparison: Comparison, path: Path, zoom: int = 4) -> None:
             "smaller crops, fewer of them, or a smaller --zoom"
         )
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
+    page = figure.add_axes((0, 0, 1, 1))
+    page.set_axis_off()
 
     def write(x: float, y: float, text: str, size: int = SIZE, **how: Any) -> None:
-        figure.text(x / width, 1 - y / height, text, size=size, parse_math=False, **how)
+        page.text(x, y, text, size=size, parse_math=False, **how)
 
     for column, head in enumerate(heads):
         middle = left + column * (columns + GAP) + columns / 2
@@ -88,15 +95,15 @@ def draw(comparison: Comparison, path: Path, zoom: int = 4) -> None:
         if feet:
             write(middle, bottom, feet[column], ha="center", va="top")
     for row, top, side in zip(comparison.rows, tops, sides, strict=True):
-        tall = row.crops[0].shape[0] * zoom
-        at = left - GAP / 2, top + tall / 2
+        middle = top + row.crops[0].shape[0] * zoom / 2
+        at = left - GAP / 2, middle
         write(*at, side, ha="right", va="center", rotation=90, multialignment="center")
         for column, crop in enumerate(row.crops):
-            wide, x = crop.shape[1] * zoom, left + column * (columns + GAP)
-            place = (x / width, 1 - (top + tall) / height, wide / width, tall / height)
-            axes = figure.add_axes(place)
-            axes.set_axis_off()
-            axes.imshow(_enlarged(crop, zoom), interpolation="none", aspect="auto")
+            tall, wide = (pixels * zoom for pixels in crop.shape[:2])
+            x = left + column * (columns + GAP)
+            place = (x, x + wide, top + tall, top)
+            page.imshow(_enlarged(crop, zoom), interpolation="none", aspect="auto", extent=place)
+    page.set(xlim=(0, width), ylim=(height, 0))  # imshow has moved them
     for note in notes:
         write(GAP, below, note, SMALL, va="top")
         below += _height([note], SMALL)

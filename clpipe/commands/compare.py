@@ -19,10 +19,12 @@ FILE = click.Path(path_type=Path)
 @click.option(
     "-o",
     "--output",
+    "outputs",
     required=True,
+    multiple=True,
     type=FILE,
     metavar="FIGURE",
-    help="The figure to write: .png, .pdf or .svg.",
+    help="The figure to write, as .png, .pdf or .svg; may be repeated.",
 )
 @click.option(
     "--crop",
@@ -61,7 +63,7 @@ FILE = click.Path(path_type=Path)
 )
 def compare(
     pictures: tuple[Path, ...],
-    output: Path,
+    outputs: tuple[Path, ...],
     crops: tuple[str, ...],
     labels: tuple[str, ...],
     truths: tuple[Path, ...],
@@ -86,16 +88,18 @@ def compare(
     require("clpipe compare", "calibrate", "matplotlib", "scipy")
     from clpipe.analysis.comparison_plot import check_name, draw
 
-    check_name(output, (*pictures, *truths))
+    for output in outputs:
+        check_name(output, (*pictures, *truths))
     found = compare_pictures(pictures, crops, labels, truths, difference)
-    draw(found, output, zoom)
+    for output in outputs:
+        draw(found, output, zoom)
     show(("place", "crop"), [(place.name, place.box) for place in found.places])
     if found.noise:
         click.echo()
         show_noise(found)
     for note in found.notes:
         click.echo(note)
-    click.echo(f"wrote {output}")
+    click.echo(f"wrote {' and '.join(map(str, outputs))}")
 
 
 def show_noise(found: Comparison) -> None:
