@@ -144,12 +144,12 @@ def test_differences_are_from_the_truth_or_else_from_the_first(scene, write_png)
     )
     place, difference = compare([a, b], ["0,0,8x6"], difference=True).rows
     assert place.name == "0,0,8x6"
-    assert difference.name == "difference, x16"  # 4 levels become 64, and 16 more would be 160
+    assert difference.name == "difference x16"  # 4 levels become 64, and 16 more would be 160
     assert np.allclose(difference.crops[0], 0.5)
     assert np.allclose(difference.crops[1], 0.5 + 16 * 4 / 255, atol=1e-5)
     _, difference = compare([a, b], ["0,0,8x6"], truths=[truth], difference=True).rows
     for crop, level in zip(difference.crops, (8, 12), strict=True):
-        gain = int(difference.name.removeprefix("difference, x"))
+        gain = int(difference.name.removeprefix("difference x"))
         assert np.allclose(crop, 0.5 + gain * level / 255, atol=1e-5)
 
 
@@ -159,7 +159,7 @@ def test_light_is_shown_through_the_curve_of_srgb(clpipe, scene, write_exr, writ
     text = clpipe("compare", render, shown, "-o", "a.png").stdout
     assert "linear, shown through sRGB's curve: render" in text
     _, difference = compare([shown, render], ["flat"], difference=True).rows
-    gain = int(difference.name.removeprefix("difference, x"))
+    gain = int(difference.name.removeprefix("difference x"))
     assert np.abs(difference.crops[1] - 0.5).max() / gain < 1 / 255
 
 

@@ -7,8 +7,8 @@ from importlib.util import module_from_spec, spec_from_loader
 
 import numpy as np
 import pytest
-from PIL import Image
 
+from clpipe.analysis.comparison_plot import draw as draw_comparison
 from clpipe.camera.profile import load_camera
 from clpipe.chain.files import built_in_configs
 from clpipe.chain.registry import all_stages
@@ -27,16 +27,20 @@ LOADER.exec_module(figures)
 
 def test_the_figures_are_made(clpipe, tmp_path, write_exr, monkeypatch):
     write_exr("view.01.exr", read_image(STILL_LIFE).pixels[230:390, 400:640])
-    write_dng(
-        tmp_path / "shot.dng", np.random.default_rng(0).normal(2000, 300, (128, 192)).astype(int)
-    )
-    commands = []
+    random = np.random.default_rng(0)
+    write_dng(tmp_path / "shot.dng", random.normal(2000, 300, (128, 192)).astype(int))
+    commands, drawn = [], []
 
     def command(*words):
         commands.append(words)
         clpipe(*words)
 
+    def draw(comparison, path):
+        drawn.append(comparison)
+        draw_comparison(comparison, path)
+
     monkeypatch.setattr(figures, "clpipe", command)
+    monkeypatch.setattr(figures, "draw", draw)
     monkeypatch.setattr(figures, "SUFFIXES", (".png",))
     monkeypatch.setattr(figures, "METHODS", ("bilinear", "bounded"))
     monkeypatch.setattr("sys.argv", ["figures", "--render", "view.01.exr", "--raw", "shot.dng"])
@@ -45,8 +49,10 @@ def test_the_figures_are_made(clpipe, tmp_path, write_exr, monkeypatch):
     names = ("demosaicing", "iso100", "iso1600", "raw_demosaicing", "raw_iso100", "statistics")
     assert made == [f"{name}.png" for name in names]
     assert [words[0] for words in commands].count("compare") == 4
-    with Image.open("figures/iso100.png") as four, Image.open("figures/raw_iso100.png") as five:
-        assert five.width - four.width == 96 * 4 + 12  # the raw's column
+    (found,) = drawn
+    assert found.labels == (*figures.PICTURES.values(), "shot")
+    assert found.noise[-1].sigma > 5 > found.noise[0].sigma  # the raw is noise alone
+    assert all(len(row.crops) == 5 for row in found.rows)
 
 
 def rows_of_the_table():

@@ -57,6 +57,9 @@ PICTURES = {
 TRUTHS = {ending: ".truth.png" if ending == ".png" else ".truth_clean.png" for ending in PICTURES}
 
 
+PLACES = ("textured", "saturated", "flat")
+
+
 def clpipe(*words: str | Path | int) -> None:
     """Run a command of clpipe, printed as it would be typed; end with its status where it fails."""
     texts = list(map(str, words))
@@ -118,7 +121,7 @@ def compare_methods(made: Mapping[str, Sequence[Path]], figure: Path) -> None:
     """
     pictures = [paths[0] for paths in made.values()]
     truths = options("--truth", (paths[1] for paths in made.values() if len(paths) > 1))
-    rows = options("--crop", ("textured", "saturated", "flat"))
+    rows = options("--crop", PLACES[:2])
     labels = options("--label", made)
     clpipe("compare", *pictures, *truths, *rows, *labels, *outputs(figure))
 
@@ -133,11 +136,12 @@ def compare_noise(picture: Path, figure: Path) -> None:
     pictures = [picture.with_suffix(ending) for ending in PICTURES]
     truths = options("--truth", (picture.with_suffix(ending) for ending in TRUTHS.values()))
     labels = options("--label", PICTURES.values())
-    clpipe("compare", *pictures, *truths, *labels, *outputs(figure))
+    rows = [*options("--crop", PLACES), "--difference"]
+    clpipe("compare", *pictures, *truths, *rows, *labels, *outputs(figure))
 
 
 def with_raw(picture: Path, developed: Path) -> Comparison:
-    """:func:`compare_noise` with one more column: a raw's picture, at places found in itself.
+    """What :func:`compare_noise` shows, and one more column: a raw's picture, at its own places.
 
     Args:
         picture: NAME.png, as before.
@@ -150,8 +154,8 @@ def with_raw(picture: Path, developed: Path) -> Comparison:
         [picture.with_suffix(ending) for ending in endings]
         for endings in (PICTURES, TRUTHS.values())
     )
-    renders = compare(pictures, (), list(PICTURES.values()), truths)
-    raw = compare([developed, developed])
+    renders = compare(pictures, PLACES, list(PICTURES.values()), truths)
+    raw = compare([developed, developed], PLACES)
     rows = zip(renders.rows, raw.rows, strict=True)
     return replace(
         renders,
@@ -237,7 +241,7 @@ def statistics(picture: Path, figure: Path, title: str) -> None:
         axes.set_ylim(bottom=0)
     with rc_context(STYLE):
         for suffix in SUFFIXES:
-            sheet.savefig(figure.with_suffix(suffix), dpi=150, metadata=METADATA[suffix])
+            sheet.savefig(figure.with_suffix(suffix), dpi=110, metadata=METADATA[suffix])
 
 
 def caption(axes: Axes, title: str, below: str, beside: str) -> None:

@@ -195,7 +195,7 @@ def _with_differences(
     found = []
     for row, crops in zip(rows, differences, strict=True):
         shown = tuple(np.float32(0.5) + np.float32(gain) * crop for crop in crops)
-        found += [row, Row(f"difference, x{gain}", shown)]
+        found += [row, Row(f"difference x{gain}", shown)]
     return found
 
 
