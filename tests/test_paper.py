@@ -43,6 +43,7 @@ def test_the_figures_are_made(clpipe, tmp_path, write_exr, monkeypatch):
     monkeypatch.setattr(figures, "draw", draw)
     monkeypatch.setattr(figures, "SUFFIXES", (".png",))
     monkeypatch.setattr(figures, "METHODS", ("bilinear", "bounded"))
+    monkeypatch.setattr(figures, "PLACES", ("flat",))
     monkeypatch.setattr("sys.argv", ["figures", "--render", "view.01.exr", "--raw", "shot.dng"])
     assert figures.main() == 0
     made = sorted(path.name for path in (tmp_path / "figures").glob("*.*"))

@@ -264,14 +264,14 @@ def main() -> int:
     out: Path = given.output
     try:
         pictures = develop(given.render, out / "pictures")
+        if given.raw:
+            raw_figures(given.raw, pictures, out)
         high = pictures[ISOS[-1]]
         mosaics = [high.with_suffix(end) for end in (".normalize.exr", ".truth.normalize.exr")]
         compare_methods(demosaicing(mosaics, out / "demosaicing"), out / "demosaicing")
         for iso, picture in pictures.items():
             compare_noise(picture, out / f"iso{iso}")
         statistics(high, out / "statistics", f"Noise at ISO {ISOS[-1]}, {given.render.name}")
-        if given.raw:
-            raw_figures(given.raw, pictures, out)
     except ClpipeError as error:
         print(f"figures: {error}", file=sys.stderr)
         return error.exit_status
