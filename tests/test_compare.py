@@ -153,6 +153,18 @@ def test_differences_are_from_the_truth_or_else_from_the_first(scene, write_png)
         assert np.allclose(crop, 0.5 + gain * level / 255, atol=1e-5)
 
 
+def test_names_are_text(clpipe, write_png, caplog):
+    # No markup, no control characters; letters that the font lacks are said.
+    paths = [write_png(f"{n}.png", np.full((40, 60, 3), 0.5)) for n in ("[red]a", "b\n\x1b[31m")]
+    report = ("--truth", paths[0], "--crop", "0,0,30x20")
+    text = clpipe("compare", *paths, *report, "-o", "a.svg").stdout
+    assert "[red]a " in text
+    assert "b\\n\\x1b[31m" in text
+    assert not caplog.records
+    clpipe("compare", *paths, *report, "-o", "a.png", "--label", "a", "--label", "\u4e2d")
+    assert "the font lacks letters" in caplog.text
+
+
 def test_light_is_shown_through_the_curve_of_srgb(clpipe, scene, write_exr, write_png):
     render = write_exr("render.exr", scene)
     shown = write_png("shown.png", srgb_curve(scene))

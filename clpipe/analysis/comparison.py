@@ -12,6 +12,7 @@ from clpipe.analysis.places import Place, choose_places
 from clpipe.analysis.signature import luma
 from clpipe.analysis.spatial import energy_left
 from clpipe.base.errors import RequestError
+from clpipe.base.text import one_line
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.transfer import srgb_curve
 
@@ -98,7 +99,7 @@ def compare(
     if difference:
         against = [one.pixels for one in references or pictures[:1] * len(pictures)]
         rows = _with_differences(rows, places, against)
-    names = tuple(labels or distinct_names(paths))
+    names = tuple(map(one_line, labels or distinct_names(paths)))
     noise: list[Noise] = []
     notes: list[str] = []
     flat = next((place for place in places if place.name == "flat"), None)
@@ -201,6 +202,8 @@ def _with_differences(
 
 def _against_truth(picture: Picture, truth: Picture) -> Noise:
     """The noise of a picture against its truth."""
+    if np.array_equal(picture.pixels, truth.pixels):
+        return Noise(0.0, 0.0, np.nan)
     (light,) = (one for one in measure([picture], truth).channels if one.name == "Y")
     rms = float(np.sqrt(np.square(picture.pixels - truth.pixels).mean(dtype=np.float64)))
     return Noise(rms * LEVELS, light.sigma * LEVELS, light.energy_left)

@@ -3,7 +3,9 @@
 Everything is placed in whole pixels of 300 dpi, so that each pixel of a crop becomes a square.
 """
 
+import logging
 import textwrap
+import warnings
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -19,6 +21,8 @@ from clpipe.base.files import write_new
 from clpipe.base.text import one_line
 from clpipe.base.types import Array
 from clpipe.reference.curve import to_8_bit
+
+log = logging.getLogger(__name__)
 
 DPI = 300
 LARGEST = 1 << 26  # pixels of a figure, 256 MB while it is drawn
@@ -62,7 +66,7 @@ def draw(comparison: Comparison, path: Path, zoom: int = 4) -> None:
         RequestError: it would be too large.
         ImageError: the file cannot be written.
     """
-    words = [len(word) for label in comparison.labels for word in one_line(label).split()]
+    words = [len(word) for label in comparison.labels for word in label.split()]
     crops = max(place.width for place in comparison.places) * zoom
     columns = max(crops, round(max(words, default=0) * LETTER * SIZE))
     heads = [_wrapped(label, columns, SIZE) for label in comparison.labels]
@@ -108,8 +112,11 @@ def draw(comparison: Comparison, path: Path, zoom: int = 4) -> None:
         write(GAP, below, note, SMALL, va="top")
         below += _height([note], SMALL)
     data = BytesIO()
-    with rc_context(STYLE):
+    with rc_context(STYLE), warnings.catch_warnings(record=True) as missing:
+        warnings.simplefilter("always")
         figure.savefig(data, format=path.suffix[1:], metadata=METADATA[path.suffix])
+    if missing:
+        log.warning("%s: the font lacks letters of the labels; give others with --label", path)
     write_new(path, data.getvalue())
 
 
