@@ -1,5 +1,6 @@
 """Measurement of noise: statistics of images; cameras, calibrated or of others' noise models;
-and the development of a camera, matched. And of light: the exposures of a sequence.
+and the development of a camera, matched. And of light: the exposures of a sequence. And pictures
+compared, as figures.
 
 This room works on arrays and on files that ``images`` reads; only ``matching`` develops pictures,
 and ``metering`` runs a chain as far as its exposure. It imports ``outputs`` and below, and is the

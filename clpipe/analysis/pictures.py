@@ -9,6 +9,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Floats, Mask
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import Settings
+from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import holds_mosaic, read_finished, read_image
 from clpipe.inputs.kept import carried_settings
 from clpipe.reference.cfa import Pattern
@@ -64,8 +65,13 @@ def load_picture(path: Path, pattern: Pattern = "RGGB") -> Picture:
     stays in the unit of the file and gets ``pattern``.
 
     Raises:
-        ImageError: the file cannot be read, or its settings cannot be used.
+        ImageError: the file cannot be read, is a camera raw, or its settings cannot be used.
     """
+    if path.suffix.lower() in RAW_SUFFIXES:  # some hold a small picture, too
+        raise ImageError(
+            f"{path}: a camera raw, which is not read here; give what 'clpipe run' makes of it: "
+            "'--format png' develops it, '--keep normalize' keeps its mosaic"
+        )
     finished = read_finished(path)
     if finished is not None:
         return Picture(path, "display", finished.pixels, black=0.0, white=1.0)

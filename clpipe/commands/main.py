@@ -29,6 +29,7 @@ COMMANDS = (
     "devices",
     "meter",
     "measure",
+    "compare",
     "calibrate",
     "match",
     "check",

@@ -54,7 +54,9 @@ def show(headings: Sequence[str], rows: Iterable[Sequence[str]], left: int | Non
     for row in rows:
         table.add_row(*row)
     # A pipe gets room for whole lines.
-    Console(width=None if sys.stdout.isatty() else 140, highlight=False).print(table)
+    # Names of files go in here, and are no markup.
+    width = None if sys.stdout.isatty() else 140
+    Console(width=width, highlight=False, markup=False, emoji=False).print(table)
 
 
 def show_json(values: Any) -> None:

@@ -1,0 +1,226 @@
+"""Pictures compared: their crops beside each other, their differences, the noise of each."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from clpipe.analysis.measure import measure
+from clpipe.analysis.pictures import Picture, load_picture
+from clpipe.analysis.places import Place, choose_places
+from clpipe.analysis.signature import luma
+from clpipe.analysis.spatial import energy_left
+from clpipe.base.errors import RequestError
+from clpipe.base.text import one_line
+from clpipe.base.types import Doubles, Floats
+from clpipe.reference.transfer import srgb_curve
+
+LEVELS = 255  # sigmas are in levels of eight bits
+STRONGEST = 64  # times that a difference is shown
+LEFT = "2x2 leaves: the share of its variance after averaging 2x2 (independent noise: 0.25)"
+SHOWN = 99  # percentile of the differences that the strength leaves unclipped
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The noise of a picture, in levels of 255.
+
+    ``rms`` is the difference from the truth over all of the picture, R, G and B. ``sigma`` is that
+    of luma in flat places, and ``left`` the share of its variance that averaging 2x2 pixels leaves.
+    NaN is what is not known.
+    """
+
+    rms: float
+    sigma: float
+    left: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """A place, or the differences there: its name, and a crop of each picture, 0..1."""
+
+    name: str
+    crops: tuple[Floats, ...]  # (height, width, 3)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What a figure shows; ``notes`` say what its numbers are and how pictures are shown."""
+
+    labels: tuple[str, ...]
+    places: tuple[Place, ...]
+    rows: tuple[Row, ...]
+    noise: tuple[Noise, ...]  # of each picture; empty where it is not known
+    notes: tuple[str, ...]
+
+
+def compare(
+    paths: Sequence[Path],
+    crops: Sequence[str] = (),
+    labels: Sequence[str] = (),
+    truths: Sequence[Path] = (),
+    difference: bool = False,
+) -> Comparison:
+    """Compare pictures of one scene.
+
+    Places are found in the mean of the truths, or else of the pictures, so that neither order nor
+    labels change them. The noise of a picture with a truth is what :func:`measure` finds of it, of
+    what is shown; without one it is what luma has about a plane in the flat place, where one was
+    looked for. The pattern of a mosaic would count as noise there.
+
+    Args:
+        paths: of two pictures or more, of one size: finished ones, kept images, renders.
+        crops: as :func:`clpipe.analysis.places.choose_places` takes them.
+        labels: of the pictures; none: what tells their paths apart.
+        truths: the same without noise: none, one for all pictures, or one for each.
+        difference: a row of differences below each place: from the truth, or else from the first
+            picture.
+
+    Raises:
+        RequestError: there are too few pictures, or as many labels or truths as cannot be, or sizes
+            differ, or a crop cannot be had.
+        ImageError: a picture cannot be read or shown.
+    """
+    _check_counts(paths, labels, truths)
+    loaded = [load_picture(path) for path in paths]
+    true = [load_picture(path) for path in truths]
+    for other in (*loaded[1:], *true):
+        if other.pixels.shape[:2] != loaded[0].pixels.shape[:2]:
+            raise RequestError(
+                f"{other.path} is {_size(other)}, but {loaded[0].path} is {_size(loaded[0])}; "
+                "compare pictures of one size, which show the same places"
+            )
+    pictures, references = list(map(displayed, loaded)), list(map(displayed, true))
+    places = choose_places(crops, np.mean([one.pixels for one in references or pictures], axis=0))
+    if references:  # one for all, or one for each
+        references *= len(pictures) // len(references)
+    rows = [Row(place.name, tuple(place.of(one.pixels) for one in pictures)) for place in places]
+    if difference:
+        against = [one.pixels for one in references or pictures[:1] * len(pictures)]
+        rows = _with_differences(rows, places, against)
+    names = tuple(map(one_line, labels or distinct_names(paths)))
+    noise: list[Noise] = []
+    notes: list[str] = []
+    flat = next((place for place in places if place.name == "flat"), None)
+    if references:
+        noise = [_against_truth(*pair) for pair in zip(pictures, references, strict=True)]
+        notes = [
+            f"levels of 255; rms: difference from the truth; sigma: of luma in flat places; {LEFT}"
+        ]
+    elif flat:
+        noise = [_in_flat_place(one, flat) for one in loaded]
+        notes = [f"levels of 255; sigma: of luma in the flat place; {LEFT}"]
+    if linear := [name for name, one in zip(names, loaded, strict=True) if one.kind != "display"]:
+        notes.append(f"linear, shown through sRGB's curve: {', '.join(linear)}")
+    return Comparison(names, tuple(places), tuple(rows), tuple(noise), tuple(notes))
+
+
+def _check_counts(paths: Sequence[Path], labels: Sequence[str], truths: Sequence[Path]) -> None:
+    """See that there are pictures to compare, and as many labels and truths as fit.
+
+    Raises:
+        RequestError: there are not.
+    """
+    if len(paths) < 2:
+        raise RequestError(
+            f"{paths[0] if paths else 'nothing'}: one picture has nothing to be compared with; "
+            "give two or more"
+        )
+    if labels and len(labels) != len(paths):
+        raise RequestError(
+            f"--label: found {len(labels)} for {len(paths)} pictures; give one for each, in order"
+        )
+    if len(truths) not in (0, 1, len(paths)):
+        raise RequestError(
+            f"--truth: found {len(truths)} for {len(paths)} pictures; give one for all, or one for "
+            "each, in order"
+        )
+
+
+def _size(picture: Picture) -> str:
+    height, width = picture.pixels.shape[:2]
+    return f"{width}x{height}"
+
+
+def displayed(picture: Picture) -> Picture:
+    """A picture as a screen shows it: linear light through sRGB's curve, mosaics in grey.
+
+    Raises:
+        RequestError: it is a mosaic whose levels are not known.
+    """
+    if picture.kind == "values":
+        raise RequestError(
+            f"{picture.path}: {picture.what}, so it cannot be shown; develop it first, as "
+            "'clpipe run' does"
+        )
+    pixels = picture.pixels
+    if picture.kind != "display":
+        curve = srgb_curve(pixels.clip(0, 1).astype(np.float64)).astype(np.float32)
+        pixels = np.repeat(curve[..., None], 3, axis=2) if curve.ndim == 2 else curve
+    return Picture(picture.path, "display", pixels, black=0.0, white=1.0)
+
+
+def distinct_names(paths: Sequence[Path]) -> list[str]:
+    """What tells paths apart: their file names without ending, else what differs of their folders.
+
+    >>> distinct_names([Path("out/a.png"), Path("out/a.iid.png")])
+    ['a', 'a.iid']
+    >>> distinct_names([Path("out/iso100/a.png"), Path("out/iso1600/a.png")])
+    ['iso100', 'iso1600']
+    >>> distinct_names([Path("x/a.png"), Path("y/a.png"), Path("y/b.png")])
+    ['x/a', 'y/a', 'y/b']
+    """
+    for names in ([path.stem for path in paths], [path.name for path in paths]):
+        if len(set(names)) == len(names):
+            return names
+    parts = [path.with_suffix("").parts for path in paths]
+    while all(parts) and len({part[0] for part in parts}) == 1:
+        parts = [part[1:] for part in parts]
+    while all(parts) and len({part[-1] for part in parts}) == 1:
+        parts = [part[:-1] for part in parts]
+    return ["/".join(part) for part in parts]
+
+
+def _with_differences(
+    rows: Sequence[Row], places: Sequence[Place], against: Sequence[Floats]
+) -> list[Row]:
+    """Each row, and below it its difference from what each picture is compared with."""
+    differences = [
+        [crop - place.of(other) for crop, other in zip(row.crops, against, strict=True)]
+        for row, place in zip(rows, places, strict=True)
+    ]
+    sizes = np.concatenate([np.abs(crop).ravel() for row in differences for crop in row])
+    largest = max(float(np.percentile(sizes, SHOWN)), 0.5 / STRONGEST)
+    gain = 2 ** max(int(np.log2(0.5 / largest)), 0)
+    found = []
+    for row, crops in zip(rows, differences, strict=True):
+        shown = tuple(np.float32(0.5) + np.float32(gain) * crop for crop in crops)
+        found += [row, Row(f"difference x{gain}", shown)]
+    return found
+
+
+def _against_truth(picture: Picture, truth: Picture) -> Noise:
+    """The noise of a picture against its truth."""
+    if np.array_equal(picture.pixels, truth.pixels):
+        return Noise(0.0, 0.0, np.nan)
+    (light,) = (one for one in measure([picture], truth).channels if one.name == "Y")
+    rms = float(np.sqrt(np.square(picture.pixels - truth.pixels).mean(dtype=np.float64)))
+    return Noise(rms * LEVELS, light.sigma * LEVELS, light.energy_left)
+
+
+def _in_flat_place(picture: Picture, place: Place) -> Noise:
+    """The noise of a picture about a plane in a flat place."""
+    if picture.pixels.ndim == 2:
+        return Noise(np.nan, np.nan, np.nan)
+    noise = _without_plane(luma(place.of(displayed(picture).pixels)))
+    left = energy_left(noise[None], np.ones(noise.shape, bool))
+    return Noise(np.nan, float(noise.std()) * LEVELS, left)
+
+
+def _without_plane(values: Doubles) -> Doubles:
+    """(height, width) less the plane that fits it best."""
+    y, x = np.indices(values.shape)
+    terms = np.stack([np.ones(values.size), x.ravel(), y.ravel()], axis=1)
+    plane, *_ = np.linalg.lstsq(terms, values.ravel(), rcond=None)
+    return np.asarray(values - (terms @ plane).reshape(values.shape))
