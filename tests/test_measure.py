@@ -44,6 +44,7 @@ def test_the_raw_has_the_noise_of_the_camera(clpipe, measured):
         assert one["column"]["sigma"] <= one["column"]["limit"]
         assert abs(one["excess_kurtosis"]) < 0.06
         assert one["energy_left_2x2"] == pytest.approx(0.25, abs=0.006)
+        assert one["sigma_picture"] == pytest.approx(one["sigma"], rel=0.03)
         pixels = 960 * 640 if name == "mosaic" else 480 * 320
         assert 0.95 * pixels < one["samples"] <= pixels
 
@@ -167,6 +168,48 @@ def test_finished_pictures_of_others(tmp_path, measured):
         assert found == pytest.approx([4, 6, 8], rel=near)
         assert report["share_used"] > 0.95
         assert report["channels"]["Y"]["energy_left_2x2"] == pytest.approx(0.25, abs=0.01)
+
+
+def test_the_whole_picture_and_the_covariance_of_channels(tmp_path, measured, clpipe):
+    """Noise is twice as large beside edges, so flat places have less; channels share a part."""
+    random = np.random.default_rng(5)
+    clean = np.full((256, 257, 3), 128.0)
+    clean[:128, ::2] -= 40  # stripes: nowhere flat
+    noise = random.normal(0, 4, clean.shape) + random.normal(0, 3, clean.shape[:2])[..., None]
+    noise[:128] *= 2
+    paths = [
+        png(tmp_path / f"{name}.png", (clean + part).round().astype(np.uint8))
+        for name, part in (("noisy", noise), ("clean", 0))
+    ]
+    report = measured(paths[0], "--truth", paths[1])
+    assert 0.45 < report["share_used"] < 0.5
+    tables = {name: np.array(table) * 255**2 for name, table in report["covariance"].items()}
+    shared = np.full((3, 3), 9.0) + 16 * np.eye(3)
+    assert tables["flat"] == pytest.approx(shared, rel=0.05)
+    assert tables["picture"] == pytest.approx(2.5 * shared, rel=0.05)
+    assert tables["halved"] == pytest.approx(2.5 / 4 * shared, rel=0.05)
+    for i, name in enumerate("RGB"):
+        one = report["channels"][name]
+        assert one["sigma"] ** 2 == pytest.approx(report["covariance"]["flat"][i][i])
+        assert one["sigma_picture"] ** 2 == pytest.approx(report["covariance"]["picture"][i][i])
+        curve = one["intensity_picture"]
+        variance = np.average(np.square(curve["sigma"]), weights=curve["samples"])
+        assert variance * 255**2 == pytest.approx(2.5 * 25, rel=0.05)
+    cb = 0.564 * (noise[..., 2] - noise @ (0.299, 0.587, 0.114))
+    assert report["channels"]["Cb"]["sigma_picture"] * 255 == pytest.approx(cb.std(), rel=0.02)
+    text = clpipe("measure", paths[0], "--truth", paths[1]).stdout
+    assert re.search(r"sigma \(flat, 4\d%\) +sigma \(all, 100%\)", text)
+    assert re.search(r"^all, after 2x2 +0\.0", text, re.MULTILINE)
+
+
+def test_repeats_have_the_whole_noise_of_each(tmp_path, measured):
+    random = np.random.default_rng(6)
+    scene = np.tile(random.uniform(60, 190, 128), (128, 1))[..., None].repeat(3, -1)
+    frames = [scene + random.normal(0, (4, 6, 8), scene.shape) for _ in range(3)]
+    paths = [png(tmp_path / f"{i}.png", f.round().astype(np.uint8)) for i, f in enumerate(frames)]
+    channels = measured(*paths)["channels"]
+    found = [channels[name]["sigma_picture"] * 255 for name in "RGB"]
+    assert found == pytest.approx([4, 6, 8], rel=0.02)
 
 
 def test_a_mosaic_that_says_nothing_is_taken_as_it_is(write_exr, measured):

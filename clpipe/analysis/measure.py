@@ -1,16 +1,17 @@
 """Measuring the noise of images against their clean truth, or against each other."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
 from clpipe.analysis.intensity import bin_edges, noise_by_intensity, pool_curves
 from clpipe.analysis.pictures import SITES, WHOLE, Picture
-from clpipe.analysis.report import NoiseReport
+from clpipe.analysis.report import PLACES, NoiseReport
 from clpipe.analysis.selection import select_flat, select_unclipped
-from clpipe.analysis.spatial import count_pairs
-from clpipe.analysis.statistics import Channel, channel_statistics, correlation
+from clpipe.analysis.spatial import count_pairs, halved
+from clpipe.analysis.statistics import Channel, channel_statistics, correlation, covariance
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Doubles, Floats, Mask
 from clpipe.reference.cfa import red_site
@@ -27,8 +28,8 @@ TRUTH_SHARE = 0.6
 SCENE_SHARE = 0.05
 BLOCK = 64  # px
 
-# The share of pixels that count, the channels, and the correlations of pairs of channels.
-Parts = tuple[float, tuple[Channel, ...], dict[tuple[str, str], float]]
+# The share of pixels that count, the channels, the correlations of pairs of them, covariances.
+Parts = tuple[float, tuple[Channel, ...], dict[tuple[str, str], float], dict[str, Doubles]]
 
 
 def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseReport:
@@ -37,7 +38,8 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
     Against the mean of n frames, noise is the difference times sqrt(n / (n - 1)). What all frames
     share, such as column noise, is then part of the mean and not measured. Clipped intensities are
     left out, see :func:`clpipe.analysis.selection.select_unclipped`; of pictures, only flat places
-    count, see :func:`clpipe.analysis.selection.select_flat`.
+    count, see :func:`clpipe.analysis.selection.select_flat`. The whole sigma and the covariances of
+    the whole picture, and of it after averaging 2x2, are those of every pixel.
 
     Args:
         images: of one kind and size.
@@ -69,7 +71,9 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
         low = max(low, 0.0)
     edges = bin_edges(low, high, first.kind != "display")
     parts = mosaic_channels if clean.ndim == 2 else picture_channels
-    share, channels, correlations = parts(first, clean, noise, clipped, start, edges, freedom)
+    share, channels, correlations, covariances = parts(
+        first, clean, noise, clipped, start, edges, freedom
+    )
     return NoiseReport(
         kind=first.kind,
         images=tuple(str(image.path) for image in images),
@@ -80,6 +84,7 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
         edges=edges,
         channels=channels,
         correlations=correlations,
+        covariances=covariances,
         notes=tuple(notes_on(images, truth, noise)),
     )
 
@@ -214,24 +219,37 @@ def picture_channels(
     if not mask.any():
         raise nothing_counts(first)
     mask = select_flat(clean, noise, mask)
+    everywhere = np.ones_like(mask)
+    whole = covariance(noise)
+    to_ycbcr = rgb_to_ycbcr(np.eye(3, dtype=np.float32)[None])[0]
+    sigmas = np.sqrt([*np.diag(whole), *np.diag(to_ycbcr.T @ whole @ to_ycbcr)])
     luma = rgb_to_ycbcr(clean)[..., 0]
     planes = [clean[..., 0], clean[..., 1], clean[..., 2], luma, luma, luma]
     noises = np.concatenate([noise, rgb_to_ycbcr(noise)], axis=-1)
     names = (*Kind.RGB.channels, *Kind.YCBCR.channels)
     pairs = count_pairs(mask)
-    channels, standards = [], {}
+    channels, standards, flat = [], {}, []
     for i, (name, plane) in enumerate(zip(names, planes, strict=True)):
         curve, centred, standard = noise_by_intensity(
             plane, noises[..., i], mask, edges, 1 - freedom
         )
         fits_line = first.kind == "rgb" and name in Kind.RGB.channels
-        channels.append(
-            channel_statistics(name, curve, centred, standard, mask, pairs, fits_line, freedom)
+        channel = channel_statistics(
+            name, curve, centred, standard, mask, pairs, fits_line, freedom
         )
+        channel = replace(channel, whole_sigma=float(sigmas[i]))
+        if name in Kind.RGB.channels:
+            flat.append(centred[:, mask])
+            curve, *_ = noise_by_intensity(plane, noise[..., i], everywhere, edges, 1 - freedom)
+            channel = replace(channel, whole_curve=curve)
+        channels.append(channel)
         standards[name] = standard
     both = [*combinations(Kind.RGB.channels, 2), *combinations(Kind.YCBCR.channels, 2)]
     correlations = {(a, b): correlation(standards[a], standards[b], mask) for a, b in both}
-    return float(mask.mean()), tuple(channels), correlations
+    samples = np.stack(flat, axis=-1)[:, None]
+    tables = covariance(samples), whole, covariance(halved(noise))
+    covariances = dict(zip(PLACES, tables, strict=True))
+    return float(mask.mean()), tuple(channels), correlations, covariances
 
 
 def mosaic_channels(
@@ -261,15 +279,15 @@ def mosaic_channels(
         whole_mask[at] = mask
         curves.append(curve)
         pairs = count_pairs(mask)
-        channels.append(
-            channel_statistics(name, curve, centred[at], standard[at], mask, pairs, True, freedom)
+        channel = channel_statistics(
+            name, curve, centred[at], standard[at], mask, pairs, True, freedom
         )
+        channels.append(replace(channel, whole_sigma=float(noise[at].std(dtype=np.float64))))
     curve, pairs = pool_curves(curves), count_pairs(whole_mask)
-    channels.append(
-        channel_statistics(WHOLE, curve, centred, standard, whole_mask, pairs, True, freedom)
-    )
+    channel = channel_statistics(WHOLE, curve, centred, standard, whole_mask, pairs, True, freedom)
+    channels.append(replace(channel, whole_sigma=float(noise.std(dtype=np.float64))))
     correlations = {}
     for a, b in combinations(SITES, 2):
         both = whole_mask[slices[a]] & whole_mask[slices[b]]
         correlations[a, b] = correlation(standard[slices[a]], standard[slices[b]], both)
-    return float(whole_mask.mean()), tuple(channels), correlations
+    return float(whole_mask.mean()), tuple(channels), correlations, {}

@@ -81,7 +81,8 @@ def load_picture(path: Path, pattern: Pattern = "RGGB") -> Picture:
     iso = context.iso if context else None
     if not mosaic:
         if kind == Kind.DISPLAY.label:
-            return Picture(path, "display", pixels, black=0.0, white=1.0, iso=iso)
+            shown = np.clip(pixels, 0, 1)  # as in finished pictures
+            return Picture(path, "display", shown, black=0.0, white=1.0, iso=iso)
         return Picture(path, "rgb", pixels, white=1.0, iso=iso)
     if context is None:
         return Picture(path, "values", pixels, pattern)

@@ -43,6 +43,8 @@ class Channel:
     autocorrelation: Doubles  # (17, 17), down and right from -8 to 8; [8, 8] is 1
     energy_left: float  # share, after averaging 2x2 pixels
     tails: Tails
+    whole_sigma: float = math.nan  # of every pixel, those that do not count, too
+    whole_curve: NoiseCurve | None = None  # of every pixel
 
 
 def tails(standard: Floats, mask: Mask) -> Tails:
@@ -65,6 +67,26 @@ def gaussian_beyond(sigmas: float) -> float:
     0.0455
     """
     return math.erfc(sigmas / math.sqrt(2))
+
+
+def covariance(noise: Floats) -> Doubles:
+    """The covariance of the channels' noise over all pixels of all frames, (channel, channel).
+
+    Args:
+        noise: (frame, height, width, channel).
+
+    >>> covariance(np.float32([1, 2, -1, -2]).reshape(1, 1, 2, 2)).tolist()
+    [[1.0, 2.0], [2.0, 4.0]]
+    """
+    channels = noise.shape[-1]
+    products, total = np.zeros((channels, channels)), np.zeros(channels)
+    for frame in noise:  # doubles of all at once would take much memory
+        samples = frame.reshape(-1, channels).astype(np.float64)
+        products += samples.T @ samples
+        total += samples.sum(0)
+    count = noise.size // channels
+    mean = total / count
+    return np.asarray(products / count - np.outer(mean, mean))
 
 
 def correlation(one: Floats, two: Floats, mask: Mask) -> float:

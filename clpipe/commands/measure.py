@@ -15,6 +15,7 @@ from clpipe.base.extras import require
 from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import Rows, number, show, show_json
 from clpipe.reference.cfa import PATTERNS, Pattern
+from clpipe.stage import Kind
 
 
 @click.command("measure", cls=Command)
@@ -87,7 +88,7 @@ def measure_heading(report: NoiseReport) -> str:
     lines = [
         f"{len(report.images)} x {report.kind}, {report.width}x{report.height}, against {against}; "
         f"unit: {UNITS[report.kind]}",
-        f"{report.share:.1%} of the {what} count",
+        f"{report.share:.1%} of the {what} count; sigma (all) is that of every one",
         *(f"note: {note}" for note in report.notes),
     ]
     return "\n".join(lines)
@@ -97,7 +98,9 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
     """The tables of a report, each a title and rows of text; the first row is the headings."""
     names = [one.name for one in report.channels]
     laws = ["a", "b"] if any(one.law for one in report.channels) else []
-    size: Rows = [("", "samples", "sigma", *laws, "row sigma", "column sigma")]
+    which = "not clipped" if report.kind in ("mosaic", "values") else "flat"
+    sigmas_of = f"sigma ({which}, {report.share:.0%})", "sigma (all, 100%)"
+    size: Rows = [("", "samples", *sigmas_of, *laws, "row sigma", "column sigma")]
     shape: Rows = [("", *(f"{k}" for k in range(1, LAGS + 1)), "diagonal 1", "left after 2x2")]
     far: Rows = [("", "skewness", "excess kurtosis", *(f"> {k} sigma" for k in SIGMAS))]
     for one in report.channels:
@@ -105,7 +108,8 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
         if law := one.law:
             fit = [f"{law.a:.4g} ± {law.a_error:.1g}", f"{law.b:.4g} ± {law.b_error:.1g}"]
         lines = line_text(one.rows), line_text(one.columns)
-        size.append((one.name, str(one.count), number(one.sigma, ".4g"), *fit, *lines))
+        sizes = number(one.sigma, ".4g"), number(one.whole_sigma, ".4g")
+        size.append((one.name, str(one.count), *sizes, *fit, *lines))
         table, middle = one.autocorrelation, slice(LAGS + 1, None)
         right = [number(r, ".3f") for r in table[LAGS, middle]]
         down = [number(r, ".3f") for r in table[middle, LAGS]]
@@ -128,6 +132,21 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
         ("noise" + ("; variance = a * intensity + b" if laws else ""), size),
         ("autocorrelation (independent noise: 0; left after 2x2: 0.25)", shape),
         ("correlation between channels", across),
+        *([("covariance of the channels", covariance_rows(report))] if report.covariances else []),
         ("tails of standardised noise", far),
         ("sigma by intensity", curve),
     ]
+
+
+WHERE = {"flat": "flat places", "picture": "all", "halved": "all, after 2x2"}
+
+
+def covariance_rows(report: NoiseReport) -> Rows:
+    """The covariances of red, green and blue, a line for each place that they are measured in."""
+    first, *_ = report.covariances.values()
+    places = [(i, j) for i in range(len(first)) for j in range(i, len(first))]
+    names = Kind.RGB.channels
+    rows: Rows = [("", *(f"{names[i]}-{names[j]}" for i, j in places))]
+    for where, table in report.covariances.items():
+        rows.append((WHERE[where], *(number(float(table[at]), ".4g") for at in places)))
+    return rows
