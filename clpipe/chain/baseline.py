@@ -14,7 +14,7 @@ import numpy as np
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.chain.chain import Chain
-from clpipe.chain.truth import CLEAN, adds_noise, picture_without_noise
+from clpipe.chain.truth import CLEAN, picture_without_noise
 from clpipe.stages.picture_noise import IidGaussian, IntensityDependent
 
 IID, INTENSITY = BASELINES = ("iid", "intensity")
@@ -140,7 +140,7 @@ def baseline_of(chain: Chain) -> Chain:
     step = next((step for step in chain.steps if step.name == STEP), None)
     if step is None:
         raise RequestError(f"--baseline: its noise is that of {STEP}, and this chain has none")
-    if adds_noise(step):
+    if step.adds_noise:
         raise RequestError(f"--baseline: {STEP} adds noise already; leave one of them out")
     clean = picture_without_noise(CLEAN, chain)
     steps = *(each for each in clean.steps if each.name != STEP), step
