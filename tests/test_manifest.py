@@ -17,6 +17,7 @@ from clpipe.chain.files import load_settings
 from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
 from clpipe.inputs.manifest import Row, check_rows, read_manifest
+from tests.conftest import noise_report
 
 DEFAULT = settings_from({})
 
@@ -410,10 +411,7 @@ def test_draws_under_dotted_keys_of_jsonl(tmp_path):
 
 
 def test_a_row_completes_and_replaces_what_options_set(tmp_path, monkeypatch):
-    curve = {"sigma": 0.02, "intensity": {"mean": [0.5], "sigma": [0.02]}}
-    (tmp_path / "noise.json").write_text(
-        json.dumps({"kind": "display", "channels": dict.fromkeys("RGB", curve)})
-    )
+    (tmp_path / "noise.json").write_text(json.dumps(noise_report(0.02, 0.02, 0.02)))
     monkeypatch.chdir(tmp_path)  # what a row names is found beside the manifest, not here
     (tmp_path / "rows").mkdir()
     (tmp_path / "noise.json").rename(tmp_path / "rows" / "noise.json")
