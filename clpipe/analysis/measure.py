@@ -8,12 +8,13 @@ import numpy as np
 
 from clpipe.analysis.intensity import bin_edges, noise_by_intensity, pool_curves
 from clpipe.analysis.pictures import SITES, WHOLE, Picture
-from clpipe.analysis.report import PLACES, NoiseReport
-from clpipe.analysis.selection import select_flat, select_unclipped
-from clpipe.analysis.spatial import count_pairs, halved
-from clpipe.analysis.statistics import Channel, channel_statistics, correlation, covariance
+from clpipe.analysis.report import NoiseReport
+from clpipe.analysis.selection import select_unclipped
+from clpipe.analysis.spatial import count_pairs
+from clpipe.analysis.statistics import Channel, channel_statistics, correlation
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Doubles, Floats, Mask
+from clpipe.outputs.places import FLAT, HALVED, PICTURE, covariance, halved, select_flat
 from clpipe.reference.cfa import red_site
 from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.stage import Kind
@@ -38,7 +39,7 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
     Against the mean of n frames, noise is the difference times sqrt(n / (n - 1)). What all frames
     share, such as column noise, is then part of the mean and not measured. Clipped intensities are
     left out, see :func:`clpipe.analysis.selection.select_unclipped`; of pictures, only flat places
-    count, see :func:`clpipe.analysis.selection.select_flat`. The whole sigma and the covariances of
+    count, see :func:`clpipe.outputs.places.select_flat`. The whole sigma and the covariances of
     the whole picture, and of it after averaging 2x2, are those of every pixel.
 
     Args:
@@ -247,8 +248,7 @@ def picture_channels(
     both = [*combinations(Kind.RGB.channels, 2), *combinations(Kind.YCBCR.channels, 2)]
     correlations = {(a, b): correlation(standards[a], standards[b], mask) for a, b in both}
     samples = np.stack(flat, axis=-1)[:, None]
-    tables = covariance(samples), whole, covariance(halved(noise))
-    covariances = dict(zip(PLACES, tables, strict=True))
+    covariances = {FLAT: covariance(samples), PICTURE: whole, HALVED: covariance(halved(noise))}
     return float(mask.mean()), tuple(channels), correlations, covariances
 
 

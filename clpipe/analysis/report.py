@@ -10,9 +10,6 @@ from clpipe.analysis.spatial import LineNoise
 from clpipe.analysis.statistics import HISTOGRAM, SIGMAS, Channel, gaussian_beyond
 from clpipe.base.types import Doubles
 
-# Where noise is measured: in flat places, in the whole picture, and there after averaging 2x2.
-PLACES = ("flat", "picture", "halved")
-
 # The unit of intensities and sigmas, by the kind of the images.
 UNITS = {
     "display": "of full scale, display values",
@@ -35,7 +32,9 @@ class NoiseReport:
     edges: Doubles  # of the intensity bins
     channels: tuple[Channel, ...]
     correlations: Mapping[tuple[str, str], float]
-    covariances: Mapping[str, Doubles]  # of red, green and blue, (3, 3), by PLACES; {} of mosaics
+    covariances: Mapping[
+        str, Doubles
+    ]  # of red, green and blue, (3, 3), by the places; {} of mosaics
     notes: tuple[str, ...]
 
     def record(self) -> dict[str, Any]:

@@ -88,16 +88,6 @@ def line_noise(noise: Floats, mask: Mask) -> LineNoise:
     return LineNoise(math.sqrt(max(float(variance), 0.0)), math.sqrt(3 * float(error)))
 
 
-def halved(noise: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """Noise, (frame, height, width, channel), averaged over 2x2 pixels; an odd last row or column
-    is left out.
-    """
-    frames, height, width, channels = noise.shape
-    even = noise[:, : height // 2 * 2, : width // 2 * 2]
-    blocks = even.reshape(frames, height // 2, 2, width // 2, 2, channels)
-    return np.asarray(blocks.mean((2, 4)))
-
-
 def energy_left(standard: NDArray[np.floating[Any]], mask: Mask) -> float:
     """The share of the noise's energy that remains after averaging 2x2 pixels.
 

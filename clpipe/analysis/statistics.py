@@ -69,26 +69,6 @@ def gaussian_beyond(sigmas: float) -> float:
     return math.erfc(sigmas / math.sqrt(2))
 
 
-def covariance(noise: Floats) -> Doubles:
-    """The covariance of the channels' noise over all pixels of all frames, (channel, channel).
-
-    Args:
-        noise: (frame, height, width, channel).
-
-    >>> covariance(np.float32([1, 2, -1, -2]).reshape(1, 1, 2, 2)).tolist()
-    [[1.0, 2.0], [2.0, 4.0]]
-    """
-    channels = noise.shape[-1]
-    products, total = np.zeros((channels, channels)), np.zeros(channels)
-    for frame in noise:  # doubles of all at once would take much memory
-        samples = frame.reshape(-1, channels).astype(np.float64)
-        products += samples.T @ samples
-        total += samples.sum(0)
-    count = noise.size // channels
-    mean = total / count
-    return np.asarray(products / count - np.outer(mean, mean))
-
-
 def correlation(one: Floats, two: Floats, mask: Mask) -> float:
     """The correlation of two channels' standardised noise over the pixels that count."""
     first, second = one[:, mask].astype(np.float64), two[:, mask].astype(np.float64)

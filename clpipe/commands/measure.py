@@ -14,6 +14,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
 from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import Rows, number, show, show_json
+from clpipe.outputs.places import FLAT, HALVED, PICTURE
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.stage import Kind
 
@@ -137,7 +138,7 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
     ]
 
 
-WHERE = {"flat": "flat places", "picture": "all", "halved": "all, after 2x2"}
+WHERE = {FLAT: "flat places", PICTURE: "all", HALVED: "all, after 2x2"}
 
 
 def covariance_rows(report: NoiseReport) -> Rows:

@@ -62,6 +62,12 @@ class NoNoise(Unchanged, Matched):
     method: ClassVar = "none"
     summary: ClassVar = "no noise here; sensor_noise adds it where a sensor does"
 
+    jpeg: bool = parameter(
+        False,
+        "Match the noise of --baseline in the decoded JPEG, which keeps more of a camera's noise "
+        "than of independent noise.",
+    )
+
 
 def _as_three(value: Any) -> Any:
     """One number as three equal ones, and a list, as TOML has it, as a tuple."""
