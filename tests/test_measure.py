@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -351,3 +352,20 @@ def test_another_scene_among_the_repeats_is_refused():
                 measure([*repeats, other])
             with pytest.raises(RequestError, match=r"does not show the same scene as"):
                 measure([repeats[0], other])
+
+
+def test_a_shift_by_a_pixel_is_refused_and_strong_noise_is_not(clpipe, tmp_path):
+    name = run(clpipe, "burst", "--iso", 12800, "--frames", 3, "--format", "png")
+    frames = [load_picture(tmp_path / f"{name}.frame{k}.png") for k in range(3)]
+    assert measure(frames) and frames[0].iso == 12800
+    moved = replace(frames[1], path=Path("moved.png"), pixels=np.roll(frames[1].pixels, 1, 1))
+    with pytest.raises(RequestError, match=r"^moved\.png does not lie over the others: "):
+        measure([frames[0], moved, frames[2]])
+    with pytest.raises(RequestError, match=r"^moved\.png does not lie over \S+frame0\.png: "):
+        measure([frames[0], moved])
+
+
+def test_repeats_of_real_cameras_are_repeats(shared_data):
+    for name in ("5dmark3_iso3200_1", "d800_iso1600_1"):
+        paths = (shared_data / "real_noise" / f"{name}_{end}.png" for end in ("real", "mean"))
+        assert measure([load_picture(path) for path in paths]).share > 0.2

@@ -8,6 +8,7 @@ import numpy as np
 
 from clpipe.analysis.intensity import bin_edges, noise_by_intensity, pool_curves
 from clpipe.analysis.pictures import SITES, WHOLE, Picture
+from clpipe.analysis.repeats import check_repeats
 from clpipe.analysis.report import NoiseReport
 from clpipe.analysis.selection import select_unclipped
 from clpipe.analysis.spatial import count_pairs
@@ -18,16 +19,6 @@ from clpipe.outputs.places import FLAT, HALVED, PICTURE, covariance, halved, sel
 from clpipe.reference.cfa import red_site
 from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.stage import Kind
-
-# A repeat with less than this share of the others' noise energy is taken for a truth among them.
-# Among n frames and against their mean, a truth has (n - 1) / (n^2 - n - 1), at most 0.4.
-TRUTH_SHARE = 0.6
-
-# A repeat shows another scene, where averaging BLOCK x BLOCK pixels leaves more than this share of
-# the energy of its difference from the mean. Noise leaves 1 / BLOCK^2, and up to 0.01 where
-# processing has smeared it; another view leaves 0.2.
-SCENE_SHARE = 0.05
-BLOCK = 64  # px
 
 # The share of pixels that count, the channels, the correlations of pairs of them, covariances.
 Parts = tuple[float, tuple[Channel, ...], dict[tuple[str, str], float], dict[str, Doubles]]
@@ -61,8 +52,7 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
         freedom = (len(images) - 1) / len(images)
         clean = frames.mean(0, dtype=np.float64).astype(np.float32)
         noise = (frames - clean) / np.float32(freedom**0.5)
-        refuse_other_scenes(images, noise)
-        refuse_truth_among_repeats(images, noise)
+        check_repeats(images, clean, noise)
     start = ~truth.clipped() if truth else np.ones(clean.shape, bool)
     if not start.any():
         raise nothing_counts(first)
@@ -111,7 +101,8 @@ def check_partners(images: Sequence[Picture], truth: Picture | None) -> None:
                 f"{other.path} is {other.balance}, but {first.path} is {first.balance}; "
                 "keep both after the same stage of the same camera"
             )
-        if other is not truth and other.iso != first.iso:
+        isos = {other.iso, first.iso} - {None}
+        if other is not truth and len(isos) > 1:
             raise RequestError(
                 f"{other.path} was made at ISO {other.iso}, {first.path} at {first.iso}; "
                 "repeats must have one ISO"
@@ -127,51 +118,6 @@ def clipped_samples(images: Sequence[Picture], frames: Floats) -> Mask:
     # The levels are unknown; samples that clip can only be the smallest and the largest.
     low, high = frames.min(), frames.max()
     return ((frames <= low) | (frames >= high)) & (low < high)
-
-
-def refuse_other_scenes(images: Sequence[Picture], noise: Floats) -> None:
-    """See that no repeat differs from the others over wide areas, as another scene would.
-
-    Images of less than 2x2 blocks are not judged.
-
-    Raises:
-        RequestError: one does.
-    """
-    frames, rows, columns = len(noise), noise.shape[1] // BLOCK, noise.shape[2] // BLOCK
-    if min(rows, columns) < 2:
-        return
-    whole = noise[:, : rows * BLOCK, : columns * BLOCK].reshape(
-        frames, rows, BLOCK, columns, BLOCK, -1
-    )
-    means = whole.mean((2, 4), dtype=np.float64)
-    for axis in (1, 2):  # rows, columns and the brightness of a frame may have noise of their own
-        means -= means.mean(axis, keepdims=True)
-    remaining = np.square(means).mean((1, 2, 3))
-    worst = int(remaining.argmax())
-    energy = np.square(whole[worst]).mean(dtype=np.float64)
-    if remaining[worst] > SCENE_SHARE * energy:
-        others = "the others" if frames > 2 else images[1 - worst].path
-        raise RequestError(
-            f"{images[worst].path} does not show the same scene as {others}: averaged over "
-            f"{BLOCK}x{BLOCK} pixels, {remaining[worst] / energy:.0%} of the difference remains, "
-            f"of noise less than {SCENE_SHARE:.0%} would; give repeats of one scene, or a --truth"
-        )
-
-
-def refuse_truth_among_repeats(images: Sequence[Picture], noise: Floats) -> None:
-    """See that no repeat has much less noise than the others, as a truth among them would.
-
-    Raises:
-        RequestError: one has.
-    """
-    energy = np.square(noise).mean(axis=tuple(range(1, noise.ndim)), dtype=np.float64)
-    least = int(energy.argmin())
-    others = float(np.median(np.delete(energy, least)))
-    if len(images) > 2 and noise[0].size >= 1000 and energy[least] < TRUTH_SHARE * others:
-        raise RequestError(
-            f"{images[least].path} has {energy[least] / others:.2g} times the others' noise; "
-            "if it is their clean truth, give it as --truth"
-        )
 
 
 def notes_on(images: Sequence[Picture], truth: Picture | None, noise: Floats) -> list[str]:

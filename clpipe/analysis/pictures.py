@@ -9,7 +9,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Floats, Mask
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import Settings
-from clpipe.images.read import holds_mosaic, read_finished, read_image
+from clpipe.images.read import holds_mosaic, photograph_iso, read_finished, read_image
 from clpipe.inputs.kept import carried_settings
 from clpipe.reference.cfa import Pattern
 from clpipe.stage import Context, Kind
@@ -34,7 +34,7 @@ class Picture:
     black: float | None = None
     white: float | None = None
     balance: str = ""  # of a kept mosaic, in words: the white balance gains taken out and applied
-    iso: float | None = None  # of an image that clpipe kept
+    iso: float | None = None  # where the file says it
 
     @property
     def what(self) -> str:
@@ -68,7 +68,8 @@ def load_picture(path: Path, pattern: Pattern = "RGGB") -> Picture:
     """
     finished = read_finished(path)
     if finished is not None:
-        return Picture(path, "display", finished.pixels, black=0.0, white=1.0)
+        iso = photograph_iso(path)
+        return Picture(path, "display", finished.pixels, black=0.0, white=1.0, iso=iso)
     mosaic = holds_mosaic(path)
     source = read_image(path, mosaic)
     pixels = source.pixels.astype(np.float32)
