@@ -12,6 +12,7 @@ from PIL import Image
 
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import Picture, load_picture
+from clpipe.analysis.pooling import pool_by_iso
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import load_camera
 from clpipe.commands.measure import measure_tables
@@ -199,6 +200,91 @@ def test_the_whole_picture_and_the_covariance_of_channels(tmp_path, measured, cl
     text = clpipe("measure", paths[0], "--truth", paths[1]).stdout
     assert re.search(r"sigma \(flat, 4\d%\) +sigma \(all, 100%\)", text)
     assert re.search(r"^all, after 2x2 +0\.0", text, re.MULTILINE)
+
+
+def scene_of(seed, height=96):
+    tiles = np.random.default_rng(seed).uniform(60, 190, (height // 32, 4))
+    return np.kron(tiles, np.ones((32, 32)))[..., None].repeat(3, -1)
+
+
+def burst(folder, name, seed, sigma, iso=None, height=96):
+    random, exif = np.random.default_rng(seed + 10), Image.Exif()
+    if iso:
+        exif[0x8769] = {0x8827: iso}
+    folder.mkdir(parents=True, exist_ok=True)
+    for k in range(3):
+        noisy = scene_of(seed, height) + random.normal(0, sigma, (height, 128, 3))
+        picture = Image.fromarray(noisy.round().astype(np.uint8))
+        picture.save(folder / name.format(k), exif=exif)
+
+
+def test_bursts_of_several_scenes_are_one_figure_for_each_iso(tmp_path, measured, clpipe):
+    out = tmp_path / "out"
+    burst(out / "low", "one.frame{}.png", 1, 3, 100)
+    burst(out / "low", "two.frame{}.png", 2, 6, 100, height=192)
+    burst(out / "high", "one.frame{}.png", 1, 9, 800)
+    png(out / "high" / "one.truth.png", scene_of(1).astype(np.uint8))
+    by_iso = measured(out)["by_iso"]
+    assert [(iso, one["bursts"], len(one["images"])) for iso, one in by_iso.items()] == [
+        ("100", 2, 6),
+        ("800", 1, 3),
+    ]
+    for iso, wanted in (("100", (3**2 + 2 * 6**2) / 3), ("800", 9**2)):
+        report = by_iso[iso]
+        one = report["channels"]["G"]
+        for found in (one["sigma_picture"] ** 2, report["covariance"]["picture"][1][1]):
+            assert found * 255**2 == pytest.approx(wanted, rel=0.05)
+        assert report["covariance"]["halved"][2][2] * 255**2 == pytest.approx(wanted / 4, rel=0.06)
+        curve = one["intensity_picture"]
+        variance = np.average(np.square(curve["sigma"]), weights=curve["samples"])
+        assert variance * 255**2 == pytest.approx(wanted, rel=0.05)
+        assert one["energy_left_2x2"] == pytest.approx(0.25, abs=0.02)
+        assert sum(one["histogram"]["samples"]) == one["samples"]
+    low = measured(*sorted((out / "low").glob("*.frame?.png")))
+    assert low == by_iso["100"] | {"images": low["images"]}
+    text = clpipe("measure", out).stdout
+    assert "6 x display in 2 bursts, 128x96, ISO 100, against the mean of their burst" in text
+    assert "3 x display, 128x96, ISO 800, against their mean" in text
+
+
+def test_a_raws_law_is_pooled_by_its_errors():
+    random, a, b, reports = np.random.default_rng(7), 6e-4, 1e-4, []
+    for size in (200, 800):
+        clean = np.tile(np.linspace(0, 0.8, size, dtype=np.float32), (size, 1))
+        frames = [
+            clean + random.standard_normal(clean.shape, np.float32) * np.sqrt(a * clean + b)
+            for _ in range(2)
+        ]
+        reports.append(
+            measure([Picture(Path("n"), "mosaic", frame, white=1.0) for frame in frames])
+        )
+    (pooled,) = pool_by_iso(reports)
+    laws = [report.channels[-1].law for report in (*reports, pooled)]
+    assert abs(laws[2].a - a) < 3 * laws[2].a_error and abs(laws[2].b - b) < 3 * laws[2].b_error
+    assert laws[2].a_error < min(laws[0].a_error, laws[1].a_error)
+    assert laws[2].a_error > 0.8 * laws[1].a_error
+    assert pooled.channels[-1].rows.limit < reports[0].channels[-1].rows.limit
+
+
+def test_folders_of_photographs_are_a_burst_each_and_what_is_refused(tmp_path, measured, clpipe):
+    photos = tmp_path / "photos"
+    burst(photos / "a", "DSC{}.jpg", 3, 5)
+    burst(photos / "b", "DSC{}.jpg", 4, 5)
+    assert measured(photos / "a", photos / "b")["bursts"] == 2
+    files = sorted(photos.rglob("*.jpg"))
+    assert "does not" in clpipe("measure", *files, status=2).stderr
+    burst(photos / "b", "x.frame{}.png", 4, 5)
+    burst(photos / "b", "x.frame{}.jpg", 4, 5)
+    (tmp_path / "empty").mkdir()
+    for arguments, message in (
+        ([photos / "b"], "it holds frames that end in .jpg and in .png; name those of one ending"),
+        ([tmp_path / "empty"], "empty: it holds no pictures (.jpg, "),
+        (
+            [photos / "a", files[3], files[4], "--truth", files[0]],
+            "one scene has it, but there are 2",
+        ),
+    ):
+        assert message in clpipe("measure", *arguments, status=2).stderr
 
 
 def test_repeats_have_the_whole_noise_of_each(tmp_path, measured):

@@ -101,6 +101,21 @@ def test_measured_sigma(develop, grey, report):
             assert found.std((0, 1)) == pytest.approx(sigma, rel=0.02)
 
 
+def test_a_report_on_several_isos(tmp_path):
+    path = tmp_path / "isos.json"
+    by_iso = {"100": noise_report(0.01, 0.01, 0.01), "800": noise_report(0.03, 0.03, 0.03)}
+    path.write_text(json.dumps({"by_iso": by_iso}))
+    values = {"method": "iid_gaussian", "measured": str(path)}
+
+    def sigma(iso):
+        settings = {"stages": ["picture_noise"], "picture_noise": values, "iso": iso}
+        return make_chain(settings_from(settings)).steps[0].method.sigma
+
+    assert sigma(100) == pytest.approx((0.01,) * 3) and sigma(800) == pytest.approx((0.03,) * 3)
+    with pytest.raises(RequestError, match=r"isos\.json has no ISO 400, only 100, 800"):
+        sigma(400)
+
+
 @pytest.mark.parametrize("method", ["iid_gaussian", "intensity_dependent"])
 def test_channels_are_correlated_as_given(develop, grey, method):
     wanted = (0.8, -0.4, 0.1)
@@ -113,7 +128,7 @@ def test_channels_are_correlated_as_given(develop, grey, method):
 
 
 def test_a_report_that_changes_is_read_again(report):
-    before = measured_noise(report())["picture"].sigma
+    before = measured_noise(report())[None]["picture"].sigma
     path = report(channels=json.loads('{"R": 0}'))
     assert before == pytest.approx((0.01, 0.02, 0.03))
     with pytest.raises(ValueError, match="not a report"):

@@ -77,6 +77,7 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
         correlations=correlations,
         covariances=covariances,
         notes=tuple(notes_on(images, truth, noise)),
+        iso=next((image.iso for image in images if image.iso), None),
     )
 
 
@@ -104,7 +105,7 @@ def check_partners(images: Sequence[Picture], truth: Picture | None) -> None:
         isos = {other.iso, first.iso} - {None}
         if other is not truth and len(isos) > 1:
             raise RequestError(
-                f"{other.path} was made at ISO {other.iso}, {first.path} at {first.iso}; "
+                f"{other.path} was made at ISO {other.iso:g}, {first.path} at {first.iso:g}; "
                 "repeats must have one ISO"
             )
     if min(first.pixels.shape[:2]) < 2:
@@ -184,7 +185,7 @@ def picture_channels(
         channel = channel_statistics(
             name, curve, centred, standard, mask, pairs, fits_line, freedom
         )
-        channel = replace(channel, whole_sigma=float(sigmas[i]))
+        channel = replace(channel, whole_sigma=float(sigmas[i]), size=noises[..., i].size)
         if name in Kind.RGB.channels:
             flat.append(centred[:, mask])
             curve, *_ = noise_by_intensity(plane, noise[..., i], everywhere, edges, 1 - freedom)
@@ -228,10 +229,12 @@ def mosaic_channels(
         channel = channel_statistics(
             name, curve, centred[at], standard[at], mask, pairs, True, freedom
         )
-        channels.append(replace(channel, whole_sigma=float(noise[at].std(dtype=np.float64))))
+        sigma = float(noise[at].std(dtype=np.float64))
+        channels.append(replace(channel, whole_sigma=sigma, size=noise[at].size))
     curve, pairs = pool_curves(curves), count_pairs(whole_mask)
     channel = channel_statistics(WHOLE, curve, centred, standard, whole_mask, pairs, True, freedom)
-    channels.append(replace(channel, whole_sigma=float(noise.std(dtype=np.float64))))
+    sigma = float(noise.std(dtype=np.float64))
+    channels.append(replace(channel, whole_sigma=sigma, size=noise.size))
     correlations = {}
     for a, b in combinations(SITES, 2):
         both = whole_mask[slices[a]] & whole_mask[slices[b]]

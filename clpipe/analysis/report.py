@@ -36,12 +36,16 @@ class NoiseReport:
         str, Doubles
     ]  # of red, green and blue, (3, 3), by the places; {} of mosaics
     notes: tuple[str, ...]
+    iso: float | None = None  # where the images say it
+    bursts: int = 1  # whose noise is pooled
 
     def record(self) -> dict[str, Any]:
         """The report as JSON values; what could not be computed is null."""
         return {
             "kind": self.kind,
             "unit": UNITS[self.kind],
+            "iso": self.iso,
+            "bursts": self.bursts,
             "images": list(self.images),
             "truth": self.truth,
             "width": self.width,

@@ -45,6 +45,7 @@ class Channel:
     tails: Tails
     whole_sigma: float = math.nan  # of every pixel, those that do not count, too
     whole_curve: NoiseCurve | None = None  # of every pixel
+    size: int = 0  # samples, those that do not count, too
 
 
 def tails(standard: Floats, mask: Mask) -> Tails:

@@ -32,6 +32,7 @@ from clpipe.stage import (
 )
 
 ENTRIES = 256  # of the kernel's table
+UNKNOWN = "unknown"  # in a report, the ISO of images that do not say theirs
 RESOLVED = 65  # entries of a measured curve in the resolved parameters, and so in the sidecar
 CHANNELS = Kind.DISPLAY.channels
 MIXING = ("green_red", "green_green", "blue_red", "blue_green", "blue_blue")  # kernel arguments
@@ -120,20 +121,31 @@ class IndependentNoise(Matched):
             raise ValueError("found both sigma and measured; set one of them")
         return self
 
-    def noise(self) -> "MeasuredNoise":
+    def noise(self, iso: float) -> "MeasuredNoise":
         """The measured noise, where it is matched.
+
+        Args:
+            iso: of the picture; a report may be on several.
 
         Raises:
             RequestError: neither sigma nor a report is set. It is refused as late as here because
-                options may choose the method, and each row of a manifest its report.
+                options may choose the method, and each row of a manifest its report. Or the
+                report is on other ISOs.
         """
         if not self.measured:
             raise RequestError(
                 "picture_noise: needs sigma, or measured, a report of clpipe measure --json"
             )
-        return measured_noise(self.measured)[self.match]
+        by_iso = measured_noise(self.measured)
+        noise = by_iso.get(iso, by_iso.get(None))
+        if noise is None:
+            found = ", ".join(f"{each:g}" for each in by_iso if each is not None)
+            raise RequestError(
+                f"picture_noise.measured: {self.measured} has no ISO {iso:g}, only {found}"
+            )
+        return noise[self.match]
 
-    def with_correlation(self) -> Self:
+    def with_correlation(self, iso: float) -> Self:
         """A copy with the correlation that is set or measured.
 
         Raises:
@@ -146,7 +158,7 @@ class IndependentNoise(Matched):
                 "picture_noise: correlated is true, but nothing is measured; set correlation, or "
                 "measured, a report of clpipe measure --json"
             )
-        return self.filled(correlation=self.noise().correlation)
+        return self.filled(correlation=self.noise(iso).correlation)
 
     def normals(self, image: Floats, frame: Frame) -> Floats:
         """The normals of each sample, (height, width, 3), of the image's stream."""
@@ -184,8 +196,10 @@ class IidGaussian(IndependentNoise):
     )
 
     def resolve(self, context: Context) -> "IidGaussian":
-        correlated = self.with_correlation()
-        return correlated if self.sigma is not None else correlated.filled(sigma=self.noise().sigma)
+        correlated = self.with_correlation(context.iso)
+        if self.sigma is not None:
+            return correlated
+        return correlated.filled(sigma=self.noise(context.iso).sigma)
 
     def passes(self) -> tuple[Pass, ...]:
         names = ("red", "green", "blue", *MIXING)
@@ -231,11 +245,11 @@ class IntensityDependent(IndependentNoise):
     )
 
     def resolve(self, context: Context) -> "IntensityDependent":
-        correlated = self.with_correlation()
+        correlated = self.with_correlation(context.iso)
         if self.sigma is not None:
             return correlated
         places = np.linspace(0, 1, RESOLVED)
-        curves = (np.interp(places, *curve).clip(0, 1) for curve in self.noise().curves)
+        curves = (np.interp(places, *c).clip(0, 1) for c in self.noise(context.iso).curves)
         return correlated.filled(sigma=tuple(tuple(curve.round(6).tolist()) for curve in curves))
 
     def table(self) -> Floats:
@@ -275,8 +289,10 @@ class MeasuredNoise(NamedTuple):
     correlation: tuple[float, ...]
 
 
-def measured_noise(path: str) -> Mapping[str, MeasuredNoise]:
-    """The noise in a report of ``clpipe measure --json``, by where it is matched.
+def measured_noise(path: str) -> Mapping[float | None, Mapping[str, MeasuredNoise]]:
+    """The noise in a report of ``clpipe measure --json``, by ISO and by where it is matched.
+
+    The ISO is None where the report is on one alone, or does not say it.
 
     That of "halved" is what leaves the measured variance after averaging 2x2 pixels, which leaves a
     quarter of the variance of independent noise.
@@ -295,15 +311,22 @@ def measured_noise(path: str) -> Mapping[str, MeasuredNoise]:
 
 
 @lru_cache(maxsize=16)
-def _measured_noise(path: str, time: int, size: int) -> Mapping[str, MeasuredNoise]:
+def _measured_noise(
+    path: str, time: int, size: int
+) -> Mapping[float | None, Mapping[str, MeasuredNoise]]:
     try:
         report = parse_json(read_bytes(Path(path)))
-        kind = report["kind"]
-        if kind == Kind.DISPLAY.label:
+        reports = report.get("by_iso", {UNKNOWN: report})
+        kinds = {each["kind"] for each in reports.values()}
+        kind = ", ".join(kinds)
+        if kinds == {Kind.DISPLAY.label}:
             return {
-                "picture": _noise_of(report, "picture", "intensity_picture"),
-                "flat": _noise_of(report, "flat", "intensity"),
-                "halved": _noise_of(report, "halved", "intensity_picture", factor=2),
+                None if iso == UNKNOWN else float(iso): {
+                    "picture": _noise_of(each, "picture", "intensity_picture"),
+                    "flat": _noise_of(each, "flat", "intensity"),
+                    "halved": _noise_of(each, "halved", "intensity_picture", factor=2),
+                }
+                for iso, each in reports.items()
             }
     except (ValueError, OverflowError, LookupError, TypeError, AttributeError):
         raise ValueError("not a report of clpipe measure --json") from None
