@@ -317,7 +317,7 @@ def _measured_noise(
     try:
         report = parse_json(read_bytes(Path(path)))
         reports = report.get("by_iso", {UNKNOWN: report})
-        kinds = {each["kind"] for each in reports.values()}
+        kinds = {each["kind"] for each in reports.values()} or {report["kind"]}
         kind = ", ".join(kinds)
         if kinds == {Kind.DISPLAY.label}:
             return {
@@ -340,7 +340,8 @@ def _noise_of(report: Any, where: str, curve: str, factor: float = 1) -> Measure
     """The noise in one place of a report; the curves are scaled to the sigma there."""
     covariance = np.array(report["covariance"][where], float)
     variance = np.diag(covariance)
-    if covariance.shape != (3, 3) or not (variance >= 0).all() or not (variance <= 1).all():
+    are_variances = ((variance >= 0) & (variance <= 1)).all() and np.isfinite(covariance).all()
+    if covariance.shape != (3, 3) or not are_variances:
         raise TypeError
     sigma = np.sqrt(variance)
     divisor = np.where(sigma > 0, sigma, 1)
