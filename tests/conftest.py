@@ -53,7 +53,8 @@ def noise_report(*sigmas: float, **changes: Any) -> dict[str, Any]:
     whole = np.outer(sigmas, sigmas) * [[1, 0.5, 0], [0.5, 1, 0], [0, 0, 1]]
     places = {"flat": whole / 4, "picture": whole, "halved": whole / 2}
     covariance = {where: table.tolist() for where, table in places.items()}
-    return {"kind": "display", "channels": channels, "covariance": covariance} | changes
+    report = {"kind": "display", "rounding_variance": 0.0}
+    return {**report, "channels": channels, "covariance": covariance, **changes}
 
 
 @contextmanager

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 
 from clpipe.base.errors import RequestError
 from clpipe.chain.chain import make_chain
@@ -99,6 +100,28 @@ def test_measured_sigma(develop, grey, report):
             found = noisy(develop, image, method="intensity_dependent", **values) - image
             sigma = np.multiply(wanted * factor / 5**0.5, [0.01, 0.02, 0.03])
             assert found.std((0, 1)) == pytest.approx(sigma, rel=0.02)
+
+
+def test_rounding_is_not_added_twice(tmp_path, develop):
+    """Noise of one level, in files of 8 bits: measured, put on, rounded, and measured again."""
+    random, clean = np.random.default_rng(8), np.full((256, 256, 3), 128.3)
+
+    def measured(name, noisy):
+        for end, pixels in (("noisy", noisy), ("clean", clean)):
+            picture = Image.fromarray(pixels.round().astype(np.uint8))
+            picture.save(tmp_path / f"{name}_{end}.png")
+        paths = (tmp_path / f"{name}_{end}.png" for end in ("noisy", "clean"))
+        frame, truth = paths
+        (tmp_path / f"{name}.json").write_text(clpipe("measure", frame, "--truth", truth, "--json"))
+        report = json.loads((tmp_path / f"{name}.json").read_text())
+        return np.diag(report["covariance"]["picture"]) * 255**2
+
+    clean += random.uniform(-9, 9, clean.shape)  # so that the truth's rounding counts
+    before = measured("one", clean + random.normal(0, 1, clean.shape))
+    assert before == pytest.approx([1 + 2 / 12] * 3, rel=0.02)
+    values = {"method": "iid_gaussian", "measured": str(tmp_path / "one.json")}
+    again = noisy(develop, (clean / 255).astype(np.float32), **values)
+    assert measured("two", again * 255.0) == pytest.approx(before, rel=0.025)
 
 
 def test_a_report_on_several_isos(tmp_path):

@@ -78,6 +78,7 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
         covariances=covariances,
         notes=tuple(notes_on(images, truth, noise)),
         iso=next((image.iso for image in images if image.iso), None),
+        rounding=sum(picture.step**2 / 12 for picture in (first, truth) if picture),
     )
 
 

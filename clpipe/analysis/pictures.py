@@ -9,7 +9,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Floats, Mask
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import Settings
-from clpipe.images.read import holds_mosaic, photograph_iso, read_finished, read_image
+from clpipe.images.read import holds_mosaic, photograph_facts, read_finished, read_image
 from clpipe.inputs.kept import carried_settings
 from clpipe.reference.cfa import Pattern
 from clpipe.stage import Context, Kind
@@ -35,6 +35,7 @@ class Picture:
     white: float | None = None
     balance: str = ""  # of a kept mosaic, in words: the white balance gains taken out and applied
     iso: float | None = None  # where the file says it
+    step: float = 0.0  # of a finished picture, to which its samples are rounded
 
     @property
     def what(self) -> str:
@@ -68,8 +69,9 @@ def load_picture(path: Path, pattern: Pattern = "RGGB") -> Picture:
     """
     finished = read_finished(path)
     if finished is not None:
-        iso = photograph_iso(path)
-        return Picture(path, "display", finished.pixels, black=0.0, white=1.0, iso=iso)
+        iso, bits = photograph_facts(path)
+        step = 1 / (2**bits - 1)
+        return Picture(path, "display", finished.pixels, black=0.0, white=1.0, iso=iso, step=step)
     mosaic = holds_mosaic(path)
     source = read_image(path, mosaic)
     pixels = source.pixels.astype(np.float32)

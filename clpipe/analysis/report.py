@@ -38,6 +38,7 @@ class NoiseReport:
     notes: tuple[str, ...]
     iso: float | None = None  # where the images say it
     bursts: int = 1  # whose noise is pooled
+    rounding: float = 0.0  # the part of every channel's variance that rounding in files has
 
     def record(self) -> dict[str, Any]:
         """The report as JSON values; what could not be computed is null."""
@@ -46,6 +47,7 @@ class NoiseReport:
             "unit": UNITS[self.kind],
             "iso": self.iso,
             "bursts": self.bursts,
+            "rounding_variance": self.rounding,
             "images": list(self.images),
             "truth": self.truth,
             "width": self.width,

@@ -324,7 +324,7 @@ def _measured_noise(
                 None if iso == UNKNOWN else float(iso): {
                     "picture": _noise_of(each, "picture", "intensity_picture"),
                     "flat": _noise_of(each, "flat", "intensity"),
-                    "halved": _noise_of(each, "halved", "intensity_picture", factor=2),
+                    "halved": _noise_of(each, "halved", "intensity_picture", averaged=4),
                 }
                 for iso, each in reports.items()
             }
@@ -336,8 +336,10 @@ def _measured_noise(
     )
 
 
-def _noise_of(report: Any, where: str, curve: str, factor: float = 1) -> MeasuredNoise:
-    """The noise in one place of a report; the curves are scaled to the sigma there."""
+def _noise_of(report: Any, where: str, curve: str, averaged: int = 1) -> MeasuredNoise:
+    """The noise in one place of a report, after averaging so many pixels; the curves are scaled to
+    the sigma there. Rounding is left out, since the noisy picture will be rounded again.
+    """
     covariance = np.array(report["covariance"][where], float)
     variance = np.diag(covariance)
     are_variances = ((variance >= 0) & (variance <= 1)).all() and np.isfinite(covariance).all()
@@ -348,7 +350,10 @@ def _noise_of(report: Any, where: str, curve: str, factor: float = 1) -> Measure
     correlation = (covariance / np.outer(divisor, divisor)).clip(-1, 1)
     pairs = tuple(correlation[[0, 0, 1], [1, 2, 2]].tolist())
     mixing(*pairs)
-    sigmas = tuple(np.minimum(factor * sigma, 1).tolist())
+    rounding = float(report["rounding_variance"])
+    if not 0 <= rounding <= 1:
+        raise TypeError
+    sigmas = tuple(np.sqrt((averaged * variance - rounding).clip(0, 1)).tolist())
     records = (report["channels"][name][curve] for name in CHANNELS)
     curves = tuple(_curve_of(each, s) for each, s in zip(records, sigmas, strict=True))
     return MeasuredNoise(sigmas, curves, pairs)
