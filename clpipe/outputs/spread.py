@@ -69,9 +69,8 @@ class Spread:
             planes = zip(self._selected(truth).T, self._selected(noise).T, strict=True)
             self._curves = [curve_of(*each) for each in planes]
         elif name == clean:
-            self._clean = (
-                picture.copy() if self.matching.jpeg or self.matching.match == HALVED else None
-            )
+            if self.matching.jpeg or self.matching.match == HALVED:
+                self._clean = picture.copy()
             self._intensities = [
                 np.histogram(np.clip(plane, -0.5, 1.5), FINE, (-0.5, 1.5))[0]
                 for plane in self._selected(picture).T
@@ -107,7 +106,7 @@ class Spread:
         channels = zip(wanted / left, curves, self._intensities, strict=True)
         strengths = np.array([strength_for(*channel) for channel in channels])
         method = self._with_strength(baseline, strengths)
-        if self._clean is None or not wanted.all():
+        if self._clean is None or not (wanted > 0).all():
             return method, {}
         # Channels are coupled by JPEG's luma and chroma, so a channel's error is not of its own
         # strength alone: Broyden's method (1965), in logarithms, from the unit matrix on.
@@ -116,14 +115,14 @@ class Spread:
         for _ in range(ROUNDS):
             noise = self._shown(run_reference(method, self._clean)) - clean
             ratio = np.diag(self._covariance_of(noise)) / wanted
-            error = np.log(ratio)
+            error = np.log(np.maximum(ratio, 1e-3))
             if np.abs(error).max() < least:
                 best, reached, least = method, ratio, np.abs(error).max()
             if least < CLOSE:
                 break
             if step.any():
                 slope += np.outer(error - before - slope @ step, step) / (step @ step)
-            before, step = error, np.linalg.solve(slope, -error).clip(-1, 1)
+            before, step = error, (np.linalg.pinv(slope) @ -error).clip(-1, 1)
             strengths = strengths * np.exp(step / 2)
             method = self._with_strength(baseline, strengths)
         names = (f"variance_ratio_{name.lower()}" for name in CHANNELS)
