@@ -1,5 +1,7 @@
-// Independent Gaussian noise whose sigma follows each channel's intensity, by a table of 256 entries
-// for each channel (SyB3R; Ley, Haensch, Hellwich 2016).
+// Gaussian noise, independent in each pixel, whose sigma follows each channel's intensity, by a table of
+// 256 entries for each channel (SyB3R; Ley, Haensch, Hellwich 2016).
+#include "lib/correlated.h"
+
 INLINE vf sigma_at(vf v, __global const float *table) {
     const vi index = to_8_bit(v);
 #if LANES == 1
@@ -13,9 +15,10 @@ INLINE vf sigma_at(vf v, __global const float *table) {
 #endif
 }
 
-INLINE rgb picture_noise(rgb c, site at, stream s, __global const float *sigmas) {
-    const rgb v = {c.r + normal_at(at, 0, s) * sigma_at(c.r, sigmas),
-                   c.g + normal_at(at, 1, s) * sigma_at(c.g, sigmas + 256),
-                   c.b + normal_at(at, 2, s) * sigma_at(c.b, sigmas + 512)};
+INLINE rgb picture_noise(rgb c, site at, stream s, __global const float *sigmas, float green_red,
+                         float green_green, float blue_red, float blue_green, float blue_blue) {
+    const rgb n = correlated_normals(at, s, green_red, green_green, blue_red, blue_green, blue_blue);
+    const rgb v = {c.r + n.r * sigma_at(c.r, sigmas), c.g + n.g * sigma_at(c.g, sigmas + 256),
+                   c.b + n.b * sigma_at(c.b, sigmas + 512)};
     return v;
 }

@@ -34,6 +34,29 @@ def written(folder: Path) -> list[str]:
     return sorted(files - {"run.jsonl"})
 
 
+def noise_report(*sigmas: float, **changes: Any) -> dict[str, Any]:
+    """What clpipe measure --json says of a picture whose R, G, B have these sigmas; with changes.
+
+    Flat places have half of them, and red and green are correlated by 0.5. At an intensity of 0.75
+    there is three times the noise of 0.25.
+    """
+    curve = {"mean": [0.25, 0.75], "samples": [100, 100]}
+    channels = {
+        name: {
+            "sigma": sigma / 2,
+            "sigma_picture": sigma,
+            "intensity": {**curve, "sigma": [sigma / 2 / 5**0.5, sigma / 2 * 3 / 5**0.5]},
+            "intensity_picture": {**curve, "sigma": [sigma / 5**0.5, sigma * 3 / 5**0.5]},
+        }
+        for name, sigma in zip("RGB", sigmas, strict=True)
+    }
+    whole = np.outer(sigmas, sigmas) * [[1, 0.5, 0], [0.5, 1, 0], [0, 0, 1]]
+    places = {"flat": whole / 4, "picture": whole, "halved": whole / 2}
+    covariance = {where: table.tolist() for where, table in places.items()}
+    report = {"kind": "display", "rounding_variance": 0.0}
+    return {**report, "channels": channels, "covariance": covariance, **changes}
+
+
 @contextmanager
 def file_limit(size: int) -> Iterator[None]:
     """Let no file grow beyond a size in bytes, as a full disk does."""

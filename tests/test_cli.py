@@ -201,7 +201,7 @@ def test_a_folder_keeps_its_structure_and_a_bad_file_stops_nobody(clpipe, write_
         (["--set", "sensor_noise.a=1e300"], 2, "sensor_noise.a: found 1e+300"),
         (["--set", "denoise.grain=true"], 2, "denoise.grain: found True"),
         (["--device", ""], 3, "unknown device ''"),
-        (["--skip", "noise"], 2, "unknown stage 'noise'"),
+        (["--skip", "nois"], 2, "unknown stage 'nois'"),
         (["--keep", "noise"], 2, "unknown stage in this chain 'noise'"),
         (["-c", "missing.toml"], 2, "missing.toml: cannot read"),
         (["--camera", "leica"], 2, "unknown camera 'leica'"),

@@ -17,6 +17,7 @@ from clpipe.chain.files import load_settings
 from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
 from clpipe.inputs.manifest import Row, check_rows, read_manifest
+from tests.conftest import noise_report
 
 DEFAULT = settings_from({})
 
@@ -161,7 +162,7 @@ def test_rows_lie_over_settings(manifest):
         ("path,iso,iso\n", "row 1: there are two columns 'iso'"),
         ("path,,iso\n", "row 1: column 2 has no name"),
         ("path,isoo\n", "row 1: unknown column 'isoo' .*mean 'iso'.*, or stage.parameter"),
-        ("path,skip\n", "row 1: unknown column 'skip'"),
+        ("path,skips\n", "row 1: unknown column 'skips'"),
         ("path,mosaic\n", "row 1: mosaic: its parameters have columns of their own: mosaic.NAME"),
         (
             "path,sensr_noise.a\n",
@@ -221,7 +222,7 @@ def test_a_csv_that_is_wrong(manifest, text, message):
         ('{"path": "b.exr", "isoo": 3}', "row 2: unknown column 'isoo'"),
         ('{"path": "b.exr", "exposure": 3}', "row 2: exposure: its parameters have columns"),
         ('{"path": "b.exr", "exposure": {"e": 3}}', "row 2: unknown parameter of exposure 'e'"),
-        ('{"path": "b.exr", "skip": ["denoise"]}', "row 2: unknown column 'skip'"),
+        ('{"path": "b.exr", "skips": ["denoise"]}', "row 2: unknown column 'skips'"),
         ('{"path": "b.exr", "iso": ' + "[" * 100_000, "row 2: not valid JSON"),
         ('{"path": "b.exr", "iso": ' + "1" * 5000 + "}", "row 2: not valid JSON"),
     ],
@@ -261,6 +262,8 @@ def test_a_manifest_that_is_not_there(tmp_path):
         ("demosaic.method\nbiliner", "row 2: demosaic.method: unknown method .*'bilinear'"),
         ("picture_noise.sigma\n0.1", "row 2: unknown parameter of picture_noise .none. 'sigma'"),
         ("mosaic_denoise.size\n5", "row 2: unknown stage in this chain 'mosaic_denoise'"),
+        ("skip\n3", "row 2: skip: found 3, but it is a list of stage names"),
+        ("skip\ndenoise nois", "row 2: unknown stage 'nois'"),
         ("denoise_2.luma_strength\n5", "row 2: unknown stage in this chain 'denoise_2'"),
     ],
 )
@@ -275,6 +278,22 @@ def test_what_is_wrong_in_several_rows(manifest):
     rows = manifest("path,iso\na,100\nb,50\nc,x\nd,800\n")
     with pytest.raises(RequestError, match=r"row 3: iso: found 50.*; and 1 more row is wrong$"):
         check_rows(rows, DEFAULT)
+
+
+def test_a_row_leaves_out_stages_and_noise(manifest):
+    rows = manifest('path,skip\na,denoise noise\nb,"[""denoise""]"\nc,picture_noise\nd,\n')
+    rows += manifest('{"path": "e", "skip": ["noise"]}', "frames.jsonl")
+    loud = ("picture_noise.method=iid_gaussian", "picture_noise.sigma=[0.1, 0.1, 0.1]")
+    request = Request.from_options(assignments=[*loud, "prnu.sigma=0.01"], skip=["sharpen"])
+    check_rows(rows, request.settings())
+    chains = [request.for_image(row.key, row.values).chain() for row in rows]
+    assert all(chain.settings.skip[0] == "sharpen" for chain in chains)
+    noisy = [[step.name for step in chain.steps if step.adds_noise] for chain in chains]
+    sensor = ["prnu", "sensor_noise", "row_noise"]
+    both = [*sensor, "picture_noise"]
+    assert noisy == [[], both, sensor, both, []]
+    denoised = ["denoise" in [step.name for step in chain.steps] for chain in chains]
+    assert denoised == [False, False, True, True, True]
 
 
 def test_an_image_that_brings_its_own_camera_may_have_its_isos(manifest):
@@ -392,10 +411,7 @@ def test_draws_under_dotted_keys_of_jsonl(tmp_path):
 
 
 def test_a_row_completes_and_replaces_what_options_set(tmp_path, monkeypatch):
-    curve = {"sigma": 0.02, "intensity": {"mean": [0.5], "sigma": [0.02]}}
-    (tmp_path / "noise.json").write_text(
-        json.dumps({"kind": "display", "channels": dict.fromkeys("RGB", curve)})
-    )
+    (tmp_path / "noise.json").write_text(json.dumps(noise_report(0.02, 0.02, 0.02)))
     monkeypatch.chdir(tmp_path)  # what a row names is found beside the manifest, not here
     (tmp_path / "rows").mkdir()
     (tmp_path / "noise.json").rename(tmp_path / "rows" / "noise.json")

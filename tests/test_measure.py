@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,11 @@ from PIL import Image
 
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import Picture, load_picture
+from clpipe.analysis.pooling import pool_by_iso
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import load_camera
 from clpipe.commands.measure import measure_tables
 from tests.conftest import STILL_LIFE
-
-NOISELESS = ("--skip", "sensor_noise", "--skip", "row_noise", "--skip", "column_noise")
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def run(clpipe, folder, *options):
 
 def test_the_raw_has_the_noise_of_the_camera(clpipe, measured):
     noisy = run(clpipe, "noisy", "--until", "quantize")
-    clean = run(clpipe, "clean", "--until", "quantize", *NOISELESS)
+    clean = run(clpipe, "clean", "--until", "quantize", "--no-noise")
     report = measured(f"{noisy}.exr", "--truth", f"{clean}.exr")
     noise = load_camera("sony-a7r2").noise(3200)
     assert list(report["channels"]) == ["R", "G1", "G2", "B", "mosaic"]
@@ -44,13 +44,14 @@ def test_the_raw_has_the_noise_of_the_camera(clpipe, measured):
         assert one["column"]["sigma"] <= one["column"]["limit"]
         assert abs(one["excess_kurtosis"]) < 0.06
         assert one["energy_left_2x2"] == pytest.approx(0.25, abs=0.006)
+        assert one["sigma_picture"] == pytest.approx(one["sigma"], rel=0.03)
         pixels = 960 * 640 if name == "mosaic" else 480 * 320
         assert 0.95 * pixels < one["samples"] <= pixels
 
 
 def test_row_noise_is_found_and_shared_by_the_sites_of_a_row(clpipe, measured):
     noisy = run(clpipe, "noisy", "--until", "quantize", "--set", "row_noise.sigma=0.004")
-    clean = run(clpipe, "clean", "--until", "quantize", *NOISELESS)
+    clean = run(clpipe, "clean", "--until", "quantize", "--no-noise")
     report = measured(f"{noisy}.exr", "--truth", f"{clean}.exr")
     for one in report["channels"].values():
         assert one["row"]["sigma"] == pytest.approx(0.004, rel=0.1)
@@ -80,7 +81,7 @@ def test_repeats_measure_what_the_truth_does(clpipe, measured):
     names = [
         run(clpipe, str(seed), "--until", "normalize", "--seed", seed) + ".exr" for seed in range(6)
     ]
-    clean = run(clpipe, "clean", "--until", "normalize", *NOISELESS)
+    clean = run(clpipe, "clean", "--until", "normalize", "--no-noise")
     repeats, against = measured(*names), measured(*names, "--truth", f"{clean}.exr")
     assert repeats["truth"] is None
     for name, one in repeats["channels"].items():
@@ -99,7 +100,7 @@ def test_repeats_measure_what_the_truth_does(clpipe, measured):
 def test_processing_correlates_noise(clpipe, measured):
     formats = ("--format", "jpg", "--format", "png", "--format", "exr", "--keep", "demosaic")
     noisy = run(clpipe, "noisy", *formats)
-    clean = run(clpipe, "clean", *formats, *NOISELESS, "--skip", "denoise")
+    clean = run(clpipe, "clean", *formats, "--no-noise", "--skip", "denoise")
     reports = {
         ending: measured(f"{noisy}.{ending}", "--truth", f"{clean}.{ending}")
         for ending in ("jpg", "png", "exr", "demosaic.exr")
@@ -125,7 +126,7 @@ def test_processing_correlates_noise(clpipe, measured):
 
 def test_the_tables_and_the_picture(clpipe, tmp_path):
     noisy = run(clpipe, "noisy", "--until", "quantize")
-    clean = run(clpipe, "clean", "--until", "quantize", *NOISELESS)
+    clean = run(clpipe, "clean", "--until", "quantize", "--no-noise")
     text = clpipe(
         "measure", f"{noisy}.exr", "--truth", f"{clean}.exr", "--plot", "plots/noise.png"
     ).stdout
@@ -169,6 +170,133 @@ def test_finished_pictures_of_others(tmp_path, measured):
         assert report["channels"]["Y"]["energy_left_2x2"] == pytest.approx(0.25, abs=0.01)
 
 
+def test_the_whole_picture_and_the_covariance_of_channels(tmp_path, measured, clpipe):
+    """Noise is twice as large beside edges, so flat places have less; channels share a part."""
+    random = np.random.default_rng(5)
+    clean = np.full((256, 257, 3), 128.0)
+    clean[:128, ::2] -= 40  # stripes: nowhere flat
+    noise = random.normal(0, 4, clean.shape) + random.normal(0, 3, clean.shape[:2])[..., None]
+    noise[:128] *= 2
+    paths = [
+        png(tmp_path / f"{name}.png", (clean + part).round().astype(np.uint8))
+        for name, part in (("noisy", noise), ("clean", 0))
+    ]
+    report = measured(paths[0], "--truth", paths[1])
+    assert 0.45 < report["share_used"] < 0.5
+    tables = {name: np.array(table) * 255**2 for name, table in report["covariance"].items()}
+    shared = np.full((3, 3), 9.0) + 16 * np.eye(3)
+    assert tables["flat"] == pytest.approx(shared, rel=0.05)
+    assert tables["picture"] == pytest.approx(2.5 * shared, rel=0.05)
+    assert tables["halved"] == pytest.approx(2.5 / 4 * shared, rel=0.05)
+    for i, name in enumerate("RGB"):
+        one = report["channels"][name]
+        assert one["sigma"] ** 2 == pytest.approx(report["covariance"]["flat"][i][i])
+        assert one["sigma_picture"] ** 2 == pytest.approx(report["covariance"]["picture"][i][i])
+        curve = one["intensity_picture"]
+        variance = np.average(np.square(curve["sigma"]), weights=curve["samples"])
+        assert variance * 255**2 == pytest.approx(2.5 * 25, rel=0.05)
+    cb = 0.564 * (noise[..., 2] - noise @ (0.299, 0.587, 0.114))
+    assert report["channels"]["Cb"]["sigma_picture"] * 255 == pytest.approx(cb.std(), rel=0.02)
+    text = clpipe("measure", paths[0], "--truth", paths[1]).stdout
+    assert re.search(r"sigma \(flat, 4\d%\) +sigma \(all, 100%\)", text)
+    assert re.search(r"^all, after 2x2 +0\.0", text, re.MULTILINE)
+
+
+def scene_of(seed, height=96):
+    tiles = np.random.default_rng(seed).uniform(60, 190, (height // 32, 4))
+    return np.kron(tiles, np.ones((32, 32)))[..., None].repeat(3, -1)
+
+
+def burst(folder, name, seed, sigma, iso=None, height=96):
+    random, exif = np.random.default_rng(seed + 10), Image.Exif()
+    if iso:
+        exif[0x8769] = {0x8827: iso}
+    folder.mkdir(parents=True, exist_ok=True)
+    for k in range(3):
+        noisy = scene_of(seed, height) + random.normal(0, sigma, (height, 128, 3))
+        picture = Image.fromarray(noisy.round().astype(np.uint8))
+        picture.save(folder / name.format(k), exif=exif)
+
+
+def test_bursts_of_several_scenes_are_one_figure_for_each_iso(tmp_path, measured, clpipe):
+    out = tmp_path / "out"
+    burst(out / "low", "one.frame{}.png", 1, 3, 100)
+    burst(out / "low", "two.frame{}.png", 2, 6, 100, height=192)
+    burst(out / "high", "one.frame{}.png", 1, 9, 800)
+    png(out / "high" / "one.truth.png", scene_of(1).astype(np.uint8))
+    by_iso = measured(out)["by_iso"]
+    assert [(iso, one["bursts"], len(one["images"])) for iso, one in by_iso.items()] == [
+        ("100", 2, 6),
+        ("800", 1, 3),
+    ]
+    for iso, wanted in (("100", (3**2 + 2 * 6**2) / 3), ("800", 9**2)):
+        report = by_iso[iso]
+        one = report["channels"]["G"]
+        for found in (one["sigma_picture"] ** 2, report["covariance"]["picture"][1][1]):
+            assert found * 255**2 == pytest.approx(wanted, rel=0.05)
+        assert report["covariance"]["halved"][2][2] * 255**2 == pytest.approx(wanted / 4, rel=0.06)
+        curve = one["intensity_picture"]
+        variance = np.average(np.square(curve["sigma"]), weights=curve["samples"])
+        assert variance * 255**2 == pytest.approx(wanted, rel=0.05)
+        assert one["energy_left_2x2"] == pytest.approx(0.25, abs=0.02)
+        assert sum(one["histogram"]["samples"]) == one["samples"]
+    low = measured(*sorted((out / "low").glob("*.frame?.png")))
+    assert low == by_iso["100"] | {"images": low["images"]}
+    text = clpipe("measure", out).stdout
+    assert "6 x display in 2 bursts, 128x96, ISO 100, against the mean of their burst" in text
+    assert "3 x display, 128x96, ISO 800, against their mean" in text
+
+
+def test_a_raws_law_is_pooled_by_its_errors():
+    random, a, b, reports = np.random.default_rng(7), 6e-4, 1e-4, []
+    for size in (200, 800):
+        clean = np.tile(np.linspace(0, 0.8, size, dtype=np.float32), (size, 1))
+        frames = [
+            clean + random.standard_normal(clean.shape, np.float32) * np.sqrt(a * clean + b)
+            for _ in range(2)
+        ]
+        reports.append(
+            measure([Picture(Path("n"), "mosaic", frame, white=1.0) for frame in frames])
+        )
+    (pooled,) = pool_by_iso(reports)
+    laws = [report.channels[-1].law for report in (*reports, pooled)]
+    assert abs(laws[2].a - a) < 3 * laws[2].a_error and abs(laws[2].b - b) < 3 * laws[2].b_error
+    assert laws[2].a_error < min(laws[0].a_error, laws[1].a_error)
+    assert laws[2].a_error > 0.8 * laws[1].a_error
+    assert pooled.channels[-1].rows.limit < reports[0].channels[-1].rows.limit
+
+
+def test_folders_of_photographs_are_a_burst_each_and_what_is_refused(tmp_path, measured, clpipe):
+    photos = tmp_path / "photos"
+    burst(photos / "a", "DSC{}.jpg", 3, 5)
+    burst(photos / "b", "DSC{}.jpg", 4, 5)
+    assert measured(photos / "a", photos / "b")["bursts"] == 2
+    files = sorted(photos.rglob("*.jpg"))
+    assert "does not" in clpipe("measure", *files, status=2).stderr
+    burst(photos / "b", "x.frame{}.png", 4, 5)
+    burst(photos / "b", "x.frame{}.jpg", 4, 5)
+    (tmp_path / "empty").mkdir()
+    for arguments, message in (
+        ([photos / "b"], "it holds frames that end in .jpg and in .png; name those of one ending"),
+        ([tmp_path / "empty"], "empty: it holds no pictures (.jpg, "),
+        (
+            [photos / "a", files[3], files[4], "--truth", files[0]],
+            "one scene has it, but there are 2",
+        ),
+    ):
+        assert message in clpipe("measure", *arguments, status=2).stderr
+
+
+def test_repeats_have_the_whole_noise_of_each(tmp_path, measured):
+    random = np.random.default_rng(6)
+    scene = np.tile(random.uniform(60, 190, 128), (128, 1))[..., None].repeat(3, -1)
+    frames = [scene + random.normal(0, (4, 6, 8), scene.shape) for _ in range(3)]
+    paths = [png(tmp_path / f"{i}.png", f.round().astype(np.uint8)) for i, f in enumerate(frames)]
+    channels = measured(*paths)["channels"]
+    found = [channels[name]["sigma_picture"] * 255 for name in "RGB"]
+    assert found == pytest.approx([4, 6, 8], rel=0.02)
+
+
 def test_a_mosaic_that_says_nothing_is_taken_as_it_is(write_exr, measured):
     random = np.random.default_rng(3)
     scene = np.tile(np.linspace(600, 3000, 200), (200, 1))
@@ -187,7 +315,7 @@ def test_a_mosaic_that_says_nothing_is_taken_as_it_is(write_exr, measured):
 
 
 def test_no_noise_is_said_not_divided_by(clpipe, measured):
-    clean = run(clpipe, "clean", "--format", "png", *NOISELESS)
+    clean = run(clpipe, "clean", "--format", "png", "--no-noise")
     report = measured(f"{clean}.png", "--truth", f"{clean}.png")
     assert "identical" in " ".join(report["notes"])
     for one in report["channels"].values():
@@ -310,3 +438,20 @@ def test_another_scene_among_the_repeats_is_refused():
                 measure([*repeats, other])
             with pytest.raises(RequestError, match=r"does not show the same scene as"):
                 measure([repeats[0], other])
+
+
+def test_a_shift_by_a_pixel_is_refused_and_strong_noise_is_not(clpipe, tmp_path):
+    name = run(clpipe, "burst", "--iso", 12800, "--frames", 3, "--format", "png")
+    frames = [load_picture(tmp_path / f"{name}.frame{k}.png") for k in range(3)]
+    assert measure(frames) and frames[0].iso == 12800
+    moved = replace(frames[1], path=Path("moved.png"), pixels=np.roll(frames[1].pixels, 1, 1))
+    with pytest.raises(RequestError, match=r"^moved\.png does not lie over the others: "):
+        measure([frames[0], moved, frames[2]])
+    with pytest.raises(RequestError, match=r"^moved\.png does not lie over \S+frame0\.png: "):
+        measure([frames[0], moved])
+
+
+def test_repeats_of_real_cameras_are_repeats(shared_data):
+    for name in ("5dmark3_iso3200_1", "d800_iso1600_1"):
+        paths = (shared_data / "real_noise" / f"{name}_{end}.png" for end in ("real", "mean"))
+        assert measure([load_picture(path) for path in paths]).share > 0.2

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 
 from clpipe.base.errors import RequestError
 from clpipe.chain.chain import make_chain
@@ -13,7 +14,7 @@ from clpipe.commands.main import main
 from clpipe.engine.plan import make_plan
 from clpipe.stage import Kind
 from clpipe.stages.picture_noise import measured_noise
-from tests.conftest import STILL_LIFE
+from tests.conftest import STILL_LIFE, noise_report
 
 CLEAN = ("sensor_noise", "row_noise", "column_noise", "denoise")
 
@@ -37,13 +38,8 @@ def report(tmp_path):
     """A report as clpipe measure writes one, with changes."""
 
     def write(name="report.json", **changes):
-        levels = {"R": 0.01, "G": 0.02, "B": 0.03}
-        channels = {
-            name: {"sigma": level, "intensity": {"mean": [0.25, 0.75], "sigma": [level, level * 3]}}
-            for name, level in levels.items()
-        }
         path = tmp_path / name
-        path.write_text(json.dumps({"kind": "display", "channels": channels} | changes))
+        path.write_text(json.dumps(noise_report(0.01, 0.02, 0.03, **changes)))
         return str(path)
 
     return write
@@ -89,18 +85,75 @@ def test_sigma_follows_intensity(develop, grey):
 
 def test_measured_sigma(develop, grey, report):
     path = report()
-    image = noisy(develop, grey, method="iid_gaussian", measured=path) - grey
-    assert image.std((0, 1)) == pytest.approx([0.01, 0.02, 0.03], rel=0.01)
-    for level, factor in ((0.0, 1), (0.5, 2), (1.0, 3)):
-        image = np.full_like(grey, level)
-        found = noisy(develop, image, method="intensity_dependent", measured=path) - image
-        assert found.std((0, 1)) == pytest.approx(np.multiply(factor, [0.01, 0.02, 0.03]), rel=0.02)
+    for match, wanted in (("picture", 1), ("flat", 1 / 2), ("halved", 2**0.5)):
+        values = {"measured": path, "match": match, "correlated": match == "flat"}
+        noise = noisy(develop, grey, method="iid_gaussian", **values) - grey
+        assert noise.std((0, 1)) == pytest.approx(np.multiply(wanted, [0.01, 0.02, 0.03]), rel=0.01)
+        if match == "halved":
+            left = noise.reshape(150, 2, 200, 2, 3).mean((1, 3)).var((0, 1))
+            assert left == pytest.approx(np.square([0.01, 0.02, 0.03]) / 2, rel=0.02)
+        red_green, red_blue, green_blue = np.corrcoef(noise.reshape(-1, 3).T)[[0, 0, 1], [1, 2, 2]]
+        assert red_green == pytest.approx(0.5 if match == "flat" else 0, abs=0.015)
+        assert (red_blue, green_blue) == pytest.approx((0, 0), abs=0.015)
+        for level, factor in ((0.0, 1), (0.5, 2), (1.0, 3)):
+            image = np.full_like(grey, level)
+            found = noisy(develop, image, method="intensity_dependent", **values) - image
+            sigma = np.multiply(wanted * factor / 5**0.5, [0.01, 0.02, 0.03])
+            assert found.std((0, 1)) == pytest.approx(sigma, rel=0.02)
+
+
+def test_rounding_is_not_added_twice(tmp_path, develop):
+    """Noise of one level, in files of 8 bits: measured, put on, rounded, and measured again."""
+    random, clean = np.random.default_rng(8), np.full((256, 256, 3), 128.3)
+
+    def measured(name, noisy):
+        for end, pixels in (("noisy", noisy), ("clean", clean)):
+            picture = Image.fromarray(pixels.round().astype(np.uint8))
+            picture.save(tmp_path / f"{name}_{end}.png")
+        paths = (tmp_path / f"{name}_{end}.png" for end in ("noisy", "clean"))
+        frame, truth = paths
+        (tmp_path / f"{name}.json").write_text(clpipe("measure", frame, "--truth", truth, "--json"))
+        report = json.loads((tmp_path / f"{name}.json").read_text())
+        return np.diag(report["covariance"]["picture"]) * 255**2
+
+    clean += random.uniform(-9, 9, clean.shape)  # so that the truth's rounding counts
+    before = measured("one", clean + random.normal(0, 1, clean.shape))
+    assert before == pytest.approx([1 + 2 / 12] * 3, rel=0.02)
+    values = {"method": "iid_gaussian", "measured": str(tmp_path / "one.json")}
+    again = noisy(develop, (clean / 255).astype(np.float32), **values)
+    assert measured("two", again * 255.0) == pytest.approx(before, rel=0.025)
+
+
+def test_a_report_on_several_isos(tmp_path):
+    path = tmp_path / "isos.json"
+    by_iso = {"100": noise_report(0.01, 0.01, 0.01), "800": noise_report(0.03, 0.03, 0.03)}
+    path.write_text(json.dumps({"by_iso": by_iso}))
+    values = {"method": "iid_gaussian", "measured": str(path)}
+
+    def sigma(iso):
+        settings = {"stages": ["picture_noise"], "picture_noise": values, "iso": iso}
+        return make_chain(settings_from(settings)).steps[0].method.sigma
+
+    assert sigma(100) == pytest.approx((0.01,) * 3) and sigma(800) == pytest.approx((0.03,) * 3)
+    with pytest.raises(RequestError, match=r"isos\.json has no ISO 400, only 100, 800"):
+        sigma(400)
+
+
+@pytest.mark.parametrize("method", ["iid_gaussian", "intensity_dependent"])
+def test_channels_are_correlated_as_given(develop, grey, method):
+    wanted = (0.8, -0.4, 0.1)
+    noise = noisy(develop, grey, method=method, sigma=[0.02] * 3, correlation=wanted) - grey
+    assert noise.std((0, 1)) == pytest.approx([0.02] * 3, rel=0.01)
+    table = np.corrcoef(noise.reshape(-1, 3).T)
+    assert table[[0, 0, 1], [1, 2, 2]] == pytest.approx(wanted, abs=0.015)
+    beside = np.corrcoef(noise[:, 1:].ravel(), noise[:, :-1].ravel())[0, 1]
+    assert abs(beside) < 0.015
 
 
 def test_a_report_that_changes_is_read_again(report):
-    before = measured_noise(report())[0].sigma
+    before = measured_noise(report())[None]["picture"].sigma
     path = report(channels=json.loads('{"R": 0}'))
-    assert before == 0.01
+    assert before == pytest.approx((0.01, 0.02, 0.03))
     with pytest.raises(ValueError, match="not a report"):
         measured_noise(path)
 
@@ -124,21 +177,25 @@ def test_what_is_refused(method, report, tmp_path):
         ({"sigma": [0.1, -0.2, 0.3]}, "greater than or equal to 0"),
         ({"sigma": [0.1]}, "sigma"),
         ({"sigma": "loud"}, "sigma"),
+        ({"sigma": sigma, "correlated": True}, "correlated is true, but nothing is measured"),
+        ({"sigma": sigma, "correlation": [0.9, 0.9, -0.9]}, "no three channels can be correlated"),
+        ({"sigma": sigma, "correlation": [2, 0, 0]}, "less than or equal to 1"),
+        ({"sigma": sigma, "match": "flatt"}, "picture_noise.match"),
     ):
         with pytest.raises(RequestError, match=message):
             chain(method=method, **values)
     for records in ({"R": {}}, {"R": {"sigma": None}}, [], dict.fromkeys("RGB", 1)):
         with pytest.raises(RequestError, match="not a report"):
             chain(method=method, measured=report(channels=records))
-    for sigma, means, sigmas in (
-        (0.1, [], []),
-        (-0.1, [0, 1], [0, 0]),
-        (1e300, [0, 1], [0, 0]),
-        (0.1, [0, 1], [0, 1e300]),
-    ):
-        record = {"sigma": sigma, "intensity": {"mean": means, "sigma": sigmas}}
+    for means, sigmas in (([], []), ([0, 1], [0]), ([0, 1], [0, 1e300]), ([0, 1], [-1, 0])):
+        curve = {"mean": means, "sigma": sigmas, "samples": [1] * len(means)}
+        record = {"intensity": curve, "intensity_picture": curve}
         with pytest.raises(RequestError, match="not a report"):
             chain(method=method, measured=report(channels=dict.fromkeys("RGB", record)))
+    for table in ([[1]], [[-1, 0, 0]] * 3, [[1e300, 0, 0]] * 3, "loud", [[None] * 3] * 3):
+        places = dict.fromkeys(("flat", "picture", "halved"), table)
+        with pytest.raises(RequestError, match="not a report"):
+            chain(method=method, measured=report(covariance=places))
 
 
 def test_a_configuration_names_the_report_relative_to_itself(report, tmp_path):
@@ -175,8 +232,8 @@ def loop(tmp_path_factory):
     run("clean", *clean)
     reports = {"camera": json.loads(measure("camera"))}
     (folder / "camera.json").write_text(json.dumps(reports["camera"]))
-    for method in ("iid_gaussian", "intensity_dependent"):
-        noise = ("--set", f"picture_noise.method={method}")
+    for method, match in (("iid_gaussian", "picture"), ("intensity_dependent", "flat")):
+        noise = ("--set", f"picture_noise.method={method}", "--set", f"picture_noise.match={match}")
         noise += ("--set", f"picture_noise.measured={folder / 'camera.json'}")
         run(method, *clean, *noise)
         reports[method] = json.loads(measure(method))
@@ -186,7 +243,7 @@ def loop(tmp_path_factory):
 def test_the_matched_variance_is_measured_again(loop):
     for name in "RGB":
         camera, baseline = (loop[x]["channels"][name] for x in ("camera", "iid_gaussian"))
-        assert baseline["sigma"] == pytest.approx(camera["sigma"], rel=0.01)
+        assert baseline["sigma_picture"] == pytest.approx(camera["sigma_picture"], rel=0.015)
         assert np.std(baseline["intensity"]["sigma"]) < 0.1 * np.std(camera["intensity"]["sigma"])
 
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from clpipe.analysis.intensity import bin_edges, fit_variance, noise_by_intensity, pool_curves
-from clpipe.analysis.selection import select_flat, select_unclipped
+from clpipe.analysis.selection import select_unclipped
 from clpipe.analysis.spatial import LAGS, autocorrelation, count_pairs, energy_left, line_noise
 from clpipe.analysis.statistics import SIGMAS, channel_statistics, correlation, tails
+from clpipe.outputs.places import select_flat
 
 RANDOM = np.random.default_rng(5)
 START = RANDOM.bit_generator.state

@@ -1,34 +1,27 @@
 """Measuring the noise of images against their clean truth, or against each other."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
 from clpipe.analysis.intensity import bin_edges, noise_by_intensity, pool_curves
 from clpipe.analysis.pictures import SITES, WHOLE, Picture
+from clpipe.analysis.repeats import check_repeats
 from clpipe.analysis.report import NoiseReport
-from clpipe.analysis.selection import select_flat, select_unclipped
+from clpipe.analysis.selection import select_unclipped
 from clpipe.analysis.spatial import count_pairs
 from clpipe.analysis.statistics import Channel, channel_statistics, correlation
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Doubles, Floats, Mask
+from clpipe.outputs.places import FLAT, HALVED, PICTURE, covariance, halved, select_flat
 from clpipe.reference.cfa import red_site
 from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.stage import Kind
 
-# A repeat with less than this share of the others' noise energy is taken for a truth among them.
-# Among n frames and against their mean, a truth has (n - 1) / (n^2 - n - 1), at most 0.4.
-TRUTH_SHARE = 0.6
-
-# A repeat shows another scene, where averaging BLOCK x BLOCK pixels leaves more than this share of
-# the energy of its difference from the mean. Noise leaves 1 / BLOCK^2, and up to 0.01 where
-# processing has smeared it; another view leaves 0.2.
-SCENE_SHARE = 0.05
-BLOCK = 64  # px
-
-# The share of pixels that count, the channels, and the correlations of pairs of channels.
-Parts = tuple[float, tuple[Channel, ...], dict[tuple[str, str], float]]
+# The share of pixels that count, the channels, the correlations of pairs of them, covariances.
+Parts = tuple[float, tuple[Channel, ...], dict[tuple[str, str], float], dict[str, Doubles]]
 
 
 def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseReport:
@@ -37,7 +30,8 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
     Against the mean of n frames, noise is the difference times sqrt(n / (n - 1)). What all frames
     share, such as column noise, is then part of the mean and not measured. Clipped intensities are
     left out, see :func:`clpipe.analysis.selection.select_unclipped`; of pictures, only flat places
-    count, see :func:`clpipe.analysis.selection.select_flat`.
+    count, see :func:`clpipe.outputs.places.select_flat`. The whole sigma and the covariances of
+    the whole picture, and of it after averaging 2x2, are those of every pixel.
 
     Args:
         images: of one kind and size.
@@ -58,8 +52,7 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
         freedom = (len(images) - 1) / len(images)
         clean = frames.mean(0, dtype=np.float64).astype(np.float32)
         noise = (frames - clean) / np.float32(freedom**0.5)
-        refuse_other_scenes(images, noise)
-        refuse_truth_among_repeats(images, noise)
+        check_repeats(images, clean, noise)
     start = ~truth.clipped() if truth else np.ones(clean.shape, bool)
     if not start.any():
         raise nothing_counts(first)
@@ -69,7 +62,9 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
         low = max(low, 0.0)
     edges = bin_edges(low, high, first.kind != "display")
     parts = mosaic_channels if clean.ndim == 2 else picture_channels
-    share, channels, correlations = parts(first, clean, noise, clipped, start, edges, freedom)
+    share, channels, correlations, covariances = parts(
+        first, clean, noise, clipped, start, edges, freedom
+    )
     return NoiseReport(
         kind=first.kind,
         images=tuple(str(image.path) for image in images),
@@ -80,7 +75,10 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
         edges=edges,
         channels=channels,
         correlations=correlations,
+        covariances=covariances,
         notes=tuple(notes_on(images, truth, noise)),
+        iso=next((image.iso for image in images if image.iso), None),
+        rounding=sum(picture.step**2 / 12 for picture in (first, truth) if picture),
     )
 
 
@@ -105,9 +103,10 @@ def check_partners(images: Sequence[Picture], truth: Picture | None) -> None:
                 f"{other.path} is {other.balance}, but {first.path} is {first.balance}; "
                 "keep both after the same stage of the same camera"
             )
-        if other is not truth and other.iso != first.iso:
+        isos = {other.iso, first.iso} - {None}
+        if other is not truth and len(isos) > 1:
             raise RequestError(
-                f"{other.path} was made at ISO {other.iso}, {first.path} at {first.iso}; "
+                f"{other.path} was made at ISO {other.iso:g}, {first.path} at {first.iso:g}; "
                 "repeats must have one ISO"
             )
     if min(first.pixels.shape[:2]) < 2:
@@ -121,51 +120,6 @@ def clipped_samples(images: Sequence[Picture], frames: Floats) -> Mask:
     # The levels are unknown; samples that clip can only be the smallest and the largest.
     low, high = frames.min(), frames.max()
     return ((frames <= low) | (frames >= high)) & (low < high)
-
-
-def refuse_other_scenes(images: Sequence[Picture], noise: Floats) -> None:
-    """See that no repeat differs from the others over wide areas, as another scene would.
-
-    Images of less than 2x2 blocks are not judged.
-
-    Raises:
-        RequestError: one does.
-    """
-    frames, rows, columns = len(noise), noise.shape[1] // BLOCK, noise.shape[2] // BLOCK
-    if min(rows, columns) < 2:
-        return
-    whole = noise[:, : rows * BLOCK, : columns * BLOCK].reshape(
-        frames, rows, BLOCK, columns, BLOCK, -1
-    )
-    means = whole.mean((2, 4), dtype=np.float64)
-    for axis in (1, 2):  # rows, columns and the brightness of a frame may have noise of their own
-        means -= means.mean(axis, keepdims=True)
-    remaining = np.square(means).mean((1, 2, 3))
-    worst = int(remaining.argmax())
-    energy = np.square(whole[worst]).mean(dtype=np.float64)
-    if remaining[worst] > SCENE_SHARE * energy:
-        others = "the others" if frames > 2 else images[1 - worst].path
-        raise RequestError(
-            f"{images[worst].path} does not show the same scene as {others}: averaged over "
-            f"{BLOCK}x{BLOCK} pixels, {remaining[worst] / energy:.0%} of the difference remains, "
-            f"of noise less than {SCENE_SHARE:.0%} would; give repeats of one scene, or a --truth"
-        )
-
-
-def refuse_truth_among_repeats(images: Sequence[Picture], noise: Floats) -> None:
-    """See that no repeat has much less noise than the others, as a truth among them would.
-
-    Raises:
-        RequestError: one has.
-    """
-    energy = np.square(noise).mean(axis=tuple(range(1, noise.ndim)), dtype=np.float64)
-    least = int(energy.argmin())
-    others = float(np.median(np.delete(energy, least)))
-    if len(images) > 2 and noise[0].size >= 1000 and energy[least] < TRUTH_SHARE * others:
-        raise RequestError(
-            f"{images[least].path} has {energy[least] / others:.2g} times the others' noise; "
-            "if it is their clean truth, give it as --truth"
-        )
 
 
 def notes_on(images: Sequence[Picture], truth: Picture | None, noise: Floats) -> list[str]:
@@ -214,24 +168,36 @@ def picture_channels(
     if not mask.any():
         raise nothing_counts(first)
     mask = select_flat(clean, noise, mask)
+    everywhere = np.ones_like(mask)
+    whole = covariance(noise)
+    to_ycbcr = rgb_to_ycbcr(np.eye(3, dtype=np.float32)[None])[0]
+    sigmas = np.sqrt([*np.diag(whole), *np.diag(to_ycbcr.T @ whole @ to_ycbcr)])
     luma = rgb_to_ycbcr(clean)[..., 0]
     planes = [clean[..., 0], clean[..., 1], clean[..., 2], luma, luma, luma]
     noises = np.concatenate([noise, rgb_to_ycbcr(noise)], axis=-1)
     names = (*Kind.RGB.channels, *Kind.YCBCR.channels)
     pairs = count_pairs(mask)
-    channels, standards = [], {}
+    channels, standards, flat = [], {}, []
     for i, (name, plane) in enumerate(zip(names, planes, strict=True)):
         curve, centred, standard = noise_by_intensity(
             plane, noises[..., i], mask, edges, 1 - freedom
         )
         fits_line = first.kind == "rgb" and name in Kind.RGB.channels
-        channels.append(
-            channel_statistics(name, curve, centred, standard, mask, pairs, fits_line, freedom)
+        channel = channel_statistics(
+            name, curve, centred, standard, mask, pairs, fits_line, freedom
         )
+        channel = replace(channel, whole_sigma=float(sigmas[i]), size=noises[..., i].size)
+        if name in Kind.RGB.channels:
+            flat.append(centred[:, mask])
+            curve, *_ = noise_by_intensity(plane, noise[..., i], everywhere, edges, 1 - freedom)
+            channel = replace(channel, whole_curve=curve)
+        channels.append(channel)
         standards[name] = standard
     both = [*combinations(Kind.RGB.channels, 2), *combinations(Kind.YCBCR.channels, 2)]
     correlations = {(a, b): correlation(standards[a], standards[b], mask) for a, b in both}
-    return float(mask.mean()), tuple(channels), correlations
+    samples = np.stack(flat, axis=-1)[:, None]
+    covariances = {FLAT: covariance(samples), PICTURE: whole, HALVED: covariance(halved(noise))}
+    return float(mask.mean()), tuple(channels), correlations, covariances
 
 
 def mosaic_channels(
@@ -261,15 +227,17 @@ def mosaic_channels(
         whole_mask[at] = mask
         curves.append(curve)
         pairs = count_pairs(mask)
-        channels.append(
-            channel_statistics(name, curve, centred[at], standard[at], mask, pairs, True, freedom)
+        channel = channel_statistics(
+            name, curve, centred[at], standard[at], mask, pairs, True, freedom
         )
+        sigma = float(noise[at].std(dtype=np.float64))
+        channels.append(replace(channel, whole_sigma=sigma, size=noise[at].size))
     curve, pairs = pool_curves(curves), count_pairs(whole_mask)
-    channels.append(
-        channel_statistics(WHOLE, curve, centred, standard, whole_mask, pairs, True, freedom)
-    )
+    channel = channel_statistics(WHOLE, curve, centred, standard, whole_mask, pairs, True, freedom)
+    sigma = float(noise.std(dtype=np.float64))
+    channels.append(replace(channel, whole_sigma=sigma, size=noise.size))
     correlations = {}
     for a, b in combinations(SITES, 2):
         both = whole_mask[slices[a]] & whole_mask[slices[b]]
         correlations[a, b] = correlation(standard[slices[a]], standard[slices[b]], both)
-    return float(whole_mask.mean()), tuple(channels), correlations
+    return float(whole_mask.mean()), tuple(channels), correlations, {}

@@ -10,7 +10,7 @@ from clpipe.base.types import Floats, Mask
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import Settings
 from clpipe.images.raw import RAW_SUFFIXES
-from clpipe.images.read import holds_mosaic, read_finished, read_image
+from clpipe.images.read import holds_mosaic, photograph_facts, read_finished, read_image
 from clpipe.inputs.kept import carried_settings
 from clpipe.reference.cfa import Pattern
 from clpipe.stage import Context, Kind
@@ -35,7 +35,8 @@ class Picture:
     black: float | None = None
     white: float | None = None
     balance: str = ""  # of a kept mosaic, in words: the white balance gains taken out and applied
-    iso: float | None = None  # of an image that clpipe kept
+    iso: float | None = None  # where the file says it
+    step: float = 0.0  # of a finished picture, to which its samples are rounded
 
     @property
     def what(self) -> str:
@@ -74,7 +75,9 @@ def load_picture(path: Path, pattern: Pattern = "RGGB") -> Picture:
         )
     finished = read_finished(path)
     if finished is not None:
-        return Picture(path, "display", finished.pixels, black=0.0, white=1.0)
+        iso, bits = photograph_facts(path)
+        step = 1 / (2**bits - 1)
+        return Picture(path, "display", finished.pixels, black=0.0, white=1.0, iso=iso, step=step)
     mosaic = holds_mosaic(path)
     source = read_image(path, mosaic)
     pixels = source.pixels.astype(np.float32)
@@ -87,7 +90,8 @@ def load_picture(path: Path, pattern: Pattern = "RGGB") -> Picture:
     iso = context.iso if context else None
     if not mosaic:
         if kind == Kind.DISPLAY.label:
-            return Picture(path, "display", pixels, black=0.0, white=1.0, iso=iso)
+            shown = np.clip(pixels, 0, 1)  # as in finished pictures
+            return Picture(path, "display", shown, black=0.0, white=1.0, iso=iso)
         return Picture(path, "rgb", pixels, white=1.0, iso=iso)
     if context is None:
         return Picture(path, "values", pixels, pattern)

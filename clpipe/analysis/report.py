@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from clpipe.analysis.intensity import NoiseCurve
 from clpipe.analysis.spatial import LineNoise
 from clpipe.analysis.statistics import HISTOGRAM, SIGMAS, Channel, gaussian_beyond
 from clpipe.base.types import Doubles
@@ -31,13 +32,22 @@ class NoiseReport:
     edges: Doubles  # of the intensity bins
     channels: tuple[Channel, ...]
     correlations: Mapping[tuple[str, str], float]
+    covariances: Mapping[
+        str, Doubles
+    ]  # of red, green and blue, (3, 3), by the places; {} of mosaics
     notes: tuple[str, ...]
+    iso: float | None = None  # where the images say it
+    bursts: int = 1  # whose noise is pooled
+    rounding: float = 0.0  # the part of every channel's variance that rounding in files has
 
     def record(self) -> dict[str, Any]:
         """The report as JSON values; what could not be computed is null."""
         return {
             "kind": self.kind,
             "unit": UNITS[self.kind],
+            "iso": self.iso,
+            "bursts": self.bursts,
+            "rounding_variance": self.rounding,
             "images": list(self.images),
             "truth": self.truth,
             "width": self.width,
@@ -45,6 +55,7 @@ class NoiseReport:
             "share_used": self.share,
             "notes": list(self.notes),
             "channels": {channel.name: channel_record(channel) for channel in self.channels},
+            "covariance": {where: table.tolist() for where, table in self.covariances.items()},
             "correlation": {f"{a}-{b}": json_number(r) for (a, b), r in self.correlations.items()},
         }
 
@@ -59,19 +70,27 @@ def line_record(lines: LineNoise) -> dict[str, float | None]:
     return {"sigma": json_number(lines.sigma), "limit": json_number(lines.limit)}
 
 
+def curve_record(curve: NoiseCurve) -> dict[str, list[float]]:
+    """Noise by intensity as JSON values."""
+    return {
+        "mean": curve.mean.tolist(),
+        "sigma": curve.sigma.tolist(),
+        "shift": curve.shift.tolist(),
+        "samples": curve.count.tolist(),
+    }
+
+
 def channel_record(channel: Channel) -> dict[str, Any]:
     """A channel as JSON values."""
-    curve, law, tails = channel.curve, channel.law, channel.tails
+    law, tails = channel.law, channel.tails
+    whole = channel.whole_curve
     return {
         "samples": channel.count,
         "sigma": channel.sigma,
+        "sigma_picture": channel.whole_sigma,
         "law": law and {"a": law.a, "b": law.b, "a_error": law.a_error, "b_error": law.b_error},
-        "intensity": {
-            "mean": curve.mean.tolist(),
-            "sigma": curve.sigma.tolist(),
-            "shift": curve.shift.tolist(),
-            "samples": curve.count.tolist(),
-        },
+        "intensity": curve_record(channel.curve),
+        "intensity_picture": whole and curve_record(whole),
         "row": line_record(channel.rows),
         "column": line_record(channel.columns),
         "autocorrelation": [

@@ -43,6 +43,9 @@ class Channel:
     autocorrelation: Doubles  # (17, 17), down and right from -8 to 8; [8, 8] is 1
     energy_left: float  # share, after averaging 2x2 pixels
     tails: Tails
+    whole_sigma: float = math.nan  # of every pixel, those that do not count, too
+    whole_curve: NoiseCurve | None = None  # of every pixel
+    size: int = 0  # samples, those that do not count, too
 
 
 def tails(standard: Floats, mask: Mask) -> Tails:

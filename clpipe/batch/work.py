@@ -15,7 +15,7 @@ from clpipe.base.digests import stamp_of_all
 from clpipe.base.errors import ImageError, NoPictureError, RequestError
 from clpipe.base.types import Array
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome, Span
-from clpipe.chain.baseline import with_noise
+from clpipe.chain.baseline import STEP, with_noise
 from clpipe.chain.chain import Chain
 from clpipe.chain.depth import lenses_of
 from clpipe.chain.formats import DNG
@@ -230,8 +230,9 @@ class ImageWorker:
         """A rendition with its noise, where that is measured on the results of those before it."""
         if not rendition.spread:
             return rendition
-        method = rendition.spread.method(rendition.baseline)
-        known = replace(rendition, chain=with_noise(rendition.chain, method), spread=None)
+        method, estimates = rendition.spread.method(rendition.baseline)
+        chain = with_noise(rendition.chain, method)
+        known = replace(rendition, chain=chain, spread=None, estimates=estimates)
         task.renditions[task.renditions.index(rendition)] = known
         return known
 
@@ -263,6 +264,8 @@ class ImageWorker:
             if result and result.final is not None:
                 for spread in {each.spread for each in task.renditions if each.spread}:
                     spread.take(rendition.name, result.final)
+            if result and rendition.estimates:
+                result.estimates[STEP] = dict(rendition.estimates)
             name = threading.current_thread().name
             task.spans += [Span(t.name, name, t.start, t.seconds) for t in timings or []]
             if result and rendition is task.renditions[-1] and DNG not in self.writer.formats:

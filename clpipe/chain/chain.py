@@ -10,7 +10,7 @@ from clpipe.camera.lens import Tables, lens_tables
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.profile import Camera, load_camera
 from clpipe.chain.draws import Draw
-from clpipe.chain.keys import LENS
+from clpipe.chain.keys import LENS, NOISE
 from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
@@ -28,6 +28,11 @@ class Step:
     stage: Stage
     method: Method
     context: Context
+
+    @property
+    def adds_noise(self) -> bool:
+        """Whether it adds noise, as its method says."""
+        return self.method.without_noise() is not self.method
 
     def __repr__(self) -> str:
         return f"Step({self.name}, {self.method.method})"
@@ -227,7 +232,9 @@ def make_chain(
         )
     if source is None:
         source = steps[first].stage.reads
-    return Chain(tuple(steps[first:last]), source, camera, settings, tuple(names), draws)
+    chain = Chain(tuple(steps[first:last]), source, camera, settings, tuple(names), draws)
+    noiseless = NOISE in settings.skip and any(step.adds_noise for step in chain.steps)
+    return chain.without_noise() if noiseless else chain
 
 
 def entry(settings: Settings) -> Kind:

@@ -26,6 +26,8 @@ MAX_ISO = 10**9
 
 MAX_LENGTH = 10**6  # of what a lens is set to, in mm or m
 
+NOISE = "noise"  # under "skip": the noise of every stage
+
 MAX_STAGES = 256  # of a chain; an image can carry one
 
 TYPES: dict[str, tuple[str, Any]] = {

@@ -19,6 +19,7 @@ from pydantic import ValidationError
 
 from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.base.reading import check_regular
+from clpipe.chain.keys import NOISE
 from clpipe.stage import Context, Literal, Method, Stage
 from clpipe.stages import own_stages
 
@@ -200,6 +201,8 @@ def _check_stage_name(place: str, name: str, taken: dict[str, Stage]) -> None:
             f"{place}: its stage is called '{name}'; "
             "a name has letters, digits and _, and no digit last"
         )
+    if name == NOISE:
+        raise RequestError(f"{place}: its stage is called '{name}', which stands for all noise")
     if name in taken:
         owner = taken[name].folder or "clpipe itself"
         raise RequestError(

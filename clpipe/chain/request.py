@@ -14,7 +14,7 @@ from clpipe.chain.carry import Carry, check_companion, parse_carry
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.files import load_config
 from clpipe.chain.formats import EVERY_FORMAT, NPY
-from clpipe.chain.keys import KEYS, OUTPUT
+from clpipe.chain.keys import KEYS, NOISE, OUTPUT
 from clpipe.chain.registry import code_files, load_stage_file
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import parse_assignment
@@ -108,6 +108,7 @@ class Request:
         assignments: Sequence[str] = (),
         stages: str | None = None,
         skip: Sequence[str] = (),
+        no_noise: bool = False,
         stage_files: Sequence[Path] = (),
         raw_size: str | None = None,
         raw_type: str | None = None,
@@ -120,6 +121,7 @@ class Request:
             config: the name of a built-in configuration, or of a TOML file.
             camera, iso, seed, noise_key, skip, raw_size, raw_type: settings.
             lens, focal_length, aperture, focus_distance: settings.
+            no_noise: skip the noise of every stage.
             assignments: texts of the form ``stage.parameter=value``.
             stages: names, separated by commas.
             stage_files: as for the class.
@@ -138,8 +140,8 @@ class Request:
         options: dict[str, Any] = {k: v for k, v in plain.items() if v is not None}
         if stages is not None:
             options["stages"] = [s.strip() for s in stages.split(",") if s.strip()]
-        if skip:
-            options["skip"] = list(skip)
+        if skip or no_noise:
+            options["skip"] = [*skip, *([NOISE] if no_noise else [])]
         for text in assignments:
             stage, parameter, value = parse_assignment(text)
             options.setdefault(stage, {})[parameter] = value
@@ -257,9 +259,10 @@ class Request:
             RequestError: it cannot be made, or the options name a stage that is not in it.
         """
         chain = make_chain(settings, start_at=start_at, until=self.until)
+        known = (*chain.names, *self.image.get("skip", ()), OUTPUT)
         for step, value in self.options.items():
             is_table = isinstance(value, Mapping) and step not in KEYS  # where it is a draw
-            if is_table and step not in (*chain.names, OUTPUT):
+            if is_table and step not in known:
                 raise RequestError(one_of("stage in this chain", step, chain.names))
         return chain
 

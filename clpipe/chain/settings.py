@@ -18,7 +18,7 @@ from clpipe.base.text import one_of
 from clpipe.camera.profile import DEFAULT_CAMERA, built_in_name, load_camera
 from clpipe.chain.drawing import draw_of, extremes_of, values_of
 from clpipe.chain.draws import TINY, Choice, Draw, Limits, limits_of
-from clpipe.chain.keys import CODE, KEYS, LENS, MAX_STAGES, OUTPUT, check_type, names_in
+from clpipe.chain.keys import CODE, KEYS, LENS, MAX_STAGES, NOISE, OUTPUT, check_type, names_in
 from clpipe.chain.methods import (
     base_name,
     chosen_method,
@@ -297,6 +297,8 @@ def _checked_plain(settings: Settings, plain: Mapping[str, Any]) -> dict[str, An
             if key == "stages" and len(names) > MAX_STAGES:
                 raise KeyedError(key, f"{key}: found {len(names)}, but at most {MAX_STAGES} run")
             for name in names:
+                if (key, name) == ("skip", NOISE):
+                    continue
                 stage_named(key, name if key == "stages" else base_name(name))
             checked[key] = (*settings.skip, *names) if key == "skip" else names
     checked |= {key: convert(plain[key]) for key, convert in CONVERSIONS.items() if key in plain}

@@ -18,11 +18,6 @@ DEVELOPMENT, CLEAN, MOSAIC, VARIANCE = TRUTHS = ("development", "clean", "mosaic
 PICTURES = (DEVELOPMENT, CLEAN)
 
 
-def adds_noise(step: Step) -> bool:
-    """Whether a step adds noise, as its method says."""
-    return step.method.without_noise() is not step.method
-
-
 def picture_without_noise(truth: str, chain: Chain) -> Chain:
     """The chain of a truth that is a picture, one of :data:`PICTURES`.
 
@@ -34,7 +29,7 @@ def picture_without_noise(truth: str, chain: Chain) -> Chain:
     Raises:
         RequestError: the chain adds no noise.
     """
-    if truth == CLEAN and any(map(adds_noise, chain.steps)):
+    if truth == CLEAN and any(step.adds_noise for step in chain.steps):
         return chain.cleaned()
     return chain.without_noise()
 
@@ -49,7 +44,7 @@ def noisy_mosaic(chain: Chain) -> Chain:
         RequestError: the chain has no such mosaic.
     """
     chain.without_noise()  # refuses a chain without noise
-    first = [adds_noise(step) for step in chain.steps].index(True)
+    first = [step.adds_noise for step in chain.steps].index(True)
     noisy = chain.steps[first:]
     ends = [s for s in noisy if (s.stage.reads, s.stage.writes) == (Kind.RAW, Kind.MOSAIC)][:1]
     if not ends and any(s.stage.writes is Kind.RAW for s in noisy):
@@ -57,7 +52,7 @@ def noisy_mosaic(chain: Chain) -> Chain:
             f"the chain ends in DN, at {noisy[-1].name}, but the truth of a mosaic is in signal; "
             "end it with normalize or a later stage"
         )
-    ends = ends or [s for s in noisy if adds_noise(s) and s.stage.writes is Kind.MOSAIC][-1:]
+    ends = ends or [s for s in noisy if s.adds_noise and s.stage.writes is Kind.MOSAIC][-1:]
     if not ends:
         raise RequestError(
             f"the first noise of this chain is that of {noisy[0].name}, behind the mosaic; "
@@ -74,7 +69,7 @@ def signal_and_noise(chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
         RequestError: the chain has no such mosaic, or a step does not know its variance.
     """
     steps = noisy_mosaic(chain).steps
-    first = [adds_noise(step) for step in steps].index(True)
+    first = [step.adds_noise for step in steps].index(True)
     noise = steps[first:]
     channels = len(noise[0].stage.reads.channels)
     variance_of(noise, np.zeros((2, 2, 3) if channels == 3 else (2, 2), np.float32))
@@ -104,9 +99,9 @@ def variance_of(noise: Sequence[Step], signal: Floats) -> Floats:
         RequestError: a step does not know its variance.
     """
     analogue = list(takewhile(lambda step: step.stage.writes is not Kind.RAW, noise))
-    if len(analogue) < len(noise) and all(adds_noise(s) or not s.method.passes() for s in analogue):
+    if len(analogue) < len(noise) and all(s.adds_noise or not s.method.passes() for s in analogue):
         signal = np.minimum(signal, np.float32(1))
-    last = max(i for i, step in enumerate(noise) if adds_noise(step))
+    last = max(i for i, step in enumerate(noise) if step.adds_noise)
     variance: Floats = np.zeros((), np.float32)
     for i, step in enumerate(noise):
         with user_code_errors(f"stage {step.name}", step.stage.folder):

@@ -103,6 +103,11 @@ _CHAIN_OPTIONS = (
         help="Leave a stage out; may be repeated.",
     ),
     click.option(
+        "--no-noise",
+        is_flag=True,
+        help="Leave the noise of all stages out; denoising and the rest stay as at that ISO.",
+    ),
+    click.option(
         "--start-at",
         metavar="STAGE",
         shell_complete=steps,

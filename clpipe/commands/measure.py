@@ -5,8 +5,10 @@ from pathlib import Path
 
 import click
 
+from clpipe.analysis.bursts import bursts_in
 from clpipe.analysis.measure import measure as measure_images
 from clpipe.analysis.pictures import load_picture
+from clpipe.analysis.pooling import pool_by_iso
 from clpipe.analysis.report import UNITS, NoiseReport
 from clpipe.analysis.spatial import LAGS, LineNoise
 from clpipe.analysis.statistics import SIGMAS, gaussian_beyond
@@ -14,7 +16,10 @@ from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
 from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import Rows, number, show, show_json
+from clpipe.outputs.places import FLAT, HALVED, PICTURE
 from clpipe.reference.cfa import PATTERNS, Pattern
+from clpipe.stage import Kind
+from clpipe.stages.picture_noise import UNKNOWN
 
 
 @click.command("measure", cls=Command)
@@ -44,33 +49,45 @@ def measure(
     """Measure the noise of images: its size, correlation and distribution.
 
     IMAGE is a kept EXR of any stage, a mosaic, or a finished picture (JPEG, PNG, TIFF). Noise is
-    the difference from --truth, or, of two or more frames of one scene, from their mean.
+    the difference from --truth, or, of two or more frames of one scene, from their mean. Several
+    bursts, NAME.frame0.png and so on, or folders with one or more each, make one report per ISO.
 
     \b
     clpipe run render.exr -o noisy --iso 3200 --until quantize
-    clpipe run render.exr -o clean --iso 3200 --until quantize \\
-        --skip sensor_noise --skip row_noise --skip column_noise
+    clpipe run render.exr -o clean --iso 3200 --until quantize --no-noise
     clpipe measure noisy/render.exr --truth clean/render.exr
     """
     if plot is not None and plot.suffix != ".png":
         raise RequestError(f"--plot: found {plot}; expected a name that ends in .png")
     if plot is not None:
         require("--plot", "calibrate", "matplotlib")
-    report = measure_images(
-        [load_picture(path, pattern) for path in images],
-        load_picture(truth, pattern) if truth else None,
+    bursts = bursts_in(images)
+    if truth is not None and len(bursts) > 1:
+        raise RequestError(f"--truth: one scene has it, but there are {len(bursts)} bursts")
+    clean = load_picture(truth, pattern) if truth else None
+    reports = pool_by_iso(
+        [measure_images([load_picture(p, pattern) for p in burst], clean) for burst in bursts]
     )
+    if plot is not None and len(reports) > 1:
+        raise RequestError("--plot: it draws one ISO; name the images of one")
     if plot is not None:
         from clpipe.analysis.plot import draw
 
-        draw(report, plot)
+        draw(reports[0], plot)
     if as_json:
-        show_json(report.record())
+        several = {"by_iso": {iso_text(report): report.record() for report in reports}}
+        show_json(reports[0].record() if len(reports) == 1 else several)
         return
-    click.echo(measure_heading(report))
-    for title, (headings, *rows) in measure_tables(report):
-        click.echo(f"\n{title}")
-        show(headings, rows, left=0 if headings[0] else 1)
+    for report in reports:
+        click.echo(("\n\n" if report is not reports[0] else "") + measure_heading(report))
+        for title, (headings, *rows) in measure_tables(report):
+            click.echo(f"\n{title}")
+            show(headings, rows, left=0 if headings[0] else 1)
+
+
+def iso_text(report: NoiseReport) -> str:
+    """The ISO of a report."""
+    return UNKNOWN if report.iso is None else f"{report.iso:g}"
 
 
 def line_text(lines: LineNoise) -> str:
@@ -82,12 +99,15 @@ def line_text(lines: LineNoise) -> str:
 
 def measure_heading(report: NoiseReport) -> str:
     """What was measured, in which unit, and over which pixels."""
-    against = report.truth or "their mean"
+    against = report.truth or ("their mean" if report.bursts == 1 else "the mean of their burst")
+    of = f" in {report.bursts} bursts" if report.bursts > 1 else ""
+    at = f", ISO {report.iso:g}" if report.iso else ""
     what = "samples" if report.kind in ("mosaic", "values") else "pixels (flat, not clipped)"
     lines = [
-        f"{len(report.images)} x {report.kind}, {report.width}x{report.height}, against {against}; "
+        f"{len(report.images)} x {report.kind}{of}, {report.width}x{report.height}{at}, "
+        f"against {against}; "
         f"unit: {UNITS[report.kind]}",
-        f"{report.share:.1%} of the {what} count",
+        f"{report.share:.1%} of the {what} count; sigma (all) is that of every one",
         *(f"note: {note}" for note in report.notes),
     ]
     return "\n".join(lines)
@@ -97,7 +117,9 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
     """The tables of a report, each a title and rows of text; the first row is the headings."""
     names = [one.name for one in report.channels]
     laws = ["a", "b"] if any(one.law for one in report.channels) else []
-    size: Rows = [("", "samples", "sigma", *laws, "row sigma", "column sigma")]
+    which = "not clipped" if report.kind in ("mosaic", "values") else "flat"
+    sigmas_of = f"sigma ({which}, {report.share:.0%})", "sigma (all, 100%)"
+    size: Rows = [("", "samples", *sigmas_of, *laws, "row sigma", "column sigma")]
     shape: Rows = [("", *(f"{k}" for k in range(1, LAGS + 1)), "diagonal 1", "left after 2x2")]
     far: Rows = [("", "skewness", "excess kurtosis", *(f"> {k} sigma" for k in SIGMAS))]
     for one in report.channels:
@@ -105,7 +127,8 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
         if law := one.law:
             fit = [f"{law.a:.4g} ± {law.a_error:.1g}", f"{law.b:.4g} ± {law.b_error:.1g}"]
         lines = line_text(one.rows), line_text(one.columns)
-        size.append((one.name, str(one.count), number(one.sigma, ".4g"), *fit, *lines))
+        sizes = number(one.sigma, ".4g"), number(one.whole_sigma, ".4g")
+        size.append((one.name, str(one.count), *sizes, *fit, *lines))
         table, middle = one.autocorrelation, slice(LAGS + 1, None)
         right = [number(r, ".3f") for r in table[LAGS, middle]]
         down = [number(r, ".3f") for r in table[middle, LAGS]]
@@ -128,6 +151,21 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
         ("noise" + ("; variance = a * intensity + b" if laws else ""), size),
         ("autocorrelation (independent noise: 0; left after 2x2: 0.25)", shape),
         ("correlation between channels", across),
+        *([("covariance of the channels", covariance_rows(report))] if report.covariances else []),
         ("tails of standardised noise", far),
         ("sigma by intensity", curve),
     ]
+
+
+WHERE = {FLAT: "flat places", PICTURE: "all", HALVED: "all, after 2x2"}
+
+
+def covariance_rows(report: NoiseReport) -> Rows:
+    """The covariances of red, green and blue, a line for each place that they are measured in."""
+    first, *_ = report.covariances.values()
+    places = [(i, j) for i in range(len(first)) for j in range(i, len(first))]
+    names = Kind.RGB.channels
+    rows: Rows = [("", *(f"{names[i]}-{names[j]}" for i, j in places))]
+    for where, table in report.covariances.items():
+        rows.append((WHERE[where], *(number(float(table[at]), ".4g") for at in places)))
+    return rows

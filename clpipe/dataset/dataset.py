@@ -16,7 +16,7 @@ from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import one_of
 from clpipe.base.validation import typed
 from clpipe.chain.request import Request
-from clpipe.chain.truth import DEVELOPMENT, adds_noise
+from clpipe.chain.truth import DEVELOPMENT
 from clpipe.dataset.arrays import Form, dtype_named
 from clpipe.dataset.developer import Sample, Wanted
 from clpipe.dataset.numbering import Numbering
@@ -167,7 +167,7 @@ class Dataset(ReadOnly):
         _check_files(self._jobs)
         _check_keys(self._jobs)
         chain = loader.first_chain(self._jobs)
-        if truth is None and patch and any(map(adds_noise, chain.steps)):
+        if truth is None and patch and any(step.adds_noise for step in chain.steps):
             truth = "clean"
         wanted = Wanted(
             form=Form(dtype_named(dtype), channels_first, raw),

@@ -219,6 +219,18 @@ def read_finished(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> SourceImage
         return SourceImage(np.ascontiguousarray(rgb), _digest(path), "", (), attributes, shot)
 
 
+def photograph_facts(path: Path) -> tuple[float | None, int]:
+    """The ISO in the EXIF of a finished picture, None where it does not say it, and its bits.
+
+    Raises:
+        ImageError: the file is missing, empty, damaged or not an image.
+    """
+    with open_image(path) as file:
+        iso = file.spec().getattribute("Exif:PhotographicSensitivity")
+        bits = 8 * file.spec().format.size()
+    return float(iso) if isinstance(iso, int) and iso > 0 else None, bits
+
+
 def holds_mosaic(path: Path) -> bool:
     """Whether a file has no red, green and blue, but one channel that may be a mosaic.
 

@@ -16,7 +16,7 @@ from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings, settings_from
-from clpipe.chain.truth import CLEAN, adds_noise
+from clpipe.chain.truth import CLEAN
 from clpipe.images.attributes import read_attributes
 from clpipe.images.read import SourceImage
 from clpipe.inputs.plausibility import input_warnings
@@ -137,7 +137,7 @@ class KeptLoader:
         except RequestError as error:
             raise ImageError(f"{path}: what it was made with cannot be used: {error}") from None
         noise = attributes.get(NOISE)
-        if noise == CLEAN and not any(map(adds_noise, chain.steps)):
+        if noise == CLEAN and not any(step.adds_noise for step in chain.steps):
             return chain.cleaned()
         return _without_input_noise(chain) if noise in ("none", CLEAN) else chain
 

@@ -58,9 +58,9 @@ def read_manifest(path: Path, keep_suffix: bool = False) -> list[Row]:
     A .csv has a header, commas and UTF-8; its cells are TOML values, else text, and an empty cell
     sets nothing. A .jsonl has an object in each line, nested as a configuration or with dotted
     keys, and null sets nothing. Columns are ``path``, ``name``, ``frames``, ``iso``, ``camera``,
-    ``lens``, ``focal_length``, ``aperture``, ``focus_distance``, ``seed``, ``noise_key`` and any
-    ``stage.parameter``, also of stage files that are loaded. Names of files are relative to the
-    manifest.
+    ``lens``, ``focal_length``, ``aperture``, ``focus_distance``, ``seed``, ``noise_key``, ``skip``
+    (names with spaces between, or a list) and any ``stage.parameter``, also of stage files that are
+    loaded. Names of files are relative to the manifest.
 
     The key is the name where there is one; else the path relative to the manifest's folder
     where it lies below that; else the file's name.
@@ -251,6 +251,8 @@ def _row(folder: Path, place: str, record: Mapping[str, Any]) -> Row:
         step, _, parameter = column.partition(".")
         if parameter:
             values.setdefault(step, {})[parameter] = value
+        elif column == "skip" and isinstance(value, str):
+            values[column] = value.split()
         elif column in PLAIN:
             values[column] = value
     key = name or key_of(folder, folder / path)

@@ -23,7 +23,14 @@ TEXTS = ("path", "name")  # columns that are text, whatever they look like
 
 OWN = (*TEXTS, "frames")  # columns that are no settings
 
-PLAIN = ("iso", "camera", *LENS, "seed", "noise_key")  # columns of settings that stand in no table
+PLAIN = (
+    "iso",
+    "camera",
+    *LENS,
+    "seed",
+    "noise_key",
+    "skip",
+)  # columns of settings that stand in no table
 
 
 def csv_records(

@@ -5,12 +5,12 @@ A bracket has all of these at each of its exposures.
 
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 from clpipe.base.errors import KeyedError, RequestError
-from clpipe.chain.baseline import BASELINES, Spread, baseline_of
+from clpipe.chain.baseline import BASELINES, baseline_of, matching_of
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.identity import noise_key, of_bracket
 from clpipe.chain.settings import overlay
@@ -25,6 +25,7 @@ from clpipe.chain.truth import (
     picture_without_noise,
     signal_and_noise,
 )
+from clpipe.outputs.spread import Spread
 
 # What is put behind the image's name for each truth.
 SUFFIXES = {
@@ -53,6 +54,7 @@ class Rendition:
             image, see :func:`clpipe.chain.truth.variance_of`; else ().
         baseline: of :data:`clpipe.chain.baseline.BASELINES`; "" is none.
         spread: what its noise is measured on, of a baseline; the chain has it when that is known.
+        estimates: what was found about its noise, of a baseline.
     """
 
     name: str
@@ -62,6 +64,7 @@ class Rendition:
     noise: tuple[Step, ...] = ()
     baseline: str = ""
     spread: Spread | None = None
+    estimates: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def noise_key(self) -> str:
@@ -158,12 +161,20 @@ class RenditionPlan:
             renditions += [Rendition(exposure + name, own, own_key, n) for name, n in named]
             for truth in (truth_of(each, own) for each in self._all_truths()):
                 renditions.append(replace(truth, name=exposure + truth.name, key=own_key))
-            spread = Spread(tuple(exposure + name for name in self._measured()))
-            for each in self._all_baselines():
-                name = exposure + baseline_name(each)
-                baseline = Rendition(name, baseline_of(own), own_key, None, (), each, spread)
-                renditions.append(baseline)
+            renditions += self._baselines_of(own, own_key, exposure)
         return renditions
+
+    def _baselines_of(self, chain: Chain, key: str, exposure: str) -> list[Rendition]:
+        """The baselines of a picture, by its chain, its key and the name of its exposure."""
+        if not self.baselines:
+            return []
+        baseline = baseline_of(chain)
+        names = tuple(exposure + name for name in self._measured())
+        spread = Spread(names, matching_of(chain), chain.settings.output)
+        return [
+            Rendition(exposure + baseline_name(each), baseline, key, baseline=each, spread=spread)
+            for each in self._all_baselines()
+        ]
 
 
 def parse_bracket(text: str) -> tuple[float, ...]:

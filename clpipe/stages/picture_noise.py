@@ -1,13 +1,14 @@
 """Noise on the finished picture, as synthetic data usually has it: baselines to compare with.
 
-Real noise arises before the processing, which shapes it; see ``sensor_noise``. Here independent
-noise is added after the processing, with a sigma of the user's or of ``clpipe measure --json``.
+Real noise arises before the processing, which shapes it; see ``sensor_noise``. Here noise that is
+independent in each pixel is added after the processing, with a sigma of the user's, of ``clpipe
+measure --json``, or of the picture itself (``clpipe run --baseline``).
 """
 
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, field_validator, model_validator
@@ -15,8 +16,8 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import check_regular, parse_json, read_bytes
 from clpipe.base.types import Floats
+from clpipe.reference.correlated import correlated_normals, mixing
 from clpipe.reference.curve import to_8_bit
-from clpipe.reference.random import normal_at
 from clpipe.stage import (
     Argument,
     Context,
@@ -31,18 +32,42 @@ from clpipe.stage import (
 )
 
 ENTRIES = 256  # of the kernel's table
+UNKNOWN = "unknown"  # in a report, the ISO of images that do not say theirs
 RESOLVED = 65  # entries of a measured curve in the resolved parameters, and so in the sidecar
 CHANNELS = Kind.DISPLAY.channels
+MIXING = ("green_red", "green_green", "blue_red", "blue_green", "blue_blue")  # kernel arguments
 
 Sigma = Annotated[float, Field(ge=0, le=1)]
 Sigmas = Annotated[tuple[Sigma, ...], Field(min_length=2, max_length=ENTRIES)]
 
 
-class NoNoise(Unchanged):
-    """No noise on the finished picture."""
+Correlation = Annotated[float, Field(ge=-1, le=1)]
+
+
+class Matched(Method):
+    """How noise on the finished picture is matched to measured noise."""
+
+    match: Literal["picture", "flat", "halved"] = parameter(
+        "picture",
+        "Where measured noise and this one have the same variance: in the whole picture, in its "
+        "flat places, or in the whole picture after averaging 2x2 pixels.",
+    )
+    correlated: bool = parameter(
+        False, "Draw red, green and blue with the measured correlation between them."
+    )
+
+
+class NoNoise(Unchanged, Matched):
+    """No noise on the finished picture; ``clpipe run --baseline`` is matched as it says."""
 
     method: ClassVar = "none"
     summary: ClassVar = "no noise here; sensor_noise adds it where a sensor does"
+
+    jpeg: bool = parameter(
+        False,
+        "Match the noise of --baseline in the decoded JPEG, which keeps more of a camera's noise "
+        "than of independent noise.",
+    )
 
 
 def _as_three(value: Any) -> Any:
@@ -57,8 +82,8 @@ def _as_tuples(value: Any) -> Any:
     return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple) else value
 
 
-class IndependentNoise(Method):
-    """Gaussian noise, independent in each pixel, channel and image; sigma is set or measured."""
+class IndependentNoise(Matched):
+    """Gaussian noise, independent in each pixel and image; sigma is set or measured."""
 
     alternatives: ClassVar = frozenset({"sigma", "measured"})
 
@@ -66,6 +91,14 @@ class IndependentNoise(Method):
         "",
         "A report of clpipe measure --json on finished pictures; the noise gets its sigma.",
         file=True,
+    )
+    correlation: (
+        Annotated[tuple[Correlation, Correlation, Correlation], BeforeValidator(_as_tuples)] | None
+    ) = parameter(
+        None,
+        "Correlation of red with green, of red with blue, and of green with blue.",
+        "",
+        "as measured, where correlated is true; else 0",
     )
 
     @field_validator("measured")
@@ -75,24 +108,68 @@ class IndependentNoise(Method):
             measured_noise(path)
         return path
 
+    @field_validator("correlation")
+    @classmethod
+    def _possible(cls, values: tuple[float, float, float] | None) -> Any:
+        if values:
+            mixing(*values)
+        return values
+
     @model_validator(mode="after")
     def _at_most_one(self) -> Self:
         if getattr(self, "sigma", None) is not None and self.measured:
             raise ValueError("found both sigma and measured; set one of them")
         return self
 
-    def noise(self) -> tuple["ChannelNoise", ...]:
-        """The measured noise of red, green and blue.
+    def noise(self, iso: float) -> "MeasuredNoise":
+        """The measured noise, where it is matched.
+
+        Args:
+            iso: of the picture; a report may be on several.
 
         Raises:
             RequestError: neither sigma nor a report is set. It is refused as late as here because
-                options may choose the method, and each row of a manifest its report.
+                options may choose the method, and each row of a manifest its report. Or the
+                report is on other ISOs.
         """
         if not self.measured:
             raise RequestError(
                 "picture_noise: needs sigma, or measured, a report of clpipe measure --json"
             )
-        return measured_noise(self.measured)
+        by_iso = measured_noise(self.measured)
+        noise = by_iso.get(iso, by_iso.get(None))
+        if noise is None:
+            found = ", ".join(f"{each:g}" for each in by_iso if each is not None)
+            raise RequestError(
+                f"picture_noise.measured: {self.measured} has no ISO {iso:g}, only {found}"
+            )
+        return noise[self.match]
+
+    def with_correlation(self, iso: float) -> Self:
+        """A copy with the correlation that is set or measured.
+
+        Raises:
+            RequestError: it is to be the measured one, and no report is set.
+        """
+        if self.correlation is not None or not self.correlated:
+            return self.filled(correlation=(0.0, 0.0, 0.0))
+        if not self.measured:
+            raise RequestError(
+                "picture_noise: correlated is true, but nothing is measured; set correlation, or "
+                "measured, a report of clpipe measure --json"
+            )
+        return self.filled(correlation=self.noise(iso).correlation)
+
+    def normals(self, image: Floats, frame: Frame) -> Floats:
+        """The normals of each sample, (height, width, 3), of the image's stream."""
+        assert self.correlation is not None
+        stream = frame.stream[NoiseScope.IMAGE]
+        return correlated_normals(image.shape, stream, mixing(*self.correlation))
+
+    def mixing_arguments(self) -> dict[str, Argument]:
+        """The kernel's arguments for the correlation."""
+        assert self.correlation is not None
+        return dict(zip(MIXING, mixing(*self.correlation), strict=True))
 
 
 class IidGaussian(IndependentNoise):
@@ -109,7 +186,7 @@ class IidGaussian(IndependentNoise):
     method: ClassVar = "iid_gaussian"
     kernel: ClassVar = "picture_noise_iid_gaussian"
     summary: ClassVar = "independent Gaussian noise of one sigma: the usual baseline"
-    example: ClassVar = {"sigma": [0.05, 0.02, 0.1]}
+    example: ClassVar = {"sigma": [0.05, 0.02, 0.1], "correlation": [0.6, -0.3, 0.5]}
 
     sigma: Annotated[tuple[Sigma, Sigma, Sigma], BeforeValidator(_as_three)] | None = parameter(
         None,
@@ -119,19 +196,22 @@ class IidGaussian(IndependentNoise):
     )
 
     def resolve(self, context: Context) -> "IidGaussian":
+        correlated = self.with_correlation(context.iso)
         if self.sigma is not None:
-            return self
-        return self.filled(sigma=tuple(noise.sigma for noise in self.noise()))
+            return correlated
+        return correlated.filled(sigma=self.noise(context.iso).sigma)
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("picture_noise", arguments=("red", "green", "blue"), random=NoiseScope.IMAGE),)
+        names = ("red", "green", "blue", *MIXING)
+        return (Pass("picture_noise", arguments=names, random=NoiseScope.IMAGE),)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         assert self.sigma is not None
-        return dict(zip(("red", "green", "blue"), map(np.float32, self.sigma), strict=True))
+        sigmas = zip(("red", "green", "blue"), map(np.float32, self.sigma), strict=True)
+        return {**dict(sigmas), **self.mixing_arguments()}
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
-        return image + _normals(image, frame) * np.array(self.sigma, np.float32)
+        return image + self.normals(image, frame) * np.array(self.sigma, np.float32)
 
 
 class IntensityDependent(IndependentNoise):
@@ -152,7 +232,7 @@ class IntensityDependent(IndependentNoise):
     method: ClassVar = "intensity_dependent"
     kernel: ClassVar = "picture_noise_intensity_dependent"
     summary: ClassVar = "independent Gaussian noise, sigma from a table by intensity (SyB3R)"
-    example: ClassVar = {"sigma": [0.01, 0.08, 0.03]}
+    example: ClassVar = {"sigma": [0.01, 0.08, 0.03], "correlation": [0.6, -0.3, 0.5]}
 
     sigma: Annotated[Sigmas | tuple[Sigmas, Sigmas, Sigmas], BeforeValidator(_as_tuples)] | None = (
         parameter(
@@ -165,11 +245,12 @@ class IntensityDependent(IndependentNoise):
     )
 
     def resolve(self, context: Context) -> "IntensityDependent":
+        correlated = self.with_correlation(context.iso)
         if self.sigma is not None:
-            return self
+            return correlated
         places = np.linspace(0, 1, RESOLVED)
-        curves = (np.interp(places, c.intensity, c.sigmas) for c in self.noise())
-        return self.filled(sigma=tuple(tuple(curve.round(6).tolist()) for curve in curves))
+        curves = (np.interp(places, *c).clip(0, 1) for c in self.noise(context.iso).curves)
+        return correlated.filled(sigma=tuple(tuple(curve.round(6).tolist()) for curve in curves))
 
     def table(self) -> Floats:
         """Sigma at the 256 intensities v = i / 255 of red, of green and of blue, (768,)."""
@@ -177,20 +258,15 @@ class IntensityDependent(IndependentNoise):
         return _table(self.sigma)
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("picture_noise", arguments=("sigmas",), random=NoiseScope.IMAGE),)
+        names = ("sigmas", *MIXING)
+        return (Pass("picture_noise", arguments=names, random=NoiseScope.IMAGE),)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
-        return {"sigmas": self.table()}
+        return {"sigmas": self.table(), **self.mixing_arguments()}
 
     def reference(self, image: Floats, frame: Frame) -> Floats:
         place = to_8_bit(image) + np.arange(3) * ENTRIES
-        return image + _normals(image, frame) * self.table()[place]
-
-
-def _normals(image: Floats, frame: Frame) -> Floats:
-    """A standard normal for each sample, (height, width, 3), of the image's stream."""
-    stream = frame.stream[NoiseScope.IMAGE]
-    return np.stack([normal_at(image.shape, draw, stream) for draw in range(3)], axis=-1)
+        return image + self.normals(image, frame) * self.table()[place]
 
 
 @lru_cache(maxsize=16)
@@ -201,19 +277,25 @@ def _table(sigma: tuple[Any, ...]) -> Floats:
     return np.concatenate(each).astype(np.float32)
 
 
-class ChannelNoise(NamedTuple):
-    """The measured noise of one channel, in display values, 0..1.
+class MeasuredNoise(NamedTuple):
+    """Measured noise of red, green and blue, in display values, 0..1.
 
-    ``sigma`` is that of all samples; ``sigmas`` are those at each ``intensity``, ascending.
+    ``sigma`` is that of all samples. A curve is the intensities, ascending, and sigma at each.
+    ``correlation`` is that of red with green, of red with blue, and of green with blue.
     """
 
-    sigma: float
-    intensity: tuple[float, ...]
-    sigmas: tuple[float, ...]
+    sigma: tuple[float, ...]
+    curves: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]
+    correlation: tuple[float, ...]
 
 
-def measured_noise(path: str) -> tuple[ChannelNoise, ...]:
-    """The noise of red, green and blue in a report of ``clpipe measure --json``.
+def measured_noise(path: str) -> Mapping[float | None, Mapping[str, MeasuredNoise]]:
+    """The noise in a report of ``clpipe measure --json``, by ISO and by where it is matched.
+
+    The ISO is None where the report is on one alone, or does not say it.
+
+    That of "halved" is what leaves the measured variance after averaging 2x2 pixels, which leaves a
+    quarter of the variance of independent noise.
 
     The file is read again when it changes.
 
@@ -229,12 +311,23 @@ def measured_noise(path: str) -> tuple[ChannelNoise, ...]:
 
 
 @lru_cache(maxsize=16)
-def _measured_noise(path: str, time: int, size: int) -> tuple[ChannelNoise, ...]:
+def _measured_noise(
+    path: str, time: int, size: int
+) -> Mapping[float | None, Mapping[str, MeasuredNoise]]:
     try:
         report = parse_json(read_bytes(Path(path)))
-        kind, channels = report["kind"], report["channels"]
-        if kind == Kind.DISPLAY.label:
-            return tuple(_channel_of(channels[name]) for name in CHANNELS)
+        reports = report.get("by_iso", {UNKNOWN: report})
+        kinds = {each["kind"] for each in reports.values()} or {report["kind"]}
+        kind = ", ".join(kinds)
+        if kinds == {Kind.DISPLAY.label}:
+            return {
+                None if iso == UNKNOWN else float(iso): {
+                    "picture": _noise_of(each, "picture", "intensity_picture"),
+                    "flat": _noise_of(each, "flat", "intensity"),
+                    "halved": _noise_of(each, "halved", "intensity_picture", averaged=4),
+                }
+                for iso, each in reports.items()
+            }
     except (ValueError, OverflowError, LookupError, TypeError, AttributeError):
         raise ValueError("not a report of clpipe measure --json") from None
     raise ValueError(
@@ -243,15 +336,38 @@ def _measured_noise(path: str, time: int, size: int) -> tuple[ChannelNoise, ...]
     )
 
 
-def _channel_of(record: Any) -> ChannelNoise:
-    curve = record["intensity"]
-    mean, sigma = (tuple(float(x) for x in curve[key]) for key in ("mean", "sigma"))
-    noise = ChannelNoise(float(record["sigma"]), mean, sigma)
-    is_curve = 0 < len(mean) == len(sigma)
-    are_noise = all(0 <= value <= 1 for value in (noise.sigma, *sigma))
+def _noise_of(report: Any, where: str, curve: str, averaged: int = 1) -> MeasuredNoise:
+    """The noise in one place of a report, after averaging so many pixels; the curves are scaled to
+    the sigma there. Rounding is left out, since the noisy picture will be rounded again.
+    """
+    covariance = np.array(report["covariance"][where], float)
+    variance = np.diag(covariance)
+    are_variances = ((variance >= 0) & (variance <= 1)).all() and np.isfinite(covariance).all()
+    if covariance.shape != (3, 3) or not are_variances:
+        raise TypeError
+    sigma = np.sqrt(variance)
+    divisor = np.where(sigma > 0, sigma, 1)
+    correlation = (covariance / np.outer(divisor, divisor)).clip(-1, 1)
+    pairs = tuple(correlation[[0, 0, 1], [1, 2, 2]].tolist())
+    mixing(*pairs)
+    rounding = float(report["rounding_variance"])
+    if not 0 <= rounding <= 1:
+        raise TypeError
+    sigmas = tuple(np.sqrt((averaged * variance - rounding).clip(0, 1)).tolist())
+    records = (report["channels"][name][curve] for name in CHANNELS)
+    curves = tuple(_curve_of(each, s) for each, s in zip(records, sigmas, strict=True))
+    return MeasuredNoise(sigmas, curves, pairs)
+
+
+def _curve_of(record: Any, wanted: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """A curve of a report, scaled so that all of its samples have one sigma together."""
+    mean, sigma, samples = (np.array(record[key], float) for key in ("mean", "sigma", "samples"))
+    are_noise = ((sigma >= 0) & (sigma <= 1) & (samples > 0)).all()
+    is_curve = mean.shape == sigma.shape == samples.shape == (mean.size,) and mean.size > 0
     if not (is_curve and are_noise and np.isfinite(mean).all()):
         raise TypeError
-    return noise
+    whole = np.sqrt(np.average(sigma**2, weights=samples))
+    return tuple(mean.tolist()), tuple((sigma * (wanted / whole if whole else 0)).tolist())
 
 
 STAGE = Stage(

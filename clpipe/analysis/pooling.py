@@ -1,0 +1,138 @@
+"""Pooling: one report of the noise in several bursts, of other scenes or views, at one ISO.
+
+Variances and correlations are means over all samples. The laws of a raw are means weighted by the
+inverse of their squared errors, since each burst is an estimate of its own.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clpipe.analysis.intensity import NoiseCurve, VarianceLaw, bin_edges, bin_of, pool_curves
+from clpipe.analysis.report import NoiseReport
+from clpipe.analysis.spatial import LineNoise
+from clpipe.analysis.statistics import Channel, Tails
+from clpipe.base.errors import RequestError
+from clpipe.base.types import Doubles
+
+
+def pool_by_iso(reports: Sequence[NoiseReport]) -> list[NoiseReport]:
+    """One report for each ISO, in ascending order; of images that do not say theirs, one as well.
+
+    Raises:
+        RequestError: the reports are on images of several kinds.
+    """
+    for other in reports:
+        if other.kind != reports[0].kind:
+            raise RequestError(
+                f"{other.images[0]} is {other.kind}, but {reports[0].images[0]} is "
+                f"{reports[0].kind}; measure them apart"
+            )
+    isos = sorted({report.iso for report in reports}, key=lambda iso: iso or 0)
+    return [pool([report for report in reports if report.iso == iso]) for iso in isos]
+
+
+def pool(reports: Sequence[NoiseReport]) -> NoiseReport:
+    """One report of several, of one kind; the size is that of the first."""
+    first = reports[0]
+    if len(reports) == 1:
+        return first
+    low, high = (end(report.edges[k] for report in reports) for end, k in ((min, 0), (max, -1)))
+    edges = bin_edges(low, high, first.kind != "display")
+    sizes = np.array([len(r.images) * r.width * r.height for r in reports], float)
+    used = sizes * [r.share for r in reports]
+    channels = (
+        pool_channel(each, edges) for each in zip(*(r.channels for r in reports), strict=True)
+    )
+    pairs = {pair: [r.correlations[pair] for r in reports] for pair in first.correlations}
+    tables = {where: [r.covariances[where] for r in reports] for where in first.covariances}
+    return replace(
+        first,
+        images=tuple(image for report in reports for image in report.images),
+        share=float(used.sum() / sizes.sum()),
+        edges=edges,
+        channels=tuple(channels),
+        correlations={pair: float(mean(values, used)) for pair, values in pairs.items()},
+        covariances={
+            where: mean(values, used if where == "flat" else sizes)
+            for where, values in tables.items()
+        },
+        notes=tuple(dict.fromkeys(note for report in reports for note in report.notes)),
+        bursts=len(reports),
+    )
+
+
+def pool_channel(channels: Sequence[Channel], edges: Doubles) -> Channel:
+    """One channel of several bursts, with intensity bins between these edges."""
+    count = np.array([one.count for one in channels], float)
+    sizes = np.array([one.size for one in channels], float)
+    laws = [one.law for one in channels if one.law]
+    whole = [one.whole_curve for one in channels if one.whole_curve]
+    return Channel(
+        name=channels[0].name,
+        count=int(count.sum()),
+        sigma=root_mean_square([one.sigma for one in channels], count),
+        curve=pool_curves([rebinned(one.curve, edges) for one in channels]),
+        law=pool_laws(laws) if len(laws) == len(channels) else None,
+        rows=pool_lines([one.rows for one in channels], count),
+        columns=pool_lines([one.columns for one in channels], count),
+        autocorrelation=mean([one.autocorrelation for one in channels], count),
+        energy_left=float(mean([one.energy_left for one in channels], count)),
+        tails=pool_tails([one.tails for one in channels], count),
+        whole_sigma=root_mean_square([one.whole_sigma for one in channels], sizes),
+        whole_curve=pool_curves([rebinned(each, edges) for each in whole]) if whole else None,
+        size=int(sizes.sum()),
+    )
+
+
+def mean(values: Sequence[Any], weights: Doubles) -> NDArray[np.float64]:
+    """The weighted mean of numbers or arrays, those left out that are NaN; NaN where all are."""
+    stack = np.array(values, float)
+    known = np.isfinite(stack)
+    each = weights.reshape(-1, *[1] * (stack.ndim - 1)) * known
+    total = each.sum(0)
+    sums = (np.where(known, stack, 0) * each).sum(0)
+    return np.asarray(np.divide(sums, total, out=np.full_like(sums, np.nan), where=total > 0))
+
+
+def root_mean_square(sigmas: Sequence[float], weights: Doubles) -> float:
+    """The sigma of all samples together."""
+    return float(np.sqrt(mean([sigma**2 for sigma in sigmas], weights)))
+
+
+def rebinned(curve: NoiseCurve, edges: Doubles) -> NoiseCurve:
+    """A curve with the numbers of the bins between other edges that its means are in."""
+    return replace(curve, bins=bin_of(curve.mean.astype(np.float32), edges))
+
+
+def pool_laws(laws: Sequence[VarianceLaw]) -> VarianceLaw:
+    """The law of several, weighted by the inverse of their squared errors."""
+    numbers = []
+    for name in ("a", "b"):
+        values = np.array([getattr(law, name) for law in laws])
+        weights = np.array([getattr(law, f"{name}_error") for law in laws]).clip(1e-300) ** -2.0
+        numbers.append((float(np.average(values, weights=weights)), float(weights.sum() ** -0.5)))
+    (a, a_error), (b, b_error) = numbers
+    return VarianceLaw(a, b, a_error, b_error)
+
+
+def pool_lines(lines: Sequence[LineNoise], count: Doubles) -> LineNoise:
+    """The noise that rows share in several bursts; the limits are of independent variances."""
+    share = count / count.sum()
+    limits = np.array([one.limit for one in lines]) ** 2 * share
+    sigma = root_mean_square([one.sigma for one in lines], count)
+    return LineNoise(sigma, float(np.sqrt(np.sqrt((limits**2).sum()))))
+
+
+def pool_tails(tails: Sequence[Tails], count: Doubles) -> Tails:
+    """The distribution of all samples together."""
+    beyond = mean([one.beyond for one in tails], count)
+    return Tails(
+        skewness=float(mean([one.skewness for one in tails], count)),
+        excess_kurtosis=float(mean([one.excess_kurtosis for one in tails], count)),
+        beyond=tuple(map(float, beyond)),
+        histogram=np.sum([one.histogram for one in tails], axis=0),
+    )

@@ -1,0 +1,116 @@
+"""Repeats: whether frames show one scene, from one place, each with noise of its own."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from clpipe.analysis.pictures import Picture
+from clpipe.base.errors import RequestError
+from clpipe.base.types import Floats
+from clpipe.outputs.places import halved
+
+# A repeat with less than this share of the others' noise energy is taken for a truth among them.
+# Among n frames and against their mean, a truth has (n - 1) / (n^2 - n - 1), at most 0.4.
+TRUTH_SHARE = 0.6
+
+# A repeat shows another scene, where averaging BLOCK x BLOCK pixels leaves more than this share of
+# the energy of its difference from the mean. Noise leaves 1 / BLOCK^2, and up to 0.02 where
+# processing has smeared it; another view leaves 0.17.
+SCENE_SHARE = 0.08
+BLOCK = 32  # px
+
+# A repeat is shifted, where more than this share of the energy of its difference from the mean
+# follows the mean's gradient. Noise leaves 0.001 at most; a shift by a pixel 0.2 at ISO 12800.
+SHIFTED_SHARE = 0.02
+
+FEWEST = 1000  # samples, below which chance decides
+
+
+def check_repeats(images: Sequence[Picture], mean: Floats, noise: Floats) -> None:
+    """See that images are repeats.
+
+    Args:
+        images: what was measured.
+        mean: of them.
+        noise: (frame, height, width[, 3]), their difference from the mean, scaled.
+
+    Raises:
+        RequestError: one shows another scene, is shifted, or has much less noise.
+    """
+    refuse_other_scenes(images, noise)
+    refuse_shifted(images, mean, noise)
+    refuse_truth_among_repeats(images, noise)
+
+
+def refuse_shifted(images: Sequence[Picture], mean: Floats, noise: Floats) -> None:
+    """See that no repeat is shifted against the others, by least squares (Lucas and Kanade, IJCAI
+    1981): a small shift changes a picture by its gradient times the shift.
+
+    Raises:
+        RequestError: one is.
+    """
+    if mean.ndim == 2:  # of a mosaic, whose neighbours have other colours
+        mean, noise = halved(mean[None, ..., None])[0], halved(noise[..., None])
+    if min(mean.shape[:2]) < 2 or mean.size < FEWEST:
+        return
+    gradients = np.gradient(mean, axis=(0, 1))
+    table = np.array([[(a * b).sum(dtype=np.float64) for b in gradients] for a in gradients])
+    if np.linalg.det(table) <= 0:
+        return  # there is no structure to see a shift by
+    products = np.array([[(frame * g).sum(dtype=np.float64) for g in gradients] for frame in noise])
+    shifts = np.linalg.solve(table, products.T).T
+    energy = np.square(noise).sum(axis=(1, 2, 3), dtype=np.float64)
+    worst = int(np.square(shifts).sum(1).argmax()) if len(noise) > 2 else 1
+    follows = shifts[worst] @ products[worst]
+    if follows > SHIFTED_SHARE * energy[worst]:
+        others = "the others" if len(noise) > 2 else images[0].path
+        raise RequestError(
+            f"{images[worst].path} does not lie over {others}: {follows / energy[worst]:.0%} of "
+            f"the difference follows the picture's edges, of noise less than {SHIFTED_SHARE:.0%}; "
+            "something moved, or the view is another; give repeats from one place, or a --truth"
+        )
+
+
+def refuse_other_scenes(images: Sequence[Picture], noise: Floats) -> None:
+    """See that no repeat differs from the others over wide areas, as another scene would.
+
+    Images of less than 2x2 blocks are not judged.
+
+    Raises:
+        RequestError: one does.
+    """
+    frames, rows, columns = len(noise), noise.shape[1] // BLOCK, noise.shape[2] // BLOCK
+    if min(rows, columns) < 2:
+        return
+    whole = noise[:, : rows * BLOCK, : columns * BLOCK].reshape(
+        frames, rows, BLOCK, columns, BLOCK, -1
+    )
+    means = whole.mean((2, 4), dtype=np.float64)
+    for axis in (1, 2):  # rows, columns and the brightness of a frame may have noise of their own
+        means -= means.mean(axis, keepdims=True)
+    remaining = np.square(means).mean((1, 2, 3))
+    worst = int(remaining.argmax())
+    energy = np.square(whole[worst]).mean(dtype=np.float64)
+    if remaining[worst] > SCENE_SHARE * energy:
+        others = "the others" if frames > 2 else images[1 - worst].path
+        raise RequestError(
+            f"{images[worst].path} does not show the same scene as {others}: averaged over "
+            f"{BLOCK}x{BLOCK} pixels, {remaining[worst] / energy:.0%} of the difference remains, "
+            f"of noise less than {SCENE_SHARE:.0%} would; give repeats of one scene, or a --truth"
+        )
+
+
+def refuse_truth_among_repeats(images: Sequence[Picture], noise: Floats) -> None:
+    """See that no repeat has much less noise than the others, as a truth among them would.
+
+    Raises:
+        RequestError: one has.
+    """
+    energy = np.square(noise).mean(axis=tuple(range(1, noise.ndim)), dtype=np.float64)
+    least = int(energy.argmin())
+    others = float(np.median(np.delete(energy, least)))
+    if len(images) > 2 and noise[0].size >= FEWEST and energy[least] < TRUTH_SHARE * others:
+        raise RequestError(
+            f"{images[least].path} has {energy[least] / others:.2g} times the others' noise; "
+            "if it is their clean truth, give it as --truth"
+        )

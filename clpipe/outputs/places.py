@@ -1,0 +1,78 @@
+"""Where the noise of a picture is looked at: flat places, all of it, and that after averaging 2x2.
+
+The constants are choices; tests/test_statistics.py shows what they select.
+"""
+
+import numpy as np
+
+from clpipe.base.types import Doubles, Floats, Mask
+
+PICTURE, FLAT, HALVED = PLACES = ("picture", "flat", "halved")
+
+WINDOW = 5  # px, in which a flat place has to be flat
+FLATTEST = 0.25  # share of a picture that counts as flat whatever its noise
+MAD_TO_SIGMA = 1.4826  # of a normal distribution
+
+
+def covariance(noise: Floats) -> Doubles:
+    """The covariance of the channels' noise over all pixels of all frames, (channel, channel).
+
+    Args:
+        noise: (frame, height, width, channel).
+
+    >>> covariance(np.float32([1, 2, -1, -2]).reshape(1, 1, 2, 2)).tolist()
+    [[1.0, 2.0], [2.0, 4.0]]
+    """
+    channels = noise.shape[-1]
+    products, total = np.zeros((channels, channels)), np.zeros(channels)
+    for frame in noise:  # doubles of all at once would take much memory
+        samples = frame.reshape(-1, channels).astype(np.float64)
+        products += samples.T @ samples
+        total += samples.sum(0)
+    count = noise.size // channels
+    mean = total / count
+    return np.asarray(products / count - np.outer(mean, mean))
+
+
+def halved(noise: Floats) -> Floats:
+    """Noise, (frame, height, width, channel), averaged over 2x2 pixels; an odd last row or column
+    is left out.
+    """
+    frames, height, width, channels = noise.shape
+    even = noise[:, : height // 2 * 2, : width // 2 * 2]
+    blocks = even.reshape(frames, height // 2, 2, width // 2, 2, channels)
+    return np.asarray(blocks.mean((2, 4)), np.float32)
+
+
+def select_flat(truth: Floats, noise: Floats, mask: Mask) -> Mask:
+    """The pixels of ``mask`` around which the truth hardly changes.
+
+    At edges, shifts of pixels, demosaicing and JPEG make differences that are not noise. A pixel is
+    flat where the truth, averaged over 5x5 pixels, spans no more in the 5x5 window around it than
+    the sigma of the noise, in every channel. The flattest quarter of the picture always counts; the
+    sigma is measured there, as 1.4826 times the median absolute deviation.
+
+    Args:
+        truth: (height, width, channel).
+        noise: (frame, height, width, channel).
+        mask: (height, width), the pixels to select from; at least one.
+    """
+    smooth = _over_window(np.add, truth) / np.float32(WINDOW**2)
+    span = (_over_window(np.maximum, smooth) - _over_window(np.minimum, smooth)).max(-1)
+    quarter = np.quantile(span[mask], FLATTEST)
+    samples = noise[:, mask & (span <= quarter)]
+    sigma = MAD_TO_SIGMA * float(np.median(np.abs(samples - np.median(samples))))
+    return mask & (span <= max(float(quarter), sigma))
+
+
+def _over_window(function: np.ufunc, image: Floats) -> Floats:
+    """A commutative function over the 5x5 window around each pixel; edge pixels are repeated."""
+    for axis in (0, 1):
+        size = image.shape[axis]
+        places = np.arange(WINDOW)[:, None] + np.arange(size) - WINDOW // 2
+        first, *rest = np.clip(places, 0, size - 1)
+        result = image.take(first, axis)
+        for place in rest:
+            result = function(result, image.take(place, axis))
+        image = result
+    return image
