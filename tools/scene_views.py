@@ -79,6 +79,9 @@ def read_views(folder: Path) -> list[View]:
 def _read_view(folder: Path, record: dict) -> View:
     path = folder / record["file"]
     truth = read_layers(path, CHANNELS[3:])
+    if truth.shape[0] % 2 or truth.shape[1] % 2:
+        size = f"{truth.shape[1]}x{truth.shape[0]}"
+        raise ValueError(f"{path}: found {size} px; expected even sizes, which can be halved")
     k, r, t = (np.array(record[key], np.float64) for key in "KRt")
     return View(path.stem, k, r, t, truth[..., 0], np.rint(truth[..., 1]).astype(np.uint8))
 

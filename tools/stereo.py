@@ -14,7 +14,7 @@ from scene_views import SAME, View, seen_from, visible
 from clpipe.base.types import Array, Doubles, Floats, Mask
 
 BLOCK = 5  # px, a side of the block whose costs are added up
-MARGIN = 8  # px of disparity that are searched beyond those of the scene, on either side
+MARGIN = 5  # px of disparity that are searched beyond those of the scene, on either side
 STEP = 16  # OpenCV searches multiples of so many disparities, and returns 1/16 px
 UNIQUE = 10  # %, by which the best cost must be below the second
 CONSISTENT = 1  # px, how far the disparities of left and right may differ
@@ -40,9 +40,16 @@ class Score:
 
 
 def pairs(views: Sequence[View]) -> list[tuple[int, int]]:
-    """The numbers of views that are neighbours in a row of cameras, left first."""
+    """The numbers of views that are neighbours in a row of cameras, left first.
+
+    Raises:
+        ValueError: there are none.
+    """
     placed = sorted((tuple((-v.r.T @ v.t).round(6)[[2, 0]]), n) for n, v in enumerate(views))
-    return [(a, b) for (at, a), (to, b) in pairwise(placed) if at[0] == to[0]]
+    found = [(a, b) for (at, a), (to, b) in pairwise(placed) if at[0] == to[0]]
+    if not found:
+        raise ValueError("found no two cameras at the same height, side by side, to be matched")
+    return found
 
 
 def true_disparities(left: View, right: View) -> Doubles:
@@ -82,11 +89,11 @@ def match(left: Array, right: Array, lowest: float, highest: float) -> Floats:
 
 
 def halved(image: Array) -> Array:
-    """The means of 2x2 pixels: (height, width[, 3]) of even sizes to half of them, of its type."""
-    height, width = image.shape[:2]
-    cells = image.reshape(height // 2, 2, width // 2, 2, *image.shape[2:])
-    mean = cells.mean(axis=(1, 3), dtype=np.float64)
-    return (np.rint(mean) if image.dtype.kind == "u" else mean).astype(image.dtype)
+    """The means of 2x2 pixels: uint8 or float, (height, width[, 3]), both even, to half of them."""
+    is_whole = image.dtype == np.uint8
+    wide = image.astype(np.uint16) if is_whole else image
+    total = wide[::2, ::2] + wide[::2, 1::2] + wide[1::2, ::2] + wide[1::2, 1::2]
+    return ((total + 2) // 4).astype(np.uint8) if is_whole else total / 4
 
 
 class Pair:
@@ -131,5 +138,5 @@ def score(found: Floats, depth: Floats, places: Mask) -> Score:
     if not len(error):
         return Score(count, 0.0, 0.0, np.nan, np.nan)
     rms = float(np.sqrt((error**2).mean()))
-    complete = np.count_nonzero(error < reach) / count
+    complete = float(np.count_nonzero(error < reach) / count)
     return Score(count, len(error) / count, complete, float(np.median(error)), rms)
