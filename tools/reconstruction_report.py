@@ -129,14 +129,14 @@ def draw(path: Path, panels: Sequence[tuple[str, str, Table]], columns: int, fac
                 linewidth=1.2,
                 label=kind,
             )
-        axis.set(title=title, xscale="log", ylabel=label)
+        axis.set_title(title, fontsize=10)
+        axis.set(xscale="log", xlabel="ISO", ylabel=label)
         axis.set_ylim(bottom=0)
         axis.set_xticks(table.isos, [str(iso) for iso in table.isos], fontsize=7)
         axis.minorticks_off()
         axis.grid(alpha=0.3)
     handles, labels = axes.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
-    figure.supxlabel("ISO", fontsize=9)
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "clpipe"}):  # small, and reproducible
         figure.savefig(path, metadata={"Date": None})
 
