@@ -67,9 +67,8 @@ class Session:
         pieces: dict[int, list[Mapping[str, Any]]] = {}
         for line in done:
             ends = moment(line) - begun + sum(number(line.get(f"{step}_seconds")) for step in STEPS)
-            pieces.setdefault(int(min(max(ends, 0), self.seconds * 0.9999) / width), []).append(
-                line
-            )
+            piece = int(min(max(ends, 0), length * 0.9999) / width)
+            pieces.setdefault(piece, []).append(line)
         rows = []
         for i in range(max(pieces) + 1):
             lines = pieces.get(i, [])
@@ -219,31 +218,31 @@ class Step:
 def steps_of(pictures: Sequence[Made]) -> list[Step]:
     """The steps of the chains of pictures, in the order of the longest chain."""
     order: list[str] = []
-    methods: dict[str, Counter[str]] = {}
-    values: dict[tuple[str, str], Counter[Any]] = {}
+    counts: dict[str, dict[int, tuple[Mapping[str, Any], int]]] = {}
     for made in pictures:
-        records = made.value("stages")
-        steps = [s for s in records if isinstance(s, Mapping)] if isinstance(records, list) else []
+        steps = made.steps
         names = [str(step.get("name")) for step in steps]
         if len(names) > len(order):
             order = names + [name for name in order if name not in names]
         for name, step in zip(names, steps, strict=True):
-            if name not in order:
-                order.append(name)
-            methods.setdefault(name, Counter())[str(step.get("method"))] += 1
-            parameters = step.get("parameters")
-            for key, value in parameters.items() if isinstance(parameters, Mapping) else ():
-                plain = value if isinstance(value, int | float | str | None) else str(value)
-                values.setdefault((name, str(key)), Counter())[plain] += 1
-    return [
-        Step(
-            name,
-            methods[name],
-            [Parameter(key, each) for (step, key), each in values.items() if step == name],
-            methods[name].total(),
-        )
-        for name in order
-    ]
+            of_step = counts.setdefault(name, {})  # steps that are alike are the same object
+            of_step[id(step)] = step, of_step.get(id(step), (step, 0))[1] + 1
+    order += [name for name in counts if name not in order]
+    return [_step(name, list(counts[name].values())) for name in order]
+
+
+def _step(name: str, counted: Sequence[tuple[Mapping[str, Any], int]]) -> Step:
+    """A step, from how often each record of it occurs."""
+    methods: Counter[str] = Counter()
+    values: dict[str, Counter[Any]] = {}
+    for record, count in counted:
+        methods[str(record.get("method"))] += count
+        parameters = record.get("parameters")
+        for key, value in parameters.items() if isinstance(parameters, Mapping) else ():
+            plain = value if isinstance(value, int | float | str | None) else str(value)
+            values.setdefault(str(key), Counter())[plain] += count
+    parameters = [Parameter(key, each) for key, each in values.items()]
+    return Step(name, methods, parameters, methods.total())
 
 
 def drawn(pictures: Sequence[Made], steps: Sequence[Step]) -> list[Parameter]:

@@ -159,9 +159,8 @@ def _pooled(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 def parameters_of(made: Made, step: str) -> Mapping[str, Any]:
     """The parameters of a step of a picture's chain; none where it has no such step."""
-    stages = made.value("stages")
-    for each in stages if isinstance(stages, list) else []:
-        if isinstance(each, dict) and each.get("name") == step:
+    for each in made.steps:
+        if each.get("name") == step:
             parameters = each.get("parameters")
             return parameters if isinstance(parameters, dict) else {}
     return {}

@@ -16,6 +16,9 @@ from clpipe.batch.tars import DAMAGED
 from clpipe.outputs.sidecar import BEGINNING, SIDECAR, outputs_in
 
 TAR = ".tar"
+# What is kept of sidecars, of which there may be hundreds of thousands.
+KEYS = ("clpipe", "iso", "camera", "width", "height", "noise", "clipped", "warnings")
+ALIKE = ("device", "versions")  # which most of them share
 LOGS = "run*.jsonl"
 
 
@@ -55,13 +58,19 @@ class Made:
 
     image: str  # the name of what it was made of, without ending; with folders of a series
     rendition: str  # what is behind that name, such as ".truth"; "" is the picture itself
-    record: Mapping[str, Any]  # the sidecar
+    record: Mapping[str, Any]  # what is needed of the sidecar: KEYS, in which what is alike is one
     files: Mapping[str, Blob]  # by what is behind the picture's name: "jpg", "demosaic.exr"
 
     @property
     def name(self) -> str:
         """The name of the picture, without ending."""
         return self.image + self.rendition
+
+    @property
+    def steps(self) -> Sequence[Mapping[str, Any]]:
+        """The steps of its chain."""
+        found = self.record.get("stages")
+        return [each for each in found if isinstance(each, Mapping)] if found else []
 
     def value(self, *keys: str) -> Any:
         """A value of the sidecar, by the keys on the way to it; None where it is not there."""
@@ -96,6 +105,18 @@ class Run:
 
     def __post_init__(self) -> None:
         self._by_image: dict[str, dict[str, Made]] = {}
+        self._alike: dict[str, Any] = {}
+
+    def slim(self, record: Mapping[str, Any]) -> dict[str, Any]:
+        """What is kept of a sidecar; values that are alike become one object."""
+        steps = record.get("stages")
+        kept = {key: record.get(key) for key in KEYS}
+        kept |= {key: self._one(record.get(key)) for key in ALIKE}
+        kept["stages"] = [self._one(step) for step in steps] if isinstance(steps, list) else []
+        return kept
+
+    def _one(self, value: Any) -> Any:
+        return self._alike.setdefault(repr(value), value)
 
     def add(self, made: Made) -> None:
         """Add a picture."""
@@ -222,7 +243,7 @@ def _made(
         files[file.removeprefix(f"{stem}.")] = Blob(
             there.path, there.name, said, there.offset, there.size
         )
-    yield Made(_joined(below, stem.removesuffix(rendition)), rendition, record, files)
+    yield Made(_joined(below, stem.removesuffix(rendition)), rendition, run.slim(record), files)
 
 
 def _joined(below: str, name: str) -> str:

@@ -2,7 +2,7 @@
 
 import base64
 import hashlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -206,10 +206,8 @@ def _views(run: Run, made: Made) -> Iterator[tuple[str, Blob]]:
 
 def _strip(made: Made, budget: Budget, problems: list[str]) -> list[dict[str, str]]:
     """The kept stages of a picture, small, in the order of its chain."""
-    stages = made.value("stages")
-    names = [str(each.get("name")) for each in stages if isinstance(each, Mapping)]
     strip = []
-    for name in names:
+    for name in (str(step.get("name")) for step in made.steps):
         file = made.files.get(f"{name}.exr") or made.files.get(f"{name}.npy")
         if not file:
             continue
