@@ -532,3 +532,24 @@ def test_an_output_folder_is_not_named_like_a_picture(clpipe, small, tmp_path):
     (tmp_path / "shots.exr").mkdir()
     clpipe("run", small, "-o", "shots.exr", "--device", "numpy")
     assert written(tmp_path / "shots.exr") == ["small.jpg", "small.json"]
+
+
+def test_json_lines_are_those_of_the_log(small, clpipe):
+    result = clpipe("run", small, "-o", "out", "--json-lines")
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    assert [line["event"] for line in lines] == ["start", "image", "end"]
+    assert lines[1]["outputs"] == ["small.jpg", "small.json"] and lines[2]["done"] == 1
+    assert result.stdout == (small.parent.parent / "out" / "run.jsonl").read_text()
+    assert "->" not in result.stderr
+
+
+def test_many_images_have_a_line_every_so_often(small, clpipe, monkeypatch):
+    monkeypatch.setattr("clpipe.commands.progress.FEW", 1)
+    monkeypatch.setattr("clpipe.commands.progress.EVERY", 0)
+    more = "--iso", "100,200,400"
+    said = clpipe("run", small, "-o", "out", "--device", "numpy", *more).stderr
+    assert re.search(r"^1 of 3 images; [\d.]+ MP/s; decode .*; about [\d.]+ s left$", said, re.M)
+    assert "3 of 3 images done" in said and "->" not in said
+    monkeypatch.setattr("clpipe.commands.progress.EVERY", 60)
+    said = clpipe("run", small, "-o", "again", "--device", "numpy", *more).stderr
+    assert "of 3 images;" not in said

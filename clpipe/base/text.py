@@ -41,3 +41,17 @@ def printable(text: str) -> str:
     """
     line = " ".join(text.split())
     return "".join(letter if letter.isprintable() else "?" for letter in line)
+
+
+def duration(seconds: float) -> str:
+    """A length of time for people.
+
+    >>> duration(5.21), duration(83), duration(7265)
+    ('5.2 s', '1 min 23 s', '2 h 01 min')
+    """
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02} s"
+    return f"{minutes // 60} h {minutes % 60:02} min"

@@ -6,7 +6,7 @@ import json
 import os
 import stat
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -106,10 +106,19 @@ def _line(event: str, at: float, values: Mapping[str, Any]) -> bytes:
 
 
 class RunLog:
-    """The log of a run, behind those of earlier runs; nothing is written before the first image."""
+    """The log of a run, behind those of earlier runs; nothing is written before the first image.
 
-    def __init__(self, path: Path, start: Mapping[str, Any]) -> None:
+    Args:
+        path: the file.
+        start: what the line of the start says.
+        echo: gets each line, too.
+    """
+
+    def __init__(
+        self, path: Path, start: Mapping[str, Any], echo: Callable[[bytes], None] | None = None
+    ) -> None:
         self._path = path
+        self._echo = echo
         self._file: int | None = None
         self._start = _line("start", time.time(), {"clpipe": __version__, **start})
 
@@ -121,6 +130,8 @@ class RunLog:
             _append(self._file, line)
         except OSError as error:
             raise OutputError(f"{self._path}: cannot be written: {error.strerror}") from None
+        if self._echo:
+            self._echo(line)
 
     def _opened(self) -> int:
         """The file, open behind its last whole line.

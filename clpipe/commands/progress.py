@@ -1,11 +1,14 @@
-"""What a run prints on stderr: a bar on a terminal, otherwise a line for each image."""
+"""What a run prints on stderr: a bar on a terminal, otherwise a line for each image, or of many
+images one every so often."""
 
 import contextlib
+import shlex
+import time
 from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
 
-from clpipe.base.text import one_line
+from clpipe.base.text import duration, one_line
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
 from clpipe.batch.run_log import Summary
 from clpipe.engine.clipping import clipping_text
@@ -15,6 +18,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 REPEATED = 20  # failures that are printed again at the end
+FEW = 50  # images that have a line each, where there is no terminal
+EVERY = 10.0  # s, from line to line of more images
 
 
 def bar_on(console: Console) -> "Progress":
@@ -49,6 +54,7 @@ class Reporter:
         self._console = console
         self._quiet = quiet
         self._several = summary.total > 1
+        self._said = time.perf_counter()
         self._bar: Progress | None = None
         if self._several and console.is_terminal and not quiet:
             self._bar = bar_on(console)
@@ -80,6 +86,10 @@ class Reporter:
             self._bar.update(
                 self._task, completed=self._summary.finished, description=self._state()
             )
+        elif self._summary.total > FEW:
+            if time.perf_counter() - self._said >= EVERY:
+                self._said = time.perf_counter()
+                self.print(self._state(with_count=True))
         elif outcome.status == DONE:
             self.print(f"{outcome.job.path} -> {self._files(outcome)}")
 
@@ -91,12 +101,19 @@ class Reporter:
         seconds = sum(outcome.seconds(step) for step in self._summary.seconds)
         return f"{text}  {outcome.megapixels:.2g} MP  {seconds:.2f} s"
 
-    def _state(self) -> str:
+    def _state(self, with_count: bool = False) -> str:
+        """How it goes, as the bar and, with the count of images, a line of its own says it."""
         summary = self._summary
         failed = summary.counts[FAILED]
         speed = summary.megapixels / max(summary.elapsed, 1e-9)
         text = f"{speed:.0f}" if speed >= 10 else f"{speed:.2g}"
-        return f"{text} MP/s  {summary.shares()}" + f"  {failed} failed" * bool(failed)
+        parts = [f"{text} MP/s", summary.shares()] + [f"{failed} failed"] * bool(failed)
+        if not with_count:
+            return "  ".join(parts)
+        left = summary.total - summary.finished
+        remaining = duration(summary.elapsed * left / summary.finished)
+        count = f"{summary.finished} of {summary.total} images"
+        return "; ".join([count, *parts, f"about {remaining} left"])
 
     def _clipping(self) -> str:
         """What is said of images that are clipped much."""
@@ -141,3 +158,5 @@ class Reporter:
             speed = summary.megapixels / summary.elapsed
             text += f"; {summary.elapsed:.1f} s, {speed:.3g} MP/s; {summary.shares()}"
         self.print(text)
+        if self._bar and counts[DONE]:
+            self.print(f"look at it: clpipe report {shlex.quote(str(self._writer.folder))}")

@@ -3,7 +3,7 @@
 import logging
 import sys
 from collections.abc import Mapping
-from contextlib import closing, nullcontext
+from contextlib import closing, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -170,6 +170,11 @@ from clpipe.stage import Kind
 )
 @click.option("--quiet", is_flag=True, help="Print failures only.")
 @click.option(
+    "--json-lines",
+    is_flag=True,
+    help="Print the lines of the log on stdout, for programs: the start, each image, the end.",
+)
+@click.option(
     "--trace",
     type=click.Path(path_type=Path),
     metavar="FILE.json",
@@ -194,6 +199,7 @@ def run(
     overwrite: bool,
     verify: bool,
     quiet: bool,
+    json_lines: bool,
     trace: Path | None,
     **options: Any,
 ) -> None:
@@ -270,24 +276,30 @@ def run(
     )
     opened = batch_of(spec, loader, chain, tars, dask)
     summary = Summary(len(jobs))  # counts seconds from here on
-    reporter = Reporter(summary, writer, Console(stderr=True), quiet)
-    events = Trace(trace) if trace else nullcontext()
+    reporter = Reporter(summary, writer, Console(stderr=True), quiet or json_lines)
     has_views = poses and not tars and shard.of == 1
     with (
         opened as batch,
         output_folder(output, shard),
         views_behind(series.under(output), summary, quiet) if has_views else nullcontext(),
-        events as timeline,
+        Trace(trace) if trace else nullcontext() as timeline,
     ):
         if replay and isinstance(batch, Batch):
             warn_of_changes(replay, again, batch.devices[0])
         remove_unfinished(output, jobs, request.patch is not None)
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
-        with closing(RunLog(output / log_name(shard), start)) as log:
+        log = RunLog(output / log_name(shard), start, print_line if json_lines else None)
+        with closing(log):
             follow(batch, jobs, summary, reporter, log, timeline)
     if summary.interrupted:
         sys.exit(130)
     sys.exit(1 if summary.failures or summary.is_fruitless else 0)
+
+
+def print_line(line: bytes) -> None:
+    """Print a line on stdout. One that cannot be printed ends no run."""
+    with suppress(OSError):
+        click.echo(line, nl=False)
 
 
 def patch_count_of(options: Mapping[str, Any]) -> Any:

@@ -7,6 +7,7 @@ from datetime import datetime
 from typing import Any
 
 from clpipe.base.memory import in_words
+from clpipe.base.text import duration
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS
 from clpipe.engine.clipping import MUCH
 from clpipe.reports.run import Made, Run
@@ -139,26 +140,12 @@ def totals(run: Run, found: Sequence[Session]) -> list[tuple[str, str]]:
         rows += [("left out", f"{left_out:,}")] if left_out else []
         if last.seconds > 0:
             rows += [
-                ("time of the last run", clock(last.seconds)),
+                ("time of the last run", duration(last.seconds)),
                 ("speed of the last run", f"{last.megapixels / last.seconds:.3g} MP/s"),
             ]
         if peak := number(last.end.get("peak_memory")):
             rows.append(("most memory", in_words(peak)))
     return rows
-
-
-def clock(seconds: float) -> str:
-    """A length of time for people.
-
-    >>> clock(5.21), clock(83), clock(7265)
-    ('5.2 s', '1 min 23 s', '2 h 01 min')
-    """
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest:02} s"
-    return f"{minutes // 60} h {minutes % 60:02} min"
 
 
 @dataclass(frozen=True)

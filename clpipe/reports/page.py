@@ -11,6 +11,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from clpipe.analysis.svg import histogram_svg, lines_svg, shares_svg
 from clpipe.base.about import __version__
+from clpipe.base.text import duration
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, STEPS
 from clpipe.reports import figures
 from clpipe.reports.figures import Parameter, Session, Step
@@ -166,7 +167,7 @@ def session_row(session: Session) -> Mapping[str, str]:
         "done": f"{session.count(DONE):,}",
         "skipped": f"{session.count(SKIPPED):,}",
         "failed": f"{session.count(FAILED):,}",
-        "time": figures.clock(session.seconds),
+        "time": duration(session.seconds),
         "speed": f"{speed:.3g} MP/s",
     }
 
