@@ -85,6 +85,12 @@ def made(renders):
     return out
 
 
+@pytest.fixture(autouse=True)
+def few_drawings(monkeypatch):
+    """The noise of one picture is drawn: that is what takes long."""
+    monkeypatch.setattr("clpipe.reports.page.DRAWN", 1)
+
+
 @pytest.fixture
 def out(made, tmp_path):
     """A copy of that run."""
@@ -100,7 +106,8 @@ def test_figures_pictures_and_failures(out):
     assert all(entry["image"].startswith("data:image/jpeg;base64,") for entry in entries)
     assert {entry["iso"] for entry in entries} == {1600}
     large = page.data["look-data"]
-    assert [view["label"] for view in large[0]["views"]] == ["picture", "truth"]
+    assert [view["label"] for view in large[0]["views"]] == ["picture", "truth", "after normalize"]
+    assert [view["label"] for view in large[2]["views"]] == ["picture", "truth"]
     assert "exposure.ev : " in page.said.replace("exposure.ev:", "exposure.ev :")
     assert "sensor_noise gaussian" in page.said
     assert "finished" in page.said

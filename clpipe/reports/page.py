@@ -17,11 +17,12 @@ from clpipe.reports import figures
 from clpipe.reports.figures import Parameter, Session, Step
 from clpipe.reports.noise import LIMIT, laws, noises
 from clpipe.reports.run import Made, Run
-from clpipe.reports.shown import BUDGET, Budget, Large, chosen, contact_sheet, large
+from clpipe.reports.shown import BUDGET, Budget, Large, add_stages, chosen, contact_sheet, large
 
 TEMPLATES = Path(__file__).parent / "page"
 LISTED = 40  # failures, warnings, problems
 HISTOGRAMS = 12
+STAGED = 2  # images whose kept stages are shown large
 DRAWN = 3  # pictures whose noise is drawn
 SESSIONS = 12  # starts of the program, the latest
 
@@ -77,8 +78,11 @@ def html(runs: Sequence[Run]) -> str:
     sheets = [contact_sheet(run, budget, label) for label, run in zip(labels, runs, strict=True)]
     problems += [text for sheet in sheets for text in sheet.problems]
     entries = [entry for sheet in sheets for entry in sheet.entries]
-    found_large = (large(runs, labels, made, budget, problems) for made in picked)
-    shown = [each for each in found_large if each]
+    found_large = [(made, large(runs, labels, made, budget, problems)) for made in picked]
+    shown = [each for _, each in found_large if each]
+    for made, each in found_large[:STAGED]:
+        if each:
+            add_stages(each, made, budget)
     totals = [figures.totals(run, found) for run, found in zip(runs, every, strict=True)]
     names = list(dict.fromkeys(name for rows in totals for name, _ in rows))
     found = [session for each in every for session in each]

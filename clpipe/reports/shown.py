@@ -204,13 +204,36 @@ def _views(run: Run, made: Made) -> Iterator[tuple[str, Blob]]:
             yield rendition.removeprefix(exposure).strip("."), file
 
 
+def _kept(made: Made) -> Iterator[tuple[str, Blob]]:
+    """The kept stages of a picture, in the order of its chain."""
+    for name in (str(step.get("name")) for step in made.steps):
+        if file := made.files.get(f"{name}.exr") or made.files.get(f"{name}.npy"):
+            yield name, file
+
+
+def add_stages(shown: Large, made: Made, budget: Budget) -> None:
+    """Show the kept stages of a picture large, too, as far as the budget goes.
+
+    Those of another size, before a picture is made smaller, are left out. What cannot be read is
+    known from the small ones.
+    """
+    for name, file in _kept(made):
+        try:
+            pixels, _ = part_of(decoded(checked(file), file.name))
+        except ImageError:
+            continue
+        if pixels.shape[:2] != (shown.height, shown.width):
+            continue
+        image = data_uri(jpeg_bytes(pixels))
+        if not budget.take(image):
+            return
+        shown.views.append({"label": f"after {name}", "image": image})
+
+
 def _strip(made: Made, budget: Budget, problems: list[str]) -> list[dict[str, str]]:
     """The kept stages of a picture, small, in the order of its chain."""
     strip = []
-    for name in (str(step.get("name")) for step in made.steps):
-        file = made.files.get(f"{name}.exr") or made.files.get(f"{name}.npy")
-        if not file:
-            continue
+    for name, file in _kept(made):
         try:
             image = data_uri(thumbnail_bytes(checked(file), file.name, 2 * SMALL))
         except ImageError as error:
