@@ -27,6 +27,9 @@ def line_of(text: str, key: str) -> int | None:
     return within
 
 
+POINTED = re.compile(r"[+-]?(\d+\.|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
+
+
 def parse_assignment(text: str) -> tuple[str, str, Any]:
     """The three parts of ``stage.parameter=value``; the value as :func:`toml_value` has it.
 
@@ -45,13 +48,17 @@ def parse_assignment(text: str) -> tuple[str, str, Any]:
 def toml_value(text: str) -> Any:
     """The value of a text that is valid TOML, such as a number or a list; else the text itself.
 
+    Numbers may begin or end with the point, as TOML's may not.
+
     >>> toml_value("1e-4"), toml_value("{choice = [100, 400]}"), toml_value("bilinear")
     (0.0001, {'choice': [100, 400]}, 'bilinear')
+    >>> toml_value(".5"), toml_value("-2."), toml_value(".")
+    (0.5, -2.0, '.')
     """
     try:
         table = parse_toml(f"value = {text}")
     except ValueError:
-        return text
+        return float(text) if POINTED.fullmatch(text) else text
     return table["value"] if len(table) == 1 else text
 
 
