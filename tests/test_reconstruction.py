@@ -186,6 +186,28 @@ def test_points_are_drawn_the_nearest_on_top():
     assert (image == 200).all(2).sum() > 50
 
 
+def test_after_ctrl_c_what_was_run_for_all_pictures_is_reported(monkeypatch, capsys, tmp_path):
+    pictures = tool.Pictures(tmp_path, ["a"], [100], range(1))
+    textures = (tool.ALL, *tool.TEXTURES)
+
+    def stopped(*_):
+        for threshold, jobs in ((0.7, pictures.all()), (0.9, pictures.all()[:2])):
+            for job in jobs:
+                for texture in textures:
+                    yield tool.PointsRow("PMVS2", "half", threshold, *job, texture, 5, 4)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tool, "compare_points", stopped)
+    rows = tool.points_until_stopped({}, [], pictures)
+    assert {row.threshold for row in rows} == {0.7}
+    assert len(rows) == len(pictures.all()) * len(textures)
+    text = []
+    tool.report_points(tmp_path, rows, text)
+    assert "Points: PMVS2, half resolution, threshold 0.7" in "".join(text)
+    assert (tmp_path / "points.csv").is_file() and (tmp_path / "points.svg").is_file()
+    assert "stopped" in capsys.readouterr().err
+
+
 def test_what_is_missing_or_wrong_is_named(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(tool, "NEEDED", ("numpy", "no_such_module"))
     monkeypatch.setattr("sys.argv", ["reconstruction", "-o", str(tmp_path)])
