@@ -108,7 +108,7 @@ def test_figures_pictures_and_failures(out):
     large = page.data["look-data"]
     assert [view["label"] for view in large[0]["views"]] == ["picture", "truth", "after normalize"]
     assert [view["label"] for view in large[2]["views"]] == ["picture", "truth"]
-    assert "exposure.ev : " in page.said.replace("exposure.ev:", "exposure.ev :")
+    assert re.search(r"exposure\.ev ?: -?[\d.]+ to -?[\d.]+", page.said)
     assert "sensor_noise gaussian" in page.said
     assert "finished" in page.said
 
@@ -242,6 +242,14 @@ def test_many_pictures_are_sampled_within_the_budget(out, monkeypatch):
 def test_bad_input(tmp_path, monkeypatch, arguments, message):
     monkeypatch.chdir(tmp_path)
     assert message in clpipe("report", *arguments, status=2)
+
+
+def test_a_file_of_the_users_is_not_replaced(out):
+    report(out)
+    report(out)  # its own is
+    (out / "report.html").write_text("<p>mine</p>")
+    assert "clpipe did not write this file" in clpipe("report", out, status=2)
+    assert (out / "report.html").read_text() == "<p>mine</p>"
 
 
 def test_the_pace_of_a_run():

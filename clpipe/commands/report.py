@@ -1,5 +1,6 @@
 """``clpipe report``: what a run made, as one HTML file to look at."""
 
+import os
 from pathlib import Path
 
 import click
@@ -8,6 +9,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
 from clpipe.base.files import write_new
 from clpipe.commands.options import Command
+from clpipe.outputs.existing import is_marked
 
 
 @click.command("report", cls=Command)
@@ -38,6 +40,10 @@ def report(folders: tuple[Path, ...], output: Path | None) -> None:
     path = output or folders[0] / "report.html"
     if path.suffix != ".html":
         raise RequestError(f"-o: found {path}; expected a name that ends in .html")
+    if os.path.lexists(path) and not is_marked(path):
+        raise RequestError(
+            f"{path}: clpipe did not write this file; move it, or name another with -o"
+        )
     require("clpipe report", "report", "jinja2", "matplotlib")
     from clpipe.reports.page import html
     from clpipe.reports.run import read_run
