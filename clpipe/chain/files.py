@@ -1,6 +1,6 @@
 """Configurations: TOML files in, and a chain as such a file out."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -10,7 +10,8 @@ from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.reading import parse_toml, read_text
 from clpipe.base.text import one_of
 from clpipe.chain.chain import Chain, Step
-from clpipe.chain.keys import CODE, LENS, OUTPUT, names_in
+from clpipe.chain.keys import CODE, KEYS, LENS, OUTPUT, names_in
+from clpipe.chain.paths import from_folder
 from clpipe.chain.registry import load_stage_file
 from clpipe.chain.settings import Settings, settings_from
 from clpipe.chain.toml import line_of, value_text
@@ -99,6 +100,31 @@ def toml_text(chain: Chain) -> str:
         lines += ["", f"[{step.name}]", *_step_lines(step, settings, draws)]
     for name, table in _other_tables(chain, draws).items():
         if table:
+            lines += ["", f"[{name}]", *(f"{k} = {value_text(v)}" for k, v in table.items())]
+    return "\n".join(lines) + "\n"
+
+
+def config_text(values: Mapping[str, Any], stage_files: Sequence[Path] = ()) -> str:
+    """Nested values as the text of a configuration; names of files become absolute.
+
+    Args:
+        values: as :class:`Config` has them.
+        stage_files: that it loads.
+
+    >>> print(config_text({"iso": 800.0, "denoise": {"method": "mean"}, "skip": ["gamma"]}), end="")
+    iso = 800
+    skip = ["gamma"]
+    <BLANKLINE>
+    [denoise]
+    method = "mean"
+    """
+    values = from_folder(Path.cwd(), values)
+    code = {CODE: [str(file.resolve()) for file in stage_files]} if stage_files else {}
+    is_table = {key: isinstance(v, Mapping) and key not in KEYS for key, v in values.items()}
+    plain = {key: value for key, value in values.items() if not is_table[key]}
+    lines = [f"{key} = {value_text(value)}" for key, value in (code | plain).items()]
+    for name, table in values.items():
+        if is_table[name] and table:
             lines += ["", f"[{name}]", *(f"{k} = {value_text(v)}" for k, v in table.items())]
     return "\n".join(lines) + "\n"
 

@@ -23,6 +23,7 @@ COMMANDS = (
     "dataset",
     "poses",
     "report",
+    "explore",
     "plan",
     "stages",
     "cameras",

@@ -2,6 +2,7 @@
 
 import io
 import tempfile
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +95,24 @@ def decoded(data: bytes, name: str) -> Array:
         raise ImageError(f"{name}: {str(error).partition(': ')[2]}") from None
     except DAMAGED as error:
         raise ImageError(f"{name}: cannot be shown: {error}") from None
+
+
+@cache
+def _light_table() -> Array:
+    """Eight bits of linear light by sRGB's curve, by the bits of a half float."""
+    halves = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float64)
+    light = np.clip(np.nan_to_num(halves, posinf=1, neginf=0), 0, 1)
+    return to_8_bit(srgb_curve(light).astype(np.float32))
+
+
+def encoded_light(image: Array) -> Array:
+    """Linear light, 0 is black and 1 white, as eight bits by sRGB's curve; half floats are enough.
+
+    >>> encoded_light(np.float32([[-1, 0, 0.5, 1, 9]])).tolist()
+    [[0, 0, 188, 255, 255]]
+    """
+    with np.errstate(over="ignore"):
+        return _light_table()[image.astype(np.float16).view(np.uint16)]
 
 
 def _decoded_exr(data: bytes) -> Array:

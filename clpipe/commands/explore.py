@@ -1,0 +1,59 @@
+"""``clpipe explore``: a page on which a camera is tried on renders."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+from clpipe.base.extras import require
+from clpipe.chain.request import Request
+from clpipe.commands.chain_options import chain_options
+from clpipe.commands.input_options import layer_option, max_pixels_option, transfer_option
+from clpipe.commands.options import Command, device_option, raw_size_option, raw_type_option
+from clpipe.engine.device import open_device
+from clpipe.inputs.find import find_jobs
+from clpipe.inputs.loader import ImageLoader
+
+
+@click.command("explore", cls=Command)
+@click.argument("inputs", nargs=-1, required=True, metavar="RENDER...")
+@chain_options
+@raw_size_option
+@raw_type_option
+@transfer_option
+@layer_option
+@max_pixels_option
+@device_option
+@click.option(
+    "--port",
+    type=click.IntRange(1, 65535),
+    metavar="N",
+    help="The port of the page, to be forwarded from another machine. [default: a free one]",
+)
+def explore(
+    inputs: tuple[str, ...], selector: str | None, port: int | None, **options: Any
+) -> None:
+    """Try a camera on renders: a page on this machine, developed live as settings change.
+
+    It has a control for every parameter of every stage, and shows any stage, pixel values, the
+    histogram, the noise of a part, the time of each launch, and another setting or the clean
+    picture beside. What is found is saved as a configuration, or copied as a command; both give the
+    same picture. Only this machine can open the page, and only by the address that is printed.
+
+    \b
+    clpipe explore render.exr
+    clpipe explore renders/ --iso 3200 -c paper
+    """
+    require("clpipe explore", "explore", "starlette", "uvicorn", "matplotlib")
+    from clpipe.explorer.explorer import Explorer
+    from clpipe.explorer.server import Server
+
+    request = Request.from_options(**options)
+    loader = ImageLoader(request)
+    jobs = loader.exposures(find_jobs(inputs, Path(os.devnull), loader.endings()))
+    loader.first_chain(jobs)  # a wrong request is refused here
+    explorer = Explorer(jobs, request, open_device(selector))
+    server = Server(explorer, port or 0)
+    click.echo(f"{explorer.label}: open {server.address} in a browser; Ctrl-C ends")
+    server.run()

@@ -1,0 +1,82 @@
+"""What a page can set: the stages of a chain with their methods and parameters, as declared."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from clpipe.camera.profile import built_in_cameras, load_camera
+from clpipe.chain.chain import step_names
+from clpipe.chain.methods import base_name
+from clpipe.chain.registry import all_stages
+from clpipe.chain.settings import Settings
+from clpipe.stages import DEFAULT_CHAIN
+
+HIDDEN = {"title", "description"}  # of a parameter's schema; the description is sent as "text"
+
+
+def stage_controls() -> dict[str, Any]:
+    """Every stage by its name: what it does, and its methods with their parameters.
+
+    A parameter is its JSON schema, which has its type, limits, unit and default; "text" says what
+    it is, "auto" where its value comes from when it is not set.
+    """
+    return {
+        name: {
+            "summary": stage.summary,
+            "methods": [
+                {
+                    "name": method.method,
+                    "summary": method.summary,
+                    "parameters": parameters_of(method),
+                }
+                for method in stage.methods
+            ],
+        }
+        for name, stage in all_stages().items()
+    }
+
+
+def parameters_of(model: type[BaseModel]) -> dict[str, Any]:
+    """The parameters that a class declares, each as its JSON schema with a text.
+
+    >>> from clpipe.stages.gamma import STAGE
+    >>> list(parameters_of(STAGE.methods[0]))
+    []
+    """
+    properties = model.model_json_schema().get("properties", {})
+    return {
+        name: {k: v for k, v in schema.items() if k not in HIDDEN}
+        | {"text": schema.get("description", "")}
+        for name, schema in properties.items()
+    }
+
+
+def camera_controls(others: Sequence[str]) -> list[dict[str, Any]]:
+    """The cameras that can be chosen, with their ISOs: the built-in ones, and files that are named.
+
+    Raises:
+        RequestError: a file is no camera profile.
+    """
+    cameras = [(name, load_camera(name)) for name in (*sorted(built_in_cameras()), *others)]
+    return [
+        {
+            "value": name,
+            "label": f"{camera.make} {camera.model}".strip() or Path(name).name,
+            "isos": list(camera.iso_range),
+        }
+        for name, camera in cameras
+    ]
+
+
+def steps_of(settings: Settings) -> list[dict[str, Any]]:
+    """All steps of settings in their order, those that are skipped as well, with their stages."""
+    on = set(step_names(settings))
+    every = step_names(Settings(stages=settings.stages))
+    return [{"name": name, "stage": base_name(name), "on": name in on} for name in every]
+
+
+def default_stages() -> list[str]:
+    """The stages of the chain, where none are listed."""
+    return list(DEFAULT_CHAIN)

@@ -1,0 +1,407 @@
+"""Images developed again and again with other settings, as ``clpipe run`` would develop them."""
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from clpipe.analysis.measure import measure
+from clpipe.analysis.pictures import Picture
+from clpipe.analysis.report import NoiseReport
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.types import Array, Floats
+from clpipe.chain.chain import Chain
+from clpipe.chain.identity import noise_key
+from clpipe.chain.request import Request
+from clpipe.chain.settings import Settings
+from clpipe.chain.truth import DEVELOPMENT, PICTURES, picture_without_noise
+from clpipe.engine.clipping import clipped_share
+from clpipe.engine.device import Device, Timing
+from clpipe.engine.plan import AnyLaunch
+from clpipe.engine.runner import Result, Runner, is_planar
+from clpipe.explorer.controls import steps_of
+from clpipe.explorer.named import check_named, files_in
+from clpipe.images.preview import encoded_light
+from clpipe.images.read import SourceImage
+from clpipe.images.tags import upright
+from clpipe.inputs.find import Job
+from clpipe.inputs.loader import ImageLoader, LoadedImage
+from clpipe.outputs.writer import OutputWriter
+from clpipe.stage import Context, Kind
+
+SOURCES = 2  # images that stay decoded
+RESULTS = 3  # images whose values can still be asked for
+AT_START = (
+    "camera",
+    "iso",
+    "seed",
+    "stages",
+    "skip",
+)  # of Settings.record(), which always has them
+
+
+@dataclass(frozen=True)
+class View:
+    """What is looked at: the image after a step ("" is the last), or the truth of it.
+
+    ``truth`` is one of :data:`clpipe.chain.truth.PICTURES`, or "" for the picture with its noise.
+    """
+
+    step: str = ""
+    truth: str = ""
+
+
+@dataclass(frozen=True)
+class Developed:
+    """An image as it is shown, and what is said of it.
+
+    ``pixels`` is (height, width, 3) uint8; ``facts`` are JSON values.
+    """
+
+    pixels: Array
+    facts: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A result whose values can be asked for, turned as it is shown."""
+
+    image: Array
+    unit: str
+
+
+class Explorer:
+    """Develops the images of a request with any settings, on one device.
+
+    It may be used by several threads; they take turns at the device.
+
+    Args:
+        jobs: the images.
+        request: what was asked for at the start.
+        device: where to run; None is NumPy.
+
+    Raises:
+        RequestError: an image has settings of its own, from a manifest.
+    """
+
+    def __init__(self, jobs: Sequence[Job], request: Request, device: Device | None) -> None:
+        if listed := next((job for job in jobs if job.place), None):
+            raise RequestError(
+                f"{listed.place}: its rows may have settings of their own; give the images "
+                "themselves, or folders"
+            )
+        self.jobs = tuple(jobs)
+        self.device = device
+        self._request = request
+        self._lock = threading.Lock()
+        self._sources: OrderedDict[Any, SourceImage] = OrderedDict()
+        self._runners: dict[bool, Runner] = {}
+        self._results: OrderedDict[int, Sample] = OrderedDict()
+        self._number = 0
+
+    @property
+    def label(self) -> str:
+        """How many images, and where they are developed, for people."""
+        count = "1 image" if len(self.jobs) == 1 else f"{len(self.jobs)} images"
+        return f"{count}, on {self.device.info.label if self.device else 'NumPy'}"
+
+    @cached_property
+    def initial(self) -> dict[str, Any]:
+        """The values that are set at the start, nested as in a configuration.
+
+        Whoever changes them has a configuration: what is left out is automatic.
+        """
+        settings = replace(self._request, image={}, image_name="").settings()
+        asked = {**(self._request.config or {}), **self._request.options}
+        record = settings.record()
+        return {k: v for k, v in record.items() if k not in AT_START or k in asked}
+
+    @cached_property
+    def named(self) -> tuple[str, ...]:
+        """The files that the settings name at the start."""
+        return tuple(dict.fromkeys(name for _, name in files_in(self.initial)))
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The camera profiles among these files."""
+        return tuple(dict.fromkeys(name for key, name in files_in(self.initial) if key == "camera"))
+
+    def job(self, image: int) -> Job:
+        """An image by its number.
+
+        Raises:
+            RequestError: there is no such image.
+        """
+        if not 0 <= image < len(self.jobs):
+            raise RequestError(f"there is no image {image}; there are {len(self.jobs)}")
+        return self.jobs[image]
+
+    def request(self, values: Mapping[str, Any]) -> Request:
+        """The request of values, which hold in place of those at the start.
+
+        Raises:
+            KeyedError: they name a file that was not named at the start.
+        """
+        check_named(values, self.named)
+        return replace(self._request, config=dict(values), options={}, image={}, image_name="")
+
+    def develop(self, image: int, values: Mapping[str, Any], view: View) -> Developed:
+        """An image, developed as ``clpipe run`` does with a configuration of these values.
+
+        Args:
+            image: which of the jobs.
+            values: nested, as in a configuration file.
+            view: what of it.
+
+        Raises:
+            ClpipeError: as of a run.
+        """
+        start = time.perf_counter()
+        loaded, settings = self._loaded(image, values)
+        timings: list[Timing] = []
+        chain, result, launches = self._run(loaded, view, timings)
+        shown = self._shown(loaded, chain, result)
+        developed = time.perf_counter() - start
+        facts = {
+            "number": self._keep(loaded, chain, result),
+            "width": shown.shape[1],
+            "height": shown.shape[0],
+            "kind": chain.result.label,
+            "steps": _steps(settings, loaded.chain),
+            "camera": settings.camera,
+            "iso": chain.settings.iso,
+            "seed": chain.settings.seed,
+            "launches": _times(launches, timings),
+            "estimates": _finite(result.estimates),
+            "clipped": clipped_share(result, chain),
+            "warnings": list(loaded.source.warnings),
+            "seconds": developed,
+        }
+        return Developed(shown, facts)
+
+    def values_at(self, number: int, x: int, y: int) -> dict[str, Any]:
+        """The values of a pixel of an image that :meth:`develop` gave a short while ago.
+
+        Args:
+            number: of the image, among its facts.
+            x, y: the place, in px.
+
+        Raises:
+            RequestError: there is no such image any more, or no such pixel.
+        """
+        with self._lock:
+            sample = self._results.get(number)
+        if sample is None or not (
+            0 <= y < sample.image.shape[0] and 0 <= x < sample.image.shape[1]
+        ):
+            raise RequestError(f"there is no pixel {x}, {y} of image {number} any more")
+        found = np.atleast_1d(sample.image[y, x])
+        return {"values": [float(value) for value in found], "unit": sample.unit}
+
+    def noise(
+        self, image: int, values: Mapping[str, Any], view: View, box: tuple[int, int, int, int]
+    ) -> NoiseReport:
+        """The noise in a part of an image, against the truth of its development.
+
+        It is that of ``clpipe measure`` of these parts.
+
+        Args:
+            image, values, view: as for :meth:`develop`.
+            box: left, top, width and height in px; of a mosaic they are made even.
+
+        Raises:
+            ClpipeError: as of a run; or there is no noise, or the part is none of the image.
+        """
+        loaded, _ = self._loaded(image, values)
+        pair = []
+        for truth in ("", DEVELOPMENT):
+            chain, result, _ = self._run(loaded, View(view.step, truth), None)
+            picture = result.final if result.encoded is None else result.encoded
+            assert picture is not None
+            pair.append(_picture(truth or "picture", cut(picture, box), chain))
+        return measure(pair[:1], pair[1])
+
+    def _loaded(self, image: int, values: Mapping[str, Any]) -> tuple[LoadedImage, Settings]:
+        """An image with its chain, and the settings that are asked for it.
+
+        Raises:
+            ClpipeError: it cannot be read, or has no chain with these values.
+        """
+        job, request = self.job(image), self.request(values)
+        loader = ImageLoader(request).for_job(job)
+        try:
+            loaded = loader.enter(job, self._source(image, loader))
+        except (ImageError, MemoryError) as error:
+            raise ImageError(loader.error_text(job, error)) from None
+        if loaded is None:
+            raise ImageError(f"{job.path}: is not the image that this chain goes on from")
+        return loaded, loaded.chain.settings
+
+    def _source(self, image: int, loader: ImageLoader) -> SourceImage:
+        """An image's pixels, decoded once for all settings that read it in the same way."""
+        key = image, loader.reads, loader.reads_overscan, loader.settings.dump
+        with self._lock:
+            if key in self._sources:
+                self._sources.move_to_end(key)
+                return self._sources[key]
+        source = loader.read(self.jobs[image])
+        with self._lock:
+            self._sources[key] = source
+            while len(self._sources) > SOURCES:
+                self._sources.popitem(last=False)
+        return source
+
+    def _run(
+        self, loaded: LoadedImage, view: View, timings: list[Timing] | None
+    ) -> tuple[Chain, Result, Sequence[AnyLaunch]]:
+        """The chain of a view, what it makes of an image, and all launches of its plan.
+
+        Raises:
+            ClpipeError: the chain has no such step or truth, or the device fails.
+        """
+        chain = loaded.chain
+        if view.truth:
+            if view.truth not in PICTURES:
+                raise RequestError(f"found truth {view.truth!r}; it is {' or '.join(PICTURES)}")
+            chain = picture_without_noise(view.truth, chain)
+        if view.step:
+            chain = chain.through([chain.step_named(view.step).name])
+        pixels = loaded.source.pixels
+        key = noise_key(chain.settings, loaded.key)
+        with self._lock:
+            runner = self._runner(chain)
+            result = runner.submit(pixels, key, timings, unchanged=True)()
+            plan = runner.plan(
+                pixels.dtype == np.float16,
+                min(chain.size(*pixels.shape[1::-1])) > 1,
+                is_planar(pixels),
+            )
+        return chain, result, plan.launches
+
+    def _runner(self, chain: Chain) -> Runner:
+        """A runner of a chain, which shares plans with those before it."""
+        encode = chain.result is Kind.DISPLAY
+        if encode not in self._runners:
+            self._runners[encode] = Runner(chain, self.device, (), encode, not encode)
+        return self._runners[encode].of(chain)
+
+    @staticmethod
+    def _shown(loaded: LoadedImage, chain: Chain, result: Result) -> Array:
+        """A result as eight bits, turned as ``clpipe run`` turns it."""
+        image = result.image
+        if result.encoded is None:
+            image = encoded_light(signal_of(image, chain))
+        shown = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+        return upright(shown, OutputWriter.turn_of(loaded.source, chain))
+
+    def _keep(self, loaded: LoadedImage, chain: Chain, result: Result) -> int:
+        """Keep a result for questions about its values; its number."""
+        image = upright(result.image, OutputWriter.turn_of(loaded.source, chain))
+        unit = UNITS[chain.result] if result.encoded is None else "of 255"
+        with self._lock:
+            self._number += 1
+            self._results[self._number] = Sample(image, unit)
+            while len(self._results) > RESULTS:
+                self._results.popitem(last=False)
+            return self._number
+
+
+UNITS = {
+    Kind.RGB: "linear, 1 = full scale",
+    Kind.MOSAIC: "signal, 1 = white level",
+    Kind.RAW: "DN",
+    Kind.DISPLAY: "of 1",
+}
+
+
+def context_of(chain: Chain) -> Context:
+    """What a chain's steps say of the image that comes out."""
+    last = chain.steps[-1]
+    return last.method.after(last.context)
+
+
+def signal_of(image: Floats, chain: Chain) -> Floats:
+    """A result in which 0 is black and 1 is white: a raw in signal, others as they are."""
+    context = context_of(chain)
+    black, white = context.black_level, context.white_level
+    if chain.result is not Kind.RAW or black is None or white is None:
+        return image
+    return (image - np.float32(black)) / np.float32(white - black)
+
+
+def cut(image: Array, box: tuple[int, int, int, int]) -> Array:
+    """A part of an image, from left, top, width and height; of a mosaic, whole 2x2 cells.
+
+    >>> cut(np.arange(12).reshape(3, 4), (1, 0, 3, 3)).tolist()
+    [[0, 1], [4, 5]]
+
+    Raises:
+        RequestError: it is empty, or not all in the image.
+    """
+    left, top, width, height = box
+    if image.ndim == 2:
+        left, top, width, height = (size // 2 * 2 for size in box)
+    inside = (
+        0 <= left <= left + width <= image.shape[1] and 0 <= top <= top + height <= image.shape[0]
+    )
+    if not inside or width < 1 or height < 1:
+        raise RequestError(
+            f"the rectangle {box[2]}x{box[3]} at {box[0]}, {box[1]} is not in the image of "
+            f"{image.shape[1]}x{image.shape[0]} px, or is empty"
+        )
+    return image[top : top + height, left : left + width]
+
+
+def _picture(name: str, part: Array, chain: Chain) -> Picture:
+    """A part of a result as it is measured, as if it had been read from a file."""
+    from pathlib import Path
+
+    path, kind, context = Path(name), chain.result, context_of(chain)
+    if kind is Kind.DISPLAY:
+        step = 1 / 255
+        pixels = part.astype(np.float32) * np.float32(step)
+        return Picture(path, "display", pixels, black=0.0, white=1.0, step=step)
+    if kind is Kind.RGB:
+        return Picture(path, "rgb", part, white=1.0)
+    black, white = context.black_level, context.white_level
+    lowest = None if black is None or white is None else -black / (white - black)
+    return Picture(path, "mosaic", signal_of(part, chain), context.pattern, lowest, 1.0)
+
+
+def _steps(settings: Settings, chain: Chain) -> list[dict[str, Any]]:
+    """All steps, each with its method and the values that its parameters have."""
+    resolved = {step.name: step.method for step in chain.steps}
+    steps = steps_of(settings)
+    for step in steps:
+        method = resolved.get(step["name"])
+        asked = settings.method(step["name"]) if step["on"] else None
+        step["method"] = (asked or method or settings.method(step["name"])).method
+        step["values"] = method.model_dump(mode="json") if method else {}
+        step["here"] = method is not None
+        step["idle"] = method is None or not method.passes()
+    return steps
+
+
+def _finite(estimates: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
+    """Estimates that JSON can hold."""
+    return {
+        step: {name: value for name, value in found.items() if np.isfinite(value)}
+        for step, found in estimates.items()
+    }
+
+
+def _times(launches: Sequence[AnyLaunch], timings: Sequence[Timing]) -> list[dict[str, Any]]:
+    """The launches of a plan, each with its time in ms; None where it was not run again."""
+    seconds: dict[str, list[float]] = {}
+    for timing in timings:
+        if not timing.transfer:
+            seconds.setdefault(timing.name, []).append(timing.seconds)
+    return [
+        {"name": each.name, "ms": sum(found) * 1e3 if (found := seconds.get(each.name)) else None}
+        for each in launches
+    ]

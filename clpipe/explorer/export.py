@@ -1,0 +1,93 @@
+"""What a page's settings are elsewhere: a configuration, and the commands that use it."""
+
+import shlex
+from collections.abc import Mapping
+from os.path import commonpath
+from pathlib import Path
+from typing import Any
+
+from clpipe.chain.files import config_text
+from clpipe.chain.keys import KEYS
+from clpipe.chain.request import Request
+from clpipe.chain.toml import value_text
+from clpipe.explorer.explorer import Explorer
+from clpipe.images.pixels import USUAL_MAX_PIXELS
+from clpipe.inputs.find import Job
+
+OUT = "out"  # the output folder of the commands
+SAVED = "camera.toml"  # the name that a configuration is saved under
+
+
+def exported(explorer: Explorer, image: int, values: Mapping[str, Any]) -> dict[str, str]:
+    """Values as texts: "config", "command" for the image alone and "folder" for all beside it.
+
+    Raises:
+        ClpipeError: the values are not allowed.
+    """
+    request = explorer.request(values)
+    request.settings()
+    job, reading = explorer.job(image), _reading(request)
+    files = [Path(file) for file in request.stage_files]
+    loading = [part for file in files for part in ("--stage-file", str(file))]
+    saved, own = ["-c", SAVED], options_of(values)
+    roots = [root_of(each) for each in explorer.jobs]
+    return {
+        "config": config_text(values, files),
+        "command": run_command(input_of(job), reading + (saved if own is None else loading + own)),
+        "folder": run_command(Path(commonpath(roots) or "."), reading + saved),
+    }
+
+
+def run_command(source: Path, options: list[str]) -> str:
+    """A command of a shell that develops a file or a folder."""
+    return shlex.join(["clpipe", "run", str(source), "-o", OUT, *options])
+
+
+def root_of(job: Job) -> Path:
+    """The folder below which an image has its key."""
+    return job.path.parents[len(Path(job.key).parts) - 1]
+
+
+def input_of(job: Job) -> Path:
+    """What is given to ``clpipe run`` so that an image has the same key, and so the same noise.
+
+    >>> input_of(Job(Path("a/b.exr"), "b.exr")), input_of(Job(Path("a/left/b.exr"), "left/b.exr"))
+    (PosixPath('a/b.exr'), PosixPath('a'))
+    """
+    return job.path if job.key == job.path.name else root_of(job)
+
+
+def options_of(values: Mapping[str, Any]) -> list[str] | None:
+    """Nested values as options of ``clpipe run``; None where these cannot say them.
+
+    >>> options_of({"iso": 800.0, "skip": ["gamma"], "denoise": {"method": "mean", "radius": 2}})
+    ['--iso', '800', '--skip', 'gamma', '--set', 'denoise.method=mean', '--set', 'denoise.radius=2']
+    """
+    options: list[str] = []
+    for key, value in values.items():
+        option = f"--{key.replace('_', '-')}"
+        if key not in KEYS:
+            for name, each in value.items():
+                text = each if name == "method" and isinstance(each, str) else value_text(each)
+                options += ["--set", f"{key}.{name}={text}"]
+        elif isinstance(value, Mapping):
+            return None  # a draw
+        elif key == "stages":
+            options += [option, ",".join(value)]
+        elif key == "skip":
+            options += [part for name in value for part in (option, name)]
+        else:
+            options += [option, value if isinstance(value, str) else value_text(value)]
+    return options
+
+
+def _reading(request: Request) -> list[str]:
+    """The options of a request that say how images are read, and where they enter."""
+    own = {
+        "--start-at": request.start_at,
+        "--until": request.until,
+        "--layer": request.layer,
+        "--transfer": request.transfer,
+        "--max-pixels": None if request.max_pixels == USUAL_MAX_PIXELS else request.max_pixels,
+    }
+    return [str(part) for option, value in own.items() if value for part in (option, value)]

@@ -1,0 +1,54 @@
+"""Names of files in settings: a page may use those that the command line named, and no others."""
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
+
+from clpipe.base.errors import KeyedError
+from clpipe.camera.profile import built_in_name
+from clpipe.chain.methods import base_name
+from clpipe.chain.paths import file_parameters
+from clpipe.chain.registry import all_stages
+
+
+def files_in(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """The names of files in nested values, each after its dotted key; those of draws, too.
+
+    >>> list(files_in({"camera": "a.toml", "iso": 100, "tone_curve": {"path": "b.cube"}}))
+    [('camera', 'a.toml'), ('tone_curve.path', 'b.cube')]
+    >>> list(files_in({"camera": {"choice": ["sony-a7r2", "/b"]}}))
+    [('camera', '/b')]
+    """
+    for key, value in values.items():
+        stage = all_stages().get(base_name(key))
+        if key == "camera":
+            yield from ((key, name) for name in texts_in(value) if not built_in_name(name))
+        elif isinstance(value, Mapping) and stage:
+            for name in sorted(file_parameters(stage) & value.keys()):
+                yield from ((f"{key}.{name}", text) for text in texts_in(value[name]) if text)
+
+
+def texts_in(value: Any) -> Iterator[str]:
+    """The texts in a value, however deep."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping):
+        yield from texts_in(list(value.values()))
+    elif isinstance(value, list | tuple):
+        for each in value:
+            yield from texts_in(each)
+
+
+def check_named(values: Mapping[str, Any], named: Collection[str]) -> None:
+    """See that values name no files but those in ``named``.
+
+    Raises:
+        KeyedError: they do.
+    """
+    for key, name in files_in(values):
+        if name not in named:
+            what = "a built-in camera or a file" if key == "camera" else "a file"
+            raise KeyedError(
+                key,
+                f"{key}: found {name!r}; a page may name {what} that clpipe explore was started "
+                "with, and no other",
+            )

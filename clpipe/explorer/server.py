@@ -1,0 +1,215 @@
+"""The page and what it asks for, on this machine alone and below an address that nobody guesses."""
+
+import json
+import secrets
+import socket
+import struct
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from importlib import resources
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Mount, Route
+
+from clpipe.analysis.svg import noise_svg
+from clpipe.base.errors import ClpipeError, KeyedError, RequestError
+from clpipe.explorer.controls import (
+    camera_controls,
+    default_stages,
+    parameters_of,
+    stage_controls,
+)
+from clpipe.explorer.explorer import Explorer, View
+from clpipe.explorer.export import SAVED, exported
+from clpipe.images.encoding import Output
+
+HOST = "127.0.0.1"
+LONGEST = 1 << 20  # bytes of a question
+FILES = {"": "text/html", "explore.css": "text/css", "explore.js": "text/javascript"}
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; connect-src 'self'; "
+    "style-src 'self' 'unsafe-inline'; "  # Matplotlib's drawings have styles
+    "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+}
+
+Answer = Callable[[Mapping[str, Any]], Response]
+
+
+class Server:
+    """Serves an explorer to browsers on this machine.
+
+    Args:
+        explorer: what develops.
+        port: 0 takes a free one.
+
+    Raises:
+        RequestError: the port is in use, or may not be used.
+    """
+
+    def __init__(self, explorer: Explorer, port: int = 0) -> None:
+        self._explorer = explorer
+        token = secrets.token_urlsafe(16)
+        self._socket = socket.socket()
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            self._socket.bind((HOST, port))
+            self._socket.listen()
+        except OSError as error:
+            self._socket.close()
+            raise RequestError(
+                f"--port {port}: cannot be used: {error.strerror}; choose another, or leave it out"
+            ) from None
+        self.address = f"http://{HOST}:{self._socket.getsockname()[1]}/{token}/"
+        config = uvicorn.Config(
+            self._app(token),
+            log_level="error",
+            access_log=False,
+            server_header=False,
+            lifespan="off",
+            timeout_graceful_shutdown=1,
+        )
+        self._server = uvicorn.Server(config)
+
+    def run(self) -> None:
+        """Answer until :meth:`stop`, or Ctrl-C."""
+        with suppress(KeyboardInterrupt):
+            self._server.run(sockets=[self._socket])
+
+    def stop(self) -> None:
+        """Have :meth:`run` return."""
+        self._server.should_exit = True
+
+    def _app(self, token: str) -> Starlette:
+        answers: dict[str, Answer] = {
+            "start": self._start,
+            "develop": self._develop,
+            "values": self._values,
+            "noise": self._noise,
+            "export": self._export,
+        }
+        routes = [
+            *(Route(f"/{name}", page_file(name)) for name in FILES),
+            *(
+                Route(f"/{name}", asked(answer), methods=["POST"])
+                for name, answer in answers.items()
+            ),
+        ]
+        hosts = Middleware(TrustedHostMiddleware, allowed_hosts=[HOST, "localhost"])
+        return Starlette(routes=[Mount(f"/{token}", routes=routes)], middleware=[hosts])
+
+    def _start(self, question: Mapping[str, Any]) -> Response:
+        """What does not change: the images, the controls, and the values to begin with."""
+        explorer = self._explorer
+        device = explorer.device
+        return JSONResponse(
+            {
+                "images": [job.key for job in explorer.jobs],
+                "values": explorer.initial,
+                "stages": stage_controls(),
+                "output": parameters_of(Output),
+                "cameras": camera_controls(explorer.cameras),
+                "chain": default_stages(),
+                "device": device.info.label if device else "NumPy",
+                "saved": SAVED,
+            },
+            headers=HEADERS,
+        )
+
+    def _develop(self, question: Mapping[str, Any]) -> Response:
+        """The facts of an image and its pixels: the length of the JSON in four bytes, JSON, RGB."""
+        developed = self._explorer.develop(*subject(question))
+        facts = json.dumps(developed.facts, allow_nan=False).encode()
+        body = struct.pack("<I", len(facts)) + facts + developed.pixels.tobytes()
+        return Response(body, media_type="application/octet-stream", headers=HEADERS)
+
+    def _values(self, question: Mapping[str, Any]) -> Response:
+        number, x, y = whole_numbers(question, "number", "x", "y")
+        return JSONResponse(self._explorer.values_at(number, x, y), headers=HEADERS)
+
+    def _noise(self, question: Mapping[str, Any]) -> Response:
+        left, top, width, height = whole_numbers(question, "left", "top", "width", "height")
+        report = self._explorer.noise(*subject(question), (left, top, width, height))
+        return JSONResponse({"report": report.record(), "svg": noise_svg(report)}, headers=HEADERS)
+
+    def _export(self, question: Mapping[str, Any]) -> Response:
+        image, values, _ = subject(question)
+        return JSONResponse(exported(self._explorer, image, values), headers=HEADERS)
+
+
+def page_file(name: str) -> Callable[[Request], Response]:
+    """What answers with a file of the page."""
+    text = (resources.files("clpipe.explorer") / "page" / (name or "explore.html")).read_text(
+        "utf-8"
+    )
+
+    def answer(_: Request) -> Response:
+        return Response(text, media_type=FILES[name], headers=HEADERS)
+
+    return answer
+
+
+def asked(answer: Answer) -> Callable[[Request], Any]:
+    """What answers a question in JSON; errors are JSON, too, with the key that they are about."""
+
+    async def respond(request: Request) -> Response:
+        body = b""
+        async for part in request.stream():
+            body += part
+            if len(body) > LONGEST:
+                return problem(f"the question is longer than {LONGEST} bytes", status=413)
+        try:
+            question = json.loads(body or b"{}")
+            if not isinstance(question, dict):
+                raise ValueError("expected an object")
+        except ValueError as error:
+            return problem(f"the question is no JSON: {error}")
+        try:
+            return await run_in_threadpool(answer, question)
+        except ClpipeError as error:
+            return problem(str(error), error.key if isinstance(error, KeyedError) else "")
+
+    return respond
+
+
+def problem(text: str, key: str = "", status: int = 400) -> Response:
+    """An error as the page shows it."""
+    return JSONResponse({"error": text, "key": key}, status_code=status, headers=HEADERS)
+
+
+def subject(question: Mapping[str, Any]) -> tuple[int, Mapping[str, Any], View]:
+    """What a question is about: the image, the values, the view.
+
+    Raises:
+        RequestError: it does not say them.
+    """
+    (image,) = whole_numbers(question, "image")
+    values, step, truth = (
+        question.get("values"),
+        question.get("step", ""),
+        question.get("truth", ""),
+    )
+    if not isinstance(values, dict) or not isinstance(step, str) or not isinstance(truth, str):
+        raise RequestError("the question says no values, or no view")
+    return image, values, View(step, truth)
+
+
+def whole_numbers(question: Mapping[str, Any], *names: str) -> tuple[int, ...]:
+    """Whole numbers of a question, by their names.
+
+    Raises:
+        RequestError: one is missing, or is of another type.
+    """
+    found = tuple(question.get(name) for name in names)
+    if not all(type(value) is int for value in found):
+        raise RequestError(f"the question says no whole numbers {', '.join(names)}")
+    return tuple(value for value in found if isinstance(value, int))

@@ -1,0 +1,348 @@
+"""``clpipe explore``: what its server answers, and what its page does in a browser."""
+
+import http.client
+import json
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import closing
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from clpipe.base.errors import ClpipeError, KeyedError, RequestError
+from clpipe.chain.request import Request
+from clpipe.chain.settings import Settings, overlay
+from clpipe.commands.main import main
+from clpipe.engine.device import open_device
+from clpipe.images.write import write_exr as write
+from clpipe.inputs.find import find_jobs
+from tests.conftest import ROOT
+
+pytest.importorskip("starlette")
+
+from clpipe.explorer.explorer import Explorer, View
+from clpipe.explorer.export import exported, options_of
+from clpipe.explorer.server import Server
+
+NOISY = {
+    "iso": 6400,
+    "seed": 3,
+    "skip": ["sharpen"],
+    "denoise": {"luma_strength": 0.5},
+    "white_balance": {"method": "gray_world"},
+    "output": {"jpeg_quality": 80},
+}
+
+
+@pytest.fixture(scope="module")
+def renders(tmp_path_factory):
+    """Two small renders, one of them in a folder of the folder."""
+    folder = tmp_path_factory.mktemp("explore") / "renders"
+    (folder / "left").mkdir(parents=True)
+    y, x = np.mgrid[0:63, 0:96] / 96
+    for i, name in enumerate(("a", "left/b")):
+        picture = np.stack([0.2 + 0.5 * x, 0.6 - 0.5 * y, 0.3 + 0.2 * np.sin(9 * x + i)], -1)
+        write(folder / f"{name}.exr", picture.astype(np.float32), ("R", "G", "B"), {})
+    return folder
+
+
+def explorer_of(*inputs, device=None, **options) -> Explorer:
+    jobs = find_jobs([str(each) for each in inputs], Path("nowhere"))
+    return Explorer(jobs, Request.from_options(**options), open_device(device))
+
+
+@pytest.fixture(scope="module")
+def explorer(renders):
+    return explorer_of(renders)
+
+
+def clpipe(*arguments) -> str:
+    result = CliRunner().invoke(main, [str(each) for each in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("image", [0, 1])
+def test_what_is_seen_is_what_run_makes_of_the_configuration_and_of_the_command(
+    explorer, renders, tmp_path, monkeypatch, image
+):
+    monkeypatch.chdir(tmp_path)
+    seen = explorer.develop(image, NOISY, View())
+    texts = exported(explorer, image, NOISY)
+    Path("camera.toml").write_text(texts["config"], "utf-8")
+    for name in ("folder", "command"):
+        _, *command = shlex.split(texts[name])
+        clpipe(*command, "--format", "png", "--quiet")
+        made = np.asarray(Image.open(f"out/{('a', 'left/b')[image]}.png"))
+        np.testing.assert_array_equal(made, seen.pixels)
+        shutil.rmtree("out")
+
+
+def test_the_jpeg_of_a_saved_configuration_is_that_of_its_command_byte_for_byte(
+    explorer, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    texts = exported(explorer, 0, NOISY)
+    Path("camera.toml").write_text(texts["config"], "utf-8")
+    jpegs = []
+    for name in ("folder", "command"):
+        _, *command = shlex.split(texts[name])
+        clpipe(*command, "--quiet")
+        jpegs.append(Path("out/a.jpg").read_bytes())
+        shutil.rmtree("out")
+    assert jpegs[0] == jpegs[1]
+
+
+def test_options_are_the_same_settings(renders):
+    options = options_of(
+        NOISY | {"lens": "a b", "noise_key": "it's", "stages": ["mosaic", "demosaic"]}
+    )
+    text = ["run", str(renders), "-o", "out", *options]
+    context = main.get_command(None, "run").make_context("run", text[1:])
+    params = context.params
+    own = {"iso": 6400, "seed": 3, "noise_key": "it's", "lens": "a b"}
+    assert params["isos"] == "6400"
+    assert {k: params[k] for k in ("seed", "noise_key", "lens")} == {
+        k: own[k] for k in ("seed", "noise_key", "lens")
+    }
+    assert params["stages"] == "mosaic,demosaic"
+    given = Request.from_options(
+        iso=6400.0, seed=3, skip=params["skip"], assignments=params["assignments"]
+    )
+    assert given.settings() == overlay(Settings(), NOISY)
+
+
+def test_what_is_drawn_is_saved_as_a_draw_and_seen_as_run_draws_it(renders, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    drawn = {"iso": {"choice": [400, 3200]}, "denoise": {"luma_strength": {"uniform": [0, 1]}}}
+    Path("own.toml").write_text(
+        "iso = { choice = [400, 3200] }\n[denoise]\nluma_strength = { uniform = [0, 1] }\n"
+    )
+    explorer = explorer_of(renders / "a.exr", config="own.toml", device="numpy")
+    assert explorer.initial == drawn
+    seen = explorer.develop(0, explorer.initial, View())
+    texts = exported(explorer, 0, explorer.initial)
+    Path("camera.toml").write_text(texts["config"], "utf-8")
+    _, *command = shlex.split(texts["command"])
+    assert "-c" in command
+    clpipe(*command, "--format", "png", "--quiet", "--device", "numpy")
+    np.testing.assert_array_equal(np.asarray(Image.open("out/a.png")), seen.pixels)
+
+
+def test_noise_of_all_of_a_picture_is_that_of_measure(explorer, renders, tmp_path):
+    out = tmp_path / "out"
+    options = ["--iso", 6400, "--truth", "development", "--truth", "mosaic", "--format", "png"]
+    clpipe("run", renders / "a.exr", "-o", out, *options, "--keep", "normalize", "--quiet")
+    pairs = {"": ("a.png", "a.truth.png"), "normalize": ("a.normalize.exr", "a.truth_mosaic.exr")}
+    for step, (picture, truth) in pairs.items():
+        box = (0, 0, 96, 63)
+        report = explorer.noise(0, {"iso": 6400}, View(step), box)
+        said = json.loads(clpipe("measure", out / picture, "--truth", out / truth, "--json"))
+        own = report.record()
+        assert own["channels"].keys() == said["channels"].keys()
+        for name, channel in own["channels"].items():
+            if step == "":  # a mosaic of an odd height is cut to whole cells
+                assert channel == said["channels"][name]
+            assert channel["sigma"] == pytest.approx(said["channels"][name]["sigma"], rel=0.05)
+
+
+def test_views_are_stages_and_truths_and_their_values(explorer):
+    raw = explorer.develop(0, {"iso": 6400}, View("quantize"))
+    assert raw.facts["kind"] == "raw"
+    said = explorer.values_at(raw.facts["number"], 5, 7)
+    assert said["unit"] == "DN"
+    assert said["values"] == [round(said["values"][0])]
+    clean = explorer.develop(0, {"iso": 6400}, View(truth="clean"))
+    other = explorer.develop(0, {"iso": 6400, "seed": 9}, View(truth="clean"))
+    np.testing.assert_array_equal(clean.pixels, other.pixels)
+    noisy = explorer.develop(0, {"iso": 6400}, View())
+    assert (noisy.pixels != clean.pixels).mean() > 0.5
+    assert explorer.values_at(noisy.facts["number"], 5, 7)["values"] == noisy.pixels[7, 5].tolist()
+    with pytest.raises(RequestError, match="no pixel"):
+        explorer.values_at(noisy.facts["number"], 96, 0)
+
+
+def test_steps_say_what_is_on_and_which_values_follow(explorer):
+    steps = {step["name"]: step for step in explorer.develop(0, NOISY, View()).facts["steps"]}
+    assert not steps["sharpen"]["on"]
+    assert steps["sharpen"]["idle"]
+    assert steps["denoise"]["values"]["luma_strength"] == 0.5
+    assert steps["sensor_noise"]["values"]["a"] > 0
+    assert steps["white_balance"]["method"] == "gray_world"
+
+
+def test_a_page_may_switch_on_what_the_command_line_skipped(renders):
+    explorer = explorer_of(renders, skip=["sharpen"], device="numpy")
+    assert explorer.initial == {"skip": ["sharpen"]}
+    on = explorer.develop(0, {}, View()).facts["steps"]
+    assert {step["name"]: step["on"] for step in on}["sharpen"]
+
+
+@pytest.mark.parametrize(
+    ("values", "key"),
+    [
+        ({"camera": "/etc/passwd.toml"}, "camera"),
+        ({"camera": {"choice": ["sony-a7r2", "other.toml"]}}, "camera"),
+        ({"tone_curve": {"method": "file", "path": "/etc/passwd"}}, "tone_curve.path"),
+        ({"stage_files": ["/tmp/a.py"]}, "stage_files"),
+        ({"iso": -1}, ""),
+        ({"denoise": {"luma_strength": -1}}, "denoise.luma_strength"),
+        ({"denoise": {"x": 1}}, "denoise.x"),
+        ({"no_such": 1}, "no_such"),
+    ],
+)
+def test_values_that_are_not_allowed_are_refused_with_their_key(explorer, values, key):
+    with pytest.raises(ClpipeError) as refused:
+        explorer.develop(0, values, View())
+    assert (refused.value.key if isinstance(refused.value, KeyedError) else "") == key
+
+
+def test_files_that_were_named_may_be_used(renders, tmp_path):
+    profile = tmp_path / "own.toml"
+    built_in = ROOT / "clpipe/camera/profiles/sony-a7r2.toml"
+    profile.write_text(built_in.read_text("utf-8"), "utf-8")
+    explorer = explorer_of(renders, camera=str(profile), device="numpy")
+    assert explorer.cameras == (str(profile),)
+    explorer.develop(0, {"camera": str(profile)}, View())
+    assert f'camera = "{profile}"' in exported(explorer, 0, explorer.initial)["config"]
+
+
+@pytest.mark.parametrize(
+    ("box", "says"), [((90, 0, 10, 5), "not in the image"), ((0, 0, 0, 5), "empty")]
+)
+def test_a_rectangle_that_is_not_in_the_picture_is_refused(explorer, box, says):
+    with pytest.raises(RequestError, match=says):
+        explorer.noise(0, {}, View(), box)
+
+
+def test_a_manifest_is_refused(renders, tmp_path):
+    manifest = tmp_path / "list.csv"
+    manifest.write_text(f"path,iso\n{renders / 'a.exr'},800\n")
+    result = CliRunner().invoke(main, ["explore", str(manifest), "--device", "numpy"])
+    assert result.exit_code == 2
+    assert "rows may have settings of their own" in result.output
+
+
+# The server.
+
+
+@pytest.fixture(scope="module")
+def served(explorer):
+    server = Server(explorer)
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    yield server.address
+    server.stop()
+    thread.join(10)
+    assert not thread.is_alive()
+
+
+def answer(address, name, question=None, host=None, token=None):
+    """The status, the headers and the body of an answer."""
+    parts = urlsplit(address)
+    body = None if question is None else json.dumps(question)
+    path = f"/{token}/" if token is not None else parts.path
+    headers = {"Host": host} if host else {}
+    with closing(http.client.HTTPConnection(parts.hostname, parts.port, timeout=60)) as connection:
+        connection.request("GET" if body is None else "POST", path + name, body, headers)
+        response = connection.getresponse()
+        return response.status, response.headers, response.read()
+
+
+def test_the_server_answers_with_pixels(served, explorer):
+    question = {"image": 0, "values": NOISY, "step": "", "truth": ""}
+    status, _, body = answer(served, "develop", question)
+    assert status == 200
+    length = int.from_bytes(body[:4], "little")
+    facts = json.loads(body[4 : 4 + length])
+    pixels = np.frombuffer(body[4 + length :], np.uint8).reshape(facts["height"], facts["width"], 3)
+    np.testing.assert_array_equal(pixels, explorer.develop(0, NOISY, View()).pixels)
+    ran = [launch for launch in facts["launches"] if launch["ms"] is not None]
+    assert ran
+    assert all(launch["ms"] > 0 for launch in ran)
+
+
+def test_nobody_without_the_token_gets_an_answer(served):
+    assert answer(served, "")[0] == 200
+    for token in ("", "x", "..", "%2e%2e"):
+        assert answer(served, "", token=token)[0] == 404
+        assert answer(served, "start", {}, token=token)[0] == 404
+    for name in ("../../pyproject.toml", "%2e%2e/server.py", "/etc/passwd", "explore.html"):
+        assert answer(served, name)[0] == 404
+
+
+def test_another_host_name_is_refused(served):
+    """So no page elsewhere can have its own name lead here."""
+    assert answer(served, "", host="evil.example")[0] == 400
+
+
+def test_the_page_may_load_nothing_from_elsewhere(served):
+    headers = answer(served, "")[1]
+    assert "default-src 'none'" in headers["Content-Security-Policy"]
+    assert headers["Referrer-Policy"] == "no-referrer"
+    assert "Access-Control-Allow-Origin" not in headers
+
+
+@pytest.mark.parametrize(
+    ("name", "question", "says"),
+    [
+        ("develop", [], "no JSON"),
+        ("develop", {}, "whole numbers image"),
+        ("develop", {"image": 7, "values": {}}, "no image 7"),
+        ("develop", {"image": 0, "values": []}, "no values"),
+        ("develop", {"image": 0, "values": {}, "step": "x"}, "stage in this chain"),
+        ("develop", {"image": 0, "values": {}, "truth": "x"}, "development or clean"),
+        ("values", {"number": 0, "x": 1.5, "y": 0}, "whole numbers"),
+        ("noise", {"image": 0, "values": {}}, "whole numbers left"),
+        ("export", {"image": -1, "values": {}}, "no image -1"),
+        ("export", {"image": 0, "values": {"x": "y" * (1 << 20)}}, "longer than"),
+    ],
+)
+def test_a_wrong_question_gets_one_message(served, name, question, says):
+    status, _, body = answer(served, name, question)
+    assert status in (400, 413)
+    assert says in json.loads(body)["error"]
+
+
+def test_two_explorers_at_once(served, renders):
+    other = Server(explorer_of(renders / "a.exr", device="numpy"))
+    thread = threading.Thread(target=other.run, daemon=True)
+    thread.start()
+    try:
+        for address, count in ((served, 2), (other.address, 1)):
+            assert len(json.loads(answer(address, "start", {})[2])["images"]) == count
+    finally:
+        other.stop()
+        thread.join(10)
+
+
+def test_a_port_in_use_is_said(renders):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        command = ["explore", str(renders), "--device", "numpy", "--port", port]
+        result = CliRunner().invoke(main, command)
+    assert result.exit_code == 2
+    assert f"--port {port}: cannot be used: Address already in use" in result.output
+
+
+def test_ctrl_c_ends_it_quietly(renders):
+    command = [sys.executable, "-m", "clpipe", "explore", str(renders), "--device", "numpy"]
+    with subprocess.Popen(command, stdout=-1, stderr=-1, text=True) as process:
+        line = process.stdout.readline()
+        assert "http://127.0.0.1:" in line
+        address = next(word for word in line.split() if word.startswith("http"))
+        assert answer(address, "")[0] == 200
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=20)
+    assert (process.returncode, errors) == (0, "")
