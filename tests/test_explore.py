@@ -83,7 +83,7 @@ def test_what_is_seen_is_what_run_makes_of_the_configuration_and_of_the_command(
         _, *command = shlex.split(texts[name])
         clpipe(*command, "--format", "png", "--quiet")
         made = np.asarray(Image.open(f"out/{('a', 'left/b')[image]}.png"))
-        np.testing.assert_array_equal(made, seen.pixels)
+        np.testing.assert_array_equal(made, seen.shown)
         shutil.rmtree("out")
 
 
@@ -135,7 +135,7 @@ def test_what_is_drawn_is_saved_as_a_draw_and_seen_as_run_draws_it(renders, tmp_
     _, *command = shlex.split(texts["command"])
     assert "-c" in command
     clpipe(*command, "--format", "png", "--quiet", "--device", "numpy")
-    np.testing.assert_array_equal(np.asarray(Image.open("out/a.png")), seen.pixels)
+    np.testing.assert_array_equal(np.asarray(Image.open("out/a.png")), seen.shown)
 
 
 def test_noise_of_all_of_a_picture_is_that_of_measure(explorer, renders, tmp_path):
@@ -163,10 +163,10 @@ def test_views_are_stages_and_truths_and_their_values(explorer):
     assert said["values"] == [round(said["values"][0])]
     clean = explorer.develop(0, {"iso": 6400}, View(truth="clean"))
     other = explorer.develop(0, {"iso": 6400, "seed": 9}, View(truth="clean"))
-    np.testing.assert_array_equal(clean.pixels, other.pixels)
+    np.testing.assert_array_equal(clean.shown, other.shown)
     noisy = explorer.develop(0, {"iso": 6400}, View())
-    assert (noisy.pixels != clean.pixels).mean() > 0.5
-    assert explorer.values_at(noisy.facts["number"], 5, 7)["values"] == noisy.pixels[7, 5].tolist()
+    assert (noisy.shown != clean.shown).mean() > 0.5
+    assert explorer.values_at(noisy.facts["number"], 5, 7)["values"] == noisy.shown[7, 5].tolist()
     with pytest.raises(RequestError, match="no pixel"):
         explorer.values_at(noisy.facts["number"], 96, 0)
 
@@ -258,14 +258,29 @@ def answer(address, name, question=None, host=None, token=None):
         return response.status, response.headers, response.read()
 
 
-def test_the_server_answers_with_pixels(served, explorer):
-    question = {"image": 0, "values": NOISY, "step": "", "truth": ""}
-    status, _, body = answer(served, "develop", question)
-    assert status == 200
+def pixels_of(found):
+    """The facts and the pixels of an answer."""
+    status, _, body = found
+    assert status == 200, body
     length = int.from_bytes(body[:4], "little")
     facts = json.loads(body[4 : 4 + length])
-    pixels = np.frombuffer(body[4 + length :], np.uint8).reshape(facts["height"], facts["width"], 3)
-    np.testing.assert_array_equal(pixels, explorer.develop(0, NOISY, View()).pixels)
+    shape = facts["part"]["rows"], facts["part"]["columns"], 3
+    return facts, np.frombuffer(body[4 + length :], np.uint8).reshape(shape)
+
+
+def test_the_server_answers_with_pixels(served, explorer):
+    part = {"left": 10, "top": 20, "width": 30, "height": 500, "by": 1}
+    question = {"image": 0, "values": NOISY, "step": "", "truth": ""}
+    facts, first = pixels_of(answer(served, "develop", question | part))
+    shown = explorer.develop(0, NOISY, View()).shown
+    np.testing.assert_array_equal(first, shown[20:, 10:40])
+    _, whole = pixels_of(answer(served, "pixels", {"number": facts["number"]}))
+    np.testing.assert_array_equal(whole, shown)
+    _, small = pixels_of(answer(served, "develop", question | part | {"by": 4}))
+    assert small.shape == (11, 8, 3)
+    assert abs(small.mean() - first.mean()) < 2
+    _, none = pixels_of(answer(served, "develop", question | part | {"left": 1000, "by": 0}))
+    assert none.size == 0
     ran = [launch for launch in facts["launches"] if launch["ms"] is not None]
     assert ran
     assert all(launch["ms"] > 0 for launch in ran)

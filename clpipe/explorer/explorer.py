@@ -35,7 +35,7 @@ from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Context, Kind
 
 SOURCES = 2  # images that stay decoded
-RESULTS = 3  # images whose values can still be asked for
+SAMPLES = 3  # of what was made, that can still be asked for
 AT_START = (
     "camera",
     "iso",
@@ -57,22 +57,17 @@ class View:
 
 
 @dataclass(frozen=True)
-class Developed:
-    """An image as it is shown, and what is said of it.
-
-    ``pixels`` is (height, width, 3) uint8; ``facts`` are JSON values.
-    """
-
-    pixels: Array
-    facts: dict[str, Any]
-
-
-@dataclass(frozen=True)
 class Sample:
-    """A result whose values can be asked for, turned as it is shown."""
+    """What was made of an image, turned as ``clpipe run`` turns it.
+
+    ``image`` has its values, of which ``unit`` is the unit; ``shown`` is (height, width, 3) uint8,
+    as it is looked at. ``facts`` are what is said of it, as JSON values.
+    """
 
     image: Array
     unit: str
+    shown: Array
+    facts: Mapping[str, Any]
 
 
 class Explorer:
@@ -101,7 +96,7 @@ class Explorer:
         self._lock = threading.Lock()
         self._sources: OrderedDict[Any, SourceImage] = OrderedDict()
         self._runners: dict[bool, Runner] = {}
-        self._results: OrderedDict[int, Sample] = OrderedDict()
+        self._samples: OrderedDict[int, Sample] = OrderedDict()
         self._number = 0
 
     @property
@@ -150,7 +145,7 @@ class Explorer:
         check_named(values, self.named)
         return replace(self._request, config=dict(values), options={}, image={}, image_name="")
 
-    def develop(self, image: int, values: Mapping[str, Any], view: View) -> Developed:
+    def develop(self, image: int, values: Mapping[str, Any], view: View) -> Sample:
         """An image, developed as ``clpipe run`` does with a configuration of these values.
 
         Args:
@@ -165,10 +160,9 @@ class Explorer:
         loaded, settings = self._loaded(image, values)
         timings: list[Timing] = []
         chain, result, launches = self._run(loaded, view, timings)
-        shown = self._shown(loaded, chain, result)
-        developed = time.perf_counter() - start
+        turn = OutputWriter.turn_of(loaded.source, chain)
+        shown = upright(_shown(chain, result), turn)
         facts = {
-            "number": self._keep(loaded, chain, result),
             "width": shown.shape[1],
             "height": shown.shape[0],
             "kind": chain.result.label,
@@ -176,30 +170,51 @@ class Explorer:
             "camera": settings.camera,
             "iso": chain.settings.iso,
             "seed": chain.settings.seed,
-            "launches": _times(launches, timings),
+            "launches": _times(launches, timings) if self.device else [],
             "estimates": _finite(result.estimates),
             "clipped": clipped_share(result, chain),
             "warnings": list(loaded.source.warnings),
-            "seconds": developed,
+            "seconds": time.perf_counter() - start,
         }
-        return Developed(shown, facts)
+        is_shown = result.encoded is not None
+        unit = "of 255" if is_shown else UNITS[chain.result]
+        with self._lock:
+            self._number += 1
+            values_of = shown if is_shown else upright(result.image, turn)
+            sample = Sample(values_of, unit, shown, facts | {"number": self._number})
+            self._samples[self._number] = sample
+            while len(self._samples) > SAMPLES:
+                self._samples.popitem(last=False)
+        return sample
 
-    def values_at(self, number: int, x: int, y: int) -> dict[str, Any]:
-        """The values of a pixel of an image that :meth:`develop` gave a short while ago.
+    def sample(self, number: int) -> Sample:
+        """What :meth:`develop` gave a short while ago.
 
         Args:
-            number: of the image, among its facts.
+            number: of it, among its facts.
+
+        Raises:
+            RequestError: it is not kept any more.
+        """
+        with self._lock:
+            if number not in self._samples:
+                raise RequestError(f"image {number} is not kept any more; ask for it again")
+            return self._samples[number]
+
+    def values_at(self, number: int, x: int, y: int) -> dict[str, Any]:
+        """The values of a pixel of what :meth:`develop` gave a short while ago.
+
+        Args:
+            number: of it, among its facts.
             x, y: the place, in px.
 
         Raises:
-            RequestError: there is no such image any more, or no such pixel.
+            RequestError: it is not kept any more, or has no such pixel.
         """
-        with self._lock:
-            sample = self._results.get(number)
-        if sample is None or not (
-            0 <= y < sample.image.shape[0] and 0 <= x < sample.image.shape[1]
-        ):
-            raise RequestError(f"there is no pixel {x}, {y} of image {number} any more")
+        sample = self.sample(number)
+        height, width = sample.image.shape[:2]
+        if not (0 <= y < height and 0 <= x < width):
+            raise RequestError(f"there is no pixel {x}, {y} in {width}x{height}")
         found = np.atleast_1d(sample.image[y, x])
         return {"values": [float(value) for value in found], "unit": sample.unit}
 
@@ -290,26 +305,6 @@ class Explorer:
             self._runners[encode] = Runner(chain, self.device, (), encode, not encode)
         return self._runners[encode].of(chain)
 
-    @staticmethod
-    def _shown(loaded: LoadedImage, chain: Chain, result: Result) -> Array:
-        """A result as eight bits, turned as ``clpipe run`` turns it."""
-        image = result.image
-        if result.encoded is None:
-            image = encoded_light(signal_of(image, chain))
-        shown = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
-        return upright(shown, OutputWriter.turn_of(loaded.source, chain))
-
-    def _keep(self, loaded: LoadedImage, chain: Chain, result: Result) -> int:
-        """Keep a result for questions about its values; its number."""
-        image = upright(result.image, OutputWriter.turn_of(loaded.source, chain))
-        unit = UNITS[chain.result] if result.encoded is None else "of 255"
-        with self._lock:
-            self._number += 1
-            self._results[self._number] = Sample(image, unit)
-            while len(self._results) > RESULTS:
-                self._results.popitem(last=False)
-            return self._number
-
 
 UNITS = {
     Kind.RGB: "linear, 1 = full scale",
@@ -317,6 +312,14 @@ UNITS = {
     Kind.RAW: "DN",
     Kind.DISPLAY: "of 1",
 }
+
+
+def _shown(chain: Chain, result: Result) -> Array:
+    """A result as eight bits, (height, width, 3)."""
+    image = result.image
+    if result.encoded is None:
+        image = encoded_light(signal_of(image, chain))
+    return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
 
 def context_of(chain: Chain) -> Context:

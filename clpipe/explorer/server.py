@@ -9,6 +9,7 @@ from contextlib import suppress
 from importlib import resources
 from typing import Any
 
+import numpy as np
 import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -20,6 +21,7 @@ from starlette.routing import Mount, Route
 
 from clpipe.analysis.svg import noise_svg
 from clpipe.base.errors import ClpipeError, KeyedError, RequestError
+from clpipe.base.types import Array
 from clpipe.explorer.controls import (
     camera_controls,
     default_stages,
@@ -29,9 +31,11 @@ from clpipe.explorer.controls import (
 from clpipe.explorer.explorer import Explorer, View
 from clpipe.explorer.export import SAVED, exported
 from clpipe.images.encoding import Output
+from clpipe.images.preview import reduced
 
 HOST = "127.0.0.1"
 LONGEST = 1 << 20  # bytes of a question
+MOST = 1 << 20  # px a side, more than a picture has
 FILES = {"": "text/html", "explore.css": "text/css", "explore.js": "text/javascript"}
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; connect-src 'self'; "
@@ -93,6 +97,7 @@ class Server:
         answers: dict[str, Answer] = {
             "start": self._start,
             "develop": self._develop,
+            "pixels": self._pixels,
             "values": self._values,
             "noise": self._noise,
             "export": self._export,
@@ -126,11 +131,24 @@ class Server:
         )
 
     def _develop(self, question: Mapping[str, Any]) -> Response:
-        """The facts of an image and its pixels: the length of the JSON in four bytes, JSON, RGB."""
-        developed = self._explorer.develop(*subject(question))
-        facts = json.dumps(developed.facts, allow_nan=False).encode()
-        body = struct.pack("<I", len(facts)) + facts + developed.pixels.tobytes()
-        return Response(body, media_type="application/octet-stream", headers=HEADERS)
+        """What is made of an image: facts, and the part of it that is on the screen, made smaller.
+
+        A browser takes longer to receive a whole picture than clpipe to develop it.
+        """
+        sample = self._explorer.develop(*subject(question))
+        left, top, width, height, by = whole_numbers(
+            question, "left", "top", "width", "height", "by"
+        )
+        left, top = min(max(left, 0), MOST), min(max(top, 0), MOST)
+        part = sample.shown[top : top + max(height, 0), left : left + max(width, 0)]
+        small = reduced(np.ascontiguousarray(part), min(max(by, 1), 64)) if part.size else part
+        place = {"left": left, "top": top, "width": part.shape[1], "height": part.shape[0]}
+        return with_pixels(sample.facts, small, place)
+
+    def _pixels(self, question: Mapping[str, Any]) -> Response:
+        """All of what was made."""
+        (number,) = whole_numbers(question, "number")
+        return with_pixels({}, self._explorer.sample(number).shown, {})
 
     def _values(self, question: Mapping[str, Any]) -> Response:
         number, x, y = whole_numbers(question, "number", "x", "y")
@@ -179,6 +197,18 @@ def asked(answer: Answer) -> Callable[[Request], Any]:
             return problem(str(error), error.key if isinstance(error, KeyedError) else "")
 
     return respond
+
+
+def with_pixels(facts: Mapping[str, Any], pixels: Array, place: Mapping[str, int]) -> Response:
+    """The length of the JSON in four bytes, JSON, and RGB, a byte a channel.
+
+    The JSON has the facts, and as "part" the place of the pixels in the picture and their number.
+    """
+    height, width = pixels.shape[:2]
+    part = {**place, "columns": width, "rows": height}
+    said = json.dumps({**facts, "part": part}, allow_nan=False).encode()
+    body = struct.pack("<I", len(said)) + said + pixels.tobytes()
+    return Response(body, media_type="application/octet-stream", headers=HEADERS)
 
 
 def problem(text: str, key: str = "", status: int = 400) -> Response:

@@ -97,6 +97,15 @@ def decoded(data: bytes, name: str) -> Array:
         raise ImageError(f"{name}: cannot be shown: {error}") from None
 
 
+def reduced(pixels: Array, by: int) -> Array:
+    """(height, width, 3) uint8, ``by`` x ``by`` pixels of which become one, their mean.
+
+    >>> reduced(np.uint8([[[0, 0, 9], [2, 0, 9], [4, 4, 4]]]), 2).tolist()
+    [[[1, 0, 9], [4, 4, 4]]]
+    """
+    return np.asarray(Image.fromarray(pixels).reduce(by)) if by > 1 else pixels
+
+
 @cache
 def _light_table() -> Array:
     """Eight bits of linear light by sRGB's curve, by the bits of a half float."""

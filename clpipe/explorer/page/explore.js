@@ -12,7 +12,7 @@ let known; // what the server says at the start
 let past = [];
 let future = [];
 let settingB = null;
-let picture = null; // {facts, pixels, canvas}
+let picture = null; // facts, pixels, canvas; and the part that came first, until they are there
 let other = null; // what is beside it, and the question that gave it
 
 // Questions.
@@ -30,24 +30,41 @@ const ask = async (name, question) => {
   throw Object.assign(new Error(said.error), { key: said.key || "" });
 };
 
-const developed = async (values, truth) => {
-  const start = performance.now();
-  const response = await ask("develop", { image: state.image, values, step: state.step, truth });
-  const data = await response.arrayBuffer();
+// Facts and pixels: the length of the facts, the facts, then RGB.
+const pictured = async (name, question) => {
+  const data = await (await ask(name, question)).arrayBuffer();
   const length = new DataView(data).getUint32(0, true);
   const facts = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
+  const { columns, rows: lines } = facts.part;
+  if (!columns || !lines) return { facts, canvas: null };
   const pixels = new Uint8Array(data, 4 + length);
-  const image = new ImageData(facts.width, facts.height);
+  const image = new ImageData(columns, lines);
   const words = new Uint32Array(image.data.buffer);
   for (let i = 0, at = 0; i < words.length; i += 1, at += 3) {
     words[i] = 0xff000000 | (pixels[at + 2] << 16) | (pixels[at + 1] << 8) | pixels[at];
   }
   const canvas = document.createElement("canvas");
-  canvas.width = facts.width;
-  canvas.height = facts.height;
+  canvas.width = columns;
+  canvas.height = lines;
   canvas.getContext("2d").putImageData(image, 0, 0);
-  return { facts, pixels, canvas, start };
+  return { facts, pixels, canvas };
 };
+
+// The part of the picture that is on the screen, and by how much it is smaller there.
+const window_ = () => {
+  if (!picture) return { left: 0, top: 0, width: 1 << 20, height: 1 << 20, by: 4 };
+  const { scale, x, y } = seen;
+  const [left, top] = [Math.max(Math.floor(-x / scale), 0), Math.max(Math.floor(-y / scale), 0)];
+  const [right, bottom] = [Math.ceil((canvas.width - x) / scale), Math.ceil((canvas.height - y) / scale)];
+  return { left, top, width: Math.max(right - left, 0), height: Math.max(bottom - top, 0), by: Math.max(Math.round(1 / scale), 1) };
+};
+
+const whole = async (facts) => {
+  const { pixels, canvas: all } = await pictured("pixels", { number: facts.number });
+  return { facts, pixels, canvas: all };
+};
+
+const questionOf = (values, truth) => ({ image: state.image, values, step: state.step, truth });
 
 // Developing: one question at a time, and then the latest settings.
 
@@ -62,18 +79,28 @@ const refresh = async () => {
   running = true;
   const busy = setTimeout(() => { byId("busy").hidden = false; }, 200);
   try {
-    const before = picture;
-    picture = await developed(state.values, "");
-    picture.question = JSON.stringify(state);
-    const isNew = !before || before.canvas.width !== picture.canvas.width || before.canvas.height !== picture.canvas.height;
-    if (isNew && (!before || JSON.parse(before.question).image !== state.image)) fit();
-    draw();
-    const shown = performance.now() - picture.start;
+    const start = performance.now();
+    const of = JSON.stringify(state);
+    const first = await pictured("develop", { ...questionOf(state.values, ""), ...window_() });
+    const { facts } = first;
+    const before = picture && picture.facts;
+    const isNew = !before || before.width !== facts.width || before.height !== facts.height || picture.image !== state.image;
+    if (isNew) {
+      picture = { facts, pixels: null, canvas: null, patch: first, image: state.image };
+      fit();
+    } else {
+      picture = { ...picture, facts, patch: first };
+      draw();
+    }
     complain(null);
-    tell(picture.facts, shown);
-    drawHistogram();
-    showControls(picture.facts);
+    tell(facts, performance.now() - start);
+    showControls(facts);
     remember();
+    if (!again) {
+      picture = { ...(await whole(facts)), image: state.image, of };
+      draw();
+      drawHistogram();
+    }
     if (!again) await refreshOther();
     noiseIsOld();
   } catch (error) {
@@ -99,8 +126,8 @@ const refreshOther = async () => {
   const [values, truth] = kind === "B" ? [settingB, ""] : [state.values, kind];
   const question = JSON.stringify([state.image, state.step, values, truth]);
   if (!other || other.question !== question) {
-    other = await developed(values, truth);
-    other.question = question;
+    const { facts } = await pictured("develop", { ...questionOf(values, truth), left: 0, top: 0, width: 0, height: 0, by: 1 });
+    other = { ...(await whole(facts)), question };
   }
   draw();
 };
@@ -156,7 +183,7 @@ const sizeCanvas = () => {
 const fit = () => {
   if (!picture) return;
   sizeCanvas();
-  const { width, height } = picture.canvas;
+  const { width, height } = picture.facts;
   seen.scale = Math.min(canvas.width / width, canvas.height / height, 8);
   seen.x = (canvas.width - width * seen.scale) / 2;
   seen.y = (canvas.height - height * seen.scale) / 2;
@@ -188,7 +215,12 @@ const draw = () => {
   if (!picture) return;
   context.imageSmoothingEnabled = seen.scale < 1;
   context.imageSmoothingQuality = "high";
-  const put = (shown) => context.drawImage(shown.canvas, seen.x, seen.y, shown.canvas.width * seen.scale, shown.canvas.height * seen.scale);
+  const put = ({ canvas: drawn, facts, patch }) => {
+    if (drawn) context.drawImage(drawn, seen.x, seen.y, facts.width * seen.scale, facts.height * seen.scale);
+    if (!patch || !patch.canvas) return;
+    const { left, top, width, height } = patch.facts.part;
+    context.drawImage(patch.canvas, seen.x + left * seen.scale, seen.y + top * seen.scale, width * seen.scale, height * seen.scale);
+  };
   put(picture);
   if (other && byId("compare").value) {
     const split = splitAt();
@@ -318,7 +350,7 @@ let asked = null;
 
 const readPixel = async ([x, y]) => {
   const { facts, pixels } = picture;
-  if (x < 0 || y < 0 || x >= facts.width || y >= facts.height) {
+  if (!pixels || x < 0 || y < 0 || x >= facts.width || y >= facts.height) {
     byId("pixel").textContent = "\u00a0";
     return;
   }
