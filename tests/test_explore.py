@@ -361,3 +361,137 @@ def test_ctrl_c_ends_it_quietly(renders):
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=20)
     assert (process.returncode, errors) == (0, "")
+
+
+# The page.
+
+
+@pytest.fixture
+def page(served, monkeypatch, tmp_path):
+    """The page in a browser, with its downloads in the working directory."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if not chromium:
+        pytest.skip("there is no Chromium")
+    monkeypatch.chdir(tmp_path)
+    with playwright.sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1400, "height": 900})
+        said: list[str] = []
+        page.on("console", lambda message: said.append(message.text))
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.goto(served)
+        settle(page)
+        yield page
+        # Chromium notes each refusal of a value, which the page shows.
+        assert [text for text in said if "status of 400" not in text] == []
+        browser.close()
+
+
+def settle(page):
+    page.wait_for_selector('body[data-settled="true"]', timeout=60_000)
+
+
+def put(page, key, value):
+    field = page.locator(f'#panel .row[data-key="{key}"] input:not([type="range"])').last
+    field.evaluate("field => field.closest('details')?.setAttribute('open', '')")
+    field.fill(value)
+    field.press("Enter")
+    settle(page)
+
+
+def on_screen(page):
+    """The whole picture as the page has it."""
+    text = page.evaluate("Array.from(picture.pixels).join()")
+    shape = page.evaluate("[picture.facts.height, picture.facts.width, 3]")
+    return np.array(text.split(","), np.uint8).reshape(shape)
+
+
+def test_controls_change_the_picture_and_what_is_saved_makes_it_again(page, renders):
+    first = on_screen(page)
+    put(page, "iso", "6400")
+    put(page, "denoise.luma_strength", "0.5")
+    page.click('.step[data-step="sharpen"] > input')
+    settle(page)
+    assert page.evaluate("state.values") == {
+        "iso": 6400,
+        "denoise": {"luma_strength": 0.5},
+        "skip": ["sharpen"],
+    }
+    seen = on_screen(page)
+    assert (seen != first).any()
+    with page.expect_download() as download:
+        page.click("#save")
+    download.value.save_as("camera.toml")
+    run = ["run", renders / "a.exr", "-o", "out", "--format", "png", "--quiet"]
+    clpipe(*run, "-c", "camera.toml")
+    np.testing.assert_array_equal(np.asarray(Image.open("out/a.png")), seen)
+    page.click("#copy")
+    command = page.inner_text("#say-command")
+    own = "--iso 6400 --set denoise.luma_strength=0.5 --skip sharpen"
+    assert command == f"clpipe run {renders / 'a.exr'} -o out {own}"
+    page.keyboard.press("Escape")
+    for _ in range(3):
+        page.click("#undo")
+        settle(page)
+    assert page.evaluate("state.values") == {}
+    np.testing.assert_array_equal(on_screen(page), first)
+    page.click("#redo")
+    settle(page)
+    page.wait_for_timeout(400)  # until it is in the address
+    page.reload()
+    settle(page)
+    assert page.evaluate("state.values") == {"iso": 6400}
+
+
+def test_stages_pixels_comparison_and_noise(page):
+    put(page, "iso", "6400")
+    page.keyboard.press("Tab")
+    page.select_option("#step", "quantize")
+    settle(page)
+    page.mouse.move(*(page.locator("#picture").bounding_box()[side] + 300 for side in "xy"))
+    page.wait_for_selector('#pixel:has-text("(DN)")')
+    page.select_option("#step", "")
+    settle(page)
+    drawn = "document.getElementById('picture').toDataURL()"
+    before = page.evaluate(drawn)
+    page.select_option("#compare", "clean")
+    settle(page)
+    split = page.evaluate(drawn)
+    assert split != before
+    page.focus("#split")
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate(drawn) != split
+    page.select_option("#compare", "")
+    settle(page)
+    page.click("#zoom-max")
+    assert page.inner_text("#zoom") == "800 %"
+    page.click("#keep-b")
+    put(page, "seed", "5")
+    b_values = page.evaluate("settingB")
+    assert b_values == {"iso": 6400}
+    page.click("#swap-b")
+    settle(page)
+    assert page.evaluate("state.values") == b_values
+    for field, value in (("left", "8"), ("top", "8"), ("width", "48"), ("height", "48")):
+        page.fill(f"#{field}", value)
+    page.click("#measure")
+    page.wait_for_selector("#noise-plot svg", timeout=60_000)
+    assert page.locator("#noise-table tbody tr").count() == 6
+
+
+def test_a_mistake_is_said_and_marked_and_the_picture_stays(page):
+    before = on_screen(page)
+    put(page, "denoise.luma_strength", "-1")
+    page.wait_for_selector("#problem:visible")
+    assert "denoise.luma_strength" in page.inner_text("#problem")
+    assert page.locator(".row.bad").count() == 1
+    np.testing.assert_array_equal(on_screen(page), before)
+    page.click("#undo")
+    settle(page)
+    assert page.locator("#problem:visible").count() == 0
+
+
+def test_a_narrow_page_is_not_wider_than_the_screen(page):
+    page.set_viewport_size({"width": 400, "height": 800})
+    assert page.evaluate("document.documentElement.scrollWidth") == 400

@@ -37,6 +37,23 @@ TYPES: dict[str, tuple[str, Any]] = {
     **dict.fromkeys(("camera", "lens", "noise_key", "raw_size", "raw_type"), ("text", str)),
 }
 
+# What a value is, for people, and its unit.
+ABOUT: dict[str, tuple[str, str]] = {
+    "lens": (
+        "A lens of lensfun's database: its distortion, lateral colour and vignetting.",
+        "",
+    ),
+    "focal_length": ("That of a zoom lens.", "mm"),
+    "aperture": ("The lens's f-number; without it, no vignetting.", ""),
+    "focus_distance": ("Where the lens is focused; without it, far away.", "m"),
+    "seed": ("The seed of the noise.", ""),
+    "noise_key": (
+        "Share the noise with all images that have this key, whatever their ISO; without it, each "
+        "image and ISO has noise of its own.",
+        "",
+    ),
+}
+
 
 def check_type(key: str, value: Any) -> None:
     """See that the value of a key is of the key's type.

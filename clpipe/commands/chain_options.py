@@ -8,6 +8,7 @@ import click
 from clpipe.base.errors import RequestError
 from clpipe.chain.files import built_in_configs
 from clpipe.chain.formats import EVERY_FORMAT
+from clpipe.chain.keys import ABOUT
 from clpipe.chain.request import DEFAULTS
 from clpipe.commands.completion import (
     cameras,
@@ -20,6 +21,13 @@ from clpipe.commands.completion import (
 from clpipe.commands.options import stage_file_option
 from clpipe.outputs.patches import MOST, PER_IMAGE
 from clpipe.reference.carried import RESAMPLING
+
+
+def about(key: str) -> str:
+    """What the value of a key is, with its unit."""
+    text, unit = ABOUT[key]
+    return f"{text} In {unit}." if unit else text
+
 
 camera_option = click.option(
     "--camera",
@@ -75,19 +83,13 @@ _CHAIN_OPTIONS = (
     click.option(
         "--lens",
         metavar="NAME",
-        help="A lens of lensfun's database: its distortion, lateral colour and vignetting. "
-        "[default: none]",
+        help=f"{about('lens')} [default: none]",
     ),
-    click.option("--focal-length", type=float, help="That of a zoom lens, in mm."),
-    click.option("--aperture", type=float, help="Its f-number; without it, no vignetting."),
-    click.option("--focus-distance", type=float, help="In m. [default: far away]"),
-    click.option("--seed", type=int, help=f"The seed of the noise. [default: {DEFAULTS.seed}]"),
-    click.option(
-        "--noise-key",
-        metavar="TEXT",
-        help="Share the noise with all images that have this key, whatever their ISO. "
-        "[default: each image and ISO has noise of its own]",
-    ),
+    click.option("--focal-length", type=float, help=about("focal_length")),
+    click.option("--aperture", type=float, help=about("aperture")),
+    click.option("--focus-distance", type=float, help=about("focus_distance")),
+    click.option("--seed", type=int, help=f"{about('seed')} [default: {DEFAULTS.seed}]"),
+    click.option("--noise-key", metavar="TEXT", help=about("noise_key")),
     set_option,
     click.option(
         "--stages",

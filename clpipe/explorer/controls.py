@@ -8,10 +8,10 @@ from pydantic import BaseModel
 
 from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.chain import step_names
+from clpipe.chain.keys import ABOUT, LENS, TYPES
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
-from clpipe.stages import DEFAULT_CHAIN
 
 HIDDEN = {"title", "description"}  # of a parameter's schema; the description is sent as "text"
 
@@ -53,6 +53,17 @@ def parameters_of(model: type[BaseModel]) -> dict[str, Any]:
     }
 
 
+def key_controls() -> dict[str, Any]:
+    """The values that stand in no table, each as a JSON schema with a text."""
+    names = {int: "integer", str: "string", int | float: "number"}
+    controls = {}
+    for key, (text, unit) in ABOUT.items():
+        controls[key] = {"type": names[TYPES[key][1]], "text": text, "unit": unit, "plain": True}
+        if key in LENS and key != "lens":
+            controls[key]["exclusiveMinimum"] = 0
+    return controls
+
+
 def camera_controls(others: Sequence[str]) -> list[dict[str, Any]]:
     """The cameras that can be chosen, with their ISOs: the built-in ones, and files that are named.
 
@@ -75,8 +86,3 @@ def steps_of(settings: Settings) -> list[dict[str, Any]]:
     on = set(step_names(settings))
     every = step_names(Settings(stages=settings.stages))
     return [{"name": name, "stage": base_name(name), "on": name in on} for name in every]
-
-
-def default_stages() -> list[str]:
-    """The stages of the chain, where none are listed."""
-    return list(DEFAULT_CHAIN)

@@ -24,7 +24,7 @@ from clpipe.base.errors import ClpipeError, KeyedError, RequestError
 from clpipe.base.types import Array
 from clpipe.explorer.controls import (
     camera_controls,
-    default_stages,
+    key_controls,
     parameters_of,
     stage_controls,
 )
@@ -120,10 +120,10 @@ class Server:
             {
                 "images": [job.key for job in explorer.jobs],
                 "values": explorer.initial,
+                "keys": key_controls(),
                 "stages": stage_controls(),
                 "output": parameters_of(Output),
                 "cameras": camera_controls(explorer.cameras),
-                "chain": default_stages(),
                 "device": device.info.label if device else "NumPy",
                 "saved": SAVED,
             },

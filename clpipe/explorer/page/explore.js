@@ -133,6 +133,8 @@ const refreshOther = async () => {
 };
 
 const changed = () => {
+  byId("undo").disabled = !past.length;
+  byId("redo").disabled = !future.length;
   document.body.dataset.settled = "false";
   refresh();
 };
@@ -534,8 +536,6 @@ document.addEventListener("keydown", (event) => {
 
 let remembering = 0;
 const remember = () => {
-  byId("undo").disabled = !past.length;
-  byId("redo").disabled = !future.length;
   clearTimeout(remembering);
   remembering = setTimeout(() => history.replaceState(null, "", `#${encodeURIComponent(JSON.stringify(state))}`), 300);
 };
@@ -555,8 +555,19 @@ const limitsOf = (schema, value) => {
   const low = type.minimum ?? type.exclusiveMinimum;
   const high = type.maximum ?? type.exclusiveMaximum;
   const size = Math.abs(Number(value)) || 0;
-  const top = high === undefined || (size > 0 && high > 40 * size) ? (size ? 4 * size : Math.min(high ?? 1, 1)) : high;
-  return { low, high, from: low ?? -top, to: top };
+  const top = high === undefined || (size > 0 && high > 40 * size) ? (size ? 4 * size : 1) : high;
+  // A slider over all that is allowed would be too coarse.
+  const to = size || low === undefined || low >= 0 ? top : Math.min(top, 5);
+  return { low, high, from: Math.max(low ?? -to, size || low >= 0 ? -Infinity : -to), to };
+};
+
+// The limits of a number in words.
+const between = (type) => {
+  const { minimum, exclusiveMinimum, maximum, exclusiveMaximum } = type;
+  const low = minimum !== undefined ? `from ${minimum}` : exclusiveMinimum !== undefined ? `above ${exclusiveMinimum}` : "";
+  const high = maximum !== undefined ? `to ${maximum}` : exclusiveMaximum !== undefined ? `below ${exclusiveMaximum}` : "";
+  const text = [low, high].filter(Boolean).join(" ");
+  return text && `${text[0].toUpperCase()}${text.slice(1)}.`;
 };
 
 let count = 0;
@@ -567,10 +578,10 @@ const row = (key, name, schema, resolved) => {
   const id = `set-${count += 1}`;
   const inputs = made("span", { className: "inputs" });
   const auto = made("button", { className: "auto", type: "button", textContent: "auto", title: "Leave it out, as it was not set" });
-  auto.setAttribute("aria-label", `${name}: automatic`);
+  auto.setAttribute("aria-label", `auto: ${name}`);
   const element = made("div", { className: "row" },
     made("div", { className: "line" }, made("label", { htmlFor: id, textContent: name + (schema.unit ? ` (${schema.unit})` : "") }), inputs, auto));
-  const help = [schema.text, schema.auto ? `Automatic: ${schema.auto}.` : ""].filter(Boolean).join(" ");
+  const help = [schema.text, between(type), schema.auto ? `Automatic: ${schema.auto}.` : ""].filter(Boolean).join(" ");
   if (help) element.append(made("p", { className: "help", id: `${id}-help`, textContent: help }));
   element.dataset.key = key;
   let field;
@@ -632,16 +643,6 @@ const parsed = (text, type) => {
   }
 };
 
-const KEYS = [
-  ["exposure.ev", "exposure", { type: "number", minimum: -8, maximum: 8, default: 0, unit: "EV", text: "Exposure compensation, as the stage exposure has it." }],
-  ["seed", "seed", { type: "integer", default: 0, plain: true, text: "The seed of the noise." }],
-  ["noise_key", "noise key", { type: "string", text: "Shares the noise with all images that have this key." }],
-  ["lens", "lens", { type: "string", text: "A lens of lensfun's database, by name: its distortion, lateral colour and vignetting.", placeholder: "none" }],
-  ["focal_length", "focal length", { type: "number", exclusiveMinimum: 0, plain: true, unit: "mm", text: "That of a zoom lens." }],
-  ["aperture", "aperture", { type: "number", exclusiveMinimum: 0, plain: true, text: "Its f-number; without it, no vignetting." }],
-  ["focus_distance", "focus distance", { type: "number", exclusiveMinimum: 0, plain: true, unit: "m" }],
-];
-
 let isoRow = null;
 let isoCamera = "";
 let structure = "";
@@ -663,9 +664,12 @@ const makeKeys = (facts) => {
     set("skip", noise.checked ? (skip.length ? skip : null) : [...skip, "noise"]);
   });
   switchRow.append(made("div", { className: "line" }, made("label", { htmlFor: "noise-on", textContent: "noise" }), noise));
-  byId("keys").replaceChildren(camera, isoRow, switchRow, ...KEYS
-    .filter(([key]) => key !== "exposure.ev" || facts.steps.some((each) => each.name === "exposure" && "ev" in each.values))
-    .map(([key, name, schema]) => keyRow(key, name, schema, 0)));
+  const exposure = facts.steps.find((each) => each.name === "exposure" && "ev" in each.values);
+  const methods = exposure ? known.stages.exposure.methods : [];
+  const ev = methods.filter((method) => method.name === exposure.method).map((method) => method.parameters.ev);
+  byId("keys").replaceChildren(camera, isoRow, switchRow,
+    ...ev.map((schema) => keyRow("exposure.ev", "exposure", schema, 0)),
+    ...Object.entries(known.keys).map(([key, schema]) => keyRow(key, key.replaceAll("_", " "), schema, 0)));
   isoCamera = "";
 };
 
@@ -709,7 +713,7 @@ const showControls = (facts) => {
   }
   if (facts.camera !== isoCamera) {
     const [low, high] = (known.cameras.find((each) => each.value === facts.camera) || { isos: [50, 102400] }).isos;
-    const element = keyRow("iso", "ISO", { type: "number", minimum: low, maximum: high, log: true, text: `${low} to ${high}` }, high);
+    const element = keyRow("iso", "ISO", { type: "number", minimum: low, maximum: high, log: true }, high);
     if (isoRow.firstChild) rows.splice(rows.indexOf(isoRow.firstChild), 1);
     isoRow.replaceChildren(element);
     isoCamera = facts.camera;
@@ -830,6 +834,6 @@ const begin = async () => {
   }
   byId("image").value = state.image;
   sizeCanvas();
-  await refresh();
+  changed();
 };
 begin().catch(complain);
