@@ -164,8 +164,6 @@ def buffer_name(parameter: Parameter) -> str | None:
             return "dst"
         case "slot":
             return f"slot{parameter.number}"
-        case "lines" | "estimates":
+        case "lines" | "sums" | "partials" | "counts" | "histogram" | "estimates":
             return f"{parameter.role}.{parameter.step}"
-        case "sums" | "partials" | "counts" | "histogram":
-            return parameter.role
     return None

@@ -246,7 +246,7 @@ def _pixels(writer: Writer, launch: Launch) -> str:
         lines.append(f"const {kind.c_type} v{i + 1} = {made};")
     value = f"v{len(ops)}"
     if launch.sums:
-        writer.parameter("sums", "__global int4 *restrict ", "sums")
+        writer.parameter("sums", "__global int4 *restrict ", "sums", step=launch.sums.step)
         sample = call(launch.sums, [value, "at", *writer.arguments(launch.sums)])
         lines.append(f"const vi sample = only_inside({sample}, at, {writer.core()});")
         lines.append("if (ROW & 1) odd_rows += sample; else even_rows += sample;")
@@ -351,7 +351,7 @@ def _count(writer: Writer, launch: Histogram) -> str:
     read = launch.reads[0]
     planes = writer.planes(read)[: len(read.image.kind.channels)]
     origins = [f"origin{i}" for i in range(len(planes))]
-    counts = writer.parameter("counts", "__global uint *", "counts", number=bins)
+    counts = writer.parameter("counts", "__global uint *", "counts", step=op.step)
     arguments = [*origins, "x", "y", "e", *writer.arguments(op)]
     core = writer.core()
     if writer.lanes == 1:  # a work-group counts together, each of its work items other columns
@@ -376,30 +376,28 @@ def _count(writer: Writer, launch: Histogram) -> str:
 
 
 def _add_up(writer: Writer, launch: Reduce) -> str:
-    tile = writer.tile("tile")
+    tile, step = writer.tile("tile"), launch.op.step
     if bins := launch.op.pass_.bins:
-        writer.parameter("counts", "__global const uint *", "counts", number=bins)
-        writer.parameter("histogram", "__global uint *", "histogram", number=bins)
+        writer.parameter("counts", "__global const uint *", "counts", step=step)
+        writer.parameter("histogram", "__global uint *", "histogram", step=step)
         arguments = f"counts, histogram, {bins}, {PARTIALS}, {tile}"
         if writer.lanes > 1:
             return f"    add_up_counts({arguments});\n"
         group = f"    __local uint group[{local_size(writer.lanes)}];\n"
         return f"{group}    add_up_counts({arguments}, group);\n"
-    writer.parameter("sums", "__global const int4 *", "sums")
-    writer.parameter("partials", "__global long4 *", "partials")
+    writer.parameter("sums", "__global const int4 *", "sums", step=step)
+    writer.parameter("partials", "__global long4 *", "partials", step=step)
     return f"    add_up_blocks(sums, partials, {writer.tile('blocks')}, {tile});\n"
 
 
 def _find(writer: Writer, launch: Finalize) -> str:
-    pass_ = launch.op.pass_
+    pass_, step = launch.op.pass_, launch.op.step
     if pass_.bins:
-        whole = writer.parameter(
-            "histogram", "__global const uint *", "histogram", number=pass_.bins
-        )
+        whole = writer.parameter("histogram", "__global const uint *", "histogram", step=step)
     else:
-        writer.parameter("partials", "__global const long4 *", "partials")
+        writer.parameter("partials", "__global const long4 *", "partials", step=step)
         whole = f"add_up_partials(partials, {PARTIALS})"
-    estimates = writer.estimates(launch.op.step, written=True)
+    estimates = writer.estimates(step, written=True)
     arguments = writer.arguments(launch.op, pass_.finish_arguments)
     texts = [whole, *arguments, "e", estimates]
     return f"    {pass_.finish}({', '.join(texts)});\n"

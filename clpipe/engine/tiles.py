@@ -62,13 +62,12 @@ def buffer_sizes(plan: Plan, extents: Extents, ends: int = 1) -> dict[str, int]:
             case Lines(ops=ops):
                 sizes |= {f"lines.{op.step}": longest * 4 for op in ops}
             case Launch(sums=sums, level=level) if sums:
-                blocks = max(extents[level].blocks * 16, sizes.get("sums", 0))
-                sizes |= {"sums": blocks, "partials": PARTIALS * 32}
+                sizes[f"sums.{sums.step}"] = extents[level].blocks * 16
+                sizes[f"partials.{sums.step}"] = PARTIALS * 32
             case Histogram(op=op):
                 bins = op.pass_.bins
-                sizes["counts"] = max(sizes.get("counts", 0), PARTIALS * bins * 4)
-                with_runs = bins + -(-bins // RUN)
-                sizes["histogram"] = max(sizes.get("histogram", 0), with_runs * 4)
+                sizes[f"counts.{op.step}"] = PARTIALS * bins * 4
+                sizes[f"histogram.{op.step}"] = (bins + -(-bins // RUN)) * 4
             case Finalize(op=op):
                 sizes[f"estimates.{op.step}"] = 16
     return sizes
