@@ -49,7 +49,14 @@ def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[
 
 
 class Call:
-    """A compiled kernel with its arguments, most of which stay from launch to launch."""
+    """A compiled kernel with its arguments, most of which stay from launch to launch.
+
+    Attributes:
+        reads_source: whether it reads the image that is sent.
+        reads: the names of buffers that stay on the device, of those that it only reads.
+        writes: of those that it writes.
+        values: the parameters whose values an image's chain gives.
+    """
 
     def __init__(self, kernel: Kernel, compiled: Any) -> None:
         self.kernel = kernel
@@ -58,12 +65,17 @@ class Call:
         names = [(i, buffer_name(p)) for i, p in numbered]
         self._ends = [(i, name) for i, name in names if name in ("src", "dst")]
         self._buffers = [(i, name) for i, name in names if name and name not in ("src", "dst")]
+        is_read = {name: "const " in kernel.parameters[i].declaration for i, name in names}
+        self.reads_source = "src" in is_read
+        self.reads = [name for _, name in self._buffers if is_read[name]]
+        self.writes = [name for _, name in self._buffers if not is_read[name]]
         tiles = [(i, p.item) for i, p in numbered if p.role == "tile"]
         self._tile = [i for i, name in tiles if name == "tile"]
         self._larger = [(i, name[5:]) for i, name in tiles if name.startswith("from_")]
         others = {*self._tile, *(i for i, _ in self._larger)}
         self._own = [(i, name) for i, name in tiles if i not in others]
         self._values = [(i, p) for i, p in numbered if p.role in ("value", "key", "table8", "taps")]
+        self.values = [p for _, p in self._values]
         self._arguments: list[Any] = [None] * len(numbered)
         self._extents: Extents = ()
         self._bound: tuple[Any, ...] = ()

@@ -161,7 +161,7 @@ class Device:
                 what the plan reads, half or float. It must stay as it is until the results are
                 taken.
             bind: the value of a "value", "key" or "table8" parameter: a NumPy scalar or array.
-            timings: one entry a launch and transfer is appended, in order.
+            timings: one entry a launch and transfer that is done is appended, in order.
             download: bring results back; False leaves them on the device, for measuring.
             into: an array to use for the eight-bit pixels, (height, width[, channel]) uint8,
                 C-contiguous; a used one saves the time that new memory takes.

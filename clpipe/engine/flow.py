@@ -8,7 +8,7 @@ on the way together.
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -19,8 +19,9 @@ from clpipe.base.types import Array
 from clpipe.engine.buffers import HostImages, Pool, copy_encoded, copy_plane, core_of
 from clpipe.engine.calls import Bind, Call, index_space
 from clpipe.engine.extents import Box, Extent, Extents
+from clpipe.engine.held import Held
 from clpipe.engine.plan import Launch, Plan
-from clpipe.engine.tiles import Tiling, source_bytes
+from clpipe.engine.tiles import Phase, Tiling, source_bytes
 from clpipe.engine.transfers import InPlace, Staged
 
 TABLES = 1 << 26  # bytes of arrays that stay on the device beyond the next image
@@ -106,6 +107,7 @@ class Flow:
         self._tables: dict[int, tuple[Array, Any]] = {}
         self._parts: deque[Part] = deque()  # on the way
         self._reads: list[Any] = []  # events of fetches from buffers that the next part writes
+        self._held = Held()
 
     def new_queue(self) -> Any:
         """A queue whose commands are done in order, and timed."""
@@ -124,13 +126,20 @@ class Flow:
     def start(self, passage: Passage, memory: int) -> None:
         """Enqueue all of an image, while buffers take no more than ``memory`` bytes.
 
-        Where more than :attr:`depth` parts would be on the way, the oldest ones land.
+        Where more than :attr:`depth` parts would be on the way, the oldest ones land. Of a plan
+        that holds its images, launches are left out whose results are on the device.
         """
+        # Nothing is known of what buffers hold until all is enqueued.
+        known, self._held, after = self._held, Held(), Held()
         held = sum(table.nbytes for table, _ in self._tables.values())
         if len(self._tables) > 32 or held > TABLES:
             self._tables.clear()
-        tiling = passage.tiling
+        tiling, work = passage.tiling, passage.work
         self.pool.reserve(self._transfers.needs(tiling.sizes), memory)
+        if work.plan.hold and passage.is_whole:
+            options = work.source, work.unchanged, tiling.tiles[0], work.bind
+            numbers, after = known.next(passage.calls, self.pool, *options)
+            tiling = replace(tiling, phases=(Phase((), numbers, ()),))
         for phase in tiling.phases:
             tiles = tiling.tiles_of(phase)
             self._launch(passage, phase.first, tiles[0], 0, {}, [])
@@ -138,8 +147,9 @@ class Flow:
                 while len(self._parts) >= self.depth:
                     self._land()
                 is_last = phase is tiling.phases[-1]
-                self._pass(passage, phase.each, extents, tile, passage.work.download and is_last)
+                self._pass(passage, phase.each, extents, tile, work.download and is_last)
             self._launch(passage, phase.last, tiles[0], 0, {}, [])
+        self._held = after
 
     def finish(self, passage: Passage) -> None:
         """Wait until all parts of an image have landed, and any that were started before it.
@@ -173,9 +183,10 @@ class Flow:
     def _pass(
         self, passage: Passage, numbers: Sequence[int], extents: Extents, tile: int, fetches: bool
     ) -> None:
-        """Send a tile, launch kernels on it, and fetch what they made of it."""
+        """Send a tile if a kernel reads it, launch kernels, and fetch what they made of it."""
         plan = passage.work.plan
-        sent = self._send(passage, extents)
+        reads_source = any(passage.calls[number].reads_source for number in numbers)
+        sent = self._send(passage, extents) if reads_source else (None, [])
         whole = passage.work.output.encoded if fetches and passage.is_whole else None
         size = extents[-1].stored.width * extents[-1].stored.height
         size *= len(plan.encoded.channels) if plan.encoded else 0

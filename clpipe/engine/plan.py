@@ -17,6 +17,10 @@ from clpipe.engine.ops import Op, chain_ops
 from clpipe.reference.resample import Resampler, sizes
 from clpipe.stage import Access, Kind
 
+# Borders are multiples of it where images are held: planes then lie alike in plans whose widest
+# stencils differ a little.
+HELD_BORDER = 8
+
 
 @dataclass(frozen=True)
 class Image:
@@ -135,6 +139,7 @@ class Plan:
     final: Image | None = None  # the last image as float planes
     encoded: Kind | None = None  # the kind that is encoded to eight bits
     border: int = 0
+    hold: bool = False  # whether all images stay, so that launches can be left out
     resamplings: tuple[Resampler, ...] = ()  # from each level to the next
 
     def __hash__(self) -> int:
@@ -152,6 +157,7 @@ class Plan:
                 self.kept,
                 self.final,
                 self.encoded,
+                self.hold,
             )
         )
 
@@ -325,6 +331,7 @@ def make_plan(
     final: bool = False,
     fold: bool = True,
     planar: bool = False,
+    hold: bool = False,
 ) -> Plan:
     """The plan of a chain.
 
@@ -337,6 +344,8 @@ def make_plan(
         fold: whether a stencil redoes cheap passes at its taps. It must not for images one pixel
             wide or high, where mirroring changes the Bayer phase.
         planar: whether the source is planes one behind the other, not interleaved.
+        hold: whether each image has slots of its own, so that a launch whose results are on the
+            device already can be left out.
 
     Raises:
         RequestError: the chain has no such step to keep.
@@ -363,11 +372,11 @@ def make_plan(
     planner.emit(replace(group, writes=final_image, encodes=encode))
     launches = list(planner.launches)
     launches[:0] = [Lines(tuple(ops), level=level) for level, ops in planner.lines.items()]
-    pinned = {image.number for image in kept.values()}
-    if final_image:
-        pinned.add(final_image.number)
+    results = [*kept.values(), final_image] if final_image else kept.values()
+    pinned = {image.number for image in (planner.images if hold else results)}
     slots, count = assign_slots(launches, planner.images, pinned)
     radii = [x.opener.pass_.radius for x in launches if isinstance(x, Launch) and x.opener]
+    border = max(radii, default=0)
     return Plan(
         source=chain.source,
         half=half,
@@ -378,7 +387,8 @@ def make_plan(
         kept=tuple(kept.items()),
         final=final_image,
         encoded=chain.result if encode else None,
-        border=max(radii, default=0),
+        border=-(-border // HELD_BORDER) * HELD_BORDER if hold else border,
+        hold=hold,
         resamplings=tuple(planner.resamplings),
     )
 
@@ -391,7 +401,7 @@ def assign_slots(
     Args:
         launches: in order.
         images: that they write.
-        pinned: numbers of images whose slots are never reused, since they are results.
+        pinned: numbers of images whose slots are never reused, since they are results or held.
 
     Returns:
         The slots of each image, by its number, and how many slots there are.
