@@ -149,6 +149,14 @@ def test_a_launch_is_left_out_if_all_that_it_writes_is_there():
     assert launches(held) == (0, 1, 2)
 
 
+def test_planes_lie_alike_where_stencils_differ_a_little():
+    borders = {
+        make_plan(chain_of(**settings), hold=True).border
+        for settings in ({}, {"skip": ["sharpen"]}, {"demosaic": {"method": "bilinear"}})
+    }
+    assert borders == {4}
+
+
 class Walk:
     """Changes at random, each followed by a comparison with a runner that holds nothing."""
 
