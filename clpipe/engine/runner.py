@@ -154,6 +154,11 @@ class Runner:
             self._own_plans[key] = plan
         return self._own_plans[key]
 
+    def plan_for(self, image: Array) -> Plan:
+        """The plan for an image."""
+        size = self.chain.size(*image.shape[1::-1])
+        return self.plan(image.dtype == np.float16, min(size) > 1, is_planar(image))
+
     def warm_up(self, half: bool = True) -> None:
         """Compile everything, so that the first image does not wait for it.
 
@@ -241,8 +246,7 @@ class Runner:
             return lambda: Result(None, None, {}, {})
         if not self.device:
             return partial(self._run_numpy, np.asarray(image, np.float32), noise_key, boxes)
-        size = self.chain.size(*image.shape[1::-1])
-        plan = self.plan(image.dtype == np.float16, min(size) > 1, is_planar(image))
+        plan = self.plan_for(image)
         try:
             self._make_ready(plan)
         except DeviceFailedError:

@@ -23,7 +23,7 @@ from clpipe.chain.truth import DEVELOPMENT, PICTURES, picture_without_noise
 from clpipe.engine.clipping import clipped_share
 from clpipe.engine.device import Device, Timing
 from clpipe.engine.plan import AnyLaunch
-from clpipe.engine.runner import Result, Runner, is_planar
+from clpipe.engine.runner import Result, Runner
 from clpipe.explorer.controls import steps_of
 from clpipe.explorer.named import check_named, files_in
 from clpipe.images.preview import encoded_light
@@ -291,18 +291,13 @@ class Explorer:
         with self._lock:
             runner = self._runner(chain)
             result = runner.submit(pixels, key, timings, unchanged=True)()
-            plan = runner.plan(
-                pixels.dtype == np.float16,
-                min(chain.size(*pixels.shape[1::-1])) > 1,
-                is_planar(pixels),
-            )
-        return chain, result, plan.launches
+        return chain, result, runner.plan_for(pixels).launches
 
     def _runner(self, chain: Chain) -> Runner:
         """A runner of a chain, which shares plans with those before it."""
         encode = chain.result is Kind.DISPLAY
         if encode not in self._runners:
-            self._runners[encode] = Runner(chain, self.device, (), encode, not encode)
+            self._runners[encode] = Runner(chain, self.device, (), encode, not encode, hold=True)
         return self._runners[encode].of(chain)
 
 
