@@ -328,6 +328,19 @@ def test_a_wrong_question_gets_one_message(served, name, question, says):
     assert says in json.loads(body)["error"]
 
 
+def test_a_browser_that_goes_away_leaves_the_others_alone(served):
+    parts, question = urlsplit(served), {"image": 0, "values": NOISY}
+    place = {"left": 0, "top": 0, "width": 96, "height": 63, "by": 1}
+    body = json.dumps(question | place).encode()
+    head = (
+        f"POST {parts.path}develop HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: {len(body)}\r\n"
+    )
+    for sent in (f"{head}\r\n".encode() + body, f"{head}\r\n".encode() + body[:9]):
+        with socket.create_connection((parts.hostname, parts.port)) as gone:
+            gone.sendall(sent)
+    assert pixels_of(answer(served, "develop", question | place))[1].shape == (63, 96, 3)
+
+
 def test_two_explorers_at_once(served, renders):
     other = Server(explorer_of(renders / "a.exr", device="numpy"))
     thread = threading.Thread(target=other.run, daemon=True)

@@ -140,6 +140,11 @@ const changed = () => {
 };
 
 const complain = (error) => {
+  if (error && picture && picture.image !== state.image) { // which would be taken for this image
+    picture = null;
+    byId("status").textContent = "";
+    draw();
+  }
   byId("problem").hidden = !error;
   byId("problem").textContent = error ? error.message : "";
   for (const row of document.querySelectorAll(".row[data-key]")) {
@@ -675,7 +680,8 @@ const makeKeys = (facts) => {
 
 const makeStages = (facts) => {
   const opened = new Set([...document.querySelectorAll("#stages details[open]")].map((each) => each.dataset.step));
-  byId("stages").replaceChildren(...facts.steps.map((each) => {
+  // A raw enters behind the first ones; and without noise there are no stages of noise.
+  byId("stages").replaceChildren(...facts.steps.filter((each) => each.here || !each.on).map((each) => {
     const declared = known.stages[each.stage];
     const chosen = declared.methods.find((method) => method.name === each.method) || declared.methods[0];
     const toggle = made("input", { type: "checkbox", checked: each.on });
@@ -725,7 +731,7 @@ const showControls = (facts) => {
     resolved[`${each.name}.method`] = each.method;
     for (const [name, value] of Object.entries(each.values)) resolved[`${each.name}.${name}`] = value;
     const item = document.querySelector(`.step[data-step="${each.name}"]`);
-    item.classList.toggle("idle", each.idle);
+    if (item) item.classList.toggle("idle", each.idle);
   }
   for (const [name, schema] of Object.entries(known.output)) resolved[`output.${name}`] = schema.default;
   for (const element of rows) {
