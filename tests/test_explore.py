@@ -500,8 +500,11 @@ def test_a_mistake_is_said_and_marked_and_the_picture_stays(page):
     assert "denoise.luma_strength" in page.inner_text("#problem")
     assert page.locator(".row.bad").count() == 1
     np.testing.assert_array_equal(on_screen(page), before)
-    page.click("#undo")
+    put(page, "seed", "3")
+    assert "denoise.luma_strength" in page.inner_text("#problem")
+    page.click("#back")
     settle(page)
+    assert page.evaluate("state.values") == {}
     assert page.locator("#problem:visible").count() == 0
 
 

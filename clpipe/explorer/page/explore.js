@@ -81,7 +81,8 @@ const refresh = async () => {
   try {
     const start = performance.now();
     const of = JSON.stringify(state);
-    const first = await pictured("develop", { ...questionOf(state.values, ""), ...window_() });
+    const question = questionOf(state.values, "");
+    const first = await pictured("develop", { ...question, ...window_() });
     const { facts } = first;
     const before = picture && picture.facts;
     const isNew = !before || before.width !== facts.width || before.height !== facts.height || picture.image !== state.image;
@@ -92,6 +93,7 @@ const refresh = async () => {
       picture = { ...picture, facts, patch: first };
       draw();
     }
+    developedOf = question.values;
     complain(null);
     tell(facts, performance.now() - start);
     showControls(facts);
@@ -139,6 +141,8 @@ const changed = () => {
   refresh();
 };
 
+let developedOf = null; // the last values that could be developed
+
 const complain = (error) => {
   if (error && picture && picture.image !== state.image) { // which would be taken for this image
     picture = null;
@@ -146,7 +150,8 @@ const complain = (error) => {
     draw();
   }
   byId("problem").hidden = !error;
-  byId("problem").textContent = error ? error.message : "";
+  byId("problem-text").textContent = error ? error.message : "";
+  byId("back").hidden = !developedOf || same(developedOf, state.values);
   for (const row of document.querySelectorAll(".row[data-key]")) {
     row.classList.toggle("bad", Boolean(error && error.key) && row.dataset.key === error.key);
   }
@@ -516,6 +521,8 @@ const step = (from, to) => {
   lastKey = "";
   changed();
 };
+
+byId("back").addEventListener("click", () => setValues(developedOf));
 
 // The keys [ and ] go through the stages.
 document.addEventListener("keydown", (event) => {
