@@ -29,9 +29,10 @@ from tests.conftest import ROOT
 
 pytest.importorskip("starlette")
 
-from clpipe.explorer.explorer import Explorer, View
+from clpipe.explorer.explorer import Explorer
 from clpipe.explorer.export import exported, options_of
 from clpipe.explorer.server import Server
+from clpipe.explorer.views import View
 
 NOISY = {
     "iso": 6400,
@@ -440,6 +441,7 @@ def test_controls_change_the_picture_and_what_is_saved_makes_it_again(page, rend
     clpipe(*run, "-c", "camera.toml")
     np.testing.assert_array_equal(np.asarray(Image.open("out/a.png")), seen)
     page.click("#copy")
+    page.wait_for_selector("dialog[open]")
     command = page.inner_text("#say-command")
     own = "--iso 6400 --set denoise.luma_strength=0.5 --skip sharpen"
     assert command == f"clpipe run {renders / 'a.exr'} -o out {own}"

@@ -4,17 +4,15 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from clpipe.analysis.measure import measure
-from clpipe.analysis.pictures import Picture
 from clpipe.analysis.report import NoiseReport
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain
 from clpipe.chain.identity import noise_key
 from clpipe.chain.request import Request
@@ -26,13 +24,13 @@ from clpipe.engine.plan import AnyLaunch
 from clpipe.engine.runner import Result, Runner
 from clpipe.explorer.controls import steps_of
 from clpipe.explorer.named import check_named, files_in
-from clpipe.images.preview import encoded_light
+from clpipe.explorer.views import UNITS, Sample, View, cut, part_as_read, shown_of
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import upright
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.outputs.writer import OutputWriter
-from clpipe.stage import Context, Kind
+from clpipe.stage import Kind
 
 SOURCES = 2  # images that stay decoded
 SAMPLES = 3  # of what was made, that can still be asked for
@@ -43,31 +41,6 @@ AT_START = (
     "stages",
     "skip",
 )  # of Settings.record(), which always has them
-
-
-@dataclass(frozen=True)
-class View:
-    """What is looked at: the image after a step ("" is the last), or the truth of it.
-
-    ``truth`` is one of :data:`clpipe.chain.truth.PICTURES`, or "" for the picture with its noise.
-    """
-
-    step: str = ""
-    truth: str = ""
-
-
-@dataclass(frozen=True)
-class Sample:
-    """What was made of an image, turned as ``clpipe run`` turns it.
-
-    ``image`` has its values, of which ``unit`` is the unit; ``shown`` is (height, width, 3) uint8,
-    as it is looked at. ``facts`` are what is said of it, as JSON values.
-    """
-
-    image: Array
-    unit: str
-    shown: Array
-    facts: Mapping[str, Any]
 
 
 class Explorer:
@@ -161,7 +134,7 @@ class Explorer:
         timings: list[Timing] = []
         chain, result, launches = self._run(loaded, view, timings)
         turn = OutputWriter.turn_of(loaded.source, chain)
-        shown = upright(_shown(chain, result), turn)
+        shown = upright(shown_of(chain, result), turn)
         facts = {
             "width": shown.shape[1],
             "height": shown.shape[0],
@@ -236,9 +209,8 @@ class Explorer:
         pair = []
         for truth in ("", DEVELOPMENT):
             chain, result, _ = self._run(loaded, View(view.step, truth), None)
-            picture = result.final if result.encoded is None else result.encoded
-            assert picture is not None
-            pair.append(_picture(truth or "picture", cut(picture, box), chain))
+            picture = upright(result.image, OutputWriter.turn_of(loaded.source, chain))
+            pair.append(part_as_read(truth or "picture", cut(picture, box), chain))
         return measure(pair[:1], pair[1])
 
     def _loaded(self, image: int, values: Mapping[str, Any]) -> tuple[LoadedImage, Settings]:
@@ -299,76 +271,6 @@ class Explorer:
         if encode not in self._runners:
             self._runners[encode] = Runner(chain, self.device, (), encode, not encode, hold=True)
         return self._runners[encode].of(chain)
-
-
-UNITS = {
-    Kind.RGB: "linear, 1 = full scale",
-    Kind.MOSAIC: "signal, 1 = white level",
-    Kind.RAW: "DN",
-    Kind.DISPLAY: "of 1",
-}
-
-
-def _shown(chain: Chain, result: Result) -> Array:
-    """A result as eight bits, (height, width, 3)."""
-    image = result.image
-    if result.encoded is None:
-        image = encoded_light(signal_of(image, chain))
-    return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
-
-
-def context_of(chain: Chain) -> Context:
-    """What a chain's steps say of the image that comes out."""
-    last = chain.steps[-1]
-    return last.method.after(last.context)
-
-
-def signal_of(image: Floats, chain: Chain) -> Floats:
-    """A result in which 0 is black and 1 is white: a raw in signal, others as they are."""
-    context = context_of(chain)
-    black, white = context.black_level, context.white_level
-    if chain.result is not Kind.RAW or black is None or white is None:
-        return image
-    return (image - np.float32(black)) / np.float32(white - black)
-
-
-def cut(image: Array, box: tuple[int, int, int, int]) -> Array:
-    """A part of an image, from left, top, width and height; of a mosaic, whole 2x2 cells.
-
-    >>> cut(np.arange(12).reshape(3, 4), (1, 0, 3, 3)).tolist()
-    [[0, 1], [4, 5]]
-
-    Raises:
-        RequestError: it is empty, or not all in the image.
-    """
-    left, top, width, height = box
-    if image.ndim == 2:
-        left, top, width, height = (size // 2 * 2 for size in box)
-    inside = (
-        0 <= left <= left + width <= image.shape[1] and 0 <= top <= top + height <= image.shape[0]
-    )
-    if not inside or width < 1 or height < 1:
-        raise RequestError(
-            f"the rectangle {box[2]}x{box[3]} at {box[0]}, {box[1]} is not in the image of "
-            f"{image.shape[1]}x{image.shape[0]} px, or is empty"
-        )
-    return image[top : top + height, left : left + width]
-
-
-def _picture(name: str, part: Array, chain: Chain) -> Picture:
-    """A part of a result as it is measured, as if it had been read from a file."""
-    from pathlib import Path
-
-    path, kind, context = Path(name), chain.result, context_of(chain)
-    if kind is Kind.DISPLAY:
-        step = 1 / 255
-        pixels = part.astype(np.float32) * np.float32(step)
-        return Picture(path, "display", pixels, black=0.0, white=1.0, step=step)
-    if kind is Kind.RGB:
-        return Picture(path, "rgb", part, white=1.0)
-    black, white = context.black_level, context.white_level
-    lowest = None if black is None or white is None else -black / (white - black)
-    return Picture(path, "mosaic", signal_of(part, chain), context.pattern, lowest, 1.0)
 
 
 def _steps(settings: Settings, chain: Chain) -> list[dict[str, Any]]:

@@ -7,6 +7,7 @@ import struct
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,15 +29,17 @@ from clpipe.explorer.controls import (
     parameters_of,
     stage_controls,
 )
-from clpipe.explorer.explorer import Explorer, View
+from clpipe.explorer.explorer import Explorer
 from clpipe.explorer.export import SAVED, exported
+from clpipe.explorer.views import View
 from clpipe.images.encoding import Output
 from clpipe.images.preview import reduced
 
 HOST = "127.0.0.1"
 LONGEST = 1 << 20  # bytes of a question
 MOST = 1 << 20  # px a side, more than a picture has
-FILES = {"": "text/html", "explore.css": "text/css", "explore.js": "text/javascript"}
+PAGE = "explore.html"
+TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; connect-src 'self'; "
     "style-src 'self' 'unsafe-inline'; "  # Matplotlib's drawings have styles
@@ -103,7 +106,7 @@ class Server:
             "export": self._export,
         }
         routes = [
-            *(Route(f"/{name}", page_file(name)) for name in FILES),
+            *(Route(path, answer) for path, answer in page_files().items()),
             *(
                 Route(f"/{name}", asked(answer), methods=["POST"])
                 for name, answer in answers.items()
@@ -164,16 +167,20 @@ class Server:
         return JSONResponse(exported(self._explorer, image, values), headers=HEADERS)
 
 
-def page_file(name: str) -> Callable[[Request], Response]:
-    """What answers with a file of the page."""
-    text = (resources.files("clpipe.explorer") / "page" / (name or "explore.html")).read_text(
-        "utf-8"
-    )
+def page_files() -> dict[str, Callable[[Request], Response]]:
+    """What answers with each file of the page, by its path."""
+    folder = resources.files("clpipe.explorer") / "page"
+    return {
+        "/" if file.name == PAGE else f"/{file.name}": file_answer(
+            file.read_bytes(), TYPES[Path(file.name).suffix]
+        )
+        for file in folder.iterdir()
+    }
 
-    def answer(_: Request) -> Response:
-        return Response(text, media_type=FILES[name], headers=HEADERS)
 
-    return answer
+def file_answer(content: bytes, media_type: str) -> Callable[[Request], Response]:
+    """What answers with a file."""
+    return lambda _: Response(content, media_type=media_type, headers=HEADERS)
 
 
 def asked(answer: Answer) -> Callable[[Request], Any]:

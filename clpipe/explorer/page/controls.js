@@ -1,0 +1,201 @@
+"use strict";
+
+// Controls. Each is made once from what the server declares; then only its value changes.
+
+const made = (tag, properties = {}, ...children) => {
+  const element = Object.assign(document.createElement(tag), properties);
+  element.append(...children);
+  return element;
+};
+
+const typeOf = (schema) => (schema.anyOf || [schema]).find((each) => each.type !== "null") || schema;
+
+const limitsOf = (schema, value) => {
+  const type = typeOf(schema);
+  const low = type.minimum ?? type.exclusiveMinimum;
+  const high = type.maximum ?? type.exclusiveMaximum;
+  const size = Math.abs(Number(value)) || 0;
+  const top = high === undefined || (size > 0 && high > 40 * size) ? (size ? 4 * size : 1) : high;
+  // A slider over all that is allowed would be too coarse.
+  const to = size || low === undefined || low >= 0 ? top : Math.min(top, 5);
+  return { low, high, from: Math.max(low ?? -to, size || low >= 0 ? -Infinity : -to), to };
+};
+
+// The limits of a number in words.
+const between = (type) => {
+  const { minimum, exclusiveMinimum, maximum, exclusiveMaximum } = type;
+  const low = minimum !== undefined ? `from ${minimum}` : exclusiveMinimum !== undefined ? `above ${exclusiveMinimum}` : "";
+  const high = maximum !== undefined ? `to ${maximum}` : exclusiveMaximum !== undefined ? `below ${exclusiveMaximum}` : "";
+  const text = [low, high].filter(Boolean).join(" ");
+  return text && `${text[0].toUpperCase()}${text.slice(1)}.`;
+};
+
+let count = 0;
+
+// A row: the name, what sets it, and a button that leaves it to the camera again.
+const row = (key, name, schema, resolved) => {
+  const type = typeOf(schema);
+  const id = `set-${count += 1}`;
+  const inputs = made("span", { className: "inputs" });
+  const auto = made("button", { className: "auto", type: "button", textContent: "auto", title: "Leave it out, as it was not set" });
+  auto.setAttribute("aria-label", `auto: ${name}`);
+  const element = made("div", { className: "row" },
+    made("div", { className: "line" }, made("label", { htmlFor: id, textContent: name + (schema.unit ? ` (${schema.unit})` : "") }), inputs, auto));
+  const help = [schema.text, between(type), schema.auto ? `Automatic: ${schema.auto}.` : ""].filter(Boolean).join(" ");
+  if (help) element.append(made("p", { className: "help", id: `${id}-help`, textContent: help }));
+  element.dataset.key = key;
+  let field;
+  let slider = null;
+  if (type.enum || schema.options) {
+    field = made("select", {}, ...(schema.options || type.enum.map((each) => ({ value: each, label: String(each) }))).map((each) => new Option(each.label, each.value)));
+    field.addEventListener("change", () => set(key, field.value));
+  } else if (type.type === "boolean") {
+    field = made("input", { type: "checkbox" });
+    field.addEventListener("change", () => set(key, field.checked));
+  } else if (type.type === "number" || type.type === "integer") {
+    const whole = type.type === "integer";
+    const limits = limitsOf(schema, resolved ?? schema.default);
+    field = made("input", { type: "number", step: whole ? 1 : "any" });
+    if (limits.low !== undefined) field.min = limits.low;
+    if (limits.high !== undefined) field.max = limits.high;
+    field.addEventListener("change", () => set(key, field.value === "" ? null : Number(field.value)));
+    if (!schema.plain && limits.to > limits.from) {
+      const log = schema.log;
+      const place = (value) => log ? Math.log2(value) : value;
+      slider = made("input", { type: "range", min: place(limits.from), max: place(limits.to), step: whole && !log ? 1 : "any" });
+      slider.setAttribute("aria-label", `${name}, slider`);
+      const at = () => {
+        const value = log ? 2 ** Number(slider.value) : Number(slider.value);
+        return whole || (log && value > 20) ? Math.round(value) : Number(value.toPrecision(4));
+      };
+      slider.place = place;
+      slider.addEventListener("input", () => { set(key, at(), true); field.value = at(); });
+      slider.addEventListener("change", () => { lastKey = ""; });
+      inputs.append(slider);
+    }
+  } else {
+    field = made("input", { type: "text", placeholder: schema.placeholder || "" });
+    field.addEventListener("change", () => set(key, parsed(field.value, type)));
+  }
+  field.id = id;
+  if (help) field.setAttribute("aria-describedby", `${id}-help`);
+  inputs.append(field);
+  auto.addEventListener("click", () => set(key, null));
+  element.show = (value, isSet) => {
+    element.classList.toggle("set", isSet);
+    auto.hidden = !isSet;
+    if (document.activeElement === field && field.type !== "checkbox" && field.tagName !== "SELECT") return;
+    if (field.type === "checkbox") field.checked = Boolean(value);
+    else if (field.type === "number") field.value = value === null || value === undefined ? "" : Number(Number(value).toPrecision(6));
+    else field.value = value === null || value === undefined ? "" : typeof value === "object" ? JSON.stringify(value) : value;
+    if (slider && document.activeElement !== slider) slider.value = slider.place(Number(value ?? 0));
+  };
+  return element;
+};
+
+const parsed = (text, type) => {
+  if (text === "") return null;
+  if (type.type !== "array" && !type.anyOf) return text;
+  try {
+    return JSON.parse(text);
+  } catch {
+    return text; // the server says what is wrong with it
+  }
+};
+
+let isoRow = null;
+let isoCamera = "";
+let structure = "";
+const rows = []; // a key may have several
+
+const keyRow = (key, name, schema, value) => {
+  const element = row(key, name, schema, value);
+  rows.push(element);
+  return element;
+};
+
+const makeKeys = (facts) => {
+  const camera = keyRow("camera", "camera", { options: known.cameras });
+  isoRow = made("div");
+  const switchRow = made("div", { className: "row" });
+  const noise = made("input", { type: "checkbox", id: "noise-on" });
+  noise.addEventListener("change", () => {
+    const skip = (state.values.skip || []).filter((name) => name !== "noise");
+    set("skip", noise.checked ? (skip.length ? skip : null) : [...skip, "noise"]);
+  });
+  switchRow.append(made("div", { className: "line" }, made("label", { htmlFor: "noise-on", textContent: "noise" }), noise));
+  const exposure = facts.steps.find((each) => each.name === "exposure" && "ev" in each.values);
+  const methods = exposure ? known.stages.exposure.methods : [];
+  const ev = methods.filter((method) => method.name === exposure.method).map((method) => method.parameters.ev);
+  byId("keys").replaceChildren(camera, isoRow, switchRow,
+    ...ev.map((schema) => keyRow("exposure.ev", "exposure", schema, 0)),
+    ...Object.entries(known.keys).map(([key, schema]) => keyRow(key, key.replaceAll("_", " "), schema, 0)));
+  isoCamera = "";
+};
+
+const makeStages = (facts) => {
+  const opened = new Set([...document.querySelectorAll("#stages details[open]")].map((each) => each.dataset.step));
+  // A raw enters behind the first ones; and without noise there are no stages of noise.
+  byId("stages").replaceChildren(...facts.steps.filter((each) => each.here || !each.on).map((each) => {
+    const declared = known.stages[each.stage];
+    const chosen = declared.methods.find((method) => method.name === each.method) || declared.methods[0];
+    const toggle = made("input", { type: "checkbox", checked: each.on });
+    toggle.setAttribute("aria-label", `${each.name}: on`);
+    toggle.addEventListener("change", () => {
+      const skip = (state.values.skip || []).filter((name) => name !== each.name);
+      set("skip", toggle.checked ? (skip.length ? skip : null) : [...skip, each.name]);
+    });
+    const details = made("details", {}, made("summary", {}, made("b", { textContent: each.name }), " ", made("span", { textContent: each.on ? each.method : "off" })));
+    details.dataset.step = each.name;
+    details.open = opened.has(each.name);
+    details.append(made("p", { className: "help", textContent: declared.summary }));
+    if (declared.methods.length > 1) {
+      details.append(keyRow(`${each.name}.method`, "method", { enum: declared.methods.map((method) => method.name), text: chosen.summary }));
+    } else details.append(made("p", { className: "help", textContent: chosen.summary }));
+    for (const [name, schema] of Object.entries(chosen.parameters)) {
+      const key = `${each.name}.${name}`;
+      details.append(keyRow(key, name, schema, each.values[name]));
+    }
+    const item = made("div", { className: `step${each.on ? "" : " off"}${each.idle ? " idle" : ""}` }, toggle, details);
+    item.dataset.step = each.name;
+    return item;
+  }));
+  byId("step").replaceChildren(new Option("the picture", ""), ...facts.steps.filter((each) => each.here).map((each) => new Option(`after ${each.name}`, each.name)));
+};
+
+const showControls = (facts) => {
+  const now = JSON.stringify(facts.steps.map((each) => [each.name, each.on, each.here, each.method]));
+  if (now !== structure) {
+    rows.length = 0;
+    makeKeys(facts);
+    makeStages(facts);
+    byId("output").replaceChildren(...Object.entries(known.output).map(([name, schema]) => keyRow(`output.${name}`, name.replaceAll("_", " "), schema, schema.default)));
+    structure = now;
+  }
+  if (facts.camera !== isoCamera) {
+    const [low, high] = (known.cameras.find((each) => each.value === facts.camera) || { isos: [50, 102400] }).isos;
+    const element = keyRow("iso", "ISO", { type: "number", minimum: low, maximum: high, log: true }, high);
+    if (isoRow.firstChild) rows.splice(rows.indexOf(isoRow.firstChild), 1);
+    isoRow.replaceChildren(element);
+    isoCamera = facts.camera;
+  }
+  const { values } = state;
+  const valueAt = (key) => key.split(".").reduce((table, name) => (table || {})[name], values);
+  const resolved = { camera: facts.camera, iso: facts.iso, seed: facts.seed };
+  for (const each of facts.steps) {
+    resolved[`${each.name}.method`] = each.method;
+    for (const [name, value] of Object.entries(each.values)) resolved[`${each.name}.${name}`] = value;
+    const item = document.querySelector(`.step[data-step="${each.name}"]`);
+    if (item) item.classList.toggle("idle", each.idle);
+  }
+  for (const [name, schema] of Object.entries(known.output)) resolved[`output.${name}`] = schema.default;
+  for (const element of rows) {
+    const { key } = element.dataset;
+    const own = valueAt(key);
+    const isSet = own !== undefined;
+    const drawn = isSet && own !== null && typeof own === "object" && !Array.isArray(own);
+    element.show(drawn || !isSet ? resolved[key] : own, isSet);
+  }
+  byId("noise-on").checked = !(values.skip || []).includes("noise");
+  byId("step").value = state.step;
+};

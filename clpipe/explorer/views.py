@@ -1,0 +1,109 @@
+"""What is looked at: a result as it is shown, its values, and a part of it as it is measured."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clpipe.analysis.pictures import Picture
+from clpipe.base.errors import RequestError
+from clpipe.base.types import Array, Floats
+from clpipe.chain.chain import Chain
+from clpipe.engine.runner import Result
+from clpipe.images.preview import encoded_light
+from clpipe.stage import Context, Kind
+
+
+@dataclass(frozen=True)
+class View:
+    """What is looked at: the image after a step ("" is the last), or the truth of it.
+
+    ``truth`` is one of :data:`clpipe.chain.truth.PICTURES`, or "" for the picture with its noise.
+    """
+
+    step: str = ""
+    truth: str = ""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What was made of an image, turned as ``clpipe run`` turns it.
+
+    ``image`` has its values, of which ``unit`` is the unit; ``shown`` is (height, width, 3) uint8,
+    as it is looked at. ``facts`` are what is said of it, as JSON values.
+    """
+
+    image: Array
+    unit: str
+    shown: Array
+    facts: Mapping[str, Any]
+
+
+UNITS = {
+    Kind.RGB: "linear, 1 = full scale",
+    Kind.MOSAIC: "signal, 1 = white level",
+    Kind.RAW: "DN",
+    Kind.DISPLAY: "of 1",
+}
+
+
+def shown_of(chain: Chain, result: Result) -> Array:
+    """A result as eight bits, (height, width, 3)."""
+    image = result.image
+    if result.encoded is None:
+        image = encoded_light(signal_of(image, chain))
+    return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+
+
+def context_of(chain: Chain) -> Context:
+    """What a chain's steps say of the image that comes out."""
+    last = chain.steps[-1]
+    return last.method.after(last.context)
+
+
+def signal_of(image: Floats, chain: Chain) -> Floats:
+    """A result in which 0 is black and 1 is white: a raw in signal, others as they are."""
+    context = context_of(chain)
+    black, white = context.black_level, context.white_level
+    if chain.result is not Kind.RAW or black is None or white is None:
+        return image
+    return (image - np.float32(black)) / np.float32(white - black)
+
+
+def cut(image: Array, box: tuple[int, int, int, int]) -> Array:
+    """A part of an image, from left, top, width and height; of a mosaic, whole 2x2 cells.
+
+    >>> cut(np.arange(12).reshape(3, 4), (1, 0, 3, 3)).tolist()
+    [[0, 1], [4, 5]]
+
+    Raises:
+        RequestError: it is empty, or not all in the image.
+    """
+    left, top, width, height = box
+    if image.ndim == 2:
+        left, top, width, height = (size // 2 * 2 for size in box)
+    inside = (
+        0 <= left <= left + width <= image.shape[1] and 0 <= top <= top + height <= image.shape[0]
+    )
+    if not inside or width < 1 or height < 1:
+        raise RequestError(
+            f"the rectangle {box[2]}x{box[3]} at {box[0]}, {box[1]} is not in the image of "
+            f"{image.shape[1]}x{image.shape[0]} px, or is empty"
+        )
+    return image[top : top + height, left : left + width]
+
+
+def part_as_read(name: str, part: Array, chain: Chain) -> Picture:
+    """A part of a result as it is measured, as if it had been read from a file."""
+    path, kind, context = Path(name), chain.result, context_of(chain)
+    if kind is Kind.DISPLAY:
+        step = 1 / 255
+        pixels = part.astype(np.float32) * np.float32(step)
+        return Picture(path, "display", pixels, black=0.0, white=1.0, step=step)
+    if kind is Kind.RGB:
+        return Picture(path, "rgb", part, white=1.0)
+    black, white = context.black_level, context.white_level
+    lowest = None if black is None or white is None else -black / (white - black)
+    return Picture(path, "mosaic", signal_of(part, chain), context.pattern, lowest, 1.0)
