@@ -6,8 +6,9 @@ from os.path import commonpath
 from pathlib import Path
 from typing import Any
 
+from clpipe.chain.chain import step_names
 from clpipe.chain.files import config_text
-from clpipe.chain.keys import KEYS
+from clpipe.chain.keys import KEYS, OUTPUT
 from clpipe.chain.request import Request
 from clpipe.chain.toml import value_text
 from clpipe.explorer.explorer import Explorer
@@ -25,11 +26,12 @@ def exported(explorer: Explorer, image: int, values: Mapping[str, Any]) -> dict[
         ClpipeError: the values are not allowed.
     """
     request = explorer.request(values)
-    request.settings()
+    steps = step_names(request.settings())
+    used = {key: v for key, v in values.items() if key in (*KEYS, OUTPUT, *steps)}
     job, reading = explorer.job(image), _reading(request)
     files = [Path(file) for file in request.stage_files]
     loading = [part for file in files for part in ("--stage-file", str(file))]
-    saved, own = ["-c", SAVED], options_of(values)
+    saved, own = ["-c", SAVED], options_of(used)
     roots = [root_of(each) for each in explorer.jobs]
     return {
         "config": config_text(values, files),
