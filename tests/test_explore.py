@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import logging
 import shlex
 import shutil
 import signal
@@ -101,6 +102,16 @@ def test_the_jpeg_of_a_saved_configuration_is_that_of_its_command_byte_for_byte(
         jpegs.append(Path("out/a.jpg").read_bytes())
         shutil.rmtree("out")
     assert jpegs[0] == jpegs[1]
+
+
+def test_a_command_leaves_out_what_is_set_of_stages_that_are_switched_off(
+    explorer, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    texts = exported(explorer, 0, {"skip": ["denoise"], "denoise": {"luma_strength": 0.5}})
+    assert "luma_strength" in texts["config"]
+    _, *command = shlex.split(texts["command"])
+    clpipe(*command, "--quiet", "--device", "numpy")  # which refuses them
 
 
 def test_options_are_the_same_settings(renders):
@@ -250,7 +261,7 @@ def served(explorer):
 def answer(address, name, question=None, host=None, token=None):
     """The status, the headers and the body of an answer."""
     parts = urlsplit(address)
-    body = None if question is None else json.dumps(question)
+    body = question if question is None or isinstance(question, bytes) else json.dumps(question)
     path = f"/{token}/" if token is not None else parts.path
     headers = {"Host": host} if host else {}
     with closing(http.client.HTTPConnection(parts.hostname, parts.port, timeout=60)) as connection:
@@ -312,6 +323,9 @@ def test_the_page_may_load_nothing_from_elsewhere(served):
     ("name", "question", "says"),
     [
         ("develop", [], "no JSON"),
+        ("develop", {"image": 0, "values": {"\ud800": 1}}, "no JSON"),
+        ("develop", b"[" * 100_000, "nested too deeply"),
+        ("develop", {"image": 0, "values": {"\udc80": 1}}, "unknown key"),
         ("develop", {}, "whole numbers image"),
         ("develop", {"image": 7, "values": {}}, "no image 7"),
         ("develop", {"image": 0, "values": []}, "no values"),
@@ -329,7 +343,10 @@ def test_a_wrong_question_gets_one_message(served, name, question, says):
     assert says in json.loads(body)["error"]
 
 
-def test_a_browser_that_goes_away_leaves_the_others_alone(served):
+def test_a_browser_that_goes_away_leaves_the_others_alone(served, caplog, request):
+    log = logging.getLogger("uvicorn.error")
+    log.addHandler(caplog.handler)
+    request.addfinalizer(lambda: log.removeHandler(caplog.handler))
     parts, question = urlsplit(served), {"image": 0, "values": NOISY}
     place = {"left": 0, "top": 0, "width": 96, "height": 63, "by": 1}
     body = json.dumps(question | place).encode()
@@ -340,6 +357,7 @@ def test_a_browser_that_goes_away_leaves_the_others_alone(served):
         with socket.create_connection((parts.hostname, parts.port)) as gone:
             gone.sendall(sent)
     assert pixels_of(answer(served, "develop", question | place))[1].shape == (63, 96, 3)
+    assert not caplog.records
 
 
 def test_two_explorers_at_once(served, renders):

@@ -16,12 +16,13 @@ from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
-from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response
 from starlette.routing import Mount, Route
 
 from clpipe.analysis.svg import noise_svg
 from clpipe.base.errors import ClpipeError, KeyedError, RequestError
+from clpipe.base.reading import parse_json
 from clpipe.base.types import Array
 from clpipe.explorer.controls import (
     camera_controls,
@@ -119,7 +120,7 @@ class Server:
         """What does not change: the images, the controls, and the values to begin with."""
         explorer = self._explorer
         device = explorer.device
-        return JSONResponse(
+        return in_json(
             {
                 "images": [job.key for job in explorer.jobs],
                 "values": explorer.initial,
@@ -129,8 +130,7 @@ class Server:
                 "cameras": camera_controls(explorer.cameras),
                 "device": device.info.label if device else "NumPy",
                 "saved": SAVED,
-            },
-            headers=HEADERS,
+            }
         )
 
     def _develop(self, question: Mapping[str, Any]) -> Response:
@@ -155,16 +155,16 @@ class Server:
 
     def _values(self, question: Mapping[str, Any]) -> Response:
         number, x, y = whole_numbers(question, "number", "x", "y")
-        return JSONResponse(self._explorer.values_at(number, x, y), headers=HEADERS)
+        return in_json(self._explorer.values_at(number, x, y))
 
     def _noise(self, question: Mapping[str, Any]) -> Response:
         left, top, width, height = whole_numbers(question, "left", "top", "width", "height")
         report = self._explorer.noise(*subject(question), (left, top, width, height))
-        return JSONResponse({"report": report.record(), "svg": noise_svg(report)}, headers=HEADERS)
+        return in_json({"report": report.record(), "svg": noise_svg(report)})
 
     def _export(self, question: Mapping[str, Any]) -> Response:
         image, values, _ = subject(question)
-        return JSONResponse(exported(self._explorer, image, values), headers=HEADERS)
+        return in_json(exported(self._explorer, image, values))
 
 
 def page_files() -> dict[str, Callable[[Request], Response]]:
@@ -188,16 +188,18 @@ def asked(answer: Answer) -> Callable[[Request], Any]:
 
     async def respond(request: Request) -> Response:
         body = b""
-        async for part in request.stream():
-            body += part
-            if len(body) > LONGEST:
-                return problem(f"the question is longer than {LONGEST} bytes", status=413)
         try:
-            question = json.loads(body or b"{}")
+            async for part in request.stream():
+                body += part
+                if len(body) > LONGEST:
+                    return problem(f"the question is longer than {LONGEST} bytes", status=413)
+            question = parse_json(body or b"{}")
             if not isinstance(question, dict):
                 raise ValueError("expected an object")
         except ValueError as error:
             return problem(f"the question is no JSON: {error}")
+        except ClientDisconnect:
+            return Response()  # which nobody reads
         try:
             return await run_in_threadpool(answer, question)
         except ClpipeError as error:
@@ -218,9 +220,15 @@ def with_pixels(facts: Mapping[str, Any], pixels: Array, place: Mapping[str, int
     return Response(body, media_type="application/octet-stream", headers=HEADERS)
 
 
+def in_json(value: Any, status: int = 200) -> Response:
+    """A value as JSON, in ASCII, since names of files need not be UTF-8."""
+    text = json.dumps(value, allow_nan=False)
+    return Response(text, status, HEADERS, "application/json")
+
+
 def problem(text: str, key: str = "", status: int = 400) -> Response:
     """An error as the page shows it."""
-    return JSONResponse({"error": text, "key": key}, status_code=status, headers=HEADERS)
+    return in_json({"error": text, "key": key}, status)
 
 
 def subject(question: Mapping[str, Any]) -> tuple[int, Mapping[str, Any], View]:
