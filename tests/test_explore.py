@@ -31,7 +31,7 @@ from tests.conftest import ROOT
 pytest.importorskip("starlette")
 
 from clpipe.explorer.explorer import Explorer
-from clpipe.explorer.export import exported, options_of
+from clpipe.explorer.export import exported, inputs_of, options_of, run_command
 from clpipe.explorer.server import Server
 from clpipe.explorer.views import View
 
@@ -148,6 +148,33 @@ def test_what_is_drawn_is_saved_as_a_draw_and_seen_as_run_draws_it(renders, tmp_
     assert "-c" in command
     clpipe(*command, "--format", "png", "--quiet", "--device", "numpy")
     np.testing.assert_array_equal(np.asarray(Image.open("out/a.png")), seen.shown)
+
+
+def test_what_a_kept_image_carries_holds_where_nothing_is_set(renders, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    keep = ["--iso", 3200, "--skip", "sharpen", "--keep", "normalize", "--quiet"]
+    clpipe("run", renders / "a.exr", "-o", "kept", *keep, "--device", "numpy")
+    explorer = explorer_of("kept/a.normalize.exr", start_at="white_balance", device="numpy")
+    values = {"denoise": {"luma_strength": 0.5}}
+    seen = explorer.develop(0, values, View())
+    assert seen.facts["iso"] == 3200
+    texts = exported(explorer, 0, values)
+    Path("camera.toml").write_text(texts["config"], "utf-8")
+    _, *command = shlex.split(texts["command"])
+    saved = ["run", "kept/a.normalize.exr", "-o", "out", "--start-at", "white_balance"]
+    for each in (command, [*saved, "-c", "camera.toml"]):
+        clpipe(*each, "--format", "png", "--quiet", "--device", "numpy")
+        (made,) = Path("out").glob("*.png")
+        np.testing.assert_array_equal(np.asarray(Image.open(made)), seen.shown)
+        shutil.rmtree("out")
+
+
+def test_several_inputs_are_applied_to_as_they_were_given(renders):
+    jobs = find_jobs([str(renders / "left"), str(renders / "a.exr")], Path("nowhere"))
+    assert inputs_of(jobs) == [renders / "left", renders / "a.exr"]
+    assert inputs_of(jobs[:1]) == [renders / "left"]
+    assert inputs_of(jobs[1:]) == [renders]
+    assert run_command([Path("-a.exr")], []) == "clpipe run ./-a.exr -o out"
 
 
 def test_noise_of_all_of_a_picture_is_that_of_measure(explorer, renders, tmp_path):
@@ -526,6 +553,32 @@ def test_a_mistake_is_said_and_marked_and_the_picture_stays(page):
     settle(page)
     assert page.evaluate("state.values") == {}
     assert page.locator("#problem:visible").count() == 0
+
+
+def test_a_method_that_needs_a_value_can_be_chosen_and_given_it(page):
+    page.locator('.step[data-step="picture_noise"] summary').click()
+    page.select_option('.row[data-key="picture_noise.method"] select', "iid_gaussian")
+    settle(page)
+    assert "picture_noise" in page.inner_text("#problem")
+    put(page, "picture_noise.sigma", "0.05")
+    assert page.locator("#problem:visible").count() == 0
+    assert page.evaluate("state.values") == {
+        "picture_noise": {"method": "iid_gaussian", "sigma": 0.05}
+    }
+
+
+def test_a_reload_after_a_mistake_brings_back_what_worked(page):
+    put(page, "iso", "6400")
+    put(page, "denoise.luma_strength", "-1")
+    page.wait_for_timeout(400)
+    page.reload()
+    settle(page)
+    assert page.evaluate("state.values") == {"iso": 6400}
+    page.goto(page.url.partition("#")[0] + "#" + json.dumps({"image": 9, "values": {"x": 1}}))
+    settle(page)
+    page.reload()
+    settle(page)
+    assert page.evaluate("[state.image, state.values]") == [0, {}]
 
 
 def test_a_narrow_page_is_not_wider_than_the_screen(page):

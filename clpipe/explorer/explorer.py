@@ -116,7 +116,23 @@ class Explorer:
             KeyedError: they name a file that was not named at the start.
         """
         check_named(values, self.named)
-        return replace(self._request, config=dict(values), options={}, image={}, image_name="")
+        none = replace(self._request, config=None, options={}, image={}, image_name="")
+        if self.goes_on_from_carried:
+            return replace(none, options=dict(values))
+        return replace(none, config=dict(values))
+
+    @property
+    def goes_on_from_carried(self) -> bool:
+        """Whether values lie over those that a kept image carries, as none were configured."""
+        return self._request.start_at is not None and self._request.config is None
+
+    def settings(self, image: int, values: Mapping[str, Any]) -> Settings:
+        """All settings of an image, with those that it carries and those that are drawn.
+
+        Raises:
+            ClpipeError: as of a run.
+        """
+        return self._loaded(image, values)[1]
 
     def develop(self, image: int, values: Mapping[str, Any], view: View) -> Sample:
         """An image, developed as ``clpipe run`` does with a configuration of these values.

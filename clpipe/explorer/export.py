@@ -1,8 +1,7 @@
 """What a page's settings are elsewhere: a configuration, and the commands that use it."""
 
 import shlex
-from collections.abc import Mapping
-from os.path import commonpath
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,18 +30,29 @@ def exported(explorer: Explorer, image: int, values: Mapping[str, Any]) -> dict[
     job, reading = explorer.job(image), _reading(request)
     files = [Path(file) for file in request.stage_files]
     loading = [part for file in files for part in ("--stage-file", str(file))]
-    saved, own = ["-c", SAVED], options_of(used)
-    roots = [root_of(each) for each in explorer.jobs]
+    options, saved = options_of(used), ["-c", SAVED]
+    own = saved if options is None else [*loading, *options]
+    carries = explorer.goes_on_from_carried
+    # A configuration stands in place of what a kept image carries, so it must have that, too.
+    config = explorer.settings(image, values).record() if carries else values
     return {
-        "config": config_text(values, files),
-        "command": run_command(input_of(job), reading + (saved if own is None else loading + own)),
-        "folder": run_command(Path(commonpath(roots) or "."), reading + saved),
+        "config": config_text(config, files),
+        "command": run_command([input_of(job)], reading + own),
+        "folder": run_command(inputs_of(explorer.jobs), reading + (own if carries else saved)),
     }
 
 
-def run_command(source: Path, options: list[str]) -> str:
-    """A command of a shell that develops a file or a folder."""
-    return shlex.join(["clpipe", "run", str(source), "-o", OUT, *options])
+def run_command(sources: Sequence[Path], options: list[str]) -> str:
+    """A command of a shell that develops files and folders."""
+    named = [f"./{source}" if str(source).startswith("-") else str(source) for source in sources]
+    return shlex.join(["clpipe", "run", *named, "-o", OUT, *options])
+
+
+def inputs_of(jobs: Sequence[Job]) -> list[Path]:
+    """The files and folders that images came from; of a single file, the folder that it is in."""
+    if len(jobs) == 1:
+        return [root_of(jobs[0])]
+    return list(dict.fromkeys(job.path if job.listed else root_of(job) for job in jobs))
 
 
 def root_of(job: Job) -> Path:

@@ -18,7 +18,14 @@ const limitsOf = (schema, value) => {
   const top = high === undefined || (size > 0 && high > 40 * size) ? (size ? 4 * size : 1) : high;
   // A slider over all that is allowed would be too coarse.
   const to = size || low === undefined || low >= 0 ? top : Math.min(top, 5);
-  return { low, high, from: Math.max(low ?? -to, size || low >= 0 ? -Infinity : -to), to };
+  const from = Math.max(low ?? -to, size || low >= 0 ? -Infinity : -to);
+  const within = (to - from) / 400; // of a limit that is not allowed itself
+  return {
+    low,
+    high,
+    from: from === type.exclusiveMinimum ? from + within : from,
+    to: to === type.exclusiveMaximum ? to - within : to,
+  };
 };
 
 // The limits of a number in words.
@@ -59,16 +66,26 @@ const row = (key, name, schema, resolved) => {
     if (limits.low !== undefined) field.min = limits.low;
     if (limits.high !== undefined) field.max = limits.high;
     field.addEventListener("change", () => set(key, field.value === "" ? null : Number(field.value)));
-    if (!schema.plain && limits.to > limits.from) {
+    // Of whole numbers without both limits not every one may be allowed, such as even ones.
+    const slides = !schema.plain && limits.to > limits.from && !(whole && (limits.low === undefined || limits.high === undefined));
+    if (slides) {
       const log = schema.log;
       const place = (value) => log ? Math.log2(value) : value;
-      slider = made("input", { type: "range", min: place(limits.from), max: place(limits.to), step: whole && !log ? 1 : "any" });
+      slider = made("input", { type: "range", step: whole && !log ? 1 : "any" });
       slider.setAttribute("aria-label", `${name}, slider`);
+      let range = limits;
+      slider.reach = (value, isSet) => {
+        if (!log && !(isSet && value >= range.from && value <= range.to)) range = limitsOf(schema, value);
+        slider.min = place(range.from);
+        slider.max = place(range.to);
+        slider.value = place(Number(value ?? 0));
+      };
+      slider.reach(resolved ?? schema.default ?? 0, false);
       const at = () => {
         const value = log ? 2 ** Number(slider.value) : Number(slider.value);
-        return whole || (log && value > 20) ? Math.round(value) : Number(value.toPrecision(4));
+        const short = whole || (log && value > 20) ? Math.round(value) : Number(value.toPrecision(4));
+        return Math.min(Math.max(short, range.from), range.to);
       };
-      slider.place = place;
       slider.addEventListener("input", () => { set(key, at(), true); field.value = at(); });
       slider.addEventListener("change", () => { lastKey = ""; });
       inputs.append(slider);
@@ -88,7 +105,7 @@ const row = (key, name, schema, resolved) => {
     if (field.type === "checkbox") field.checked = Boolean(value);
     else if (field.type === "number") field.value = value === null || value === undefined ? "" : Number(Number(value).toPrecision(6));
     else field.value = value === null || value === undefined ? "" : typeof value === "object" ? JSON.stringify(value) : value;
-    if (slider && document.activeElement !== slider) slider.value = slider.place(Number(value ?? 0));
+    if (slider && document.activeElement !== slider) slider.reach(value ?? 0, isSet);
   };
   return element;
 };
@@ -141,6 +158,8 @@ const makeStages = (facts) => {
     const chosen = declared.methods.find((method) => method.name === each.method) || declared.methods[0];
     const toggle = made("input", { type: "checkbox", checked: each.on });
     toggle.setAttribute("aria-label", `${each.name}: on`);
+    // What an image carries cannot be taken back by values over it.
+    toggle.disabled = !each.on && !(state.values.skip || []).includes(each.name);
     toggle.addEventListener("change", () => {
       const skip = (state.values.skip || []).filter((name) => name !== each.name);
       set("skip", toggle.checked ? (skip.length ? skip : null) : [...skip, each.name]);
@@ -161,6 +180,18 @@ const makeStages = (facts) => {
     return item;
   }));
   byId("step").replaceChildren(new Option("the picture", ""), ...facts.steps.filter((each) => each.here).map((each) => new Option(`after ${each.name}`, each.name)));
+};
+
+// Facts with the methods and switches that were asked, so that what is refused can be set right.
+const asAsked = (facts) => {
+  const { values } = state;
+  const steps = facts.steps.map((each) => {
+    const method = (values[each.name] || {}).method;
+    const on = !(values.skip || []).includes(each.name);
+    if (typeof method !== "string" || method === each.method) return { ...each, on };
+    return { ...each, on, method, values: {} };
+  });
+  return { ...facts, steps };
 };
 
 const showControls = (facts) => {

@@ -31,7 +31,7 @@ const refresh = async () => {
     complain(null);
     tell(facts, performance.now() - start);
     showControls(facts);
-    remember();
+    remember(of);
     if (!again) {
       picture = { ...(await whole(facts)), image: state.image, of };
       draw();
@@ -41,6 +41,7 @@ const refresh = async () => {
     noiseIsOld();
   } catch (error) {
     complain(error);
+    if (picture) showControls(asAsked(picture.facts));
   } finally {
     clearTimeout(busy);
     byId("busy").hidden = true;
@@ -62,6 +63,7 @@ const refreshOther = async () => {
   const [values, truth] = kind === "B" ? [settingB, ""] : [state.values, kind];
   const question = JSON.stringify([state.image, state.step, values, truth]);
   if (!other || other.question !== question) {
+    other = null;
     const { facts } = await pictured("develop", { ...questionOf(values, truth), left: 0, top: 0, width: 0, height: 0, by: 1 });
     other = { ...(await whole(facts)), question };
   }
@@ -117,6 +119,7 @@ let lastKey = "";
 
 const setValues = (values, key = "") => {
   if (same(values, state.values)) return;
+  if ((values.skip || []).includes(state.step)) state.step = "";
   if (!key || key !== lastKey) past.push(state.values);
   if (past.length > 500) past.shift();
   future = [];
@@ -174,9 +177,9 @@ document.addEventListener("keydown", (event) => {
 });
 
 let remembering = 0;
-const remember = () => {
+const remember = (of) => {
   clearTimeout(remembering);
-  remembering = setTimeout(() => history.replaceState(null, "", `#${encodeURIComponent(JSON.stringify(state))}`), 300);
+  remembering = setTimeout(() => history.replaceState(null, "", `#${encodeURIComponent(of)}`), 300);
 };
 
 // What a page's settings are elsewhere.
@@ -274,6 +277,13 @@ const begin = async () => {
   }
   byId("image").value = state.image;
   sizeCanvas();
-  changed();
+  document.body.dataset.settled = "false";
+  await refresh();
+  if (!developedOf && location.hash) { // what was kept there does not fit these images
+    Object.assign(state, { image: 0, values: known.values, step: "" });
+    byId("image").value = 0;
+    changed();
+  }
 };
+window.addEventListener("hashchange", () => location.reload());
 begin().catch(complain);

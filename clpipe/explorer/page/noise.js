@@ -12,9 +12,11 @@ const setBox = ([x0, y0], [x1, y1]) => {
 };
 
 let measuring = false;
+let measureAgain = false;
 let measuredOf = "";
 
 const measure = async () => {
+  if (measuring) measureAgain = true;
   if (measuring || !picture) return;
   measuring = true;
   byId("measured").textContent = "measuring …";
@@ -45,6 +47,10 @@ const measure = async () => {
   } finally {
     measuring = false;
   }
+  if (measureAgain) {
+    measureAgain = false;
+    await measure();
+  } else noiseIsOld();
 };
 
 let remeasure = 0;
