@@ -161,6 +161,7 @@ class RunLog:
             {
                 "input": str(job.path),
                 "name": job.key,
+                "stem": job.stem,
                 "status": outcome.status,
                 "megapixels": round(outcome.megapixels, 3),
                 **{f"{step}_seconds": round(outcome.seconds(step), 6) for step in STEPS},

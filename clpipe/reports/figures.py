@@ -58,7 +58,7 @@ class Session:
         """How fast it was over its time: seconds since the start, MP/s, and shares of the steps.
 
         An image counts where the last of its steps ends, as near as the log tells: when it was
-        begun, and the time of its steps.
+        begun, and the time of its steps. Where none ends, there are no shares.
         """
         done = [line for line in self.images if line.get("status") == DONE]
         begun, length = moment(self.start), self.seconds
@@ -74,9 +74,9 @@ class Session:
         for i in range(max(pieces) + 1):
             lines = pieces.get(i, [])
             spent = {s: sum(number(x.get(f"{s}_seconds")) for x in lines) for s in STEPS}
-            whole = sum(spent.values()) or 1.0
+            whole = sum(spent.values())
             speed = sum(number(line.get("megapixels")) for line in lines) / width
-            shares = {step: spent[step] / whole for step in STEPS}
+            shares = {step: spent[step] / whole for step in STEPS} if whole else {}
             rows.append({"seconds": (i + 0.5) * width, "speed": speed, **shares})
         return rows
 
@@ -111,11 +111,14 @@ def moment(line: Mapping[str, Any]) -> float:
 
 
 def last_failures(found: Sequence[Session]) -> list[str]:
-    """The errors of images that failed and were not done since."""
+    """The errors of images that failed and were not done since.
+
+    An image is told by where its pictures are: a series makes several of one input.
+    """
     errors: dict[str, str] = {}
     for session in found:
         for line in session.images:
-            key = str(line.get("name"))
+            key = str(line.get("stem", line.get("name")))
             if line.get("status") == FAILED:
                 errors[key] = str(line.get("error"))
             elif line.get("status") in (DONE, SKIPPED):
@@ -173,8 +176,11 @@ class Parameter:
     @property
     def text(self) -> str:
         """The value, or what values there are."""
-        if self.varies and len(numbers := self.numbers) == self.values.total():
+        numbers = self.numbers
+        if len(self.values) > DISTINCT and len(numbers) == self.values.total():
             return f"{min(numbers):.6g} to {max(numbers):.6g}"
+        if len(numbers) == self.values.total():
+            return ", ".join(text_of(value) for value in sorted(self.values))
         listed = [text_of(value) for value, _ in self.values.most_common(DISTINCT)]
         more = len(self.values) - len(listed)
         return ", ".join(listed) + (f" and {more} more" if more > 0 else "")
@@ -262,5 +268,5 @@ def oddities(made: Made) -> list[str]:
     found = [blob.problem for blob in made.files.values() if blob.problem]
     clipped = number(made.value("clipped"))
     if clipped >= MUCH:
-        found.append(f"{clipped:.0%} of its pixels are clipped")
+        found.append(f"{clipped * 100:.0f} % of its pixels are clipped")
     return found + warnings_of(made)
