@@ -10,7 +10,7 @@ from typing import Any
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import load_picture
 from clpipe.analysis.report import NoiseReport
-from clpipe.analysis.svg import noise_svg
+from clpipe.analysis.svg import law_svg, noise_svg
 from clpipe.base.errors import ClpipeError
 from clpipe.chain.truth import DEVELOPMENT, MOSAIC
 from clpipe.outputs.renditions import SUFFIXES
@@ -34,6 +34,7 @@ class Law:
     b_error: float
     asked_a: float
     asked_b: float
+    report: NoiseReport
 
     @property
     def errors(self) -> float:
@@ -42,6 +43,12 @@ class Law:
             abs(self.a - self.asked_a) / max(self.a_error, 1e-12),
             abs(self.b - self.asked_b) / max(self.b_error, 1e-12),
         )
+
+    @property
+    def svg(self) -> str:
+        """The raw, drawn."""
+        title = f"Variance by intensity of {self.name}, and the law that was asked"
+        return law_svg(self.report, self.asked_a, self.asked_b, title)
 
     @property
     def leaves(self) -> bool:
@@ -145,7 +152,7 @@ def laws(run: Run, problems: list[str]) -> list[Law]:
         a, a_error = _pooled([(fit.a, fit.a_error) for fit in fits])
         b, b_error = _pooled([(fit.b, fit.b_error) for fit in fits])
         asked_a, asked_b = number(asked.get("a")), number(asked.get("b")) + other_noise(made)
-        found.append(Law(made.name, a, b, a_error, b_error, asked_a, asked_b))
+        found.append(Law(made.name, a, b, a_error, b_error, asked_a, asked_b, report))
     return found
 
 

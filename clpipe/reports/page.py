@@ -79,8 +79,10 @@ def html(runs: Sequence[Run]) -> str:
         for label, run in zip(labels, runs, strict=True)
         for each in noises(run, same(run, typical), problems, DRAWN // len(runs))
     ]
-    for _, drawing in noise:
-        budget.take(drawing.svg)
+    furthest = sorted(judged, key=lambda law: law.errors, reverse=True)[:DRAWN]
+    law_drawings = [(law.name, law.svg) for law in furthest]
+    for svg in [each.svg for _, each in noise] + [svg for _, svg in law_drawings]:
+        budget.take(svg)
     share = int(budget.left * SHEET_SHARE) // len(runs)
     rooms = [Budget(share) for _ in runs]
     sheets = [contact_sheet(*each) for each in zip(runs, rooms, labels, strict=True)]
@@ -118,6 +120,7 @@ def html(runs: Sequence[Run]) -> str:
         real_left=REAL_LEFT,
         real_right=REAL_RIGHT,
         laws=judged,
+        law_drawings=law_drawings,
         limit=f"{LIMIT:g}",
         style=(TEMPLATES / "report.css").read_text(),
         script=(TEMPLATES / "report.js").read_text(),
