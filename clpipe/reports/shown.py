@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.analysis.places import HEIGHT, WIDTH, Place, choose_places
+from clpipe.analysis.crops import HEIGHT, WIDTH, Place, choose_places
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
 from clpipe.images.preview import decoded, jpeg_bytes, reduced, thumbnail_bytes
