@@ -18,7 +18,6 @@ from clpipe.images.write import write_exr as write
 from clpipe.reports.figures import last_failures, sessions
 from clpipe.reports.run import read_run
 from clpipe.reports.shown import places_of
-from tests.conftest import ROOT
 
 pytest.importorskip("jinja2")
 
@@ -367,4 +366,12 @@ def test_a_run_is_read_from_its_sidecars(out):
     assert [made.name for made in run.pictures] == [HOSTILE, "a", "b"]
     assert sorted(run.of_image("a")) == ["", ".truth", ".truth_mosaic"]
     assert run.of_image("a")[""].files.keys() == {"jpg", "normalize.exr"}
-    assert (ROOT / "clpipe/reports/page/report.html").is_file()
+    steps = [{step["name"]: step for step in made.steps} for made in run.pictures]
+    assert steps[0]["gamma"] is steps[1]["gamma"]  # lines that are alike are held once
+    assert steps[0]["exposure"] != steps[1]["exposure"]
+    sidecar = out / "a.json"
+    whole = json.loads(sidecar.read_text())
+    assert list(steps[1].values()) == whole["stages"]
+    sidecar.write_text('{\n  "clpipe": ' + json.dumps(whole, indent=3)[len('{\n   "clpipe": ') :])
+    again = next(made for made in read_run(out).pictures if made.name == "a")
+    assert again.record == run.of_image("a")[""].record

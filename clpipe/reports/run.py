@@ -19,14 +19,15 @@ TAR = ".tar"
 # What is kept of sidecars, of which there may be hundreds of thousands.
 KEYS = ("clpipe", "iso", "camera", "width", "height", "noise", "clipped", "warnings")
 ALIKE = ("device", "versions")  # which most of them share
+STAGES, STAGES_END = b'\n  "stages": [\n', b"\n  ],\n"  # as json_text writes them
 LOGS = "run*.jsonl"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Blob:
     """A file, or a member of a tar, and what its sidecar says of it."""
 
-    path: Path
+    path: str
     name: str  # below the output folder; of a member, behind the tar's
     said: Mapping[str, Any]  # its size and SHA-256
     offset: int | None = None  # of a tar's member
@@ -38,7 +39,7 @@ class Blob:
         Raises:
             OSError: they cannot be read.
         """
-        with self.path.open("rb") as file:
+        with open(self.path, "rb") as file:
             file.seek(self.offset or 0)
             return file.read(self.size)
 
@@ -106,17 +107,38 @@ class Run:
     def __post_init__(self) -> None:
         self._by_image: dict[str, dict[str, Made]] = {}
         self._alike: dict[str, Any] = {}
+        self._steps: dict[bytes, Any] = {}
+
+    def parsed(self, sidecar: bytes) -> dict[str, Any]:
+        """The values of a sidecar that clpipe wrote.
+
+        Most lines of stages are those of other sidecars, too: a line is parsed once, and is one
+        object. Where a sidecar has been laid out anew, all of it is parsed.
+
+        Raises:
+            ValueError: it is no JSON.
+        """
+        head, _, rest = sidecar.partition(STAGES)
+        lines, end, tail = rest.partition(STAGES_END)
+        if not end:
+            return dict(parse_json(sidecar))
+        values = dict(parse_json(head + b"\n" + tail))
+        values["stages"] = [self._step(line) for line in lines.split(b",\n")]
+        return values
+
+    def _step(self, line: bytes) -> Any:
+        if line not in self._steps:
+            self._steps[line] = parse_json(line)
+        return self._steps[line]
 
     def slim(self, record: Mapping[str, Any]) -> dict[str, Any]:
-        """What is kept of a sidecar; values that are alike become one object."""
+        """What is kept of a sidecar; machines that are alike become one object."""
         steps = record.get("stages")
         kept = {key: record.get(key) for key in KEYS}
-        kept |= {key: self._one(record.get(key)) for key in ALIKE}
-        kept["stages"] = [self._one(step) for step in steps] if isinstance(steps, list) else []
+        for key in ALIKE:
+            kept[key] = self._alike.setdefault(repr(record.get(key)), record.get(key))
+        kept["stages"] = steps if isinstance(steps, list) else []
         return kept
-
-    def _one(self, value: Any) -> Any:
-        return self._alike.setdefault(repr(value), value)
 
     def add(self, made: Made) -> None:
         """Add a picture."""
@@ -160,14 +182,13 @@ def _in_folder(run: Run) -> Iterator[Made]:
         below = Path(place).relative_to(run.folder).as_posix()
         beside: dict[str, Blob] = {}
         for name in sorted(names):
-            path = Path(place, name)
             if name.startswith("."):
                 continue
             if name.endswith(TAR):
-                yield from _in_tar(run, path)
+                yield from _in_tar(run, Path(place, name))
             elif name.endswith(f".{SIDECAR}"):
                 try:
-                    data = read_bytes(path)
+                    data = read_bytes(Path(place, name))
                 except OSError as error:
                     run.problems.append(f"{_joined(below, name)}: cannot be read: {error}")
                     continue
@@ -179,9 +200,7 @@ def _files(folder: str, below: str) -> dict[str, Blob]:
     """A folder's files by their names."""
     with os.scandir(folder) as entries:
         return {
-            entry.name: Blob(
-                Path(entry.path), _joined(below, entry.name), {}, None, entry.stat().st_size
-            )
+            entry.name: Blob(entry.path, _joined(below, entry.name), {}, None, entry.stat().st_size)
             for entry in entries
             if entry.is_file()
         }
@@ -202,7 +221,7 @@ def _in_tar(run: Run, path: Path) -> Iterator[Made]:
                     str(PurePosixPath(member.name).parent),
                 )
                 place = member.offset_data, member.size
-                beside[below][name] = Blob(path, f"{label}/{member.name}", {}, *place)
+                beside[below][name] = Blob(str(path), f"{label}/{member.name}", {}, *place)
                 is_text = name.endswith(f".{SIDECAR}") and member.size <= TEXT_BYTES
                 if is_text and (file := tar.extractfile(member)):
                     sidecars.append((below, name, file.read()))
@@ -227,7 +246,7 @@ def _made(
     if not data.startswith(BEGINNING):
         return
     try:
-        record = parse_json(data)
+        record = run.parsed(data)
     except ValueError:
         run.problems.append(f"{_joined(below, name)}: is cut off or damaged")
         return
@@ -239,7 +258,7 @@ def _made(
     files = {}
     for file, said in outputs_in(record).items():
         label = _joined(below, file)
-        there = beside.get(file, Blob(run.folder, label, {}))
+        there = beside.get(file, Blob("", label, {}))
         files[file.removeprefix(f"{stem}.")] = Blob(
             there.path, there.name, said, there.offset, there.size
         )
