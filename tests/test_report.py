@@ -141,6 +141,16 @@ def test_the_law_is_held_against_raws(out):
     page = report(out)
     assert "Raws against the law that was asked" in page.said
     assert "leaves the law" not in page.said
+    pair = (out / "a.normalize.exr", "--truth", out / "a.truth_mosaic.exr")
+    report_of_it = json.loads(clpipe("measure", *pair, "--json"))
+    fit = report_of_it["channels"]["mosaic"]["law"]
+    assert f"{fit['a']:.4g} ± {fit['a_error']:.1g}" in page.said
+    assert f"{fit['b']:.4g} ± {fit['b_error']:.1g}" in page.said
+    (name,) = re.findall(r"Against (.*?)\.truth\.jpg, in flat places", page.said)
+    pair = (out / f"{name}.jpg", "--truth", out / f"{name}.truth.jpg")
+    channels = json.loads(clpipe("measure", *pair, "--json"))["channels"]
+    assert f"R {channels['R']['sigma'] * 255:.2f}, G" in page.said
+    assert f"leaves {channels['Y']['energy_left_2x2']:.2f} of luma" in page.said
     sidecar = out / "a.json"
     record = json.loads(sidecar.read_text())
     asked = record["noise"]["signal"]["a"]

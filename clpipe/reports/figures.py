@@ -54,6 +54,11 @@ class Session:
         moments = [moment(line) for line in self.images]
         return max(moments, default=0.0) - moment(self.start) if moments else 0.0
 
+    @property
+    def speed(self) -> float:
+        """In MP/s; 0 where nothing was done."""
+        return self.megapixels / self.seconds if self.seconds > 0 else 0.0
+
     def pace(self) -> list[dict[str, float]]:
         """How fast it was over its time: seconds since the start, MP/s, and shares of the steps.
 
@@ -127,11 +132,11 @@ def last_failures(found: Sequence[Session]) -> list[str]:
 
 
 def totals(run: Run, found: Sequence[Session]) -> list[tuple[str, str]]:
-    """The figures that stand on top, by their names."""
+    """The figures that stand on top, by their names; the last run is one that made pictures."""
     pictures = run.pictures
     others = len(run.made) - len(pictures)
     megapixels = sum(number(p.value("width")) * number(p.value("height")) for p in pictures) / 1e6
-    last = found[-1] if found else None
+    last = next((session for session in reversed(found) if session.count(DONE)), None)
     rows = [
         ("pictures", f"{len(pictures):,}"),
         ("truths, frames, baselines", f"{others:,}"),
@@ -142,10 +147,9 @@ def totals(run: Run, found: Sequence[Session]) -> list[tuple[str, str]]:
         left_out = last.count(LEFT_OUT)
         rows += [("left out", f"{left_out:,}")] if left_out else []
         if last.seconds > 0:
-            rows += [
-                ("time of the last run", duration(last.seconds)),
-                ("speed of the last run", f"{last.megapixels / last.seconds:.3g} MP/s"),
-            ]
+            rows.append(("time of the last run", duration(last.seconds)))
+        if last.speed:
+            rows.append(("speed of the last run", f"{last.speed:.3g} MP/s"))
         if peak := number(last.end.get("peak_memory")):
             rows.append(("most memory", in_words(peak)))
     return rows

@@ -182,7 +182,6 @@ def view_record(each: Large) -> Mapping[str, Any]:
 
 def session_row(session: Session) -> Mapping[str, str]:
     """A start of the program, as a row of a table."""
-    speed = session.megapixels / session.seconds if session.seconds > 0 else 0.0
     return {
         "command": shlex.join(["clpipe", *session.command]),
         "at": str(session.start.get("at", ""))[:19].replace("T", " "),
@@ -191,7 +190,7 @@ def session_row(session: Session) -> Mapping[str, str]:
         "skipped": f"{session.count(SKIPPED):,}",
         "failed": f"{session.count(FAILED):,}",
         "time": duration(session.seconds),
-        "speed": f"{speed:.3g} MP/s",
+        "speed": f"{session.speed:.3g} MP/s" if session.speed else "-",
     }
 
 

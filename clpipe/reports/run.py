@@ -59,7 +59,7 @@ class Made:
 
     image: str  # the name of what it was made of, without ending; with folders of a series
     rendition: str  # what is behind that name, such as ".truth"; "" is the picture itself
-    record: Mapping[str, Any]  # what is needed of the sidecar: KEYS, in which what is alike is one
+    record: dict[str, Any]  # what is needed of the sidecar, in which what is alike is one
     files: Mapping[str, Blob]  # by what is behind the picture's name: "jpg", "demosaic.exr"
 
     @property
@@ -70,14 +70,14 @@ class Made:
     @property
     def steps(self) -> Sequence[Mapping[str, Any]]:
         """The steps of its chain."""
-        found = self.record.get("stages")
-        return [each for each in found if isinstance(each, Mapping)] if found else []
+        found: list[Mapping[str, Any]] = self.record["stages"]
+        return found
 
     def value(self, *keys: str) -> Any:
         """A value of the sidecar, by the keys on the way to it; None where it is not there."""
         found: Any = self.record
         for key in keys:
-            found = found.get(key) if isinstance(found, Mapping) else None
+            found = found.get(key) if isinstance(found, dict) else None
         return found
 
 
@@ -134,10 +134,11 @@ class Run:
     def slim(self, record: Mapping[str, Any]) -> dict[str, Any]:
         """What is kept of a sidecar; machines that are alike become one object."""
         steps = record.get("stages")
+        steps = steps if isinstance(steps, list) else []
         kept = {key: record.get(key) for key in KEYS}
         for key in ALIKE:
             kept[key] = self._alike.setdefault(repr(record.get(key)), record.get(key))
-        kept["stages"] = steps if isinstance(steps, list) else []
+        kept["stages"] = [step for step in steps if isinstance(step, dict)]
         return kept
 
     def add(self, made: Made) -> None:
