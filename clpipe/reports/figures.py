@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import cached_property
 from typing import Any
 
 from clpipe.base.memory import in_words
@@ -41,12 +42,12 @@ class Session:
         """How many images have a status."""
         return sum(line.get("status") == status for line in self.images)
 
-    @property
+    @cached_property
     def megapixels(self) -> float:
         """Of what was done."""
         return sum(number(line.get("megapixels")) for line in self.images)
 
-    @property
+    @cached_property
     def seconds(self) -> float:
         """From the start to the end, or to the last image that was begun."""
         if self.end:
@@ -215,17 +216,19 @@ class Step:
 def steps_of(pictures: Sequence[Made]) -> list[Step]:
     """The steps of the chains of pictures, in the order of the longest chain."""
     order: list[str] = []
-    counts: dict[str, dict[int, tuple[Mapping[str, Any], int]]] = {}
+    records: dict[int, Mapping[str, Any]] = {}  # steps that are alike are the same object
+    counts: Counter[int] = Counter()
     for made in pictures:
-        steps = made.steps
-        names = [str(step.get("name")) for step in steps]
-        if len(names) > len(order):
+        ids = [id(step) for step in made.steps]
+        counts.update(ids)
+        records.update(zip(ids, made.steps, strict=True))
+        if len(ids) > len(order):
+            names = [str(step.get("name")) for step in made.steps]
             order = names + [name for name in order if name not in names]
-        for name, step in zip(names, steps, strict=True):
-            of_step = counts.setdefault(name, {})  # steps that are alike are the same object
-            of_step[id(step)] = step, of_step.get(id(step), (step, 0))[1] + 1
-    order += [name for name in counts if name not in order]
-    return [_step(name, list(counts[name].values())) for name in order]
+    by_name: dict[str, list[tuple[Mapping[str, Any], int]]] = {name: [] for name in order}
+    for key, record in records.items():
+        by_name.setdefault(str(record.get("name")), []).append((record, counts[key]))
+    return [_step(name, counted) for name, counted in by_name.items()]
 
 
 def _step(name: str, counted: Sequence[tuple[Mapping[str, Any], int]]) -> Step:
