@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from clpipe.analysis.comparison import compare, displayed
+from clpipe.analysis.crops import FOUND, choose_places
 from clpipe.analysis.pictures import Picture
-from clpipe.analysis.places import FOUND, choose_places
 from clpipe.reference.transfer import srgb_curve
 
 

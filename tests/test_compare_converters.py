@@ -10,6 +10,7 @@ import side_by_side
 from PIL import Image
 
 from clpipe.analysis.charts import chart_image, chart_patches, saturated_image
+from clpipe.analysis.crops import HEIGHT, WIDTH
 from clpipe.analysis.fidelity import colour_errors
 from tests.conftest import ROOT
 
@@ -72,19 +73,10 @@ def test_the_middle_of_what_was_enlarged_is_the_image():
     assert np.array_equal(tool.reduced(tool.enlarged(image)), image)
 
 
-def test_a_place_is_where_the_picture_is_saturated_or_detailed():
-    picture = np.full((300, 400, 3), 128, np.uint8)
-    picture[20:120, 30:160] = 250, 0, 0
-    picture[180:290:2, 220:390] = 0
-    places = side_by_side.telling_places(picture)
-    assert (places["saturated"].of(picture) == (250, 0, 0)).all()
-    assert side_by_side.luma(places["detail"].of(picture)).std() > 60
-
-
 def test_a_sheet_holds_the_crops_at_400_percent():
-    crop = np.random.default_rng(0).integers(0, 256, (*side_by_side.CROP, 3), dtype=np.uint8)
+    crop = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     page = np.asarray(side_by_side.sheet(["one", "two"], {"a, b": [crop, 255 - crop]}))
-    high, wide = (side * 4 for side in side_by_side.CROP)
+    high, wide = (side * 4 for side in (HEIGHT, WIDTH))
     top, left = side_by_side.HEAD, side_by_side.SIDE
     assert np.array_equal(page[top : top + high : 4, left : left + wide : 4], crop)
 

@@ -1,5 +1,7 @@
 """``clpipe report``: what its page says of runs, and what it does in a browser."""
 
+import base64
+import io
 import json
 import re
 import shutil
@@ -9,12 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 
 from clpipe.commands.main import main
 from clpipe.images.write import write_exr as write
-from clpipe.reports.figures import sessions
+from clpipe.reports.figures import last_failures, sessions
 from clpipe.reports.run import read_run
-from tests.conftest import ROOT
+from clpipe.reports.shown import places_of
 
 pytest.importorskip("jinja2")
 
@@ -62,6 +65,10 @@ def report(*arguments) -> Page:
     return Page(page)
 
 
+def pixels_of(data: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(data))).astype(float)
+
+
 @pytest.fixture(scope="module")
 def renders(tmp_path_factory):
     """Three small renders, one with a hostile name, and one that is damaged."""
@@ -103,12 +110,12 @@ def test_figures_pictures_and_failures(out):
     assert "cut.exr" in page.said
     entries = page.data["sheet-data"]
     assert [entry["name"] for entry in entries] == [HOSTILE, "a", "b"]
-    assert all(entry["image"].startswith("data:image/jpeg;base64,") for entry in entries)
+    assert all(entry["image"].startswith("data:image/webp;base64,") for entry in entries)
     assert {entry["iso"] for entry in entries} == {1600}
     large = page.data["look-data"]
     assert [view["label"] for view in large[0]["views"]] == ["picture", "truth", "after normalize"]
     assert [view["label"] for view in large[2]["views"]] == ["picture", "truth"]
-    assert re.search(r"exposure\.ev ?: -?[\d.]+ to -?[\d.]+", page.said)
+    assert re.search(r"exposure\.ev ?: -?[\d.]+, -?[\d.]+, -?[\d.]+", page.said)
     assert "sensor_noise gaussian" in page.said
     assert "finished" in page.said
 
@@ -134,6 +141,16 @@ def test_the_law_is_held_against_raws(out):
     page = report(out)
     assert "Raws against the law that was asked" in page.said
     assert "leaves the law" not in page.said
+    pair = (out / "a.normalize.exr", "--truth", out / "a.truth_mosaic.exr")
+    report_of_it = json.loads(clpipe("measure", *pair, "--json"))
+    fit = report_of_it["channels"]["mosaic"]["law"]
+    assert f"{fit['a']:.4g} ± {fit['a_error']:.1g}" in page.said
+    assert f"{fit['b']:.4g} ± {fit['b_error']:.1g}" in page.said
+    (name,) = re.findall(r"Against (.*?)\.truth\.jpg, in flat places", page.said)
+    pair = (out / f"{name}.jpg", "--truth", out / f"{name}.truth.jpg")
+    channels = json.loads(clpipe("measure", *pair, "--json"))["channels"]
+    assert f"R {channels['R']['sigma'] * 255:.2f}, G" in page.said
+    assert f"leaves {channels['Y']['energy_left_2x2']:.2f} of luma" in page.said
     sidecar = out / "a.json"
     record = json.loads(sidecar.read_text())
     asked = record["noise"]["signal"]["a"]
@@ -199,7 +216,7 @@ def test_tars_and_series_are_read(renders, tmp_path):
     page = report(out / "s")
     names = {entry["name"]: entry["iso"] for entry in page.data["sheet-data"]}
     assert names == {"iso100/a": 100, "iso100/b": 100, "iso1600/a": 1600, "iso1600/b": 1600}
-    assert "ISO 100 to 1600" in page.said
+    assert "ISO 100, 1600" in page.said
     page = report(out / "t")
     assert [entry["name"] for entry in page.data["sheet-data"]] == ["a", "b"]
     assert all(entry["image"] for entry in page.data["sheet-data"])
@@ -208,6 +225,45 @@ def test_tars_and_series_are_read(renders, tmp_path):
     tar = out / "t" / "000000.tar"
     tar.write_bytes(tar.read_bytes()[:3000])
     assert "000000.tar: cannot be read to its end" in report(out / "t").said
+
+
+def test_of_a_large_picture_the_page_has_all_reduced_and_crops_as_they_are(out, monkeypatch):
+    monkeypatch.setattr("clpipe.reports.shown.LARGE", 4_000)
+    monkeypatch.setattr("clpipe.reports.shown.CROP", (60, 40))
+    page = report(out)
+    shown = next(each for each in page.data["look-data"] if each["name"] == "a")
+    picture = pixels_of((out / "a.jpg").read_bytes())
+    assert (shown["width"], shown["height"], shown["by"]) == (160, 96, 2)
+    assert shown["places"] == [{"name": "middle", "left": 50, "top": 28, "width": 60, "height": 40}]
+    view = shown["views"][0]
+    (crop,) = [pixels_of(base64.b64decode(each.partition(",")[2])) for each in view["crops"]]
+    assert np.abs(crop - picture[28:68, 50:110]).mean() < 1.5
+    whole = pixels_of(base64.b64decode(view["image"].partition(",")[2]))
+    means = picture.reshape(48, 2, 80, 2, 3).mean((1, 3))
+    assert np.abs(whole - means).mean() < 3
+    assert "2 x 2 pixels are averaged" in page.said
+
+
+def test_places_of_a_reduced_picture_are_around_what_was_found():
+    pixels = np.full((400, 600, 3), 128, np.uint8)
+    pixels[350:, 560:] = 0, 0, 255
+    found = {place.name: place for place in places_of(pixels, 2)}
+    assert found["textured"].box == "280,160,320x240"  # within the picture
+    assert all(place.within(600, 400) for place in found.values())
+
+
+def test_an_image_that_failed_at_one_iso_is_counted_though_another_was_done():
+    from clpipe.reports.page import listed
+
+    line = {"event": "image", "name": "a.exr", "error": "a.exr: damaged"}
+    done = {**line, "stem": "iso100/a", "status": "done"}
+    failed = [{**line, "stem": f"iso{iso}/a", "status": "failed"} for iso in (200, 400)]
+    start = {"event": "start"}
+    texts = last_failures(sessions([start, *failed, done]))
+    assert texts == ["a.exr: damaged"] * 2
+    assert listed(texts).shown == ["a.exr: damaged (2 times)"] and listed(texts).total == 2
+    again = {**done, "stem": "iso200/a"}
+    assert len(last_failures(sessions([start, *failed, start, again]))) == 1
 
 
 def test_two_runs_are_compared(out, renders, tmp_path):
@@ -224,7 +280,7 @@ def test_two_runs_are_compared(out, renders, tmp_path):
 
 
 def test_many_pictures_are_sampled_within_the_budget(out, monkeypatch):
-    monkeypatch.setattr("clpipe.reports.page.BUDGET", 20_000)
+    monkeypatch.setattr("clpipe.reports.page.BUDGET", 3_000)
     page = report(out)
     assert len(page.data["sheet-data"]) < 3
     assert re.search(r"\d of 3 pictures: unusual ones", page.said)
@@ -261,6 +317,8 @@ def test_the_pace_of_a_run():
     assert len(pace) == 10
     assert sum(row["speed"] for row in pace) / 10 == pytest.approx(2.0, rel=0.01)
     assert all(row["decode"] == 1 for row in pace)
+    (late,) = sessions([start, images[0], images[39], {"event": "end", "seconds": 40.0}])
+    assert len(late.pace()) == 1
     (cut,) = sessions([start, *images])
     assert cut.seconds == 39 and cut.state.startswith("cut off")
 
@@ -294,6 +352,17 @@ def test_in_a_browser(out):
         first = page.evaluate(crop)
         page.mouse.move(*(page.locator("#slider").bounding_box()[side] + 9 for side in "xy"))
         assert page.evaluate(crop) != first
+        first = page.evaluate(crop)
+        page.focus("#loupes")
+        page.keyboard.press("ArrowRight")
+        assert page.evaluate(crop) != first
+        first = page.evaluate(crop)
+        middle = page.locator("#loupe-right-4").bounding_box()
+        page.mouse.move(middle["x"] + 50, middle["y"] + 50)
+        page.mouse.down()
+        page.mouse.move(middle["x"] + 20, middle["y"] + 50)
+        page.mouse.up()
+        assert page.evaluate(crop) != first
         page.select_option("#look-image", "1")
         assert page.evaluate("document.documentElement.scrollWidth") == 400
         page.click("#theme")
@@ -307,4 +376,12 @@ def test_a_run_is_read_from_its_sidecars(out):
     assert [made.name for made in run.pictures] == [HOSTILE, "a", "b"]
     assert sorted(run.of_image("a")) == ["", ".truth", ".truth_mosaic"]
     assert run.of_image("a")[""].files.keys() == {"jpg", "normalize.exr"}
-    assert (ROOT / "clpipe/reports/page/report.html").is_file()
+    steps = [{step["name"]: step for step in made.steps} for made in run.pictures]
+    assert steps[0]["gamma"] is steps[1]["gamma"]  # lines that are alike are held once
+    assert steps[0]["exposure"] != steps[1]["exposure"]
+    sidecar = out / "a.json"
+    whole = json.loads(sidecar.read_text())
+    assert list(steps[1].values()) == whole["stages"]
+    sidecar.write_text('{\n  "clpipe": ' + json.dumps(whole, indent=3)[len('{\n   "clpipe": ') :])
+    again = next(made for made in read_run(out).pictures if made.name == "a")
+    assert again.record == run.of_image("a")[""].record

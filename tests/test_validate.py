@@ -119,7 +119,7 @@ def test_the_section_of_cameras(monkeypatch, capsys, tmp_path):
     assert "ISO 6400" in (tmp_path / "real_cameras.svg").read_text()
     for crops, columns in ((tmp_path, 4), (out, 5)):
         with Image.open(crops / "real_cameras_crops.png") as image:
-            assert image.width // (side_by_side.CROP[1] * side_by_side.SCALE) == columns
+            assert image.width // (side_by_side.WIDTH * side_by_side.SCALE) == columns
     independent = np.random.default_rng(0).normal(0, 5, pair.clean.shape)
     other = replace(pair, noisy=np.rint(pair.clean + independent).astype(np.uint8))
     monkeypatch.setattr(real_cameras, "develop", lambda *_: other)

@@ -218,7 +218,7 @@ def _label(axes: Axes, title: str, below: str, beside: str) -> None:
 def crops(groups: Mapping[str, Pair]) -> Image.Image:
     """Two places of each picture at 400 %, a column each."""
     columns = {
-        name: {what: place.of(pair.noisy) for what, place in telling_places(pair.clean).items()}
+        name: {place.name: place.of(pair.noisy) for place in telling_places(pair.clean)}
         for name, pair in groups.items()
     }
     places = next(iter(columns.values()))

@@ -1,17 +1,15 @@
 """What tools print and draw where developments are compared: Markdown tables, sheets of crops."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
-from scipy import ndimage
 
-from clpipe.analysis.signature import Signature, luma
-from clpipe.base.types import Array, Doubles
+from clpipe.analysis.crops import HEIGHT, WIDTH, Place, choose_places
+from clpipe.analysis.signature import Signature
+from clpipe.base.types import Array
 
 SCALE = 4  # of crops
-CROP = 64, 96  # px: height, width
 GAP, HEAD, SIDE = 6, 24, 150  # px: between crops, above and left of them
 
 # The columns of a signature as a table has them: heading, attribute, format.
@@ -47,37 +45,13 @@ def markdown(heads: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
     return "\n".join([first, "|---" * len(heads) + "|", *others])
 
 
-class Place(NamedTuple):
-    """Where a crop is: its top and its left, px."""
-
-    top: int
-    left: int
-
-    def of(self, picture: Array) -> Array:
-        """The crop of a picture."""
-        return picture[self.top : self.top + CROP[0], self.left : self.left + CROP[1]]
-
-
-def telling_places(picture: Array) -> dict[str, Place]:
+def telling_places(picture: Array) -> list[Place]:
     """Where a crop shows most: the most saturated place, and the richest in detail.
 
     Args:
-        picture: without noise, (height, width, 3) of 0 to 255, larger than a crop.
+        picture: without noise, (height, width, 3) of 0 to 255.
     """
-    levels = picture.astype(np.float64)
-    y = luma(levels)
-    gradient = np.hypot(ndimage.sobel(y, 0), ndimage.sobel(y, 1))
-    of = {"saturated": np.ptp(levels, axis=2), "detail": gradient}
-    return {name: _highest(np.asarray(measure)) for name, measure in of.items()}
-
-
-def _highest(measure: Doubles) -> Place:
-    """The crop with the largest mean."""
-    mean = ndimage.uniform_filter(measure, CROP)
-    (up, left), (height, width) = (side // 2 for side in CROP), measure.shape
-    inside = mean[up : height - CROP[0] + up + 1, left : width - CROP[1] + left + 1]
-    top, first = np.unravel_index(inside.argmax(), inside.shape)
-    return Place(int(top), int(first))
+    return choose_places(("saturated", "textured"), picture.astype(np.float32) / np.float32(255))
 
 
 def sheet(columns: Sequence[str], rows: Mapping[str, Sequence[Array]]) -> Image.Image:
@@ -87,7 +61,7 @@ def sheet(columns: Sequence[str], rows: Mapping[str, Sequence[Array]]) -> Image.
         columns: their captions.
         rows: caption -> as many crops, (height, width, 3) uint8, all of one size.
     """
-    height, width = (side * SCALE for side in CROP)
+    height, width = (side * SCALE for side in (HEIGHT, WIDTH))
     size = SIDE + len(columns) * (width + GAP), HEAD + len(rows) * (height + GAP)
     page = Image.new("RGB", size, "white")
     draw, font = ImageDraw.Draw(page), ImageFont.load_default(15)

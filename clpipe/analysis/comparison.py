@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from clpipe.analysis.crops import Place, choose_places
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import Picture, load_picture
-from clpipe.analysis.places import Place, choose_places
 from clpipe.analysis.signature import luma
 from clpipe.analysis.spatial import energy_left
 from clpipe.base.errors import RequestError
@@ -71,7 +71,7 @@ def compare(
 
     Args:
         paths: of two pictures or more, of one size: finished ones, kept images, renders.
-        crops: as :func:`clpipe.analysis.places.choose_places` takes them.
+        crops: as :func:`clpipe.analysis.crops.choose_places` takes them.
         labels: of the pictures; none: what tells their paths apart.
         truths: the same without noise: none, one for all pictures, or one for each.
         difference: a row of differences below each place: from the truth, or else from the first

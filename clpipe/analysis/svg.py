@@ -104,7 +104,7 @@ def shares_svg(
 ) -> str:
     """Shares that are 1 together, one above the other, over x."""
     with mpl.rc_context(SETTINGS):
-        figure = _figure(7, 2.6, right=1.1)
+        figure = _figure(7, 2.6, right=1.3)
         axes = figure.add_subplot()
         used = COLOURS[: len(shares)]
         axes.stackplot(x, *shares.values(), labels=list(shares), colors=used, alpha=0.8)
@@ -150,6 +150,34 @@ def noise_svg(report: NoiseReport) -> str:
         _draw_map(below[1], report)
         _draw_correlations(below[2], report)
         return _text(figure, "Noise by intensity, its autocorrelation, spectrum, tails and colours")
+
+
+def law_svg(report: NoiseReport, a: float, b: float, title: str) -> str:
+    """The variance of a mosaic's sites over intensity, and the law a y + b that was asked.
+
+    Args:
+        report: of a mosaic in signal, 0 to 1.
+        a: in signal.
+        b: in signal squared.
+        title: for those who cannot see it.
+    """
+    with mpl.rc_context(SETTINGS):
+        figure = _figure(3.8, 2.4)
+        axes = figure.add_subplot()
+        sites = [one for one in report.channels if one.name != "mosaic"]
+        for one in sites:
+            variance = one.curve.sigma**2
+            axes.plot(
+                one.curve.mean, variance, "o", markersize=4, color=INK[one.name], label=one.name
+            )
+        ends = np.array([0, max(one.curve.mean.max() for one in sites)])
+        axes.plot(ends, a * ends + b, color=PAGE, linewidth=1.2, label="asked")
+        axes.set_ylim(bottom=0)
+        axes.set_xlabel("intensity (signal)")
+        axes.set_ylabel("variance")
+        axes.ticklabel_format(axis="y", scilimits=(0, 0))
+        axes.legend(fontsize=8)
+        return _text(figure, title)
 
 
 def _draw_variance(axes: Axes, report: NoiseReport) -> None:

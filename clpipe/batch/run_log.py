@@ -161,8 +161,9 @@ class RunLog:
             {
                 "input": str(job.path),
                 "name": job.key,
+                "stem": job.stem,
                 "status": outcome.status,
-                "megapixels": round(outcome.megapixels, 3),
+                "megapixels": round(outcome.megapixels, 6),
                 **{f"{step}_seconds": round(outcome.seconds(step), 6) for step in STEPS},
                 "outputs": list(outcome.outputs),
                 "warnings": list(outcome.warnings),

@@ -6,7 +6,7 @@ import click
 
 from clpipe.analysis.comparison import Comparison
 from clpipe.analysis.comparison import compare as compare_pictures
-from clpipe.analysis.places import FOUND, HEIGHT, WIDTH
+from clpipe.analysis.crops import FOUND, HEIGHT, WIDTH
 from clpipe.base.extras import require
 from clpipe.commands.options import Command
 from clpipe.commands.printing import number, show

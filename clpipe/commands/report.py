@@ -44,7 +44,7 @@ def report(folders: tuple[Path, ...], output: Path | None) -> None:
         raise RequestError(
             f"{path}: clpipe did not write this file; move it, or name another with -o"
         )
-    require("clpipe report", "report", "jinja2", "matplotlib")
+    require("clpipe report", "report", "jinja2", "matplotlib", "scipy")
     from clpipe.reports.page import html
     from clpipe.reports.run import read_run
 

@@ -46,7 +46,7 @@ def jpeg_bytes(pixels: Array, quality: int = 93) -> bytes:
 
 
 def thumbnail_bytes(data: bytes, name: str, side: int) -> bytes:
-    """A small JPEG of a picture, at most ``side`` pixels wide and high.
+    """A small WebP of a picture, at most ``side`` pixels wide and high.
 
     Args:
         data: the bytes of its file; see :func:`decoded`.
@@ -67,7 +67,7 @@ def thumbnail_bytes(data: bytes, name: str, side: int) -> bytes:
         small = Image.fromarray(decoded(data, name))
     small.thumbnail((side, side), Image.Resampling.LANCZOS)
     file = io.BytesIO()
-    small.save(file, "JPEG", quality=80)
+    small.save(file, "WEBP", quality=75)
     return file.getvalue()
 
 

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import cached_property
 from typing import Any
 
 from clpipe.base.memory import in_words
@@ -41,12 +42,12 @@ class Session:
         """How many images have a status."""
         return sum(line.get("status") == status for line in self.images)
 
-    @property
+    @cached_property
     def megapixels(self) -> float:
         """Of what was done."""
         return sum(number(line.get("megapixels")) for line in self.images)
 
-    @property
+    @cached_property
     def seconds(self) -> float:
         """From the start to the end, or to the last image that was begun."""
         if self.end:
@@ -54,11 +55,16 @@ class Session:
         moments = [moment(line) for line in self.images]
         return max(moments, default=0.0) - moment(self.start) if moments else 0.0
 
+    @property
+    def speed(self) -> float:
+        """In MP/s; 0 where nothing was done."""
+        return self.megapixels / self.seconds if self.seconds > 0 else 0.0
+
     def pace(self) -> list[dict[str, float]]:
         """How fast it was over its time: seconds since the start, MP/s, and shares of the steps.
 
         An image counts where the last of its steps ends, as near as the log tells: when it was
-        begun, and the time of its steps.
+        begun, and the time of its steps. Where none ends, there are no shares.
         """
         done = [line for line in self.images if line.get("status") == DONE]
         begun, length = moment(self.start), self.seconds
@@ -74,9 +80,9 @@ class Session:
         for i in range(max(pieces) + 1):
             lines = pieces.get(i, [])
             spent = {s: sum(number(x.get(f"{s}_seconds")) for x in lines) for s in STEPS}
-            whole = sum(spent.values()) or 1.0
+            whole = sum(spent.values())
             speed = sum(number(line.get("megapixels")) for line in lines) / width
-            shares = {step: spent[step] / whole for step in STEPS}
+            shares = {step: spent[step] / whole for step in STEPS} if whole else {}
             rows.append({"seconds": (i + 0.5) * width, "speed": speed, **shares})
         return rows
 
@@ -111,11 +117,14 @@ def moment(line: Mapping[str, Any]) -> float:
 
 
 def last_failures(found: Sequence[Session]) -> list[str]:
-    """The errors of images that failed and were not done since."""
+    """The errors of images that failed and were not done since.
+
+    An image is told by where its pictures are: a series makes several of one input.
+    """
     errors: dict[str, str] = {}
     for session in found:
         for line in session.images:
-            key = str(line.get("name"))
+            key = str(line.get("stem", line.get("name")))
             if line.get("status") == FAILED:
                 errors[key] = str(line.get("error"))
             elif line.get("status") in (DONE, SKIPPED):
@@ -124,11 +133,11 @@ def last_failures(found: Sequence[Session]) -> list[str]:
 
 
 def totals(run: Run, found: Sequence[Session]) -> list[tuple[str, str]]:
-    """The figures that stand on top, by their names."""
+    """The figures that stand on top, by their names; the last run is one that made pictures."""
     pictures = run.pictures
     others = len(run.made) - len(pictures)
     megapixels = sum(number(p.value("width")) * number(p.value("height")) for p in pictures) / 1e6
-    last = found[-1] if found else None
+    last = next((session for session in reversed(found) if session.count(DONE)), None)
     rows = [
         ("pictures", f"{len(pictures):,}"),
         ("truths, frames, baselines", f"{others:,}"),
@@ -139,10 +148,9 @@ def totals(run: Run, found: Sequence[Session]) -> list[tuple[str, str]]:
         left_out = last.count(LEFT_OUT)
         rows += [("left out", f"{left_out:,}")] if left_out else []
         if last.seconds > 0:
-            rows += [
-                ("time of the last run", duration(last.seconds)),
-                ("speed of the last run", f"{last.megapixels / last.seconds:.3g} MP/s"),
-            ]
+            rows.append(("time of the last run", duration(last.seconds)))
+        if last.speed:
+            rows.append(("speed of the last run", f"{last.speed:.3g} MP/s"))
         if peak := number(last.end.get("peak_memory")):
             rows.append(("most memory", in_words(peak)))
     return rows
@@ -173,8 +181,11 @@ class Parameter:
     @property
     def text(self) -> str:
         """The value, or what values there are."""
-        if self.varies and len(numbers := self.numbers) == self.values.total():
+        numbers = self.numbers
+        if len(self.values) > DISTINCT and len(numbers) == self.values.total():
             return f"{min(numbers):.6g} to {max(numbers):.6g}"
+        if len(numbers) == self.values.total():
+            return ", ".join(text_of(value) for value in sorted(self.values))
         listed = [text_of(value) for value, _ in self.values.most_common(DISTINCT)]
         more = len(self.values) - len(listed)
         return ", ".join(listed) + (f" and {more} more" if more > 0 else "")
@@ -205,17 +216,19 @@ class Step:
 def steps_of(pictures: Sequence[Made]) -> list[Step]:
     """The steps of the chains of pictures, in the order of the longest chain."""
     order: list[str] = []
-    counts: dict[str, dict[int, tuple[Mapping[str, Any], int]]] = {}
+    records: dict[int, Mapping[str, Any]] = {}  # steps that are alike are the same object
+    counts: Counter[int] = Counter()
     for made in pictures:
-        steps = made.steps
-        names = [str(step.get("name")) for step in steps]
-        if len(names) > len(order):
+        ids = [id(step) for step in made.steps]
+        counts.update(ids)
+        records.update(zip(ids, made.steps, strict=True))
+        if len(ids) > len(order):
+            names = [str(step.get("name")) for step in made.steps]
             order = names + [name for name in order if name not in names]
-        for name, step in zip(names, steps, strict=True):
-            of_step = counts.setdefault(name, {})  # steps that are alike are the same object
-            of_step[id(step)] = step, of_step.get(id(step), (step, 0))[1] + 1
-    order += [name for name in counts if name not in order]
-    return [_step(name, list(counts[name].values())) for name in order]
+    by_name: dict[str, list[tuple[Mapping[str, Any], int]]] = {name: [] for name in order}
+    for key, record in records.items():
+        by_name.setdefault(str(record.get("name")), []).append((record, counts[key]))
+    return [_step(name, counted) for name, counted in by_name.items()]
 
 
 def _step(name: str, counted: Sequence[tuple[Mapping[str, Any], int]]) -> Step:
@@ -262,5 +275,5 @@ def oddities(made: Made) -> list[str]:
     found = [blob.problem for blob in made.files.values() if blob.problem]
     clipped = number(made.value("clipped"))
     if clipped >= MUCH:
-        found.append(f"{clipped:.0%} of its pixels are clipped")
+        found.append(f"{clipped * 100:.0f} % of its pixels are clipped")
     return found + warnings_of(made)

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from clpipe.analysis.intensity import VarianceLaw
 from clpipe.analysis.measure import measure
-from clpipe.analysis.pictures import load_picture
+from clpipe.analysis.pictures import WHOLE, load_picture
 from clpipe.analysis.report import NoiseReport
-from clpipe.analysis.svg import noise_svg
+from clpipe.analysis.svg import law_svg, noise_svg
 from clpipe.base.errors import ClpipeError
 from clpipe.chain.truth import DEVELOPMENT, MOSAIC
 from clpipe.outputs.renditions import SUFFIXES
@@ -28,20 +29,24 @@ class Law:
     """The variance of one raw, as measured and as asked: a y + b."""
 
     name: str
-    a: float
-    b: float
-    a_error: float
-    b_error: float
+    measured: VarianceLaw
     asked_a: float
     asked_b: float
+    report: NoiseReport
 
     @property
     def errors(self) -> float:
         """By how many standard errors the further of the two is away."""
         return max(
-            abs(self.a - self.asked_a) / max(self.a_error, 1e-12),
-            abs(self.b - self.asked_b) / max(self.b_error, 1e-12),
+            abs(self.measured.a - self.asked_a) / max(self.measured.a_error, 1e-30),
+            abs(self.measured.b - self.asked_b) / max(self.measured.b_error, 1e-30),
         )
+
+    @property
+    def svg(self) -> str:
+        """The raw, drawn."""
+        title = f"Variance by intensity of {self.name}, and the law that was asked"
+        return law_svg(self.report, self.asked_a, self.asked_b, title)
 
     @property
     def leaves(self) -> bool:
@@ -122,7 +127,7 @@ def noises(run: Run, pictures: Sequence[Made], problems: list[str], most: int) -
 def laws(run: Run, problems: list[str]) -> list[Law]:
     """Raws against the law that was asked, where the mosaic after normalize and its truth are kept.
 
-    Each site's law is fitted; that of all four is the mean of theirs, weighted by their errors.
+    The law is that of all four sites together, as ``clpipe measure`` fits it.
     """
     found = []
     pictures = [made for made in run.pictures if NORMALIZED in made.files]
@@ -139,22 +144,12 @@ def laws(run: Run, problems: list[str]) -> list[Law]:
         except ClpipeError as error:
             problems.append(f"{made.name}: its raw cannot be measured: {error}")
             continue
-        fits = [one.law for one in report.channels if one.law and one.name != "mosaic"]
-        if not fits:
+        fit = next(one.law for one in report.channels if one.name == WHOLE)
+        if not fit:
             continue
-        a, a_error = _pooled([(fit.a, fit.a_error) for fit in fits])
-        b, b_error = _pooled([(fit.b, fit.b_error) for fit in fits])
         asked_a, asked_b = number(asked.get("a")), number(asked.get("b")) + other_noise(made)
-        found.append(Law(made.name, a, b, a_error, b_error, asked_a, asked_b))
+        found.append(Law(made.name, fit, asked_a, asked_b, report))
     return found
-
-
-def _pooled(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """The mean of values, weighted by their standard errors, and its own."""
-    weights = [1 / max(error, 1e-30) ** 2 for _, error in values]
-    whole = sum(weights)
-    mean = sum(w * value for w, (value, _) in zip(weights, values, strict=True)) / whole
-    return float(mean), float(whole**-0.5)
 
 
 def parameters_of(made: Made, step: str) -> Mapping[str, Any]:

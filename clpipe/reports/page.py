@@ -2,8 +2,9 @@
 
 import json
 import shlex
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from clpipe.reports.shown import BUDGET, Budget, Large, add_stages, chosen, cont
 TEMPLATES = Path(__file__).parent / "page"
 LISTED = 40  # failures, warnings, problems
 HISTOGRAMS = 12
+SHEET_SHARE = 0.45  # of the budget, for contact sheets
 STAGED = 2  # images whose kept stages are shown large
 DRAWN = 3  # pictures whose noise is drawn
 SESSIONS = 12  # starts of the program, the latest
@@ -38,12 +40,15 @@ class Listed:
     """Texts, of which only the first are shown."""
 
     shown: Sequence[str]
-    more: int
+    more: int  # different ones
+    total: int
 
 
 def listed(texts: Sequence[str]) -> Listed:
-    """Texts, at most so many as are read."""
-    return Listed(texts[:LISTED], max(len(texts) - LISTED, 0))
+    """Texts, at most so many as are read; those that are equal are one."""
+    counted = Counter(texts)
+    lines = [text + (f" ({n:,} times)" if n > 1 else "") for text, n in counted.items()]
+    return Listed(lines[:LISTED], max(len(lines) - LISTED, 0), len(texts))
 
 
 def html(runs: Sequence[Run]) -> str:
@@ -67,15 +72,21 @@ def html(runs: Sequence[Run]) -> str:
     problems = [text for run in runs for text in run.problems]
     judged = [law for run in runs for law in laws(run, problems)]
     picked = chosen(first, {law.name for law in judged if law.leaves})
+    typical = sorted(picked, key=lambda made: bool(figures.oddities(made)))
     budget = Budget(BUDGET)
     noise = [
         (label, each)
         for label, run in zip(labels, runs, strict=True)
-        for each in noises(run, same(run, picked), problems, DRAWN // len(runs))
+        for each in noises(run, same(run, typical), problems, DRAWN // len(runs))
     ]
-    for _, drawing in noise:
-        budget.take(drawing.svg)
-    sheets = [contact_sheet(run, budget, label) for label, run in zip(labels, runs, strict=True)]
+    furthest = sorted(judged, key=lambda law: law.errors, reverse=True)[:DRAWN]
+    law_drawings = [(law.name, law.svg) for law in furthest]
+    for svg in [each.svg for _, each in noise] + [svg for _, svg in law_drawings]:
+        budget.take(svg)
+    share = int(budget.left * SHEET_SHARE) // len(runs)
+    rooms = [Budget(share) for _ in runs]
+    sheets = [contact_sheet(*each) for each in zip(runs, rooms, labels, strict=True)]
+    budget.left -= sum(share - room.left for room in rooms)
     problems += [text for sheet in sheets for text in sheet.problems]
     entries = [entry for sheet in sheets for entry in sheet.entries]
     found_large = [(made, large(runs, labels, made, budget, problems)) for made in picked]
@@ -109,7 +120,8 @@ def html(runs: Sequence[Run]) -> str:
         real_left=REAL_LEFT,
         real_right=REAL_RIGHT,
         laws=judged,
-        limit=LIMIT,
+        law_drawings=law_drawings,
+        limit=f"{LIMIT:g}",
         style=(TEMPLATES / "report.css").read_text(),
         script=(TEMPLATES / "report.js").read_text(),
     )
@@ -158,12 +170,18 @@ def script_json(value: Any) -> str:
 
 def view_record(each: Large) -> Mapping[str, Any]:
     """What the script needs of a large picture."""
-    return {"name": each.name, "views": each.views, "width": each.width}
+    return {
+        "name": each.name,
+        "width": each.width,
+        "height": each.height,
+        "by": each.by,
+        "places": [asdict(place) for place in each.places],
+        "views": each.views,
+    }
 
 
 def session_row(session: Session) -> Mapping[str, str]:
     """A start of the program, as a row of a table."""
-    speed = session.megapixels / session.seconds if session.seconds > 0 else 0.0
     return {
         "command": shlex.join(["clpipe", *session.command]),
         "at": str(session.start.get("at", ""))[:19].replace("T", " "),
@@ -172,7 +190,7 @@ def session_row(session: Session) -> Mapping[str, str]:
         "skipped": f"{session.count(SKIPPED):,}",
         "failed": f"{session.count(FAILED):,}",
         "time": duration(session.seconds),
-        "speed": f"{speed:.3g} MP/s",
+        "speed": f"{session.speed:.3g} MP/s" if session.speed else "-",
     }
 
 
@@ -184,11 +202,13 @@ def pace_drawings(found: Sequence[Session]) -> list[str]:
             continue
         x = [row["seconds"] for row in rows]
         speed = {"MP/s": [row["speed"] for row in rows]}
-        shares = {step: [row[step] for row in rows] for step in STEPS}
+        told = [row for row in rows if STEPS[0] in row]
+        told_x = [row["seconds"] for row in told]
+        shares = {step: [row[step] for row in told] for step in STEPS}
         label = "seconds since the start"
         return [
             lines_svg(x, speed, (label, "MP/s"), "Speed over the time of the run"),
-            shares_svg(x, shares, label, "Shares of the steps over the time of the run"),
+            shares_svg(told_x, shares, label, "Shares of the steps over the time of the run"),
         ]
     return []
 

@@ -19,14 +19,15 @@ TAR = ".tar"
 # What is kept of sidecars, of which there may be hundreds of thousands.
 KEYS = ("clpipe", "iso", "camera", "width", "height", "noise", "clipped", "warnings")
 ALIKE = ("device", "versions")  # which most of them share
+STAGES, STAGES_END = b'\n  "stages": [\n', b"\n  ],\n"  # as json_text writes them
 LOGS = "run*.jsonl"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Blob:
     """A file, or a member of a tar, and what its sidecar says of it."""
 
-    path: Path
+    path: str
     name: str  # below the output folder; of a member, behind the tar's
     said: Mapping[str, Any]  # its size and SHA-256
     offset: int | None = None  # of a tar's member
@@ -38,7 +39,7 @@ class Blob:
         Raises:
             OSError: they cannot be read.
         """
-        with self.path.open("rb") as file:
+        with open(self.path, "rb") as file:
             file.seek(self.offset or 0)
             return file.read(self.size)
 
@@ -58,7 +59,7 @@ class Made:
 
     image: str  # the name of what it was made of, without ending; with folders of a series
     rendition: str  # what is behind that name, such as ".truth"; "" is the picture itself
-    record: Mapping[str, Any]  # what is needed of the sidecar: KEYS, in which what is alike is one
+    record: dict[str, Any]  # what is needed of the sidecar, in which what is alike is one
     files: Mapping[str, Blob]  # by what is behind the picture's name: "jpg", "demosaic.exr"
 
     @property
@@ -69,14 +70,14 @@ class Made:
     @property
     def steps(self) -> Sequence[Mapping[str, Any]]:
         """The steps of its chain."""
-        found = self.record.get("stages")
-        return [each for each in found if isinstance(each, Mapping)] if found else []
+        found: list[Mapping[str, Any]] = self.record["stages"]
+        return found
 
     def value(self, *keys: str) -> Any:
         """A value of the sidecar, by the keys on the way to it; None where it is not there."""
         found: Any = self.record
         for key in keys:
-            found = found.get(key) if isinstance(found, Mapping) else None
+            found = found.get(key) if isinstance(found, dict) else None
         return found
 
 
@@ -106,17 +107,39 @@ class Run:
     def __post_init__(self) -> None:
         self._by_image: dict[str, dict[str, Made]] = {}
         self._alike: dict[str, Any] = {}
+        self._steps: dict[bytes, Any] = {}
+
+    def parsed(self, sidecar: bytes) -> dict[str, Any]:
+        """The values of a sidecar that clpipe wrote.
+
+        Most lines of stages are those of other sidecars, too: a line is parsed once, and is one
+        object. Where a sidecar has been laid out anew, all of it is parsed.
+
+        Raises:
+            ValueError: it is no JSON.
+        """
+        head, _, rest = sidecar.partition(STAGES)
+        lines, end, tail = rest.partition(STAGES_END)
+        if not end:
+            return dict(parse_json(sidecar))
+        values = dict(parse_json(head + b"\n" + tail))
+        values["stages"] = [self._step(line) for line in lines.split(b",\n")]
+        return values
+
+    def _step(self, line: bytes) -> Any:
+        if line not in self._steps:
+            self._steps[line] = parse_json(line)
+        return self._steps[line]
 
     def slim(self, record: Mapping[str, Any]) -> dict[str, Any]:
-        """What is kept of a sidecar; values that are alike become one object."""
+        """What is kept of a sidecar; machines that are alike become one object."""
         steps = record.get("stages")
+        steps = steps if isinstance(steps, list) else []
         kept = {key: record.get(key) for key in KEYS}
-        kept |= {key: self._one(record.get(key)) for key in ALIKE}
-        kept["stages"] = [self._one(step) for step in steps] if isinstance(steps, list) else []
+        for key in ALIKE:
+            kept[key] = self._alike.setdefault(repr(record.get(key)), record.get(key))
+        kept["stages"] = [step for step in steps if isinstance(step, dict)]
         return kept
-
-    def _one(self, value: Any) -> Any:
-        return self._alike.setdefault(repr(value), value)
 
     def add(self, made: Made) -> None:
         """Add a picture."""
@@ -160,14 +183,13 @@ def _in_folder(run: Run) -> Iterator[Made]:
         below = Path(place).relative_to(run.folder).as_posix()
         beside: dict[str, Blob] = {}
         for name in sorted(names):
-            path = Path(place, name)
             if name.startswith("."):
                 continue
             if name.endswith(TAR):
-                yield from _in_tar(run, path)
+                yield from _in_tar(run, Path(place, name))
             elif name.endswith(f".{SIDECAR}"):
                 try:
-                    data = read_bytes(path)
+                    data = read_bytes(Path(place, name))
                 except OSError as error:
                     run.problems.append(f"{_joined(below, name)}: cannot be read: {error}")
                     continue
@@ -179,9 +201,7 @@ def _files(folder: str, below: str) -> dict[str, Blob]:
     """A folder's files by their names."""
     with os.scandir(folder) as entries:
         return {
-            entry.name: Blob(
-                Path(entry.path), _joined(below, entry.name), {}, None, entry.stat().st_size
-            )
+            entry.name: Blob(entry.path, _joined(below, entry.name), {}, None, entry.stat().st_size)
             for entry in entries
             if entry.is_file()
         }
@@ -202,7 +222,7 @@ def _in_tar(run: Run, path: Path) -> Iterator[Made]:
                     str(PurePosixPath(member.name).parent),
                 )
                 place = member.offset_data, member.size
-                beside[below][name] = Blob(path, f"{label}/{member.name}", {}, *place)
+                beside[below][name] = Blob(str(path), f"{label}/{member.name}", {}, *place)
                 is_text = name.endswith(f".{SIDECAR}") and member.size <= TEXT_BYTES
                 if is_text and (file := tar.extractfile(member)):
                     sidecars.append((below, name, file.read()))
@@ -227,7 +247,7 @@ def _made(
     if not data.startswith(BEGINNING):
         return
     try:
-        record = parse_json(data)
+        record = run.parsed(data)
     except ValueError:
         run.problems.append(f"{_joined(below, name)}: is cut off or damaged")
         return
@@ -239,7 +259,7 @@ def _made(
     files = {}
     for file, said in outputs_in(record).items():
         label = _joined(below, file)
-        there = beside.get(file, Blob(run.folder, label, {}))
+        there = beside.get(file, Blob("", label, {}))
         files[file.removeprefix(f"{stem}.")] = Blob(
             there.path, there.name, said, there.offset, there.size
         )

@@ -2,21 +2,33 @@
 
 import base64
 import hashlib
+import json
+import math
+import os
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from typing import Any
 
+import numpy as np
+
+from clpipe.analysis.crops import HEIGHT, WIDTH, Place, choose_places
 from clpipe.base.errors import ImageError
-from clpipe.images.preview import decoded, jpeg_bytes, thumbnail_bytes
+from clpipe.base.types import Array
+from clpipe.images.preview import decoded, jpeg_bytes, reduced, thumbnail_bytes
 from clpipe.outputs.renditions import baseline_named, truth_named
 from clpipe.reports.figures import number, oddities
 from clpipe.reports.run import Blob, Made, Run
 
 BUDGET = 14 << 20  # bytes of the whole page
 SMALL = 160  # px, the longer side of a picture on the contact sheet
-SMALL_SHARE = 0.4  # of the budget, for the contact sheet
+SMALL_PIXELS = 4e9  # of the pictures that the contact sheet reads: a minute of one processor
+TOGETHER = 64  # small pictures that are made at a time
 CHOSEN = 8  # images that are shown large
-LARGE = 1_200_000  # px, of a picture that is shown large
+LARGE = 1_200_000  # px, of a picture that is shown large; one that has more is reduced
+CROP = 320, 240  # px, width and height of what is kept as it is of a picture that is reduced
+TRUE_QUALITY, REDUCED_QUALITY = 93, 85  # of JPEGs of pixels as they are, and reduced
 PICTURE = "picture"  # its label, beside truths and baselines
 SHOWN = ("jpg", "png", "tif", "tif16", "exr", "npy")
 
@@ -57,9 +69,14 @@ def checked(blob: Blob) -> bytes:
     return data
 
 
-def data_uri(data: bytes) -> str:
-    """A JPEG as an address that holds it."""
-    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
+def jpeg_uri(pixels: Array, quality: int = TRUE_QUALITY) -> str:
+    """(height, width, 3) uint8 as a JPEG in an address."""
+    return data_uri("jpeg", jpeg_bytes(np.ascontiguousarray(pixels), quality))
+
+
+def data_uri(kind: str, data: bytes) -> str:
+    """A picture as an address that holds it."""
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
 
 @dataclass
@@ -71,50 +88,86 @@ class Sheet:
     problems: list[str] = field(default_factory=list)
 
 
-def contact_sheet(run: Run, budget: Budget, label: str) -> Sheet:
-    """Small pictures of a run: all, or those with something unusual and others evenly between.
+def contact_sheet(run: Run, room: Budget, label: str) -> Sheet:
+    """Small pictures of a run, in its order: as many as there is room and time for.
 
     Args:
         run: the run.
-        budget: that it takes from.
+        room: that they take.
         label: stands before the names of its pictures; "" does not.
     """
     pictures = run.pictures
     sheet = Sheet(pictures=len(pictures))
-    room = Budget(int(budget.left * SMALL_SHARE))
-    for made in spread(pictures, room.left // 4_000):
-        file = picture_file(made)
-        image, size = "", (number(made.value("width")), number(made.value("height")))
-        if file:
-            try:
-                image = data_uri(thumbnail_bytes(checked(file), file.name, SMALL))
-            except ImageError as error:
-                sheet.problems.append(str(error))
-        if not room.take(image):
+    entries: dict[int, dict[str, Any]] = {}
+    order = telling_order([bool(oddities(made)) for made in pictures])
+    for i, image, problem in _small_pictures(pictures, order):
+        entry = _entry(pictures[i], image, label)
+        if not room.take(json.dumps(entry)):
             break
-        sheet.entries.append(
-            {
-                "name": f"{label}: {made.name}" if label else made.name,
-                "image": image,
-                "iso": number(made.value("iso")),
-                "camera": str(made.value("camera")),
-                "clipped": number(made.value("clipped")),
-                "size": f"{size[0]:.0f} x {size[1]:.0f}",
-                "odd": oddities(made),
-            }
-        )
-    budget.left -= int(budget.left * SMALL_SHARE) - room.left
+        entries[i] = entry
+        sheet.problems += [problem] if problem else []
+    sheet.entries = [entries[i] for i in sorted(entries)]
     return sheet
 
 
-def spread(pictures: Sequence[Made], most: int) -> list[Made]:
-    """At most so many pictures, in their order: those with oddities first, others evenly."""
-    if len(pictures) <= most:
-        return list(pictures)
-    odd = [i for i, made in enumerate(pictures) if oddities(made)][: most // 2]
-    step = len(pictures) / max(most - len(odd), 1)
-    chosen = {*odd, *(int(i * step) for i in range(most - len(odd)))}
-    return [pictures[i] for i in sorted(chosen)]
+def _small_pictures(
+    pictures: Sequence[Made], order: Sequence[int]
+) -> Iterator[tuple[int, str, str]]:
+    """Numbers of pictures, with the small picture of each or why there is none."""
+
+    def small(i: int) -> tuple[str, str]:
+        if not (file := picture_file(pictures[i])):
+            return "", ""
+        try:
+            return data_uri("webp", thumbnail_bytes(checked(file), file.name, SMALL)), ""
+        except ImageError as error:
+            return "", str(error)
+
+    pixels = 0.0
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for start in range(0, len(order), TOGETHER):
+            numbers = order[start : start + TOGETHER]
+            for i, (image, problem) in zip(numbers, pool.map(small, numbers), strict=True):
+                yield i, image, problem
+                pixels += number(pictures[i].value("width")) * number(pictures[i].value("height"))
+            if pixels >= SMALL_PIXELS:
+                return
+
+
+def _entry(made: Made, image: str, label: str) -> dict[str, Any]:
+    """What the page's script needs of a small picture."""
+    return {
+        "name": f"{label}: {made.name}" if label else made.name,
+        "image": image,
+        "iso": number(made.value("iso")),
+        "camera": str(made.value("camera")),
+        "clipped": number(made.value("clipped")),
+        "odd": oddities(made),
+    }
+
+
+def telling_order(odd: Sequence[bool]) -> list[int]:
+    """The numbers of pictures in an order whose every beginning is a fair sample of them.
+
+    Unusual ones alternate with others as long as there are both; each are spread evenly, in the
+    order of van der Corput (1935).
+
+    Args:
+        odd: of each picture, whether it is unusual.
+
+    >>> telling_order([False, False, True, False, False])
+    [2, 0, 3, 1, 4]
+    """
+    unusual = [i for i, is_odd in enumerate(odd) if is_odd]
+    others = [i for i, is_odd in enumerate(odd) if not is_odd]
+    pairs = zip_longest(_spread(unusual), _spread(others))
+    return [i for pair in pairs for i in pair if i is not None]
+
+
+def _spread(values: Sequence[int]) -> list[int]:
+    bits = max(len(values) - 1, 1).bit_length()
+    turned = (int(f"{i:0{bits}b}"[::-1], 2) for i in range(1 << bits))
+    return [values[i] for i in turned if i < len(values)]
 
 
 @dataclass
@@ -124,11 +177,74 @@ class Large:
     name: str
     facts: str
     odd: Sequence[str]
-    width: int
+    width: int  # px, of the picture
     height: int
-    views: list[dict[str, str]] = field(default_factory=list)  # label and image
-    share: str = ""  # what part of the picture is shown; "" is all of it
+    by: int  # this many pixels, squared, are one of the page's; 1 is the picture as it is
+    places: Sequence[
+        Place
+    ]  # to look at; of a picture that is reduced, the page has these as they are
+    views: list[dict[str, Any]] = field(default_factory=list)  # label, image, crops
     strip: list[dict[str, str]] = field(default_factory=list)  # kept stages, from the mosaic on
+
+    @classmethod
+    def of(cls, made: Made, pixels: Array) -> "Large":
+        """Without views yet.
+
+        Args:
+            made: the picture.
+            pixels: (height, width, 3) uint8.
+        """
+        height, width = pixels.shape[:2]
+        by = math.ceil((height * width / LARGE) ** 0.5)
+        places = places_of(pixels, by)
+        return cls(made.name, _facts(made), oddities(made), width, height, by, places)
+
+    def add(self, label: str, pixels: Array, budget: Budget) -> bool:
+        """Add a view; False where the budget does not have it.
+
+        Args:
+            label: of the view.
+            pixels: (height, width, 3) uint8, as large as the picture.
+            budget: that it takes from.
+        """
+        if self.by > 1:
+            image = jpeg_uri(reduced(pixels, self.by), REDUCED_QUALITY)
+            crops = [jpeg_uri(place.of(pixels)) for place in self.places]
+        else:
+            image, crops = jpeg_uri(pixels), []
+        if not budget.take(image + "".join(crops)):
+            return False
+        self.views.append({"label": label, "image": image, "crops": crops})
+        return True
+
+
+def places_of(pixels: Array, by: int) -> list[Place]:
+    """The places of a picture that are worth a closer look.
+
+    Args:
+        pixels: (height, width, 3) uint8.
+        by: as of :class:`Large`. Places are looked for in the reduced picture; those of one that is
+            reduced are CROP px large, around what was found.
+    """
+    height, width = pixels.shape[:2]
+    small = reduced(pixels, by)
+    if small.shape[1] < WIDTH or small.shape[0] < HEIGHT:
+        found = [Place("middle", 0, 0, small.shape[1], small.shape[0])]
+    else:
+        found = choose_places((), small.astype(np.float32) / np.float32(255))
+    if by == 1:
+        return found
+    wide, high = min(CROP[0], width), min(CROP[1], height)
+    return [
+        replace(
+            place,
+            left=min(max(by * (2 * place.left + place.width) // 2 - wide // 2, 0), width - wide),
+            top=min(max(by * (2 * place.top + place.height) // 2 - high // 2, 0), height - high),
+            width=wide,
+            height=high,
+        )
+        for place in found
+    ]
 
 
 def chosen(run: Run, names: Collection[str]) -> list[Made]:
@@ -161,35 +277,18 @@ def large(
     ]
     for label, file in sorted(views, key=lambda view: not view[0].endswith(PICTURE)):
         try:
-            pixels, share = part_of(decoded(checked(file), file.name))
+            pixels = decoded(checked(file), file.name)
         except ImageError as error:
             problems.append(str(error))
             continue
-        height, width = pixels.shape[:2]
-        if shown is None:
-            shown = Large(made.name, _facts(made), oddities(made), width, height, share=share)
-        elif (height, width) != (shown.height, shown.width):
+        shown = shown or Large.of(made, pixels)
+        if pixels.shape[:2] != (shown.height, shown.width):
             problems.append(f"{file.name}: is of another size than {made.name}")
-            continue
-        image = data_uri(jpeg_bytes(pixels))
-        if not budget.take(image):
+        elif not shown.add(label, pixels, budget):
             return None
-        shown.views.append({"label": label, "image": image})
     if shown:
         shown.strip = _strip(made, budget, problems)
     return shown
-
-
-def part_of(pixels: Any) -> tuple[Any, str]:
-    """The middle of a picture, at most LARGE px of it, and what it is in words."""
-    height, width = pixels.shape[:2]
-    if height * width <= LARGE:
-        return pixels, ""
-    scale = (LARGE / (height * width)) ** 0.5
-    rows, columns = max(int(height * scale), 1), max(int(width * scale), 1)
-    top, left = (height - rows) // 2, (width - columns) // 2
-    part = pixels[top : top + rows, left : left + columns]
-    return part, f"its middle, {columns} x {rows} of {width} x {height} px"
 
 
 def _views(run: Run, made: Made) -> Iterator[tuple[str, Blob]]:
@@ -219,15 +318,12 @@ def add_stages(shown: Large, made: Made, budget: Budget) -> None:
     """
     for name, file in _kept(made):
         try:
-            pixels, _ = part_of(decoded(checked(file), file.name))
+            pixels = decoded(checked(file), file.name)
         except ImageError:
             continue
-        if pixels.shape[:2] != (shown.height, shown.width):
-            continue
-        image = data_uri(jpeg_bytes(pixels))
-        if not budget.take(image):
+        is_alike = pixels.shape[:2] == (shown.height, shown.width)
+        if is_alike and not shown.add(f"after {name}", pixels, budget):
             return
-        shown.views.append({"label": f"after {name}", "image": image})
 
 
 def _strip(made: Made, budget: Budget, problems: list[str]) -> list[dict[str, str]]:
@@ -235,7 +331,7 @@ def _strip(made: Made, budget: Budget, problems: list[str]) -> list[dict[str, st
     strip = []
     for name, file in _kept(made):
         try:
-            image = data_uri(thumbnail_bytes(checked(file), file.name, 2 * SMALL))
+            image = data_uri("webp", thumbnail_bytes(checked(file), file.name, 2 * SMALL))
         except ImageError as error:
             problems.append(str(error))
             continue
@@ -250,5 +346,5 @@ def _facts(made: Made) -> str:
     law = f"; variance {number(noise.get('a')):.3g} y + {number(noise.get('b')):.3g}"
     size = f"{number(made.value('width')):.0f} x {number(made.value('height')):.0f} px"
     iso, clipped = number(made.value("iso")), number(made.value("clipped"))
-    text = f"{size}, {made.value('camera')}, ISO {iso:g}, {clipped:.2%} clipped"
+    text = f"{size}, {made.value('camera')}, ISO {iso:g}, {clipped * 100:.2f} % clipped"
     return text + (law if noise else "")
