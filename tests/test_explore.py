@@ -210,6 +210,16 @@ def test_views_are_stages_and_truths_and_their_values(explorer):
         explorer.values_at(noisy.facts["number"], 96, 0)
 
 
+def test_what_was_made_is_kept_as_far_as_memory_goes(explorer, monkeypatch):
+    numbers = [explorer.develop(0, {"seed": n}, View()).facts["number"] for n in range(5)]
+    assert [explorer.sample(number).facts["seed"] for number in numbers] == [0, 1, 2, 3, 4]
+    monkeypatch.setattr("clpipe.explorer.explorer.KEPT", 0)
+    explorer.develop(0, {"seed": 5}, View())
+    assert explorer.sample(numbers[-2]).facts["seed"] == 3
+    with pytest.raises(RequestError, match="not kept any more"):
+        explorer.sample(numbers[-3])
+
+
 def test_steps_say_what_is_on_and_which_values_follow(explorer):
     steps = {step["name"]: step for step in explorer.develop(0, NOISY, View()).facts["steps"]}
     assert not steps["sharpen"]["on"]

@@ -33,7 +33,8 @@ from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
 SOURCES = 2  # images that stay decoded
-SAMPLES = 3  # of what was made, that can still be asked for
+SAMPLES = 3  # of what was made, that can always still be asked for
+KEPT = 1 << 28  # bytes, up to which more are
 AT_START = (
     "camera",
     "iso",
@@ -172,9 +173,13 @@ class Explorer:
             values_of = shown if is_shown else upright(result.image, turn)
             sample = Sample(values_of, unit, shown, facts | {"number": self._number})
             self._samples[self._number] = sample
-            while len(self._samples) > SAMPLES:
+            while len(self._samples) > SAMPLES and self._kept > KEPT:
                 self._samples.popitem(last=False)
         return sample
+
+    @property
+    def _kept(self) -> int:
+        return sum(each.image.nbytes + each.shown.nbytes for each in self._samples.values())
 
     def sample(self, number: int) -> Sample:
         """What :meth:`develop` gave a short while ago.
