@@ -542,7 +542,14 @@ def test_stages_pixels_comparison_and_noise(page):
     assert b_values == {"iso": 6400}
     page.click("#swap-b")
     settle(page)
-    assert page.evaluate("state.values") == b_values
+    swapped = {"iso": 6400, "seed": 5}
+    assert page.evaluate("[state.values, settingB]") == [b_values, swapped]
+    page.click("#undo")
+    settle(page)
+    assert page.evaluate("[state.values, settingB]") == [swapped, b_values]
+    page.click("#redo")
+    settle(page)
+    assert page.evaluate("[state.values, settingB]") == [b_values, swapped]
     for field, value in (("left", "8"), ("top", "8"), ("width", "48"), ("height", "48")):
         page.fill(f"#{field}", value)
     page.click("#measure")

@@ -117,10 +117,11 @@ const tell = (facts, shown) => {
 
 let lastKey = "";
 
-const setValues = (values, key = "") => {
+// What undoing brings back: the values and, where they changed places with it, setting B.
+const setValues = (values, key = "", swapped = null) => {
   if (same(values, state.values)) return;
   if ((values.skip || []).includes(state.step)) state.step = "";
-  if (!key || key !== lastKey) past.push(state.values);
+  if (!key || key !== lastKey) past.push({ values: state.values, b: swapped });
   if (past.length > 500) past.shift();
   future = [];
   lastKey = key;
@@ -146,8 +147,10 @@ const set = (key, value, moving = false) => {
 
 const step = (from, to) => {
   if (!from.length) return;
-  to.push(state.values);
-  state.values = from.pop();
+  const { values, b } = from.pop();
+  to.push({ values: state.values, b: b && settingB });
+  state.values = values;
+  settingB = b || settingB;
   lastKey = "";
   changed();
 };
@@ -254,9 +257,10 @@ byId("keep-b").addEventListener("click", () => {
   changed();
 });
 byId("swap-b").addEventListener("click", () => {
-  const mine = copy(state.values);
-  setValues(settingB);
+  if (same(settingB, state.values)) return;
+  const [mine, theirs] = [copy(state.values), settingB];
   settingB = mine;
+  setValues(theirs, "", theirs);
 });
 byId("zoom-in").addEventListener("click", () => zoomBy(1));
 byId("zoom-out").addEventListener("click", () => zoomBy(-1));
