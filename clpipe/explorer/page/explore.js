@@ -19,9 +19,9 @@ const refresh = async () => {
     const first = await pictured("develop", { ...question, ...window_() });
     const { facts } = first;
     const before = picture && picture.facts;
-    const isNew = !before || before.width !== facts.width || before.height !== facts.height || picture.image !== state.image;
+    const isNew = !before || before.width !== facts.width || before.height !== facts.height || picture.image !== question.image;
     if (isNew) {
-      picture = { facts, pixels: null, canvas: null, patch: first, image: state.image };
+      picture = { facts, pixels: null, canvas: null, patch: first, image: question.image };
       fit();
     } else {
       picture = { ...picture, facts, patch: first };
@@ -33,7 +33,7 @@ const refresh = async () => {
     showControls(facts);
     remember(of);
     if (!again) {
-      picture = { ...(await whole(facts)), image: state.image, of };
+      picture = { ...(await whole(facts)), image: question.image };
       draw();
       drawHistogram();
     }
