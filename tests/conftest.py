@@ -1,4 +1,5 @@
 import resource
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -160,3 +161,25 @@ def clpipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Cli
         return result
 
     return call
+
+
+@pytest.fixture
+def browser_page() -> Iterator[Any]:
+    """A page of Chromium, which says nothing on its console.
+
+    But for a line of Chromium's own for each answer with status 400, which is a refusal that the
+    page shows.
+    """
+    playwright = pytest.importorskip("playwright.sync_api")
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if not chromium:
+        pytest.skip("there is no Chromium")
+    with playwright.sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1400, "height": 900})
+        said: list[str] = []
+        page.on("console", lambda message: said.append(message.text))
+        page.on("pageerror", lambda error: said.append(str(error)))
+        yield page
+        assert [text for text in said if "status of 400" not in text] == []
+        browser.close()

@@ -436,25 +436,12 @@ def test_ctrl_c_ends_it_quietly(renders):
 
 
 @pytest.fixture
-def page(served, monkeypatch, tmp_path):
+def page(browser_page, served, monkeypatch, tmp_path):
     """The page in a browser, with its downloads in the working directory."""
-    playwright = pytest.importorskip("playwright.sync_api")
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
-    if not chromium:
-        pytest.skip("there is no Chromium")
     monkeypatch.chdir(tmp_path)
-    with playwright.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 1400, "height": 900})
-        said: list[str] = []
-        page.on("console", lambda message: said.append(message.text))
-        page.on("pageerror", lambda error: said.append(str(error)))
-        page.goto(served)
-        settle(page)
-        yield page
-        # Chromium notes each refusal of a value, which the page shows.
-        assert [text for text in said if "status of 400" not in text] == []
-        browser.close()
+    browser_page.goto(served)
+    settle(browser_page)
+    return browser_page
 
 
 def settle(page):

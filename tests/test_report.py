@@ -323,52 +323,42 @@ def test_the_pace_of_a_run():
     assert cut.seconds == 39 and cut.state.startswith("cut off")
 
 
-def test_in_a_browser(out):
+def test_in_a_browser(browser_page, out):
     """The slider moves, filters filter, pages turn, and the console stays empty."""
-    playwright = pytest.importorskip("playwright.sync_api")
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
-    if not chromium:
-        pytest.skip("there is no Chromium")
     report(out)
-    with playwright.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 400, "height": 800})
-        said: list[str] = []
-        page.on("console", lambda message: said.append(message.text))
-        page.on("pageerror", lambda error: said.append(str(error)))
-        page.goto((out / "report.html").as_uri())
-        assert page.locator("#sheet-list li").count() == 3
-        page.fill("#filter-name", "b")
-        assert page.locator("#sheet-list li").count() == 1
-        page.fill("#filter-name", "")
-        page.select_option("#filter-iso", "1600")
-        assert page.locator("#sheet-list li").count() == 3
-        page.focus("#look-split")
-        before = page.evaluate("getComputedStyle(slider).getPropertyValue('--split')")
-        page.keyboard.press("ArrowRight")
-        after = page.evaluate("getComputedStyle(slider).getPropertyValue('--split')")
-        assert (before, after) == ("50%", "50.5%")
-        crop = "document.getElementById('loupe-left-4').toDataURL()"
-        first = page.evaluate(crop)
-        page.mouse.move(*(page.locator("#slider").bounding_box()[side] + 9 for side in "xy"))
-        assert page.evaluate(crop) != first
-        first = page.evaluate(crop)
-        page.focus("#loupes")
-        page.keyboard.press("ArrowRight")
-        assert page.evaluate(crop) != first
-        first = page.evaluate(crop)
-        middle = page.locator("#loupe-right-4").bounding_box()
-        page.mouse.move(middle["x"] + 50, middle["y"] + 50)
-        page.mouse.down()
-        page.mouse.move(middle["x"] + 20, middle["y"] + 50)
-        page.mouse.up()
-        assert page.evaluate(crop) != first
-        page.select_option("#look-image", "1")
-        assert page.evaluate("document.documentElement.scrollWidth") == 400
-        page.click("#theme")
-        assert page.evaluate("document.documentElement.dataset.theme") in ("dark", "light")
-        assert said == []
-        browser.close()
+    page = browser_page
+    page.set_viewport_size({"width": 400, "height": 800})
+    page.goto((out / "report.html").as_uri())
+    assert page.locator("#sheet-list li").count() == 3
+    page.fill("#filter-name", "b")
+    assert page.locator("#sheet-list li").count() == 1
+    page.fill("#filter-name", "")
+    page.select_option("#filter-iso", "1600")
+    assert page.locator("#sheet-list li").count() == 3
+    page.focus("#look-split")
+    before = page.evaluate("getComputedStyle(slider).getPropertyValue('--split')")
+    page.keyboard.press("ArrowRight")
+    after = page.evaluate("getComputedStyle(slider).getPropertyValue('--split')")
+    assert (before, after) == ("50%", "50.5%")
+    crop = "document.getElementById('loupe-left-4').toDataURL()"
+    first = page.evaluate(crop)
+    page.mouse.move(*(page.locator("#slider").bounding_box()[side] + 9 for side in "xy"))
+    assert page.evaluate(crop) != first
+    first = page.evaluate(crop)
+    page.focus("#loupes")
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate(crop) != first
+    first = page.evaluate(crop)
+    middle = page.locator("#loupe-right-4").bounding_box()
+    page.mouse.move(middle["x"] + 50, middle["y"] + 50)
+    page.mouse.down()
+    page.mouse.move(middle["x"] + 20, middle["y"] + 50)
+    page.mouse.up()
+    assert page.evaluate(crop) != first
+    page.select_option("#look-image", "1")
+    assert page.evaluate("document.documentElement.scrollWidth") == 400
+    page.click("#theme")
+    assert page.evaluate("document.documentElement.dataset.theme") in ("dark", "light")
 
 
 def test_a_run_is_read_from_its_sidecars(out):
