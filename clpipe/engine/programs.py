@@ -48,7 +48,7 @@ class Programs:
             raise DeviceError(f"{info.label} cannot be opened: {error}") from None
         self._programs: dict[str, Any] = {}
         self._lock = threading.Lock()
-        self._options = ["-cl-std=CL1.2"]
+        self._options = ["-cl-std=CL1.2", "-w"]
         if info.handle.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
             self._options.append("-cl-fp32-correctly-rounded-divide-sqrt")
         # PoCL keeps programs in the same folder by itself, with what it makes of them at the first
