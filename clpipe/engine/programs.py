@@ -16,7 +16,8 @@ from typing import Any
 from clpipe.base.errors import DeviceError, RequestError
 from clpipe.engine.cache_folder import cache_folder, later_runs
 from clpipe.engine.codegen import Kernel
-from clpipe.engine.discovery import DeviceInfo, is_pocl
+from clpipe.engine.discovery import DeviceInfo
+from clpipe.engine.runtimes import is_pocl
 
 # PoCL includes the declarations of all of OpenCL's functions before a program. The first says that
 # it has done so; the second has those that are called declared in kernels/lib/builtins.h.
