@@ -23,7 +23,7 @@ from clpipe.base.files import passing_files, write_new
 from clpipe.engine.cache_folder import cache_folder
 from clpipe.engine.cpu_target import VARIABLE, Target, candidates, cpu_text
 from clpipe.engine.runtimes import attempt
-from clpipe.engine.sources import file_text
+from clpipe.engine.sources import LIBRARY, kernel_folder
 from clpipe.engine.vendors import VARIABLES, icd_files, installed_drivers
 
 LIMIT = 120  # seconds for one process; then the runtime that it is at counts as hanging
@@ -181,15 +181,17 @@ def _path() -> Path | None:
         "sys": Path("/sys/devices/system/cpu").is_dir(),
         "environment": {name: os.environ.get(name) for name in SENSITIVE},
         "drivers": {str(path): text for path, text in icd_files()},
-        "versions": [sys.executable, version("pyopencl"), version("numpy")],
-        "trial": [
-            Path(__file__).with_name(f"{name}.py").read_text("utf-8")
-            for name in ("trial", "cpu_target", "runtimes")
-        ]
-        + [file_text(f"lib/{name}.h", set()) for name in ("lanes", "math", "random")],
+        "program": [sys.executable, version("pyopencl")],
+        "trial": [[path.stat().st_size, path.stat().st_mtime_ns] for path in _trial_files()],
     }
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
     return folder / "runtimes" / f"{digest[:32]}.json"
+
+
+def _trial_files() -> list[Path]:
+    """The files of this program that a trial depends on."""
+    modules = [Path(__file__).with_name(f"{m}.py") for m in ("trial", "cpu_target", "runtimes")]
+    return [*modules, *(kernel_folder() / f"lib/{name}.h" for name in LIBRARY)]
 
 
 def _read(path: Path) -> Verdicts | None:
