@@ -249,7 +249,7 @@ def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, m
 def test_memory_does_not_grow_with_the_number_of_images(renders, tmp_path):
     renders(1)
     code = (
-        "import sys; from clpipe.batch.bench import peak_memory\n"
+        "import sys; from clpipe.base.memory import peak_memory\n"
         "from clpipe.commands.main import main\n"
         "try: main(sys.argv[1:])\n"
         "except SystemExit as end: assert not end.code, end.code\n"

@@ -74,7 +74,9 @@ def test_a_user_without_a_home(monkeypatch):
 
 def test_what_a_folder_for_programs_needs(tmp_path, monkeypatch):
     def mounted(flags=0, room=2**30):
-        status = SimpleNamespace(f_flag=flags, f_bavail=room // 4096, f_frsize=4096)
+        status = SimpleNamespace(
+            f_flag=flags, f_blocks=room, f_bfree=room, f_bavail=room // 4096, f_frsize=4096
+        )
         monkeypatch.setattr(os, "statvfs", lambda _: status)
 
     mounted()

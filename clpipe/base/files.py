@@ -13,6 +13,7 @@ from typing import BinaryIO
 from clpipe.base.errors import ImageError
 from clpipe.base.reading import check_regular
 from clpipe.base.steps import Step
+from clpipe.base.system import bring_to_disk
 
 
 @Step("hash")
@@ -139,11 +140,7 @@ def keep_names(folder: Path) -> None:
     if hasattr(_passing, "files"):
         return
     with contextlib.suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        bring_to_disk(folder)
 
 
 def remove_temporary_files() -> None:

@@ -1,9 +1,9 @@
 """How many processors this process may use."""
 
-import os
 from pathlib import Path
 
 from clpipe.base.control_groups import group_folders
+from clpipe.base.system import processors
 
 
 def available_processors(root: Path = Path("/")) -> int:
@@ -12,7 +12,7 @@ def available_processors(root: Path = Path("/")) -> int:
     A quota of one and a half counts as two. ``root`` is for tests.
     """
     quotas = [quota for quota in (_quota(*group) for group in group_folders("cpu", root)) if quota]
-    return max(min([len(os.sched_getaffinity(0)), *quotas]), 1)
+    return max(min([processors(), *quotas]), 1)
 
 
 def _quota(folder: Path, is_first_version: bool) -> int | None:

@@ -1,6 +1,5 @@
 """Benchmark of whole batches: how fast they are, and what their CPU time goes into."""
 
-import re
 import shutil
 import tempfile
 import time
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.errors import ImageError
+from clpipe.base.memory import peak_memory
 from clpipe.base.processors import available_processors
 from clpipe.base.steps import Step, StepTimes
 from clpipe.batch.outcome import DONE, STEPS, Span
@@ -62,7 +62,7 @@ class BatchSpeed:
         seconds: how long its images take.
         cpu_ms: the CPU time of an image, by step, see :data:`CPU_STEPS`.
         processors: how many there are for the process.
-        peak_mib: the most memory that the process held.
+        peak_mib: the most memory that the process held; None outside Linux.
     """
 
     images: int
@@ -71,7 +71,7 @@ class BatchSpeed:
     seconds: float
     cpu_ms: dict[str, float]
     processors: int
-    peak_mib: float
+    peak_mib: float | None
 
     @property
     def busy(self) -> float:
@@ -134,7 +134,7 @@ def bench_batch(device: Device, request: Request, load: Load) -> BatchSpeed:
         seconds=seconds,
         cpu_ms={step: cpu[step] / load.images * 1e3 for step in CPU_STEPS},
         processors=available_processors(),
-        peak_mib=peak / 2**20,
+        peak_mib=None if peak is None else peak / 2**20,
     )
 
 
@@ -160,17 +160,11 @@ def forget_peak_memory() -> None:
         Path("/proc/self/clear_refs").write_text("5", "utf-8")
 
 
-def peak_memory() -> int:
-    """The most memory that this process held, in bytes; 0 where the system has no /proc."""
-    try:
-        match = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text("utf-8"))
-    except OSError:
-        match = None
-    return int(match[1]) * 1024 if match else 0
-
-
 def write_renders(folder: Path, load: Load) -> None:
-    """Write a folder of renders in half floats: :data:`DISTINCT` files, and links to them."""
+    """Write a folder of renders in half floats: :data:`DISTINCT` files, and links to them.
+
+    They are copies where links cannot be made, as on Windows by most users.
+    """
     folder.mkdir()
     picture = scene(load.width, load.height)
     digits = len(str(load.images - 1))
@@ -180,4 +174,8 @@ def write_renders(folder: Path, load: Load) -> None:
             rolled = np.roll(picture, 37 * i, axis=1)
             write_exr(path, rolled, Kind.RGB.channels, {}, half=True)
         else:
-            path.symlink_to(f"{i % DISTINCT:0{digits}}.exr")
+            first = f"{i % DISTINCT:0{digits}}.exr"
+            try:
+                path.symlink_to(first)
+            except OSError:
+                shutil.copyfile(folder / first, path)

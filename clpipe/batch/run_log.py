@@ -15,6 +15,7 @@ from typing import Any
 from clpipe.base.about import __version__
 from clpipe.base.errors import OutputError
 from clpipe.base.memory import peak_memory
+from clpipe.base.system import open_plain
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS, Outcome
 from clpipe.engine.clipping import MUCH
 from clpipe.inputs.find import Shard
@@ -139,13 +140,15 @@ class RunLog:
         Raises:
             OSError: it cannot be opened, or is no regular file.
         """
-        file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+        file = open_plain(self._path, os.O_RDWR | os.O_CREAT)
         status = os.fstat(file)
         if not stat.S_ISREG(status.st_mode):
             os.close(file)
             raise OSError(errno.EINVAL, "not a regular file")
-        if status.st_size and os.pread(file, 1, status.st_size - 1) != b"\n":
-            _append(file, b"\n")  # after a line that was cut off
+        if status.st_size:
+            os.lseek(file, -1, os.SEEK_END)
+            if os.read(file, 1) != b"\n":
+                _append(file, b"\n")  # after a line that was cut off
         return file
 
     def add(self, outcome: Outcome) -> None:

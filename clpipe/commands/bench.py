@@ -131,5 +131,5 @@ def batch_row(speed: BatchSpeed) -> tuple[str, ...]:
         *(f"{ms:.1f}" for ms in speed.cpu_ms.values()),
         f"{sum(speed.cpu_ms.values()):.1f}",
         f"{speed.busy:.0%}",
-        f"{speed.peak_mib:.0f}",
+        "" if speed.peak_mib is None else f"{speed.peak_mib:.0f}",
     )

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import platformdirs
 
+from clpipe.base.system import forbids_programs
+
 VARIABLE = "CLPIPE_CACHE_DIR"  # names another folder
 
 ROOM = 32 * 2**20  # bytes; with less, PoCL's compiler may end the process
@@ -27,11 +29,10 @@ def is_usable(folder: Path | None, runs_code: bool = False) -> bool:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
-            system = os.statvfs(folder)
+            has_room = shutil.disk_usage(folder).free >= ROOM
+        return has_room and not (runs_code and forbids_programs(folder))
     except OSError:
         return False
-    has_room = system.f_bavail * system.f_frsize >= ROOM
-    return has_room and not (runs_code and system.f_flag & os.ST_NOEXEC)
 
 
 def user_folder(name: str | None = None) -> Path | None:

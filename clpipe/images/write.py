@@ -3,7 +3,6 @@
 import errno
 import mmap
 import os
-import resource
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
@@ -18,6 +17,7 @@ from clpipe.base.about import __version__
 from clpipe.base.errors import ImageError
 from clpipe.base.files import Stored, write_whole
 from clpipe.base.steps import Step
+from clpipe.base.system import largest_file, passing_file
 from clpipe.base.types import Array, Floats
 from clpipe.images.attributes import PREFIX
 from clpipe.images.encoding import Output
@@ -181,16 +181,19 @@ def _stored(path: Path, size: int, encode: Callable[[str], None]) -> Stored:
         ImageError: the file cannot be written.
     """
     # The encoders do not notice all that a full disk refuses, and libjpeg then ends the process; so
-    # they write to memory.
-    with open(os.memfd_create("picture"), "rb", buffering=0) as memory:
-        try:
-            _check_file_limit(2 * size)
-            encode(f"/proc/self/fd/{memory.fileno()}")
-            encoded = mmap.mmap(memory.fileno(), 0, prot=mmap.PROT_READ)
-        except OSError as error:
-            raise ImageError(f"{path}: cannot be written: {error.strerror or error}") from None
-        with encoded, memoryview(encoded) as data:
-            return write_whole(path, data)
+    # they write to memory, or where there is room enough.
+    try:
+        _check_file_limit(2 * size)
+        with passing_file(2 * size) as to:
+            encode(to)
+            with (
+                open(to, "rb", buffering=0) as file,
+                mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as encoded,
+                memoryview(encoded) as data,
+            ):
+                return write_whole(path, data)
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
 def _check_file_limit(size: int) -> None:
@@ -199,8 +202,8 @@ def _check_file_limit(size: int) -> None:
     Raises:
         OSError: it may not.
     """
-    limit, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
-    if limit != resource.RLIM_INFINITY and size > limit:
+    limit = largest_file()
+    if limit is not None and size > limit:
         raise OSError(errno.EFBIG, f"{os.strerror(errno.EFBIG)} (ulimit -f)")
 
 

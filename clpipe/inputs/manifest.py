@@ -295,5 +295,5 @@ def key_of(folder: Path, path: Path) -> str:
     ('c/x.exr', 'x.exr')
     """
     whole = os.path.abspath(path)
-    below = os.path.relpath(whole, os.path.abspath(folder))
+    below = Path(os.path.relpath(whole, os.path.abspath(folder))).as_posix()
     return os.path.basename(whole) if below.startswith("../") else below

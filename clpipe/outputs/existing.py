@@ -14,6 +14,7 @@ from clpipe.base.about import __version__
 from clpipe.base.digests import digests, joint_digest, stamp_of, stamp_of_all
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
+from clpipe.base.system import open_plain
 from clpipe.inputs.find import Job
 from clpipe.outputs.sidecar import OWN, outputs_in, read_sidecar
 
@@ -166,7 +167,7 @@ def _same_request(one: Any, other: Mapping[str, Any]) -> bool:
 def is_marked(path: Path) -> bool:
     """Whether a file is clpipe's work by its tags, or is what a loss of power may leave of one."""
     try:
-        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
+        with open(open_plain(path, os.O_RDONLY), "rb") as file:
             status = os.fstat(file.fileno())
             if not stat.S_ISREG(status.st_mode):
                 return False

@@ -2,7 +2,6 @@
 
 import contextlib
 import errno
-import fcntl
 import os
 import re
 import secrets
@@ -12,6 +11,7 @@ from pathlib import Path
 from clpipe.base.errors import RequestError
 from clpipe.base.files import shortened
 from clpipe.base.memory import in_words
+from clpipe.base.system import HOLDABLE, hold, let_go, open_plain, reserve
 from clpipe.inputs.find import Job, Shard
 from clpipe.outputs.patches import without_patch
 
@@ -22,8 +22,6 @@ ROOM = 8 * 2**20  # bytes; a disk with less counts as full
 
 LOCK = ".clpipe.lock"
 
-PARTS = 2**40  # bytes of the lock, of which each shard holds its part; none is ever written
-
 UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # as whole_file names them
 
 
@@ -32,7 +30,7 @@ def write_problem(folder: Path) -> str:
     probe = folder / f".clpipe.{secrets.token_hex(8)}"
     try:
         with open(probe, "xb") as file:
-            os.posix_fallocate(file.fileno(), 0, ROOM)
+            reserve(file, ROOM)
     except OSError as error:
         needed = f" ({in_words(ROOM)} are needed)" if error.errno == errno.ENOSPC else ""
         return f"cannot write there: {error.strerror}{needed}"
@@ -57,17 +55,14 @@ def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
         raise RequestError(f"{folder}: cannot write there: {error.strerror}") from None
     if reason := write_problem(folder):
         raise RequestError(f"{folder}: {reason}")
-    first = PARTS * (shard.number - 1) // shard.of
-    share = PARTS * shard.number // shard.of - first
+    # Each shard holds its part of a file in which nothing is ever written.
+    first = HOLDABLE * (shard.number - 1) // shard.of
+    share = HOLDABLE * shard.number // shard.of - first
     lock = _locked(folder / LOCK, share, first)
     try:
         yield
     finally:
-        # Where nobody else holds the lock, its file is of no more use.
-        with contextlib.suppress(OSError):
-            fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB, PARTS)
-            (folder / LOCK).unlink()
-        os.close(lock)
+        let_go(folder / LOCK, lock, first, share)
 
 
 def _locked(path: Path, length: int, first: int) -> int:
@@ -78,19 +73,19 @@ def _locked(path: Path, length: int, first: int) -> int:
     """
     while True:
         try:
-            lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+            lock = open_plain(path, os.O_RDWR | os.O_CREAT)
         except OSError as error:
             raise RequestError(f"{path}: cannot be locked: {error.strerror}") from None
         try:
-            fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB, length, first)
-        except OSError as error:
-            if error.errno in (errno.EACCES, errno.EAGAIN):
-                os.close(lock)
-                raise RequestError(
-                    f"{path.parent}: another run is writing there; wait for it, or choose another "
-                    "output folder"
-                ) from None
+            is_ours = hold(lock, first, length)
+        except OSError:
             return lock  # a file system without locks
+        if not is_ours:
+            os.close(lock)
+            raise RequestError(
+                f"{path.parent}: another run is writing there; wait for it, or choose another "
+                "output folder"
+            )
         with contextlib.suppress(OSError):
             if os.fstat(lock).st_ino == path.stat().st_ino:
                 return lock

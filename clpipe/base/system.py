@@ -1,0 +1,183 @@
+"""What only some systems have, and what stands in for it on the others.
+
+Elsewhere in clpipe nothing is used that Linux, macOS and Windows do not all have. What is missing
+is asked for when it is needed: where a thing is there, it is used, on whichever system.
+"""
+
+import contextlib
+import errno
+import importlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+
+def _optional(name: str) -> Any:
+    """A module of the standard library; None where this system has none."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        return None
+
+
+fcntl, msvcrt, resource = (_optional(name) for name in ("fcntl", "msvcrt", "resource"))
+
+# Bytes of a file that can be held, of which none need be there. Windows's C runtime counts with
+# 31 bits.
+HOLDABLE = 2**40 if fcntl else 2**30
+
+# Without O_BINARY, Windows writes "\r\n" for "\n".
+_PLAIN = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
+
+
+def open_plain(path: Path, flags: int) -> int:
+    """A descriptor of a file, as ``os.open``, but following no link and waiting for no pipe.
+
+    Raises:
+        OSError: it cannot be opened, or is a link.
+    """
+    if not hasattr(os, "O_NOFOLLOW") and path.is_symlink():
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+    return os.open(path, flags | _PLAIN, 0o666)
+
+
+def hold(file: int, first: int, length: int) -> bool:
+    """Hold a range of a file's bytes against other processes, until the file is closed.
+
+    The system lets go of it when the process ends, however that comes about.
+
+    Args:
+        file: a descriptor, open for writing.
+        first: the first byte.
+        length: how many; the last one is within :data:`HOLDABLE`.
+
+    Returns:
+        False where another process holds one of them.
+
+    Raises:
+        OSError: there are no such locks on this system, or in this file system.
+    """
+    try:
+        if fcntl:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, length, first)
+        elif msvcrt:
+            os.lseek(file, first, os.SEEK_SET)
+            msvcrt.locking(file, msvcrt.LK_NBLCK, length)
+        else:
+            raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+    except OSError as error:
+        if error.errno in (errno.EACCES, errno.EAGAIN):
+            return False
+        raise
+    return True
+
+
+def let_go(path: Path, file: int, first: int, length: int) -> None:
+    """Close a file of which this process holds a range, and remove it if no other holds any.
+
+    Args:
+        path: the file.
+        file: its descriptor.
+        first, length: the range, as in :func:`hold`.
+    """
+    with contextlib.suppress(OSError):
+        if fcntl:
+            if hold(file, 0, HOLDABLE):
+                path.unlink()
+        elif msvcrt:
+            os.lseek(file, first, os.SEEK_SET)
+            msvcrt.locking(file, msvcrt.LK_UNLCK, length)
+    os.close(file)
+    if msvcrt and not fcntl:
+        with contextlib.suppress(OSError):  # Windows refuses while another process has it open
+            path.unlink()
+
+
+def reserve(file: BinaryIO, size: int) -> None:
+    """See that a new file can take a number of bytes.
+
+    Raises:
+        OSError: it cannot.
+    """
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file.fileno(), 0, size)
+    else:
+        _check_room(file.name, size)
+
+
+def _check_room(path: str, size: int) -> None:
+    """See that a number of bytes are free where a path lies.
+
+    Raises:
+        OSError: they are not.
+    """
+    if shutil.disk_usage(path).free < size:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def forbids_programs(folder: Path) -> bool:
+    """Whether no library in a folder can be loaded ("noexec"), as far as the system says.
+
+    Raises:
+        OSError: the folder cannot be looked at.
+    """
+    if not hasattr(os, "statvfs"):
+        return False
+    return bool(os.statvfs(folder).f_flag & getattr(os, "ST_NOEXEC", 0))  # macOS lacks the name
+
+
+@contextlib.contextmanager
+def passing_file(size: int) -> Iterator[str]:
+    """The path of a file for a library to write; it is gone afterwards.
+
+    It is in memory where the system has such files, else in the folder for temporary files.
+
+    Args:
+        size: bytes that must be free in that folder.
+
+    Raises:
+        OSError: they are not, or there is no such folder.
+    """
+    if hasattr(os, "memfd_create"):
+        memory = os.memfd_create("passing")
+        try:
+            yield f"/proc/self/fd/{memory}"
+        finally:
+            os.close(memory)
+        return
+    with tempfile.TemporaryDirectory(prefix="clpipe-", ignore_cleanup_errors=True) as folder:
+        _check_room(folder, size)
+        yield os.path.join(folder, "passing")
+
+
+def largest_file() -> int | None:
+    """The most bytes that a file of this process may have (``ulimit -f``); None without a limit."""
+    if not resource:
+        return None
+    limit = int(resource.getrlimit(resource.RLIMIT_FSIZE)[0])
+    return None if limit == resource.RLIM_INFINITY else limit
+
+
+def bring_to_disk(folder: Path) -> None:
+    """Have the names in a folder outlive a loss of power; nothing on Windows, which opens none.
+
+    Raises:
+        OSError: its file system cannot do that.
+    """
+    if not hasattr(os, "O_DIRECTORY"):
+        return
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def processors() -> int:
+    """How many processors this process may run on; all, where the system does not tell it."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
