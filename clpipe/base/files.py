@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import os
 import secrets
+import shutil
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -133,6 +134,15 @@ def write_new(path: Path, data: bytes) -> Stored:
     """
     make_folder_of(path)
     return write_whole(path, data)
+
+
+def discard(path: Path) -> None:
+    """Remove a file, or a folder and all in it; what cannot be removed stays."""
+    with contextlib.suppress(OSError):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
 
 
 def keep_names(folder: Path) -> None:

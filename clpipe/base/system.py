@@ -9,6 +9,7 @@ import errno
 import importlib
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -73,6 +74,45 @@ def hold(file: int, first: int, length: int) -> bool:
             return False
         raise
     return True
+
+
+def use(file: int, alone: bool = False, wait: bool = True) -> bool:
+    """Share a file with other processes that use it, or have it alone, until it is closed.
+
+    The system lets go of it when the process ends. It is another lock than that of :func:`hold`,
+    and nothing where the system or the file system has none.
+
+    Args:
+        file: a descriptor.
+        alone: whether to have it alone.
+        wait: whether to wait until the others let that be.
+
+    Returns:
+        Whether it is had; True on a system without such locks, False in a file system without them.
+    """
+    if not fcntl:
+        return True
+    try:
+        how = fcntl.LOCK_EX if alone else fcntl.LOCK_SH
+        fcntl.flock(file, how if wait else how | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+def writable_by_others(folder: Path) -> str:
+    """Why others than this user may write to a folder, in words; "" where they may not.
+
+    Raises:
+        OSError: the folder cannot be looked at.
+    """
+    if not hasattr(os, "geteuid"):
+        return ""
+    status = folder.stat()
+    if status.st_uid != os.geteuid():
+        return f"it belongs to another user (number {status.st_uid})"
+    mode = stat.S_IMODE(status.st_mode)
+    return f"others may write to it (mode {mode:04o})" if mode & 0o022 else ""
 
 
 def let_go(path: Path, file: int, first: int, length: int) -> None:

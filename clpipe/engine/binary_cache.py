@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import ImageError
-from clpipe.base.files import passing_files, write_new
+from clpipe.base.files import discard, passing_files, write_new
 
 
 class BinaryCache:
@@ -42,14 +42,15 @@ class BinaryCache:
         path = self.path(source, options)
         try:
             digest, binary = (data := path.read_bytes())[:32], data[32:]
-        except OSError:
+        except FileNotFoundError:
             return None
+        except OSError:
+            digest = binary = b""
         if hashlib.sha256(binary).digest() == digest:
             with suppress(cl.Error):
                 program = cl.Program(context, [self._device], [binary])
                 return program.build(options, cache_dir=False)
-        with suppress(OSError):
-            path.unlink()
+        discard(path)
         return None
 
     def store(self, program: Any, source: str, options: list[str]) -> None:

@@ -1,6 +1,10 @@
-"""Where compiled programs are kept between processes."""
+"""Where compiled programs are kept between processes.
+
+What lies there is run, so it is a folder that nobody but this user may write to.
+"""
 
 import atexit
+import logging
 import os
 import shutil
 import tempfile
@@ -11,11 +15,14 @@ from pathlib import Path
 
 import platformdirs
 
-from clpipe.base.system import forbids_programs
+from clpipe.base.system import forbids_programs, writable_by_others
+from clpipe.engine.pocl_cache import is_sound, list_programs
 
 VARIABLE = "CLPIPE_CACHE_DIR"  # names another folder
+OF_POCL = "POCL_CACHE_DIR"  # PoCL's own variable
 
 ROOM = 32 * 2**20  # bytes; with less, PoCL's compiler may end the process
+log = logging.getLogger(__name__)
 
 
 def is_usable(folder: Path | None, runs_code: bool = False) -> bool:
@@ -27,7 +34,7 @@ def is_usable(folder: Path | None, runs_code: bool = False) -> bool:
     if folder is None:
         return False
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             has_room = shutil.disk_usage(folder).free >= ROOM
         return has_room and not (runs_code and forbids_programs(folder))
@@ -51,14 +58,36 @@ def lasting_folder() -> Path | None:
 
 
 @cache
+def is_private(folder: Path) -> bool:
+    """Whether only this user may write to a folder; if not, that is logged, once."""
+    try:
+        reason = writable_by_others(folder)
+    except OSError:
+        return False
+    if reason:
+        log.warning(
+            "%s: %s, and what lies there is run; kernels go to a folder of this process "
+            "(chmod 700, or name another with %s)",
+            *(folder, reason, VARIABLE),
+        )
+    return not reason
+
+
+@cache
 def cache_folder(runs_code: bool = False) -> Path | None:
     """The folder for compiled programs; None where there is none. Argument as :func:`is_usable`.
 
-    It is the lasting one, else a temporary folder that is removed when the process ends.
+    It is the lasting one, if it is private, else a temporary one.
     """
     folder = lasting_folder()
-    if folder and is_usable(folder, runs_code):
+    if folder and is_usable(folder, runs_code) and is_private(folder):
         return folder.resolve()
+    return temporary_folder(runs_code)
+
+
+@cache
+def temporary_folder(runs_code: bool = False) -> Path | None:
+    """A folder that is removed when the process ends. Argument as :func:`is_usable`."""
     for place in temporary_places():
         if is_usable(place, runs_code):
             temporary = tempfile.mkdtemp(prefix="clpipe-", dir=place)
@@ -88,15 +117,47 @@ def prepare_environment() -> None:
     PoCL keeps its programs in our folder too, unless the user named another one. Both it and
     pyopencl fail to start where their cache folder cannot be used, so there they get ours.
     """
-    if pocl_problem() and (folder := cache_folder(runs_code=True)):
-        os.environ["POCL_CACHE_DIR"] = str(folder / "pocl")
+    named = os.environ.get(OF_POCL)
+    if folder := pocl_folder(named):
+        os.environ[OF_POCL] = str(folder)
     if not is_usable(user_folder()) and (folder := cache_folder()):
         os.environ["XDG_CACHE_HOME"] = str(folder)
 
 
+def pocl_folder(named: str | None) -> Path | None:
+    """The folder for PoCL's programs, with nothing in it that is damaged; None where there is none.
+
+    ``named`` is what the user named, which comes before ours and a temporary one.
+    """
+    for place in pocl_places(named):
+        with suppress(OSError):
+            if is_usable(place, runs_code=True) and is_private(place):
+                if is_sound(place.resolve()):
+                    return place.resolve()
+                log.warning(
+                    "%s: damaged, and in use; kernels go to a folder of this process", place
+                )
+    return None
+
+
+def list_pocl_programs() -> None:
+    """List what PoCL has compiled, so that later processes believe it."""
+    if named := os.environ.get(OF_POCL):
+        list_programs(Path(named))
+
+
+def pocl_places(named: str | None) -> Iterator[Path]:
+    """Where PoCL may keep its programs, the first choice first; argument as there."""
+    if named:
+        yield Path(named)
+    for folder in (cache_folder, temporary_folder):
+        if base := folder(True):
+            yield base / "pocl"
+
+
 def pocl_problem() -> str:
     """Why PoCL has no folder to compile in, or nothing."""
-    named = os.environ.get("POCL_CACHE_DIR")
+    named = os.environ.get(OF_POCL)
     if named and is_usable(Path(named), runs_code=True):
         return ""
     return (

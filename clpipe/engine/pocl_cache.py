@@ -11,23 +11,16 @@ is theirs, and listed when their kernels are compiled.
 
 import json
 import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import xxhash
 
 from clpipe.base.errors import ImageError
-from clpipe.base.files import passing_files, write_whole
-
-fcntl: ModuleType | None
-try:
-    import fcntl
-except ImportError:  # Windows, for which there is no PoCL
-    fcntl = None
+from clpipe.base.files import discard, passing_files, write_whole
+from clpipe.base.system import use
 
 INDEX, LOCK, INDEX_LOCK = "index.json", "in_use.lock", "index.lock"
 TOUCHED = "last_accessed"  # PoCL writes it at each use, and never reads it
@@ -47,38 +40,45 @@ def is_sound(folder: Path) -> bool:
     """
     if folder in _in_use:
         return True
-    lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    for name in (INDEX, LOCK, INDEX_LOCK):
+        if (folder / name).is_dir():
+            discard(folder / name)
+    lock = _opened(folder / LOCK)
+    alone = use(lock, alone=True, wait=False)
+    if not alone:
+        use(lock)
     try:
-        alone = _try_lock(lock)
-        listed, found = _index(folder), dict(_programs(folder))
-        for program, files in found.items():
-            was = listed.get(program)
-            if was is None:
-                damaged = alone
-            else:
-                damaged = not _is_as_it_was(folder / program, was, files, alone)
-            if damaged and not alone:
-                os.close(lock)
-                return False
-            if damaged:
-                shutil.rmtree(folder / program)
-        if alone:
-            for left in folder.glob("tempfile*"):
-                left.unlink()
-        _share(lock)
+        damaged = list(_damaged(folder, alone))
+        for path in [*damaged, *folder.glob("tempfile*")] if alone else ():
+            discard(path)
     except OSError:
-        with suppress(OSError):
-            os.close(lock)
+        os.close(lock)
         raise
+    use(lock)
+    if damaged and not alone:
+        os.close(lock)
+        return False
     _in_use[folder] = lock
     return True
+
+
+def _damaged(folder: Path, alone: bool) -> Iterator[Path]:
+    """The folders of programs that are not as they were written.
+
+    ``alone`` counts in those that are not listed, as of a process that was ended.
+    """
+    listed = _index(folder)
+    for program, files in _programs(folder):
+        was = listed.get(program)
+        if alone if was is None else not _is_as_it_was(folder / program, was, files, alone):
+            yield folder / program
 
 
 def list_programs(folder: Path) -> None:
     """List what has been compiled in a folder, so that later processes believe it."""
     if folder not in _in_use:
         return
-    with suppress(OSError, ImageError), _locked(folder / INDEX_LOCK):
+    with suppress(OSError, ImageError), _waited_for(folder / INDEX_LOCK):
         listed, found = _index(folder), dict(_programs(folder))
         now: dict[str, Files] = {}
         for program, files in found.items():
@@ -141,33 +141,16 @@ def _digest(path: Path) -> str:
     return xxhash.xxh3_128_hexdigest(path.read_bytes())
 
 
-def _try_lock(lock: int) -> bool:
-    """Lock a file for this process alone, if no other one uses it; else wait to share it."""
-    if fcntl is None:
-        return True
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        _share(lock)
-        return False
-    return True
-
-
-def _share(lock: int) -> None:
-    """Share a lock; a file system without locks has none."""
-    if fcntl is not None:
-        with suppress(OSError):
-            fcntl.flock(lock, fcntl.LOCK_SH)
-
-
 @contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Hold a lock that others wait for."""
-    lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+def _waited_for(path: Path) -> Iterator[None]:
+    """Hold a file for this process alone, once others have let go of it."""
+    lock = _opened(path)
     try:
-        if fcntl is not None:
-            with suppress(OSError):
-                fcntl.flock(lock, fcntl.LOCK_EX)
+        use(lock, alone=True)
         yield
     finally:
         os.close(lock)
+
+
+def _opened(path: Path) -> int:
+    return os.open(path, os.O_RDWR | os.O_CREAT, 0o600)

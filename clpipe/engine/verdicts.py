@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import ImageError
-from clpipe.base.files import passing_files, write_new
+from clpipe.base.files import discard, passing_files, write_new
 from clpipe.engine.cache_folder import cache_folder
 from clpipe.engine.cpu_target import VARIABLE, Target, candidates, cpu_text
 from clpipe.engine.runtimes import attempt
@@ -80,6 +80,7 @@ def verdicts(again: bool = False, missing: bool = False) -> Verdicts:
         return known
     found = tried(known or Verdicts())
     if path and found.lasting:
+        discard(path)
         with passing_files(), suppress(ImageError):
             write_new(path, json.dumps(asdict(found), indent=1).encode())
     return found
