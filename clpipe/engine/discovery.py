@@ -203,9 +203,9 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
         places = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES")  # where the loader looks for platforms
         limits = "".join(f" ({n} is {os.environ[n]!r})" for n in places if n in os.environ)
         raise DeviceError(
-            f"no OpenCL platform was found{limits}; install one "
-            "(pip install 'pyopencl[pocl]', or your GPU's driver), or use --device numpy, which is "
-            "slow but needs none"
+            f"no OpenCL platform was found{limits}; install one (your GPU's driver, or for CPUs "
+            "Debian's and Ubuntu's pocl-opencl-icd; docs/install.md has other systems), or use "
+            "--device numpy, which is slow but needs none"
         )
     if selector is not None:
         matching = [
