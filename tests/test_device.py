@@ -16,12 +16,14 @@ from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.commands.devices import device_rows
 from clpipe.engine import hardware
+from clpipe.engine.cpu_target import Target
 from clpipe.engine.device import Device, open_devices
-from clpipe.engine.discovery import choose, choose_all, find_devices, lanes_for
+from clpipe.engine.discovery import choose, choose_all, find_devices
 from clpipe.engine.extents import Extent
 from clpipe.engine.flow import Flow
 from clpipe.engine.hardware import Hardware, hardware_of
 from clpipe.engine.runner import Runner
+from clpipe.engine.runtimes import lanes_for
 
 
 @pytest.fixture
@@ -49,21 +51,22 @@ def test_a_gpu_comes_first_then_intels_runtime_then_pocl(devices):
 
 
 @pytest.mark.parametrize(
-    ("type_", "platform", "cpu", "width", "lanes"),
+    ("type_", "platform", "target", "width", "lanes"),
     [
         ("GPU", "NVIDIA CUDA", "", 1, 1),
+        ("CPU", "Portable Computing Language", "skx", 16, 16),
         ("CPU", "Portable Computing Language", "cascadelake", 16, 16),
-        ("CPU", "Portable Computing Language", "znver3", 16, 8),  # a Zen 4, says PoCL 3.0
-        ("CPU", "Portable Computing Language", "haswell", 8, 8),
+        ("CPU", "Portable Computing Language", "znver3", 16, 8),
+        ("CPU", "Portable Computing Language", "x86-64", 4, 8),
+        ("CPU", "Portable Computing Language", "cortex-a57", 4, 8),
         ("CPU", "Intel(R) OpenCL", "", 16, 16),
         ("CPU", "Intel(R) OpenCL", "", 8, 8),
         ("CPU", "rusticl", "", 1, 1),
     ],
 )
-def test_lanes(type_, platform, cpu, width, lanes):
-    version = f"OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-{cpu} "
-    device = SimpleNamespace(native_vector_width_float=width, version=version)
-    assert lanes_for(type_, platform, device) == lanes
+def test_lanes(type_, platform, target, width, lanes):
+    of, device = SimpleNamespace(name=platform), SimpleNamespace(native_vector_width_float=width)
+    assert lanes_for(type_, of, device, Target(target, "")) == lanes
 
 
 @pytest.mark.parametrize(
@@ -90,7 +93,7 @@ def test_devices_that_cannot_be_used(devices, monkeypatch):
     with pytest.raises(DeviceError, match="no OpenCL platform"):
         choose(None, [])
     monkeypatch.setenv("OCL_ICD_VENDORS", "/nowhere")
-    with pytest.raises(DeviceError, match=r"was found .OCL_ICD_VENDORS is '/nowhere'.; install"):
+    with pytest.raises(DeviceError, match=r"was found .OCL_ICD_VENDORS is '/nowhere'.; what helps"):
         choose(None, [])
 
 

@@ -15,7 +15,7 @@ from clpipe.engine.bench import scene
 from clpipe.engine.device import Device
 from clpipe.engine.discovery import find_devices
 from clpipe.engine.runner import Runner
-from clpipe.engine.vendors import intel_library, intel_visible
+from clpipe.engine.vendors import drivers_visible, intel_library
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def installed(tmp_path, monkeypatch):
 
 
 def test_it_is_seen_beside_the_systems(installed):
-    with intel_visible():
+    with drivers_visible():
         folder = Path(os.environ["OCL_ICD_VENDORS"])
         texts = {file.read_text().strip() for file in folder.glob("*.icd")}
     assert texts == {"libgpu.so", str(installed.runtime)}
@@ -47,21 +47,21 @@ def test_it_is_seen_beside_the_systems(installed):
 def test_a_users_own_choice_stays(installed, monkeypatch, variable):
     monkeypatch.setenv(variable, "/mine")
     before = dict(os.environ)
-    with intel_visible():
+    with drivers_visible():
         assert dict(os.environ) == before
     assert dict(os.environ) == before
 
 
 def test_nothing_changes_without_the_package_or_where_it_is_found_anyhow(installed, monkeypatch):
     (installed.system / "intel.icd").write_text(f"{installed.runtime}\n")
-    with intel_visible():
+    with drivers_visible():
         assert "OCL_ICD_VENDORS" not in os.environ
     (installed.system / "intel.icd").write_text("/opt/wrong/libintelocl.so\n")
-    with intel_visible():
+    with drivers_visible():
         assert "OCL_ICD_VENDORS" in os.environ
     installed.runtime.unlink()
     assert intel_library() is None
-    with intel_visible():
+    with drivers_visible():
         assert "OCL_ICD_VENDORS" not in os.environ
 
 

@@ -162,7 +162,8 @@ def worker_environment(selectors: Sequence[str]) -> WorkerEnvironment:
 def device_text(info: DeviceInfo) -> str:
     """All of a device that bits may depend on."""
     platform = info.handle.platform.version.strip()
-    return f"{info.label}, driver {info.driver}, {platform}, {info.lanes} lanes"
+    target = f" for {info.target.name}" if info.target.name else ""
+    return f"{info.label}, driver {info.driver}, {platform}, {info.lanes} lanes{target}"
 
 
 def probe_worker(spec: RunSpec, probe: str, size: int | None) -> WorkerEnvironment | str:

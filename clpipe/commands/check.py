@@ -45,7 +45,9 @@ def check(
         records = [c.record() for c in checks]
         show_json({**machine_record(device), "failed": failed, "checks": records})
     else:
-        click.echo(f"{device.info.label}, driver {device.info.driver}, {device.info.lanes} lanes")
+        target = f" for {device.info.target.name}" if device.info.target.name else ""
+        lanes = f"{device.info.lanes} lanes{target}"
+        click.echo(f"{device.info.label}, driver {device.info.driver}, {lanes}")
         headings = ("stage", "method", "cases", "samples", "differing", "largest", "allowed", "")
         show(headings, map(check_row, checks))
         click.echo(f"{len(checks) - failed} passed, {failed} failed")

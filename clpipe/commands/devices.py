@@ -15,11 +15,16 @@ from clpipe.engine.discovery import DeviceInfo, choose, find_devices
 @json_option
 def devices(as_json: bool) -> None:
     """List the OpenCL devices, and say which one is used and why others are not."""
-    rows = device_rows(find_devices())
+    rows = device_rows(find_devices(again=True))
     if as_json:
         show_json(rows)
         return
-    show([key.replace("_", " ") for key in rows[0]], [[*map(str, r.values())] for r in rows])
+    shown = [{key: v for key, v in row.items() if key != "target_reason"} for row in rows]
+    show([key.replace("_", " ") for key in shown[0]], [[*map(str, r.values())] for r in shown])
+    for row in rows:
+        if row["target"]:
+            lanes = f"{row['lanes']} lanes"
+            click.echo(f"{row['index']}: for {row['target']}, {lanes}: {row['target_reason']}")
 
 
 def device_rows(devices: Sequence[DeviceInfo]) -> list[dict[str, Any]]:
@@ -50,11 +55,15 @@ def device_rows(devices: Sequence[DeviceInfo]) -> list[dict[str, Any]]:
                 "compute_units": device.compute_units,
                 "memory": f"{device.memory / 2**30:.1f} GiB",
                 "lanes": device.lanes,
+                "target": device.target.name,
+                "target_reason": device.target.reason,
                 "status": status,
             }
         )
     numpy = "slow; --device numpy"
-    blank = dict.fromkeys(("driver", "compute_units", "memory", "lanes"), "")
+    blank = dict.fromkeys(
+        ("driver", "compute_units", "memory", "lanes", "target", "target_reason"), ""
+    )
     rows.append(
         {"index": "numpy", "name": "NumPy", "platform": "the references", "type": "CPU"}
         | blank

@@ -1,7 +1,7 @@
 """The OpenCL devices of this machine, and which of them to use."""
 
 import os
-import shutil
+import platform as this_system
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,8 +10,18 @@ from clpipe.base.errors import DeviceError
 from clpipe.base.memory import available_memory
 from clpipe.base.text import one_of
 from clpipe.engine.cache_folder import pocl_problem, prepare_environment
+from clpipe.engine.cpu_target import Target, candidates, compile_for, forced_target
 from clpipe.engine.hardware import Hardware, hardware_of
-from clpipe.engine.vendors import intel_visible
+from clpipe.engine.runtimes import (
+    is_pocl,
+    is_tried,
+    lanes_for,
+    platform_id,
+    problem_with,
+    type_of,
+)
+from clpipe.engine.vendors import platforms
+from clpipe.engine.verdicts import Verdicts, verdicts
 
 _process: int | None = None  # the process id that first used OpenCL, here or before a fork
 
@@ -33,6 +43,7 @@ class DeviceInfo:
     memory: int  # bytes
     max_buffer: int  # bytes
     lanes: int
+    target: Target  # what kernels are compiled for
     problem: str
     handle: Any
     hardware: Hardware
@@ -57,8 +68,10 @@ class DeviceInfo:
         return 1 if is_pocl(self.platform) else self.handle.mem_base_addr_align // 8
 
 
-def find_devices() -> list[DeviceInfo]:
-    """Every device of every OpenCL platform, in the platforms' order.
+def find_devices(again: bool = False) -> list[DeviceInfo]:
+    """Every device of every OpenCL platform, in the platforms' order, each tried once.
+
+    ``again`` is whether to try once more what did not work when it was tried.
 
     Raises:
         DeviceError: pyopencl cannot be loaded, or this process cannot use it.
@@ -71,40 +84,48 @@ def find_devices() -> list[DeviceInfo]:
         )
     _process = os.getpid()
     prepare_environment()
-    try:
-        import pyopencl as cl
-    except (ImportError, OSError) as error:
-        raise DeviceError(f"pyopencl cannot be loaded: {error}") from None
-    try:
-        with intel_visible():
-            platforms = cl.get_platforms()
-    except cl.Error as error:
-        if "PLATFORM_NOT_FOUND" in str(error):
-            return []
-        raise DeviceError(f"OpenCL cannot be used: {error}") from None
+    forced_target()
+    known = verdicts(again)
+    if known.listing:
+        raise DeviceError(f"OpenCL's drivers cannot be listed: {known.listing}; {remedies()}")
     found: list[DeviceInfo] = []
-    for platform in platforms:
-        try:
-            devices, reason = platform.get_devices(), "it offers no device"
-        except cl.Error as error:
-            devices, reason = [], f"it offers no device: {error}"
-        found += [describe(len(found) + i, platform, d) for i, d in enumerate(devices)]
+    for platform in platforms(known.hidden):
+        devices, reason = devices_of(platform, known)
+        for device in devices:
+            if is_tried(type_of(platform, device), platform, device) and not known.of(
+                platform, device
+            ):
+                known = verdicts(missing=True)
+            found.append(describe(len(found), platform, device, known))
         if not devices:
-            problem = pocl_problem() if is_pocl(platform.name) else ""
-            found.append(without_device(len(found), platform, problem or reason))
+            handle, version = platform.int_ptr, platform.version
+            found.append(without_device(len(found), platform.name, reason, version, handle))
+    for name, reason in known.hidden.items():
+        found.append(without_device(len(found), name, reason))
     return found
 
 
-def describe(index: int, platform: Any, device: Any) -> DeviceInfo:
-    """What is to be known of a ``pyopencl.Device``."""
+def devices_of(platform: Any, known: Verdicts) -> tuple[list[Any], str]:
+    """The devices of a ``pyopencl.Platform``, and, where there are none, why."""
     import pyopencl as cl
 
-    kind = device.type
-    type_ = "GPU" if kind & cl.device_type.GPU else "CPU"
-    if not kind & (cl.device_type.GPU | cl.device_type.CPU):
-        type_ = "accelerator"
-    if "oclgrind" in platform.name.lower():
-        type_ = "emulator"  # it finds errors in kernels, slowly, and says it is all types
+    if reason := known.platforms.get(platform_id(platform)):
+        return [], f"asked for its devices, {reason}"
+    problem = pocl_problem() if is_pocl(platform.name) else ""
+    try:
+        return list(platform.get_devices()), problem or "it offers no device"
+    except cl.Error as error:
+        return [], problem or f"it offers no device: {error}"
+
+
+def describe(index: int, platform: Any, device: Any, known: Verdicts) -> DeviceInfo:
+    """What is to be known of a ``pyopencl.Device``, which compiles for its target from now on."""
+    type_ = type_of(platform, device)
+    problem = problem_with(type_, platform, device)
+    target = candidates(platform, device)[0]
+    if not problem and (verdict := known.of(platform, device)):
+        target, problem = verdict
+    compile_for(device, target)
     return DeviceInfo(
         index=index,
         platform=platform.name.strip(),
@@ -115,79 +136,46 @@ def describe(index: int, platform: Any, device: Any) -> DeviceInfo:
         compute_units=device.max_compute_units,
         memory=device.global_mem_size,
         max_buffer=device.max_mem_alloc_size,
-        lanes=lanes_for(type_, platform.name, device),
-        problem=problem_with(type_, platform.name, device),
+        lanes=lanes_for(type_, platform, device, target),
+        target=target,
+        problem=problem,
         handle=device,
         hardware=hardware_of(device),
     )
 
 
-def without_device(index: int, platform: Any, reason: str) -> DeviceInfo:
+def without_device(
+    index: int, platform: str, reason: str, version: str = "", handle: int = 0
+) -> DeviceInfo:
     """A platform that is installed and has nothing to offer; its user wants to know why."""
     return DeviceInfo(
         index=index,
-        platform=platform.name.strip(),
+        platform=platform.strip(),
         name="no device",
         type="none",
-        version=platform.version.strip(),
+        version=version.strip(),
         driver="",
         compute_units=0,
         memory=0,
         max_buffer=0,
         lanes=0,
+        target=Target("", ""),
         problem=reason,
         handle=None,
-        hardware=Hardware(platform.int_ptr),
+        hardware=Hardware(handle),
     )
 
 
-def is_pocl(platform: str) -> bool:
-    """Whether a platform is PoCL, by its name."""
-    return "Portable Computing" in platform
-
-
-# CPUs with AVX-512, as LLVM names them, whose code from PoCL 3.0 (LLVM 14) is right and twice as
-# wide. On later ones that it takes for others (AMD Zen 4) it crashes on 16 lanes.
-WIDE_IN_POCL = (
-    "skylake-avx512",
-    "cascadelake",
-    "cooperlake",
-    "cannonlake",
-    "icelake-client",
-    "icelake-server",
-    "tigerlake",
-    "rocketlake",
-    "sapphirerapids",
-)
-
-
-def lanes_for(type_: str, platform: str, device: Any) -> int:
-    """How many lanes the kernels are compiled for: one vector register on a CPU, 1 on a GPU.
-
-    A CPU whose natural vectors are one wide has a compiler like a GPU's: Mesa's rusticl, which gets
-    the pictures of wider ones wrong.
-    """
-    if type_ != "CPU":
-        return 1
-    if is_pocl(platform):
-        # The version ends with the name of the CPU that PoCL compiles for.
-        return 16 if device.version.strip().endswith(WIDE_IN_POCL) else 8
-    width = device.native_vector_width_float
-    return 1 if width == 1 else 8 if width < 16 else 16
-
-
-def problem_with(type_: str, platform: str, device: Any) -> str:
-    """Why a device cannot be used, or nothing."""
-    if type_ == "accelerator":
-        return "neither a GPU nor a CPU (an emulator or an FPGA)"
-    if not device.available or not device.compiler_available:
-        return "it is not available or has no compiler"
-    if is_pocl(platform) and not shutil.which("ld"):
-        return (
-            "PoCL needs a linker and there is no 'ld' on the PATH "
-            "(Debian, Ubuntu: apt-get install binutils; conda: binutils)"
-        )
-    return pocl_problem() if is_pocl(platform) else ""
+def remedies() -> str:
+    """What helps on this machine where no OpenCL runtime works."""
+    linux = this_system.system() == "Linux"
+    x86 = this_system.machine() in ("x86_64", "AMD64")
+    ways = [
+        "your GPU's driver",
+        *(["pip install 'clpipe[intel]'"] if linux and x86 else []),
+        *(["apt-get install pocl-opencl-icd (Debian, Ubuntu)"] if linux else []),
+    ]
+    return f"what helps here: {', or '.join(ways)}; --device numpy needs none, and is slow"
 
 
 def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
@@ -202,11 +190,7 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
     if not devices:
         places = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES")  # where the loader looks for platforms
         limits = "".join(f" ({n} is {os.environ[n]!r})" for n in places if n in os.environ)
-        raise DeviceError(
-            f"no OpenCL platform was found{limits}; install one (your GPU's driver, or for CPUs "
-            "Debian's and Ubuntu's pocl-opencl-icd; docs/install.md has other systems), or use "
-            "--device numpy, which is slow but needs none"
-        )
+        raise DeviceError(f"no OpenCL platform was found{limits}; {remedies()}")
     if selector is not None:
         matching = [
             d
@@ -223,7 +207,7 @@ def choose(selector: str | None, devices: list[DeviceInfo]) -> DeviceInfo:
     usable = [d for d in devices if d.type in ("GPU", "CPU") and not d.problem]
     if not usable:
         reasons = "; ".join(f"{d.label}: {d.problem or 'an emulator'}" for d in devices)
-        raise DeviceError(f"no usable OpenCL device ({reasons}); or use --device numpy")
+        raise DeviceError(f"no usable OpenCL device ({reasons}); {remedies()}")
     return min(usable, key=rank)
 
 

@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError, RequestError
+from clpipe.engine.binary_cache import BinaryCache
 from clpipe.engine.cache_folder import cache_folder, later_runs
 from clpipe.engine.codegen import Kernel
-from clpipe.engine.discovery import DeviceInfo, is_pocl
+from clpipe.engine.discovery import DeviceInfo
+from clpipe.engine.runtimes import is_pocl
 
 # PoCL includes the declarations of all of OpenCL's functions before a program. The first says that
 # it has done so; the second has those that are called declared in kernels/lib/builtins.h.
@@ -40,6 +42,7 @@ class Programs:
 
     def __init__(self, info: DeviceInfo) -> None:
         import pyopencl as cl
+        from pyopencl.characterize import has_src_build_cache
 
         self._cl = cl
         try:
@@ -48,15 +51,14 @@ class Programs:
             raise DeviceError(f"{info.label} cannot be opened: {error}") from None
         self._programs: dict[str, Any] = {}
         self._lock = threading.Lock()
-        self._options = ["-cl-std=CL1.2"]
+        self._options = ["-cl-std=CL1.2", "-w"]
         if info.handle.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
             self._options.append("-cl-fp32-correctly-rounded-divide-sqrt")
-        # PoCL keeps programs in the same folder by itself, with what it makes of them at the first
-        # launch. For other platforms pyopencl keeps binaries under a key of text, options, device
-        # and driver.
         self.declares = is_pocl(info.platform)
-        folder = None if is_pocl(info.platform) else cache_folder()
-        self._cache_dir = str(folder / "programs") if folder else False
+        # PoCL keeps programs in the same folder by itself, with what it makes of them at the first
+        # launch, and NVIDIA's driver in a folder of its own.
+        folder = None if has_src_build_cache(info.handle) else cache_folder()
+        self._cache = BinaryCache(folder / "programs", info.handle) if folder else None
 
     def __len__(self) -> int:
         """How many programs there are."""
@@ -95,8 +97,13 @@ class Programs:
         return program
 
     def _build(self, kernel: Kernel, options: list[str]) -> Any:
+        if self._cache and (kept := self._cache.load(self.context, kernel.source, options)):
+            return kept
         program = self._cl.Program(self.context, kernel.source)
-        return program.build(options, cache_dir=self._cache_dir)
+        program.build(options, cache_dir=False)
+        if self._cache:
+            self._cache.store(program, kernel.source, options)
+        return program
 
 
 def programs_of(info: DeviceInfo) -> Programs:

@@ -258,6 +258,7 @@ def device_record(device: Device | None) -> dict[str, Any]:
         "version": device.info.version if device else all_versions()["numpy"],
         "driver": device.info.driver if device else "",
         "lanes": device.info.lanes if device else 0,
+        "target": device.info.target.name if device else "",
     }
 
 

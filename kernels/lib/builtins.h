@@ -14,13 +14,10 @@ DECLARE(size_t) get_group_id(uint);
 DECLARE(size_t) get_num_groups(uint);
 DECLARE(int) convert_int(float);
 DECLARE(float) convert_float(int);
-DECLARE(long4) convert_long4(int4);
 DECLARE(float) native_exp2(float);
 #undef DECLARE
 
 float __attribute__((overloadable, pure)) vload_half(size_t, const __global half *);
-float8 __attribute__((overloadable, pure)) vload_half8(size_t, const __global half *);
-float16 __attribute__((overloadable, pure)) vload_half16(size_t, const __global half *);
 void __attribute__((overloadable, convergent)) barrier(uint);
 uint __attribute__((overloadable)) atomic_inc(volatile __global uint *);
 

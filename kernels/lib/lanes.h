@@ -65,9 +65,18 @@ INLINE void spill_int(vi v, __private int *p) { *(__private unaligned_vi *)p = v
 INLINE vf to_float(vi v) { return __builtin_convertvector(v, vf); }
 INLINE vi to_int(vf v) { return __builtin_convertvector(v, vi); }
 
-// Finite halves by their bits: exponent and mantissa move into place, and a factor of 2^112 mends
-// the exponent's bias; subnormal halves go through a subtraction, for speed.
-INLINE vf load_half(__global const half *p) { return LANES_OF(vload_half)(0, p); }
+// Halves by their bits: exponent and mantissa move into place, a subnormal half is what it adds to the smallest
+// normal one, and the largest exponent stays the largest. Not vload_half, a function of PoCL's library: where that
+// is compiled for another CPU than the kernel is, the two disagree about the registers of a vector.
+INLINE vf load_half(__global const half *p) {
+    const vi bits = __builtin_convertvector(*(__global const unaligned_vs *)p, vi);
+    const vi moved = (bits & 0x7fff) << 13;
+    const vi normal = moved + 0x38000000;  // (127 - 15) << 23
+    const vf small = LANES_OF(as_float)(moved + 0x38800000) - 0x1p-14f;
+    const vi finite = moved < 0x00800000 ? LANES_OF(as_int)(small) : normal;
+    const vi value = moved < 0x0f800000 ? finite : moved | 0x7f800000;
+    return LANES_OF(as_float)(value | (bits & 0x8000) << 16);
+}
 #endif
 
 INLINE vf vmin(vf a, vf b) { return a < b ? a : b; }

@@ -45,7 +45,10 @@ INLINE void add_up_blocks(__global const int4 *blocks, __global long4 *partials,
                           uint tile) {
     const uint n = get_global_size(0), i = get_global_id(0);
     long4 sum = tile ? partials[i] : (long4)(0);
-    for (uint k = i; k < count; k += n) sum += convert_long4(blocks[k]);
+    for (uint k = i; k < count; k += n) {
+        const int4 block = blocks[k];  // not convert_long4, for the reason that load_half has
+        sum += (long4)(block.x, block.y, block.z, block.w);
+    }
     partials[i] = sum;
 }
 

@@ -1,0 +1,291 @@
+"""Which CPU the PoCL of pip compiles for: the one that the features say, not the one LLVM names.
+
+PoCL up to 4 asks LLVM for the name of the CPU and compiles for that. LLVM 14, of 2022, which is
+within pip's PoCL 3.0, calls an AMD Zen 5 "generic", for which nothing compiles (PoCL's issue 1049).
+It takes a Zen 4 for a Zen 3 without AVX-512, and recent Intel CPUs for an Atom without AVX; and it
+goes by family and model where a hypervisor masks features, so that the first launch ends in SIGILL.
+PoCL 5 and later choose one of seven targets by features. This module does the same for pip's.
+
+There is no option for it, so it is set where PoCL keeps it: the device record (what a cl_device_id
+points to) has a pointer to the name, behind one to the target triple. Both texts are also in the
+device's version, so the place can be proven: it is used only where two adjacent pointers to just
+these texts are found, once. That is so in pip's PoCL 3.0. Everything else is left as it is. The
+record is read and written through /proc/self/mem, where a bad address is an error, not a crash.
+PoCL's cache of programs tells targets apart, since their macros differ.
+"""
+
+import ctypes
+import os
+import platform as this_system
+import re
+import struct
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from clpipe.base.errors import DeviceError
+from clpipe.base.text import one_of
+
+VARIABLE = "CLPIPE_CPU_TARGET"  # forces a target, for tests and support
+
+_AVX2 = frozenset({"avx2", "fma", "f16c", "bmi1", "bmi2", "abm", "cx16", "popcnt"})
+_AVX512 = frozenset({"avx512f", "avx512bw", "avx512dq", "avx512cd", "avx512vl"})
+# The targets of PoCL 5 and later, the widest first, with the features that each needs as Linux
+# calls them. PoCL's library of functions, which is linked to every kernel, has the same ones.
+TARGETS: dict[str, frozenset[str]] = {
+    "skx": _AVX2 | _AVX512,
+    "haswell": _AVX2,
+    "ivybridge": frozenset({"avx", "f16c"}),
+    "sandybridge": frozenset({"avx"}),
+    "penryn": frozenset({"sse4_1"}),
+    "core2": frozenset({"ssse3"}),
+    "x86-64": frozenset(),
+}
+# LLVM's names for CPUs that have just what a target has, as far as vectors go.
+SAME_AS = {
+    "skx": (
+        "skylake-avx512",
+        "cascadelake",
+        "cooperlake",
+        "cannonlake",
+        "icelake-client",
+        "icelake-server",
+        "tigerlake",
+        "rocketlake",
+        "sapphirerapids",
+        "emeraldrapids",
+        "graniterapids",
+        "graniterapids-d",
+        "znver4",
+        "znver5",
+        "x86-64-v4",
+    ),
+    "haswell": (
+        *("broadwell", "skylake", "alderlake", "raptorlake", "meteorlake", "arrowlake"),
+        *("arrowlake-s", "lunarlake", "gracemont", "sierraforest", "x86-64-v3"),
+        *("bdver4", "znver1", "znver2", "znver3"),
+    ),
+    "ivybridge": ("core-avx-i", "bdver2", "bdver3", "btver2"),
+    "sandybridge": ("corei7-avx", "bdver1"),
+    "penryn": ("nehalem", "westmere", "silvermont", "goldmont", "goldmont-plus", "tremont"),
+    "core2": ("bonnell",),
+}
+RECORD = 1200  # bytes of the device record to look through; in PoCL 3.0 the pointer is at 640
+_texts: dict[int, ctypes.Array[ctypes.c_char]] = {}  # set names, by device; PoCL keeps pointers
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a runtime compiles for.
+
+    Args:
+        name: a CPU, as LLVM calls it; "" where the runtime does not say.
+        reason: who chose it, in words.
+    """
+
+    name: str
+    reason: str
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether it has vector registers of 512 bits."""
+        return row_of(self.name) == "skx"
+
+
+def row_of(name: str) -> str | None:
+    """The one of :data:`TARGETS` that has what a CPU has; None for a name that is not known."""
+    if name in TARGETS:
+        return name
+    return next((target for target, names in SAME_AS.items() if name in names), None)
+
+
+def target_for(features: frozenset[str]) -> str:
+    """The widest of :data:`TARGETS` whose features are there, as Linux calls them.
+
+    >>> target_for(frozenset({"sse4_1", "avx", "f16c", "avx512f"}))
+    'ivybridge'
+    """
+    return next(name for name, needed in TARGETS.items() if needed <= features)
+
+
+# Of glibc's <sys/platform/x86.h>: leaf, register and bit of each feature that a target needs.
+_ACTIVE = {
+    "ssse3": (0, 2, 9),
+    "fma": (0, 2, 12),
+    "cx16": (0, 2, 13),
+    "sse4_1": (0, 2, 19),
+    "popcnt": (0, 2, 23),
+    "avx": (0, 2, 28),
+    "f16c": (0, 2, 29),
+    "bmi1": (1, 1, 3),
+    "avx2": (1, 1, 5),
+    "bmi2": (1, 1, 8),
+    "avx512f": (1, 1, 16),
+    "avx512dq": (1, 1, 17),
+    "avx512cd": (1, 1, 28),
+    "avx512bw": (1, 1, 30),
+    "avx512vl": (1, 1, 31),
+    "abm": (2, 2, 5),
+}
+
+
+CPUINFO = Path("/proc/cpuinfo")
+
+
+@cache
+def cpu_text() -> str:
+    """What tells this CPU from others: maker, model and features, as Linux lists them, or ""."""
+    try:
+        lines = CPUINFO.read_text("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return ""
+    keys = ("vendor", "cpu family", "model", "flags", "CPU ", "Features")
+    return "\n".join(dict.fromkeys(line for line in lines if line.startswith(keys)))
+
+
+@cache
+def cpu_features() -> frozenset[str] | None:
+    """The features of this x86-64 CPU that programs may use; None where they are not known.
+
+    They are what Linux lists and glibc (2.33 and later) found usable, each as far as it can be
+    asked: emulators and containers pass the host's list on, which may have more than is there.
+    """
+    if this_system.machine() not in ("x86_64", "AMD64"):
+        return None
+    found = [features for features in (_listed(), _usable()) if features is not None]
+    return frozenset.intersection(*found) if found else None
+
+
+def _listed() -> frozenset[str] | None:
+    """The features that all processors have, as Linux lists them."""
+    lines = re.findall(r"^flags\s*:(.*)$", cpu_text(), re.MULTILINE)
+    return frozenset.intersection(*(frozenset(line.split()) for line in lines)) if lines else None
+
+
+def _usable() -> frozenset[str] | None:
+    """The features that CPU and system let programs use, as glibc found them; None without it."""
+    try:
+        query = ctypes.CDLL(None).__x86_get_cpuid_feature_leaf
+    except (OSError, AttributeError, TypeError):
+        return None
+    # struct cpuid_feature: what the CPU has, then what is active, EAX to EDX each.
+    query.restype = ctypes.POINTER(ctypes.c_uint32 * 8)
+    query.argtypes = [ctypes.c_uint32]
+    active = {
+        leaf: list(query(leaf).contents)[4:] for leaf in {leaf for leaf, *_ in _ACTIVE.values()}
+    }
+    return frozenset(
+        name for name, (leaf, register, bit) in _ACTIVE.items() if active[leaf][register] >> bit & 1
+    )
+
+
+def forced_target() -> str | None:
+    """The target that :data:`VARIABLE` names; None where it is not set.
+
+    Raises:
+        DeviceError: there is no such target.
+    """
+    name = os.environ.get(VARIABLE) or None
+    if name and name not in TARGETS:
+        raise DeviceError(f"{VARIABLE}: {one_of('target', name, list(TARGETS))}")
+    return name
+
+
+def own_target(version: str) -> tuple[str, str] | None:
+    """The triple and the CPU that a PoCL on Linux compiles for by itself, by its device's version.
+
+    >>> own_target("OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-znver3")
+    ('x86_64-unknown-linux-gnu', 'znver3')
+    """
+    found = re.search(r"HSTR: \w+-((?:\w+-){1,2}linux-(?:gnu|musl))-(\S+)", version)
+    return (found[1], found[2]) if found else None
+
+
+def candidates(platform: Any, device: Any) -> list[Target]:
+    """What a device may compile for, the first that works is taken; see :func:`compile_for`.
+
+    Args:
+        platform: a ``pyopencl.Platform``.
+        device: one of its devices.
+
+    Raises:
+        DeviceError: :data:`VARIABLE` names no target.
+    """
+    forced = forced_target()
+    known = own_target(device.version) if "Portable Computing" in platform.name else None
+    if known is None:
+        return [Target("", "the driver's choice")]
+    own = known[1]
+    features = cpu_features()
+    if features is None or not _chooses_by_name(platform.version) or _place(device) is None:
+        return [Target(own, f"PoCL's choice{f'; {VARIABLE} cannot change it' if forced else ''}")]
+    if forced:
+        return [Target(forced, f"{VARIABLE} names it")]
+    target = target_for(features)
+    if row_of(own) == target:
+        return [Target(own, "PoCL's choice, and what the CPU's features say")]
+    failed = f"since {target}, which the CPU's features say, does not work"
+    return [
+        Target(target, f"the CPU's features say so; PoCL takes it for {own}"),
+        *([] if own == "generic" else [Target(own, f"PoCL's choice, {failed}")]),
+        Target("x86-64", f"what every such CPU has, {failed}"),
+    ]
+
+
+def compile_for(device: Any, target: Target) -> None:
+    """Have a ``pyopencl.Device`` compile for one of its :func:`candidates`.
+
+    It counts for what is compiled from now on, in all contexts of this process.
+    """
+    known = own_target(device.version)
+    set_before = _texts.get(device.int_ptr)
+    now = set_before.value.decode() if set_before else known and known[1]
+    place = _place(device)
+    if place is None or target.name == now:
+        return
+    text = ctypes.create_string_buffer(target.name.encode())
+    with open("/proc/self/mem", "r+b", buffering=0) as memory:
+        os.pwrite(memory.fileno(), struct.pack("Q", ctypes.addressof(text)), place)
+    _texts[device.int_ptr] = text
+
+
+def _chooses_by_name(version: str) -> bool:
+    """Whether a PoCL, by its platform's version, is one that takes LLVM's name for the CPU."""
+    found = re.search(r"PoCL (\d+)\.", version, re.IGNORECASE)
+    return found is not None and int(found[1]) < 5
+
+
+def _place(device: Any) -> int | None:
+    """The address of the pointer to the name of the CPU; None where it cannot be proven."""
+    known = own_target(device.version)
+    if known is None:
+        return None
+    changed = _texts.get(device.int_ptr)
+    triple = known[0].encode() + b"\0"
+    cpu = (changed.value if changed else known[1].encode()) + b"\0"
+    try:
+        with open("/proc/self/mem", "rb", buffering=0) as memory:
+            descriptor = memory.fileno()
+            record = _read(descriptor, device.int_ptr, RECORD)
+            words = struct.unpack_from(f"{len(record) // 8}Q", record)
+            found = [
+                device.int_ptr + 8 * (i + 1)
+                for i, (one, two) in enumerate(pairwise(words))
+                if _read(descriptor, two, len(cpu)) == cpu
+                and _read(descriptor, one, len(triple)) == triple
+            ]
+    except OSError:
+        return None
+    return found[0] if len(found) == 1 else None
+
+
+def _read(memory: int, address: int, size: int) -> bytes:
+    """Bytes of this process; fewer where no more can be read."""
+    if not 4096 <= address < 2**47:
+        return b""
+    try:
+        return os.pread(memory, size, address)
+    except OSError:
+        return b""

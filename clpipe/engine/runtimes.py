@@ -1,0 +1,67 @@
+"""What kind of device an OpenCL runtime offers, and how kernels are compiled for it."""
+
+import shutil
+from typing import Any
+
+from clpipe.engine.cache_folder import pocl_problem
+from clpipe.engine.cpu_target import Target
+
+
+def is_pocl(platform: str) -> bool:
+    """Whether a platform is PoCL, by its name."""
+    return "Portable Computing" in platform
+
+
+def type_of(platform: Any, device: Any) -> str:
+    """The type of a ``pyopencl.Device``: "GPU", "CPU", "emulator" or "accelerator"."""
+    import pyopencl as cl
+
+    if "oclgrind" in platform.name.lower():
+        return "emulator"  # it finds errors in kernels, slowly, and says it is all types
+    if not device.type & (cl.device_type.GPU | cl.device_type.CPU):
+        return "accelerator"
+    return "GPU" if device.type & cl.device_type.GPU else "CPU"
+
+
+def lanes_for(type_: str, platform: Any, device: Any, target: Target) -> int:
+    """How many lanes the kernels are compiled for: one vector register on a CPU, 1 on a GPU.
+
+    A CPU whose natural vectors are one wide has a compiler like a GPU's: Mesa's rusticl, which gets
+    the pictures of wider ones wrong.
+    """
+    if type_ != "CPU":
+        return 1
+    if is_pocl(platform.name):
+        return 16 if target.is_wide else 8
+    width = device.native_vector_width_float
+    return 1 if width == 1 else 8 if width < 16 else 16
+
+
+def problem_with(type_: str, platform: Any, device: Any) -> str:
+    """Why a device cannot be used, as far as can be told without trying it; "" where it can."""
+    if type_ == "accelerator":
+        return "neither a GPU nor a CPU (an emulator or an FPGA)"
+    if not device.available or not device.compiler_available:
+        return "it is not available or has no compiler"
+    if is_pocl(platform.name) and not shutil.which("ld"):
+        return (
+            "PoCL needs a linker and there is no 'ld' on the PATH "
+            "(Debian, Ubuntu: apt-get install binutils; conda: binutils)"
+        )
+    return pocl_problem() if is_pocl(platform.name) else ""
+
+
+def is_tried(type_: str, platform: Any, device: Any) -> bool:
+    """Whether a device computes something before it is trusted; emulators would take long."""
+    return type_ in ("GPU", "CPU") and not problem_with(type_, platform, device)
+
+
+def platform_id(platform: Any) -> str:
+    """A platform in one text, with its version."""
+    return f"{platform.name.strip()}, {platform.version.strip()}"
+
+
+def attempt(platform: Any, device: Any, target: Target) -> str:
+    """All that the result of a trial depends on, in one text."""
+    parts = (platform_id(platform), device.name, device.version, device.driver_version, target.name)
+    return " | ".join(part.strip() for part in parts)

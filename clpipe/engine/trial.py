@@ -1,0 +1,148 @@
+"""A program that tries OpenCL's runtimes, in a process of its own, because they may end it.
+
+It has every runtime compute a little and looks at the result. ``clpipe.engine.verdicts`` starts it,
+writes to its standard input what is known already, and reads lines of JSON: before each step what
+is tried, so that it is known what ended the process, and after it what came of it.
+"""
+
+import json
+import os
+import sys
+from typing import Any
+
+import numpy as np
+
+from clpipe.base.errors import DeviceError
+from clpipe.base.types import Floats
+from clpipe.engine.cache_folder import prepare_environment
+from clpipe.engine.cpu_target import candidates, compile_for
+from clpipe.engine.runtimes import attempt, is_tried, lanes_for, platform_id, type_of
+from clpipe.engine.sources import files_text
+from clpipe.engine.vendors import platforms
+from clpipe.reference.math import square_root
+from clpipe.reference.random import Stream, normal_of, philox
+
+# What a raw is made of: halves, 64-bit products, roots, a division; on lanes, with a local size.
+TEXT = """
+__kernel void trial(__global const half *src, __global float *dst, float divisor) {
+    const uint i = (uint)get_global_id(0) * LANES, count = (uint)get_global_size(0) * LANES;
+    const stream s = {1, 2, 3};
+    const vf a = load_half(src + i);
+    const vf noise = normal_of(philox(lane_indices(i), 0, 0, s).word0);
+    store(a + square_root(magnitude(a)) * noise, dst + i);
+    store(a / divisor, dst + count + i);
+}
+"""
+COUNT, LOCAL, DIVISOR = 1024, 8, np.float32(0.7)
+
+
+def samples() -> np.ndarray:
+    """Halves of all sizes, (COUNT,) float16: subnormal, usual, large, of both signs."""
+    bits = np.random.default_rng(0).integers(0, 0x7C00, COUNT) | np.arange(COUNT) % 2 << 15
+    return bits.astype(np.uint16).view(np.float16)
+
+
+def expected(source: np.ndarray) -> tuple[Floats, Floats]:
+    """What the kernel makes of halves: noisy values, bit for bit, and quotients."""
+    a, zero = source.astype(np.float32), np.zeros(1, np.uint32)
+    word, *_ = philox(np.arange(COUNT, dtype=np.uint32), zero, zero, zero + 3, Stream(1, 2, 3))
+    return a + square_root(np.abs(a)) * normal_of(word), a / DIVISOR
+
+
+def problem_of(device: Any, lanes: int) -> str:
+    """Why a ``pyopencl.Device`` is not to be trusted; "" where it computes as it should.
+
+    Raises:
+        pyopencl.Error: it cannot be opened, or has no memory.
+    """
+    import pyopencl as cl
+
+    queue = cl.CommandQueue(context := cl.Context([device]))
+    text = f"#define LANES {lanes}\n" + files_text(
+        [f"lib/{name}.h" for name in ("builtins", "lanes", "math", "image", "random")], set()
+    )
+    try:
+        program = cl.Program(context, text + TEXT).build(["-cl-std=CL1.2", "-w"], cache_dir=False)
+    except cl.MemoryError:
+        raise
+    except cl.Error as error:
+        return f"it compiles nothing: {first_error(str(error))}"
+    source, results = samples(), np.zeros((2, COUNT), np.float32)
+    flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
+    src = cl.Buffer(context, flags, hostbuf=source)
+    dst = cl.Buffer(context, cl.mem_flags.WRITE_ONLY, results.nbytes)
+    program.trial(queue, (COUNT // lanes,), (LOCAL,), src, dst, DIVISOR)
+    cl.enqueue_copy(queue, results, dst)
+    queue.finish()
+    noisy, quotients = expected(source)
+    wrong = int((results[0] != noisy).sum())
+    wrong += int((np.abs(results[1] - quotients) > 4e-7 * np.abs(quotients)).sum())
+    return f"it computes {wrong} of {2 * COUNT} numbers wrongly" if wrong else ""
+
+
+def first_error(text: str) -> str:
+    """The first line of a compiler's output that names an error.
+
+    >>> first_error("x failed\\nerror: unknown target CPU 'generic'\\nmore")
+    "unknown target CPU 'generic'"
+    """
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    errors = [line.partition("error: ")[2] for line in lines if "error: " in line]
+    return [*errors, *lines, "it does not say why"][0]
+
+
+def try_all(known: dict[str, Any]) -> None:
+    """Try what is not known yet, and say what comes of it on the standard output."""
+    report = os.dup(sys.stdout.fileno())  # runtimes write to the usual one
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+
+    def say(**values: Any) -> None:
+        os.write(report, json.dumps(values).encode() + b"\n")
+
+    import pyopencl as cl
+
+    say(at="list")
+    for platform in platforms(known["hidden"]):
+        if platform_id(platform) in known["platforms"]:
+            continue
+        say(at="platform", name=platform_id(platform))
+        try:
+            devices = platform.get_devices()
+        except cl.Error:
+            continue
+        for device in [] if known["only_listing"] else devices:
+            if not is_tried(type_of(platform, device), platform, device):
+                continue
+            for target in candidates(platform, device):
+                name = attempt(platform, device, target)
+                if name in known["attempts"]:
+                    if known["attempts"][name]:
+                        continue
+                    break
+                say(at="attempt", name=name)
+                compile_for(device, target)
+                lanes = lanes_for(type_of(platform, device), platform, device, target)
+                passing = False
+                try:
+                    problem = problem_of(device, lanes)
+                except cl.Error as error:  # others may be using it: not a fault that lasts
+                    problem, passing = "", True
+                    sys.stderr.write(f"{error}\n")
+                say(attempt=name, problem=problem, passing=passing)
+                known["attempts"][name] = problem
+                if not problem:
+                    break
+
+
+def main() -> None:
+    """Read what is known from the standard input, and try the rest."""
+    known = json.load(sys.stdin)
+    prepare_environment()
+    try:
+        try_all(known)
+    except DeviceError as error:
+        sys.exit(str(error))
+
+
+if __name__ == "__main__":
+    main()

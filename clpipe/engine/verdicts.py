@@ -1,0 +1,206 @@
+"""Which OpenCL runtimes work: each is tried once, in a child process, and the result is kept.
+
+A runtime that crashes, compiles nothing or computes wrongly is found there, by
+:mod:`clpipe.engine.trial`, and not by a user. What is known is bound to the CPU, the installed
+drivers, their versions and the trial itself; it lies in the cache folder.
+"""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from clpipe.base.errors import ImageError
+from clpipe.base.files import passing_files, write_new
+from clpipe.engine.cache_folder import cache_folder
+from clpipe.engine.cpu_target import VARIABLE, Target, candidates, cpu_text
+from clpipe.engine.runtimes import attempt
+from clpipe.engine.sources import LIBRARY, kernel_folder
+from clpipe.engine.vendors import VARIABLES, icd_files, installed_drivers
+
+LIMIT = 120  # seconds for one process; then the runtime that it is at counts as hanging
+SENSITIVE = (*VARIABLES, VARIABLE, "POCL_DEVICES", "LD_LIBRARY_PATH", "LD_PRELOAD")
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """What became of trials.
+
+    Args:
+        listing: why the platforms cannot be listed at all; "" where they can.
+        hidden: why a driver is kept from the loader, by its name among
+            :func:`~clpipe.engine.vendors.installed_drivers`.
+        platforms: why a platform's devices cannot be asked for, by :func:`platform_id`.
+        attempts: why a device does not work, or "", by :func:`attempt`.
+        lasting: whether they hold for later processes, too.
+    """
+
+    listing: str = ""
+    hidden: dict[str, str] = field(default_factory=dict)
+    platforms: dict[str, str] = field(default_factory=dict)
+    attempts: dict[str, str] = field(default_factory=dict)
+    lasting: bool = True
+
+    @property
+    def problems(self) -> bool:
+        """Whether anything failed."""
+        return bool(self.listing or self.hidden or self.platforms or any(self.attempts.values()))
+
+    def of(self, platform: Any, device: Any) -> tuple[Target, str] | None:
+        """What a device compiles for, and why it does not work, or ""; None if it was not tried."""
+        targets = candidates(platform, device)
+        found = {t: self.attempts.get(attempt(platform, device, t)) for t in targets}
+        works = next((t for t, problem in found.items() if problem == ""), None)
+        if works:
+            return works, ""
+        first = found[targets[0]]
+        return None if first is None else (targets[0], first)
+
+
+def verdicts(again: bool = False, missing: bool = False) -> Verdicts:
+    """What is known of this machine's runtimes, after they are tried if that is not known.
+
+    Args:
+        again: try what failed once more.
+        missing: a device is there that was not tried; try what is new.
+    """
+    path = _path()
+    known = _read(path) if path else None
+    if known and again and known.problems:
+        known = None
+    if known and not missing:
+        return known
+    found = tried(known or Verdicts())
+    if path and found.lasting:
+        with passing_files(), suppress(ImageError):
+            write_new(path, json.dumps(asdict(found), indent=1).encode())
+    return found
+
+
+def tried(known: Verdicts) -> Verdicts:
+    """Verdicts with all that was not known; what ends the process is passed over in the next."""
+    while True:
+        lines, ending = _run(known)
+        at: dict[str, str] = {}
+        for line in lines:
+            if "at" in line:
+                at = line
+            else:
+                known.attempts[line["attempt"]] = line["problem"]
+                known = replace(known, lasting=known.lasting and not line["passing"])
+                at = {}
+        if ending is None:
+            return known
+        if ending == "" or not at:  # it could not be tried, which says nothing of the runtimes
+            return replace(known, lasting=False)
+        if at["at"] == "list":
+            found = _that_end_the_listing(known)
+            if not found:
+                return replace(known, listing=ending)
+            known.hidden.update(found)
+            continue
+        of = known.platforms if at["at"] == "platform" else known.attempts
+        if at["name"] in of:
+            return replace(known, lasting=False)
+        of[at["name"]] = ending
+
+
+def _that_end_the_listing(known: Verdicts) -> dict[str, str]:
+    """The drivers that end a process which lists them and their devices, each alone; and how.
+
+    A loader that has several asks each for its devices, to have those first that have some.
+    """
+    drivers = [name for name in installed_drivers() if name not in known.hidden]
+    found = {}
+    for name in drivers:
+        others = dict.fromkeys([*known.hidden, *drivers], "")
+        del others[name]
+        _, ending = _run(replace(known, hidden=others), only_listing=True)
+        if ending:
+            found[name] = ending
+    return found
+
+
+def _run(known: Verdicts, only_listing: bool = False) -> tuple[list[dict[str, Any]], str | None]:
+    """Run the trial: the lines that it wrote, and what ended it, in words.
+
+    The latter is None where it came to its end, and "" where that is not the runtimes' doing.
+    """
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "clpipe.engine.trial"],
+            input=json.dumps(asdict(known) | {"only_listing": only_listing}).encode(),
+            capture_output=True,
+            timeout=LIMIT,
+            env=environment,
+            check=False,
+        )
+        output, errors, status = done.stdout, done.stderr, done.returncode
+    except subprocess.TimeoutExpired as error:
+        output, errors, status = error.stdout or b"", b"", None
+    except (OSError, ValueError):  # there is no such program, as within others
+        return [], ""
+    lines = list(_parsed(output))
+    if status is None:
+        return lines, f"it takes longer than {LIMIT} s for a tiny kernel"
+    if status >= 0:
+        return lines, None if status == 0 else ""
+    if -status == getattr(signal, "SIGKILL", None):  # most likely for want of memory
+        return lines, ""
+    said = [line.strip() for line in errors.decode("utf-8", "replace").splitlines()]
+    last = next((f": {line[:200]}" for line in reversed(said) if line), "")
+    try:
+        name = signal.Signals(-status).name
+    except ValueError:
+        name = f"signal {-status}"
+    return lines, f"it ends the process ({name}){last}"
+
+
+def _parsed(output: bytes) -> Iterator[dict[str, Any]]:
+    for line in output.splitlines():
+        with suppress(ValueError):
+            yield json.loads(line)
+
+
+def _path() -> Path | None:
+    """The file of what is known of this machine as it is; None without a folder for it."""
+    folder = cache_folder()
+    if folder is None:
+        return None
+    parts = {
+        "cpu": cpu_text(),
+        "sys": Path("/sys/devices/system/cpu").is_dir(),
+        "environment": {name: os.environ.get(name) for name in SENSITIVE},
+        "drivers": {str(path): text for path, text in icd_files()},
+        "program": [sys.executable, version("pyopencl")],
+        "trial": [[path.stat().st_size, path.stat().st_mtime_ns] for path in _trial_files()],
+    }
+    digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+    return folder / "runtimes" / f"{digest[:32]}.json"
+
+
+def _trial_files() -> list[Path]:
+    """The files of this program that a trial depends on."""
+    modules = [Path(__file__).with_name(f"{m}.py") for m in ("trial", "cpu_target", "runtimes")]
+    return [*modules, *(kernel_folder() / f"lib/{name}.h" for name in LIBRARY)]
+
+
+def _read(path: Path) -> Verdicts | None:
+    """What a file holds; None where there is none, or it is damaged."""
+    with suppress(OSError, ValueError, TypeError, AttributeError):
+        found = Verdicts(**json.loads(path.read_bytes()))
+        texts = [found.listing]
+        for each in (found.hidden, found.platforms, found.attempts):
+            texts += [*each, *each.values()]
+        if all(isinstance(text, str) for text in texts):
+            return found
+    return None

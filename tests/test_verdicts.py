@@ -1,0 +1,216 @@
+"""OpenCL's runtimes are tried before they are trusted, in a process that they may end."""
+
+import json
+import sys
+from types import SimpleNamespace
+
+import pyopencl as cl
+import pytest
+
+from clpipe.base.errors import DeviceError
+from clpipe.commands.devices import device_rows
+from clpipe.engine import discovery, trial, verdicts
+from clpipe.engine.cpu_target import Target, compile_for
+from clpipe.engine.discovery import choose, find_devices
+from clpipe.engine.runtimes import attempt, platform_id
+from clpipe.engine.verdicts import Verdicts, tried
+
+
+@pytest.fixture
+def program(tmp_path, monkeypatch):
+    """A shell script in place of the trial; it is given what is known on its standard input."""
+
+    def be(script):
+        path = tmp_path / "python"
+        path.write_text(f"#!/bin/sh\nknown=$(cat)\n{script}\n")
+        path.chmod(0o755)
+        monkeypatch.setattr(sys, "executable", str(path))
+        monkeypatch.setattr(verdicts, "_path", lambda: tmp_path / "known.json")
+
+    return be
+
+
+def say(**values):
+    return f"echo '{json.dumps(values)}'"
+
+
+def test_what_ends_the_process_is_passed_over_and_the_rest_tried(program):
+    program(f"""case "$known" in
+        *SIGILL*) {say(at="attempt", name="b")}; {say(attempt="b", problem="", passing=False)};;
+        *) {say(at="attempt", name="a")}; echo noise; echo no such instruction >&2; kill -ILL $$;;
+        esac""")
+    found = tried(Verdicts())
+    assert found.attempts == {
+        "a": "it ends the process (SIGILL): no such instruction",
+        "b": "",
+    }
+    assert found.lasting and found.problems
+
+
+def test_a_platform_that_ends_the_process_is_named(program):
+    program(f"""case "$known" in
+        *SIGABRT*) ;;
+        *) {say(at="platform", name="A")}; kill -ABRT $$;;
+        esac""")
+    assert tried(Verdicts()).platforms == {"A": "it ends the process (SIGABRT)"}
+
+
+def test_the_driver_that_ends_the_listing_is_hidden(program, monkeypatch):
+    monkeypatch.setattr(verdicts, "installed_drivers", lambda: ["good", "bad"])
+    # It ends it wherever "bad" is not hidden.
+    program(f"""case "$known" in
+        *'"bad":'*) {say(at="list")};;
+        *) {say(at="list")}; kill -SEGV $$;;
+        esac""")
+    assert tried(Verdicts()).hidden == {"bad": "it ends the process (SIGSEGV)"}
+    monkeypatch.setattr(verdicts, "installed_drivers", list)
+    assert tried(Verdicts()).listing == "it ends the process (SIGSEGV)"
+
+
+@pytest.mark.parametrize("script", ["exit 1", "kill -KILL $$", f"{say(at='list')}; kill -KILL $$"])
+def test_what_says_nothing_of_runtimes_is_not_kept(program, tmp_path, script):
+    program(script)
+    assert not tried(Verdicts()).lasting
+    assert not verdicts.verdicts().problems
+    assert not (tmp_path / "known.json").exists()
+
+
+def test_a_program_that_cannot_be_started_says_nothing_either(monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    assert tried(Verdicts()) == Verdicts(lasting=False)
+
+
+def test_a_runtime_that_hangs_is_passed_over(program, monkeypatch):
+    monkeypatch.setattr(verdicts, "LIMIT", 0.3)
+    program(f"""case "$known" in
+        *longer*) ;;
+        *) {say(at="attempt", name="a")}; exec sleep 9;;
+        esac""")
+    assert tried(Verdicts()).attempts["a"].startswith("it takes longer than 0.3 s")
+
+
+def test_what_is_known_is_not_tried_again_unless_it_failed(program, tmp_path):
+    passed = say(attempt="a", problem="", passing=False)
+    program(f"echo once >> {tmp_path}/runs; {passed}")
+    assert verdicts.verdicts() == verdicts.verdicts(again=True) == Verdicts(attempts={"a": ""})
+    assert (tmp_path / "runs").read_text() == "once\n"
+    (tmp_path / "known.json").write_text('{"attempts": {"a": "it is wrong"}}')
+    assert verdicts.verdicts().problems
+    assert not verdicts.verdicts(again=True).problems
+    for damage in ("", "{", "[]", "null", '{"a": 1}', '{"attempts": 3}', '{"attempts": {"a": 1}}'):
+        (tmp_path / "known.json").write_text(damage)
+        assert verdicts.verdicts() == Verdicts(attempts={"a": ""})
+
+
+def test_the_file_is_bound_to_cpu_drivers_and_environment(monkeypatch):
+    before = verdicts._path()
+    assert before == verdicts._path()
+    changes = {
+        "cpu_text": lambda: "another CPU",
+        "icd_files": lambda: [("new.icd", "libnew.so")],
+        "version": lambda _: "9",
+    }
+    for name, value in changes.items():
+        with monkeypatch.context() as patch:
+            patch.setattr(verdicts, name, value)
+            assert verdicts._path() != before
+    monkeypatch.setenv("CLPIPE_CPU_TARGET", "haswell")
+    assert verdicts._path() != before
+
+
+def test_a_device_is_tried_for_each_target_it_may_compile_for(device, monkeypatch):
+    handle, platform = device.info.handle, device.info.handle.platform
+    wide, narrow = Target("skx", "by features"), Target("x86-64", "since skx does not work")
+    monkeypatch.setattr(verdicts, "candidates", lambda *_: [wide, narrow])
+    first, second = (attempt(platform, handle, t) for t in (wide, narrow))
+    assert Verdicts().of(platform, handle) is None
+    assert Verdicts(attempts={first: ""}).of(platform, handle) == (wide, "")
+    assert Verdicts(attempts={first: "no", second: ""}).of(platform, handle) == (narrow, "")
+    assert Verdicts(attempts={first: "no", second: "nor"}).of(platform, handle) == (wide, "no")
+
+
+def test_this_machines_device_computes_as_numpy_does(device, monkeypatch):
+    info = device.info
+    assert trial.problem_of(info.handle, info.lanes) == ""
+    with monkeypatch.context() as patch:
+        patch.setattr(trial, "TEXT", trial.TEXT.replace("a / divisor", "a * divisor"))
+        assert (
+            trial.problem_of(info.handle, info.lanes) == "it computes 1024 of 2048 numbers wrongly"
+        )
+        patch.setattr(trial, "TEXT", "this is no C")
+        assert trial.problem_of(info.handle, info.lanes).startswith("it compiles nothing: ")
+
+
+def test_the_cpu_that_llvm_does_not_know_is_found(device):
+    info = device.info
+    if "PoCL 3.0" not in info.handle.platform.version:
+        pytest.skip("needs pip's PoCL 3.0")
+    compile_for(info.handle, Target("generic", "as on an AMD Zen 5"))
+    try:
+        problem = trial.problem_of(info.handle, 8)
+    finally:
+        compile_for(info.handle, info.target)
+    assert problem == "it compiles nothing: unknown target CPU 'generic'"
+
+
+def test_the_trial_as_a_program(device):
+    found = tried(Verdicts())
+    info = device.info
+    assert found.of(info.handle.platform, info.handle) == (info.target, "")
+    assert found.lasting and not found.listing
+
+
+def test_what_fails_is_passed_over_and_what_helps_is_said(device, monkeypatch):
+    platform, handle = device.info.handle.platform, device.info.handle
+    failed = dict.fromkeys(
+        [attempt(platform, handle, t) for t in discovery.candidates(platform, handle)],
+        "it ends the process (SIGILL)",
+    )
+    known = Verdicts(attempts=failed, hidden={"/etc/bad.icd": "it ends the process (SIGABRT)"})
+    monkeypatch.setattr(discovery, "verdicts", lambda *_, **__: known)
+    monkeypatch.setattr(discovery, "platforms", lambda _: [platform])
+    devices = find_devices()
+    rows = device_rows(devices)
+    assert rows[0]["status"] == "passed over: it ends the process (SIGILL)"
+    assert rows[1]["platform"] == "/etc/bad.icd" and "SIGABRT" in rows[1]["status"]
+    monkeypatch.setattr(discovery.this_system, "system", lambda: "Linux")
+    monkeypatch.setattr(discovery.this_system, "machine", lambda: "x86_64")
+    with pytest.raises(DeviceError, match=r"SIGILL.*clpipe\[intel\].*pocl-opencl-icd.*numpy"):
+        choose(None, devices)
+    monkeypatch.setattr(discovery.this_system, "machine", lambda: "aarch64")
+    with pytest.raises(
+        DeviceError, match=r"helps here: your GPU's driver, or apt-get install pocl"
+    ):
+        choose(None, devices)
+    gone = Verdicts(platforms={platform_id(platform): "it ends the process (SIGABRT)"})
+    monkeypatch.setattr(discovery, "verdicts", lambda *_, **__: gone)
+    monkeypatch.setattr(cl.Platform, "get_devices", lambda _: pytest.fail("it would end here"))
+    assert "asked for its devices, it ends" in find_devices()[0].problem
+    monkeypatch.setattr(discovery, "verdicts", lambda *_, **__: Verdicts(listing="it ends"))
+    with pytest.raises(DeviceError, match=r"drivers cannot be listed: it ends; what helps here"):
+        find_devices()
+
+
+def test_a_device_that_was_not_there_is_tried(device, monkeypatch):
+    asked = []
+
+    def answer(again=False, missing=False):
+        asked.append(missing)
+        return Verdicts()
+
+    monkeypatch.setattr(discovery, "verdicts", answer)
+    assert not next(d for d in find_devices() if d.handle == device.info.handle).problem
+    assert asked[:2] == [False, True]
+
+
+def test_a_runtime_that_is_busy_is_not_blamed(monkeypatch, capfd):
+    def busy(*_):
+        raise cl.MemoryError("CL_OUT_OF_RESOURCES")
+
+    monkeypatch.setattr(trial, "problem_of", busy)
+    monkeypatch.setattr(trial.os, "dup2", lambda *_: None)
+    monkeypatch.setattr(trial, "sys", SimpleNamespace(stdout=sys.__stdout__, stderr=sys.stderr))
+    trial.try_all({"hidden": {}, "platforms": {}, "attempts": {}, "only_listing": False})
+    lines = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
+    results = [line for line in lines if "attempt" in line]
+    assert results and all(r["problem"] == "" and r["passing"] for r in results)
