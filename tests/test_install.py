@@ -3,8 +3,10 @@
 import os
 import subprocess
 import sys
+import tomllib
 
 import pytest
+from packaging.requirements import Requirement
 
 from clpipe.base import extras
 from tests.conftest import ROOT, STILL_LIFE
@@ -51,3 +53,21 @@ def test_what_an_extra_installs_is_named_where_it_is_missing(clpipe, monkeypatch
     error = clpipe(*command, status=2).stderr
     extra = "dask" if "--dask" in command else "calibrate"
     assert f"{message}; pip install 'clpipe[{extra}]'" in error
+
+
+@pytest.mark.parametrize(
+    ("system", "machine", "expected"),
+    [
+        ("linux", "x86_64", {"pocl-binary-distribution", "pyopencl"}),
+        ("linux", "aarch64", {"pyopencl"}),
+        ("darwin", "arm64", {"pyopencl"}),
+        ("win32", "AMD64", {"pyopencl"}),
+    ],
+)
+def test_pocl_is_asked_for_only_where_it_has_a_wheel(system, machine, expected):
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    here = {"sys_platform": system, "platform_machine": machine}
+    asked = [Requirement(text) for text in project["dependencies"]]
+    asked = [each for each in asked if each.marker is None or each.marker.evaluate(here)]
+    assert {each.name for each in asked if "cl" in each.name and each.name != "click"} == expected
+    assert not any(each.extras for each in asked)

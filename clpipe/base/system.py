@@ -1,7 +1,7 @@
 """What only some systems have, and what stands in for it on the others.
 
-Elsewhere in clpipe nothing is used that Linux, macOS and Windows do not all have. What is missing
-is asked for when it is needed: where a thing is there, it is used, on whichever system.
+Elsewhere in clpipe nothing is needed that Linux, macOS and Windows do not all have. What is there
+is used, whichever system it is.
 """
 
 import contextlib
