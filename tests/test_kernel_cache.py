@@ -1,19 +1,20 @@
-"""What lies in the cache of compiled kernels is looked at before it is believed."""
+"""What is kept of compiled kernels is looked at before it is used, and is this user's alone."""
 
-import json
 import os
-import shutil
 import subprocess
 import sys
+import time
+import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import pyopencl as cl
 import pytest
 
 from clpipe.base import system
-from clpipe.engine import cache_folder, pocl_cache
-from clpipe.engine.binary_cache import BinaryCache
-from clpipe.engine.pocl_cache import is_sound, list_programs
+from clpipe.base.errors import DeviceError
+from clpipe.engine import cache_folder, process_folder, program_store
+from clpipe.engine.program_store import BinaryBuilder, PoclBuilder, ProgramStore
 from tests.test_programs import DEVELOP, python
 
 TEXT = "__kernel void f(__global int *a) { a[get_global_id(0)] = 7; }"
@@ -31,199 +32,132 @@ def flip(path: Path) -> None:
     path.write_bytes(data)
 
 
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """A folder like PoCL's, with two programs that are listed."""
-    monkeypatch.setattr(pocl_cache, "_in_use", {})
-    for program in ("AB/ONE", "CD/TWO"):
-        put(tmp_path / program / "program.bc", b"bytecode")
-        put(tmp_path / program / "last_accessed", b"")
-        put(tmp_path / program / "f/8-1-1/f.so", b"library")
-    assert again(tmp_path, lambda: put(tmp_path / pocl_cache.INDEX, b"{}"), listing=True)
-    return tmp_path
+DAMAGE = [
+    flip,
+    lambda path: os.truncate(path, path.stat().st_size // 2),
+    lambda path: os.truncate(path, 0),
+    lambda path: (path.unlink(), put(path / "inside")),
+]
 
 
-def again(folder, change=lambda: None, listing=False):
-    """A process that comes after a change; whether it finds the folder sound."""
-    for lock in pocl_cache._in_use.values():
-        os.close(lock)
-    pocl_cache._in_use.clear()
-    change()
-    if not listing:
-        return is_sound(folder)
-    pocl_cache._in_use[folder] = os.open(folder / pocl_cache.LOCK, os.O_RDWR | os.O_CREAT)
-    list_programs(folder)
-    return True
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_what_is_damaged_is_not_there(tmp_path, damage):
+    store = ProgramStore(tmp_path, ["driver"])
+    store.keep("text", ["-w"], b"program")
+    assert store.load("text", ["-w"]) == b"program"
+    damage(store.path("text", ["-w"]))
+    assert store.load("text", ["-w"]) is None
+    store.keep("text", ["-w"], b"again")
+    assert store.load("text", ["-w"]) == b"again"
 
 
-def programs(folder):
-    return sorted(path.name for path in folder.glob("??/*"))
+def test_what_is_kept_is_of_one_text_driver_and_options(tmp_path):
+    store, other = ProgramStore(tmp_path, ["driver 1"]), ProgramStore(tmp_path, ["driver 2"])
+    of = [store.path("a", []), store.path("b", []), store.path("a", ["-w"]), other.path("a", [])]
+    assert len({*of}) == 4
 
 
-def test_what_is_as_it_was_written_is_believed(folder):
-    assert again(folder)
-    assert again(folder, lambda: put(folder / "AB/ONE/last_accessed", b"now"))
-    assert again(folder, lambda: os.utime(folder / "AB/ONE/program.bc", ns=(1, 1)))
-    assert programs(folder) == ["ONE", "TWO"]
-    assert is_sound(folder)  # asked twice
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda program: put(program / "f/8-1-1/f.so", b""),
-        lambda program: put(program / "f/8-1-1/f.so", b"libr"),
-        lambda program: flip(program / "f/8-1-1/f.so"),
-        lambda program: flip(program / "program.bc"),
-        lambda program: (program / "program.bc").unlink(),
-        lambda program: shutil.rmtree(program / "f"),
-        lambda program: put(program / "f/16-1-1/f.so", b"not listed"),
-        lambda program: put(program.with_name("THREE") / "program.bc", b"of a killed process"),
-    ],
-)
-def test_what_differs_or_is_not_listed_is_removed(folder, change):
-    assert again(folder, lambda: change(folder / "AB/ONE"))
-    assert "TWO" in programs(folder)
-    assert programs(folder) != ["ONE", "THREE", "TWO"]
-    assert programs(folder) in (["TWO"], ["ONE", "TWO"])
-    if "ONE" in programs(folder):  # it was another that was not listed
-        assert (folder / "AB/ONE/f/8-1-1/f.so").read_bytes() == b"library"
-
-
-@pytest.mark.parametrize(
-    "index", [b"", b"{", b"[]", b"null", b'{"AB/ONE": 1}', b'{"a": {"b": []}}']
-)
-def test_a_damaged_index_lists_nothing(folder, index):
-    assert again(folder, lambda: put(folder / pocl_cache.INDEX, index))
-    assert programs(folder) == []
-
-
-def test_folders_in_the_place_of_files_are_removed(folder):
-    def change():
-        for name in (pocl_cache.INDEX, pocl_cache.LOCK, "tempfile_x"):
-            (folder / name).unlink(missing_ok=True)
-            put(folder / name / "inside")
-
-    assert again(folder, change)
-    assert sorted(p.name for p in folder.iterdir() if p.is_dir()) == ["AB", "CD"]
-    assert not (folder / "tempfile_x").exists() and (folder / pocl_cache.LOCK).is_file()
-
-
-HOLD = """if True:
-    import sys
-    from pathlib import Path
-    from clpipe.engine.pocl_cache import is_sound
-    print(is_sound(Path(sys.argv[1])), flush=True)
-    sys.stdin.read()
-"""
+def test_a_store_that_cannot_be_written_to_keeps_nothing(tmp_path):
+    for store in (ProgramStore(None, []), ProgramStore(put(tmp_path / "file") / "x", [])):
+        store.keep("text", [], b"program")
+        assert store.load("text", []) is None
 
 
 @pytest.fixture
-def another(folder):
-    """Another process that uses the folder."""
-    if not system.fcntl:
-        pytest.skip("needs locks of the system")
-    for lock in pocl_cache._in_use.values():
-        os.close(lock)
-    pocl_cache._in_use.clear()
-    command = [sys.executable, "-c", HOLD, str(folder)]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout.readline() == "True\n"
-        yield process
-        process.stdin.close()
-
-
-def test_beside_another_process_nothing_is_removed(folder, another):
-    put(folder / "CD/NEW/program.bc", b"the other one compiles it now")
-    assert again(folder)
-    assert programs(folder) == ["NEW", "ONE", "TWO"]
-    assert not again(folder, lambda: flip(folder / "AB/ONE/program.bc"))
-    assert programs(folder) == ["NEW", "ONE", "TWO"]
-    another.kill()
-    another.wait()
-    assert again(folder)
-    assert programs(folder) == ["TWO"]
-
-
-def test_what_is_compiled_is_listed_and_what_is_listed_stays(folder):
-    assert again(folder)
-    put(folder / "CD/NEW/program.bc", b"new")
-    flip(folder / "AB/ONE/program.bc")  # while this process runs
-    list_programs(folder)
-    listed = json.loads((folder / pocl_cache.INDEX).read_text())
-    assert sorted(listed) == ["AB/ONE", "CD/NEW", "CD/TWO"]
-    assert again(folder)
-    assert programs(folder) == ["NEW", "TWO"]
-
-
-def test_a_library_that_was_cut_is_compiled_again(device, tmp_path):
-    if "Portable Computing" not in device.info.platform:
-        pytest.skip("looks into PoCL's cache")
-    python(DEVELOP, CLPIPE_CACHE_DIR=tmp_path)
-    libraries = list(tmp_path.rglob("*.so"))
-    whole = {path: path.stat().st_size for path in libraries}
-    assert libraries
-    for number, path in enumerate(libraries):
-        os.truncate(path, whole[path] // 2 if number % 2 else 0)
-    python(DEVELOP, CLPIPE_CACHE_DIR=tmp_path)  # SIGBUS or SIGABRT, where PoCL maps them
-    rebuilt = {path: path.stat().st_size for path in tmp_path.rglob("*.so")}
-    developed = {p: s for p, s in rebuilt.items() if "trial" not in p.name}
-    assert developed and all(whole.get(path) == size for path, size in developed.items())
-
-
-@pytest.fixture
-def binaries(device, tmp_path):
-    """A folder of binaries, and what compiles and runs a program through it."""
+def builder(device, tmp_path):
+    """What builds a program as a process would that starts now, and runs it."""
     context = cl.Context([device.info.handle])
-    kept = BinaryCache(tmp_path / "programs", device.info.handle)
+    store = ProgramStore(tmp_path / "programs", ["test"])
+    # A PoCL has one folder as long as its process lives, so the folder stays where it is.
+    of_pocl = Path(os.environ["POCL_CACHE_DIR"])
 
-    def value():
-        """What the program writes, and whether it was compiled."""
-        program, options = kept.load(context, TEXT, ["-w"]), ["-w"]
-        compiled = program is None
-        if compiled:
-            program = cl.Program(context, TEXT).build(options, cache_dir=False)
-            kept.store(program, TEXT, options)
-        queue = cl.CommandQueue(context)
-        result = bytearray(4)
+    def new():
+        if "Portable Computing" in device.info.platform:
+            return PoclBuilder(context, store, of_pocl)
+        return BinaryBuilder(context, store)
+
+    def value(text=TEXT, made=new):
+        builder = made()
+        program = builder.build(text, ["-w"])
+        queue, result = cl.CommandQueue(context), bytearray(4)
         buffer = cl.Buffer(context, cl.mem_flags.WRITE_ONLY, 4)
         cl.Kernel(program, "f")(queue, (1,), None, buffer)
         cl.enqueue_copy(queue, result, buffer)
-        return result[0], compiled
+        builder.keep()
+        return result[0]
 
-    value.path = kept.path(TEXT, ["-w"])
+    value.store, value.context = store, context
     return value
 
 
-def test_a_binary_is_kept_and_taken(binaries):
-    assert binaries() == (7, True)
-    assert binaries() == (7, False)
+def test_a_program_is_built_and_kept(builder, tmp_path):
+    # The text is this test's, since PoCL's folder is that of the whole process.
+    text = TEXT.replace("f(", f"f(/* {tmp_path} */ ")
+    assert builder(text) == 7
+    assert builder.store.load(text, ["-w"])
+    assert builder(text) == 7
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        flip,
-        lambda path: os.truncate(path, path.stat().st_size // 2),
-        lambda path: os.truncate(path, 0),
-        lambda path: (path.unlink(), put(path / "inside")),
-    ],
-)
-def test_a_damaged_binary_is_compiled_again(binaries, damage):
-    binaries()
-    damage(binaries.path)
-    assert binaries() == (7, True)
-    assert binaries() == (7, False)
+def test_what_a_runtime_does_not_take_is_compiled(builder, device):
+    binary = lambda: BinaryBuilder(builder.context, builder.store)  # noqa: E731
+    assert builder(made=binary) == 7
+    if "Portable Computing" in device.info.platform:
+        return  # it ends the process for what is whole and no binary
+    builder.store.keep(TEXT, ["-w"], b"no binary at all")
+    assert builder(made=binary) == 7
 
 
-def test_binaries_are_of_one_text_driver_and_options(device, tmp_path):
-    kept = BinaryCache(tmp_path, device.info.handle)
-    other = BinaryCache(tmp_path, device.info.handle)
-    other._made_by += "1"
-    paths = [kept.path(TEXT, []), kept.path(TEXT + " ", []), kept.path(TEXT, ["-w"])]
-    assert len({*paths, other.path(TEXT, [])}) == 4
+def test_a_packed_program_is_put_back(tmp_path):
+    program = tmp_path / "one/AB/CDEF"
+    put(program / "program.bc", b"bytecode")
+    put(program / "last_accessed")
+    put(program / "f/8-1-1/f.so", b"library")
+    assert program_store._programs_in(tmp_path / "one") == {"AB/CDEF"}
+    files = program_store._files_of(program)
+    assert files == {"program.bc", "f/8-1-1/f.so"}
+    program_store._unpack(
+        program_store._packed(tmp_path / "one", "AB/CDEF", files), tmp_path / "two"
+    )
+    assert program_store._files_of(tmp_path / "two/AB/CDEF") == files
+    assert (tmp_path / "two/AB/CDEF/f/8-1-1/f.so").read_bytes() == b"library"
+
+
+def test_nothing_is_put_elsewhere(tmp_path):
+    path = tmp_path / "a.zip"
+    names = ["../x", "/x", "AB/../x", "AB/CD/../../../x", "AB/CD/./x", "x", "AB/cd/x"]
+    with zipfile.ZipFile(path, "w") as archive:
+        for name in names:
+            archive.writestr(name, b"data")
+    program_store._unpack(path.read_bytes(), tmp_path / "folder")
+    program_store._unpack(b"no archive", tmp_path / "folder")
+    assert sorted(tmp_path.rglob("*")) == [path]
+
+
+def test_without_room_to_compile_pocl_is_not_asked(tmp_path, monkeypatch):
+    monkeypatch.setattr(program_store, "has_room", lambda _: False)
+    builder = PoclBuilder(None, ProgramStore(None, []), tmp_path / "pocl")
+    with pytest.raises(DeviceError, match=r"needs 32 MiB of room there .* TMPDIR"):
+        builder.build(TEXT, [])
+
+
+def test_a_second_process_compiles_nothing(device, tmp_path):
+    """Nor does one after damage compile more than was damaged."""
+    if "Portable Computing" not in device.info.platform:
+        pytest.skip("looks at PoCL's programs")
+
+    def kept():
+        return {path: path.stat().st_mtime_ns for path in tmp_path.glob("programs/*")}
+
+    python(DEVELOP, CLPIPE_CACHE_DIR=tmp_path)
+    first = kept()
+    assert first
+    python(DEVELOP, CLPIPE_CACHE_DIR=tmp_path)
+    assert kept() == first
+    one, *others = sorted(first)
+    os.truncate(one, one.stat().st_size // 2)
+    python(DEVELOP, CLPIPE_CACHE_DIR=tmp_path)
+    assert kept()[one] != first[one]
+    assert all(kept()[path] == first[path] for path in others)
 
 
 @pytest.mark.parametrize(
@@ -234,32 +168,96 @@ def test_a_folder_that_others_may_write_to_is_not_used(tmp_path, caplog, mode, s
     place = tmp_path / "cache"
     place.mkdir()
     place.chmod(mode)
-    cache_folder.is_private.cache_clear()
-    for _ in range(2):
-        assert cache_folder.is_private(place) is (said is None)
+    assert cache_folder.is_private(place) is (said is None)
     assert len(caplog.messages) == (said is not None)
     assert said is None or (said in caplog.text and "CLPIPE_CACHE_DIR" in caplog.text)
 
 
 def test_another_users_folder_is_not_used(tmp_path, monkeypatch, caplog):
-    cache_folder.is_private.cache_clear()
     monkeypatch.setattr(os, "geteuid", lambda: os.stat(tmp_path).st_uid + 1)
     assert not cache_folder.is_private(tmp_path)
     assert "belongs to another user" in caplog.text
 
 
-def test_kernels_then_go_to_a_folder_of_the_process(device, tmp_path):
+def test_kernels_are_not_kept_there_and_that_is_said_once(device, tmp_path):
     shared = tmp_path / "shared"
     shared.mkdir()
     shared.chmod(0o777)
-    code = f"{DEVELOP}; import os; print(os.environ['POCL_CACHE_DIR'])"
-    for variable in ("CLPIPE_CACHE_DIR", "POCL_CACHE_DIR"):
-        used = Path(python(code, HOME=tmp_path, **{variable: shared}))
-        assert list(shared.iterdir()) == []
-        assert shared not in used.parents and used != shared
+    done = subprocess.run(
+        [sys.executable, "-c", DEVELOP],
+        env={**os.environ, "CLPIPE_CACHE_DIR": str(shared), "POCL_CACHE_DIR": str(shared)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0
+    assert done.stderr.count("others may write to it (mode 0777)") == 1
+    assert list(shared.iterdir()) == []
 
 
 def test_folders_that_are_made_are_the_users_alone(tmp_path):
-    code = "from clpipe.engine.cache_folder import *; prepare_environment(); print(cache_folder())"
-    for path in (Path(python(code, CLPIPE_CACHE_DIR=tmp_path / "new")), tmp_path / "new/pocl"):
-        assert path.stat().st_mode & 0o777 == 0o700
+    code = (
+        "from clpipe.engine.cache_folder import *; prepare_environment(); print(cache_folder());"
+        "print(oct(process_folder().stat().st_mode))"
+    )
+    made, mode = python(code, CLPIPE_CACHE_DIR=tmp_path / "new").splitlines()
+    assert Path(made).stat().st_mode & 0o777 == 0o700
+    assert mode.endswith("700")
+
+
+FOLDER_OF_A_PROCESS = (
+    "from clpipe.engine.process_folder import process_folder; print(process_folder(), flush=True)"
+)
+
+
+@pytest.fixture
+def ended(tmp_path, monkeypatch):
+    """The folder of a process that was killed a while ago."""
+    if not system.fcntl:
+        pytest.skip("needs locks of the system")
+    monkeypatch.setattr(process_folder.tempfile, "tempdir", str(tmp_path))
+    code = f"{FOLDER_OF_A_PROCESS}; import os; os.kill(os.getpid(), 9)"
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True)
+    folder = Path(done.stdout.decode().strip())
+    assert folder.is_dir() and tmp_path in folder.parents
+    os.utime(folder, (time.time() - 100,) * 2)
+    return folder
+
+
+def test_a_process_removes_its_folder_and_those_of_killed_ones(ended, tmp_path):
+    own = Path(python(FOLDER_OF_A_PROCESS, TMPDIR=tmp_path))
+    assert own.parent == ended.parent
+    assert not own.exists() and not ended.exists()
+
+
+def test_a_folder_in_use_or_just_made_stays(ended, tmp_path):
+    code = f"{FOLDER_OF_A_PROCESS}; import sys; sys.stdin.read()"
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", code], env=environment, **streams) as process:
+        used = Path(process.stdout.readline().strip())
+        os.utime(used, (time.time() - 100,) * 2)
+        young = ended.with_name("young")
+        young.mkdir()
+        python(FOLDER_OF_A_PROCESS, TMPDIR=tmp_path)
+        assert used.is_dir() and young.is_dir()
+        process.stdin.close()
+
+
+def test_a_parent_that_somebody_else_made_is_passed_over(tmp_path):
+    (tmp_path / f"clpipe-{os.getuid()}").mkdir(mode=0o700)
+    (tmp_path / f"clpipe-{os.getuid()}").chmod(0o777)
+    assert Path(python(FOLDER_OF_A_PROCESS, TMPDIR=tmp_path)).parent == tmp_path
+
+
+def test_a_folder_needs_room_and_the_right_to_run_programs(tmp_path, monkeypatch):
+    fresh = process_folder.process_folder.__wrapped__
+    monkeypatch.setattr(process_folder, "temporary_places", lambda: [tmp_path])
+    with monkeypatch.context() as patch:
+        patch.setattr(process_folder, "forbids_programs", lambda _: True)
+        assert fresh() is None
+    with monkeypatch.context() as patch:
+        usage = SimpleNamespace(free=2**20)
+        patch.setattr(process_folder.shutil, "disk_usage", lambda _: usage)
+        assert fresh() is None
+    assert tmp_path in fresh().parents

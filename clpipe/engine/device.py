@@ -129,6 +129,10 @@ class Device:
             self._calls[plan.unscaled] = [Call(k, self._programs.kernel(k)) for k in kernels]
         return self._calls[plan.unscaled]
 
+    def keep_programs(self) -> None:
+        """Keep for later processes what was compiled, and launched once, since the last time."""
+        self._programs.keep()
+
     def _borders(self, plan: Plan, written: Launch) -> Iterator[Call]:
         """The calls that fill the borders of the planes that a launch has written."""
         slots = plan.slots[written.writes.number] if written.writes else ()

@@ -22,9 +22,10 @@ from clpipe.base.errors import ImageError
 from clpipe.base.files import discard, passing_files, write_new
 from clpipe.engine.cache_folder import cache_folder
 from clpipe.engine.cpu_target import VARIABLE, Target, candidates, cpu_text
+from clpipe.engine.process_folder import process_folder
 from clpipe.engine.runtimes import attempt
 from clpipe.engine.sources import LIBRARY, kernel_folder
-from clpipe.engine.vendors import VARIABLES, icd_files, installed_drivers
+from clpipe.engine.vendors import VARIABLES, drivers_visible, icd_files, installed_drivers
 
 LIMIT = 120  # seconds for one process; then the runtime that it is at counts as hanging
 SENSITIVE = (*VARIABLES, VARIABLE, "POCL_DEVICES", "LD_LIBRARY_PATH", "LD_PRELOAD")
@@ -135,16 +136,17 @@ def _run(known: Verdicts, only_listing: bool = False) -> tuple[list[dict[str, An
 
     The latter is None where it came to its end, and "" where that is not the runtimes' doing.
     """
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    environment = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     try:
-        done = subprocess.run(
-            [sys.executable, "-m", "clpipe.engine.trial"],
-            input=json.dumps(asdict(known) | {"only_listing": only_listing}).encode(),
-            capture_output=True,
-            timeout=LIMIT,
-            env=environment,
-            check=False,
-        )
+        with drivers_visible(known.hidden):  # here, since a child that is ended tidies nothing up
+            done = subprocess.run(
+                [sys.executable, "-m", "clpipe.engine.trial"],
+                input=json.dumps(asdict(known) | {"only_listing": only_listing}).encode(),
+                capture_output=True,
+                timeout=LIMIT,
+                env=os.environ | environment,
+                check=False,
+            )
         output, errors, status = done.stdout, done.stderr, done.returncode
     except subprocess.TimeoutExpired as error:
         output, errors, status = error.stdout or b"", b"", None
@@ -174,7 +176,7 @@ def _parsed(output: bytes) -> Iterator[dict[str, Any]]:
 
 def _path() -> Path | None:
     """The file of what is known of this machine as it is; None without a folder for it."""
-    folder = cache_folder()
+    folder = cache_folder() or process_folder()
     if folder is None:
         return None
     parts = {
