@@ -25,6 +25,7 @@ ELSEWHERE = {
     5: ("test_hostile_files", "test_images_that_claim_too_much_are_refused_in_little_memory"),
     6: ("test_hostile_files", "test_names_from_a_file_are_escaped_in_messages"),
     7: ("test_existing", "test_what_is_missing_or_damaged_is_made_again"),
+    8: ("test_kernel_cache", "test_a_folder_that_others_may_write_to_is_not_used"),
 }
 
 
