@@ -13,8 +13,9 @@ import pytest
 
 from clpipe.base import system
 from clpipe.base.errors import DeviceError
-from clpipe.engine import cache_folder, process_folder, program_store
-from clpipe.engine.program_store import BinaryBuilder, PoclBuilder, ProgramStore
+from clpipe.engine import builders, cache_folder, process_folder
+from clpipe.engine.builders import BinaryBuilder, PoclBuilder
+from clpipe.engine.store import Store
 from tests.test_programs import DEVELOP, python
 
 TEXT = "__kernel void f(__global int *a) { a[get_global_id(0)] = 7; }"
@@ -42,32 +43,32 @@ DAMAGE = [
 
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_what_is_damaged_is_not_there(tmp_path, damage):
-    store = ProgramStore(tmp_path, ["driver"])
-    store.keep("text", ["-w"], b"program")
-    assert store.load("text", ["-w"]) == b"program"
-    damage(store.path("text", ["-w"]))
-    assert store.load("text", ["-w"]) is None
-    store.keep("text", ["-w"], b"again")
-    assert store.load("text", ["-w"]) == b"again"
+    store = Store(tmp_path, "driver")
+    store.keep(b"program", "text", "-w")
+    assert store.load("text", "-w") == b"program"
+    damage(store.path("text", "-w"))
+    assert store.load("text", "-w") is None
+    store.keep(b"again", "text", "-w")
+    assert store.load("text", "-w") == b"again"
 
 
 def test_what_is_kept_is_of_one_text_driver_and_options(tmp_path):
-    store, other = ProgramStore(tmp_path, ["driver 1"]), ProgramStore(tmp_path, ["driver 2"])
-    of = [store.path("a", []), store.path("b", []), store.path("a", ["-w"]), other.path("a", [])]
-    assert len({*of}) == 4
+    store, other = Store(tmp_path, "driver 1"), Store(tmp_path, "driver 2")
+    keys = (("a",), ("b",), ("a", "-w"), ("a-w",), ("a\0-w",))
+    assert len({*(store.path(*key) for key in keys), other.path("a")}) == 6
 
 
 def test_a_store_that_cannot_be_written_to_keeps_nothing(tmp_path):
-    for store in (ProgramStore(None, []), ProgramStore(put(tmp_path / "file") / "x", [])):
-        store.keep("text", [], b"program")
-        assert store.load("text", []) is None
+    for store in (Store(None), Store(put(tmp_path / "file") / "x")):
+        store.keep(b"program", "text")
+        assert store.load("text") is None
 
 
 @pytest.fixture
 def builder(device, tmp_path):
     """What builds a program as a process would that starts now, and runs it."""
     context = cl.Context([device.info.handle])
-    store = ProgramStore(tmp_path / "programs", ["test"])
+    store = Store(tmp_path / "programs", "test")
     # A PoCL has one folder as long as its process lives, so the folder stays where it is.
     of_pocl = Path(os.environ["POCL_CACHE_DIR"])
 
@@ -94,7 +95,7 @@ def test_a_program_is_built_and_kept(builder, tmp_path):
     # The text is this test's, since PoCL's folder is that of the whole process.
     text = TEXT.replace("f(", f"f(/* {tmp_path} */ ")
     assert builder(text) == 7
-    assert builder.store.load(text, ["-w"])
+    assert builder.store.load(text, "-w")
     assert builder(text) == 7
 
 
@@ -103,7 +104,7 @@ def test_what_a_runtime_does_not_take_is_compiled(builder, device):
     assert builder(made=binary) == 7
     if "Portable Computing" in device.info.platform:
         return  # it ends the process for what is whole and no binary
-    builder.store.keep(TEXT, ["-w"], b"no binary at all")
+    builder.store.keep(b"no binary at all", TEXT, "-w")
     assert builder(made=binary) == 7
 
 
@@ -112,13 +113,11 @@ def test_a_packed_program_is_put_back(tmp_path):
     put(program / "program.bc", b"bytecode")
     put(program / "last_accessed")
     put(program / "f/8-1-1/f.so", b"library")
-    assert program_store._programs_in(tmp_path / "one") == {"AB/CDEF"}
-    files = program_store._files_of(program)
+    assert builders._programs_in(tmp_path / "one") == {"AB/CDEF"}
+    files = builders._files_of(program)
     assert files == {"program.bc", "f/8-1-1/f.so"}
-    program_store._unpack(
-        program_store._packed(tmp_path / "one", "AB/CDEF", files), tmp_path / "two"
-    )
-    assert program_store._files_of(tmp_path / "two/AB/CDEF") == files
+    builders._unpack(builders._packed(tmp_path / "one", "AB/CDEF", files), tmp_path / "two")
+    assert builders._files_of(tmp_path / "two/AB/CDEF") == files
     assert (tmp_path / "two/AB/CDEF/f/8-1-1/f.so").read_bytes() == b"library"
 
 
@@ -128,14 +127,14 @@ def test_nothing_is_put_elsewhere(tmp_path):
     with zipfile.ZipFile(path, "w") as archive:
         for name in names:
             archive.writestr(name, b"data")
-    program_store._unpack(path.read_bytes(), tmp_path / "folder")
-    program_store._unpack(b"no archive", tmp_path / "folder")
+    builders._unpack(path.read_bytes(), tmp_path / "folder")
+    builders._unpack(b"no archive", tmp_path / "folder")
     assert sorted(tmp_path.rglob("*")) == [path]
 
 
 def test_without_room_to_compile_pocl_is_not_asked(tmp_path, monkeypatch):
-    monkeypatch.setattr(program_store, "has_room", lambda _: False)
-    builder = PoclBuilder(None, ProgramStore(None, []), tmp_path / "pocl")
+    monkeypatch.setattr(builders, "has_room", lambda _: False)
+    builder = PoclBuilder(None, Store(None), tmp_path / "pocl")
     with pytest.raises(DeviceError, match=r"needs 32 MiB of room there .* TMPDIR"):
         builder.build(TEXT, [])
 

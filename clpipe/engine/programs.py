@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError, RequestError
+from clpipe.engine.builders import BinaryBuilder, PoclBuilder
 from clpipe.engine.cache_folder import cache_folder, later_runs, pocl_folder
 from clpipe.engine.codegen import Kernel
 from clpipe.engine.discovery import DeviceInfo
-from clpipe.engine.program_store import BinaryBuilder, PoclBuilder, ProgramStore
 from clpipe.engine.runtimes import is_pocl
+from clpipe.engine.store import Store
 
 # PoCL includes the declarations of all of OpenCL's functions before a program. The first says that
 # it has done so; the second has those that are called declared in kernels/lib/builtins.h.
@@ -111,7 +112,7 @@ def builder_for(info: DeviceInfo, context: Any) -> BinaryBuilder | PoclBuilder |
     folder, of_pocl = cache_folder(), pocl_folder()
     platform = info.handle.platform.version
     made_by = (info.platform, platform, info.name, info.version, info.driver, info.target.name)
-    store = ProgramStore(folder / "programs" if folder else None, made_by)
+    store = Store(folder / "programs" if folder else None, *made_by)
     if is_pocl(info.platform):
         return PoclBuilder(context, store, of_pocl) if of_pocl else None
     return None if has_src_build_cache(info.handle) else BinaryBuilder(context, store)

@@ -5,7 +5,6 @@ A runtime that crashes, compiles nothing or computes wrongly is found there, by
 drivers, their versions and the trial itself; it lies in the cache folder.
 """
 
-import hashlib
 import json
 import os
 import signal
@@ -18,13 +17,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.errors import ImageError
-from clpipe.base.files import discard, passing_files, write_new
 from clpipe.engine.cache_folder import cache_folder
 from clpipe.engine.cpu_target import VARIABLE, Target, candidates, cpu_text
 from clpipe.engine.process_folder import process_folder
 from clpipe.engine.runtimes import attempt
 from clpipe.engine.sources import LIBRARY, kernel_folder
+from clpipe.engine.store import Store
 from clpipe.engine.vendors import VARIABLES, drivers_visible, icd_files, installed_drivers
 
 LIMIT = 120  # seconds for one process; then the runtime that it is at counts as hanging
@@ -73,17 +71,15 @@ def verdicts(again: bool = False, missing: bool = False) -> Verdicts:
         again: try what failed once more.
         missing: a device is there that was not tried; try what is new.
     """
-    path = _path()
-    known = _read(path) if path else None
+    store, state = _store(), _state()
+    known = _known(store.load("runtimes", state))
     if known and again and known.problems:
         known = None
     if known and not missing:
         return known
     found = tried(known or Verdicts())
-    if path and found.lasting:
-        discard(path)
-        with passing_files(), suppress(ImageError):
-            write_new(path, json.dumps(asdict(found), indent=1).encode())
+    if found.lasting:
+        store.keep(json.dumps(asdict(found)).encode(), "runtimes", state)
     return found
 
 
@@ -174,11 +170,14 @@ def _parsed(output: bytes) -> Iterator[dict[str, Any]]:
             yield json.loads(line)
 
 
-def _path() -> Path | None:
-    """The file of what is known of this machine as it is; None without a folder for it."""
+def _store() -> Store:
+    """Where verdicts are kept; without a lasting folder, for this process."""
     folder = cache_folder() or process_folder()
-    if folder is None:
-        return None
+    return Store(folder / "known" if folder else None)
+
+
+def _state() -> str:
+    """All that verdicts hold for: this machine, its drivers and the trial, in one text."""
     parts = {
         "cpu": cpu_text(),
         "sys": Path("/sys/devices/system/cpu").is_dir(),
@@ -187,8 +186,7 @@ def _path() -> Path | None:
         "program": [sys.executable, version("pyopencl")],
         "trial": [[path.stat().st_size, path.stat().st_mtime_ns] for path in _trial_files()],
     }
-    digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
-    return folder / "runtimes" / f"{digest[:32]}.json"
+    return json.dumps(parts, sort_keys=True)
 
 
 def _trial_files() -> list[Path]:
@@ -197,13 +195,6 @@ def _trial_files() -> list[Path]:
     return [*modules, *(kernel_folder() / f"lib/{name}.h" for name in LIBRARY)]
 
 
-def _read(path: Path) -> Verdicts | None:
-    """What a file holds; None where there is none, or it is damaged."""
-    with suppress(OSError, ValueError, TypeError, AttributeError):
-        found = Verdicts(**json.loads(path.read_bytes()))
-        texts = [found.listing]
-        for each in (found.hidden, found.platforms, found.attempts):
-            texts += [*each, *each.values()]
-        if all(isinstance(text, str) for text in texts):
-            return found
-    return None
+def _known(data: bytes | None) -> Verdicts | None:
+    """Verdicts as they are kept; None for none."""
+    return Verdicts(**json.loads(data)) if data else None

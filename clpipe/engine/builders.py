@@ -1,68 +1,25 @@
-"""Compiled programs kept between processes, as files that are looked at before they are used.
+"""Programs, compiled or taken from what is kept of them between processes.
 
 A runtime believes what it is given: of a library that was cut, PoCL ends the process. So none
-reads this store itself. Each file begins with its digest, is written whole or not at all, and is
-named after all that decides it, so there is no lock and nothing to go stale.
+reads the store itself.
 
 PoCL has no call that takes compiled kernels back; it maps libraries out of a folder. So each
 process has a folder for it, and what is kept of a program is its part of that folder.
 """
 
-import hashlib
 import io
 import os
 import re
 import threading
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.errors import DeviceError, ImageError
-from clpipe.base.files import discard, passing_files, write_new
+from clpipe.base.errors import DeviceError
 from clpipe.engine.process_folder import ROOM, has_room
-
-
-class ProgramStore:
-    """A folder of compiled programs.
-
-    Args:
-        folder: for the files, made when the first one is written; None keeps nothing.
-        made_by: what decides what a compiler makes of a text: runtime, device, driver, target.
-    """
-
-    def __init__(self, folder: Path | None, made_by: Sequence[str]) -> None:
-        self.folder = folder
-        self._made_by = made_by
-
-    def path(self, source: str, options: Sequence[str]) -> Path | None:
-        """The file of a program that is compiled with these options; None without a folder."""
-        parts = "\0".join([*self._made_by, *options, source]).encode()
-        return self.folder / hashlib.sha256(parts).hexdigest()[:40] if self.folder else None
-
-    def load(self, source: str, options: Sequence[str]) -> bytes | None:
-        """What is kept of a program; None where it is not there, or damaged."""
-        path = self.path(source, options)
-        if path is None:
-            return None
-        try:
-            data = path.read_bytes()
-        except FileNotFoundError:
-            return None
-        except OSError:
-            data = b""
-        if hashlib.sha256(data[32:]).digest() == data[:32]:
-            return data[32:]
-        discard(path)
-        return None
-
-    def keep(self, source: str, options: Sequence[str], data: bytes) -> None:
-        """Keep a program, if there is room."""
-        path = self.path(source, options)
-        if path is not None:
-            with suppress(ImageError), passing_files():
-                write_new(path, hashlib.sha256(data).digest() + data)
+from clpipe.engine.store import Store
 
 
 class BinaryBuilder:
@@ -73,7 +30,7 @@ class BinaryBuilder:
         store: for the binaries.
     """
 
-    def __init__(self, context: Any, store: ProgramStore) -> None:
+    def __init__(self, context: Any, store: Store) -> None:
         self._context = context
         self._store = store
 
@@ -85,7 +42,7 @@ class BinaryBuilder:
         """
         import pyopencl as cl
 
-        if kept := self._store.load(source, options):
+        if kept := self._store.load(source, *options):
             with suppress(cl.Error):
                 program = cl.Program(self._context, self._context.devices, [kept])
                 return program.build(options, cache_dir=False)
@@ -93,7 +50,7 @@ class BinaryBuilder:
         with suppress(cl.Error):
             (binary,) = program.get_info(cl.program_info.BINARIES)
             if binary:
-                self._store.keep(source, options, binary)
+                self._store.keep(binary, source, *options)
         return program
 
     def keep(self) -> None:
@@ -114,7 +71,7 @@ class PoclBuilder:
 
     _one_at_a_time = threading.Lock()  # what a build has added to the folder is seen by looking
 
-    def __init__(self, context: Any, store: ProgramStore, folder: Path) -> None:
+    def __init__(self, context: Any, store: Store, folder: Path) -> None:
         self._context = context
         self._store = store
         self._folder = folder
@@ -132,7 +89,7 @@ class PoclBuilder:
 
         with self._one_at_a_time:
             before = _programs_in(self._folder)
-            if kept := self._store.load(source, options):
+            if kept := self._store.load(source, *options):
                 _unpack(kept, self._folder)
             unpacked = _programs_in(self._folder) - before
             if not unpacked and not has_room(self._folder.parent):
@@ -154,7 +111,7 @@ class PoclBuilder:
             files = _files_of(self._folder / name)
             if files - kept:
                 data = _packed(self._folder, name, files)
-                self._store.keep(source, options, data)
+                self._store.keep(data, source, *options)
                 self._built[source, options] = name, files
 
 
