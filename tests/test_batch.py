@@ -38,7 +38,7 @@ from clpipe.outputs import existing, sidecar
 from clpipe.outputs import folder as output_folders
 from clpipe.outputs.folder import LOCK, output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
-from tests.conftest import ROOT, written
+from tests.conftest import ROOT, reseal, written
 
 # A chain that other tests compile too.
 RUN = ("-o", "out", "--iso", 3200)
@@ -624,6 +624,8 @@ def test_a_sidecar_whose_picture_cannot_be_the_same(clpipe, renders, monkeypatch
         "clpipe did not write" in clpipe("run", "--replay", "mine.toml", "-o", "b", status=2).stderr
     )
     Path("half.json").write_text('{"clpipe": "9.9.9", "request": {}}')
+    assert "was changed since" in clpipe("run", "--replay", "half.json", "-o", "b", status=2).stderr
+    reseal(Path("half.json"), {"clpipe": "9.9.9", "request": {}})
     assert "it is damaged" in clpipe("run", "--replay", "half.json", "-o", "b", status=2).stderr
     assert "no such file" in clpipe("run", "--replay", "no.json", "-o", "b", status=2).stderr
 
@@ -692,7 +694,7 @@ def test_an_output_or_memory_that_cannot_be(clpipe, renders):
 def test_a_sidecar_that_somebody_edited(clpipe, renders, key, value):
     clpipe("run", renders(1), *RUN)
     record = json.loads(Path("out/r000.json").read_text())
-    Path("edited.json").write_text(json.dumps({**record, key: value}))
+    reseal(Path("edited.json"), {**record, key: value})
     stderr = clpipe("run", "--replay", "edited.json", "-o", "b", status=2).stderr
     assert "edited.json: it is damaged" in stderr
     assert not Path("b").exists()
@@ -703,7 +705,7 @@ def test_a_sidecar_whose_request_somebody_edited(clpipe, renders, key, value):
     clpipe("run", renders(1), *RUN)
     record = json.loads(Path("out/r000.json").read_text())
     record["request"][key] = value
-    Path("edited.json").write_text(json.dumps(record))
+    reseal(Path("edited.json"), record)
     stderr = clpipe("run", "--replay", "edited.json", "-o", "b", status=2).stderr
     assert "edited.json: it is damaged" in stderr
     assert not Path("b").exists()
@@ -715,14 +717,14 @@ def test_a_sidecar_made_with_other_libraries(clpipe, renders):
     record = json.loads(sidecar_.read_text())
     assert "warning" not in clpipe("run", "--replay", sidecar_, "-o", "b").stderr
     record["versions"]["OpenImageIO"] = "1.2.3"
-    sidecar_.write_text(json.dumps(record))
+    reseal(sidecar_, record)
     stderr = clpipe("run", "--replay", sidecar_, "-o", "c").stderr
     now = OpenImageIO.__version__
     assert f"warning: was made with OpenImageIO 1.2.3 (now {now}); the bytes may be" in stderr
     record["versions"]["OpenImageIO"] = now
     for key, value in (("driver", "9.9"), ("name", "GPU"), ("lanes", 3)):
         changed = {**record, "device": {**record["device"], key: value}}
-        sidecar_.write_text(json.dumps(changed))
+        reseal(sidecar_, changed)
         stderr = clpipe("run", "--replay", sidecar_, "-o", "d", "--overwrite").stderr
         assert f"warning: was made with device {key} {value} (now " in stderr
 

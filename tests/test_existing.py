@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 
 from clpipe.batch.run_log import read_log
-from clpipe.outputs.sidecar import outputs_in
+from clpipe.outputs.sealed import outputs_in
+from tests.conftest import reseal
 
 RUN = ("-o", "out", "--device", "numpy", "--keep", "normalize", "--truth", "mosaic")
 MADE = ("a.jpg", "a.normalize.exr", "a.truth_mosaic.exr")
@@ -91,7 +92,7 @@ def test_copied_moved_and_dated_elsewhere_it_is_done_still(again, tmp_path):
 def test_a_sidecar_with_a_list_that_is_none_counts_for_nothing(again, value):
     values = json.loads(Path("out/a.json").read_text())
     assert set(outputs_in(values)) == {"a.jpg", "a.normalize.exr"}
-    Path("out/a.json").write_text(json.dumps({**values, "outputs": value}))
+    reseal(Path("out/a.json"), {**values, "outputs": value})
     assert "a.jpg" in again()
 
 

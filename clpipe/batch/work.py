@@ -29,7 +29,8 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.patches import Patch, every_patch
 from clpipe.outputs.renditions import Rendition
-from clpipe.outputs.sidecar import SIDECAR, intrinsics_of, sidecar, write_sidecar
+from clpipe.outputs.sealed import SIDECAR, write_sidecar
+from clpipe.outputs.sidecar import intrinsics_of, sidecar
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 

@@ -15,7 +15,7 @@ from clpipe.base.digests import digests, joint_digest, stamp_of, stamp_of_all
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.inputs.find import Job
-from clpipe.outputs.sidecar import OWN, outputs_in, read_sidecar
+from clpipe.outputs.sealed import OWN, SidecarError, outputs_in, read_sidecar
 
 MARKED = 1 << 16  # bytes at either end of a file, in which a format of clpipe names clpipe
 
@@ -56,7 +56,7 @@ class Existing:
         """
         try:
             values = read_sidecar(self.sidecar)
-        except FileNotFoundError:
+        except (FileNotFoundError, SidecarError):
             values = {}
         listed = outputs_in(values)
         written = 0 if verify else _written(self.sidecar)

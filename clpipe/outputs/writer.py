@@ -35,7 +35,7 @@ from clpipe.outputs.renditions import (
     truth_named,
 )
 from clpipe.outputs.results import results_of
-from clpipe.outputs.sidecar import SIDECAR
+from clpipe.outputs.sealed import SIDECAR
 from clpipe.reference.geometry import NO_MARGINS
 from clpipe.stage import Kind
 

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import logging
 import os
 import shlex
 from collections.abc import Mapping, Sequence
@@ -13,7 +14,7 @@ from clpipe.base.about import __version__
 from clpipe.base.files import write_new
 from clpipe.images.sheet import SHOWN, contact_sheet
 from clpipe.inputs.find import Job
-from clpipe.outputs.sidecar import SIDECAR, read_sidecar
+from clpipe.outputs.sealed import SIDECAR, SidecarError, read_sidecar
 from clpipe.outputs.views import FILES
 from clpipe.outputs.writer import OutputWriter
 from clpipe.scenes.record import RECORD
@@ -21,6 +22,8 @@ from clpipe.scenes.record import RECORD
 SHEET, MANIFEST, README = "contact_sheet.jpg", "manifest.csv", "README.md"
 MOST_ROWS = 12  # of the contact sheet
 PICTURE, CARRIED = "picture", "carried"
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,7 @@ def _view(job: Job) -> str:
 
 
 def _member(writer: OutputWriter, job: Job) -> Member | None:
-    """What was made of a job; None where something of it failed."""
+    """What was made of a job; None where something of it failed, or is not as it was written."""
     files: dict[str, str] = {}
     records = []
     for name in writer.names_of(job):
@@ -100,6 +103,9 @@ def _member(writer: OutputWriter, job: Job) -> Member | None:
         try:
             records.append(read_sidecar(path))
         except FileNotFoundError:
+            return None
+        except SidecarError as error:
+            log.warning("%s; the card goes without it", error)
             return None
         place = path.parent.relative_to(writer.folder)
         made = [(place / each["name"]).as_posix() for each in records[-1]["outputs"]]
