@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.about import __version__
-from clpipe.base.digests import digests, joint_digest, stamp_of, stamp_of_all
+from clpipe.base.digests import digests, joint_digest, stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.inputs.find import Job
@@ -112,22 +112,32 @@ def is_current(
 ) -> bool:
     """Whether a sidecar's values are of the same input, the same request and this version.
 
-    An input of the same size and time of change is taken for the same; else, and with ``verify``,
-    its SHA-256 decides. Arguments as for :meth:`Existing.is_done`.
+    An input each of whose files has the same size and time of change is taken for the same; else,
+    and with ``verify``, its SHA-256 decides. Arguments as for :meth:`Existing.is_done`.
     """
     if values.get(OWN) != __version__ or not _same_request(values.get("request"), request):
         return False
-    size, modified = stamp_of_all(job.paths)
-    if values.get("input_size") != size:
-        return False
-    is_touched = values.get("input_modified") != modified
-    if (is_touched or verify) and values.get("sha256") != _digest_of(job):
-        return False
     try:
+        was, now = stamps_in(values), [stamp_of(path) for path in job.paths]
+        if [size for size, _ in was] != [size for size, _ in now]:
+            return False
+        if (was != now or verify) and values["sha256"] != _digest_of(job):
+            return False
         layers = (*values.get("carried", ()), *values.get("depth", ()))
         return all(_is_same(job, each, verify) for each in layers)
     except (KeyError, TypeError):  # the sidecar is damaged
         return False
+
+
+def stamps_in(values: Mapping[str, Any]) -> list[tuple[int, int]]:
+    """The size and the time of change of each file of the input, as a sidecar's values say them.
+
+    Raises:
+        KeyError, TypeError: the values are damaged.
+    """
+    if "subframes" in values:
+        return [(each["size"], each["modified"]) for each in values["subframes"]]
+    return [(values["input_size"], values["input_modified"])]
 
 
 def _digest_of(job: Job) -> str | None:

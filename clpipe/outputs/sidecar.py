@@ -50,15 +50,20 @@ def intrinsics_of(chain: Chain, source: SourceImage) -> Intrinsics | None:
     return chain.intrinsics(width, height, shot)
 
 
-def subframe_records(source: SourceImage) -> list[dict[str, str]]:
+def subframe_records(
+    source: SourceImage, stamps: Sequence[tuple[int, int]]
+) -> list[dict[str, Any]]:
     """The files that an exposure is the mean of, relative to the folder of the first."""
-    return [{"file": name, "sha256": digest} for name, digest in source.subframes]
+    return [
+        {"file": name, "size": size, "modified": modified, "sha256": digest}
+        for (name, digest), (size, modified) in zip(source.subframes, stamps, strict=True)
+    ]
 
 
 def sidecar(
     job: Job,
     request: Mapping[str, Any],
-    stamp: tuple[int, int],
+    stamps: Sequence[tuple[int, int]],
     rendition: Rendition,
     frames: int | None,
     device: Device | None,
@@ -74,7 +79,7 @@ def sidecar(
     Args:
         job: the image.
         request: the record of the request for the image.
-        stamp: the input's size and time of change, before it was read.
+        stamps: the size and the time of change of each file of the input, before it was read.
         rendition: the picture.
         frames: how many frames its burst has; None without a burst.
         device: where it was made; None is NumPy.
@@ -88,16 +93,15 @@ def sidecar(
     chain = rendition.whole
     facts = source.facts if isinstance(source, RawImage) else None
     noise = chain.noise if not facts or chain.is_noisy else None
-    bytes_, modified = stamp
     width, height = chain.size(*source.pixels.shape[1::-1])
     intrinsics = intrinsics_of(chain, source)
     return {
         OWN: __version__,
         "input": job.input,
-        "input_size": bytes_,
-        "input_modified": modified,
+        "input_size": stamps[0][0],
+        "input_modified": stamps[0][1],
         "sha256": source.sha256,
-        **({"subframes": subframe_records(source)} if source.subframes else {}),
+        **({"subframes": subframe_records(source, stamps)} if source.subframes else {}),
         "layer": source.layer,
         "name": job.stem,
         "picture": rendition.name,
