@@ -122,6 +122,21 @@ def write_sidecar(path: Path, record: Mapping[str, Any]) -> None:
     keep_names(path.parent)
 
 
+def remove_sidecar(path: Path) -> None:
+    """Remove a sidecar where there is one: its pictures are about to be written.
+
+    Raises:
+        ImageError: it cannot be removed.
+    """
+    try:
+        path.unlink()
+        keep_names(path.parent)
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be removed: {error.strerror}") from None
+
+
 def outputs_in(values: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """The files that a sidecar's values list: the size and the SHA-256 of each, by its name.
 
