@@ -1,7 +1,10 @@
 """Sidecars carry their own digest: an edited one is a missing one, and every reader says so."""
 
+import copy
 import hashlib
 import json
+import os
+import random
 import subprocess
 import tarfile
 from pathlib import Path
@@ -12,6 +15,7 @@ import pytest
 from clpipe.base.errors import ImageError
 from clpipe.batch.run_log import read_log
 from clpipe.outputs.sealed import SEAL, SidecarError, read_sidecar, sealed, values_in
+from tests.conftest import reseal
 
 CHANGED = f"was changed since clpipe wrote it (its {SEAL} does not fit)"
 CAMERA = ("--set", "output.fx=30", "--set", "output.fy=30")
@@ -112,6 +116,71 @@ def test_what_others_wrote_is_no_sidecar(tmp_path, text):
     with pytest.raises(expected) as caught:
         read_sidecar(path)
     assert not isinstance(caught.value, SidecarError)
+
+
+ODD = [7, -1.5, [], ["x"], None, "", "\0", {}, {"a": {"b": [1]}}, True, 10**400, float("nan")]
+
+
+def places(values, at=()):
+    """The keys on the way to each value of a sidecar; of a list, to its first."""
+    if at:
+        yield at
+    if isinstance(values, dict):
+        for key, value in values.items():
+            yield from places(value, (*at, key))
+    elif isinstance(values, list) and values:
+        yield from places(values[0], (*at, 0))
+
+
+def edited(values, at, value):
+    values = copy.deepcopy(values)
+    inner = values
+    for key in at[:-1]:
+        inner = inner[key]
+    inner[at[-1]] = value
+    return values
+
+
+NUMPY = ("-o", "b", "--device", "numpy", "--overwrite")
+
+PATCHES = ("--patch", 4, "--patches-per-image", 2, "--keep", "normalize", "--format", "png")
+
+
+@pytest.mark.parametrize("options", [(), PATCHES])
+def test_whatever_a_forged_sidecar_holds_no_command_ends_in_a_traceback(made, clpipe, options):
+    made(*options)
+    whole, luck = read_sidecar(Path("out/a.json")), random.Random(0)
+    everywhere = [(at, odd) for at in places(whole) for odd in ODD]
+    for number, (at, odd) in enumerate(luck.sample(everywhere, 400)):
+        Path(f"odd/{number}").mkdir(parents=True)
+        os.link("out/a.jpg", f"odd/{number}/a.jpg")
+        reseal(Path(f"odd/{number}/a.json"), edited(whole, at, odd))
+    assert "Traceback" not in clpipe("poses", "odd", status=2 if options else 0).output
+    clpipe("report", "odd")
+    resumed = ("clpipe", "input_size", "input_modified", "sha256", "request", "outputs")
+    cases = [(key, odd) for key in (*resumed, "subframes", "carried", "depth") for odd in ODD]
+    for number, (key, odd) in enumerate(cases):
+        os.link("in/a.exr", f"in/x{number}.exr")
+        reseal(Path(f"out/x{number}.json"), {**whole, key: odd})
+    run = ("run", "in", "-o", "out", "--device", "numpy", *CAMERA, *options)
+    assert "unexpected" not in clpipe(*run).stderr
+    for key in whole["request"]:
+        for odd in luck.sample(ODD, 4):
+            reseal(Path("e.json"), edited(whole, ("request", key), odd))
+            again = clpipe("run", "--replay", "e.json", *NUMPY, status=(0, 1, 2))
+            assert "unexpected" not in again.stderr, (key, odd)
+
+
+@pytest.mark.parametrize("key", ["iso", "noise", "width", "camera", "outputs"])
+def test_a_card_goes_without_what_a_forged_sidecar_holds(clpipe, write_exr, key):
+    for name in "ab":
+        write_exr(f"in/{name}.exr", np.full((8, 8, 3), 0.25, np.float32))
+    run = ("dataset", "in", "-o", "out", "--device", "numpy", "--iso", 100)
+    clpipe(*run)
+    values = read_sidecar(Path("out/a.json"))
+    for odd in ODD:
+        reseal(Path("out/a.json"), {**values, key: odd})
+        clpipe(*run)
 
 
 def edited_in_tar(path: Path, name: str) -> None:

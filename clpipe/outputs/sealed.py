@@ -148,6 +148,7 @@ def outputs_in(values: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
         for each in (listed if isinstance(listed, list) else ())
         if isinstance(each, dict) and {"name", "size", "sha256"} <= each.keys()
         if isinstance(each["name"], str) and os.path.basename(each["name"]) == each["name"] != ""
+        if "\0" not in each["name"]
     }
 
 
