@@ -22,7 +22,14 @@ from clpipe.chain.formats import DNG, ending_of
 from clpipe.images.encoding import Matrix, Vector
 from clpipe.outputs.existing import is_marked
 from clpipe.outputs.renditions import truth_named
-from clpipe.outputs.sealed import SIDECAR, SidecarError, json_text, outputs_in, values_in
+from clpipe.outputs.sealed import (
+    SIDECAR,
+    SidecarError,
+    is_sidecar,
+    json_text,
+    outputs_in,
+    values_in,
+)
 from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
 from clpipe.reference.pose import to_opengl, to_quaternion
 
@@ -81,7 +88,7 @@ def check_view_files(folder: Path) -> None:
         ImageError: one of their names is somebody else's.
     """
     for path in (folder / name for name in FILES):
-        if os.path.lexists(path) and not is_marked(path):
+        if os.path.lexists(path) and not (is_marked(path) or _is_taken(path)):
             raise ImageError(
                 f"{path}: clpipe did not write this file, and would overwrite it with the cameras "
                 "of this folder's pictures; move it, or choose another output folder"
@@ -105,8 +112,13 @@ def write_views(folder: Path) -> Written:
     texts = {CAMERAS: cameras_json(found), **colmap(found, posed, left_out)} if found else {}
     if nerf := nerfstudio(posed, left_out):
         texts[TRANSFORMS] = nerf
+    taken = [name for name in texts if _is_taken(folder / name)]
+    for name in taken:
+        del texts[name]
     for name in FILES:
         path = folder / name
+        if _is_taken(path):
+            continue
         if name in texts:
             make_folder_of(path)
             write_whole(path, texts[name].encode())
@@ -118,7 +130,20 @@ def write_views(folder: Path) -> Written:
         for why, files in left_out.items()
         if files
     )
+    reasons += tuple(
+        f"{folder / name} is the sidecar of a picture, so the cameras are not written there; give "
+        "that image another name"
+        for name in taken
+    )
     return Written(tuple(name for name in FILES if name in texts), len(found), reasons)
+
+
+def _is_taken(path: Path) -> bool:
+    """Whether a file of the views would take the place of a picture's sidecar."""
+    try:
+        return is_sidecar(read_bytes(path))
+    except OSError:
+        return False
 
 
 def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Photograph]:
