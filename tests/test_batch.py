@@ -378,6 +378,21 @@ def test_a_trace_that_cannot_be_written_stops_no_image(clpipe, renders, monkeypa
     assert not list(Path().glob("*t.json"))
 
 
+@pytest.mark.parametrize("options", [(), ("--webdataset", 2)])
+def test_a_disk_without_room_is_no_problem_where_all_is_done(clpipe, renders, monkeypatch, options):
+    clpipe("run", renders(2), *RUN, *options)
+    before = contents("out")
+
+    def full(descriptor, offset, length):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    assert "2 of them were there already" in clpipe("run", "in", *RUN, *options).stderr
+    told = clpipe("run", "in", *RUN, *options, "--seed", 7, status=1).stderr
+    assert "out: cannot write there: No space left on device (8.0 MiB are needed); " in told
+    assert {name: data for name, data in contents("out").items() if name in before} == before
+
+
 def test_two_runs_in_one_folder(tmp_path):
     holder = (
         "import sys; from pathlib import Path; from clpipe.outputs.folder import output_folder\n"

@@ -27,12 +27,16 @@ PARTS = 2**40  # bytes of the lock, of which each shard holds its part; none is 
 UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # as whole_file names them
 
 
-def write_problem(folder: Path) -> str:
-    """Why nothing can be written to a folder, "" where it can."""
+def write_problem(folder: Path, with_room: bool = True) -> str:
+    """Why nothing can be written to a folder, "" where it can.
+
+    Without ``with_room`` a full disk will do, as for a run that may find all done.
+    """
     probe = folder / f".clpipe.{secrets.token_hex(8)}"
     try:
         with open(probe, "xb") as file:
-            os.posix_fallocate(file.fileno(), 0, ROOM)
+            if with_room:
+                os.posix_fallocate(file.fileno(), 0, ROOM)
     except OSError as error:
         needed = f" ({in_words(ROOM)} are needed)" if error.errno == errno.ENOSPC else ""
         return f"cannot write there: {error.strerror}{needed}"
@@ -44,7 +48,7 @@ def write_problem(folder: Path) -> str:
 
 @contextlib.contextmanager
 def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
-    """Make the folder, see that it can be written to, and lock it against other runs.
+    """Make the folder, see that files can be made in it, and lock it against other runs.
 
     Shards of one run share the lock. It is the system's, so it ends with the process.
 
@@ -55,7 +59,7 @@ def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RequestError(f"{folder}: cannot write there: {error.strerror}") from None
-    if reason := write_problem(folder):
+    if reason := write_problem(folder, with_room=False):
         raise RequestError(f"{folder}: {reason}")
     first = PARTS * (shard.number - 1) // shard.of
     share = PARTS * shard.number // shard.of - first
