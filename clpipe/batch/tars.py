@@ -116,7 +116,7 @@ def prepare(tars: Sequence[Tar], overwrite: bool) -> None:
 
 
 def is_own(path: Path) -> bool:
-    """Whether a file is a tar whose first JSON is a sidecar, or what a lost one leaves: nothing."""
+    """Whether a file is a tar whose first JSON is a sidecar, or what a lost one leaves: zeros."""
     try:
         check_regular(path)
         with open(path, "rb") as file:
@@ -126,7 +126,9 @@ def is_own(path: Path) -> bool:
             for info in tar:
                 is_text = info.isreg() and info.name.endswith(f".{SIDECAR}")
                 if is_text and (data := tar.extractfile(info)):
-                    return info.size <= TEXT_BYTES and is_sidecar(data.read())
+                    text = data.read(TEXT_BYTES)
+                    if text.strip(b"\0"):
+                        return is_sidecar(text)
     except DAMAGED:
         pass
     return False
