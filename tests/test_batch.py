@@ -38,7 +38,7 @@ from clpipe.outputs import existing, sidecar
 from clpipe.outputs import folder as output_folders
 from clpipe.outputs.folder import LOCK, output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
-from tests.conftest import ROOT, written
+from tests.conftest import ROOT, reseal, written
 
 # A chain that other tests compile too.
 RUN = ("-o", "out", "--iso", 3200)
@@ -378,6 +378,21 @@ def test_a_trace_that_cannot_be_written_stops_no_image(clpipe, renders, monkeypa
     assert not list(Path().glob("*t.json"))
 
 
+@pytest.mark.parametrize("options", [(), ("--webdataset", 2)])
+def test_a_disk_without_room_is_no_problem_where_all_is_done(clpipe, renders, monkeypatch, options):
+    clpipe("run", renders(2), *RUN, *options)
+    before = contents("out")
+
+    def full(descriptor, offset, length):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    assert "2 of them were there already" in clpipe("run", "in", *RUN, *options).stderr
+    told = clpipe("run", "in", *RUN, *options, "--seed", 7, status=1).stderr
+    assert "out: cannot write there: No space left on device (8.0 MiB are needed); " in told
+    assert {name: data for name, data in contents("out").items() if name in before} == before
+
+
 def test_two_runs_in_one_folder(tmp_path):
     holder = (
         "import sys; from pathlib import Path; from clpipe.outputs.folder import output_folder\n"
@@ -624,6 +639,8 @@ def test_a_sidecar_whose_picture_cannot_be_the_same(clpipe, renders, monkeypatch
         "clpipe did not write" in clpipe("run", "--replay", "mine.toml", "-o", "b", status=2).stderr
     )
     Path("half.json").write_text('{"clpipe": "9.9.9", "request": {}}')
+    assert "was changed since" in clpipe("run", "--replay", "half.json", "-o", "b", status=2).stderr
+    reseal(Path("half.json"), {"clpipe": "9.9.9", "request": {}})
     assert "it is damaged" in clpipe("run", "--replay", "half.json", "-o", "b", status=2).stderr
     assert "no such file" in clpipe("run", "--replay", "no.json", "-o", "b", status=2).stderr
 
@@ -692,7 +709,7 @@ def test_an_output_or_memory_that_cannot_be(clpipe, renders):
 def test_a_sidecar_that_somebody_edited(clpipe, renders, key, value):
     clpipe("run", renders(1), *RUN)
     record = json.loads(Path("out/r000.json").read_text())
-    Path("edited.json").write_text(json.dumps({**record, key: value}))
+    reseal(Path("edited.json"), {**record, key: value})
     stderr = clpipe("run", "--replay", "edited.json", "-o", "b", status=2).stderr
     assert "edited.json: it is damaged" in stderr
     assert not Path("b").exists()
@@ -703,7 +720,7 @@ def test_a_sidecar_whose_request_somebody_edited(clpipe, renders, key, value):
     clpipe("run", renders(1), *RUN)
     record = json.loads(Path("out/r000.json").read_text())
     record["request"][key] = value
-    Path("edited.json").write_text(json.dumps(record))
+    reseal(Path("edited.json"), record)
     stderr = clpipe("run", "--replay", "edited.json", "-o", "b", status=2).stderr
     assert "edited.json: it is damaged" in stderr
     assert not Path("b").exists()
@@ -715,14 +732,14 @@ def test_a_sidecar_made_with_other_libraries(clpipe, renders):
     record = json.loads(sidecar_.read_text())
     assert "warning" not in clpipe("run", "--replay", sidecar_, "-o", "b").stderr
     record["versions"]["OpenImageIO"] = "1.2.3"
-    sidecar_.write_text(json.dumps(record))
+    reseal(sidecar_, record)
     stderr = clpipe("run", "--replay", sidecar_, "-o", "c").stderr
     now = OpenImageIO.__version__
     assert f"warning: was made with OpenImageIO 1.2.3 (now {now}); the bytes may be" in stderr
     record["versions"]["OpenImageIO"] = now
     for key, value in (("driver", "9.9"), ("name", "GPU"), ("lanes", 3)):
         changed = {**record, "device": {**record["device"], key: value}}
-        sidecar_.write_text(json.dumps(changed))
+        reseal(sidecar_, changed)
         stderr = clpipe("run", "--replay", sidecar_, "-o", "d", "--overwrite").stderr
         assert f"warning: was made with device {key} {value} (now " in stderr
 

@@ -15,7 +15,8 @@ from clpipe.engine.device import Device
 from clpipe.inputs.find import Job
 from clpipe.inputs.manifest import check_output_name
 from clpipe.outputs.renditions import RenditionPlan, baseline_named, bracket_in, truth_named
-from clpipe.outputs.sidecar import all_versions, device_record, read_sidecar
+from clpipe.outputs.sealed import SidecarError, read_sidecar
+from clpipe.outputs.sidecar import all_versions, device_record
 
 CODE = (".py", ".cl")  # the endings of files that are run
 
@@ -112,8 +113,10 @@ def _values(path: Path) -> dict[str, Any]:
     try:
         values = read_sidecar(path)
     except FileNotFoundError:
-        reason = "it is damaged: no whole JSON in UTF-8" if path.exists() else "no such file"
-        raise RequestError(f"{path}: {reason}") from None
+        reason = "it is empty" if path.exists() else "no such file"
+        raise RequestError(f"{path}: {reason}; --replay takes a sidecar") from None
+    except SidecarError as error:
+        raise RequestError(str(error)) from None
     except ImageError:
         raise RequestError(
             f"{path}: clpipe did not write this file; --replay takes a sidecar"

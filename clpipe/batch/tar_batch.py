@@ -3,6 +3,7 @@
 The pictures of a tar are first written to a hidden folder, and packed when all are there.
 """
 
+import hashlib
 import os
 import shutil
 import tarfile
@@ -27,7 +28,8 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.existing import Existing, is_current
 from clpipe.outputs.folder import RESUMABLE
-from clpipe.outputs.sidecar import SIDECAR, outputs_in, patch_text, read_sidecar
+from clpipe.outputs.sealed import SIDECAR, outputs_in, read_sidecar
+from clpipe.outputs.sidecar import patch_text
 from clpipe.outputs.writer import OutputWriter
 
 # Where the bytes of a member are: in a file, or at an offset and size in the old tar; or they.
@@ -121,7 +123,7 @@ class Packer:
         """
         try:
             members = list(self._members())
-            new = any(isinstance(source, Path) for _, source in members)
+            new = any(self._is_new(*member) for member in members)
             same = [name for name, _ in members] == self._old.names
             if members and (new or not (same or FAILED in self._statuses.values())):
                 self._write(members)
@@ -130,6 +132,12 @@ class Packer:
         except FileNotFoundError as error:
             raise OutputError(f"{error.filename}: has gone; {RESUMABLE}") from None
         shutil.rmtree(self._tar.staging, ignore_errors=True)
+
+    def _is_new(self, name: str, source: Source) -> bool:
+        """Whether a member is not in the old tar as it is to be."""
+        if isinstance(source, bytes):
+            return self._old.sha256(name) != hashlib.sha256(source).hexdigest()
+        return isinstance(source, Path)
 
     def _members(self) -> Iterator[tuple[str, Source]]:
         """The members of the tar, in order."""
@@ -168,7 +176,7 @@ class Packer:
             values = read_sidecar(self._writer.path(job, SIDECAR, self._writer.names_of(job)[0]))
         for number, (key, files) in enumerate(samples.items()):
             yield from files
-            yield f"{key}.{SIDECAR}", patch_text(values, number).encode()
+            yield f"{key}.{SIDECAR}", patch_text(values, number)
 
     def _write(self, members: Sequence[tuple[str, Source]]) -> None:
         with (

@@ -221,6 +221,10 @@ class Batch:
             waits: list[float] = []
             try:
                 task = self._worker.decode(job, partial(self._begin, job, waits))
+            except OutputError as error:
+                self._outcomes.put(Outcome(job, FAILED, error=failure_text(job, error)))
+                self._fail(error)
+                continue
             except BaseException as error:  # nothing that one image does may end the thread
                 self._outcomes.put(Outcome(job, FAILED, error=failure_text(job, error)))
                 continue
@@ -237,9 +241,15 @@ class Batch:
         self._outcomes.put(None)
 
     def _begin(self, job: Job, waits: list[float]) -> None:
-        """Wait until there is room for a job's image, and note how long: it is decoded next."""
-        self._begun.set()
+        """Wait until there is room for a job's image, and note how long: it is decoded next.
+
+        Raises:
+            OutputError: the first image of the run is to be made, but cannot be written.
+        """
         writer = self._worker.writer
+        if not self._begun.is_set():
+            writer.check_folder()
+        self._begun.set()
         results = min(len(writer.names_of(job)), self.threads + len(self.devices))
         layers = self._worker.layers
         # Baselines are measured on floats.

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from clpipe.base.digests import stamp_of_all
+from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, NoPictureError, RequestError
 from clpipe.base.types import Array
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome, Span
@@ -29,7 +29,8 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.patches import Patch, every_patch
 from clpipe.outputs.renditions import Rendition
-from clpipe.outputs.sidecar import SIDECAR, intrinsics_of, sidecar, write_sidecar
+from clpipe.outputs.sealed import SIDECAR, write_sidecar
+from clpipe.outputs.sidecar import intrinsics_of, sidecar
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
@@ -45,7 +46,7 @@ class Task:
     began: float = field(default_factory=time.time)
     spans: list[Span] = field(default_factory=list)
     source: SourceImage | None = None
-    stamp: tuple[int, int] = (0, 0)
+    stamps: Sequence[tuple[int, int]] = ()  # of the files of its exposure
     request: Mapping[str, Any] = field(default_factory=dict)  # its record
     renditions: list[Rendition] = field(default_factory=list)
     unwritten: int = 0  # renditions
@@ -206,7 +207,7 @@ class ImageWorker:
             ImageError, RequestError, MemoryError: it cannot be read, or cannot enter the chain.
         """
         job = task.job
-        task.stamp = stamp_of_all(job.paths)
+        task.stamps = [stamp_of(path) for path in job.paths]
         source = task.loader.read(job)
         loaded = task.loader.enter(job, source)
         if loaded is None:
@@ -324,7 +325,7 @@ class ImageWorker:
                 record = sidecar(
                     job,
                     writer.record_of(job, task.request, rendition.name),
-                    task.stamp,
+                    task.stamps,
                     rendition,
                     writer.plan_of(job).frames,
                     device,

@@ -2,8 +2,8 @@
 
 import logging
 import sys
-from collections.abc import Mapping
-from contextlib import closing, nullcontext, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,11 +45,12 @@ from clpipe.commands.progress import Reporter
 from clpipe.commands.running import batch_of, follow
 from clpipe.engine.device import Device
 from clpipe.images.read import PICTURE_SUFFIXES
-from clpipe.inputs.find import Shard, find_jobs, parse_shard
+from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.poses import with_views
 from clpipe.inputs.series import Series, parse_isos
 from clpipe.outputs.folder import output_folder, remove_unfinished
+from clpipe.outputs.gone import pictures_without_input
 from clpipe.outputs.patches import PER_IMAGE
 from clpipe.outputs.renditions import parse_bracket
 from clpipe.outputs.writer import OutputWriter
@@ -277,11 +278,14 @@ def run(
     opened = batch_of(spec, loader, chain, tars, dask)
     summary = Summary(len(jobs))  # counts seconds from here on
     reporter = Reporter(summary, writer, Console(stderr=True), quiet or json_lines)
-    has_views = poses and not tars and shard.of == 1
+    is_whole = not (replay or tars or shard.of > 1)
     with (
         opened as batch,
         output_folder(output, shard),
-        views_behind(series.under(output), summary, quiet) if has_views else nullcontext(),
+        views_behind(series.under(output), summary, quiet) if poses and is_whole else nullcontext(),
+        gone_behind(writer, jobs, inputs)
+        if is_whole and not (quiet or json_lines)
+        else nullcontext(),
         Trace(trace) if trace else nullcontext() as timeline,
     ):
         if replay and isinstance(batch, Batch):
@@ -294,6 +298,16 @@ def run(
     if summary.interrupted:
         sys.exit(130)
     sys.exit(1 if summary.failures or summary.is_fruitless else 0)
+
+
+@contextmanager
+def gone_behind(writer: OutputWriter, jobs: Sequence[Job], inputs: Sequence[str]) -> Iterator[None]:
+    """Say behind a run how many pictures are there whose inputs are not."""
+    yield
+    if count := pictures_without_input(writer, jobs, inputs):
+        pictures, are = ("picture", "is") if count == 1 else ("pictures", "are")
+        there = f"{count} {pictures} in {writer.folder} {are} of inputs that are not there any more"
+        click.echo(there, err=True)
 
 
 def print_line(line: bytes) -> None:

@@ -6,6 +6,7 @@ This is the only module that imports rawpy and exifread.
 import io
 import logging
 import math
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -163,6 +164,16 @@ def read_raw(path: Path, facts: RawFacts, max_pixels: int = USUAL_MAX_PIXELS) ->
     for site, black in enumerate(facts.black_levels):
         mosaic[site // 2 :: 2, site % 2 :: 2] += np.float32(facts.black_level - black)
     return mosaic
+
+
+def check_raw(path: Path) -> None:
+    """See that LibRaw can read all of a raw, of whatever kind.
+
+    Raises:
+        ImageError: it cannot.
+    """
+    with _opened(path, sys.maxsize) as raw:
+        raw.unpack()
 
 
 @contextmanager

@@ -5,20 +5,23 @@ import os
 import re
 import stat
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from clpipe.base.about import __version__
-from clpipe.base.digests import digests, joint_digest, stamp_of, stamp_of_all
+from clpipe.base.digests import digests, joint_digest, stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.base.system import open_plain
+from clpipe.images.whole import is_whole
 from clpipe.inputs.find import Job
-from clpipe.outputs.sidecar import OWN, outputs_in, read_sidecar
+from clpipe.outputs.sealed import OWN, SidecarError, outputs_in, read_sidecar
 
 MARKED = 1 << 16  # bytes at either end of a file, in which a format of clpipe names clpipe
+
+OVERWRITTEN = "would be overwritten; move it, choose another output folder, or say --overwrite"
 
 # The tag Software of clpipe, or an attribute of its own. The camera of a DNG is called clpipe, too,
 # and converters repeat it in what they make.
@@ -57,46 +60,63 @@ class Existing:
         """
         try:
             values = read_sidecar(self.sidecar)
-        except FileNotFoundError:
+        except (FileNotFoundError, SidecarError):
             values = {}
         listed = outputs_in(values)
-        written = 0 if verify else _written(self.sidecar)
-        intact = {name for name, was in listed.items() if self._is_intact(name, was, written)}
+        written = _written(self.sidecar)
+        intact = {
+            name for name, was in listed.items() if self._is_intact(name, was, written, verify)
+        }
         pictures = {path.name for path in self.pictures}
         if pictures <= intact == listed.keys() and is_current(values, job, request, verify):
             return True
-        self._check_own(intact)
+        if not self.is_ours:
+            for path in (*self.pictures, *self.others):
+                if path.name not in intact and os.path.lexists(path):
+                    self._check_own(path, path.name in listed, written)
         return False
 
-    def _is_intact(self, name: str, was: Mapping[str, Any], written: int) -> bool:
+    def _is_intact(self, name: str, was: Mapping[str, Any], written: int, verify: bool) -> bool:
         """Whether a file is what a sidecar says of it.
 
         Args:
             name: of the file.
             was: its size and SHA-256.
-            written: when the sidecar was written, in ns since 1970; 0 compares the SHA-256.
+            written: when the sidecar was written, in ns since 1970.
+            verify: compare the SHA-256 in any case.
         """
         path = self.sidecar.with_name(name)
         try:
             status = os.lstat(path)
             if not stat.S_ISREG(status.st_mode) or status.st_size != was["size"]:
                 return False
-            return 0 <= status.st_ctime_ns <= written or sha256_of(path)[0] == was["sha256"]
+            is_untouched = not verify and status.st_ctime_ns <= written
+            return is_untouched or sha256_of(path)[0] == was["sha256"]
         except OSError:
             return False
 
-    def _check_own(self, intact: Collection[str]) -> None:
-        """See that what would be overwritten is clpipe's.
+    def _check_own(self, path: Path, is_listed: bool, written: int) -> None:
+        """See that a file that would be overwritten is clpipe's.
+
+        Args:
+            path: the file, which is not as a sidecar says.
+            is_listed: whether the sidecar lists it.
+            written: when the sidecar was written, in ns since 1970.
 
         Raises:
-            ImageError: a file is somebody else's.
+            ImageError: it is somebody else's, or somebody changed it.
         """
-        for path in () if self.is_ours else (*self.pictures, *self.others):
-            if path.name not in intact and os.path.lexists(path) and not is_marked(path):
-                raise ImageError(
-                    f"{path}: clpipe did not write this file, or it was changed since, and would "
-                    "be overwritten; move it, choose another output folder, or say --overwrite"
-                )
+        if not is_marked(path):
+            raise ImageError(
+                f"{path}: clpipe did not write this file, or it was changed since, and "
+                f"{OVERWRITTEN}"
+            )
+        # What nobody has touched since was changed by the disk, which has no title to it.
+        if is_listed and os.lstat(path).st_ctime_ns > written and is_whole(path):
+            raise ImageError(
+                f"{path}: was changed since clpipe wrote it (its SHA-256 is not that in "
+                f"{self.sidecar.name}), and {OVERWRITTEN}"
+            )
 
 
 def _written(path: Path) -> int:
@@ -113,22 +133,32 @@ def is_current(
 ) -> bool:
     """Whether a sidecar's values are of the same input, the same request and this version.
 
-    An input of the same size and time of change is taken for the same; else, and with ``verify``,
-    its SHA-256 decides. Arguments as for :meth:`Existing.is_done`.
+    An input each of whose files has the same size and time of change is taken for the same; else,
+    and with ``verify``, its SHA-256 decides. Arguments as for :meth:`Existing.is_done`.
     """
     if values.get(OWN) != __version__ or not _same_request(values.get("request"), request):
         return False
-    size, modified = stamp_of_all(job.paths)
-    if values.get("input_size") != size:
-        return False
-    is_touched = values.get("input_modified") != modified
-    if (is_touched or verify) and values.get("sha256") != _digest_of(job):
-        return False
     try:
+        was, now = stamps_in(values), [stamp_of(path) for path in job.paths]
+        if [size for size, _ in was] != [size for size, _ in now]:
+            return False
+        if (was != now or verify) and values["sha256"] != _digest_of(job):
+            return False
         layers = (*values.get("carried", ()), *values.get("depth", ()))
         return all(_is_same(job, each, verify) for each in layers)
     except (KeyError, TypeError):  # the sidecar is damaged
         return False
+
+
+def stamps_in(values: Mapping[str, Any]) -> list[tuple[int, int]]:
+    """The size and the time of change of each file of the input, as a sidecar's values say them.
+
+    Raises:
+        KeyError, TypeError: the values are damaged.
+    """
+    if "subframes" in values:
+        return [(each["size"], each["modified"]) for each in values["subframes"]]
+    return [(values["input_size"], values["input_modified"])]
 
 
 def _digest_of(job: Job) -> str | None:
