@@ -34,8 +34,8 @@ from clpipe.engine.runner import Runner
 from clpipe.images import write
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs import existing, sidecar
 from clpipe.outputs import folder as output_folders
+from clpipe.outputs import sidecar
 from clpipe.outputs.folder import LOCK, output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
 from tests.conftest import ROOT, reseal, written
@@ -139,7 +139,7 @@ def test_the_content_of_a_file_that_is_named_is_a_part_of_the_request(clpipe, re
 
 def test_another_version_makes_everything_again(clpipe, renders, monkeypatch):
     clpipe("run", renders(2), *RUN)
-    for module in (sidecar, existing, replay):
+    for module in (sidecar, replay):
         monkeypatch.setattr(module, "__version__", "9.9.9")
     clpipe("run", "in", *RUN)
     assert set(statuses("out").values()) == {"done"}
@@ -632,7 +632,7 @@ def test_a_sidecar_whose_picture_cannot_be_the_same(clpipe, renders, monkeypatch
     assert Path("b/r000.jpg").read_bytes() == Path("out/r000.jpg").read_bytes()
     Path("mine.toml").write_text(Path("mine.toml").read_text() + "\n")
     assert "mine.toml: has changed since" in refused("moved.exr")
-    for module in (sidecar, existing, replay):
+    for module in (sidecar, replay):
         monkeypatch.setattr(module, "__version__", "9.9.9")
     assert "it is of clpipe 0" in refused("moved.exr")
     assert (
@@ -726,22 +726,34 @@ def test_a_sidecar_whose_request_somebody_edited(clpipe, renders, key, value):
     assert not Path("b").exists()
 
 
-def test_a_sidecar_made_with_other_libraries(clpipe, renders):
+def test_a_replay_says_that_the_bytes_are_the_same(clpipe, renders):
+    clpipe("run", renders(1), *RUN)
+    for _ in ("made", "there already"):
+        stderr = clpipe("run", "--replay", "out/r000.json", "-o", "b").stderr
+        assert "b/r000.jpg: the same bytes" in stderr
+    assert clpipe("run", "out/r000.jpg", "-o", "c", "-c", "unprocess").exit_code == 0
+
+
+def test_a_replay_with_other_bytes_says_what_was_different(clpipe, renders):
     clpipe("run", renders(1), *RUN)
     sidecar_ = Path("out/r000.json")
     record = json.loads(sidecar_.read_text())
-    assert "warning" not in clpipe("run", "--replay", sidecar_, "-o", "b").stderr
-    record["versions"]["OpenImageIO"] = "1.2.3"
-    reseal(sidecar_, record)
-    stderr = clpipe("run", "--replay", sidecar_, "-o", "c").stderr
+    record["outputs"][0]["sha256"] = "0" * 64
+
+    def differs(**changes):
+        reseal(sidecar_, {**record, **changes})
+        options = ("--replay", sidecar_, "-o", "d", "--overwrite")
+        return clpipe("run", *options, status=1).stderr
+
+    assert "d/r000.jpg: other bytes (r000.jpg): by the same program and device" in differs()
+    versions = {**record["versions"], "OpenImageIO": "1.2.3"}
     now = OpenImageIO.__version__
-    assert f"warning: was made with OpenImageIO 1.2.3 (now {now}); the bytes may be" in stderr
-    record["versions"]["OpenImageIO"] = now
-    for key, value in (("driver", "9.9"), ("name", "GPU"), ("lanes", 3)):
-        changed = {**record, "device": {**record["device"], key: value}}
-        reseal(sidecar_, changed)
-        stderr = clpipe("run", "--replay", sidecar_, "-o", "d", "--overwrite").stderr
-        assert f"warning: was made with device {key} {value} (now " in stderr
+    assert f"made with OpenImageIO 1.2.3 (now {now})" in differs(versions=versions)
+    for key, value in (("driver", "9.9"), ("name", "GPU"), ("lanes", 3), ("target", "knl")):
+        device = {**record["device"], key: value}
+        assert f"made with device {key} {value} (now " in differs(device=device)
+    was, now = "ab" * 6, record["program"][:12]
+    assert f"made with program {was} (now {now})" in differs(program="ab" * 32)
 
 
 class Panic(BaseException):

@@ -230,3 +230,48 @@ def test_pictures_of_inputs_that_are_gone_are_counted(clpipe, write_exr):
         assert f"\n{count} pictures in out are of inputs that are {there}" in told
     for option in (("--quiet",), ("--shard", "1/2"), ("--json-lines",)):
         assert there not in clpipe("run", "in", *run, *option).output
+
+
+@pytest.fixture
+def program(monkeypatch):
+    """Be another program from now on."""
+
+    def be(digest):
+        for module in ("existing", "sidecar"):
+            monkeypatch.setattr(f"clpipe.outputs.{module}.program_digest", lambda: digest)
+
+    return be
+
+
+def test_pictures_of_another_program_are_made_again_and_that_is_said(again, clpipe, program):
+    program("f" * 64)
+    stderr = clpipe("run", "in", *RUN).stderr
+    assert "2 pictures were made by another clpipe" in stderr
+    assert "and are made again; --keep-old keeps such pictures" in stderr
+    assert again() == []
+    assert "another clpipe" not in clpipe("run", "in", *RUN).stderr
+    assert read_log(Path("out/run.jsonl"))[-1]["of_another_program"] == 0
+
+
+def test_pictures_of_another_program_can_be_kept(again, clpipe, program):
+    before = Path("out/a.jpg").read_bytes()
+    program("f" * 64)
+    for options in (("--keep-old",), ("--keep-old", "--verify")):
+        assert "and stay (--keep-old)" in clpipe("run", "in", *RUN, *options).stderr
+        assert again("--keep-old") == []
+    assert Path("out/a.jpg").read_bytes() == before
+    damaged(Path("out/a.jpg"), "cut")
+    assert "a.jpg" in again("--keep-old")  # it is kept where it is whole
+
+
+def test_a_tar_of_another_program(clpipe, write_exr, program):
+    write_exr("in/a.exr", np.full((8, 8, 3), 0.25, np.float32))
+    run = ("run", "in", *RUN, "--webdataset", "2")
+    clpipe(*run)
+    program("f" * 64)
+    before = Path("out/000000.tar").read_bytes()
+    assert "and stay (--keep-old)" in clpipe(*run, "--keep-old").stderr
+    assert Path("out/000000.tar").read_bytes() == before
+    assert "and are made again" in clpipe(*run).stderr
+    assert Path("out/000000.tar").read_bytes() != before
+    assert "another clpipe" not in clpipe(*run).stderr

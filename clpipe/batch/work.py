@@ -27,6 +27,7 @@ from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
+from clpipe.outputs.existing import AS_USUAL, Found, Resuming
 from clpipe.outputs.patches import Patch, every_patch
 from clpipe.outputs.renditions import Rendition
 from clpipe.outputs.sealed import SIDECAR, write_sidecar
@@ -57,6 +58,7 @@ class Task:
     carried: Carried | None = None  # until it is written
     clipped: float = 0.0  # the share of clipped pixels, of the rendition that has most
     patches: list[Patch] = field(default_factory=list)  # that are made in place of pictures
+    old: int = 0  # renditions that another program has made
 
     @contextmanager
     def timed(self, step: str) -> Iterator[None]:
@@ -86,6 +88,7 @@ class Task:
             self.began,
             tuple(self.spans),
             self.clipped,
+            self.old,
         )
 
 
@@ -96,8 +99,7 @@ class ImageWorker:
         loader: how images are loaded.
         writer: how pictures are written.
         chain: that of the first image, for which kernels are compiled early.
-        overwrite: make pictures that are done already, too.
-        verify: read pictures that are done already, to see that they are whole.
+        resuming: which pictures that are there already are made again.
         trace: note each launch and transfer.
     """
 
@@ -106,15 +108,13 @@ class ImageWorker:
         loader: ImageLoader,
         writer: OutputWriter,
         chain: Chain,
-        overwrite: bool = False,
-        verify: bool = False,
+        resuming: Resuming = AS_USUAL,
         trace: bool = False,
     ) -> None:
         self.writer = writer
         self._loader = loader
         self._chain = chain
-        self._overwrite = overwrite
-        self._verify = verify
+        self._resuming = resuming
         self._trace = trace
         self._spare = SpareArrays(0)
 
@@ -177,17 +177,18 @@ class ImageWorker:
     def _missing(self, task: Task) -> list[str]:
         """The names of a job's renditions that are to be made."""
         names = self.writer.names_of(task.job)
-        if self._overwrite:
+        if self._resuming.overwrite:
             return list(names)
-        missing = [
-            name
+        found = {
+            name: self.found(task.job, name, self.writer.record_of(task.job, task.request, name))
             for name in names
-            if not self.is_done(task.job, name, self.writer.record_of(task.job, task.request, name))
-        ]
+        }
+        task.old = sum(there is Found.OLD for there in found.values())
+        missing = [name for name, there in found.items() if not self._resuming.is_kept(there)]
         needed = self.writer.plan_of(task.job).needed(missing)
         return [name for name in self.writer.plan_of(task.job).names() if name in needed]
 
-    def is_done(self, job: Job, name: str, request: Mapping[str, Any]) -> bool:
+    def found(self, job: Job, name: str, request: Mapping[str, Any]) -> Found:
         """Whether a rendition is there already, made by the same request.
 
         Args:
@@ -198,7 +199,7 @@ class ImageWorker:
         Raises:
             ImageError: a file of its name is somebody else's.
         """
-        return self.writer.existing(job, name).is_done(job, request, self._verify)
+        return self.writer.existing(job, name).found(job, request, self._resuming.verify)
 
     def _load(self, task: Task, names: Sequence[str]) -> None:
         """Load a task's image, and decide which renditions are made of it.

@@ -10,6 +10,7 @@ from clpipe.base.errors import DeviceError
 from clpipe.base.memory import available_memory
 from clpipe.base.text import one_of
 from clpipe.engine.cache_folder import pocl_problem, prepare_environment
+from clpipe.engine.cpu_target import VARIABLE as TARGET_VARIABLE
 from clpipe.engine.cpu_target import Target, candidates, compile_for, forced_target
 from clpipe.engine.hardware import Hardware, hardware_of
 from clpipe.engine.runtimes import (
@@ -175,6 +176,8 @@ def remedies() -> str:
         *(["pip install 'clpipe[intel]'"] if linux and x86 else []),
         *(["apt-get install pocl-opencl-icd (Debian, Ubuntu)"] if linux else []),
     ]
+    if name := forced_target():
+        ways.insert(0, f"to unset {TARGET_VARIABLE} (it is {name})")
     return f"what helps here: {', or '.join(ways)}; --device numpy needs none, and is slow"
 
 

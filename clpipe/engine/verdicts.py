@@ -26,6 +26,7 @@ from clpipe.engine.store import Store
 from clpipe.engine.vendors import VARIABLES, drivers_visible, icd_files, installed_drivers
 
 LIMIT = 120  # seconds for one process; then the runtime that it is at counts as hanging
+SLOW = "it takes longer than"
 SENSITIVE = (*VARIABLES, VARIABLE, "POCL_DEVICES", "LD_LIBRARY_PATH", "LD_PRELOAD")
 
 
@@ -97,6 +98,8 @@ def tried(known: Verdicts) -> Verdicts:
                 at = {}
         if ending is None:
             return known
+        # A machine may be too busy.
+        known = replace(known, lasting=known.lasting and not ending.startswith(SLOW))
         if ending == "" or not at:  # it could not be tried, which says nothing of the runtimes
             return replace(known, lasting=False)
         if at["at"] == "list":
@@ -150,7 +153,7 @@ def _run(known: Verdicts, only_listing: bool = False) -> tuple[list[dict[str, An
         return [], ""
     lines = list(_parsed(output))
     if status is None:
-        return lines, f"it takes longer than {LIMIT} s for a tiny kernel"
+        return lines, f"{SLOW} {LIMIT} s for a tiny kernel"
     if status >= 0:
         return lines, None if status == 0 else ""
     if -status == getattr(signal, "SIGKILL", None):  # most likely for want of memory

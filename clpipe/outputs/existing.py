@@ -7,17 +7,18 @@ import stat
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.about import __version__
 from clpipe.base.digests import digests, joint_digest, stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.base.system import open_plain
 from clpipe.images.whole import is_whole
 from clpipe.inputs.find import Job
-from clpipe.outputs.sealed import OWN, SidecarError, outputs_in, read_sidecar
+from clpipe.outputs.program import program_digest
+from clpipe.outputs.sealed import SidecarError, outputs_in, read_sidecar
 
 MARKED = 1 << 16  # bytes at either end of a file, in which a format of clpipe names clpipe
 
@@ -26,6 +27,36 @@ OVERWRITTEN = "would be overwritten; move it, choose another output folder, or s
 # The tag Software of clpipe, or an attribute of its own. The camera of a DNG is called clpipe, too,
 # and converters repeat it in what they make.
 MARK = re.compile(rb"clpipe \d+\.\d|clpipe:\w")
+
+
+class Found(Enum):
+    """What lies there of a rendition."""
+
+    NOTHING = "nothing that fits, or is whole"
+    OLD = "all, but made by another program"
+    DONE = "all"
+
+
+@dataclass(frozen=True)
+class Resuming:
+    """What of the pictures that are there already is made again.
+
+    Args:
+        overwrite: all of them, also those of others.
+        verify: what is damaged, which is found by reading everything.
+        keep_old: not those that another program made; else these are.
+    """
+
+    overwrite: bool = False
+    verify: bool = False
+    keep_old: bool = False
+
+    def is_kept(self, found: Found) -> bool:
+        """Whether what was found stays."""
+        return found is Found.DONE or (found is Found.OLD and self.keep_old)
+
+
+AS_USUAL = Resuming()
 
 
 @dataclass(frozen=True)
@@ -44,7 +75,7 @@ class Existing:
     others: Sequence[Path] = ()
     is_ours: bool = False
 
-    def is_done(self, job: Job, request: Mapping[str, Any], verify: bool = False) -> bool:
+    def found(self, job: Job, request: Mapping[str, Any], verify: bool = False) -> Found:
         """Whether all is there, unchanged, made of the same input by the same request.
 
         A file counts as unchanged where it has its size and was last touched before its sidecar was
@@ -68,13 +99,15 @@ class Existing:
             name for name, was in listed.items() if self._is_intact(name, was, written, verify)
         }
         pictures = {path.name for path in self.pictures}
-        if pictures <= intact == listed.keys() and is_current(values, job, request, verify):
-            return True
+        if pictures <= intact == listed.keys():
+            found = found_in(values, job, request, verify)
+            if found is not Found.NOTHING:
+                return found
         if not self.is_ours:
             for path in (*self.pictures, *self.others):
                 if path.name not in intact and os.path.lexists(path):
                     self._check_own(path, path.name in listed, written)
-        return False
+        return Found.NOTHING
 
     def _is_intact(self, name: str, was: Mapping[str, Any], written: int, verify: bool) -> bool:
         """Whether a file is what a sidecar says of it.
@@ -128,16 +161,24 @@ def _written(path: Path) -> int:
     return modified if modified <= time.time_ns() else 0
 
 
-def is_current(
+def found_in(
     values: Mapping[str, Any], job: Job, request: Mapping[str, Any], verify: bool = False
-) -> bool:
-    """Whether a sidecar's values are of the same input, the same request and this version.
+) -> Found:
+    """Whether a sidecar's values are of the same input, the same request and this program.
+
+    Arguments as for :meth:`Existing.found`.
+    """
+    if not _same_request(values.get("request"), request) or not _same_input(values, job, verify):
+        return Found.NOTHING
+    return Found.DONE if values.get("program") == program_digest() else Found.OLD
+
+
+def _same_input(values: Mapping[str, Any], job: Job, verify: bool) -> bool:
+    """Whether a sidecar's values are of a job's files.
 
     An input each of whose files has the same size and time of change is taken for the same; else,
-    and with ``verify``, its SHA-256 decides. Arguments as for :meth:`Existing.is_done`.
+    and with ``verify``, its SHA-256 decides.
     """
-    if values.get(OWN) != __version__ or not _same_request(values.get("request"), request):
-        return False
     try:
         was, now = stamps_in(values), [stamp_of(path) for path in job.paths]
         if [size for size, _ in was] != [size for size, _ in now]:

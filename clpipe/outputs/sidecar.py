@@ -21,6 +21,7 @@ from clpipe.inputs.carry import Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.raw import RawImage
 from clpipe.outputs.patches import Patch, facts_of
+from clpipe.outputs.program import program_digest
 from clpipe.outputs.renditions import Rendition
 from clpipe.outputs.sealed import OWN, sealed
 from clpipe.reference.intrinsics import Intrinsics
@@ -136,6 +137,7 @@ def sidecar(
         **({"overscan": source.margins._asdict()} if source.margins else {}),
         "warnings": list(source.warnings),
         "device": device_record(device),
+        "program": program_digest(),
         "versions": all_versions(),
         "request": request,
     }
