@@ -137,14 +137,6 @@ def test_the_content_of_a_file_that_is_named_is_a_part_of_the_request(clpipe, re
     assert set(statuses("out").values()) == {"done"}
 
 
-def test_another_version_makes_everything_again(clpipe, renders, monkeypatch):
-    clpipe("run", renders(2), *RUN)
-    for module in (sidecar, replay):
-        monkeypatch.setattr(module, "__version__", "9.9.9")
-    clpipe("run", "in", *RUN)
-    assert set(statuses("out").values()) == {"done"}
-
-
 def test_overwrite(clpipe, renders):
     clpipe("run", renders(2), *RUN)
     before = stamps("out")

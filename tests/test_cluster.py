@@ -247,7 +247,7 @@ def test_a_worker_of_another_make_that_comes_later(clpipe, renders, address, mon
     def earlier(self, jobs):
         probe(self, jobs)
         self._spec = replace(
-            self._spec, environment=WorkerEnvironment("0.1.0", "a device that was there", "")
+            self._spec, environment=replace(worker_environment(("numpy",)), device="another")
         )
 
     monkeypatch.setattr(cluster.Cluster, "_probe", earlier)

@@ -195,13 +195,19 @@ def test_what_fails_is_passed_over_and_what_helps_is_said(device, monkeypatch):
 def test_a_device_that_was_not_there_is_tried(device, monkeypatch):
     asked = []
 
-    def answer(again=False, missing=False):
-        asked.append(missing)
-        return Verdicts()
+    def answer(again=False, missing=()):
+        asked.extend(missing)
+        return Verdicts(attempts=dict.fromkeys(missing, ""))
 
     monkeypatch.setattr(discovery, "verdicts", answer)
-    assert not next(d for d in find_devices() if d.handle == device.info.handle).problem
-    assert asked[:2] == [False, True]
+    found = next(d for d in find_devices() if d.handle == device.info.handle)
+    assert not found.problem and any(found.name in name for name in asked)
+
+
+def test_what_another_process_does_not_see_is_trusted(program):
+    program(say(attempt="a", problem="", passing=False))
+    assert verdicts.verdicts(missing=["b"]).attempts == {"a": "", "b": ""}
+    assert verdicts.verdicts().attempts == {"a": "", "b": ""}
 
 
 def test_a_runtime_that_is_busy_is_not_blamed(monkeypatch, capfd):

@@ -98,6 +98,7 @@ class WorkerEnvironment:
     """What the bytes of a picture depend on, the same on all workers of a run."""
 
     version: str
+    program: str
     device: str
     libraries: str
 
@@ -156,7 +157,8 @@ def worker_environment(selectors: Sequence[str]) -> WorkerEnvironment:
         device = " and ".join(sorted({device_text(info) for info in chosen}))
     libraries = {"NumPy": np.__version__, **versions()}
     return WorkerEnvironment(
-        f"{__version__}, program {program_digest()[:12]}",
+        __version__,
+        program_digest()[:12],
         device,
         ", ".join(f"{k} {v}" for k, v in libraries.items()),
     )

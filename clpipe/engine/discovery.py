@@ -14,6 +14,7 @@ from clpipe.engine.cpu_target import VARIABLE as TARGET_VARIABLE
 from clpipe.engine.cpu_target import Target, candidates, compile_for, forced_target
 from clpipe.engine.hardware import Hardware, hardware_of
 from clpipe.engine.runtimes import (
+    attempt,
     is_pocl,
     is_tried,
     lanes_for,
@@ -93,10 +94,11 @@ def find_devices(again: bool = False) -> list[DeviceInfo]:
     for platform in platforms(known.hidden):
         devices, reason = devices_of(platform, known)
         for device in devices:
-            if is_tried(type_of(platform, device), platform, device) and not known.of(
-                platform, device
-            ):
-                known = verdicts(missing=True)
+            is_new = known.of(platform, device) is None
+            if is_new and is_tried(type_of(platform, device), platform, device):
+                known = verdicts(
+                    missing=[attempt(platform, device, candidates(platform, device)[0])]
+                )
             found.append(describe(len(found), platform, device, known))
         if not devices:
             handle, version = platform.int_ptr, platform.version

@@ -10,7 +10,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
@@ -26,6 +26,7 @@ from clpipe.engine.store import Store
 from clpipe.engine.vendors import VARIABLES, drivers_visible, icd_files, installed_drivers
 
 LIMIT = 120  # seconds for one process; then the runtime that it is at counts as hanging
+WINDOWS_FAULT = 0xC0000000  # the status of a process that the system has ended is no smaller
 SLOW = "it takes longer than"
 SENSITIVE = (*VARIABLES, VARIABLE, "POCL_DEVICES", "LD_LIBRARY_PATH", "LD_PRELOAD")
 
@@ -65,12 +66,13 @@ class Verdicts:
         return None if first is None else (targets[0], first)
 
 
-def verdicts(again: bool = False, missing: bool = False) -> Verdicts:
+def verdicts(again: bool = False, missing: Sequence[str] = ()) -> Verdicts:
     """What is known of this machine's runtimes, after they are tried if that is not known.
 
     Args:
         again: try what failed once more.
-        missing: a device is there that was not tried; try what is new.
+        missing: what was not tried, as :func:`attempt` names it. What is still missing then, since
+            another process does not see it, is trusted.
     """
     store, state = _store(), _state()
     known = _known(store.load("runtimes", state))
@@ -79,6 +81,8 @@ def verdicts(again: bool = False, missing: bool = False) -> Verdicts:
     if known and not missing:
         return known
     found = tried(known or Verdicts())
+    for name in missing:
+        found.attempts.setdefault(name, "")
     if found.lasting:
         store.keep(json.dumps(asdict(found)).encode(), "runtimes", state)
     return found
@@ -154,6 +158,8 @@ def _run(known: Verdicts, only_listing: bool = False) -> tuple[list[dict[str, An
     lines = list(_parsed(output))
     if status is None:
         return lines, f"{SLOW} {LIMIT} s for a tiny kernel"
+    if status >= WINDOWS_FAULT:
+        return lines, f"it ends the process ({status:#x})"
     if status >= 0:
         return lines, None if status == 0 else ""
     if -status == getattr(signal, "SIGKILL", None):  # most likely for want of memory
