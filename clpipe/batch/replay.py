@@ -15,7 +15,7 @@ from clpipe.engine.device import Device
 from clpipe.inputs.find import Job
 from clpipe.inputs.manifest import check_output_name
 from clpipe.outputs.renditions import RenditionPlan, baseline_named, bracket_in, truth_named
-from clpipe.outputs.sidecar import all_versions, device_record, read_sidecar
+from clpipe.outputs.sidecar import OWN, all_versions, device_record, read_sidecar
 
 CODE = (".py", ".cl")  # the endings of files that are run
 
@@ -156,7 +156,7 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
         pictures=(picture,),
         subframes=others,
     )
-    were = {**flat(values["device"]), **values["versions"]}
+    were = {OWN: values[OWN], **flat(values["device"]), **values["versions"]}
     return Replay(request, job, {what: str(were[what]) for what in surroundings(None)})
 
 

@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.about import __version__
+from clpipe.base.about import __version__, full_version
 from clpipe.base.errors import ImageError
 from clpipe.base.files import Stored, keep_names, write_whole
 from clpipe.base.reading import parse_json, read_bytes
@@ -266,6 +266,7 @@ def device_record(device: Device | None) -> dict[str, Any]:
 def all_versions() -> dict[str, str]:
     """The versions of all that a picture's bytes may depend on, by name."""
     return {
+        "clpipe": full_version(),
         "python": platform.python_version(),
         "numpy": version("numpy"),
         "pyopencl": version("pyopencl"),
