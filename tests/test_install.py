@@ -1,12 +1,14 @@
 """The package as a user gets it: installed from another folder, kernels inside."""
 
 import os
+import re
 import subprocess
 import sys
 import tomllib
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from clpipe.base import extras
 from tests.conftest import ROOT, STILL_LIFE
@@ -81,3 +83,55 @@ def test_pocl_is_asked_for_only_where_it_has_a_wheel(system, machine, expected):
     asked = [each for each in asked if each.marker is None or each.marker.evaluate(here)]
     assert {each.name for each in asked if "cl" in each.name and each.name != "click"} == expected
     assert not any(each.extras for each in asked)
+
+
+def needed(project, extra):
+    """What pyproject.toml asks for with an extra, with what its extras of clpipe ask for."""
+    for text in project["optional-dependencies"][extra] if extra else project["dependencies"]:
+        requirement = Requirement(text)
+        if requirement.name == "clpipe":
+            for each in requirement.extras:
+                yield from needed(project, each)
+        else:
+            yield requirement
+    if extra:
+        yield from needed(project, "")
+
+
+@pytest.mark.parametrize("extra", ["", "calibrate", "dev", "docs"])
+def test_a_lock_has_all_that_is_asked_for(extra):
+    lock = (ROOT / "locks" / f"{extra or 'clpipe'}.txt").read_text()
+    versions = {}
+    for text in lock.replace("\\\n", "").splitlines():
+        if text and text.lstrip()[0] != "#":
+            requirement, *hashes = text.split("--hash=sha256:")
+            assert hashes, text
+            locked = Requirement(requirement)
+            (pinned,) = locked.specifier
+            versions.setdefault(canonicalize_name(locked.name), []).append(pinned.version)
+    pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    build = map(Requirement, pyproject["build-system"]["requires"])
+    for asked in (*needed(pyproject["project"], extra), *build):
+        found = versions.get(canonicalize_name(asked.name), [])
+        assert found, f"{asked} is not locked; run tools/versions lock {asked.name}"
+        assert all(version in asked.specifier for version in found), (asked, found)
+
+
+def test_a_lock_names_no_index_and_no_folder():
+    locks = sorted((ROOT / "locks").iterdir())
+    assert {lock.stem for lock in locks} == {"calibrate", "clpipe", "dev", "docs"}
+    for lock in locks:
+        assert not re.search(r"://|--(extra-)?index|--find-links|@ |\s/", lock.read_text())
+
+
+def test_what_a_tool_installs_is_locked():
+    found = [
+        (path, line.partition("=")[2])
+        for path in (ROOT / "tools").iterdir()
+        if path.is_file()
+        for line in path.read_text().splitlines()
+        if line.startswith("extra=") and path.name != "setup"
+    ]
+    assert len(found) == 4
+    for path, extra in found:
+        assert (ROOT / "locks" / f"{extra or 'clpipe'}.txt").is_file(), path

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.about import __version__
+from clpipe.base.about import full_version
 from clpipe.base.errors import OutputError
 from clpipe.base.memory import peak_memory
 from clpipe.base.system import open_plain
@@ -124,7 +124,7 @@ class RunLog:
         self._path = path
         self._echo = echo
         self._file: int | None = None
-        self._start = _line("start", time.time(), {"clpipe": __version__, **start})
+        self._start = _line("start", time.time(), {"clpipe": full_version(), **start})
 
     def _write(self, line: bytes) -> None:
         try:

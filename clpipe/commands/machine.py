@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from clpipe.base.about import __version__
+from clpipe.base.about import full_version
 from clpipe.engine.device import Device
 from clpipe.outputs.sidecar import all_versions, device_record
 
@@ -14,7 +14,7 @@ def machine_record(device: Device) -> dict[str, Any]:
     """A device and the versions of all that runs on it, as JSON values."""
     info = device.info
     return {
-        "clpipe": __version__,
+        "clpipe": full_version(),
         "device": device_record(device)
         | {"type": info.type, "compute_units": info.compute_units, "memory": info.memory},
         "versions": all_versions() | {"system": platform.platform()},

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 import click
 from click.shell_completion import CompletionItem
 
-from clpipe.base.about import __version__
+from clpipe.base.about import full_version
 from clpipe.base.errors import ClpipeError, OutputError, RequestError
 from clpipe.base.text import one_line
 
@@ -122,11 +122,25 @@ def fail(error: ClpipeError) -> NoReturn:
     sys.exit(error.exit_status)
 
 
+def say_version(context: click.Context, _: click.Parameter, is_asked: bool) -> None:
+    """Print the version with the commit, which takes some time to find, and exit."""
+    if is_asked and not context.resilient_parsing:
+        click.echo(f"clpipe, version {full_version()}")
+        context.exit()
+
+
 @click.group(
     cls=LazyGroup,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-@click.version_option(__version__, prog_name="clpipe")
+@click.option(
+    "--version",
+    is_flag=True,
+    expose_value=False,
+    is_eager=True,
+    callback=say_version,
+    help="Show the version and exit.",
+)
 def main() -> None:
     """Put clean, linear renders through a camera: mosaic, sensor noise, development.
 

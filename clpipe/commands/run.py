@@ -2,6 +2,7 @@
 
 import logging
 import sys
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import click
 from rich.console import Console
 
+from clpipe.base.about import full_version
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.memory import parse_size
 from clpipe.batch.dask_worker import RunSpec
@@ -235,6 +237,8 @@ def run(
     """
     if quiet:
         logging.getLogger("clpipe").setLevel(logging.WARNING)
+    # A checkout asks git for the version that log and sidecars have; here nobody waits for that.
+    threading.Thread(target=full_version, daemon=True).start()
     tars: list[Tar] = []
     series = Series(cameras, parse_isos(isos) if isos is not None else ())
     if replay:

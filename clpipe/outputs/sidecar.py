@@ -8,7 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.about import __version__
+from clpipe.base.about import __version__, full_version
 from clpipe.base.files import Stored
 from clpipe.chain.chain import Chain
 from clpipe.engine.device import Device
@@ -190,6 +190,7 @@ def device_record(device: Device | None) -> dict[str, Any]:
 def all_versions() -> dict[str, str]:
     """The versions of all that a picture's bytes may depend on, by name."""
     return {
+        "clpipe": full_version(),
         "python": platform.python_version(),
         "numpy": version("numpy"),
         "pyopencl": version("pyopencl"),

@@ -221,9 +221,9 @@ def machine_facts(pictures: Sequence[Made]) -> list[tuple[str, str]]:
         if isinstance(device, Mapping):
             text = f"{device.get('name')}, {device.get('version')}"
             rows.setdefault("device", {})[text] = None
-        rows.setdefault("clpipe", {})[str(made.value("clpipe"))] = None
         versions = made.value("versions")
-        for name, version in versions.items() if isinstance(versions, Mapping) else ():
+        said = versions if isinstance(versions, Mapping) else {}
+        for name, version in {"clpipe": made.value("clpipe"), **said}.items():
             rows.setdefault(str(name), {})[str(version)] = None
     return [(name, "; ".join(texts)) for name, texts in rows.items()]
 
