@@ -869,8 +869,8 @@ def test_images_wait_for_room(renders, tmp_path, monkeypatch):
 
     monkeypatch.setattr(ImageLoader, "read", reading)
     monkeypatch.setattr(ImageWorker, "encode", encoding)
-    large = host_bytes(jobs[1], 1, ("png",), ())
-    assert large == 24 * 32 * (12 + 3)
+    large = host_bytes(jobs[1], worker.chain, 1, ("png",), ())
+    assert large == 24 * 32 * (6 + 3 + 1)
     for room, most in ((1, 1), (2 * large, 2), (100 * large, 4)):
         seen.clear()
         outcomes = list(Batch(worker, [None], threads=4, room=room).run(jobs))
@@ -884,11 +884,15 @@ def test_images_wait_for_room(renders, tmp_path, monkeypatch):
 
 
 def test_what_images_take(tmp_path, write_exr):
+    chain = Request().chain()
     exr = Job(write_exr("a.exr", np.zeros((10, 20, 3), np.float32)), "a")
-    assert host_bytes(exr, 1, ("jpg",), ()) == 200 * (12 + 3)
-    assert host_bytes(exr, 3, ("jpg", "exr"), ("mosaic",)) == 200 * (12 + 3 * 27)
+    assert host_bytes(exr, chain, 1, ("jpg",), ()) == 200 * (6 + 3 + 1)
+    deep = 200 * (6 + 3 * (3 + 12 * 2 + 24))
+    assert host_bytes(exr, chain, 3, ("jpg", "exr"), ("mosaic",)) == deep
+    smaller = Request({"stages": ["exposure", "resize"], "resize": {"scale": 0.5}}).chain()
+    assert host_bytes(exr, smaller, 1, ("exr",), ()) == 200 * 6 + 50 * (3 + 12 + 24)
     raw = tmp_path / "a.nef"
     raw.write_bytes(bytes(1000))
     other = raw.rename(tmp_path / "b.nef")
-    assert host_bytes(Job(other, "b"), 1, ("dng",), ()) == 1000 * 27
-    assert host_bytes(Job(tmp_path / "missing.exr", "c"), 1, ("jpg",), ()) == 0
+    assert host_bytes(Job(other, "b"), chain, 1, ("dng",), ()) == 1000 * (4 + 3 + 12 + 12)
+    assert host_bytes(Job(tmp_path / "missing.exr", "c"), chain, 1, ("jpg",), ()) == 0

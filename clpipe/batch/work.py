@@ -113,7 +113,7 @@ class ImageWorker:
     ) -> None:
         self.writer = writer
         self._loader = loader
-        self._chain = chain
+        self.chain = chain
         self._resuming = resuming
         self._trace = trace
         self._spare = SpareArrays(0)
@@ -125,7 +125,7 @@ class ImageWorker:
     @property
     def layers(self) -> int:
         """How many layers are read beside an image: those that go along with it, and its depth."""
-        return len(self.writer.request.carry) + bool(lenses_of(self._chain))
+        return len(self.writer.request.carry) + bool(lenses_of(self.chain))
 
     def runners(self, device: Device | None) -> "Runners":
         """The runners of a device; the kernels of the first chain are compiled here.
@@ -134,15 +134,15 @@ class ImageWorker:
             RequestError: the memory of the device is too small for any image.
             DeviceError: a kernel does not compile.
         """
-        half = self._loader.kept is None and self._chain.source is Kind.RGB
-        return Runners(self.writer, device, self._chain, half)
+        half = self._loader.kept is None and self.chain.source is Kind.RGB
+        return Runners(self.writer, device, self.chain, half)
 
     def decode(self, job: Job, begin: Callable[[], None]) -> Task:
         """Load a job's image, unless all of its pictures are done already.
 
         Args:
             job: the image.
-            begin: called where something is to be made.
+            begin: called where something is to be made; it may raise ImageError.
         """
         task = Task(job, self._loader)
         with task.timed("decode"):

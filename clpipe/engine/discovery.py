@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from clpipe.base.errors import DeviceError
-from clpipe.base.memory import available_memory
+from clpipe.base.memory import available_memory, check_addresses
+from clpipe.base.system import processors
 from clpipe.base.text import one_of
 from clpipe.engine.cache_folder import pocl_problem, prepare_environment
 from clpipe.engine.cpu_target import VARIABLE as TARGET_VARIABLE
@@ -24,6 +25,10 @@ from clpipe.engine.runtimes import (
 )
 from clpipe.engine.vendors import platforms
 from clpipe.engine.verdicts import Verdicts, verdicts
+
+# Bytes of addresses: of PoCL with its compiler at work, and of a thread on each processor.
+ADDRESSES = 256 << 20
+OF_THREAD = 8 << 20
 
 _process: int | None = None  # the process id that first used OpenCL, here or before a fork
 
@@ -76,7 +81,8 @@ def find_devices(again: bool = False) -> list[DeviceInfo]:
     ``again`` is whether to try once more what did not work when it was tried.
 
     Raises:
-        DeviceError: pyopencl cannot be loaded, or this process cannot use it.
+        DeviceError: pyopencl cannot be loaded, or this process cannot use it, or has too small an
+            address space for it.
     """
     global _process
     if _process not in (None, os.getpid()):
@@ -84,6 +90,7 @@ def find_devices(again: bool = False) -> list[DeviceInfo]:
             "this process was forked from one that had used OpenCL, which would hang here; let it "
             'be spawned (multiprocessing\'s "spawn" or "forkserver"), or fork before'
         )
+    check_addresses(ADDRESSES + OF_THREAD * processors(), "an OpenCL runtime")
     _process = os.getpid()
     prepare_environment()
     forced_target()

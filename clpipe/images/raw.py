@@ -21,7 +21,7 @@ from clpipe.base.types import Floats
 from clpipe.camera.profile import SRGB_TO_XYZ, Matrix
 from clpipe.images.dng import D65
 from clpipe.images.encoding import SIMULATED
-from clpipe.images.pixels import USUAL_MAX_PIXELS, check_size
+from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS, check_size
 from clpipe.images.tags import DATE
 from clpipe.reference.cfa import PATTERNS, Pattern
 
@@ -174,6 +174,16 @@ def check_raw(path: Path) -> None:
     """
     with _opened(path, sys.maxsize) as raw:
         raw.unpack()
+
+
+def raw_size(path: Path) -> tuple[int, int]:
+    """The width and height of the mosaic that a raw file claims.
+
+    Raises:
+        ImageError: the file is missing, damaged or not a raw.
+    """
+    with _opened(path, MAX_PIXELS) as raw:
+        return raw.sizes.raw_width, raw.sizes.raw_height
 
 
 @contextmanager
