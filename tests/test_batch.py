@@ -16,7 +16,6 @@ import tracemalloc
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO
 import pytest
 
 from clpipe.base.errors import DeviceError, ImageError, OutputError, RequestError
@@ -714,10 +713,10 @@ def test_a_sidecar_made_with_other_libraries(clpipe, renders):
     sidecar_ = Path("out/r000.json")
     record = json.loads(sidecar_.read_text())
     assert "warning" not in clpipe("run", "--replay", sidecar_, "-o", "b").stderr
+    now = record["versions"]["OpenImageIO"]
     record["versions"]["OpenImageIO"] = "1.2.3"
     sidecar_.write_text(json.dumps(record))
     stderr = clpipe("run", "--replay", sidecar_, "-o", "c").stderr
-    now = OpenImageIO.__version__
     assert f"warning: was made with OpenImageIO 1.2.3 (now {now}); the bytes may be" in stderr
     record["versions"]["OpenImageIO"] = now
     for key, value in (("driver", "9.9"), ("name", "GPU"), ("lanes", 3)):
