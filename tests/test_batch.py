@@ -16,7 +16,6 @@ import tracemalloc
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO
 import pytest
 
 from clpipe.base.errors import DeviceError, ImageError, OutputError, RequestError
@@ -739,7 +738,7 @@ def test_a_replay_with_other_bytes_says_what_was_different(clpipe, renders):
 
     assert "d/r000.jpg: other bytes (r000.jpg): by the same program and device" in differs()
     versions = {**record["versions"], "OpenImageIO": "1.2.3"}
-    now = OpenImageIO.__version__
+    now = record["versions"]["OpenImageIO"]
     assert f"made with OpenImageIO 1.2.3 (now {now})" in differs(versions=versions)
     for key, value in (("driver", "9.9"), ("name", "GPU"), ("lanes", 3), ("target", "knl")):
         device = {**record["device"], key: value}
