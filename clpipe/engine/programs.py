@@ -5,6 +5,7 @@ share programs, and so do all :class:`~clpipe.engine.device.Device` objects on o
 """
 
 import logging
+import os
 import re
 import threading
 import warnings
@@ -14,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError, RequestError
+from clpipe.base.memory import in_words, memory_left
 from clpipe.engine.binary_cache import BinaryCache
-from clpipe.engine.cache_folder import cache_folder, later_runs
+from clpipe.engine.cache_folder import OF_POCL, cache_folder, later_runs
 from clpipe.engine.codegen import Kernel
 from clpipe.engine.discovery import DeviceInfo
 from clpipe.engine.runtimes import is_pocl
@@ -23,6 +25,7 @@ from clpipe.engine.runtimes import is_pocl
 # PoCL includes the declarations of all of OpenCL's functions before a program. The first says that
 # it has done so; the second has those that are called declared in kernels/lib/builtins.h.
 DECLARED_HERE = ("-D_OPENCL_H_", "-DDECLARED_HERE")
+COMPILER = 112 << 20  # bytes; measured: 86 to 105 MiB for the default chain
 LONG = 2.0  # s of compiling after which a user is told what is going on
 log = logging.getLogger(__name__)
 _by_device: dict[int, "Programs"] = {}
@@ -45,6 +48,7 @@ class Programs:
         from pyopencl.characterize import has_src_build_cache
 
         self._cl = cl
+        check_memory(info)
         try:
             self.context = cl.Context([info.handle])
         except cl.Error as error:
@@ -104,6 +108,24 @@ class Programs:
         if self._cache:
             self._cache.store(program, kernel.source, options)
         return program
+
+
+def check_memory(info: DeviceInfo) -> None:
+    """See that there is memory for PoCL's compiler, which ends the process where there is not.
+
+    Where PoCL finds programs in its folder, they count as those that are needed.
+
+    Raises:
+        DeviceError: there is too little.
+    """
+    if not is_pocl(info.platform) or any(Path(os.environ.get(OF_POCL, "")).glob("*/*/*")):
+        return
+    left = memory_left()
+    if left and left.bytes < COMPILER:
+        raise DeviceError(
+            f"{info.label}: its compiler takes about {in_words(COMPILER)} of memory; "
+            f"{in_words(left.bytes)} are left by {left.by}; allow more for the first run"
+        )
 
 
 def programs_of(info: DeviceInfo) -> Programs:
