@@ -13,6 +13,7 @@ import pytest
 
 from clpipe.base import system
 from clpipe.base.errors import DeviceError
+from clpipe.base.memory import Left
 from clpipe.engine import builders, cache_folder, process_folder
 from clpipe.engine.builders import BinaryBuilder, PoclBuilder
 from clpipe.engine.store import Store
@@ -136,6 +137,11 @@ def test_without_room_to_compile_pocl_is_not_asked(tmp_path, monkeypatch):
     monkeypatch.setattr(builders, "has_room", lambda _: False)
     builder = PoclBuilder(None, Store(None), tmp_path / "pocl")
     with pytest.raises(DeviceError, match=r"needs 32 MiB of room there .* TMPDIR"):
+        builder.build(TEXT, [])
+    monkeypatch.setattr(builders, "has_room", lambda _: True)
+    monkeypatch.setattr(PoclBuilder, "_has_compiled", False)
+    monkeypatch.setattr(builders, "memory_left", lambda: Left(50 << 20, "ulimit -v"))
+    with pytest.raises(DeviceError, match=r"takes about 112.0 MiB .* 50.0 MiB are left by ulimit"):
         builder.build(TEXT, [])
 
 

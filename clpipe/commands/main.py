@@ -41,7 +41,7 @@ COMMANDS = (
 
 
 # Bytes of addresses: what loading libraries takes, and a thread of theirs, one on each processor.
-LIBRARIES = 208 << 20
+LIBRARIES = 240 << 20
 OF_THREAD = 10 << 20
 
 
@@ -98,7 +98,7 @@ class LazyGroup(click.Group):
         except OSError as error:
             fail(refused(error))
         except MemoryError:
-            fail(ClpipeError("there is no memory left to go on; what was made is whole"))
+            fail(DeviceError("there is no memory left to go on; what was made is whole"))
 
 
 def prepare_memory() -> None:

@@ -18,8 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError
+from clpipe.base.memory import in_words, memory_left
 from clpipe.engine.process_folder import ROOM, has_room
 from clpipe.engine.store import Store
+
+COMPILER = 112 << 20  # bytes of memory; measured: 86 to 105 MiB for the default chain
 
 
 class BinaryBuilder:
@@ -70,6 +73,7 @@ class PoclBuilder:
     """
 
     _one_at_a_time = threading.Lock()  # what a build has added to the folder is seen by looking
+    _has_compiled = False  # in this process, which has the compiler's memory then
 
     def __init__(self, context: Any, store: Store, folder: Path) -> None:
         self._context = context
@@ -92,11 +96,8 @@ class PoclBuilder:
             if kept := self._store.load(source, *options):
                 _unpack(kept, self._folder)
             unpacked = _programs_in(self._folder) - before
-            if not unpacked and not has_room(self._folder.parent):
-                raise DeviceError(
-                    f"{self._folder}: PoCL needs {ROOM >> 20} MiB of room there to compile in; "
-                    "free some, or name another folder for temporary files with TMPDIR"
-                )
+            if not unpacked:
+                self._check_room()
             program = cl.Program(self._context, source).build(options, cache_dir=False)
             added = _programs_in(self._folder) - before
             if len(added) == 1:
@@ -104,6 +105,25 @@ class PoclBuilder:
                 files = _files_of(self._folder / name) if unpacked == added else frozenset()
                 self._built[source, tuple(options)] = name, files
         return program
+
+    def _check_room(self) -> None:
+        """See that there is room for PoCL to compile, which ends the process where there is none.
+
+        Raises:
+            DeviceError: there is too little, on the disk or in memory.
+        """
+        if not has_room(self._folder.parent):
+            raise DeviceError(
+                f"{self._folder}: PoCL needs {ROOM >> 20} MiB of room there to compile in; free "
+                "some, or name another folder for temporary files with TMPDIR"
+            )
+        left = None if self._has_compiled else memory_left()
+        if left and left.bytes < COMPILER:
+            raise DeviceError(
+                f"PoCL's compiler takes about {in_words(COMPILER)} of memory; "
+                f"{in_words(left.bytes)} are left by {left.by}; allow more for the first run"
+            )
+        PoclBuilder._has_compiled = True
 
     def keep(self) -> None:
         """Keep what PoCL has made of programs since they were built."""
