@@ -1,6 +1,6 @@
 import resource
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +19,7 @@ from clpipe.engine import programs
 from clpipe.engine.device import Device
 from clpipe.engine.discovery import choose, find_devices
 from clpipe.engine.runner import Result, Runner
+from clpipe.outputs.sealed import SEAL, sealed
 from clpipe.stage import Kind
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -56,6 +57,11 @@ def noise_report(*sigmas: float, **changes: Any) -> dict[str, Any]:
     covariance = {where: table.tolist() for where, table in places.items()}
     report = {"kind": "display", "rounding_variance": 0.0}
     return {**report, "channels": channels, "covariance": covariance, **changes}
+
+
+def reseal(path: Path, values: Mapping[str, Any]) -> None:
+    """Write a sidecar with values of one's own and the digest that fits them, as a forger can."""
+    path.write_bytes(sealed({key: value for key, value in values.items() if key != SEAL}))
 
 
 @contextmanager

@@ -33,11 +33,11 @@ from clpipe.engine.runner import Runner
 from clpipe.images import write
 from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs import existing, sidecar
 from clpipe.outputs import folder as output_folders
+from clpipe.outputs import sidecar
 from clpipe.outputs.folder import LOCK, output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
-from tests.conftest import ROOT, written
+from tests.conftest import ROOT, reseal, written
 
 # A chain that other tests compile too.
 RUN = ("-o", "out", "--iso", 3200)
@@ -133,14 +133,6 @@ def test_the_content_of_a_file_that_is_named_is_a_part_of_the_request(clpipe, re
     assert set(statuses("out").values()) == {"skipped"}
     camera.write_text(re.sub("black_level = 512", "black_level = 500", camera.read_text()))
     clpipe("run", "in", *RUN, "--camera", "mine.toml")
-    assert set(statuses("out").values()) == {"done"}
-
-
-def test_another_version_makes_everything_again(clpipe, renders, monkeypatch):
-    clpipe("run", renders(2), *RUN)
-    for module in (sidecar, existing, replay):
-        monkeypatch.setattr(module, "__version__", "9.9.9")
-    clpipe("run", "in", *RUN)
     assert set(statuses("out").values()) == {"done"}
 
 
@@ -375,6 +367,21 @@ def test_a_trace_that_cannot_be_written_stops_no_image(clpipe, renders, monkeypa
     assert "t.json: cannot be written: No space left on device" in told
     assert len(written(Path("out"))) == 6
     assert not list(Path().glob("*t.json"))
+
+
+@pytest.mark.parametrize("options", [(), ("--webdataset", 2)])
+def test_a_disk_without_room_is_no_problem_where_all_is_done(clpipe, renders, monkeypatch, options):
+    clpipe("run", renders(2), *RUN, *options)
+    before = contents("out")
+
+    def full(descriptor, offset, length):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    assert "2 of them were there already" in clpipe("run", "in", *RUN, *options).stderr
+    told = clpipe("run", "in", *RUN, *options, "--seed", 7, status=1).stderr
+    assert "out: cannot write there: No space left on device (8.0 MiB are needed); " in told
+    assert {name: data for name, data in contents("out").items() if name in before} == before
 
 
 def test_two_runs_in_one_folder(tmp_path):
@@ -616,13 +623,15 @@ def test_a_sidecar_whose_picture_cannot_be_the_same(clpipe, renders, monkeypatch
     assert Path("b/r000.jpg").read_bytes() == Path("out/r000.jpg").read_bytes()
     Path("mine.toml").write_text(Path("mine.toml").read_text() + "\n")
     assert "mine.toml: has changed since" in refused("moved.exr")
-    for module in (sidecar, existing, replay):
+    for module in (sidecar, replay):
         monkeypatch.setattr(module, "__version__", "9.9.9")
     assert "it is of clpipe 0" in refused("moved.exr")
     assert (
         "clpipe did not write" in clpipe("run", "--replay", "mine.toml", "-o", "b", status=2).stderr
     )
     Path("half.json").write_text('{"clpipe": "9.9.9", "request": {}}')
+    assert "was changed since" in clpipe("run", "--replay", "half.json", "-o", "b", status=2).stderr
+    reseal(Path("half.json"), {"clpipe": "9.9.9", "request": {}})
     assert "it is damaged" in clpipe("run", "--replay", "half.json", "-o", "b", status=2).stderr
     assert "no such file" in clpipe("run", "--replay", "no.json", "-o", "b", status=2).stderr
 
@@ -691,7 +700,7 @@ def test_an_output_or_memory_that_cannot_be(clpipe, renders):
 def test_a_sidecar_that_somebody_edited(clpipe, renders, key, value):
     clpipe("run", renders(1), *RUN)
     record = json.loads(Path("out/r000.json").read_text())
-    Path("edited.json").write_text(json.dumps({**record, key: value}))
+    reseal(Path("edited.json"), {**record, key: value})
     stderr = clpipe("run", "--replay", "edited.json", "-o", "b", status=2).stderr
     assert "edited.json: it is damaged" in stderr
     assert not Path("b").exists()
@@ -702,28 +711,40 @@ def test_a_sidecar_whose_request_somebody_edited(clpipe, renders, key, value):
     clpipe("run", renders(1), *RUN)
     record = json.loads(Path("out/r000.json").read_text())
     record["request"][key] = value
-    Path("edited.json").write_text(json.dumps(record))
+    reseal(Path("edited.json"), record)
     stderr = clpipe("run", "--replay", "edited.json", "-o", "b", status=2).stderr
     assert "edited.json: it is damaged" in stderr
     assert not Path("b").exists()
 
 
-def test_a_sidecar_made_with_other_libraries(clpipe, renders):
+def test_a_replay_says_that_the_bytes_are_the_same(clpipe, renders):
+    clpipe("run", renders(1), *RUN)
+    for _ in ("made", "there already"):
+        stderr = clpipe("run", "--replay", "out/r000.json", "-o", "b").stderr
+        assert "b/r000.jpg: the same bytes" in stderr
+    assert clpipe("run", "out/r000.jpg", "-o", "c", "-c", "unprocess").exit_code == 0
+
+
+def test_a_replay_with_other_bytes_says_what_was_different(clpipe, renders):
     clpipe("run", renders(1), *RUN)
     sidecar_ = Path("out/r000.json")
     record = json.loads(sidecar_.read_text())
-    assert "warning" not in clpipe("run", "--replay", sidecar_, "-o", "b").stderr
+    record["outputs"][0]["sha256"] = "0" * 64
+
+    def differs(**changes):
+        reseal(sidecar_, {**record, **changes})
+        options = ("--replay", sidecar_, "-o", "d", "--overwrite")
+        return clpipe("run", *options, status=1).stderr
+
+    assert "d/r000.jpg: other bytes (r000.jpg): by the same program and device" in differs()
     now = record["versions"]["OpenImageIO"]
-    record["versions"]["OpenImageIO"] = "1.2.3"
-    sidecar_.write_text(json.dumps(record))
-    stderr = clpipe("run", "--replay", sidecar_, "-o", "c").stderr
-    assert f"warning: was made with OpenImageIO 1.2.3 (now {now}); the bytes may be" in stderr
-    record["versions"]["OpenImageIO"] = now
-    for key, value in (("driver", "9.9"), ("name", "GPU"), ("lanes", 3)):
-        changed = {**record, "device": {**record["device"], key: value}}
-        sidecar_.write_text(json.dumps(changed))
-        stderr = clpipe("run", "--replay", sidecar_, "-o", "d", "--overwrite").stderr
-        assert f"warning: was made with device {key} {value} (now " in stderr
+    versions = {**record["versions"], "OpenImageIO": "1.2.3"}
+    assert f"made with OpenImageIO 1.2.3 (now {now})" in differs(versions=versions)
+    for key, value in (("driver", "9.9"), ("name", "GPU"), ("lanes", 3), ("target", "knl")):
+        device = {**record["device"], key: value}
+        assert f"made with device {key} {value} (now " in differs(device=device)
+    was, now = "ab" * 6, record["program"][:12]
+    assert f"made with program {was} (now {now})" in differs(program="ab" * 32)
 
 
 class Panic(BaseException):
@@ -847,8 +868,8 @@ def test_images_wait_for_room(renders, tmp_path, monkeypatch):
 
     monkeypatch.setattr(ImageLoader, "read", reading)
     monkeypatch.setattr(ImageWorker, "encode", encoding)
-    large = host_bytes(jobs[1], 1, ("png",), ())
-    assert large == 24 * 32 * (12 + 3)
+    large = host_bytes(jobs[1], worker.chain, 1, ("png",), ())
+    assert large == 24 * 32 * (6 + 3 + 1)
     for room, most in ((1, 1), (2 * large, 2), (100 * large, 4)):
         seen.clear()
         outcomes = list(Batch(worker, [None], threads=4, room=room).run(jobs))
@@ -862,11 +883,15 @@ def test_images_wait_for_room(renders, tmp_path, monkeypatch):
 
 
 def test_what_images_take(tmp_path, write_exr):
+    chain = Request().chain()
     exr = Job(write_exr("a.exr", np.zeros((10, 20, 3), np.float32)), "a")
-    assert host_bytes(exr, 1, ("jpg",), ()) == 200 * (12 + 3)
-    assert host_bytes(exr, 3, ("jpg", "exr"), ("mosaic",)) == 200 * (12 + 3 * 27)
+    assert host_bytes(exr, chain, 1, ("jpg",), ()) == 200 * (6 + 3 + 1)
+    deep = 200 * (6 + 3 * (3 + 12 * 2 + 24))
+    assert host_bytes(exr, chain, 3, ("jpg", "exr"), ("mosaic",)) == deep
+    smaller = Request({"stages": ["exposure", "resize"], "resize": {"scale": 0.5}}).chain()
+    assert host_bytes(exr, smaller, 1, ("exr",), ()) == 200 * 6 + 50 * (3 + 12 + 24)
     raw = tmp_path / "a.nef"
     raw.write_bytes(bytes(1000))
     other = raw.rename(tmp_path / "b.nef")
-    assert host_bytes(Job(other, "b"), 1, ("dng",), ()) == 1000 * 27
-    assert host_bytes(Job(tmp_path / "missing.exr", "c"), 1, ("jpg",), ()) == 0
+    assert host_bytes(Job(other, "b"), chain, 1, ("dng",), ()) == 1000 * (4 + 3 + 12 + 12)
+    assert host_bytes(Job(tmp_path / "missing.exr", "c"), chain, 1, ("jpg",), ()) == 0

@@ -33,6 +33,7 @@ from clpipe.engine.device import open_devices
 from clpipe.engine.discovery import shared_out
 from clpipe.engine.hardware import Hardware
 from clpipe.inputs.find import Job
+from clpipe.outputs.existing import AS_USUAL
 from tests.conftest import ROOT
 
 IMAGES = 40
@@ -246,7 +247,7 @@ def test_a_worker_of_another_make_that_comes_later(clpipe, renders, address, mon
     def earlier(self, jobs):
         probe(self, jobs)
         self._spec = replace(
-            self._spec, environment=WorkerEnvironment("0.1.0", "a device that was there", "")
+            self._spec, environment=replace(worker_environment(("numpy",)), device="another")
         )
 
     monkeypatch.setattr(cluster.Cluster, "_probe", earlier)
@@ -270,7 +271,7 @@ def test_a_worker_sees_the_same_files(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "probe").touch()
     first = Job(Path("a.exr"), "a.exr")
-    options = (("numpy",), None, None, False, False, False, "run", tmp_path)
+    options = (("numpy",), None, None, AS_USUAL, False, "run", tmp_path)
     spec = RunSpec(Request(formats=("jpg",)), Path("out"), *options).anchored()
     spec = replace(spec, first=spec.anchored_job(first))
     assert probe_worker(spec, "probe", None).startswith("does not see the output folder")

@@ -204,6 +204,7 @@ def test_mosaics_are_grey(tmp_path):
         ),
         (("a.png", "mosaic.exr", "-o", "f.png"), "mosaic that does not say its levels"),
         (("a.png", "shot.DNG", "-o", "f.png"), "shot.DNG: a camera raw, which is not read here"),
+        (("a.png", "loop.png", "-o", "f.png"), "loop.png: cannot be read: Too many levels of"),
     ],
 )
 def test_what_is_refused(arguments, message, clpipe, tmp_path, write_png, write_exr):
@@ -212,6 +213,7 @@ def test_what_is_refused(arguments, message, clpipe, tmp_path, write_png, write_
     write_png("small.png", np.full((40, 50, 3), 0.5))
     write_exr("mosaic.exr", np.full((80, 120, 1), 500), "Y")
     (tmp_path / "shot.DNG").write_bytes(b"II*\0")
+    (tmp_path / "loop.png").symlink_to("loop.png")
     before = (tmp_path / "b.png").read_bytes()
     assert message in clpipe("compare", *arguments, status=(1, 2)).output
     assert not (tmp_path / "f.png").exists()

@@ -100,6 +100,15 @@ def test_what_agrees_or_cannot_be_proven_is_left_as_it_is(pocl):
     assert names(candidates(intel, SimpleNamespace(version="OpenCL 3.0"))) == [""]
 
 
+def test_a_pocl_that_names_no_cpu_chooses_by_itself():
+    version = "OpenCL 3.0 PoCL HSTR: pthread-aarch64-unknown-linux-gnu-(null)"  # Debian 12's
+    debian = SimpleNamespace(name="Portable Computing Language", version=POCL.replace("3.0", "3.1"))
+    assert own_target(version) is None
+    assert candidates(debian, SimpleNamespace(version=version)) == [
+        Target("", "the driver's choice")
+    ]
+
+
 def test_a_target_can_be_forced(pocl):
     assert names(pocl("znver3", AVX512, forced="sandybridge")) == ["sandybridge"]
     (left,) = pocl("znver3", AVX512, place=None, forced="sandybridge")

@@ -10,7 +10,11 @@ import pytest
 from PIL import Image
 
 from clpipe.batch.run_log import read_log
-from clpipe.outputs.sidecar import outputs_in
+from clpipe.chain.formats import EVERY_FORMAT, ending_of
+from clpipe.images.whole import is_whole
+from clpipe.outputs.existing import is_marked
+from clpipe.outputs.sealed import outputs_in
+from tests.conftest import reseal
 
 RUN = ("-o", "out", "--device", "numpy", "--keep", "normalize", "--truth", "mosaic")
 MADE = ("a.jpg", "a.normalize.exr", "a.truth_mosaic.exr")
@@ -45,7 +49,7 @@ def damaged(path: Path, how: str) -> None:
 
 
 @pytest.mark.parametrize("name", MADE)
-@pytest.mark.parametrize("how", ["gone", "empty", "zeros", "cut", "long", "flipped"])
+@pytest.mark.parametrize("how", ["gone", "empty", "zeros", "cut"])
 def test_what_is_missing_or_damaged_is_made_again(again, name, how):
     path = Path("out", name)
     before, status = path.read_bytes(), path.stat()
@@ -58,6 +62,74 @@ def test_what_is_missing_or_damaged_is_made_again(again, name, how):
     assert name in again()
     assert path.read_bytes() == before
     assert again() == []
+
+
+@pytest.mark.parametrize("name", MADE)
+@pytest.mark.parametrize("how", ["long", "flipped"])
+def test_what_is_whole_and_was_changed_is_somebodys(again, clpipe, name, how):
+    path = Path("out", name)
+    before, status = path.read_bytes(), path.stat()
+    damaged(path, how)
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))  # it looks as old as before
+    changed = path.read_bytes()
+    for option in ((), ("--verify",), ("--set", "sharpen.amount=0.3")):
+        said = clpipe("run", "in", *RUN, *option, status=1).stderr
+        sidecar = "a.truth_mosaic.json" if "truth" in name else "a.json"
+        assert f"{path}: was changed since clpipe wrote it (its SHA-256 is not that in " in said
+        assert f"{sidecar})" in said and "move it, " in said and "say --overwrite" in said
+        assert path.read_bytes() == changed
+    assert name in again("--overwrite")
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("format_", [each for each in EVERY_FORMAT if each != "npy"])
+def test_a_picture_that_somebody_edited_is_kept(clpipe, write_exr, format_):
+    write_exr("in/a.exr", np.random.default_rng(1).random((40, 60, 3)))
+    write_exr("in/b.exr", np.full((20, 30, 3), 0.5, np.float32))
+    run = ("run", "in", "-o", "out", "--device", "numpy", "--format", format_)
+    clpipe(*run)
+    path = Path(f"out/a.{ending_of(format_)}")
+    if format_ in ("jpg", "png"):
+        with Image.open(path) as picture:
+            darker, exif = picture.point(lambda value: value // 2), picture.getexif()
+        darker.save(path, exif=exif)
+    else:
+        path.write_bytes(path.read_bytes() + b"and more")
+    changed = path.read_bytes()
+    assert is_marked(path)
+    said = clpipe(*run, status=1).stderr
+    assert f"{path}: was changed since clpipe wrote it" in said
+    assert path.read_bytes() == changed
+    clpipe(*run, "--overwrite")
+
+
+@pytest.mark.parametrize("format_", EVERY_FORMAT)
+def test_of_every_format_what_is_not_whole_is_made_again(clpipe, write_exr, format_):
+    write_exr("in/a.exr", np.random.default_rng(1).random((200, 300, 3)))
+    run = ("run", "in", "-o", "out", "--device", "numpy", "--format", format_)
+    clpipe(*run)
+    path = Path(f"out/a.{ending_of(format_)}")
+    whole = path.read_bytes()
+    for size in (0, 5, 1000, len(whole) // 2):
+        for data in (whole[:size], bytes(len(whole[:size]))):
+            path.write_bytes(data)
+            assert is_whole(path) is False
+            if is_marked(path):  # some of a format's tags are at its end
+                clpipe(*run)
+                assert path.read_bytes() == whole
+
+
+def test_a_run_that_was_killed_between_a_picture_and_its_new_sidecar(again, clpipe, monkeypatch):
+    changed = ("--set", "sharpen.amount=0.3")
+
+    def killed(path, record):
+        raise ZeroDivisionError
+
+    with monkeypatch.context() as patch:
+        patch.setattr("clpipe.batch.work.write_sidecar", killed)
+        clpipe("run", "in", *RUN, *changed, status=1)
+    assert not Path("out/a.json").exists()
+    assert "a.jpg" in again(*changed)
 
 
 def test_verify_reads_everything(again):
@@ -91,7 +163,7 @@ def test_copied_moved_and_dated_elsewhere_it_is_done_still(again, tmp_path):
 def test_a_sidecar_with_a_list_that_is_none_counts_for_nothing(again, value):
     values = json.loads(Path("out/a.json").read_text())
     assert set(outputs_in(values)) == {"a.jpg", "a.normalize.exr"}
-    Path("out/a.json").write_text(json.dumps({**values, "outputs": value}))
+    reseal(Path("out/a.json"), {**values, "outputs": value})
     assert "a.jpg" in again()
 
 
@@ -137,3 +209,69 @@ def test_every_format_marks_its_files(clpipe, write_exr):
     clpipe(*run)
     Path("out/a.json").unlink()
     clpipe(*run)  # a killed run may have left pictures without a sidecar: they are ours
+
+
+def test_pictures_of_inputs_that_are_gone_are_counted(clpipe, write_exr):
+    for name in ("in/a", "in/b", "in/sub/c", "other/d"):
+        write_exr(f"{name}.exr", np.full((8, 8, 3), 0.3, np.float32))
+    run = ("-o", "out", "--device", "numpy")
+    clpipe("run", "other", *run)
+    clpipe("run", "in", *run, "--truth", "clean")
+    there = "not there any more"
+    Path("other/d.exr").unlink()
+    assert there not in clpipe("run", "in", *run).stderr  # that is not looked at
+    Path("in/b.exr").unlink()
+    said = clpipe("run", "in", *run, "--truth", "clean").stderr
+    assert said.endswith("\n2 pictures in out are of inputs that are not there any more\n")
+    Path("in/sub/c.exr").unlink()
+    for given in ("in", "./in/", "in/*.exr", "in/a.exr"):
+        count = 4 if given in ("in", "./in/") else 2  # b and its truth; so with c
+        told = clpipe("run", given, *run).stderr
+        assert f"\n{count} pictures in out are of inputs that are {there}" in told
+    for option in (("--quiet",), ("--shard", "1/2"), ("--json-lines",)):
+        assert there not in clpipe("run", "in", *run, *option).output
+
+
+@pytest.fixture
+def program(monkeypatch):
+    """Be another program from now on."""
+
+    def be(digest):
+        for module in ("existing", "sidecar"):
+            monkeypatch.setattr(f"clpipe.outputs.{module}.program_digest", lambda: digest)
+
+    return be
+
+
+def test_pictures_of_another_program_are_made_again_and_that_is_said(again, clpipe, program):
+    program("f" * 64)
+    stderr = clpipe("run", "in", *RUN).stderr
+    assert "2 pictures were made by another clpipe" in stderr
+    assert "and are made again; --keep-old keeps such pictures" in stderr
+    assert again() == []
+    assert "another clpipe" not in clpipe("run", "in", *RUN).stderr
+    assert read_log(Path("out/run.jsonl"))[-1]["of_another_program"] == 0
+
+
+def test_pictures_of_another_program_can_be_kept(again, clpipe, program):
+    before = Path("out/a.jpg").read_bytes()
+    program("f" * 64)
+    for options in (("--keep-old",), ("--keep-old", "--verify")):
+        assert "and stay (--keep-old)" in clpipe("run", "in", *RUN, *options).stderr
+        assert again("--keep-old") == []
+    assert Path("out/a.jpg").read_bytes() == before
+    damaged(Path("out/a.jpg"), "cut")
+    assert "a.jpg" in again("--keep-old")  # it is kept where it is whole
+
+
+def test_a_tar_of_another_program(clpipe, write_exr, program):
+    write_exr("in/a.exr", np.full((8, 8, 3), 0.25, np.float32))
+    run = ("run", "in", *RUN, "--webdataset", "2")
+    clpipe(*run)
+    program("f" * 64)
+    before = Path("out/000000.tar").read_bytes()
+    assert "and stay (--keep-old)" in clpipe(*run, "--keep-old").stderr
+    assert Path("out/000000.tar").read_bytes() == before
+    assert "and are made again" in clpipe(*run).stderr
+    assert Path("out/000000.tar").read_bytes() != before
+    assert "another clpipe" not in clpipe(*run).stderr

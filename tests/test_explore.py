@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from contextlib import closing
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -32,7 +33,7 @@ pytest.importorskip("starlette")
 
 from clpipe.explorer.explorer import Explorer
 from clpipe.explorer.export import exported, inputs_of, options_of, run_command
-from clpipe.explorer.server import Server
+from clpipe.explorer.server import Server, in_json
 from clpipe.explorer.views import View
 
 NOISY = {
@@ -395,6 +396,32 @@ def test_a_browser_that_goes_away_leaves_the_others_alone(served, caplog, reques
             gone.sendall(sent)
     assert pixels_of(answer(served, "develop", question | place))[1].shape == (63, 96, 3)
     assert not caplog.records
+
+
+def test_a_connection_that_asks_nothing_whole_is_not_held(served, monkeypatch):
+    monkeypatch.setattr("clpipe.explorer.patience.PATIENCE", 0.5)
+    parts = urlsplit(served)
+    head = f"POST {parts.path}start HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 2\r\n"
+    whole = f"{head}\r\n{{}}".encode()
+    for sent in (b"", head.encode(), whole[:-1], whole + head.encode()):
+        with socket.create_connection((parts.hostname, parts.port)) as slow:
+            slow.settimeout(20)
+            slow.sendall(sent)
+            received = b"".join(iter(lambda: slow.recv(1 << 16), b""))  # until it is closed
+        assert (b" 200 " in received[:20]) == sent.startswith(whole)
+
+
+def test_a_question_may_take_longer_to_answer_than_to_ask(explorer, monkeypatch):
+    monkeypatch.setattr("clpipe.explorer.patience.PATIENCE", 0.2)
+    monkeypatch.setattr(Server, "_start", lambda self, question: time.sleep(1) or in_json({}))
+    slow = Server(explorer)
+    thread = threading.Thread(target=slow.run, daemon=True)
+    thread.start()
+    try:
+        assert answer(slow.address, "start", {})[0] == 200
+    finally:
+        slow.stop()
+        thread.join(10)
 
 
 def test_two_explorers_at_once(served, renders):

@@ -40,6 +40,16 @@ def test_the_installed_package_works_from_anywhere(tmp_path):
     assert (tmp_path / "out" / "still_life.jpg").is_file()
 
 
+def test_the_sdist_has_all_that_lies_beside_the_package():
+    table = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+    included = table["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
+    others = {"pyproject.toml", ".gitignore", ".ci"}  # hatch's own, and of no use elsewhere
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("there is no git repository")
+    assert {name.partition("/")[0] for name in listed.stdout.split()} <= {*included, *others}
+
+
 @pytest.mark.parametrize(
     ("command", "message"),
     [

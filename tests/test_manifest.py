@@ -433,3 +433,24 @@ def test_a_row_completes_and_replaces_what_options_set(tmp_path, monkeypatch):
     assert sigma(own, "picture_noise.measured=rows/noise.json") == (0.3, 0.3, 0.3)
     with pytest.raises(RequestError, match="picture_noise: needs sigma, or measured"):
         sigma(("iso", "400"))
+
+
+def test_values_that_rows_share_are_checked_once(tmp_path, monkeypatch):
+    rows = [f"{number}{ending}.{ending},rggb" for number in range(50) for ending in ("dng", "exr")]
+    (tmp_path / "m.csv").write_text("path,mosaic.method\n" + "\n".join(rows))
+    overlaid = []
+
+    def counted(settings, values):
+        overlaid.append(values)
+        return settings
+
+    monkeypatch.setattr("clpipe.inputs.manifest.overlay", counted)
+    without_mosaic = settings_from({"stages": ["exposure"]})
+    rows = read_manifest(tmp_path / "m.csv")
+    carries = [row.path.suffix == ".dng" for row in rows]
+    assert carries[:2] == [True, False]
+    with pytest.raises(RequestError, match="row 3: unknown stage in this chain 'mosaic'"):
+        check_rows(rows, without_mosaic, lambda path: path.suffix == ".dng")
+    checked = check_rows(rows, settings_from({}), lambda path: path.suffix == ".dng")
+    assert len(checked) == 100
+    assert len(overlaid) == 1 + 50 + 2  # the faulty ones are named one by one

@@ -16,7 +16,7 @@ from clpipe.analysis.matching.columns import (
     figures_of,
     noise_of_frames,
 )
-from clpipe.analysis.matching.scenes import Scenes, held_out, load_scenes
+from clpipe.analysis.matching.scenes import Scenes, expand, held_out, load_scenes
 from clpipe.analysis.matching.simulation import Simulator
 from clpipe.analysis.matching.space import (
     Choice,
@@ -235,6 +235,14 @@ def test_a_smaller_picture_is_sharpened_before_or_after():
         names = choice.over(Settings()).stages
         assert [name for name in names if name in order] == order
         assert names[-3:] == ("tone_curve", "gamma", "picture_noise")
+
+
+def test_a_name_with_brackets_is_no_glob_where_it_exists(tmp_path):
+    for name in ("a[1].jpg", "a1.jpg"):
+        (tmp_path / name).touch()
+    assert expand([str(tmp_path / "a[1].jpg")], "FRAME") == [tmp_path / "a[1].jpg"]
+    (tmp_path / "a[1].jpg").unlink()
+    assert expand([str(tmp_path / "a[1].jpg")], "FRAME") == [tmp_path / "a1.jpg"]
 
 
 def test_a_third_is_kept_out_of_the_search(burst, tmp_path):

@@ -308,6 +308,20 @@ def test_what_is_wrong_with_all_is_refused(clpipe, renders):
     assert Path("o/transforms.json").read_text() == "{}"
 
 
+def test_renders_that_are_named_as_the_files_of_cameras(clpipe, write_exr):
+    for name in ("cameras", "transforms", "a"):
+        write_exr(f"in/{name}.exr", np.full((8, 8, 3), 0.25))
+    run = ("run", "in", "-o", "out", "--device", "numpy", *sets("output", fx=30, fy=30))
+    clpipe(*run)
+    before = {path: path.read_bytes() for path in Path("out").glob("*.json")}
+    for _ in range(2):
+        said = clpipe("poses", "out").output
+        assert "wrote out/sparse/0/cameras.txt: 3 pictures" in said
+        assert "warning: out/cameras.json is the sidecar of a picture" in said
+        assert {path: path.read_bytes() for path in Path("out").glob("*.json")} == before
+    assert "there already" in clpipe(*run).stderr
+
+
 def test_views_are_found_by_paths_and_by_names_that_are_unique(clpipe, write_exr):
     for name in ("a/1", "b/1", "b/2"):
         write_exr(f"in/{name}.exr", np.full((6, 8, 3), 0.2))

@@ -18,6 +18,7 @@ from clpipe.images.write import write_exr as write
 from clpipe.reports.figures import last_failures, sessions
 from clpipe.reports.run import read_run
 from clpipe.reports.shown import places_of
+from tests.conftest import reseal
 
 pytest.importorskip("jinja2")
 
@@ -155,7 +156,7 @@ def test_the_law_is_held_against_raws(out):
     record = json.loads(sidecar.read_text())
     asked = record["noise"]["signal"]["a"]
     text = sidecar.read_text().replace(f'"a": {asked}, "b"', f'"a": {asked * 1.5}, "b"')
-    sidecar.write_text(text)
+    reseal(sidecar, json.loads(text))
     page = report(out)
     assert page.said.count("leaves the law") == 1
     assert page.data["look-data"][0]["name"] == "a"  # it is shown first
@@ -184,7 +185,7 @@ def test_half_a_run_and_a_log_that_is_cut_off(out):
     (out / "notes.json").write_text('{"mine": 1}')
     page = report(out)
     assert "cut off, or still going" in page.said
-    assert "b.json: is cut off or damaged" in page.said and "notes" not in page.said
+    assert "b.json: was changed since clpipe wrote it" in page.said and "notes" not in page.said
     assert [entry["name"] for entry in page.data["sheet-data"]] == [HOSTILE, "a"]
 
 
@@ -197,9 +198,7 @@ def test_hostile_sidecars(out):
     }
     record["stages"] = [{"name": "</style>", "method": [], "parameters": {"<i>": {"a": 1}}}, 3]
     record["noise"], record["device"], record["versions"] = 7, "none", [1]
-    beginning = '{\n  "clpipe": "0.1.0",\n  '
-    rest = json.dumps({key: value for key, value in record.items() if key != "clpipe"})
-    (out / "a.json").write_text(beginning + rest[1:])
+    reseal(out / "a.json", record)
     page = report(out)
     assert "</script><script>alert(1)" not in page.text
     assert "</script><script>alert(1)</script>" in page.said
@@ -372,6 +371,6 @@ def test_a_run_is_read_from_its_sidecars(out):
     sidecar = out / "a.json"
     whole = json.loads(sidecar.read_text())
     assert list(steps[1].values()) == whole["stages"]
-    sidecar.write_text('{\n  "clpipe": ' + json.dumps(whole, indent=3)[len('{\n   "clpipe": ') :])
+    reseal(sidecar, {**whole, "stages": tuple(whole["stages"])})  # in one line
     again = next(made for made in read_run(out).pictures if made.name == "a")
     assert again.record == run.of_image("a")[""].record

@@ -14,6 +14,7 @@ from clpipe.chain.settings import settings_from
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.stage import Method
+from tests.conftest import reseal
 
 OPTIONS = {
     "config": "paper",
@@ -76,12 +77,17 @@ def test_records_are_equal_where_the_bytes_of_a_picture_are(change):
         {"image_name": 3},
         {"until": ["demosaic"]},
         {"options": [1]},
+        {"layer": []},
+        {"patch": 7},  # and no number of them
+        {"patch": "grid"},
+        {"patch": 7, "patches_per_image": 10**30},
+        {"augment": 1},
     ],
 )
 def test_a_damaged_record(damage):
     with pytest.raises(RequestError, match=r"formats|damaged"):
         Request.from_record({**Request().record(), **damage})
-    with pytest.raises(RequestError, match="damaged: 'config'"):
+    with pytest.raises(RequestError, match="damaged: config: it is missing"):
         Request.from_record({})
 
 
@@ -165,7 +171,7 @@ def test_no_code_comes_from_a_sidecar(clpipe, write_exr, monkeypatch):
     ):
         forget()
         edited = {**record, "request": {**request, **changes}}
-        Path("edited.json").write_text(json.dumps(edited))
+        reseal(Path("edited.json"), edited)
         stderr = clpipe(*replay, "edited.json", status=2).stderr
         assert "--stage-file" in stderr or "unknown stage" in stderr
         assert not Path("ran").exists()

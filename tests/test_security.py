@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from clpipe.images.write import write_exr
-from tests.conftest import ROOT, written
+from tests.conftest import ROOT, reseal, written
 
 OWN_TEXT = Path(__file__).read_text("utf-8")
 NUMPY = ("--device", "numpy")
@@ -25,6 +25,7 @@ ELSEWHERE = {
     5: ("test_hostile_files", "test_images_that_claim_too_much_are_refused_in_little_memory"),
     6: ("test_hostile_files", "test_names_from_a_file_are_escaped_in_messages"),
     7: ("test_existing", "test_what_is_missing_or_damaged_is_made_again"),
+    8: ("test_kernel_cache", "test_a_folder_that_others_may_write_to_is_not_used"),
 }
 
 
@@ -56,7 +57,7 @@ def test_1_no_data_runs_code(clpipe, render):
 
     def replay(**changes):
         edited = {**values, "request": {**values["request"], **changes}}
-        Path("edited.json").write_text(json.dumps(edited))
+        reseal(Path("edited.json"), edited)
         clpipe("run", "--replay", "edited.json", "-o", "r", *NUMPY, status=(0, 2))
 
     named = {"stage_files": ["evil.py"]}
@@ -84,13 +85,13 @@ def test_2_pictures_stay_below_out(clpipe, render):
     for name in ("../x", "/tmp/x", "a/../../x", "..", "x\0y"):
         Path("in.jsonl").write_text(json.dumps({"path": "in.exr", "name": name}))
         clpipe("run", "in.jsonl", "-o", "deep/out", *NUMPY, status=2)
-        Path("deep/e.json").write_text(json.dumps({**values, "name": name}))
+        reseal(Path("deep/e.json"), {**values, "name": name})
         clpipe("run", "--replay", "deep/e.json", "-o", "deep/out", *NUMPY, status=2)
         edited = {**values, "picture": name}
-        Path("deep/e.json").write_text(json.dumps(edited))
+        reseal(Path("deep/e.json"), edited)
         clpipe("run", "--replay", "deep/e.json", "-o", "deep/out", *NUMPY, status=2)
     for outputs in (["../../in.exr"], [{"name": "../../in.exr", "size": 1, "sha256": ""}]):
-        Path("deep/out/in.json").write_text(json.dumps({**values, "outputs": outputs}))
+        reseal(Path("deep/out/in.json"), {**values, "outputs": outputs})
         clpipe("run", render, "-o", "deep/out", *NUMPY)
     assert written(Path()) == sorted([*before, "deep/e.json", "in.jsonl"])
 
@@ -118,7 +119,7 @@ def test_4_what_never_ends_is_not_read(clpipe, render, device):
     clpipe("run", render, "-o", "out", *NUMPY)
     values = json.loads(Path("out/in.json").read_text())
     values["request"]["files"][str(Path(device).resolve())] = "0" * 64
-    Path("e.json").write_text(json.dumps(values))
+    reseal(Path("e.json"), values)
     for name in ("c.toml", "m.jsonl", "s.json", "x.exr", "x.dng", "x.png", "curve.csv"):
         Path(name).symlink_to(device)
     for arguments in (

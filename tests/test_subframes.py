@@ -1,6 +1,7 @@
 """shutter.subframes: exposures that a renderer gives as several frames."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +76,31 @@ def test_a_run_is_resumed_and_replayed_with_all_frames(frames, clpipe, write_exr
     again = clpipe("run", "--replay", "o/f00.json", "-o", "r2", status=2)
     assert "f05.exr" in again.stderr and "changed" in again.stderr
     assert "there already" not in clpipe("run", "in", "-o", "o", *options).stderr
+
+
+def test_each_frame_is_compared_with_what_it_was(frames, clpipe):
+    run = ("run", "in", "-o", "o", "--set", "shutter.subframes=8", "--device", "numpy")
+
+    def is_made_again():
+        is_made = "there already" not in clpipe(*run).stderr
+        assert "there already" in clpipe(*run).stderr
+        return is_made
+
+    for path in Path("in").iterdir():
+        path.write_bytes(path.read_bytes().ljust(1000, b"\0"))  # all are of one size
+    assert is_made_again()
+    second, fifth = Path("in/f02.exr"), Path("in/f05.exr")
+    second.rename("other")
+    fifth.rename(second)
+    Path("other").rename(fifth)
+    assert is_made_again()
+    fifth.write_bytes(Path("in/f03.exr").read_bytes())
+    os.utime(fifth, (1e9, 1e9))  # of the same size, and older than all
+    assert is_made_again()
+    record = json.loads(Path("o/f00.json").read_text())
+    told = [(each["size"], each["modified"]) for each in record["subframes"]]
+    found = [Path(f"in/f{number:02}.exr").stat() for number in range(8)]
+    assert told == [(status.st_size, status.st_mtime_ns) for status in found]
 
 
 def test_a_dataset_and_a_manifest_group_frames_too(frames, write_exr):

@@ -13,6 +13,7 @@ from clpipe.engine import discovery, trial, verdicts
 from clpipe.engine.cpu_target import Target, compile_for
 from clpipe.engine.discovery import choose, find_devices
 from clpipe.engine.runtimes import attempt, platform_id
+from clpipe.engine.store import Store
 from clpipe.engine.verdicts import Verdicts, tried
 
 
@@ -25,7 +26,7 @@ def program(tmp_path, monkeypatch):
         path.write_text(f"#!/bin/sh\nknown=$(cat)\n{script}\n")
         path.chmod(0o755)
         monkeypatch.setattr(sys, "executable", str(path))
-        monkeypatch.setattr(verdicts, "_path", lambda: tmp_path / "known.json")
+        monkeypatch.setattr(verdicts, "_store", lambda: Store(tmp_path / "known"))
 
     return be
 
@@ -72,7 +73,7 @@ def test_what_says_nothing_of_runtimes_is_not_kept(program, tmp_path, script):
     program(script)
     assert not tried(Verdicts()).lasting
     assert not verdicts.verdicts().problems
-    assert not (tmp_path / "known.json").exists()
+    assert not (tmp_path / "known").exists()
 
 
 def test_a_program_that_cannot_be_started_says_nothing_either(monkeypatch):
@@ -94,17 +95,17 @@ def test_what_is_known_is_not_tried_again_unless_it_failed(program, tmp_path):
     program(f"echo once >> {tmp_path}/runs; {passed}")
     assert verdicts.verdicts() == verdicts.verdicts(again=True) == Verdicts(attempts={"a": ""})
     assert (tmp_path / "runs").read_text() == "once\n"
-    (tmp_path / "known.json").write_text('{"attempts": {"a": "it is wrong"}}')
+    store, state = verdicts._store(), verdicts._state()
+    store.keep(b'{"attempts": {"a": "it is wrong"}}', "runtimes", state)
     assert verdicts.verdicts().problems
     assert not verdicts.verdicts(again=True).problems
-    for damage in ("", "{", "[]", "null", '{"a": 1}', '{"attempts": 3}', '{"attempts": {"a": 1}}'):
-        (tmp_path / "known.json").write_text(damage)
-        assert verdicts.verdicts() == Verdicts(attempts={"a": ""})
+    store.path("runtimes", state).write_bytes(b"damaged")
+    assert verdicts.verdicts() == Verdicts(attempts={"a": ""})
 
 
-def test_the_file_is_bound_to_cpu_drivers_and_environment(monkeypatch):
-    before = verdicts._path()
-    assert before == verdicts._path()
+def test_what_is_known_is_bound_to_cpu_drivers_and_environment(monkeypatch):
+    before = verdicts._state()
+    assert before == verdicts._state()
     changes = {
         "cpu_text": lambda: "another CPU",
         "icd_files": lambda: [("new.icd", "libnew.so")],
@@ -113,9 +114,9 @@ def test_the_file_is_bound_to_cpu_drivers_and_environment(monkeypatch):
     for name, value in changes.items():
         with monkeypatch.context() as patch:
             patch.setattr(verdicts, name, value)
-            assert verdicts._path() != before
+            assert verdicts._state() != before
     monkeypatch.setenv("CLPIPE_CPU_TARGET", "haswell")
-    assert verdicts._path() != before
+    assert verdicts._state() != before
 
 
 def test_a_device_is_tried_for_each_target_it_may_compile_for(device, monkeypatch):
@@ -194,13 +195,19 @@ def test_what_fails_is_passed_over_and_what_helps_is_said(device, monkeypatch):
 def test_a_device_that_was_not_there_is_tried(device, monkeypatch):
     asked = []
 
-    def answer(again=False, missing=False):
-        asked.append(missing)
-        return Verdicts()
+    def answer(again=False, missing=()):
+        asked.extend(missing)
+        return Verdicts(attempts=dict.fromkeys(missing, ""))
 
     monkeypatch.setattr(discovery, "verdicts", answer)
-    assert not next(d for d in find_devices() if d.handle == device.info.handle).problem
-    assert asked[:2] == [False, True]
+    found = next(d for d in find_devices() if d.handle == device.info.handle)
+    assert not found.problem and any(found.name in name for name in asked)
+
+
+def test_what_another_process_does_not_see_is_trusted(program):
+    program(say(attempt="a", problem="", passing=False))
+    assert verdicts.verdicts(missing=["b"]).attempts == {"a": "", "b": ""}
+    assert verdicts.verdicts().attempts == {"a": "", "b": ""}
 
 
 def test_a_runtime_that_is_busy_is_not_blamed(monkeypatch, capfd):

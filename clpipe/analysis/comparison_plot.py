@@ -4,6 +4,7 @@ Everything is placed in whole pixels of 300 dpi, so that each pixel of a crop be
 """
 
 import logging
+import os
 import textwrap
 import warnings
 from collections.abc import Sequence
@@ -50,7 +51,7 @@ def check_name(path: Path, pictures: Sequence[Path]) -> None:
     """
     if path.suffix not in SUFFIXES:
         raise RequestError(f"-o: found {path}; expected a name that ends in {', '.join(SUFFIXES)}")
-    if any(path.resolve() == picture.resolve() for picture in pictures):
+    if os.path.realpath(path) in map(os.path.realpath, pictures):
         raise RequestError(f"-o: {path} is one of the pictures; give the figure another name")
 
 

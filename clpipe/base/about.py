@@ -1,9 +1,9 @@
 """The version of this program, in one place; ``pyproject.toml`` reads it from here.
 
 There are two, because they answer two questions. :data:`__version__` is the release that this is,
-or becomes: it marks files as clpipe's, and a run goes on where one of the same release stopped. It
-says nothing of commits, or each commit would have a developer's pictures made again.
-:func:`full_version` says which code it was, for people: ``--version``, sidecars, measurements.
+or becomes: it marks files as clpipe's. :func:`full_version` says which code it was, for people:
+``--version``, sidecars, measurements. Neither decides what a run makes again: that is the digest of
+:mod:`clpipe.outputs.program`.
 """
 
 from functools import cache

@@ -13,15 +13,9 @@ def stamp_of(path: Path) -> tuple[int, int]:
     """The size of a file in bytes and its time of change in ns; zeros where it has no status."""
     try:
         info = path.stat()
-    except OSError:
+    except (OSError, ValueError):  # or no file can have this name
         return (0, 0)
     return info.st_size, info.st_mtime_ns
-
-
-def stamp_of_all(paths: Sequence[Path]) -> tuple[int, int]:
-    """The size of some files together, and the latest time of change; see :func:`stamp_of`."""
-    sizes, times = zip(*map(stamp_of, paths), strict=True)
-    return sum(sizes), max(times)
 
 
 def digests(files: Iterable[str]) -> dict[str, str]:

@@ -1,12 +1,15 @@
 """Amounts of memory: parsed from text, formatted as text, and how much is free on this machine."""
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 from clpipe.base.control_groups import group_folders
-from clpipe.base.errors import RequestError
+from clpipe.base.errors import DeviceError, RequestError
+from clpipe.base.system import address_space
 
 UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
+NO_LIMIT = 2**60  # bytes; first-version groups without a limit have the largest number of pages
 
 
 def parse_size(text: str) -> int:
@@ -38,13 +41,42 @@ def in_words(size: float) -> str:
     return f"{size / 1024:.1f} KiB"
 
 
-def available_memory(root: Path = Path("/")) -> int | None:
-    """Bytes that this process can still allocate: the least of MemAvailable and its cgroup limits.
+@dataclass(frozen=True)
+class Left:
+    """How many bytes a process can still take, and by what it is limited, in words."""
 
-    None where the system gives neither, as outside Linux. ``root`` is for tests.
+    bytes: int
+    by: str
+
+
+def memory_left(root: Path = Path("/")) -> Left | None:
+    """What this process can still allocate: the least that one of its limits leaves.
+
+    These are MemAvailable, its control groups' and ``ulimit -v``. None where the system has none
+    of them, as outside Linux. ``root`` is for tests.
     """
-    limits = [_available(root / "proc/meminfo"), *_left_in_groups(root)]
-    return min((size for size in limits if size is not None), default=None)
+    limits = [_available(root), *_left_in_groups(root), _left_of_addresses(root)]
+    return min(filter(None, limits), key=lambda left: left.bytes, default=None)
+
+
+def available_memory(root: Path = Path("/")) -> int | None:
+    """The bytes of :func:`memory_left`."""
+    left = memory_left(root)
+    return left.bytes if left else None
+
+
+def check_addresses(needed: int, what: str) -> None:
+    """See that ``ulimit -v`` leaves so many bytes; libraries crash where it does not.
+
+    Raises:
+        DeviceError: it does not.
+    """
+    left = _left_of_addresses(Path("/"))
+    if left and left.bytes < needed:
+        raise DeviceError(
+            f"{what} takes about {in_words(needed)} of address space; {in_words(left.bytes)} are "
+            f"left by {left.by}; allow more"
+        )
 
 
 def peak_memory(root: Path = Path("/")) -> int | None:
@@ -55,8 +87,17 @@ def peak_memory(root: Path = Path("/")) -> int | None:
     return _listed(root / "proc/self/status", "VmHWM")
 
 
-def _available(meminfo: Path) -> int | None:
-    return _listed(meminfo, "MemAvailable")
+def _available(root: Path) -> Left | None:
+    size = _listed(root / "proc/meminfo", "MemAvailable")
+    return None if size is None else Left(size, "this machine's memory")
+
+
+def _left_of_addresses(root: Path) -> Left | None:
+    """What is left of the limit of ``ulimit -v``, which also counts what is reserved."""
+    limit, used = address_space(), _listed(root / "proc/self/status", "VmSize")
+    if limit is None or used is None:
+        return None
+    return Left(max(limit - used, 0), f"ulimit -v, which is {in_words(limit)}")
 
 
 def _listed(path: Path, name: str) -> int | None:
@@ -68,23 +109,30 @@ def _listed(path: Path, name: str) -> int | None:
     return int(match[1]) * 1024 if match else None
 
 
-def _left_in_groups(root: Path) -> list[int | None]:
-    """Bytes left in each control group of this process and in its parents."""
-    first = ("memory.limit_in_bytes", "memory.usage_in_bytes")
-    second = ("memory.max", "memory.current")
+def _left_in_groups(root: Path) -> list[Left | None]:
+    """What is left in each control group of this process and in its parents."""
+    first = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_{}_file", "total_mapped_file")
+    second = ("memory.max", "memory.current", "{}_file", "file_mapped")
     return [
         _left_in_group(folder, *(first if is_first_version else second))
         for folder, is_first_version in group_folders("memory", root)
     ]
 
 
-def _left_in_group(folder: Path, limit: str, used: str) -> int | None:
-    """Bytes left in one group; None without a limit. Cached files count as free: they can go."""
+def _left_in_group(folder: Path, limit: str, used: str, cached: str, mapped: str) -> Left | None:
+    """What is left in one group; None without a limit.
+
+    Cached files count as free, since they can go, but for those that programs run from.
+    """
     try:
-        rest = int((folder / limit).read_text("utf-8")) - int((folder / used).read_text("utf-8"))
-        files = re.search(
-            r"^inactive_file (\d+)", (folder / "memory.stat").read_text("utf-8"), re.MULTILINE
-        )
+        most = int((folder / limit).read_text("utf-8"))
+        if most >= NO_LIMIT:
+            return None
+        rest = most - int((folder / used).read_text("utf-8"))
+        lines = (folder / "memory.stat").read_text("utf-8").splitlines()
     except (OSError, ValueError):  # not there, or "max": no limit
         return None
-    return max(rest + (int(files[1]) if files else 0), 0)
+    values = {name: int(value) for name, _, value in (line.partition(" ") for line in lines)}
+    both = (values.get(cached.format(state), 0) for state in ("active", "inactive"))
+    files = max(sum(both) - values.get(mapped, 0), 0)
+    return Left(max(rest + files, 0), f"its control group's limit, which is {in_words(most)}")

@@ -5,6 +5,7 @@ is used, whichever system it is.
 """
 
 import contextlib
+import ctypes
 import errno
 import importlib
 import os
@@ -29,6 +30,8 @@ fcntl, msvcrt, resource = (_optional(name) for name in ("fcntl", "msvcrt", "reso
 # Bytes of a file that can be held, of which none need be there. Windows's C runtime counts with
 # 31 bits.
 HOLDABLE = 2**40 if fcntl else 2**30
+
+_ARENA_MAX = -8  # of glibc's mallopt: the most heaps
 
 # Without O_BINARY, Windows writes "\r\n" for "\n".
 _PLAIN = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
@@ -199,6 +202,30 @@ def largest_file() -> int | None:
         return None
     limit = int(resource.getrlimit(resource.RLIMIT_FSIZE)[0])
     return None if limit == resource.RLIM_INFINITY else limit
+
+
+def address_space() -> int | None:
+    """The most bytes of addresses of this process (``ulimit -v``); None without a limit."""
+    if not resource:
+        return None
+    limit = int(resource.getrlimit(resource.RLIMIT_AS)[0])
+    return None if limit == resource.RLIM_INFINITY else limit
+
+
+def save_addresses() -> None:
+    """Have all threads of this process, and of its children, share one heap.
+
+    The C library reserves 64 MiB of addresses for the heap of each thread, of which it uses little.
+    """
+    os.environ["MALLOC_ARENA_MAX"] = "1"
+    with contextlib.suppress(OSError, TypeError, AttributeError):  # another C library
+        ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)
+
+
+def give_back_memory() -> None:
+    """Give memory that was freed, and that the C library keeps for later, back to the system."""
+    with contextlib.suppress(OSError, TypeError, AttributeError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def bring_to_disk(folder: Path) -> None:

@@ -28,7 +28,9 @@ from clpipe.engine.discovery import DeviceInfo, choose_all, find_devices
 from clpipe.images.write import versions
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
+from clpipe.outputs.existing import Resuming
 from clpipe.outputs.folder import write_problem
+from clpipe.outputs.program import program_digest
 from clpipe.outputs.writer import OutputWriter
 
 
@@ -42,7 +44,7 @@ class RunSpec:
         selectors: of the devices, as ``--device`` has them.
         memory: of a device, in bytes; None is what is free.
         threads: as for :class:`clpipe.batch.threads.Batch`.
-        overwrite, verify, trace: as for :class:`clpipe.batch.work.ImageWorker`.
+        resuming, trace: as for :class:`clpipe.batch.work.ImageWorker`.
         run: a name that no other run has.
         folder: where relative paths start.
         workers: the addresses of all workers there are.
@@ -55,8 +57,7 @@ class RunSpec:
     selectors: tuple[str, ...]
     memory: int | None
     threads: int | None
-    overwrite: bool
-    verify: bool
+    resuming: Resuming
     trace: bool
     run: str = field(default_factory=lambda: secrets.token_hex(8))
     folder: Path = field(default_factory=Path.cwd)
@@ -97,6 +98,7 @@ class WorkerEnvironment:
     """What the bytes of a picture depend on, the same on all workers of a run."""
 
     version: str
+    program: str
     device: str
     libraries: str
 
@@ -155,7 +157,10 @@ def worker_environment(selectors: Sequence[str]) -> WorkerEnvironment:
         device = " and ".join(sorted({device_text(info) for info in chosen}))
     libraries = {"NumPy": np.__version__, **versions()}
     return WorkerEnvironment(
-        __version__, device, ", ".join(f"{k} {v}" for k, v in libraries.items())
+        __version__,
+        program_digest()[:12],
+        device,
+        ", ".join(f"{k} {v}" for k, v in libraries.items()),
     )
 
 
@@ -237,7 +242,7 @@ def _batch(spec: RunSpec, threads: int, share: tuple[int, int]) -> Batch:
     assert spec.first
     loader, writer = ImageLoader(spec.request, spec.folder), OutputWriter(spec.output, spec.request)
     chain = loader.first_chain([spec.first])
-    worker = ImageWorker(loader, writer, chain, spec.overwrite, spec.verify, spec.trace)
+    worker = ImageWorker(loader, writer, chain, spec.resuming, spec.trace)
     devices = _devices(spec.selectors, spec.memory, share)
     return Batch(worker, devices, spec.threads or threads, usual_room(share[1]))
 

@@ -44,6 +44,7 @@ class Outcome:
         began: in s since 1970.
         spans: what was done when.
         clipped: the share of clipped pixels, 0 to 1; of several renditions, the largest.
+        old: how many of its renditions are there, but were made by another program.
     """
 
     job: Job
@@ -56,6 +57,7 @@ class Outcome:
     began: float = 0.0
     spans: tuple[Span, ...] = ()
     clipped: float = 0.0
+    old: int = 0
 
     def seconds(self, step: str) -> float:
         """How many seconds a step took, over all renditions of the image."""

@@ -1,5 +1,6 @@
 """Makes a picture again from its sidecar: the same bytes, or a reason why not."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,11 +12,10 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.registry import code_files
 from clpipe.chain.request import Request
-from clpipe.engine.device import Device
 from clpipe.inputs.find import Job
 from clpipe.inputs.manifest import check_output_name
 from clpipe.outputs.renditions import RenditionPlan, baseline_named, bracket_in, truth_named
-from clpipe.outputs.sidecar import OWN, all_versions, device_record, read_sidecar
+from clpipe.outputs.sealed import SidecarError, outputs_in, read_sidecar
 
 CODE = (".py", ".cl")  # the endings of files that are run
 
@@ -27,27 +27,58 @@ class Replay:
     Args:
         request: what the sidecar says was asked for.
         job: the image, and the rendition of it.
-        made: what the sidecar says of the device and the versions of libraries.
+        made: what the sidecar says of the program, the device and the versions of libraries.
+        outputs: the SHA-256 of the files that it lists, by their names.
     """
 
     request: Request
     job: Job
     made: Mapping[str, str]
+    outputs: Mapping[str, str]
 
-    def warning(self, device: Device | None) -> str:
-        """Why the bytes may differ after all on a device; "" where nothing is known."""
-        now = surroundings(device)
+    def comparison(self, sidecar: Path) -> tuple[bool, str]:
+        """Whether the picture's bytes are the same, and in words, with what differs if not.
+
+        ``sidecar`` is that of the picture that was made again.
+
+        Raises:
+            ImageError: there is none, or it is damaged.
+        """
+        try:
+            values = read_sidecar(sidecar)
+        except FileNotFoundError:
+            raise ImageError(f"{sidecar}: it is not there any more") from None
+        made, now = digests_in(values), surroundings_in(values)
+        others = sorted(n for n in {*self.outputs, *made} if self.outputs.get(n) != made.get(n))
+        if not others:
+            return True, "the same bytes"
         changed = [
-            f"{what} {was or 'unknown'} (now {now[what] or 'unknown'})"
+            f"{what} {short(was) or 'unknown'} (now {short(now.get(what, '')) or 'unknown'})"
             for what, was in self.made.items()
-            if was != now[what]
+            if was != now.get(what)
         ]
-        return f"was made with {', '.join(changed)}; the bytes may be others" if changed else ""
+        why = f"made with {', '.join(changed)}" if changed else "by the same program and device"
+        return False, f"other bytes ({', '.join(others)}): {why}"
 
 
-def surroundings(device: Device | None) -> dict[str, str]:
-    """What the bytes of a picture depend on beside the request, by name, as a sidecar has it."""
-    return {**flat(device_record(device)), **all_versions()}
+def digests_in(values: Mapping[str, Any]) -> dict[str, str]:
+    """The SHA-256 of the files that a sidecar's values list, by their names."""
+    return {name: str(each["sha256"]) for name, each in outputs_in(values).items()}
+
+
+def short(value: str) -> str:
+    """A digest as far as people tell such apart; other values as they are."""
+    return value[:12] if re.fullmatch("[0-9a-f]{64}", value) else value
+
+
+def surroundings_in(values: Mapping[str, Any]) -> dict[str, str]:
+    """What the bytes of a picture depend on beside the request, by name, by a sidecar's values.
+
+    Raises:
+        KeyError, TypeError, AttributeError: they are damaged.
+    """
+    versions = {name: str(version) for name, version in values["versions"].items()}
+    return {"program": str(values["program"]), **flat(values["device"]), **versions}
 
 
 def flat(device: Mapping[str, Any]) -> dict[str, str]:
@@ -112,8 +143,10 @@ def _values(path: Path) -> dict[str, Any]:
     try:
         values = read_sidecar(path)
     except FileNotFoundError:
-        reason = "it is damaged: no whole JSON in UTF-8" if path.exists() else "no such file"
-        raise RequestError(f"{path}: {reason}") from None
+        reason = "it is empty" if path.exists() else "no such file"
+        raise RequestError(f"{path}: {reason}; --replay takes a sidecar") from None
+    except SidecarError as error:
+        raise RequestError(str(error)) from None
     except ImageError:
         raise RequestError(
             f"{path}: clpipe did not write this file; --replay takes a sidecar"
@@ -156,8 +189,7 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
         pictures=(picture,),
         subframes=others,
     )
-    were = {OWN: values[OWN], **flat(values["device"]), **values["versions"]}
-    return Replay(request, job, {what: str(were[what]) for what in surroundings(None)})
+    return Replay(request, job, surroundings_in(values), digests_in(values))
 
 
 def _check_code(path: Path, code: Mapping[str, str], stage_files: Sequence[Path]) -> None:

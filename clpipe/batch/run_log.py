@@ -48,10 +48,12 @@ class Summary:
     interrupted: bool = False
     much_clipped: int = 0  # images of which a share of MUCH or more is clipped
     most_clipped: tuple[float, str] = (0.0, "")  # the largest share, and its image
+    old: int = 0  # pictures that were there, but were made by another program
 
     def add(self, outcome: Outcome) -> None:
         """Count one more image."""
         self.counts[outcome.status] += 1
+        self.old += outcome.old
         if outcome.status == DONE:
             self.megapixels += outcome.megapixels
             self.much_clipped += outcome.clipped >= MUCH
@@ -94,6 +96,7 @@ class Summary:
             "images": self.total,
             **{status.replace(" ", "_"): n for status, n in self.counts.items()},
             "interrupted": self.interrupted,
+            "of_another_program": self.old,
             "megapixels": round(self.megapixels, 3),
             "seconds": round(self.elapsed, 3),
             "peak_memory": peak_memory(),

@@ -3,6 +3,7 @@
 The pictures of a tar are first written to a hidden folder, and packed when all are there.
 """
 
+import hashlib
 import os
 import shutil
 import tarfile
@@ -25,9 +26,10 @@ from clpipe.chain.chain import Chain
 from clpipe.engine.device import Device
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.existing import Existing, is_current
+from clpipe.outputs.existing import AS_USUAL, Existing, Found, Resuming, found_in
 from clpipe.outputs.folder import RESUMABLE
-from clpipe.outputs.sidecar import SIDECAR, outputs_in, patch_text, read_sidecar
+from clpipe.outputs.sealed import SIDECAR, outputs_in, read_sidecar
+from clpipe.outputs.sidecar import patch_text
 from clpipe.outputs.writer import OutputWriter
 
 # Where the bytes of a member are: in a file, or at an offset and size in the old tar; or they.
@@ -80,25 +82,30 @@ class Packer:
     def _packed_as(self, path: Path) -> str:
         return path.relative_to(self._tar.staging).as_posix()
 
-    def has(self, job: Job, name: str, request: Mapping[str, Any], verify: bool) -> bool:
-        """Whether the tar holds a rendition that was made by the same request; it is then reused.
+    def found(self, job: Job, name: str, request: Mapping[str, Any], resuming: Resuming) -> Found:
+        """Whether the tar holds a rendition that was made by the same request.
 
-        A tar does not say when its files were touched, so their SHA-256 is always compared.
-        Arguments as for :meth:`clpipe.outputs.existing.Existing.is_done`.
+        If it is kept, it is reused. A tar does not say when its files were touched, so their
+        SHA-256 is always compared. Arguments as for
+        :meth:`clpipe.outputs.existing.Existing.found`.
         """
         member = self._member(job, name)
         with self._lock:
             values = self._old.sidecar(member)
         listed = outputs_in(values)
         pictures = {path.name for path in self._writer.existing(job, name).pictures}
-        if not pictures <= listed.keys() or not is_current(values, job, request, verify):
-            return False
+        if not pictures <= listed.keys():
+            return Found.NOTHING
+        found = found_in(values, job, request, resuming.verify)
+        if found is Found.NOTHING:
+            return found
         beside = PurePosixPath(member.removeprefix(OF_PATCHES))
         files = {str(beside.with_name(n)): was for n, was in listed.items()}
         if any(self._old.sha256(file) != was["sha256"] for file, was in files.items()):
-            return False
-        self._reused[member] = list(files)
-        return True
+            return Found.NOTHING
+        if resuming.is_kept(found):
+            self._reused[member] = list(files)
+        return found
 
     def packed(self, outcome: Outcome) -> Outcome:
         """An outcome that names the tar in place of the hidden folder."""
@@ -121,7 +128,7 @@ class Packer:
         """
         try:
             members = list(self._members())
-            new = any(isinstance(source, Path) for _, source in members)
+            new = any(self._is_new(*member) for member in members)
             same = [name for name, _ in members] == self._old.names
             if members and (new or not (same or FAILED in self._statuses.values())):
                 self._write(members)
@@ -130,6 +137,12 @@ class Packer:
         except FileNotFoundError as error:
             raise OutputError(f"{error.filename}: has gone; {RESUMABLE}") from None
         shutil.rmtree(self._tar.staging, ignore_errors=True)
+
+    def _is_new(self, name: str, source: Source) -> bool:
+        """Whether a member is not in the old tar as it is to be."""
+        if isinstance(source, bytes):
+            return self._old.sha256(name) != hashlib.sha256(source).hexdigest()
+        return isinstance(source, Path)
 
     def _members(self) -> Iterator[tuple[str, Source]]:
         """The members of the tar, in order."""
@@ -168,7 +181,7 @@ class Packer:
             values = read_sidecar(self._writer.path(job, SIDECAR, self._writer.names_of(job)[0]))
         for number, (key, files) in enumerate(samples.items()):
             yield from files
-            yield f"{key}.{SIDECAR}", patch_text(values, number).encode()
+            yield f"{key}.{SIDECAR}", patch_text(values, number)
 
     def _write(self, members: Sequence[tuple[str, Source]]) -> None:
         with (
@@ -204,11 +217,13 @@ class TarWorker(ImageWorker):
         super().__init__(*arguments)
         self._packers = packers
 
-    def is_done(self, job: Job, name: str, request: Mapping[str, Any]) -> bool:
+    def found(self, job: Job, name: str, request: Mapping[str, Any]) -> Found:
         """Whether a rendition is done, in its tar or in the folder that will be packed."""
-        packed = self._packers.of(job).has(job, name, request, self._verify)
+        packed = self._packers.of(job).found(job, name, request, self._resuming)
+        if packed is not Found.NOTHING:
+            return packed
         # After a loss of power a passing file may have its size and time, but not its bytes.
-        return packed or self.writer.existing(job, name).is_done(job, request, verify=True)
+        return self.writer.existing(job, name).found(job, request, verify=True)
 
 
 class Packers:
@@ -232,8 +247,7 @@ class TarBatch(Batch):
 
     Args:
         tars: what is made.
-        loader, writer, chain, overwrite, verify, trace: as for
-            :class:`clpipe.batch.work.ImageWorker`.
+        loader, writer, chain, resuming, trace: as for :class:`clpipe.batch.work.ImageWorker`.
         devices, threads: as for the base.
     """
 
@@ -245,16 +259,15 @@ class TarBatch(Batch):
         chain: Chain,
         devices: Sequence[Device | None],
         threads: int | None = None,
-        overwrite: bool = False,
-        verify: bool = False,
+        resuming: Resuming = AS_USUAL,
         trace: bool = False,
     ) -> None:
         folders = {job.stem: tar.staging.name for tar in tars for job in tar.jobs}
         staged = StagedWriter(writer.folder, writer.request, folders)
         self._tars = tars
-        self._overwrite = overwrite
+        self._resuming = resuming
         self._packers = Packers(tars, staged)
-        worker = TarWorker(self._packers, loader, staged, chain, overwrite, verify, trace)
+        worker = TarWorker(self._packers, loader, staged, chain, resuming, trace)
         super().__init__(worker, devices, threads)
 
     def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
@@ -267,7 +280,7 @@ class TarBatch(Batch):
             OutputError: nothing can be written any more.
             DeviceError: a kernel does not compile.
         """
-        prepare(self._tars, self._overwrite)
+        prepare(self._tars, self._resuming.overwrite)
         packing: Future[None] | None = None
         with ThreadPoolExecutor(1, "pack") as pool:
             for outcome in super().run(jobs):

@@ -11,10 +11,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.base.errors import RequestError
-from clpipe.base.reading import TEXT_BYTES, check_regular, parse_json
+from clpipe.base.reading import TEXT_BYTES, check_regular
 from clpipe.inputs.find import Job
 from clpipe.outputs.folder import remove_unfinished
-from clpipe.outputs.sidecar import OWN, SIDECAR
+from clpipe.outputs.sealed import SIDECAR, SidecarError, is_sidecar, values_in
 
 STAGING = ".clpipe."  # begins the name of the folder that holds a tar's pictures until it is packed
 
@@ -116,7 +116,7 @@ def prepare(tars: Sequence[Tar], overwrite: bool) -> None:
 
 
 def is_own(path: Path) -> bool:
-    """Whether a file is a tar whose first JSON is a sidecar, or what a lost one leaves: nothing."""
+    """Whether a file is a tar whose first JSON is a sidecar, or what a lost one leaves: zeros."""
     try:
         check_regular(path)
         with open(path, "rb") as file:
@@ -124,10 +124,11 @@ def is_own(path: Path) -> bool:
                 return True
         with tarfile.open(path, "r:") as tar:
             for info in tar:
-                is_sidecar = info.isreg() and info.name.endswith(f".{SIDECAR}")
-                if is_sidecar and (data := tar.extractfile(info)):
-                    values = parse_json(data.read()) if info.size <= TEXT_BYTES else None
-                    return isinstance(values, dict) and OWN in values
+                is_text = info.isreg() and info.name.endswith(f".{SIDECAR}")
+                if is_text and (data := tar.extractfile(info)):
+                    text = data.read(TEXT_BYTES)
+                    if text.strip(b"\0"):
+                        return is_sidecar(text)
     except DAMAGED:
         pass
     return False
@@ -151,17 +152,16 @@ class Members:
             pass
 
     def sidecar(self, name: str) -> Mapping[str, Any]:
-        """A sidecar's values; empty where it is missing or damaged."""
+        """A sidecar's values; empty where it is missing, or is not as clpipe wrote it."""
         if name not in self.places:
             return {}
         start, size = self.places[name]
         try:
             with open(self._path, "rb") as file:
                 file.seek(start)
-                values = parse_json(file.read(min(size, TEXT_BYTES)))
-        except (OSError, ValueError):
+                return values_in(file.read(min(size, TEXT_BYTES)), name) or {}
+        except (OSError, SidecarError):
             return {}
-        return values if isinstance(values, dict) else {}
 
     def sha256(self, name: str) -> str:
         """The SHA-256 of a file; "" where it is missing or cannot be read."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from clpipe.base.errors import ClpipeError, DeviceError, OutputError
+from clpipe.base.errors import ClpipeError, DeviceError, OutputError, RequestError
 from clpipe.base.processors import available_processors
 from clpipe.base.steps import Step
 from clpipe.batch.outcome import FAILED, Outcome
@@ -103,7 +103,8 @@ class Batch:
         self._lock = threading.Lock()
         self._taking = threading.Lock()  # held while a job is waited for
         self._places = threading.Semaphore(self.in_flight)
-        self._room = Room(usual_room() if room is None else room)
+        size = usual_room() if room is None else room
+        self._room = Room(size, self.devices, partial(worker.reserve, results))
         self._results = threading.Semaphore(results)
         self._decoded: queue.SimpleQueue[Decoded | None] = queue.SimpleQueue()
         self._developed: queue.SimpleQueue[Developed | None] = queue.SimpleQueue()
@@ -157,7 +158,13 @@ class Batch:
                 self._outcomes.put(None)
 
         thread = threading.Thread(target=guarded, name=name, daemon=True)
-        thread.start()
+        try:
+            thread.start()
+        except RuntimeError:  # the system gives no more, or their stacks do not fit
+            raise RequestError(
+                f"--jobs: {self.threads}: no thread can be started for '{name}'; ask for fewer, or "
+                "allow more threads (ulimit -u) or memory (ulimit -v)"
+            ) from None
         return thread
 
     def _fail(self, error: Exception) -> None:
@@ -221,6 +228,10 @@ class Batch:
             waits: list[float] = []
             try:
                 task = self._worker.decode(job, partial(self._begin, job, waits))
+            except OutputError as error:
+                self._outcomes.put(Outcome(job, FAILED, error=failure_text(job, error)))
+                self._fail(error)
+                continue
             except BaseException as error:  # nothing that one image does may end the thread
                 self._outcomes.put(Outcome(job, FAILED, error=failure_text(job, error)))
                 continue
@@ -237,14 +248,21 @@ class Batch:
         self._outcomes.put(None)
 
     def _begin(self, job: Job, waits: list[float]) -> None:
-        """Wait until there is room for a job's image, and note how long: it is decoded next."""
-        self._begun.set()
+        """Wait until there is room for a job's image, and note how long: it is decoded next.
+
+        Raises:
+            OutputError: the first image of the run is to be made, but cannot be written.
+        """
         writer = self._worker.writer
+        if not self._begun.is_set():
+            writer.check_folder()
+        self._begun.set()
         results = min(len(writer.names_of(job)), self.threads + len(self.devices))
         layers = self._worker.layers
         # Baselines are measured on floats.
         formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
-        size = host_bytes(job, results, formats, writer.request.keep, layers)
+        chain, keep = self._worker.chain, writer.request.keep
+        size = host_bytes(job, chain, results, formats, keep, layers, None in self.devices)
         start = time.perf_counter()
         self._room.enter(job.stem, size)
         waits.append(time.perf_counter() - start)
@@ -256,7 +274,10 @@ class Batch:
         decoded: Decoded | None = None
         begun: deque[Begun] = deque()
         try:
-            runners = self._worker.runners(device)
+            try:
+                runners = self._worker.runners(device)
+            finally:
+                self._room.started()
             while decoded := self._next_decoded(begun, device):
                 self._develop(decoded, begun, runners, device)
                 decoded = None  # or its memory would be held until there is another one

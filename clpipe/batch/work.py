@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from clpipe.base.digests import stamp_of_all
+from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, NoPictureError, RequestError
 from clpipe.base.types import Array
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome, Span
@@ -27,9 +27,11 @@ from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
+from clpipe.outputs.existing import AS_USUAL, Found, Resuming
 from clpipe.outputs.patches import Patch, every_patch
 from clpipe.outputs.renditions import Rendition
-from clpipe.outputs.sidecar import SIDECAR, intrinsics_of, sidecar, write_sidecar
+from clpipe.outputs.sealed import SIDECAR, write_sidecar
+from clpipe.outputs.sidecar import intrinsics_of, sidecar
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
@@ -45,7 +47,7 @@ class Task:
     began: float = field(default_factory=time.time)
     spans: list[Span] = field(default_factory=list)
     source: SourceImage | None = None
-    stamp: tuple[int, int] = (0, 0)
+    stamps: Sequence[tuple[int, int]] = ()  # of the files of its exposure
     request: Mapping[str, Any] = field(default_factory=dict)  # its record
     renditions: list[Rendition] = field(default_factory=list)
     unwritten: int = 0  # renditions
@@ -56,6 +58,7 @@ class Task:
     carried: Carried | None = None  # until it is written
     clipped: float = 0.0  # the share of clipped pixels, of the rendition that has most
     patches: list[Patch] = field(default_factory=list)  # that are made in place of pictures
+    old: int = 0  # renditions that another program has made
 
     @contextmanager
     def timed(self, step: str) -> Iterator[None]:
@@ -85,6 +88,7 @@ class Task:
             self.began,
             tuple(self.spans),
             self.clipped,
+            self.old,
         )
 
 
@@ -95,8 +99,7 @@ class ImageWorker:
         loader: how images are loaded.
         writer: how pictures are written.
         chain: that of the first image, for which kernels are compiled early.
-        overwrite: make pictures that are done already, too.
-        verify: read pictures that are done already, to see that they are whole.
+        resuming: which pictures that are there already are made again.
         trace: note each launch and transfer.
     """
 
@@ -105,15 +108,13 @@ class ImageWorker:
         loader: ImageLoader,
         writer: OutputWriter,
         chain: Chain,
-        overwrite: bool = False,
-        verify: bool = False,
+        resuming: Resuming = AS_USUAL,
         trace: bool = False,
     ) -> None:
         self.writer = writer
         self._loader = loader
-        self._chain = chain
-        self._overwrite = overwrite
-        self._verify = verify
+        self.chain = chain
+        self._resuming = resuming
         self._trace = trace
         self._spare = SpareArrays(0)
 
@@ -124,7 +125,7 @@ class ImageWorker:
     @property
     def layers(self) -> int:
         """How many layers are read beside an image: those that go along with it, and its depth."""
-        return len(self.writer.request.carry) + bool(lenses_of(self._chain))
+        return len(self.writer.request.carry) + bool(lenses_of(self.chain))
 
     def runners(self, device: Device | None) -> "Runners":
         """The runners of a device; the kernels of the first chain are compiled here.
@@ -133,15 +134,15 @@ class ImageWorker:
             RequestError: the memory of the device is too small for any image.
             DeviceError: a kernel does not compile.
         """
-        half = self._loader.kept is None and self._chain.source is Kind.RGB
-        return Runners(self.writer, device, self._chain, half)
+        half = self._loader.kept is None and self.chain.source is Kind.RGB
+        return Runners(self.writer, device, self.chain, half)
 
     def decode(self, job: Job, begin: Callable[[], None]) -> Task:
         """Load a job's image, unless all of its pictures are done already.
 
         Args:
             job: the image.
-            begin: called where something is to be made.
+            begin: called where something is to be made; it may raise ImageError.
         """
         task = Task(job, self._loader)
         with task.timed("decode"):
@@ -176,17 +177,18 @@ class ImageWorker:
     def _missing(self, task: Task) -> list[str]:
         """The names of a job's renditions that are to be made."""
         names = self.writer.names_of(task.job)
-        if self._overwrite:
+        if self._resuming.overwrite:
             return list(names)
-        missing = [
-            name
+        found = {
+            name: self.found(task.job, name, self.writer.record_of(task.job, task.request, name))
             for name in names
-            if not self.is_done(task.job, name, self.writer.record_of(task.job, task.request, name))
-        ]
+        }
+        task.old = sum(there is Found.OLD for there in found.values())
+        missing = [name for name, there in found.items() if not self._resuming.is_kept(there)]
         needed = self.writer.plan_of(task.job).needed(missing)
         return [name for name in self.writer.plan_of(task.job).names() if name in needed]
 
-    def is_done(self, job: Job, name: str, request: Mapping[str, Any]) -> bool:
+    def found(self, job: Job, name: str, request: Mapping[str, Any]) -> Found:
         """Whether a rendition is there already, made by the same request.
 
         Args:
@@ -197,7 +199,7 @@ class ImageWorker:
         Raises:
             ImageError: a file of its name is somebody else's.
         """
-        return self.writer.existing(job, name).is_done(job, request, self._verify)
+        return self.writer.existing(job, name).found(job, request, self._resuming.verify)
 
     def _load(self, task: Task, names: Sequence[str]) -> None:
         """Load a task's image, and decide which renditions are made of it.
@@ -206,7 +208,7 @@ class ImageWorker:
             ImageError, RequestError, MemoryError: it cannot be read, or cannot enter the chain.
         """
         job = task.job
-        task.stamp = stamp_of_all(job.paths)
+        task.stamps = [stamp_of(path) for path in job.paths]
         source = task.loader.read(job)
         loaded = task.loader.enter(job, source)
         if loaded is None:
@@ -324,7 +326,7 @@ class ImageWorker:
                 record = sidecar(
                     job,
                     writer.record_of(job, task.request, rendition.name),
-                    task.stamp,
+                    task.stamps,
                     rendition,
                     writer.plan_of(job).frames,
                     device,

@@ -5,11 +5,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
+from clpipe.base.validation import first_fault
 from clpipe.chain.carry import Carry, check_companion, parse_carry
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.files import load_config
@@ -26,13 +29,43 @@ DEFAULTS = Settings()
 # What goes along with the first picture of an image.
 CARRY = ("carry", "companions", "depth_png")
 
-LISTS = ("stage_files", "formats", "keep", "carry", "companions")  # of texts
+MOST_PATCHES = 9999  # of an image; the names of their files have four digits
 
-# What decides about the bytes of a picture. The rest decides which pictures are made, or whether.
-RECORDED = (
-    *("config", "options", "image", "start_at", "until", "stage_files", "image_name"),
-    *("layer", "transfer", "formats", "keep", "patch", "patches_per_image", "augment", *CARRY),
-)
+
+class Recorded(BaseModel):
+    """What decides about the bytes of a picture, as a sidecar stores it; see :class:`Request`.
+
+    The rest decides which pictures are made, or whether.
+    """
+
+    model_config = ConfigDict(strict=True)
+
+    config: dict[str, Any] | None
+    options: dict[str, Any]
+    image: dict[str, Any]
+    start_at: str | None
+    until: str | None
+    stage_files: list[str]
+    image_name: str
+    layer: str | None
+    transfer: str | None
+    formats: list[str]
+    keep: list[str]
+    patch: Annotated[int, Field(gt=0)] | None
+    patches_per_image: Annotated[int, Field(ge=0, le=MOST_PATCHES)] | Literal["grid"]
+    augment: bool
+    carry: list[str]
+    companions: list[str]
+    depth_png: bool
+
+    @model_validator(mode="after")
+    def _has_patches(self) -> "Recorded":
+        if (self.patch is None) != (self.patches_per_image == 0):
+            raise ValueError("patch and patches_per_image contradict each other")
+        return self
+
+
+RECORDED = tuple(Recorded.model_fields)
 
 
 @dataclass(frozen=True)
@@ -167,23 +200,15 @@ class Request:
             RequestError: the record is not of that form.
         """
         try:
-            values = {name: record[name] for name in RECORDED}
-            lists = {name: tuple(record[name]) for name in LISTS}
-        except (TypeError, KeyError) as error:
-            raise RequestError(f"the request in it is damaged: {error}") from None
-        if not set(lists["formats"]) <= set(EVERY_FORMAT):
-            raise RequestError(f"found formats {', '.join(map(str, lists['formats']))}")
+            values = dict(Recorded.model_validate(record))
+        except ValidationError as error:
+            fault = first_fault(error)
+            text = f"{fault.key}: {fault.text}".removeprefix(": ")
+            raise RequestError(f"the request in it is damaged: {text}") from None
+        if not set(values["formats"]) <= set(EVERY_FORMAT):
+            raise RequestError(f"found formats {', '.join(values['formats'])}")
+        lists = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
         request = cls(**{**values, **lists})
-        tables = (request.config or {}, request.options, request.image)
-        texts = (request.start_at, request.until, request.layer, request.transfer)
-        are_texts = all(
-            isinstance(text, str) for text in (request.image_name, *filter(None, texts))
-        )
-        numbers = request.patch or 1, request.patches_per_image or 1
-        are_numbers = all((type(n) is int and n > 0) or n == "grid" for n in numbers)
-        are_tables = all(isinstance(table, Mapping) for table in tables)
-        if not (are_texts and are_numbers and are_tables):
-            raise RequestError("the request in it is damaged: a value is of the wrong type")
         request.carried()  # refuses what is wrong
         return request
 

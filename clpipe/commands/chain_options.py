@@ -9,7 +9,7 @@ from clpipe.base.errors import RequestError
 from clpipe.chain.files import built_in_configs
 from clpipe.chain.formats import EVERY_FORMAT
 from clpipe.chain.keys import ABOUT
-from clpipe.chain.request import DEFAULTS
+from clpipe.chain.request import DEFAULTS, MOST_PATCHES
 from clpipe.commands.completion import (
     cameras,
     configs,
@@ -19,7 +19,7 @@ from clpipe.commands.completion import (
     steps_or_all,
 )
 from clpipe.commands.options import stage_file_option
-from clpipe.outputs.patches import MOST, PER_IMAGE
+from clpipe.outputs.patches import PER_IMAGE
 from clpipe.reference.carried import RESAMPLING
 
 
@@ -180,9 +180,11 @@ def patch_count(text: str) -> int | str:
     """
     if text == "grid":
         return text
-    if text.isascii() and text.isdigit() and 0 < int(text) <= MOST:
+    if text.isascii() and text.isdigit() and 0 < int(text) <= MOST_PATCHES:
         return int(text)
-    raise RequestError(f"--patches-per-image: found {text!r}; expected 1 to {MOST}, or grid")
+    raise RequestError(
+        f"--patches-per-image: found {text!r}; expected 1 to {MOST_PATCHES}, or grid"
+    )
 
 
 carry_option = click.option(

@@ -26,6 +26,7 @@ from clpipe.inputs.find import Shard, find_jobs
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.poses import with_views
 from clpipe.inputs.series import Series, parse_isos
+from clpipe.outputs.existing import AS_USUAL
 from clpipe.outputs.folder import output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
 from clpipe.scenes.blender import Rendering
@@ -219,7 +220,7 @@ def develop(
     writer = OutputWriter(output, request)
     writer.check(chain, jobs)
     selectors = () if selector is None else (selector,)
-    spec = RunSpec(request, output, selectors, None, None, False, False, False, first=jobs[0])
+    spec = RunSpec(request, output, selectors, None, None, AS_USUAL, False, first=jobs[0])
     summary = Summary(len(jobs))
     reporter = Reporter(summary, writer, Console(stderr=True), quiet)
     tell = (lambda text: None) if quiet else reporter.print

@@ -14,7 +14,9 @@ import click
 from click.shell_completion import CompletionItem
 
 from clpipe.base.about import full_version
-from clpipe.base.errors import ClpipeError, OutputError, RequestError
+from clpipe.base.errors import ClpipeError, DeviceError, OutputError, RequestError
+from clpipe.base.memory import check_addresses
+from clpipe.base.system import address_space, processors, save_addresses
 from clpipe.base.text import one_line
 
 # In the order of the help. Each is a module of this folder that defines a function of its name.
@@ -38,6 +40,11 @@ COMMANDS = (
 )
 
 
+# Bytes of addresses: what loading libraries takes, and a thread of theirs, one on each processor.
+LIBRARIES = 208 << 20
+OF_THREAD = 10 << 20
+
+
 class Notices(logging.Handler):
     """Prints what the package logs, such as that kernels are being compiled."""
 
@@ -57,6 +64,7 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
+        prepare_memory()
         gc.disable()  # what is imported stays: looking through it again and again takes a tenth
         command = getattr(import_module(f"clpipe.commands.{cmd_name}"), cmd_name)
         gc.enable()
@@ -89,6 +97,19 @@ class LazyGroup(click.Group):
             sys.exit(0)
         except OSError as error:
             fail(refused(error))
+        except MemoryError:
+            fail(ClpipeError("there is no memory left to go on; what was made is whole"))
+
+
+def prepare_memory() -> None:
+    """Have a small address space last, and see that there is one for the libraries."""
+    if address_space() is None:
+        return
+    save_addresses()
+    try:
+        check_addresses(LIBRARIES + OF_THREAD * processors(), "loading clpipe's libraries")
+    except DeviceError as error:
+        fail(error)
 
 
 def refused(error: OSError) -> ClpipeError:

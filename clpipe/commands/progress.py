@@ -44,15 +44,22 @@ class Reporter:
         writer: where the pictures go.
         console: where to print; a terminal gets a bar where there are several images.
         quiet: print failures only.
+        keeps_old: whether pictures of another program are kept.
     """
 
     def __init__(
-        self, summary: Summary, writer: OutputWriter, console: Console, quiet: bool = False
+        self,
+        summary: Summary,
+        writer: OutputWriter,
+        console: Console,
+        quiet: bool = False,
+        keeps_old: bool = False,
     ) -> None:
         self._summary = summary
         self._writer = writer
         self._console = console
         self._quiet = quiet
+        self._keeps_old = keeps_old
         self._several = summary.total > 1
         self._said = time.perf_counter()
         self._bar: Progress | None = None
@@ -124,6 +131,30 @@ class Reporter:
         count = self._summary.much_clipped
         return f"{count} image{'s are' if count > 1 else ' is'} clipped much, most {path}: {text}"
 
+    def _old(self) -> str:
+        """What is said of pictures that another program has made."""
+        count = self._summary.old
+        text = (
+            f"{count} picture{'s were' if count > 1 else ' was'} made by another clpipe, or with "
+        )
+        text += "other libraries for pictures, "
+        if self._keeps_old:
+            return f"{text}and {'stay' if count > 1 else 'stays'} (--keep-old)"
+        return (
+            f"{text}and {'are' if count > 1 else 'is'} made again; --keep-old keeps such pictures"
+        )
+
+    def _print_passed_over(self) -> None:
+        """Print what is said of pictures that are old, and of images that were left out."""
+        if self._summary.old:
+            self.print(self._old())
+        without = self._summary.without_picture
+        if without:
+            hold = "images in folders hold" if len(without) > 1 else "image in a folder holds"
+            self.print(f"left out: {len(without)} {hold} no picture, such as {without[0]}")
+        if (kept := self._summary.counts[LEFT_OUT] - len(without)) > 0:
+            self.print(f"{kept} images in folders were kept after other stages and left out")
+
     def end(self) -> None:
         """Remove the bar and print the summary."""
         if self._bar:
@@ -131,13 +162,8 @@ class Reporter:
         summary, counts = self._summary, self._summary.counts
         if summary.much_clipped and not self._quiet:
             self.print(self._clipping())
-        without = summary.without_picture
-        if without and not self._quiet:
-            hold = "images in folders hold" if len(without) > 1 else "image in a folder holds"
-            self.print(f"left out: {len(without)} {hold} no picture, such as {without[0]}")
-        if counts[LEFT_OUT] > len(without) and not self._quiet:
-            kept = counts[LEFT_OUT] - len(without)
-            self.print(f"{kept} images in folders were kept after other stages and left out")
+        if not self._quiet:
+            self._print_passed_over()
         failed = summary.failures
         if self._several and failed and (self._bar or not self._quiet):
             self.print("failed:")

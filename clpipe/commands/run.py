@@ -2,21 +2,22 @@
 
 import logging
 import sys
-from collections.abc import Mapping
-from contextlib import closing, nullcontext, suppress
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.console import Console
 
-from clpipe.base.errors import RequestError
+from clpipe.base.about import full_version
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.memory import parse_size
 from clpipe.batch.dask_worker import RunSpec
 from clpipe.batch.replay import Replay, replay_of
 from clpipe.batch.run_log import RunLog, Summary, log_name
 from clpipe.batch.tars import Tar, cut
-from clpipe.batch.threads import Batch
 from clpipe.batch.trace import Trace, check_trace
 from clpipe.chain.baseline import BASELINES
 from clpipe.chain.chain import Chain
@@ -43,13 +44,14 @@ from clpipe.commands.options import Command, options_set, raw_size_option, raw_t
 from clpipe.commands.poses import views_behind
 from clpipe.commands.progress import Reporter
 from clpipe.commands.running import batch_of, follow
-from clpipe.engine.device import Device
 from clpipe.images.read import PICTURE_SUFFIXES
-from clpipe.inputs.find import Shard, find_jobs, parse_shard
+from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.poses import with_views
 from clpipe.inputs.series import Series, parse_isos
+from clpipe.outputs.existing import Resuming
 from clpipe.outputs.folder import output_folder, remove_unfinished
+from clpipe.outputs.gone import pictures_without_input
 from clpipe.outputs.patches import PER_IMAGE
 from clpipe.outputs.renditions import parse_bracket
 from clpipe.outputs.writer import OutputWriter
@@ -168,6 +170,11 @@ from clpipe.stage import Kind
     is_flag=True,
     help="Read all pictures that are up to date, and make those again that are damaged.",
 )
+@click.option(
+    "--keep-old",
+    is_flag=True,
+    help="Keep pictures that another clpipe has made, which are else made again.",
+)
 @click.option("--quiet", is_flag=True, help="Print failures only.")
 @click.option(
     "--json-lines",
@@ -198,6 +205,7 @@ def run(
     dask: str | None,
     overwrite: bool,
     verify: bool,
+    keep_old: bool,
     quiet: bool,
     json_lines: bool,
     trace: Path | None,
@@ -229,6 +237,8 @@ def run(
     """
     if quiet:
         logging.getLogger("clpipe").setLevel(logging.WARNING)
+    # A checkout asks git for the version that log and sidecars have; here nobody waits for that.
+    threading.Thread(target=full_version, daemon=True).start()
     tars: list[Tar] = []
     series = Series(cameras, parse_isos(isos) if isos is not None else ())
     if replay:
@@ -269,23 +279,23 @@ def run(
         selectors,
         parse_size(memory) if memory else None,
         threads,
-        overwrite,
-        verify,
+        Resuming(overwrite, verify, keep_old),
         trace is not None,
         first=jobs[0],
     )
     opened = batch_of(spec, loader, chain, tars, dask)
     summary = Summary(len(jobs))  # counts seconds from here on
-    reporter = Reporter(summary, writer, Console(stderr=True), quiet or json_lines)
-    has_views = poses and not tars and shard.of == 1
+    reporter = Reporter(summary, writer, Console(stderr=True), quiet or json_lines, keep_old)
+    is_whole = not (replay or tars or shard.of > 1)
     with (
         opened as batch,
         output_folder(output, shard),
-        views_behind(series.under(output), summary, quiet) if has_views else nullcontext(),
+        views_behind(series.under(output), summary, quiet) if poses and is_whole else nullcontext(),
+        gone_behind(writer, jobs, inputs)
+        if is_whole and not (quiet or json_lines)
+        else nullcontext(),
         Trace(trace) if trace else nullcontext() as timeline,
     ):
-        if replay and isinstance(batch, Batch):
-            warn_of_changes(replay, again, batch.devices[0])
         remove_unfinished(output, jobs, request.patch is not None)
         start = {"arguments": sys.argv[1:], "images": len(jobs)}
         log = RunLog(output / log_name(shard), start, print_line if json_lines else None)
@@ -293,7 +303,18 @@ def run(
             follow(batch, jobs, summary, reporter, log, timeline)
     if summary.interrupted:
         sys.exit(130)
-    sys.exit(1 if summary.failures or summary.is_fruitless else 0)
+    failed = summary.failures or summary.is_fruitless
+    sys.exit(1 if failed or (replay and not is_the_same(again, writer)) else 0)
+
+
+@contextmanager
+def gone_behind(writer: OutputWriter, jobs: Sequence[Job], inputs: Sequence[str]) -> Iterator[None]:
+    """Say behind a run how many pictures are there whose inputs are not."""
+    yield
+    if count := pictures_without_input(writer, jobs, inputs):
+        pictures, are = ("picture", "is") if count == 1 else ("pictures", "are")
+        there = f"{count} {pictures} in {writer.folder} {are} of inputs that are not there any more"
+        click.echo(there, err=True)
 
 
 def print_line(line: bytes) -> None:
@@ -328,10 +349,16 @@ def check_read_options(request: Request, chain: Chain) -> None:
             )
 
 
-def warn_of_changes(sidecar: Path, replay: Replay, device: Device | None) -> None:
-    """Say why a replay may make other bytes, where something is known."""
-    if warning := replay.warning(device):
-        click.echo(f"clpipe: {sidecar}: warning: {warning}", err=True)
+def is_the_same(replay: Replay, writer: OutputWriter) -> bool:
+    """Say whether a replay has made the bytes that its sidecar lists."""
+    (name,) = writer.names_of(replay.job)
+    existing = writer.existing(replay.job, name)
+    try:
+        same, text = replay.comparison(existing.sidecar)
+    except ImageError as error:
+        raise RequestError(str(error)) from None
+    click.echo(f"{existing.pictures[0]}: {text}", err=True)
+    return same
 
 
 def folder_named(text: str) -> Path:
@@ -353,7 +380,7 @@ def folder_named(text: str) -> Path:
 # Options that a sidecar does not store.
 BESIDE_REPLAY = (
     *("inputs", "output", "replay", "stage_files", "max_pixels", "selectors", "memory"),
-    *("overwrite", "verify", "quiet", "trace"),
+    *("overwrite", "verify", "keep_old", "quiet", "trace"),
 )
 
 

@@ -49,9 +49,9 @@ def batch_of(
     devices: list[Device | None] = [*open_devices(spec.selectors, spec.memory)] or [None]
     writer = OutputWriter(spec.output, spec.request)
     if tars:
-        options = (spec.threads, spec.overwrite, spec.verify, spec.trace)
+        options = (spec.threads, spec.resuming, spec.trace)
         return nullcontext(TarBatch(tars, loader, writer, chain, devices, *options))
-    worker = ImageWorker(loader, writer, chain, spec.overwrite, spec.verify, spec.trace)
+    worker = ImageWorker(loader, writer, chain, spec.resuming, spec.trace)
     return nullcontext(Batch(worker, devices, spec.threads))
 
 

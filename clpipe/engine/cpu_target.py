@@ -196,10 +196,12 @@ def forced_target() -> str | None:
 def own_target(version: str) -> tuple[str, str] | None:
     """The triple and the CPU that a PoCL on Linux compiles for by itself, by its device's version.
 
+    None where that names no CPU: Debian's for arm64 says "(null)", as it compiles for all of them.
+
     >>> own_target("OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-znver3")
     ('x86_64-unknown-linux-gnu', 'znver3')
     """
-    found = re.search(r"HSTR: \w+-((?:\w+-){1,2}linux-(?:gnu|musl))-(\S+)", version)
+    found = re.search(r"HSTR: \w+-((?:\w+-){1,2}linux-(?:gnu|musl))-(\w\S*)", version)
     return (found[1], found[2]) if found else None
 
 

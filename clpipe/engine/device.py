@@ -109,6 +109,11 @@ class Device:
         """Device memory of the buffers that are kept from image to image."""
         return self._flow.pool.bytes
 
+    def limit(self, memory: int) -> None:
+        """Let its buffers take no more than these bytes; nothing may be on the way."""
+        self.memory = memory
+        self._abandon()
+
     @property
     def depth(self) -> int:
         """How many images it can work on at a time."""
@@ -128,6 +133,10 @@ class Device:
             kernels = [write_kernel(plan, launch, self.info.lanes) for launch in plan.launches]
             self._calls[plan.unscaled] = [Call(k, self._programs.kernel(k)) for k in kernels]
         return self._calls[plan.unscaled]
+
+    def keep_programs(self) -> None:
+        """Keep for later processes what was compiled, and launched once, since the last time."""
+        self._programs.keep()
 
     def _borders(self, plan: Plan, written: Launch) -> Iterator[Call]:
         """The calls that fill the borders of the planes that a launch has written."""
@@ -208,7 +217,7 @@ class Device:
             passage = Passage(work, self.prepare(work.plan), borders, self._tiling(work, memory))
             self._flow.start(passage, self.memory)
             return passage
-        except self._cl.Error as error:
+        except (self._cl.Error, MemoryError) as error:
             return error
 
     def _result(
@@ -238,11 +247,11 @@ class Device:
                 if isinstance(begun, Exception):
                     raise begun
                 self._flow.finish(begun)
-            except cl.Error as error:
+            except (cl.Error, MemoryError) as error:
                 self._abandon()
                 if not self._works():
                     self._renew()
-                elif isinstance(error, cl.MemoryError):
+                elif isinstance(error, cl.MemoryError | MemoryError):
                     memory = memory if full is None else self._tiling(work, memory).bytes // 2
                     full = error
                     continue

@@ -7,12 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from clpipe.base.errors import DeviceError
-from clpipe.base.memory import available_memory
+from clpipe.base.memory import available_memory, check_addresses
+from clpipe.base.system import processors
 from clpipe.base.text import one_of
 from clpipe.engine.cache_folder import pocl_problem, prepare_environment
+from clpipe.engine.cpu_target import VARIABLE as TARGET_VARIABLE
 from clpipe.engine.cpu_target import Target, candidates, compile_for, forced_target
 from clpipe.engine.hardware import Hardware, hardware_of
 from clpipe.engine.runtimes import (
+    attempt,
     is_pocl,
     is_tried,
     lanes_for,
@@ -22,6 +25,10 @@ from clpipe.engine.runtimes import (
 )
 from clpipe.engine.vendors import platforms
 from clpipe.engine.verdicts import Verdicts, verdicts
+
+# Bytes of addresses: of PoCL with its compiler at work, and of a thread on each processor.
+ADDRESSES = 256 << 20
+OF_THREAD = 8 << 20
 
 _process: int | None = None  # the process id that first used OpenCL, here or before a fork
 
@@ -74,7 +81,8 @@ def find_devices(again: bool = False) -> list[DeviceInfo]:
     ``again`` is whether to try once more what did not work when it was tried.
 
     Raises:
-        DeviceError: pyopencl cannot be loaded, or this process cannot use it.
+        DeviceError: pyopencl cannot be loaded, or this process cannot use it, or has too small an
+            address space for it.
     """
     global _process
     if _process not in (None, os.getpid()):
@@ -82,6 +90,7 @@ def find_devices(again: bool = False) -> list[DeviceInfo]:
             "this process was forked from one that had used OpenCL, which would hang here; let it "
             'be spawned (multiprocessing\'s "spawn" or "forkserver"), or fork before'
         )
+    check_addresses(ADDRESSES + OF_THREAD * processors(), "an OpenCL runtime")
     _process = os.getpid()
     prepare_environment()
     forced_target()
@@ -92,10 +101,11 @@ def find_devices(again: bool = False) -> list[DeviceInfo]:
     for platform in platforms(known.hidden):
         devices, reason = devices_of(platform, known)
         for device in devices:
-            if is_tried(type_of(platform, device), platform, device) and not known.of(
-                platform, device
-            ):
-                known = verdicts(missing=True)
+            is_new = known.of(platform, device) is None
+            if is_new and is_tried(type_of(platform, device), platform, device):
+                known = verdicts(
+                    missing=[attempt(platform, device, candidates(platform, device)[0])]
+                )
             found.append(describe(len(found), platform, device, known))
         if not devices:
             handle, version = platform.int_ptr, platform.version
@@ -175,6 +185,8 @@ def remedies() -> str:
         *(["pip install 'clpipe[intel]'"] if linux and x86 else []),
         *(["apt-get install pocl-opencl-icd (Debian, Ubuntu)"] if linux else []),
     ]
+    if name := forced_target():
+        ways.insert(0, f"to unset {TARGET_VARIABLE} (it is {name})")
     return f"what helps here: {', or '.join(ways)}; --device numpy needs none, and is slow"
 
 

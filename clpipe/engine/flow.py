@@ -16,7 +16,7 @@ import numpy as np
 
 from clpipe.base.steps import Step
 from clpipe.base.types import Array
-from clpipe.engine.buffers import HostImages, Pool, copy_encoded, copy_plane, core_of
+from clpipe.engine.buffers import HostImages, Pool, aligned_empty, copy_encoded, copy_plane, core_of
 from clpipe.engine.calls import Bind, Call, index_space
 from clpipe.engine.extents import Box, Extent, Extents
 from clpipe.engine.held import Held
@@ -97,6 +97,7 @@ class Flow:
 
         self._cl = cl
         self.context = context
+        self._in_place = alignment is not None
         self.queue = self.new_queue()
         self.pool = Pool(self.new_buffer)
         self._transfers: InPlace | Staged = (
@@ -115,8 +116,15 @@ class Flow:
         return self._cl.CommandQueue(self.context, properties=profiling)
 
     def new_buffer(self, size: int) -> Any:
-        """A buffer on the device."""
-        return self._cl.Buffer(self.context, self._cl.mem_flags.READ_WRITE, size)
+        """A buffer on the device, or in the host's memory if the device works there.
+
+        PoCL allocates its own at the first launch, and crashes if there is no memory then.
+        """
+        flags = self._cl.mem_flags
+        if not self._in_place:
+            return self._cl.Buffer(self.context, flags.READ_WRITE, size)
+        room = aligned_empty((size,), np.uint8)
+        return self._cl.Buffer(self.context, flags.READ_WRITE | flags.USE_HOST_PTR, hostbuf=room)
 
     @property
     def depth(self) -> int:

@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError, RequestError
-from clpipe.engine.binary_cache import BinaryCache
-from clpipe.engine.cache_folder import cache_folder, later_runs
+from clpipe.engine.builders import BinaryBuilder, PoclBuilder
+from clpipe.engine.cache_folder import cache_folder, later_runs, pocl_folder
 from clpipe.engine.codegen import Kernel
 from clpipe.engine.discovery import DeviceInfo
 from clpipe.engine.runtimes import is_pocl
+from clpipe.engine.store import Store
 
 # PoCL includes the declarations of all of OpenCL's functions before a program. The first says that
 # it has done so; the second has those that are called declared in kernels/lib/builtins.h.
@@ -42,7 +43,6 @@ class Programs:
 
     def __init__(self, info: DeviceInfo) -> None:
         import pyopencl as cl
-        from pyopencl.characterize import has_src_build_cache
 
         self._cl = cl
         try:
@@ -55,10 +55,7 @@ class Programs:
         if info.handle.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
             self._options.append("-cl-fp32-correctly-rounded-divide-sqrt")
         self.declares = is_pocl(info.platform)
-        # PoCL keeps programs in the same folder by itself, with what it makes of them at the first
-        # launch, and NVIDIA's driver in a folder of its own.
-        folder = None if has_src_build_cache(info.handle) else cache_folder()
-        self._cache = BinaryCache(folder / "programs", info.handle) if folder else None
+        self._builder = builder_for(info, self.context)
 
     def __len__(self) -> int:
         """How many programs there are."""
@@ -97,13 +94,28 @@ class Programs:
         return program
 
     def _build(self, kernel: Kernel, options: list[str]) -> Any:
-        if self._cache and (kept := self._cache.load(self.context, kernel.source, options)):
-            return kept
-        program = self._cl.Program(self.context, kernel.source)
-        program.build(options, cache_dir=False)
-        if self._cache:
-            self._cache.store(program, kernel.source, options)
-        return program
+        if self._builder:
+            return self._builder.build(kernel.source, options)
+        return self._cl.Program(self.context, kernel.source).build(options, cache_dir=False)
+
+    def keep(self) -> None:
+        """Keep for later processes what was compiled, and launched once, since the last time."""
+        if self._builder:
+            with self._lock:
+                self._builder.keep()
+
+
+def builder_for(info: DeviceInfo, context: Any) -> BinaryBuilder | PoclBuilder | None:
+    """What builds a device's programs out of kept ones; None where its driver keeps them itself."""
+    from pyopencl.characterize import has_src_build_cache
+
+    folder, of_pocl = cache_folder(), pocl_folder()
+    platform = info.handle.platform.version
+    made_by = (info.platform, platform, info.name, info.version, info.driver, info.target.name)
+    store = Store(folder / "programs" if folder else None, *made_by)
+    if is_pocl(info.platform):
+        return PoclBuilder(context, store, of_pocl) if of_pocl else None
+    return None if has_src_build_cache(info.handle) else BinaryBuilder(context, store)
 
 
 def programs_of(info: DeviceInfo) -> Programs:
@@ -136,7 +148,7 @@ def announced(info: DeviceInfo) -> Iterator[None]:
     def announce() -> None:
         if not _announced.is_set():
             _announced.set()
-            log.info("compiling kernels for %s; %s", info.label, later_runs(is_pocl(info.platform)))
+            log.info("compiling kernels for %s; %s", info.label, later_runs())
 
     timer = threading.Timer(LONG, announce)
     timer.daemon = True

@@ -12,7 +12,6 @@ from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.registry import user_code_errors
 from clpipe.engine.buffers import HostImages
-from clpipe.engine.cache_folder import list_pocl_programs
 from clpipe.engine.device import Device, Timing
 from clpipe.engine.extents import Box
 from clpipe.engine.ops import chain_ops
@@ -189,7 +188,7 @@ class Runner:
                 return  # which larger images need not be refused for
             with announced(self.device.info):
                 self._submit_plan(plan, tiny, "")()
-            list_pocl_programs()
+            self.device.keep_programs()
 
     def run(
         self,

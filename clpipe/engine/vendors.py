@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import DeviceError
-from clpipe.engine.cache_folder import cache_folder
+from clpipe.engine.process_folder import process_folder
 
 PACKAGE, LIBRARY = "intel-opencl-rt", "libintelocl.so"
 # With any of these a user says where platforms are; the first is what we set.
@@ -93,7 +93,7 @@ def drivers_visible(hidden: Collection[str] = ()) -> Iterator[None]:
     home = os.environ.get(HOME)
     if BUNDLED in hidden:
         os.environ[HOME] = os.devnull
-    library, place, present = intel_library(), cache_folder(), icd_files()
+    library, place, present = intel_library(), process_folder(), icd_files()
     if any(names_library(text) for _, text in present):
         library = None
     kept = [path for path, _ in present if str(path) not in hidden]

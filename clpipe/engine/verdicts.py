@@ -5,28 +5,29 @@ A runtime that crashes, compiles nothing or computes wrongly is found there, by
 drivers, their versions and the trial itself; it lies in the cache folder.
 """
 
-import hashlib
 import json
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.errors import ImageError
-from clpipe.base.files import discard, passing_files, write_new
 from clpipe.engine.cache_folder import cache_folder
 from clpipe.engine.cpu_target import VARIABLE, Target, candidates, cpu_text
+from clpipe.engine.process_folder import process_folder
 from clpipe.engine.runtimes import attempt
 from clpipe.engine.sources import LIBRARY, kernel_folder
-from clpipe.engine.vendors import VARIABLES, icd_files, installed_drivers
+from clpipe.engine.store import Store
+from clpipe.engine.vendors import VARIABLES, drivers_visible, icd_files, installed_drivers
 
 LIMIT = 120  # seconds for one process; then the runtime that it is at counts as hanging
+WINDOWS_FAULT = 0xC0000000  # the status of a process that the system has ended is no smaller
+SLOW = "it takes longer than"
 SENSITIVE = (*VARIABLES, VARIABLE, "POCL_DEVICES", "LD_LIBRARY_PATH", "LD_PRELOAD")
 
 
@@ -65,24 +66,25 @@ class Verdicts:
         return None if first is None else (targets[0], first)
 
 
-def verdicts(again: bool = False, missing: bool = False) -> Verdicts:
+def verdicts(again: bool = False, missing: Sequence[str] = ()) -> Verdicts:
     """What is known of this machine's runtimes, after they are tried if that is not known.
 
     Args:
         again: try what failed once more.
-        missing: a device is there that was not tried; try what is new.
+        missing: what was not tried, as :func:`attempt` names it. What is still missing then, since
+            another process does not see it, is trusted.
     """
-    path = _path()
-    known = _read(path) if path else None
+    store, state = _store(), _state()
+    known = _known(store.load("runtimes", state))
     if known and again and known.problems:
         known = None
     if known and not missing:
         return known
     found = tried(known or Verdicts())
-    if path and found.lasting:
-        discard(path)
-        with passing_files(), suppress(ImageError):
-            write_new(path, json.dumps(asdict(found), indent=1).encode())
+    for name in missing:
+        found.attempts.setdefault(name, "")
+    if found.lasting:
+        store.keep(json.dumps(asdict(found)).encode(), "runtimes", state)
     return found
 
 
@@ -100,6 +102,8 @@ def tried(known: Verdicts) -> Verdicts:
                 at = {}
         if ending is None:
             return known
+        # A machine may be too busy.
+        known = replace(known, lasting=known.lasting and not ending.startswith(SLOW))
         if ending == "" or not at:  # it could not be tried, which says nothing of the runtimes
             return replace(known, lasting=False)
         if at["at"] == "list":
@@ -135,16 +139,17 @@ def _run(known: Verdicts, only_listing: bool = False) -> tuple[list[dict[str, An
 
     The latter is None where it came to its end, and "" where that is not the runtimes' doing.
     """
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    environment = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     try:
-        done = subprocess.run(
-            [sys.executable, "-m", "clpipe.engine.trial"],
-            input=json.dumps(asdict(known) | {"only_listing": only_listing}).encode(),
-            capture_output=True,
-            timeout=LIMIT,
-            env=environment,
-            check=False,
-        )
+        with drivers_visible(known.hidden):  # here, since a child that is ended tidies nothing up
+            done = subprocess.run(
+                [sys.executable, "-m", "clpipe.engine.trial"],
+                input=json.dumps(asdict(known) | {"only_listing": only_listing}).encode(),
+                capture_output=True,
+                timeout=LIMIT,
+                env=os.environ | environment,
+                check=False,
+            )
         output, errors, status = done.stdout, done.stderr, done.returncode
     except subprocess.TimeoutExpired as error:
         output, errors, status = error.stdout or b"", b"", None
@@ -152,7 +157,9 @@ def _run(known: Verdicts, only_listing: bool = False) -> tuple[list[dict[str, An
         return [], ""
     lines = list(_parsed(output))
     if status is None:
-        return lines, f"it takes longer than {LIMIT} s for a tiny kernel"
+        return lines, f"{SLOW} {LIMIT} s for a tiny kernel"
+    if status >= WINDOWS_FAULT:
+        return lines, f"it ends the process ({status:#x})"
     if status >= 0:
         return lines, None if status == 0 else ""
     if -status == getattr(signal, "SIGKILL", None):  # most likely for want of memory
@@ -172,11 +179,14 @@ def _parsed(output: bytes) -> Iterator[dict[str, Any]]:
             yield json.loads(line)
 
 
-def _path() -> Path | None:
-    """The file of what is known of this machine as it is; None without a folder for it."""
-    folder = cache_folder()
-    if folder is None:
-        return None
+def _store() -> Store:
+    """Where verdicts are kept; without a lasting folder, for this process."""
+    folder = cache_folder() or process_folder()
+    return Store(folder / "known" if folder else None)
+
+
+def _state() -> str:
+    """All that verdicts hold for: this machine, its drivers and the trial, in one text."""
     parts = {
         "cpu": cpu_text(),
         "sys": Path("/sys/devices/system/cpu").is_dir(),
@@ -185,8 +195,7 @@ def _path() -> Path | None:
         "program": [sys.executable, version("pyopencl")],
         "trial": [[path.stat().st_size, path.stat().st_mtime_ns] for path in _trial_files()],
     }
-    digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
-    return folder / "runtimes" / f"{digest[:32]}.json"
+    return json.dumps(parts, sort_keys=True)
 
 
 def _trial_files() -> list[Path]:
@@ -195,13 +204,6 @@ def _trial_files() -> list[Path]:
     return [*modules, *(kernel_folder() / f"lib/{name}.h" for name in LIBRARY)]
 
 
-def _read(path: Path) -> Verdicts | None:
-    """What a file holds; None where there is none, or it is damaged."""
-    with suppress(OSError, ValueError, TypeError, AttributeError):
-        found = Verdicts(**json.loads(path.read_bytes()))
-        texts = [found.listing]
-        for each in (found.hidden, found.platforms, found.attempts):
-            texts += [*each, *each.values()]
-        if all(isinstance(text, str) for text in texts):
-            return found
-    return None
+def _known(data: bytes | None) -> Verdicts | None:
+    """Verdicts as they are kept; None for none."""
+    return Verdicts(**json.loads(data)) if data else None

@@ -32,6 +32,7 @@ from clpipe.explorer.controls import (
 )
 from clpipe.explorer.explorer import Explorer
 from clpipe.explorer.export import SAVED, exported
+from clpipe.explorer.patience import ImpatientProtocol
 from clpipe.explorer.views import View
 from clpipe.images.encoding import Output
 from clpipe.images.preview import reduced
@@ -80,6 +81,7 @@ class Server:
         self.address = f"http://{HOST}:{self._socket.getsockname()[1]}/{token}/"
         config = uvicorn.Config(
             self._app(token),
+            http=ImpatientProtocol,
             log_level="error",
             access_log=False,
             server_header=False,

@@ -72,16 +72,6 @@ def open_image(path: Path) -> Iterator[Any]:
         raise ImageError(f"{path}: damaged: a name or attribute in it is not UTF-8") from None
 
 
-def claimed_pixels(path: Path) -> int | None:
-    """How many pixels a file says that its first part has; None where it cannot be opened."""
-    try:
-        with open_image(path) as file:
-            spec = file.spec()
-            return max(spec.width * spec.height, spec.full_width * spec.full_height)
-    except ImageError:
-        return None
-
-
 def error_text(text: str) -> str:
     """An error of a library in one short line; it gives none for some damaged files."""
     if not text or "could not find a format reader" in text:

@@ -1,6 +1,6 @@
 """Arrays of pixels as files hold them: sizes, data windows, and values that are not finite."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError
 from clpipe.base.steps import Step
-from clpipe.base.types import Array
+from clpipe.base.types import Array, Floats
 from clpipe.reference.geometry import NO_MARGINS, Margins
 
 MAX_PIXELS = 1_000_000_000  # the largest --max-pixels
@@ -58,6 +58,19 @@ def display_window(data: Array, x: int, y: int, width: int, height: int) -> Arra
     if left < right and top < bottom:
         window[top:bottom, left:right] = data[top - y : bottom - y, left - x : right - x]
     return window
+
+
+@Step("convert")
+def by_rows(convert: Callable[[Array], Array], pixels: Array) -> Floats:
+    """A new image in float32, made of some rows of another one at a time.
+
+    What is as large as several images in between never is there as a whole.
+    """
+    made = np.empty(pixels.shape, np.float32)
+    rows = max(BLOCK // max(pixels[0].size, 1), 1)
+    for top in range(0, len(pixels), rows):
+        made[top : top + rows] = convert(pixels[top : top + rows])
+    return made
 
 
 @Step("convert")

@@ -6,6 +6,7 @@ This is the only module that imports rawpy and exifread.
 import io
 import logging
 import math
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from clpipe.base.types import Floats
 from clpipe.camera.profile import SRGB_TO_XYZ, Matrix
 from clpipe.images.dng import D65
 from clpipe.images.encoding import SIMULATED
-from clpipe.images.pixels import USUAL_MAX_PIXELS, check_size
+from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS, check_size
 from clpipe.images.tags import DATE
 from clpipe.reference.cfa import PATTERNS, Pattern
 
@@ -163,6 +164,26 @@ def read_raw(path: Path, facts: RawFacts, max_pixels: int = USUAL_MAX_PIXELS) ->
     for site, black in enumerate(facts.black_levels):
         mosaic[site // 2 :: 2, site % 2 :: 2] += np.float32(facts.black_level - black)
     return mosaic
+
+
+def check_raw(path: Path) -> None:
+    """See that LibRaw can read all of a raw, of whatever kind.
+
+    Raises:
+        ImageError: it cannot.
+    """
+    with _opened(path, sys.maxsize) as raw:
+        raw.unpack()
+
+
+def raw_size(path: Path) -> tuple[int, int]:
+    """The width and height of the mosaic that a raw file claims.
+
+    Raises:
+        ImageError: the file is missing, damaged or not a raw.
+    """
+    with _opened(path, MAX_PIXELS) as raw:
+        return raw.sizes.raw_width, raw.sizes.raw_height
 
 
 @contextmanager

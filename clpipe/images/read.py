@@ -29,6 +29,7 @@ from clpipe.images.openimageio import SubsampledError, error_text, open_image
 from clpipe.images.pixels import (
     HALF_MAX,
     USUAL_MAX_PIXELS,
+    by_rows,
     check_size,
     clip_to_half,
     display_window,
@@ -134,7 +135,10 @@ def read_image(
         matrix = _srgb_matrix(path, decoded)
         if matrix is not None:
             with np.errstate(all="ignore"):  # overflow is clipped below
-                pixels = np.nan_to_num(pixels.astype(np.float32) @ matrix.T, copy=False)
+                pixels = by_rows(
+                    lambda rows: np.nan_to_num(rows.astype(np.float32) @ matrix.T, copy=False),
+                    pixels,
+                )
             warnings.append("its colours were converted to linear sRGB")
     # Beyond half it is so bright that nothing is lost, and no stage's squares overflow.
     if not mosaic and pixels.dtype == np.float32 and (beyond := clip_to_half(pixels)):
@@ -182,8 +186,9 @@ def read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
         and options.transfer
         and (finished := read_finished(path, options.max_pixels))
     ):
-        linear = TRANSFERS[options.transfer](finished.pixels.astype(np.float64))
-        return replace(finished, pixels=linear.astype(np.float32))
+        curve = TRANSFERS[options.transfer]
+        linear = by_rows(lambda rows: curve(rows.astype(np.float64)), finished.pixels)
+        return replace(finished, pixels=linear)
     if kind is not Kind.DISPLAY:
         mosaic = len(kind.channels) == 1
         overscan = options.overscan and kind is Kind.RGB

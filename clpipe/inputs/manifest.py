@@ -78,10 +78,12 @@ def read_manifest(path: Path, keep_suffix: bool = False) -> list[Row]:
     faults: list[str] = []
     rows: list[Row] = []
     makers: dict[str, Row] = {}
+    alike: dict[str, Mapping[str, Any]] = {}  # values that rows share are checked once
     for line, record in read(path, text, _check_column):
         place = f"{path}, row {line}"
         try:
             row = _row(path.parent, place, record())
+            row = replace(row, values=alike.setdefault(repr(row.values), row.values))
             if keep_suffix and not row.name:
                 row = replace(row, name=row.key)
             other = makers.setdefault(row.stem, row)
@@ -168,20 +170,21 @@ def check_rows(
     steps = step_names(settings)
     faults: list[str] = []
     checked: list[Settings] = []
-    known: dict[int, Settings] = {}  # rows may share their values
+    known: dict[tuple[int, bool], Settings] = {}  # rows may share their values
     for row in rows:
-        if shared := known.get(id(row.values)):
+        carried = carries(row.path)
+        if shared := known.get((id(row.values), carried)):
             checked.append(shared)
             continue
         try:
             own = overlay(settings, row.values)
-            if not carries(row.path):
+            if not carried:
                 own.check_cameras()
                 for step in row.values:
                     if step not in (*PLAIN, OUTPUT, *steps):
                         raise RequestError(one_of("stage in this chain", step, steps))
             checked.append(own)
-            known[id(row.values)] = own
+            known[id(row.values), carried] = own
         except RequestError as error:
             faults.append(f"{row.place}: {error}")
     _report(faults)

@@ -5,24 +5,58 @@ import os
 import re
 import stat
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.about import __version__
-from clpipe.base.digests import digests, joint_digest, stamp_of, stamp_of_all
+from clpipe.base.digests import digests, joint_digest, stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.base.system import open_plain
+from clpipe.images.whole import is_whole
 from clpipe.inputs.find import Job
-from clpipe.outputs.sidecar import OWN, outputs_in, read_sidecar
+from clpipe.outputs.program import program_digest
+from clpipe.outputs.sealed import SidecarError, outputs_in, read_sidecar
 
 MARKED = 1 << 16  # bytes at either end of a file, in which a format of clpipe names clpipe
+
+OVERWRITTEN = "would be overwritten; move it, choose another output folder, or say --overwrite"
 
 # The tag Software of clpipe, or an attribute of its own. The camera of a DNG is called clpipe, too,
 # and converters repeat it in what they make.
 MARK = re.compile(rb"clpipe \d+\.\d|clpipe:\w")
+
+
+class Found(Enum):
+    """What lies there of a rendition."""
+
+    NOTHING = "nothing that fits, or is whole"
+    OLD = "all, but made by another program"
+    DONE = "all"
+
+
+@dataclass(frozen=True)
+class Resuming:
+    """What of the pictures that are there already is made again.
+
+    Args:
+        overwrite: all of them, also those of others.
+        verify: what is damaged, which is found by reading everything.
+        keep_old: not those that another program made; else these are.
+    """
+
+    overwrite: bool = False
+    verify: bool = False
+    keep_old: bool = False
+
+    def is_kept(self, found: Found) -> bool:
+        """Whether what was found stays."""
+        return found is Found.DONE or (found is Found.OLD and self.keep_old)
+
+
+AS_USUAL = Resuming()
 
 
 @dataclass(frozen=True)
@@ -41,7 +75,7 @@ class Existing:
     others: Sequence[Path] = ()
     is_ours: bool = False
 
-    def is_done(self, job: Job, request: Mapping[str, Any], verify: bool = False) -> bool:
+    def found(self, job: Job, request: Mapping[str, Any], verify: bool = False) -> Found:
         """Whether all is there, unchanged, made of the same input by the same request.
 
         A file counts as unchanged where it has its size and was last touched before its sidecar was
@@ -57,46 +91,65 @@ class Existing:
         """
         try:
             values = read_sidecar(self.sidecar)
-        except FileNotFoundError:
+        except (FileNotFoundError, SidecarError):
             values = {}
         listed = outputs_in(values)
-        written = 0 if verify else _written(self.sidecar)
-        intact = {name for name, was in listed.items() if self._is_intact(name, was, written)}
+        written = _written(self.sidecar)
+        intact = {
+            name for name, was in listed.items() if self._is_intact(name, was, written, verify)
+        }
         pictures = {path.name for path in self.pictures}
-        if pictures <= intact == listed.keys() and is_current(values, job, request, verify):
-            return True
-        self._check_own(intact)
-        return False
+        if pictures <= intact == listed.keys():
+            found = found_in(values, job, request, verify)
+            if found is not Found.NOTHING:
+                return found
+        if not self.is_ours:
+            for path in (*self.pictures, *self.others):
+                if path.name not in intact and os.path.lexists(path):
+                    self._check_own(path, path.name in listed, written)
+        return Found.NOTHING
 
-    def _is_intact(self, name: str, was: Mapping[str, Any], written: int) -> bool:
+    def _is_intact(self, name: str, was: Mapping[str, Any], written: int, verify: bool) -> bool:
         """Whether a file is what a sidecar says of it.
 
         Args:
             name: of the file.
             was: its size and SHA-256.
-            written: when the sidecar was written, in ns since 1970; 0 compares the SHA-256.
+            written: when the sidecar was written, in ns since 1970.
+            verify: compare the SHA-256 in any case.
         """
         path = self.sidecar.with_name(name)
         try:
             status = os.lstat(path)
             if not stat.S_ISREG(status.st_mode) or status.st_size != was["size"]:
                 return False
-            return 0 <= status.st_ctime_ns <= written or sha256_of(path)[0] == was["sha256"]
+            is_untouched = not verify and status.st_ctime_ns <= written
+            return is_untouched or sha256_of(path)[0] == was["sha256"]
         except OSError:
             return False
 
-    def _check_own(self, intact: Collection[str]) -> None:
-        """See that what would be overwritten is clpipe's.
+    def _check_own(self, path: Path, is_listed: bool, written: int) -> None:
+        """See that a file that would be overwritten is clpipe's.
+
+        Args:
+            path: the file, which is not as a sidecar says.
+            is_listed: whether the sidecar lists it.
+            written: when the sidecar was written, in ns since 1970.
 
         Raises:
-            ImageError: a file is somebody else's.
+            ImageError: it is somebody else's, or somebody changed it.
         """
-        for path in () if self.is_ours else (*self.pictures, *self.others):
-            if path.name not in intact and os.path.lexists(path) and not is_marked(path):
-                raise ImageError(
-                    f"{path}: clpipe did not write this file, or it was changed since, and would "
-                    "be overwritten; move it, choose another output folder, or say --overwrite"
-                )
+        if not is_marked(path):
+            raise ImageError(
+                f"{path}: clpipe did not write this file, or it was changed since, and "
+                f"{OVERWRITTEN}"
+            )
+        # What nobody has touched since was changed by the disk, which has no title to it.
+        if is_listed and os.lstat(path).st_ctime_ns > written and is_whole(path):
+            raise ImageError(
+                f"{path}: was changed since clpipe wrote it (its SHA-256 is not that in "
+                f"{self.sidecar.name}), and {OVERWRITTEN}"
+            )
 
 
 def _written(path: Path) -> int:
@@ -108,27 +161,45 @@ def _written(path: Path) -> int:
     return modified if modified <= time.time_ns() else 0
 
 
-def is_current(
+def found_in(
     values: Mapping[str, Any], job: Job, request: Mapping[str, Any], verify: bool = False
-) -> bool:
-    """Whether a sidecar's values are of the same input, the same request and this version.
+) -> Found:
+    """Whether a sidecar's values are of the same input, the same request and this program.
 
-    An input of the same size and time of change is taken for the same; else, and with ``verify``,
-    its SHA-256 decides. Arguments as for :meth:`Existing.is_done`.
+    Arguments as for :meth:`Existing.found`.
     """
-    if values.get(OWN) != __version__ or not _same_request(values.get("request"), request):
-        return False
-    size, modified = stamp_of_all(job.paths)
-    if values.get("input_size") != size:
-        return False
-    is_touched = values.get("input_modified") != modified
-    if (is_touched or verify) and values.get("sha256") != _digest_of(job):
-        return False
+    if not _same_request(values.get("request"), request) or not _same_input(values, job, verify):
+        return Found.NOTHING
+    return Found.DONE if values.get("program") == program_digest() else Found.OLD
+
+
+def _same_input(values: Mapping[str, Any], job: Job, verify: bool) -> bool:
+    """Whether a sidecar's values are of a job's files.
+
+    An input each of whose files has the same size and time of change is taken for the same; else,
+    and with ``verify``, its SHA-256 decides.
+    """
     try:
+        was, now = stamps_in(values), [stamp_of(path) for path in job.paths]
+        if [size for size, _ in was] != [size for size, _ in now]:
+            return False
+        if (was != now or verify) and values["sha256"] != _digest_of(job):
+            return False
         layers = (*values.get("carried", ()), *values.get("depth", ()))
         return all(_is_same(job, each, verify) for each in layers)
     except (KeyError, TypeError):  # the sidecar is damaged
         return False
+
+
+def stamps_in(values: Mapping[str, Any]) -> list[tuple[int, int]]:
+    """The size and the time of change of each file of the input, as a sidecar's values say them.
+
+    Raises:
+        KeyError, TypeError: the values are damaged.
+    """
+    if "subframes" in values:
+        return [(each["size"], each["modified"]) for each in values["subframes"]]
+    return [(values["input_size"], values["input_modified"])]
 
 
 def _digest_of(job: Job) -> str | None:

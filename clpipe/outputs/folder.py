@@ -25,12 +25,16 @@ LOCK = ".clpipe.lock"
 UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # as whole_file names them
 
 
-def write_problem(folder: Path) -> str:
-    """Why nothing can be written to a folder, "" where it can."""
+def write_problem(folder: Path, with_room: bool = True) -> str:
+    """Why nothing can be written to a folder, "" where it can.
+
+    Without ``with_room`` a full disk will do, as for a run that may find all done.
+    """
     probe = folder / f".clpipe.{secrets.token_hex(8)}"
     try:
         with open(probe, "xb") as file:
-            reserve(file, ROOM)
+            if with_room:
+                reserve(file, ROOM)
     except OSError as error:
         needed = f" ({in_words(ROOM)} are needed)" if error.errno == errno.ENOSPC else ""
         return f"cannot write there: {error.strerror}{needed}"
@@ -42,7 +46,7 @@ def write_problem(folder: Path) -> str:
 
 @contextlib.contextmanager
 def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
-    """Make the folder, see that it can be written to, and lock it against other runs.
+    """Make the folder, see that files can be made in it, and lock it against other runs.
 
     Shards of one run share the lock. It is the system's, so it ends with the process.
 
@@ -53,7 +57,7 @@ def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RequestError(f"{folder}: cannot write there: {error.strerror}") from None
-    if reason := write_problem(folder):
+    if reason := write_problem(folder, with_room=False):
         raise RequestError(f"{folder}: {reason}")
     # Each shard holds its part of a file in which nothing is ever written.
     first = HOLDABLE * (shard.number - 1) // shard.of

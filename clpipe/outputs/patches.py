@@ -21,8 +21,6 @@ from clpipe.stage import Access
 
 PER_IMAGE = 16  # patches, unless another number is asked for
 
-MOST = 9999  # files of an image, whose names have four digits
-
 
 @dataclass(frozen=True)
 class Patch:

@@ -1,7 +1,5 @@
 """The sidecar: everything that is needed to make a picture again, and to see that it is done."""
 
-import json
-import os
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -11,9 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.about import __version__, full_version
-from clpipe.base.errors import ImageError
-from clpipe.base.files import Stored, keep_names, write_whole
-from clpipe.base.reading import parse_json, read_bytes
+from clpipe.base.files import Stored
 from clpipe.chain.chain import Chain
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
@@ -25,91 +21,14 @@ from clpipe.inputs.carry import Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.raw import RawImage
 from clpipe.outputs.patches import Patch, facts_of
+from clpipe.outputs.program import program_digest
 from clpipe.outputs.renditions import Rendition
+from clpipe.outputs.sealed import OWN, sealed
 from clpipe.reference.intrinsics import Intrinsics
-
-SIDECAR = "json"  # the ending of its name
-
-OWN = "clpipe"  # the first key of every sidecar
 
 FACTS, PATCHES = "facts", "patches"  # keys of a sidecar of patches
 
 SAID = ("image_key", "noise_key", "iso", "noise")  # keys of a sidecar that its patches have, too
-
-BEGINNING = f'{{\n  "{OWN}": '.encode()
-
-
-def read_sidecar(path: Path) -> dict[str, Any]:
-    """A sidecar's values, of which only the key :data:`OWN` is sure to be there.
-
-    Raises:
-        FileNotFoundError: it is missing, or is empty or cut off, as a loss of power may leave it.
-        ImageError: it cannot be read, or clpipe did not write it.
-    """
-    try:
-        data = read_bytes(path)
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
-    try:
-        values = parse_json(data)
-    except ValueError:
-        values = None
-        if not data.strip(b"\0") or data.startswith(BEGINNING):
-            raise FileNotFoundError(path) from None
-    if not isinstance(values, dict) or OWN not in values:
-        raise ImageError(
-            f"{path}: clpipe did not write this file, and would overwrite it with its sidecar; "
-            "move it, choose another output folder, or say --overwrite"
-        )
-    return values
-
-
-def outputs_in(values: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """The files that a sidecar's values list: the size and the SHA-256 of each, by its name.
-
-    What is no name beside the sidecar, or says no size and SHA-256, is left out.
-    """
-    listed = values.get("outputs")
-    return {
-        each["name"]: each
-        for each in (listed if isinstance(listed, list) else ())
-        if isinstance(each, dict) and {"name", "size", "sha256"} <= each.keys()
-        if isinstance(each["name"], str) and os.path.basename(each["name"]) == each["name"] != ""
-    }
-
-
-def write_sidecar(path: Path, record: Mapping[str, Any]) -> None:
-    """Write the sidecar of a picture, whose files are all there.
-
-    Raises:
-        ImageError: it cannot be written.
-    """
-    write_whole(path, json_text(record).encode())
-    keep_names(path.parent)
-
-
-def json_text(record: Mapping[str, Any]) -> str:
-    """JSON with a line for each key, and for each object of a list.
-
-    >>> print(json_text({"a": 1, "b": [{"c": 2}, {"d": [3, 4]}]}), end="")
-    {
-      "a": 1,
-      "b": [
-        {"c": 2},
-        {"d": [3, 4]}
-      ]
-    }
-    """
-    lines = []
-    for key, value in record.items():
-        text = json.dumps(value)
-        if isinstance(value, list) and value and isinstance(value[0], dict):
-            each = ",\n".join(f"    {json.dumps(one)}" for one in value)
-            text = f"[\n{each}\n  ]"
-        lines.append(f"  {json.dumps(key)}: {text}")
-    return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 def intrinsics_of(chain: Chain, source: SourceImage) -> Intrinsics | None:
@@ -132,15 +51,20 @@ def intrinsics_of(chain: Chain, source: SourceImage) -> Intrinsics | None:
     return chain.intrinsics(width, height, shot)
 
 
-def subframe_records(source: SourceImage) -> list[dict[str, str]]:
+def subframe_records(
+    source: SourceImage, stamps: Sequence[tuple[int, int]]
+) -> list[dict[str, Any]]:
     """The files that an exposure is the mean of, relative to the folder of the first."""
-    return [{"file": name, "sha256": digest} for name, digest in source.subframes]
+    return [
+        {"file": name, "size": size, "modified": modified, "sha256": digest}
+        for (name, digest), (size, modified) in zip(source.subframes, stamps, strict=True)
+    ]
 
 
 def sidecar(
     job: Job,
     request: Mapping[str, Any],
-    stamp: tuple[int, int],
+    stamps: Sequence[tuple[int, int]],
     rendition: Rendition,
     frames: int | None,
     device: Device | None,
@@ -156,7 +80,7 @@ def sidecar(
     Args:
         job: the image.
         request: the record of the request for the image.
-        stamp: the input's size and time of change, before it was read.
+        stamps: the size and the time of change of each file of the input, before it was read.
         rendition: the picture.
         frames: how many frames its burst has; None without a burst.
         device: where it was made; None is NumPy.
@@ -170,16 +94,15 @@ def sidecar(
     chain = rendition.whole
     facts = source.facts if isinstance(source, RawImage) else None
     noise = chain.noise if not facts or chain.is_noisy else None
-    bytes_, modified = stamp
     width, height = chain.size(*source.pixels.shape[1::-1])
     intrinsics = intrinsics_of(chain, source)
     return {
         OWN: __version__,
         "input": job.input,
-        "input_size": bytes_,
-        "input_modified": modified,
+        "input_size": stamps[0][0],
+        "input_modified": stamps[0][1],
         "sha256": source.sha256,
-        **({"subframes": subframe_records(source)} if source.subframes else {}),
+        **({"subframes": subframe_records(source, stamps)} if source.subframes else {}),
         "layer": source.layer,
         "name": job.stem,
         "picture": rendition.name,
@@ -214,6 +137,7 @@ def sidecar(
         **({"overscan": source.margins._asdict()} if source.margins else {}),
         "warnings": list(source.warnings),
         "device": device_record(device),
+        "program": program_digest(),
         "versions": all_versions(),
         "request": request,
     }
@@ -226,14 +150,14 @@ def patch_records(chain: Chain, patches: Sequence[Patch]) -> dict[str, Any]:
     return {FACTS: facts, PATCHES: places}
 
 
-def patch_text(values: Mapping[str, Any], number: int) -> str:
-    """What is said of one patch, by its number, in the sidecar's values, as JSON.
+def patch_text(values: Mapping[str, Any], number: int) -> bytes:
+    """What is said of one patch, by its number, in the sidecar's values: a sidecar of its own.
 
     Raises:
         KeyError, TypeError, IndexError: the values are damaged.
     """
     said = {key: values[key] for key in SAID}
-    return json_text({OWN: values[OWN], **said, **values[FACTS], **values[PATCHES][number]})
+    return sealed({OWN: values[OWN], **said, **values[FACTS], **values[PATCHES][number]})
 
 
 @lru_cache(maxsize=8)

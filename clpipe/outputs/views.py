@@ -17,11 +17,19 @@ from pydantic import TypeAdapter
 from clpipe.base.about import __version__
 from clpipe.base.errors import ImageError
 from clpipe.base.files import keep_names, make_folder_of, write_whole
+from clpipe.base.reading import read_bytes
 from clpipe.chain.formats import DNG, ending_of
 from clpipe.images.encoding import Matrix, Vector
 from clpipe.outputs.existing import is_marked
 from clpipe.outputs.renditions import truth_named
-from clpipe.outputs.sidecar import BEGINNING, SIDECAR, json_text, outputs_in, read_sidecar
+from clpipe.outputs.sealed import (
+    SIDECAR,
+    SidecarError,
+    is_sidecar,
+    json_text,
+    outputs_in,
+    values_in,
+)
 from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
 from clpipe.reference.pose import to_opengl, to_quaternion
 
@@ -40,6 +48,8 @@ NOTE = (
 OPENGL_NOTE = (
     f"clpipe {__version__}: camera to world, OpenGL's axes; the first pixel's centre at (0.5, 0.5)"
 )
+
+CHANGED = "a sidecar that was changed since clpipe wrote it"
 
 CAMERA = TypeAdapter(Intrinsics)
 POSE: TypeAdapter[tuple[Matrix, Vector]] = TypeAdapter(tuple[Matrix, Vector])
@@ -78,7 +88,7 @@ def check_view_files(folder: Path) -> None:
         ImageError: one of their names is somebody else's.
     """
     for path in (folder / name for name in FILES):
-        if os.path.lexists(path) and not is_marked(path):
+        if os.path.lexists(path) and not (is_marked(path) or _is_taken(path)):
             raise ImageError(
                 f"{path}: clpipe did not write this file, and would overwrite it with the cameras "
                 "of this folder's pictures; move it, or choose another output folder"
@@ -89,7 +99,7 @@ def write_views(folder: Path) -> Written:
     """Write the views of an output folder, as its sidecars say them.
 
     Raises:
-        ImageError: a sidecar cannot be read, or a file cannot be written or is somebody else's.
+        ImageError: a file cannot be written or is somebody else's.
     """
     check_view_files(folder)
     left_out: dict[str, list[str]] = defaultdict(list)
@@ -102,8 +112,13 @@ def write_views(folder: Path) -> Written:
     texts = {CAMERAS: cameras_json(found), **colmap(found, posed, left_out)} if found else {}
     if nerf := nerfstudio(posed, left_out):
         texts[TRANSFORMS] = nerf
+    taken = [name for name in texts if _is_taken(folder / name)]
+    for name in taken:
+        del texts[name]
     for name in FILES:
         path = folder / name
+        if _is_taken(path):
+            continue
         if name in texts:
             make_folder_of(path)
             write_whole(path, texts[name].encode())
@@ -115,7 +130,20 @@ def write_views(folder: Path) -> Written:
         for why, files in left_out.items()
         if files
     )
+    reasons += tuple(
+        f"{folder / name} is the sidecar of a picture, so the cameras are not written there; give "
+        "that image another name"
+        for name in taken
+    )
     return Written(tuple(name for name in FILES if name in texts), len(found), reasons)
+
+
+def _is_taken(path: Path) -> bool:
+    """Whether a file of the views would take the place of a picture's sidecar."""
+    try:
+        return is_sidecar(read_bytes(path))
+    except OSError:
+        return False
 
 
 def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Photograph]:
@@ -128,19 +156,18 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
         folder: the output folder.
         left_out: gets the names of those whose camera is not known, by the reason.
 
-    Raises:
-        ImageError: a sidecar cannot be read.
     """
     for place, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
         for name in names:
             path = Path(place, name)
-            if not name.endswith(f".{SIDECAR}") or name.startswith(".") or not _is_sidecar(path):
+            if not name.endswith(f".{SIDECAR}") or name.startswith("."):
                 continue
+            shown = path.relative_to(folder).as_posix()
             try:
-                values = read_sidecar(path)
-                file = _picture(path, values)
-                if not file:
+                values = values_in(read_bytes(path), path)
+                file = values and _picture(path, values)
+                if not values or not file:
                     continue
                 shown = file.relative_to(folder).as_posix()
                 if values["intrinsics"] is None:
@@ -150,8 +177,13 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
                 pose = values["pose"]
                 r_and_t = pose and POSE.validate_python((pose["R"], pose["t"]))
                 yield Photograph(shown, simplest(camera), r_and_t)
-            except (FileNotFoundError, KeyError, TypeError, ValueError):
-                shown = path.relative_to(folder).as_posix()
+            except SidecarError:
+                left_out[f"{CHANGED}, so not used; the same clpipe run makes it again"].append(
+                    shown
+                )
+            except OSError:  # nor does a run take it for a sidecar
+                continue
+            except (KeyError, TypeError, ValueError):
                 left_out["a sidecar that is damaged or of another version"].append(shown)
 
 
@@ -166,15 +198,6 @@ def _picture(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
         return None
     file = sidecar.with_name(f"{sidecar.name.removesuffix(SIDECAR)}{ending_of(formats[0])}")
     return file if file.name in outputs_in(values) and file.exists() else None
-
-
-def _is_sidecar(path: Path) -> bool:
-    """Whether a JSON is clpipe's, by how it begins."""
-    try:
-        with path.open("rb") as file:
-            return file.read(len(BEGINNING)) == BEGINNING
-    except OSError:
-        return False
 
 
 def simplest(camera: Intrinsics) -> Intrinsics:

@@ -35,7 +35,7 @@ from clpipe.outputs.renditions import (
     truth_named,
 )
 from clpipe.outputs.results import results_of
-from clpipe.outputs.sidecar import SIDECAR
+from clpipe.outputs.sealed import SIDECAR, remove_sidecar
 from clpipe.reference.geometry import NO_MARGINS
 from clpipe.stage import Kind
 
@@ -291,6 +291,8 @@ class OutputWriter:
             OutputError: the output folder has gone.
         """
         self._make_folder_of(job)
+        # A new picture beside an old sidecar would look like one that somebody has changed.
+        remove_sidecar(self.path(job, SIDECAR, rendition.name))
         outputs: dict[Path, Stored] = {}
         for number, part in parts_of(rendition, result, patches):
             outputs |= self._write(job, rendition, source, part, number)

@@ -1,5 +1,6 @@
 """The figures of a run: what became of its images, how long it took, and what was drawn."""
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -104,8 +105,12 @@ def sessions(logs: Iterable[Mapping[str, Any]]) -> list[Session]:
 
 
 def number(value: Any) -> float:
-    """A value as a number; what is none counts as 0."""
-    return float(value) if isinstance(value, int | float) else 0.0
+    """A value as a number; what is none, or not finite, counts as 0."""
+    try:
+        found = float(value) if isinstance(value, int | float) else 0.0
+    except OverflowError:
+        return 0.0
+    return found if math.isfinite(found) else 0.0
 
 
 def moment(line: Mapping[str, Any]) -> float:
@@ -191,6 +196,12 @@ class Parameter:
         return ", ".join(listed) + (f" and {more} more" if more > 0 else "")
 
 
+def plain(value: Any) -> int | float | str | None:
+    """A value of a sidecar that can be counted and ordered; what is none is its text."""
+    is_plain = isinstance(value, str | None) or value == number(value)
+    return value if is_plain else str(value)
+
+
 def text_of(value: Any) -> str:
     """A value of a sidecar for people."""
     if isinstance(value, bool) or value is None:
@@ -239,20 +250,23 @@ def _step(name: str, counted: Sequence[tuple[Mapping[str, Any], int]]) -> Step:
         methods[str(record.get("method"))] += count
         parameters = record.get("parameters")
         for key, value in parameters.items() if isinstance(parameters, Mapping) else ():
-            plain = value if isinstance(value, int | float | str | None) else str(value)
-            values.setdefault(str(key), Counter())[plain] += count
+            values.setdefault(str(key), Counter())[plain(value)] += count
     parameters = [Parameter(key, each) for key, each in values.items()]
     return Step(name, methods, parameters, methods.total())
 
 
 def drawn(pictures: Sequence[Made], steps: Sequence[Step]) -> list[Parameter]:
     """What differs from picture to picture: camera, ISO, noise and parameters."""
-    facts = [
-        Parameter("camera", Counter(text_of(made.value("camera")) for made in pictures)),
-        Parameter("ISO", Counter(made.value("iso") for made in pictures)),
-        Parameter("noise a", Counter(made.value("noise", "signal", "a") for made in pictures)),
-        Parameter("noise b", Counter(made.value("noise", "signal", "b") for made in pictures)),
-        Parameter("clipped share", Counter(made.value("clipped") for made in pictures)),
+    cameras = Counter(text_of(made.value("camera")) for made in pictures)
+    facts = [Parameter("camera", cameras)]
+    facts += [
+        Parameter(name, Counter(plain(made.value(*keys)) for made in pictures))
+        for name, keys in (
+            ("ISO", ("iso",)),
+            ("noise a", ("noise", "signal", "a")),
+            ("noise b", ("noise", "signal", "b")),
+            ("clipped share", ("clipped",)),
+        )
     ]
     repeated = {("sensor_noise", "a"), ("sensor_noise", "b")}
     facts += [

@@ -13,7 +13,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.reading import TEXT_BYTES, parse_json, read_bytes
 from clpipe.batch.run_log import read_log
 from clpipe.batch.tars import DAMAGED
-from clpipe.outputs.sidecar import BEGINNING, SIDECAR, outputs_in
+from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, values_in
 
 TAR = ".tar"
 # What is kept of sidecars, of which there may be hundreds of thousands.
@@ -109,20 +109,22 @@ class Run:
         self._alike: dict[str, Any] = {}
         self._steps: dict[bytes, Any] = {}
 
-    def parsed(self, sidecar: bytes) -> dict[str, Any]:
-        """The values of a sidecar that clpipe wrote.
+    def parsed(self, sidecar: bytes) -> Any:
+        """The values of a sidecar, as clpipe lays it out.
 
         Most lines of stages are those of other sidecars, too: a line is parsed once, and is one
-        object. Where a sidecar has been laid out anew, all of it is parsed.
+        object.
 
         Raises:
-            ValueError: it is no JSON.
+            ValueError: it is no JSON of an object.
         """
         head, _, rest = sidecar.partition(STAGES)
         lines, end, tail = rest.partition(STAGES_END)
         if not end:
-            return dict(parse_json(sidecar))
-        values = dict(parse_json(head + b"\n" + tail))
+            return parse_json(sidecar)
+        values = parse_json(head + b"\n" + tail)
+        if not isinstance(values, dict):
+            raise ValueError("it is no object")
         values["stages"] = [self._step(line) for line in lines.split(b",\n")]
         return values
 
@@ -244,12 +246,12 @@ def _made(
         data: its bytes.
         beside: the files of its folder by their names.
     """
-    if not data.startswith(BEGINNING):
-        return
     try:
-        record = run.parsed(data)
-    except ValueError:
-        run.problems.append(f"{_joined(below, name)}: is cut off or damaged")
+        record = values_in(data, _joined(below, name), run.parsed)
+    except SidecarError as error:
+        run.problems.append(str(error))
+        return
+    if record is None:
         return
     rendition = record.get("picture")
     stem = name.removesuffix(f".{SIDECAR}")

@@ -342,9 +342,9 @@ def _strip(made: Made, budget: Budget, problems: list[str]) -> list[dict[str, st
 
 def _facts(made: Made) -> str:
     """A line about a picture."""
-    noise = made.value("noise", "signal") or {}
-    law = f"; variance {number(noise.get('a')):.3g} y + {number(noise.get('b')):.3g}"
+    a, b = (number(made.value("noise", "signal", key)) for key in "ab")
+    law = f"; variance {a:.3g} y + {b:.3g}"
     size = f"{number(made.value('width')):.0f} x {number(made.value('height')):.0f} px"
     iso, clipped = number(made.value("iso")), number(made.value("clipped"))
     text = f"{size}, {made.value('camera')}, ISO {iso:g}, {clipped * 100:.2f} % clipped"
-    return text + (law if noise else "")
+    return text + (law if made.value("noise", "signal") else "")

@@ -2,18 +2,19 @@
 
 import csv
 import io
+import logging
 import os
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from clpipe.base.about import __version__
 from clpipe.base.files import write_new
 from clpipe.images.sheet import SHOWN, contact_sheet
 from clpipe.inputs.find import Job
-from clpipe.outputs.sidecar import SIDECAR, read_sidecar
+from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, read_sidecar
 from clpipe.outputs.views import FILES
 from clpipe.outputs.writer import OutputWriter
 from clpipe.scenes.record import RECORD
@@ -21,6 +22,20 @@ from clpipe.scenes.record import RECORD
 SHEET, MANIFEST, README = "contact_sheet.jpg", "manifest.csv", "README.md"
 MOST_ROWS = 12  # of the contact sheet
 PICTURE, CARRIED = "picture", "carried"
+
+# What is raised for values of a forged sidecar.
+DAMAGED = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
+
+log = logging.getLogger(__name__)
+
+
+class Facts(NamedTuple):
+    """What is said of a picture, as texts: its size in px, the variance of the raw's noise."""
+
+    camera: str
+    iso: str
+    size: str
+    law: str
 
 
 @dataclass(frozen=True)
@@ -31,14 +46,14 @@ class Member:
         view: the name of its render, without its ending.
         folder: below the dataset's, by camera and ISO; "" is the dataset's own.
         files: paths below the dataset's folder: "picture", "truth_clean" and so on, "carried".
-        record: the picture's sidecar.
+        facts: of the picture.
         render: what it was made of, below the dataset's folder where it lies there.
     """
 
     view: str
     folder: str
     files: Mapping[str, str]
-    record: Mapping[str, Any]
+    facts: Facts
     render: str
 
 
@@ -92,25 +107,41 @@ def _view(job: Job) -> str:
 
 
 def _member(writer: OutputWriter, job: Job) -> Member | None:
-    """What was made of a job; None where something of it failed."""
+    """What was made of a job; None where something of it failed, or is not as it was written."""
     files: dict[str, str] = {}
-    records = []
+    facts = []
     for name in writer.names_of(job):
         path = writer.path(job, SIDECAR, name)
         try:
-            records.append(read_sidecar(path))
+            values = read_sidecar(path)
+            facts.append(_facts(values))
+            first, *others = outputs_in(values)
         except FileNotFoundError:
             return None
+        except (SidecarError, *DAMAGED):
+            log.warning("%s; the card goes without it", SidecarError(path))
+            return None
         place = path.parent.relative_to(writer.folder)
-        made = [(place / each["name"]).as_posix() for each in records[-1]["outputs"]]
-        files.setdefault(name.removeprefix(".") or PICTURE, made[0])
-        for each in made:
+        files.setdefault(name.removeprefix(".") or PICTURE, (place / first).as_posix())
+        for each in others:
             if each.endswith(f".{CARRIED}.exr"):
-                files[CARRIED] = each
+                files[CARRIED] = (place / each).as_posix()
     own = job.stem.removesuffix(_view(job)).rstrip("/")
     below = os.path.relpath(job.path, writer.folder)
     render = job.input if below.startswith("..") else below
-    return Member(_view(job), own, files, records[0], render)
+    return Member(_view(job), own, files, facts[0], render)
+
+
+def _facts(values: Mapping[str, Any]) -> Facts:
+    """What the card says of a picture, by its sidecar.
+
+    Raises:
+        KeyError, TypeError, ValueError, AttributeError, OverflowError: the values are damaged.
+    """
+    noise = (values["noise"] or {}).get("signal", {"a": 0.0, "b": 0.0})
+    size = f"{values['width']:d}x{values['height']:d}"
+    law = f"{noise['a']:.3g} y + {noise['b']:.3g}"
+    return Facts(str(values["camera"]), f"{values['iso']:g}", size, law)
 
 
 def _manifest(members: Sequence[Member], splits: Mapping[str, str]) -> str:
@@ -120,8 +151,8 @@ def _manifest(members: Sequence[Member], splits: Mapping[str, str]) -> str:
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["view", "split", "camera", "iso", *kinds, "render"])
     for member in members:
-        facts = member.record["camera"], f"{member.record['iso']:g}"
         files = [member.files.get(kind, "") for kind in kinds]
+        facts = member.facts.camera, member.facts.iso
         table.writerow([member.view, splits[member.view], *facts, *files, member.render])
     return text.getvalue()
 
@@ -163,11 +194,8 @@ def _readme(
     shown = list(splits.values())
     rows = []
     for member in {each.folder: each for each in reversed(members)}.values():
-        noise = (member.record["noise"] or {}).get("signal", {"a": 0.0, "b": 0.0})
         count = sum(each.folder == member.folder for each in members)
-        camera, iso = member.record["camera"], f"{member.record['iso']:g}"
-        size = f"{member.record['width']}x{member.record['height']}"
-        law = f"{noise['a']:.3g} y + {noise['b']:.3g}"
+        camera, iso, size, law = member.facts
         rows.append(f"| `{member.folder or '.'}/` | {camera} | {iso} | {count} | {size} | {law} |")
     facts = "\n".join(f"- **{name}:** {text}" for name, text in about.items())
     kinds = dict.fromkeys(kind for member in members for kind in member.files)

@@ -1,6 +1,7 @@
 """The pictures of a camera that a development is matched to: read, checked, cut, and masked."""
 
 import glob
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -87,14 +88,15 @@ class Scenes:
 
 
 def expand(patterns: Sequence[str], what: str) -> list[Path]:
-    """The files of names and globs, in order.
+    """The files of names and globs, in order; what exists is a name.
 
     Raises:
         RequestError: a glob matches nothing.
     """
     found: list[Path] = []
     for pattern in patterns:
-        names = sorted(glob.glob(pattern)) if glob.has_magic(pattern) else [pattern]
+        is_glob = glob.has_magic(pattern) and not os.path.exists(pattern)
+        names = sorted(glob.glob(pattern)) if is_glob else [pattern]
         if not names:
             raise RequestError(f"{what}: nothing matches {pattern}")
         found += map(Path, names)

@@ -1,0 +1,171 @@
+"""Programs, compiled or taken from what is kept of them between processes.
+
+A runtime believes what it is given: of a library that was cut, PoCL ends the process. So none
+reads the store itself.
+
+PoCL has no call that takes compiled kernels back; it maps libraries out of a folder. So each
+process has a folder for it, and what is kept of a program is its part of that folder.
+"""
+
+import io
+import os
+import re
+import threading
+import zipfile
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from clpipe.base.errors import DeviceError
+from clpipe.engine.process_folder import ROOM, has_room
+from clpipe.engine.store import Store
+
+
+class BinaryBuilder:
+    """Builds programs with a runtime that gives binaries and takes them back.
+
+    Args:
+        context: a ``pyopencl.Context`` of one device.
+        store: for the binaries.
+    """
+
+    def __init__(self, context: Any, store: Store) -> None:
+        self._context = context
+        self._store = store
+
+    def build(self, source: str, options: list[str]) -> Any:
+        """The ``pyopencl.Program``, of what is kept if the runtime takes it.
+
+        Raises:
+            pyopencl.Error: it does not compile.
+        """
+        import pyopencl as cl
+
+        if kept := self._store.load(source, *options):
+            with suppress(cl.Error):
+                program = cl.Program(self._context, self._context.devices, [kept])
+                return program.build(options, cache_dir=False)
+        program = cl.Program(self._context, source).build(options, cache_dir=False)
+        with suppress(cl.Error):
+            (binary,) = program.get_info(cl.program_info.BINARIES)
+            if binary:
+                self._store.keep(binary, source, *options)
+        return program
+
+    def keep(self) -> None:
+        """Nothing is left to be kept."""
+
+
+class PoclBuilder:
+    """Builds programs with PoCL, out of and into its folder.
+
+    PoCL has a folder for each program, named by a digest that only PoCL knows, with libraries that
+    come at the first launch of each local size. So what is kept is written after that.
+
+    Args:
+        context: a ``pyopencl.Context``.
+        store: for what is in PoCL's folder.
+        folder: PoCL's, of this process alone.
+    """
+
+    _one_at_a_time = threading.Lock()  # what a build has added to the folder is seen by looking
+
+    def __init__(self, context: Any, store: Store, folder: Path) -> None:
+        self._context = context
+        self._store = store
+        self._folder = folder
+        # The folders of programs, by text and options, with the files of each that are kept.
+        self._built: dict[tuple[str, tuple[str, ...]], tuple[str, frozenset[str]]] = {}
+
+    def build(self, source: str, options: list[str]) -> Any:
+        """The ``pyopencl.Program``; what is kept is put back into PoCL's folder before.
+
+        Raises:
+            pyopencl.Error: it does not compile.
+            DeviceError: there is no room to compile in, where PoCL would end the process.
+        """
+        import pyopencl as cl
+
+        with self._one_at_a_time:
+            before = _programs_in(self._folder)
+            if kept := self._store.load(source, *options):
+                _unpack(kept, self._folder)
+            unpacked = _programs_in(self._folder) - before
+            if not unpacked and not has_room(self._folder.parent):
+                raise DeviceError(
+                    f"{self._folder}: PoCL needs {ROOM >> 20} MiB of room there to compile in; "
+                    "free some, or name another folder for temporary files with TMPDIR"
+                )
+            program = cl.Program(self._context, source).build(options, cache_dir=False)
+            added = _programs_in(self._folder) - before
+            if len(added) == 1:
+                (name,) = added
+                files = _files_of(self._folder / name) if unpacked == added else frozenset()
+                self._built[source, tuple(options)] = name, files
+        return program
+
+    def keep(self) -> None:
+        """Keep what PoCL has made of programs since they were built."""
+        for (source, options), (name, kept) in list(self._built.items()):
+            files = _files_of(self._folder / name)
+            if files - kept:
+                data = _packed(self._folder, name, files)
+                self._store.keep(data, source, *options)
+                self._built[source, options] = name, files
+
+
+PROGRAM = re.compile(r"[A-Z]{2}/[A-Z]+")
+FILE = re.compile(rf"{PROGRAM.pattern}(/(?!\.\.?/)[^/\\\0]+)+")
+TOUCHED = "last_accessed"  # PoCL writes it at each use, and never reads it
+
+
+def _programs_in(folder: Path) -> frozenset[str]:
+    """The programs in PoCL's folder, as "AB/CDE..."."""
+    groups = _names(folder)
+    found = (f"{group}/{name}" for group in groups for name in _names(folder / group))
+    return frozenset(name for name in found if PROGRAM.fullmatch(name))
+
+
+def _names(folder: Path) -> list[str]:
+    try:
+        return os.listdir(folder)
+    except OSError:  # it is a file, or not there yet
+        return []
+
+
+def _files_of(program: Path) -> frozenset[str]:
+    """The files of a program, by their names below its folder."""
+    return frozenset(
+        os.path.relpath(os.path.join(place, name), program)
+        for place, _, names in os.walk(program)
+        for name in names
+        if name != TOUCHED
+    )
+
+
+def _packed(folder: Path, program: str, files: frozenset[str]) -> bytes:
+    """Files of a program, as a ZIP archive of names in PoCL's folder."""
+    memory = io.BytesIO()
+    with zipfile.ZipFile(memory, "w") as archive:
+        for name in sorted(files):
+            with suppress(OSError):
+                data = (folder / program / name).read_bytes()
+                archive.writestr(zipfile.ZipInfo(f"{program}/{name}"), data)
+    return memory.getvalue()
+
+
+def _unpack(data: bytes, folder: Path) -> None:
+    """Put a packed program into PoCL's folder, as far as it can be."""
+    with suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(io.BytesIO(data)) as archive:
+        for name, content in _contents(archive):
+            path = folder / name
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            path.write_bytes(content)
+
+
+def _contents(archive: zipfile.ZipFile) -> Iterator[tuple[str, bytes]]:
+    """The names and the bytes of files that belong into PoCL's folder."""
+    for info in archive.infolist():
+        if FILE.fullmatch(info.filename):
+            yield info.filename, archive.read(info)

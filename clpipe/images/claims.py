@@ -1,0 +1,78 @@
+"""What a file says of its size, and the memory that reading it takes; no pixel is read."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from clpipe.base.errors import ImageError
+from clpipe.images.colour import CIE_XYZ, SRGB, to_linear_srgb
+from clpipe.images.layers import picture_channels
+from clpipe.images.openexr import WASTE
+from clpipe.images.openimageio import open_image
+from clpipe.images.raw import RAW_SUFFIXES, raw_size
+
+FLOAT = 4  # bytes
+
+
+@dataclass(frozen=True)
+class Claim:
+    """The size that a file claims; bytes of its image in memory, and the most while it is read.
+
+    The model is that of :mod:`clpipe.images.read`. At 24 MP, measured in bytes a pixel: EXR of
+    R, G and B in half 6.1 (here 6), in float 12.1 (12), with alpha 8.0 (14), with other layers 13.1
+    (18), converted from other primaries 24.1 (24), with another display window 11.9 (12); TIFF,
+    HDR, JPEG and PNG 24.0 (24); raws 9 (12).
+    """
+
+    width: int
+    height: int
+    image: int
+    reading: int
+
+
+def claim_of(path: Path, mosaic: bool = False) -> Claim | None:
+    """What a file claims; None of one that cannot be opened, and of a dump.
+
+    Args:
+        path: the file.
+        mosaic: whether a single channel is read of it.
+    """
+    try:
+        if path.suffix.lower() in RAW_SUFFIXES:
+            width, height = raw_size(path)
+            return Claim(width, height, width * height * FLOAT, width * height * 3 * FLOAT)
+        with open_image(path) as file:
+            return _claim(file.spec(), file.format_name() == "openexr", mosaic)
+    except ImageError:
+        return None
+
+
+def _claim(spec: Any, is_exr: bool, mosaic: bool) -> Claim:
+    width, height = max(spec.width, spec.full_width), max(spec.height, spec.full_height)
+    formats = spec.channelformats or [spec.format] * spec.nchannels
+    picture = None if mosaic else picture_channels(list(spec.channelnames))
+    own = [formats[i] for i in picture[1]] if picture else formats
+    sample = 2 if is_exr and all(each.size() == 2 for each in own) else FLOAT
+    image = sample * (1 if mosaic else 3)
+    stored = sum(each.size() for each in formats)
+    # The package OpenEXR decodes all channels, of which those that are wanted are copied together.
+    more = 0 if stored == image else min(stored, WASTE * image)
+    reading = image + (more if is_exr else image)
+    window = spec.x, spec.y, spec.width, spec.height
+    if window != (spec.full_x, spec.full_y, spec.full_width, spec.full_height):
+        reading = max(reading, 2 * image)
+    if not mosaic and _is_converted(spec, bool(picture)):
+        reading, image = max(reading, image + 3 * FLOAT), 3 * FLOAT
+    pixels = width * height
+    return Claim(width, height, pixels * image, pixels * reading)
+
+
+def _is_converted(spec: Any, has_picture: bool) -> bool:
+    """Whether the picture is in other primaries than sRGB's."""
+    stated, neutral = spec.getattribute("chromaticities"), spec.getattribute("adoptedNeutral")
+    if has_picture and stated is None and neutral is None:
+        return False
+    try:
+        return to_linear_srgb(stated or (SRGB if has_picture else CIE_XYZ), neutral) is not None
+    except ImageError:
+        return False

@@ -1,0 +1,40 @@
+"""Whether a picture's file is whole, or only a part of one, as a loss of power may leave it."""
+
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+
+from clpipe.base.errors import ImageError
+from clpipe.images.openimageio import BEGINNINGS, open_image
+from clpipe.images.pixels import USUAL_MAX_PIXELS
+from clpipe.images.raw import check_raw
+from clpipe.images.read import read_samples
+
+NPY = b"\x93NUMPY"
+
+
+def is_whole(path: Path) -> bool:
+    """Whether all of a picture can be read.
+
+    What is in no format of clpipe's, or too large to be looked at, counts as whole: somebody may
+    want it.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    with path.open("rb") as file:
+        beginning = file.read(16)
+    try:
+        if NPY.startswith(beginning[: len(NPY)] or b"-"):
+            np.load(path, mmap_mode="r", allow_pickle=False)
+        elif path.suffix == ".dng":
+            check_raw(path)
+        elif beginning.startswith(BEGINNINGS):
+            with open_image(path) as image:
+                spec = image.spec()
+                if spec.width * spec.height <= USUAL_MAX_PIXELS:
+                    read_samples(path, image, 0, range(spec.nchannels), oiio.UNKNOWN)
+    except (ImageError, ValueError):
+        return False
+    return bool(beginning.strip(b"\0"))

@@ -1,0 +1,42 @@
+"""Pictures of an output folder whose inputs are not there any more."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from clpipe.base.reading import read_bytes
+from clpipe.inputs.find import Job
+from clpipe.outputs.sealed import SIDECAR, SidecarError, values_in
+from clpipe.outputs.writer import OutputWriter
+
+
+def pictures_without_input(writer: OutputWriter, jobs: Sequence[Job], inputs: Sequence[str]) -> int:
+    """How many pictures of the output folder are of inputs that were removed or renamed.
+
+    Only those inputs count that lay in a folder which is an input now, or beside one: names in
+    sidecars are relative to where that run was started.
+
+    Args:
+        writer: of the run.
+        jobs: all of it.
+        inputs: as the user gave them.
+    """
+    own = {writer.path(job, SIDECAR, name) for job in jobs for name in writer.names_of(job)}
+    beside = {Path(job.input).parent for job in jobs}
+    below = [Path(text) for text in inputs if os.path.isdir(text)]
+    count = 0
+    for place, folders, names in os.walk(writer.folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for path in (Path(place, name) for name in names if name.endswith(f".{SIDECAR}")):
+            if path in own:
+                continue
+            try:
+                values = values_in(read_bytes(path), path) or {}
+            except (OSError, SidecarError):
+                continue
+            name = values.get("input")
+            if not isinstance(name, str) or os.path.lexists(name):
+                continue
+            was = Path(name)
+            count += was.parent in beside or any(was.is_relative_to(each) for each in below)
+    return count

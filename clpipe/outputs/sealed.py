@@ -1,0 +1,179 @@
+"""How a sidecar lies in a file: as JSON that carries its own digest, so that edits are seen.
+
+All sidecars are written by :func:`sealed` and read by :func:`values_in`. The digest is against
+accidents and edits; who wants to forge a sidecar can compute it, too.
+"""
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from clpipe.base.errors import ImageError
+from clpipe.base.files import keep_names, write_whole
+from clpipe.base.reading import parse_json, read_bytes
+
+SIDECAR = "json"  # the ending of its name
+
+OWN = "clpipe"  # the first key of every sidecar
+
+SEAL = "sidecar_sha256"  # the last one: the SHA-256 of all lines before its own
+
+BEGINNING = b'{\n  "%b": ' % OWN.encode()
+
+# Either end of a sidecar, so that one that was cut off or edited is known for one still.
+_BEGINNING = re.compile(rb'\s*\{\s*"%b"\s*:' % OWN.encode())
+_END = re.compile(rb'"%b"\s*:' % SEAL.encode())
+
+
+class SidecarError(ImageError):
+    """A sidecar is not as clpipe wrote it: it was edited, cut off or damaged."""
+
+    def __init__(self, name: Path | str) -> None:
+        super().__init__(
+            f"{name}: was changed since clpipe wrote it (its {SEAL} does not fit), so it is not "
+            "used; the same clpipe run makes it again, and takes other settings as options or in a "
+            "configuration"
+        )
+
+
+def sealed(record: Mapping[str, Any]) -> bytes:
+    r"""A sidecar's bytes: its values, and the digest of what is before that.
+
+    ``head -n -2 NAME.json | sha256sum`` computes it.
+
+    >>> sealed({"a": 1})[:28]
+    b'{\n  "a": 1,\n  "sidecar_sha25'
+    """
+    head = json_text(record).removesuffix("\n}\n").encode() + b",\n"
+    return head + _seal_of(head)
+
+
+def values_in(
+    data: bytes, name: Path | str, parse: Callable[[bytes], Any] = parse_json
+) -> dict[str, Any] | None:
+    """The values of a sidecar that is as clpipe wrote it, of which only :data:`OWN` is sure.
+
+    Args:
+        data: the bytes of a file.
+        name: of the file, for the message.
+        parse: makes values of the bytes, or raises ValueError.
+
+    Returns:
+        None where the file is empty, or none of clpipe's sidecars.
+
+    Raises:
+        SidecarError: it was edited, cut off or damaged.
+    """
+    end = data.rfind(b'  "%b": "' % SEAL.encode())
+    if end > 0 and data[end:] == _seal_of(data[:end]):
+        try:
+            values = parse(data)
+        except ValueError:
+            values = None
+        if isinstance(values, dict) and OWN in values:
+            return values
+    if is_sidecar(data):
+        raise SidecarError(name)
+    return None
+
+
+def is_sidecar(data: bytes) -> bool:
+    """Whether the bytes of a file are a sidecar, or what became of one."""
+    is_cut = BEGINNING.startswith(data.rstrip(b"\0") or b"-")
+    return is_cut or bool(_BEGINNING.match(data) or _END.search(data))
+
+
+def read_sidecar(path: Path) -> dict[str, Any]:
+    """A sidecar's values; see :func:`values_in`.
+
+    Raises:
+        FileNotFoundError: it is missing, or is empty, as a loss of power may leave it.
+        SidecarError: it was edited, cut off or damaged.
+        ImageError: it cannot be read, or clpipe did not write it.
+    """
+    try:
+        data = read_bytes(path)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+    if not data.strip(b"\0"):
+        raise FileNotFoundError(path)
+    values = values_in(data, path)
+    if values is None:
+        raise ImageError(
+            f"{path}: clpipe did not write this file, and would overwrite it with its sidecar; "
+            "move it, choose another output folder, or say --overwrite"
+        )
+    return values
+
+
+def write_sidecar(path: Path, record: Mapping[str, Any]) -> None:
+    """Write the sidecar of a picture, whose files are all there.
+
+    Raises:
+        ImageError: it cannot be written.
+    """
+    write_whole(path, sealed(record))
+    keep_names(path.parent)
+
+
+def remove_sidecar(path: Path) -> None:
+    """Remove a sidecar where there is one: its pictures are about to be written.
+
+    Raises:
+        ImageError: it cannot be removed.
+    """
+    try:
+        path.unlink()
+        keep_names(path.parent)
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be removed: {error.strerror}") from None
+
+
+def outputs_in(values: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """The files that a sidecar's values list: the size and the SHA-256 of each, by its name.
+
+    What is no name beside the sidecar, or says no size and SHA-256, is left out.
+    """
+    listed = values.get("outputs")
+    return {
+        each["name"]: each
+        for each in (listed if isinstance(listed, list) else ())
+        if isinstance(each, dict) and {"name", "size", "sha256"} <= each.keys()
+        if isinstance(each["name"], str) and os.path.basename(each["name"]) == each["name"] != ""
+        if "\0" not in each["name"]
+    }
+
+
+def json_text(record: Mapping[str, Any]) -> str:
+    """JSON with a line for each key, and for each object of a list.
+
+    >>> print(json_text({"a": 1, "b": [{"c": 2}, {"d": [3, 4]}]}), end="")
+    {
+      "a": 1,
+      "b": [
+        {"c": 2},
+        {"d": [3, 4]}
+      ]
+    }
+    """
+    lines = []
+    for key, value in record.items():
+        text = json.dumps(value)
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            each = ",\n".join(f"    {json.dumps(one)}" for one in value)
+            text = f"[\n{each}\n  ]"
+        lines.append(f"  {json.dumps(key)}: {text}")
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def _seal_of(head: bytes) -> bytes:
+    """The last two lines of a sidecar, by those before."""
+    return f'  "{SEAL}": "{hashlib.sha256(head).hexdigest()}"\n}}\n'.encode()

@@ -1,0 +1,262 @@
+"""What is kept of compiled kernels is looked at before it is used, and is this user's alone."""
+
+import os
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+from types import SimpleNamespace
+
+import pyopencl as cl
+import pytest
+
+from clpipe.base import system
+from clpipe.base.errors import DeviceError
+from clpipe.engine import builders, cache_folder, process_folder
+from clpipe.engine.builders import BinaryBuilder, PoclBuilder
+from clpipe.engine.store import Store
+from tests.test_programs import DEVELOP, python
+
+TEXT = "__kernel void f(__global int *a) { a[get_global_id(0)] = 7; }"
+
+
+def put(path: Path, data: bytes = b"data") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+    return path
+
+
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 4
+    path.write_bytes(data)
+
+
+DAMAGE = [
+    flip,
+    lambda path: os.truncate(path, path.stat().st_size // 2),
+    lambda path: os.truncate(path, 0),
+    lambda path: (path.unlink(), put(path / "inside")),
+]
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_what_is_damaged_is_not_there(tmp_path, damage):
+    store = Store(tmp_path, "driver")
+    store.keep(b"program", "text", "-w")
+    assert store.load("text", "-w") == b"program"
+    damage(store.path("text", "-w"))
+    assert store.load("text", "-w") is None
+    store.keep(b"again", "text", "-w")
+    assert store.load("text", "-w") == b"again"
+
+
+def test_what_is_kept_is_of_one_text_driver_and_options(tmp_path):
+    store, other = Store(tmp_path, "driver 1"), Store(tmp_path, "driver 2")
+    keys = (("a",), ("b",), ("a", "-w"), ("a-w",), ("a\0-w",))
+    assert len({*(store.path(*key) for key in keys), other.path("a")}) == 6
+
+
+def test_a_store_that_cannot_be_written_to_keeps_nothing(tmp_path):
+    for store in (Store(None), Store(put(tmp_path / "file") / "x")):
+        store.keep(b"program", "text")
+        assert store.load("text") is None
+
+
+@pytest.fixture
+def builder(device, tmp_path):
+    """What builds a program as a process would that starts now, and runs it."""
+    context = cl.Context([device.info.handle])
+    store = Store(tmp_path / "programs", "test")
+    # A PoCL has one folder as long as its process lives, so the folder stays where it is.
+    of_pocl = Path(os.environ["POCL_CACHE_DIR"])
+
+    def new():
+        if "Portable Computing" in device.info.platform:
+            return PoclBuilder(context, store, of_pocl)
+        return BinaryBuilder(context, store)
+
+    def value(text=TEXT, made=new):
+        builder = made()
+        program = builder.build(text, ["-w"])
+        queue, result = cl.CommandQueue(context), bytearray(4)
+        buffer = cl.Buffer(context, cl.mem_flags.WRITE_ONLY, 4)
+        cl.Kernel(program, "f")(queue, (1,), None, buffer)
+        cl.enqueue_copy(queue, result, buffer)
+        builder.keep()
+        return result[0]
+
+    value.store, value.context = store, context
+    return value
+
+
+def test_a_program_is_built_and_kept(builder, tmp_path):
+    # The text is this test's, since PoCL's folder is that of the whole process.
+    text = TEXT.replace("f(", f"f(/* {tmp_path} */ ")
+    assert builder(text) == 7
+    assert builder.store.load(text, "-w")
+    assert builder(text) == 7
+
+
+def test_what_a_runtime_does_not_take_is_compiled(builder, device):
+    binary = lambda: BinaryBuilder(builder.context, builder.store)  # noqa: E731
+    assert builder(made=binary) == 7
+    if "Portable Computing" in device.info.platform:
+        return  # it ends the process for what is whole and no binary
+    builder.store.keep(b"no binary at all", TEXT, "-w")
+    assert builder(made=binary) == 7
+
+
+def test_a_packed_program_is_put_back(tmp_path):
+    program = tmp_path / "one/AB/CDEF"
+    put(program / "program.bc", b"bytecode")
+    put(program / "last_accessed")
+    put(program / "f/8-1-1/f.so", b"library")
+    assert builders._programs_in(tmp_path / "one") == {"AB/CDEF"}
+    files = builders._files_of(program)
+    assert files == {"program.bc", "f/8-1-1/f.so"}
+    builders._unpack(builders._packed(tmp_path / "one", "AB/CDEF", files), tmp_path / "two")
+    assert builders._files_of(tmp_path / "two/AB/CDEF") == files
+    assert (tmp_path / "two/AB/CDEF/f/8-1-1/f.so").read_bytes() == b"library"
+
+
+def test_nothing_is_put_elsewhere(tmp_path):
+    path = tmp_path / "a.zip"
+    names = ["../x", "/x", "AB/../x", "AB/CD/../../../x", "AB/CD/./x", "x", "AB/cd/x"]
+    with zipfile.ZipFile(path, "w") as archive:
+        for name in names:
+            archive.writestr(name, b"data")
+    builders._unpack(path.read_bytes(), tmp_path / "folder")
+    builders._unpack(b"no archive", tmp_path / "folder")
+    assert sorted(tmp_path.rglob("*")) == [path]
+
+
+def test_without_room_to_compile_pocl_is_not_asked(tmp_path, monkeypatch):
+    monkeypatch.setattr(builders, "has_room", lambda _: False)
+    builder = PoclBuilder(None, Store(None), tmp_path / "pocl")
+    with pytest.raises(DeviceError, match=r"needs 32 MiB of room there .* TMPDIR"):
+        builder.build(TEXT, [])
+
+
+def test_a_second_process_compiles_nothing(device, tmp_path):
+    """Nor does one after damage compile more than was damaged."""
+    if "Portable Computing" not in device.info.platform:
+        pytest.skip("looks at PoCL's programs")
+
+    def kept():
+        return {path: path.stat().st_mtime_ns for path in tmp_path.glob("programs/*")}
+
+    python(DEVELOP, CLPIPE_CACHE_DIR=tmp_path)
+    first = kept()
+    assert first
+    python(DEVELOP, CLPIPE_CACHE_DIR=tmp_path)
+    assert kept() == first
+    one, *others = sorted(first)
+    os.truncate(one, one.stat().st_size // 2)
+    python(DEVELOP, CLPIPE_CACHE_DIR=tmp_path)
+    assert kept()[one] != first[one]
+    assert all(kept()[path] == first[path] for path in others)
+
+
+@pytest.mark.parametrize(
+    ("mode", "said"),
+    [(0o700, None), (0o755, None), (0o777, "mode 0777"), (0o1777, "1777"), (0o770, "mode 0770")],
+)
+def test_a_folder_that_others_may_write_to_is_not_used(tmp_path, caplog, mode, said):
+    place = tmp_path / "cache"
+    place.mkdir()
+    place.chmod(mode)
+    assert cache_folder.is_private(place) is (said is None)
+    assert len(caplog.messages) == (said is not None)
+    assert said is None or (said in caplog.text and "CLPIPE_CACHE_DIR" in caplog.text)
+
+
+def test_another_users_folder_is_not_used(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(os, "geteuid", lambda: os.stat(tmp_path).st_uid + 1)
+    assert not cache_folder.is_private(tmp_path)
+    assert "belongs to another user" in caplog.text
+
+
+def test_kernels_are_not_kept_there_and_that_is_said_once(device, tmp_path):
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    shared.chmod(0o777)
+    done = subprocess.run(
+        [sys.executable, "-c", DEVELOP],
+        env={**os.environ, "CLPIPE_CACHE_DIR": str(shared), "POCL_CACHE_DIR": str(shared)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0
+    assert done.stderr.count("others may write to it (mode 0777)") == 1
+    assert list(shared.iterdir()) == []
+
+
+def test_folders_that_are_made_are_the_users_alone(tmp_path):
+    code = (
+        "from clpipe.engine.cache_folder import *; prepare_environment(); print(cache_folder());"
+        "print(oct(process_folder().stat().st_mode))"
+    )
+    made, mode = python(code, CLPIPE_CACHE_DIR=tmp_path / "new").splitlines()
+    assert Path(made).stat().st_mode & 0o777 == 0o700
+    assert mode.endswith("700")
+
+
+FOLDER_OF_A_PROCESS = (
+    "from clpipe.engine.process_folder import process_folder; print(process_folder(), flush=True)"
+)
+
+
+@pytest.fixture
+def ended(tmp_path, monkeypatch):
+    """The folder of a process that was killed a while ago."""
+    if not system.fcntl:
+        pytest.skip("needs locks of the system")
+    monkeypatch.setattr(process_folder.tempfile, "tempdir", str(tmp_path))
+    code = f"{FOLDER_OF_A_PROCESS}; import os; os.kill(os.getpid(), 9)"
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True)
+    folder = Path(done.stdout.decode().strip())
+    assert folder.is_dir() and tmp_path in folder.parents
+    os.utime(folder, (time.time() - 100,) * 2)
+    return folder
+
+
+def test_a_process_removes_its_folder_and_those_of_killed_ones(ended, tmp_path):
+    own = Path(python(FOLDER_OF_A_PROCESS, TMPDIR=tmp_path))
+    assert own.parent == ended.parent
+    assert not own.exists() and not ended.exists()
+
+
+def test_a_folder_in_use_or_just_made_stays(ended, tmp_path):
+    code = f"{FOLDER_OF_A_PROCESS}; import sys; sys.stdin.read()"
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", code], env=environment, **streams) as process:
+        used = Path(process.stdout.readline().strip())
+        os.utime(used, (time.time() - 100,) * 2)
+        young = ended.with_name("young")
+        young.mkdir()
+        python(FOLDER_OF_A_PROCESS, TMPDIR=tmp_path)
+        assert used.is_dir() and young.is_dir()
+        process.stdin.close()
+
+
+def test_a_parent_that_somebody_else_made_is_passed_over(tmp_path):
+    (tmp_path / f"clpipe-{os.getuid()}").mkdir(mode=0o700)
+    (tmp_path / f"clpipe-{os.getuid()}").chmod(0o777)
+    assert Path(python(FOLDER_OF_A_PROCESS, TMPDIR=tmp_path)).parent == tmp_path
+
+
+def test_a_folder_needs_room_and_the_right_to_run_programs(tmp_path, monkeypatch):
+    fresh = process_folder.process_folder.__wrapped__
+    monkeypatch.setattr(process_folder, "temporary_places", lambda: [tmp_path])
+    with monkeypatch.context() as patch:
+        patch.setattr(process_folder, "forbids_programs", lambda _: True)
+        assert fresh() is None
+    with monkeypatch.context() as patch:
+        usage = SimpleNamespace(free=2**20)
+        patch.setattr(process_folder.shutil, "disk_usage", lambda _: usage)
+        assert fresh() is None
+    assert tmp_path in fresh().parents

@@ -1,0 +1,259 @@
+"""How much memory images may take: what files claim, which image waits, and which is refused."""
+
+import os
+import subprocess
+import sys
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from clpipe.base import memory
+from clpipe.base.errors import DeviceError, ImageError, RequestError
+from clpipe.base.memory import Left
+from clpipe.batch import room as rooms
+from clpipe.batch.room import LEAST, STARTING, Room, needed
+from clpipe.batch.threads import Batch
+from clpipe.engine.discovery import find_devices
+from clpipe.images.claims import claim_of
+from tests.conftest import ROOT
+
+MIB = 2**20
+LIMITED = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="this system has no such limit")
+
+
+class SharingDevice:
+    """A device in this machine's memory."""
+
+    def __init__(self, limit, held=0):
+        self.info = SimpleNamespace(in_place=True)
+        self.memory, self.bytes_held = limit, held
+        self.limits = []
+
+    def limit(self, limit):
+        self.memory, self.bytes_held = limit, 0
+        self.limits.append(limit)
+
+
+def room_of(free, *devices, size=None, drop=lambda: None):
+    """A room in which so many bytes are free, less what devices hold."""
+    room = Room(size, devices, drop, lambda: Left(free - sum(d.bytes_held for d in devices), "x"))
+    for _ in devices:
+        room.started()
+    return room
+
+
+def test_what_never_fits_is_refused_and_what_fits_is_let_in():
+    room = room_of(100 * MIB)
+    for _ in range(2):
+        room.enter("small", 10 * MIB)
+        room.leave("small")
+        with pytest.raises(ImageError, match=r"about 241\.0 MiB of memory; 100\.0 MiB are left by"):
+            room.enter("large", 200 * MIB)
+
+
+def test_what_fits_alone_waits_for_the_others():
+    room = room_of(200 * MIB, size=100 * MIB)
+    room.enter("small", 10 * MIB)
+    entered = threading.Event()
+    thread = threading.Thread(target=lambda: (room.enter("large", 120 * MIB), entered.set()))
+    thread.start()
+    assert not entered.wait(0.2)
+    room.leave("small")
+    assert entered.wait(5)
+    thread.join()
+
+
+def test_for_a_large_image_devices_hold_little():
+    device, dropped = SharingDevice(150 * MIB, held=100 * MIB), []
+    room = room_of(300 * MIB, device, drop=lambda: dropped.append(1))
+    room.enter("fits", 100 * MIB)
+    room.leave("fits")
+    assert not device.limits
+    room.enter("large", 200 * MIB)
+    assert device.limits == [LEAST]
+    assert dropped
+    room.leave("large")
+    assert device.memory == 150 * MIB
+    with pytest.raises(ImageError, match=r"268\.0 MiB are left"):
+        room.enter("too large", 280 * MIB)
+    assert device.limits == [LEAST]  # it would not have helped
+
+
+def test_what_was_taken_before_may_be_freed_late(monkeypatch):
+    left = [200 * MIB, 200 * MIB]
+    room = Room(None, (), left=lambda: Left(left.pop() if len(left) > 1 else left[0], ""))
+    room.enter("a", 150 * MIB)
+    room.leave("a")
+    left[:] = [200 * MIB, 60 * MIB, 60 * MIB]
+    monkeypatch.setattr(rooms, "LASTS", 0.0)
+    room.enter("b", 150 * MIB)
+
+
+def test_large_images_wait_for_the_compiler():
+    room = Room(None, (SharingDevice(0),), left=lambda: Left(STARTING + 100 * MIB, ""))
+    room.enter("small", 10 * MIB)
+    room.leave("small")
+    thread = threading.Thread(target=lambda: room.enter("large", 150 * MIB), daemon=True)
+    thread.start()
+    thread.join(0.2)
+    assert thread.is_alive()
+    room.started()
+    thread.join(5)
+    assert not thread.is_alive()
+
+
+def test_nothing_is_let_in_at_the_end():
+    room = room_of(100 * MIB)
+    room.enter("a", 50 * MIB)
+    room.open()
+    with pytest.raises(ImageError, match="ended"):
+        room.enter("b", 60 * MIB)
+
+
+def test_small_images_are_not_slowed_by_measuring():
+    count = []
+    room = Room(None, (), left=lambda: count.append(1) or Left(2**34, ""))
+    for number in range(100):
+        room.enter(str(number), MIB)
+    assert len(count) < 5
+
+
+def test_what_files_claim(write_exr, tmp_path):
+    pixels = np.zeros((4, 10, 3), np.float32)
+
+    def bytes_of(*arguments, mosaic=False, **options):
+        claim = claim_of(write_exr("a.exr", *arguments, **options), mosaic)
+        return claim.image / 40, claim.reading / 40
+
+    assert bytes_of(pixels) == (6, 6)
+    assert bytes_of(pixels, half=False) == (12, 12)
+    four = np.zeros((4, 10, 4), np.float32)
+    assert bytes_of(four, "R,G,B,A") == (6, 14)  # of all four, and of the three together
+    assert bytes_of(pixels[..., :1], "Raw", half=False, mosaic=True) == (4, 4)
+    (tmp_path / "a.pfm").write_bytes(b"PF\n6000 4000\n-1.0\n")  # nothing behind it is looked at
+    claim = claim_of(tmp_path / "a.pfm")
+    assert (claim.width, claim.image, claim.reading) == (6000, 288_000_000, 576_000_000)
+    assert claim_of(tmp_path / "missing.exr") is None
+
+
+def test_one_that_is_too_large_costs_one_line(write_exr, clpipe, tmp_path, monkeypatch):
+    for i in range(3):
+        write_exr(f"in/r{i}.exr", np.full((8, 12, 3), 0.2, np.float32))
+    (tmp_path / "in" / "b.pfm").write_bytes(b"PF\n6000 4000\n-1.0\n")
+    monkeypatch.setattr(rooms, "memory_left", lambda: Left(300 * MIB, "a limit"))
+    for _ in range(2):
+        result = clpipe("run", "in", "-o", "out", "--device", "numpy", status=1)
+        lines = [line for line in result.stderr.splitlines() if "b.pfm" in line]
+        assert all("by a limit" in line for line in lines)
+        assert len(list((tmp_path / "out").glob("*.jpg"))) == 3
+        assert "3 of 4 images done" in result.stderr
+
+
+def test_threads_that_cannot_be_started_are_one_line(monkeypatch):
+    def start(self):
+        raise RuntimeError("can't start new thread")
+
+    worker = SimpleNamespace(reserve=lambda count: None)
+    monkeypatch.setattr(threading.Thread, "start", start)
+    with pytest.raises(RequestError, match=r"--jobs: 3: no thread can be started for 'decode 0'"):
+        list(Batch(worker, [None], threads=3).run([]))
+
+
+def test_address_space_counts(tmp_path, monkeypatch):
+    monkeypatch.setattr(memory, "address_space", lambda: 100 * 2**20)
+    (tmp_path / "proc/self").mkdir(parents=True)
+    (tmp_path / "proc/self/status").write_text("VmPeak:  2 kB\nVmSize:\t 61440 kB\n")
+    left = memory.memory_left(tmp_path)
+    assert left == Left(40 * MIB, "ulimit -v, which is 100.0 MiB")
+
+
+def test_no_runtime_is_loaded_where_addresses_are_too_few(monkeypatch):
+    monkeypatch.setattr(memory, "address_space", lambda: 2**20)
+    with pytest.raises(DeviceError, match=r"an OpenCL runtime takes .* left by ulimit -v, which"):
+        find_devices()
+
+
+def limited(text, megabytes):
+    """Run Python in a process with so much address space."""
+    import resource
+
+    return subprocess.run(
+        [sys.executable, "-c", text],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: resource.setrlimit(
+            resource.RLIMIT_AS, (megabytes * MIB, resource.RLIM_INFINITY)
+        ),
+        check=False,
+    )
+
+
+@LIMITED
+def test_the_program_starts_in_no_less_than_it_needs():
+    text = "import sys; from clpipe.commands.main import main; main(['run', 'a', '-o', 'b'])"
+    done = limited(text, 150)
+    assert done.returncode == 3
+    assert "loading clpipe's libraries takes about" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+WITHOUT_ROOM = """
+from pathlib import Path
+import resource
+import numpy as np
+from clpipe.base.memory import _listed
+from clpipe.chain.request import Request
+from clpipe.engine.device import open_device
+from clpipe.engine.runner import Runner
+runner = Runner(Request().chain(), open_device(None))
+image = np.full((2000, 4400, 3), 0.2, np.float16)
+runner.warm_up()
+hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+least = _listed(Path("/proc/self/status"), "VmSize") + (100 << 20)
+resource.setrlimit(resource.RLIMIT_AS, (least, hard))
+tiled = runner.run(image, "a").encoded
+print(runner.device.bytes_held < 100 << 20)
+resource.setrlimit(resource.RLIMIT_AS, (hard, hard))
+print(np.array_equal(runner.run(image, "a").encoded, tiled), runner.device.bytes_held > 100 << 20)
+"""
+
+
+@LIMITED
+def test_where_memory_ends_tiles_become_smaller(device):
+    if device is None or not device.info.in_place:
+        pytest.skip("the device has memory of its own")
+    command = [sys.executable, "-c", WITHOUT_ROOM]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "True\nTrue True\n"), done.stderr[-500:]
+
+
+HEAPS = """
+import threading
+from pathlib import Path
+from clpipe.base.memory import _listed
+from clpipe.base.system import save_addresses
+save_addresses()
+def work():
+    held = [bytes(600) for _ in range(100)]
+    barrier.wait()
+barrier = threading.Barrier(7)
+before = _listed(Path("/proc/self/status"), "VmSize")
+threads = [threading.Thread(target=work) for _ in range(6)]
+for thread in threads: thread.start()
+import time; time.sleep(0.2)
+print(_listed(Path("/proc/self/status"), "VmSize") - before)
+barrier.wait()
+"""
+
+
+@LIMITED
+def test_heaps_are_shared_where_addresses_are_few():
+    done = limited(HEAPS, 2000)
+    assert int(done.stdout) < 6 * 64 * MIB, done.stderr
+
+
+def test_an_eighth_and_some_more_is_to_be_free():
+    assert needed(80 * MIB) == 106 * MIB

@@ -1,0 +1,226 @@
+"""Sidecars carry their own digest: an edited one is a missing one, and every reader says so."""
+
+import copy
+import hashlib
+import json
+import os
+import random
+import subprocess
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clpipe.base.errors import ImageError
+from clpipe.batch.run_log import read_log
+from clpipe.outputs.sealed import SEAL, SidecarError, read_sidecar, sealed, values_in
+from tests.conftest import reseal
+
+CHANGED = f"was changed since clpipe wrote it (its {SEAL} does not fit)"
+CAMERA = ("--set", "output.fx=30", "--set", "output.fy=30")
+
+
+@pytest.fixture
+def made(clpipe, write_exr):
+    """Run two renders; running it again gives the status of each by its name."""
+    for name, value in (("a", 0.25), ("b", 0.5)):
+        write_exr(f"in/{name}.exr", np.full((8, 8, 3), value, np.float32))
+
+    def run(*options, status=0):
+        clpipe("run", "in", "-o", "out", "--device", "numpy", *CAMERA, *options, status=status)
+        lines = [line for line in read_log(Path("out/run.jsonl")) if line["event"] == "image"]
+        return {Path(line["input"]).stem: line["status"] for line in lines[-2:]}
+
+    run()
+    return run
+
+
+def edit_intrinsics(path: Path) -> None:
+    text = path.read_text()
+    assert '"fx": 30.0' in text
+    path.write_text(text.replace('"fx": 30.0', '"fx": 31.0'))
+
+
+def lay_out_anew(path: Path) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text())))
+
+
+def cut_off(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:300])
+
+
+def without_beginning(path: Path) -> None:
+    path.write_bytes(b"x" + path.read_bytes()[40:])
+
+
+def without_seal(path: Path) -> None:
+    values = json.loads(path.read_text())
+    del values[SEAL]
+    path.write_text(json.dumps(values, indent=2))
+
+
+EDITS = [edit_intrinsics, lay_out_anew, cut_off, without_beginning, without_seal]
+
+
+def test_the_digest_is_that_of_the_lines_before(made):
+    last = Path("out/a.json").read_text().splitlines()[-2]
+    before = subprocess.run(["head", "-n", "-2", "out/a.json"], capture_output=True, check=True)
+    assert last == f'  "{SEAL}": "{hashlib.sha256(before.stdout).hexdigest()}"'
+    assert read_sidecar(Path("out/a.json"))[SEAL] in last
+
+
+@pytest.mark.parametrize("edit", EDITS)
+def test_an_edited_sidecar_is_a_missing_one(made, clpipe, edit):
+    sidecar, whole = Path("out/a.json"), Path("out/a.json").read_bytes()
+    edit(sidecar)
+    for command in ("poses", "report"):
+        said = clpipe(command, "out").output
+        if command == "report":
+            said = Path("out/report.html").read_text()
+        assert "a.json" in said and "was changed since clpipe wrote it" in said
+        assert "the same clpipe run makes it again" in said
+    views = json.loads(Path("out/cameras.json").read_text())["views"]
+    assert [view["file"] for view in views] == ["b.jpg"]
+    said = clpipe("run", "--replay", sidecar, "-o", "again", status=2).stderr
+    assert said.startswith(f"clpipe: {sidecar}: {CHANGED}")
+    assert "options or in a configuration" in said
+    assert made() == {"a": "done", "b": "skipped"}
+    assert sidecar.read_bytes() == whole
+    assert made() == {"a": "skipped", "b": "skipped"}
+
+
+def test_every_byte_counts():
+    whole = sealed({"clpipe": "0.1.0", "input": "a.exr", "stages": [{"name": "x"}], "iso": 100})
+    assert values_in(whole, "a.json")["iso"] == 100
+    for place in range(len(whole)):
+        for data in (
+            whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :],
+            whole[:place] + whole[place + 1 :],
+            whole[:place] + b" " + whole[place:],
+            whole[: place + 1] + bytes(len(whole) - place - 1),
+            whole[: place + 1],
+        ):
+            if data == whole:
+                continue
+            with pytest.raises(SidecarError, match=r"a\.json: was changed since"):
+                values_in(data, "a.json")
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[1, 2]", '{"a": "clpipe"}', "no JSON", "\0" * 50])
+def test_what_others_wrote_is_no_sidecar(tmp_path, text):
+    assert values_in(text.encode(), "a.json") is None
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    expected = ImageError if text.strip("\0") else FileNotFoundError
+    with pytest.raises(expected) as caught:
+        read_sidecar(path)
+    assert not isinstance(caught.value, SidecarError)
+
+
+ODD = [7, -1.5, [], ["x"], None, "", "\0", {}, {"a": {"b": [1]}}, True, 10**400, float("nan")]
+
+
+def places(values, at=()):
+    """The keys on the way to each value of a sidecar; of a list, to its first."""
+    if at:
+        yield at
+    if isinstance(values, dict):
+        for key, value in values.items():
+            yield from places(value, (*at, key))
+    elif isinstance(values, list) and values:
+        yield from places(values[0], (*at, 0))
+
+
+def edited(values, at, value):
+    values = copy.deepcopy(values)
+    inner = values
+    for key in at[:-1]:
+        inner = inner[key]
+    inner[at[-1]] = value
+    return values
+
+
+NUMPY = ("-o", "b", "--device", "numpy", "--overwrite")
+
+PATCHES = ("--patch", 4, "--patches-per-image", 2, "--keep", "normalize", "--format", "png")
+
+
+@pytest.mark.parametrize("options", [(), PATCHES])
+def test_whatever_a_forged_sidecar_holds_no_command_ends_in_a_traceback(made, clpipe, options):
+    made(*options)
+    whole, luck = read_sidecar(Path("out/a.json")), random.Random(0)
+    everywhere = [(at, odd) for at in places(whole) for odd in ODD]
+    for number, (at, odd) in enumerate(luck.sample(everywhere, 400)):
+        Path(f"odd/{number}").mkdir(parents=True)
+        os.link("out/a.jpg", f"odd/{number}/a.jpg")
+        reseal(Path(f"odd/{number}/a.json"), edited(whole, at, odd))
+    assert "Traceback" not in clpipe("poses", "odd", status=2 if options else 0).output
+    clpipe("report", "odd")
+    resumed = ("clpipe", "input_size", "input_modified", "sha256", "request", "outputs")
+    cases = [(key, odd) for key in (*resumed, "subframes", "carried", "depth") for odd in ODD]
+    for number, (key, odd) in enumerate(cases):
+        os.link("in/a.exr", f"in/x{number}.exr")
+        reseal(Path(f"out/x{number}.json"), {**whole, key: odd})
+    run = ("run", "in", "-o", "out", "--device", "numpy", *CAMERA, *options)
+    assert "unexpected" not in clpipe(*run).stderr
+    for key in whole["request"]:
+        for odd in luck.sample(ODD, 4):
+            reseal(Path("e.json"), edited(whole, ("request", key), odd))
+            again = clpipe("run", "--replay", "e.json", *NUMPY, status=(0, 1, 2))
+            assert "unexpected" not in again.stderr, (key, odd)
+
+
+@pytest.mark.parametrize("key", ["iso", "noise", "width", "camera", "outputs"])
+def test_a_card_goes_without_what_a_forged_sidecar_holds(clpipe, write_exr, key):
+    for name in "ab":
+        write_exr(f"in/{name}.exr", np.full((8, 8, 3), 0.25, np.float32))
+    run = ("dataset", "in", "-o", "out", "--device", "numpy", "--iso", 100)
+    clpipe(*run)
+    values = read_sidecar(Path("out/a.json"))
+    for odd in ODD:
+        reseal(Path("out/a.json"), {**values, key: odd})
+        clpipe(*run)
+
+
+def edited_in_tar(path: Path, name: str) -> None:
+    data = path.read_bytes()
+    with tarfile.open(path) as tar:
+        start = tar.getmember(name).offset_data
+    place = data.index(b'"iso": 1', start) + 7
+    path.write_bytes(data[:place] + b"2" + data[place + 1 :])
+
+
+@pytest.mark.parametrize(
+    ("options", "names"),
+    [
+        ((), ["a.json", "b.json"]),
+        (("--patch", 4, "--patches-per-image", 2), ["__clpipe__/a.json", "b_0001.json"]),
+    ],
+)
+def test_an_edited_sidecar_in_a_tar(clpipe, write_exr, options, names):
+    for name in "ab":
+        write_exr(f"in/{name}.exr", np.full((8, 8, 3), 0.25, np.float32))
+    run = ("run", "in", "-o", "out", "--device", "numpy", "--webdataset", 2, *options)
+    clpipe(*run)
+    tar, whole = Path("out/000000.tar"), Path("out/000000.tar").read_bytes()
+    for name in names:
+        edited_in_tar(tar, name)
+        clpipe("report", "out")
+        said = Path("out/report.html").read_text()
+        assert f"{name}: was changed since clpipe wrote it" in said
+        clpipe(*run)
+        assert tar.read_bytes() == whole
+
+
+def test_a_dataset_without_what_was_edited_and_cannot_be_made_again(clpipe, write_exr):
+    for name in "ab":
+        write_exr(f"in/{name}.exr", np.full((8, 8, 3), 0.25, np.float32))
+    run = ("dataset", "in", "-o", "out", "--device", "numpy", "--iso", 100)
+    clpipe(*run)
+    lay_out_anew(Path("out/a.json"))
+    Path("in/a.exr").write_bytes(b"no picture")
+    said = clpipe(*run, status=1).stderr
+    assert f"out/a.json: {CHANGED}" in said
+    rows = Path("out/manifest.csv").read_text().splitlines()[1:]
+    assert [row.split(",")[0] for row in rows] == ["b"]
