@@ -246,13 +246,13 @@ class Batch:
     def _begin(self, job: Job, waits: list[float]) -> None:
         """Wait until there is room for a job's image, and note how long: it is decoded next."""
         self._begun.set()
-        writer = self._worker.writer
+        worker, writer = self._worker, self._worker.writer
         results = min(len(writer.names_of(job)), self.threads + len(self.devices))
-        layers = self._worker.layers
+        beside = 2 * worker.layers + bool(job.subframes)
         # Baselines are measured on floats.
         formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
-        chain, keep = self._worker.chain, writer.request.keep
-        size = host_bytes(job, chain, results, formats, keep, layers, None in self.devices)
+        kinds = results, formats, writer.request.keep, beside, None in self.devices
+        size = host_bytes(worker.loader.claim(job), worker.chain, *kinds)
         start = time.perf_counter()
         self._room.enter(job.stem, size)
         waits.append(time.perf_counter() - start)
