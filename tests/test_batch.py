@@ -868,7 +868,7 @@ def test_images_wait_for_room(renders, tmp_path, monkeypatch):
 
     monkeypatch.setattr(ImageLoader, "read", reading)
     monkeypatch.setattr(ImageWorker, "encode", encoding)
-    large = host_bytes(jobs[1], worker.chain, 1, ("png",), ())
+    large = host_bytes(worker.loader.claim(jobs[1]), worker.chain, 1, ("png",), ())
     assert large == 24 * 32 * (6 + 3 + 1)
     for room, most in ((1, 1), (2 * large, 2), (100 * large, 4)):
         seen.clear()
@@ -883,15 +883,21 @@ def test_images_wait_for_room(renders, tmp_path, monkeypatch):
 
 
 def test_what_images_take(tmp_path, write_exr):
-    chain = Request().chain()
-    exr = Job(write_exr("a.exr", np.zeros((10, 20, 3), np.float32)), "a")
+    loader = ImageLoader(Request())
+    chain = loader.chain
+    exr = loader.claim(Job(write_exr("a.exr", np.zeros((10, 20, 3), np.float32)), "a"))
     assert host_bytes(exr, chain, 1, ("jpg",), ()) == 200 * (6 + 3 + 1)
     deep = 200 * (6 + 3 * (3 + 12 * 2 + 24))
     assert host_bytes(exr, chain, 3, ("jpg", "exr"), ("mosaic",)) == deep
+    assert host_bytes(exr, chain, 1, ("jpg",), (), 2) == 200 * (6 + 3 + 1 + 24)
     smaller = Request({"stages": ["exposure", "resize"], "resize": {"scale": 0.5}}).chain()
     assert host_bytes(exr, smaller, 1, ("exr",), ()) == 200 * 6 + 50 * (3 + 12 + 24)
     raw = tmp_path / "a.nef"
     raw.write_bytes(bytes(1000))
-    other = raw.rename(tmp_path / "b.nef")
-    assert host_bytes(Job(other, "b"), chain, 1, ("dng",), ()) == 1000 * (4 + 3 + 12 + 12)
-    assert host_bytes(Job(tmp_path / "missing.exr", "c"), chain, 1, ("jpg",), ()) == 0
+    claim = loader.claim(Job(raw, "b"))
+    assert host_bytes(claim, chain, 1, ("dng",), ()) == 1000 * (4 + 3 + 12 + 12)
+    missing = loader.claim(Job(tmp_path / "missing.exr", "c"))
+    assert host_bytes(missing, chain, 1, ("jpg",), ()) == 0
+    # What is refused for its size takes nothing, and its message is that of reading.
+    few = ImageLoader(Request(max_pixels=199))
+    assert few.claim(Job(tmp_path / "a.exr", "a")).reading == 0

@@ -6,15 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import prod
 
-from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.memory import Left, available_memory, in_words, memory_left
 from clpipe.base.system import give_back_memory
 from clpipe.chain.chain import Chain
 from clpipe.chain.formats import DNG, FORMATS
 from clpipe.engine.device import Device
-from clpipe.images.claims import FLOAT, Claim, claim_of
-from clpipe.inputs.find import Job
+from clpipe.images.claims import Claim
 
 FLOATS = 12  # bytes of a pixel in three floats
 IN_NUMPY = 16 * FLOATS  # of a pixel, while the chain runs in NumPy; measured: 152
@@ -35,46 +33,43 @@ def usual_room(sharing: int = 1) -> int | None:
 
 
 def host_bytes(
-    job: Job,
+    claim: Claim,
     chain: Chain,
     renditions: int,
     formats: Sequence[str],
     keep: Sequence[str],
-    carried: int = 0,
+    beside: int = 0,
     in_numpy: bool = False,
 ) -> int:
-    """About how many bytes an image takes at most while it is in flight, by its file's header.
+    """About how many bytes an image takes at most while it is in flight.
 
     What devices take is not in it. At 6 and 24 MP it was 1.05 to 2.7 times what was measured.
 
     Args:
-        job: the image; of a file that cannot be opened, and of a dump, each byte is taken for a
-            pixel.
+        claim: what its file claims.
         chain: what it goes through.
         renditions: how many results there may be of it at a time.
         formats: of the last image, and of the raw.
         keep: steps whose image is written, too.
-        carried: how many layers go along with it, before and after they are moved; depth, as it is
-            read and as kernels take it, is one more.
+        beside: how many images of three floats there are beside it: the sum of sub-frames, and two
+            of each layer that goes along, before and after it is moved, or as it is read and as
+            kernels take it.
         in_numpy: whether NumPy develops it.
 
     Raises:
         ImageError: it cannot have a size in this chain.
     """
-    mosaic = len(chain.source.channels) == 1
-    claim = claim_of(job.path, mosaic)
-    if claim is None:
-        pixels = stamp_of(job.path)[0]
-        claim = Claim(pixels, 1, pixels * FLOAT, pixels * 2 * FLOAT)
-    else:
-        pixels = prod(chain.size(claim.width, claim.height))
+    pixels = claim.width * claim.height
+    if not pixels:
+        return 0
     deep = [FORMATS[name] for name in formats if name != DNG and FORMATS[name].bits > 8]
     kept = len(keep) + bool(deep) + (DNG in formats)
     # Encoders of integers of 16 bits compute in double precision.
     encoding = max((24 if each.floats else 36 for each in deep), default=FLOATS if kept else 1)
-    results = pixels * renditions * (3 + FLOATS * kept + encoding)
-    beside = 2 * FLOATS * carried + FLOATS * bool(job.subframes) + IN_NUMPY * in_numpy
-    return max(claim.reading, claim.image + results) + claim.width * claim.height * beside
+    size = chain.size(claim.width, claim.height)
+    results = prod(size) * renditions * (3 + FLOATS * kept + encoding)
+    most = max(claim.reading, claim.image + results)
+    return most + pixels * (FLOATS * beside + IN_NUMPY * in_numpy)
 
 
 class Room:

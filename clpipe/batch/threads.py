@@ -253,16 +253,16 @@ class Batch:
         Raises:
             OutputError: the first image of the run is to be made, but cannot be written.
         """
-        writer = self._worker.writer
+        worker, writer = self._worker, self._worker.writer
         if not self._begun.is_set():
             writer.check_folder()
         self._begun.set()
         results = min(len(writer.names_of(job)), self.threads + len(self.devices))
-        layers = self._worker.layers
+        beside = 2 * worker.layers + bool(job.subframes)
         # Baselines are measured on floats.
         formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
-        chain, keep = self._worker.chain, writer.request.keep
-        size = host_bytes(job, chain, results, formats, keep, layers, None in self.devices)
+        kinds = results, formats, writer.request.keep, beside, None in self.devices
+        size = host_bytes(worker.loader.claim(job), worker.chain, *kinds)
         start = time.perf_counter()
         self._room.enter(job.stem, size)
         waits.append(time.perf_counter() - start)

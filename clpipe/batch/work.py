@@ -112,7 +112,7 @@ class ImageWorker:
         trace: bool = False,
     ) -> None:
         self.writer = writer
-        self._loader = loader
+        self.loader = loader
         self.chain = chain
         self._resuming = resuming
         self._trace = trace
@@ -134,7 +134,7 @@ class ImageWorker:
             RequestError: the memory of the device is too small for any image.
             DeviceError: a kernel does not compile.
         """
-        half = self._loader.kept is None and self.chain.source is Kind.RGB
+        half = self.loader.kept is None and self.chain.source is Kind.RGB
         return Runners(self.writer, device, self.chain, half)
 
     def decode(self, job: Job, begin: Callable[[], None]) -> Task:
@@ -144,10 +144,10 @@ class ImageWorker:
             job: the image.
             begin: called where something is to be made; it may raise ImageError.
         """
-        task = Task(job, self._loader)
+        task = Task(job, self.loader)
         with task.timed("decode"):
             try:
-                task.loader = self._loader.for_job(job)
+                task.loader = self.loader.for_job(job)
                 task.request = self._request_of(task)
                 names = self._missing(task)
                 if names:
@@ -166,7 +166,7 @@ class ImageWorker:
     def _request_of(self, task: Task) -> Mapping[str, Any]:
         """The record of the request for a task's image."""
         job = task.job
-        if task.loader is self._loader:
+        if task.loader is self.loader:
             return {**self._general_request, "image_name": job.key}
         return self.writer.request.for_image(job.key, job.values).record()
 

@@ -30,8 +30,13 @@ class Claim:
     reading: int
 
 
+def plain_claim(width: int, height: int) -> Claim:
+    """That of a mosaic which is read as it is and becomes floats."""
+    return Claim(width, height, width * height * FLOAT, width * height * 3 * FLOAT)
+
+
 def claim_of(path: Path, mosaic: bool = False) -> Claim | None:
-    """What a file claims; None of one that cannot be opened, and of a dump.
+    """What a file claims; None of one that cannot be opened.
 
     Args:
         path: the file.
@@ -39,8 +44,7 @@ def claim_of(path: Path, mosaic: bool = False) -> Claim | None:
     """
     try:
         if path.suffix.lower() in RAW_SUFFIXES:
-            width, height = raw_size(path)
-            return Claim(width, height, width * height * FLOAT, width * height * 3 * FLOAT)
+            return plain_claim(*raw_size(path))
         with open_image(path) as file:
             return _claim(file.spec(), file.format_name() == "openexr", mosaic)
     except ImageError:

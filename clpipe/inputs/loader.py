@@ -6,6 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, KindError, NoPictureError, RequestError
 from clpipe.base.reading import unchanged
 from clpipe.chain.chain import Chain, entry
@@ -16,6 +17,7 @@ from clpipe.chain.methods import base_name, stage_named
 from clpipe.chain.overscan import steps_of_overscan, with_overscan
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
+from clpipe.images.claims import Claim, claim_of, plain_claim
 from clpipe.images.pixels import USUAL_MAX_PIXELS
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import (
@@ -30,7 +32,7 @@ from clpipe.inputs.depth import read_depth
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import KeptLoader, kind_message
 from clpipe.inputs.manifest import check_rows
-from clpipe.inputs.raw import RawImage, RawLoader
+from clpipe.inputs.raw import RawImage, RawLoader, may_be_dump
 from clpipe.inputs.subframes import average, exposures, shutter_of
 from clpipe.stage import Kind
 
@@ -151,6 +153,21 @@ class ImageLoader:
         if rows := [job for job in jobs if job.place or job.values.keys() - {OUTPUT}]:
             carries = self.raw.takes if self.kept is None else lambda path: True
             check_rows(rows, self.settings, carries)
+
+    def claim(self, job: Job) -> Claim:
+        """What the file of a job claims, before it is read; nothing where reading refuses it.
+
+        Of one that cannot be opened each byte is taken for a pixel.
+        """
+        most = self.request.max_pixels or USUAL_MAX_PIXELS
+        dump = self.settings.dump
+        if dump and may_be_dump(job.path):
+            claim = plain_claim(dump.width, dump.height)
+        else:
+            mosaic = len(self.reads.channels) == 1
+            found = claim_of(job.path, mosaic)
+            claim = found or plain_claim(min(stamp_of(job.path)[0], most), 1)
+        return claim if claim.width * claim.height <= most else plain_claim(0, 0)
 
     def read(self, job: Job) -> SourceImage:
         """The image of a job.
