@@ -228,6 +228,7 @@ def _encode(format_: str, to: str, spec: Any, pixels: Array) -> None:
         raise OSError(0, error_text(file.geterror()))
 
 
+@cache
 def versions() -> dict[str, str]:
     """The versions of the libraries that read and write pictures."""
     return {name: version(name) for name in ("OpenImageIO", "OpenEXR", "Pillow", "rawpy")}
