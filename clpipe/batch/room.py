@@ -174,26 +174,29 @@ class Room:
         Raises:
             ImageError: there is not enough.
         """
+        self._drop()
+        give_back_memory()
+        free = self._free(size)
         least = min(LEAST, 4 * size + ASIDE // 2)  # the planes of a small image are no larger
-        most = self._most - sum(min(each.memory, least) for each in self._sharing)
-        if needed(size) <= most:  # or nothing helps
+        there = self._most - sum(min(each.memory, least) for each in self._sharing)
+        if needed(size) <= there:  # or nothing helps
             for device in self._sharing:
                 if device.memory > least:
                     self._limits[device] = device.memory
                     device.limit(least)
-            self._drop()
-            give_back_memory()
             end = time.monotonic() + PATIENCE
             while time.monotonic() < end:
                 if self._fits(size):
                     return
                 time.sleep(PATIENCE / 20)
+            free = self._free(size)
+            there = free.bytes if free else 0
             self._restore()
-        left = self._left() or Left(0, "this machine")
+        left = in_words(max(there, 0))
         raise ImageError(
-            f"it takes about {in_words(needed(size))} of memory; {in_words(max(most, 0))} are left "
-            f"by {left.by}; "
-            "allow more, or ask for less (--jobs 1, fewer pictures of each image)"
+            f"it takes about {in_words(needed(size))} of memory; {left} are left by "
+            f"{free.by if free else 'this machine'}; allow more, or ask for less (--jobs 1, fewer "
+            "pictures of each image)"
         )
 
     def _restore(self) -> None:

@@ -111,9 +111,9 @@ class Call:
                 for i, name in names:
                     arguments[i] = extents[of].numbers[name]
             self._extents = extents
+        for i, name in self._buffers:
+            arguments[i] = pool.held[name]
         if (pool.generation, bind) != self._bound:
-            for i, name in self._buffers:
-                arguments[i] = pool.held[name]
             for i, parameter in self._values:
                 value = bind(parameter)
                 arguments[i] = table(value) if isinstance(value, np.ndarray) else value
@@ -123,5 +123,5 @@ class Call:
         if self._launches == MANY:
             self.compiled.set_arg_types([getattr(each, "dtype", None) for each in arguments])
         self.compiled.set_args(*arguments)
-        for i, _ in self._ends:
-            arguments[i] = None  # which would hold an image
+        for i, _ in (*self._ends, *self._buffers):
+            arguments[i] = None  # which would hold an image, or a buffer that has been given back
