@@ -192,11 +192,11 @@ class Room:
             free = self._free(size)
             there = free.bytes if free else 0
             self._restore()
-        takes, left = in_words(needed(size)), in_words(max(there, 0))
-        by = free.by if free else "this machine"
+        left = in_words(max(there, 0))
         raise ImageError(
-            f"it takes about {takes} of memory; {left} are left by {by}; allow more, or ask for less "
-            "(--jobs 1, fewer pictures of each image)"
+            f"it takes about {in_words(needed(size))} of memory; {left} are left by "
+            f"{free.by if free else 'this machine'}; allow more, or ask for less (--jobs 1, fewer "
+            "pictures of each image)"
         )
 
     def _restore(self) -> None:
