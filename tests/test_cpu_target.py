@@ -1,6 +1,7 @@
 """Which CPU PoCL compiles for."""
 
 import os
+import re
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -53,6 +54,12 @@ def test_names_are_of_one_target_each():
         *("skx", "penryn", "haswell", None)
     ]
     assert Target("cascadelake", "").is_wide and not Target("alderlake", "").is_wide
+
+
+def test_the_page_has_the_table():
+    page = (ROOT / "docs/how_it_works.md").read_text("utf-8")
+    rows = re.findall(r"^\| .* \| `([\w-]+)` \| (8|16) \|$", page, re.MULTILINE)
+    assert rows == [(name, "16" if Target(name, "").is_wide else "8") for name in TARGETS]
 
 
 @pytest.fixture
