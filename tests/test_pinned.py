@@ -30,9 +30,10 @@ RUNS = {
     "paper": "-c paper --format png --format dng --baseline iid --iso 3200",
     "syb3r": "-c syb3r --format png",
     "nikon": "-c nikon-d800-jpeg --format png --iso 1600",
-    "lens": "--format png --carry Depth --set distortion.method=brown_conrady --set distortion.k1=-0.1"
-    " --set distortion.fx=70 --set vignetting.method=pa --set vignetting.k1=-0.3 --set defocus.method=thin_lens"
-    " --set defocus.f_number=2 --set defocus.focus_distance=2 --set defocus.sensor_width=36",
+    "lens": "--format png --carry Depth --set distortion.method=brown_conrady"
+    " --set distortion.k1=-0.1 --set distortion.fx=70 --set vignetting.method=pa"
+    " --set vignetting.k1=-0.3 --set defocus.method=thin_lens --set defocus.f_number=2"
+    " --set defocus.focus_distance=2 --set defocus.sensor_width=36",
     "draws": "--format png --camera sony-a7r2 --iso 800 --set 'exposure.ev={uniform=[-1, 1]}'"
     " --set 'sensor_noise.a={log_uniform=[1e-4, 0.01]}' --seed 7",
     "patches": "--format npy --patch 24 --patches-per-image 3 --augment --truth mosaic",
