@@ -20,7 +20,7 @@ from clpipe.engine.programs import announced
 from clpipe.engine.writer import Parameter
 from clpipe.reference.curve import compose, to_8_bit
 from clpipe.reference.random import Stream, stream_of
-from clpipe.stage import Frame, NoiseScope
+from clpipe.stage import NoiseScope, ReferenceContext
 
 
 @dataclass(frozen=True)
@@ -353,7 +353,7 @@ class Runner:
         steps = (self.chain if whole else self.chain.through(self.keep)).steps
         for step in steps:
             of_size = dict(step.method.of_size(*image.shape[1::-1]))
-            frame = Frame(step.context, streams(self.chain, step, noise_key), of_size)
+            frame = ReferenceContext(step.context, streams(self.chain, step, noise_key), of_size)
             with user_code_errors(f"stage {step.name}", step.stage.folder):
                 image = step.method.reference(image, frame)
             if step.name in self.keep:
