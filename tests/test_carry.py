@@ -230,7 +230,7 @@ def test_a_run_resumes_with_carried_files(clpipe, render):
         Path("out", name).unlink()
         assert there not in clpipe(*run).output
         assert (written(Path("out")), OUT.read_bytes()) == (files, before)
-    assert there in clpipe(*run, "--verify").output
+    assert there in clpipe(*run, "--redo", "damaged").output
     assert there not in clpipe(*run, *carrying("IndexOB")).output
     clpipe(*run)
     render("in/a_aux.exr", only=["View.Depth.Z"])  # another companion
@@ -256,9 +256,9 @@ def test_one_file_for_an_image_and_its_replay(clpipe, render):
     clpipe("run", "in", "-o", "bracket", "--device", "numpy", *stages, *bracket, "--carry", "Depth")
     assert Path("bracket/a.carried.exr").read_bytes() == OUT.read_bytes()
     assert "carried" in json.loads(Path("bracket/a.ev-1.json").read_text())
-    clpipe("run", "--replay", "out/a.frame0.json", "-o", "again", "--device", "numpy")
+    clpipe("replay", "out/a.frame0.json", "-o", "again", "--device", "numpy")
     assert Path("again/a.carried.exr").read_bytes() == OUT.read_bytes()
-    clpipe("run", "--replay", "out/a.frame1.json", "-o", "other", "--device", "numpy")
+    clpipe("replay", "out/a.frame1.json", "-o", "other", "--device", "numpy")
     assert not Path("other/a.carried.exr").exists()
 
 

@@ -27,7 +27,7 @@ from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.existing import AS_USUAL, Found, Resuming
+from clpipe.outputs.existing import Found, Redo
 from clpipe.outputs.patches import Patch, every_patch
 from clpipe.outputs.renditions import Rendition
 from clpipe.outputs.sealed import SIDECAR, write_sidecar
@@ -99,7 +99,7 @@ class ImageWorker:
         loader: how images are loaded.
         writer: how pictures are written.
         chain: that of the first image, for which kernels are compiled early.
-        resuming: which pictures that are there already are made again.
+        redo: which pictures that are there already are made again.
         trace: note each launch and transfer.
     """
 
@@ -108,13 +108,13 @@ class ImageWorker:
         loader: ImageLoader,
         writer: OutputWriter,
         chain: Chain,
-        resuming: Resuming = AS_USUAL,
+        redo: Redo = Redo.OLD,
         trace: bool = False,
     ) -> None:
         self.writer = writer
         self.loader = loader
         self.chain = chain
-        self._resuming = resuming
+        self._redo = redo
         self._trace = trace
         self._spare = SpareArrays(0)
 
@@ -177,14 +177,14 @@ class ImageWorker:
     def _missing(self, task: Task) -> list[str]:
         """The names of a job's renditions that are to be made."""
         names = self.writer.names_of(task.job)
-        if self._resuming.overwrite:
+        if self._redo is Redo.ALL:
             return list(names)
         found = {
             name: self.found(task.job, name, self.writer.record_of(task.job, task.request, name))
             for name in names
         }
         task.old = sum(there is Found.OLD for there in found.values())
-        missing = [name for name, there in found.items() if not self._resuming.is_kept(there)]
+        missing = [name for name, there in found.items() if not self._redo.keeps(there)]
         needed = self.writer.plan_of(task.job).needed(missing)
         return [name for name in self.writer.plan_of(task.job).names() if name in needed]
 
@@ -199,7 +199,7 @@ class ImageWorker:
         Raises:
             ImageError: a file of its name is somebody else's.
         """
-        return self.writer.existing(job, name).found(job, request, self._resuming.verify)
+        return self.writer.existing(job, name).found(job, request, self._redo.verifies)
 
     def _load(self, task: Task, names: Sequence[str]) -> None:
         """Load a task's image, and decide which renditions are made of it.

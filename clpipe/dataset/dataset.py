@@ -14,6 +14,7 @@ from clpipe.base.memory import parse_size
 from clpipe.base.processors import available_processors
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import one_of
+from clpipe.base.types import plain
 from clpipe.base.validation import typed
 from clpipe.chain.request import Request
 from clpipe.chain.truth import DEVELOPMENT
@@ -26,7 +27,6 @@ from clpipe.images.read import TRANSFERS
 from clpipe.inputs.find import Job, find_jobs
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.outputs.patches import PER_IMAGE, Patches
-from clpipe.pipeline import plain
 
 NOWHERE = Path(os.devnull)  # nothing is written
 

@@ -113,7 +113,7 @@ class ImageLoader:
     @property
     def raw(self) -> RawLoader:
         """How raws and dumps enter."""
-        return RawLoader(self.request, self.settings.dump)
+        return RawLoader(self.request, self.settings.dump_format)
 
     def endings(self) -> tuple[str, ...]:
         """The endings of the files that are taken from folders."""
@@ -160,7 +160,7 @@ class ImageLoader:
         Of one that cannot be opened each byte is taken for a pixel.
         """
         most = self.request.max_pixels or USUAL_MAX_PIXELS
-        dump = self.settings.dump
+        dump = self.settings.dump_format
         if dump and may_be_dump(job.path):
             claim = plain_claim(dump.width, dump.height)
         else:

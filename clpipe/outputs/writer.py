@@ -10,7 +10,7 @@ from clpipe.base.errors import ImageError, OutputError, RequestError
 from clpipe.base.files import Stored, keep_names
 from clpipe.chain.chain import Chain
 from clpipe.chain.formats import DNG, FORMATS, NPY, ending_of
-from clpipe.chain.request import CARRY, Request
+from clpipe.chain.request import CARRY, ResolvedRequest
 from clpipe.chain.truth import PICTURES, VARIANCE
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
@@ -46,11 +46,11 @@ class OutputWriter:
 
     Args:
         folder: where they go.
-        request: with every output named, see :meth:`Request.with_outputs`.
+        request: what is asked for.
     """
 
     folder: Path
-    request: Request
+    request: ResolvedRequest
 
     @property
     def formats(self) -> tuple[str, ...]:
@@ -99,7 +99,7 @@ class OutputWriter:
         """The steps whose image is written beside a rendition, by its name, where it has them."""
         if truth_named(name) in FLOAT_MOSAICS or baseline_named(name):
             return ()
-        if truth_named(name) in PICTURES and self.request.truth_keep is not None:
+        if truth_named(name) in PICTURES:
             return self.request.truth_keep
         return self.request.keep
 
@@ -181,7 +181,7 @@ class OutputWriter:
         if self.request.baselines:
             raise RequestError(
                 "--patch: the noise of a baseline is measured on whole pictures; leave one of "
-                "--patch and --baseline out"
+                "--patch and --truth out"
             )
         if VARIANCE in self.request.truths:
             variance_steps(chain)  # refuses steps that mix the noise of neighbours
@@ -206,10 +206,9 @@ class OutputWriter:
                             "choose another output folder"
                         )
                     if path in makers:
-                        keep = ", or say --keep-suffix" if makers[path].key != job.key else ""
                         raise RequestError(
                             f"{makers[path].label} and {job.label} would both write {path}; "
-                            f"run them into different folders{keep}"
+                            f"run them into different folders, or name them in a manifest"
                         )
                     makers[path] = job
 
