@@ -1,7 +1,6 @@
-#!/usr/bin/env python3
 """Develop clpipe's raws with other raw converters, and put them beside clpipe's own pictures.
 
-    tools/compare_converters [RENDER ...] [-c CONFIG ...]
+    tools/run compare converters [RENDER ...] [-c CONFIG ...]
 
 `clpipe run` writes pictures and DNGs, with and without noise; dcraw, darktable-cli and RawTherapee
 develop the DNGs (Debian: apt-get install dcraw darktable rawtherapee). Those that are missing are
@@ -34,7 +33,6 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from side_by_side import COLUMNS, cells, markdown, sheet, telling_places
 
 from clpipe.analysis.charts import (
     chart_image,
@@ -49,9 +47,9 @@ from clpipe.base.errors import ClpipeError
 from clpipe.base.types import Array, Floats, Mask
 from clpipe.images.read import read_image
 from clpipe.images.write import write_exr
+from tools import RENDER, ROOT
+from tools.pages.side_by_side import COLUMNS, cells, markdown, sheet, telling_places
 
-REPO = Path(__file__).resolve().parent.parent
-RENDER = REPO / "tests" / "data" / "still_life.exr"
 LIMIT = 600  # seconds a development
 BASE_ISO = 100
 ENLARGED = 8
@@ -188,7 +186,9 @@ def run(command: Sequence[str], environment: dict[str, str]) -> bytes:
         ComparisonError: it fails, or takes more than ten minutes.
     """
     try:
-        done = subprocess.run(command, capture_output=True, env=environment, timeout=LIMIT)
+        done = subprocess.run(
+            command, capture_output=True, env=environment, timeout=LIMIT, check=False
+        )
     except subprocess.TimeoutExpired:
         raise ComparisonError(f"{command[0]}: not done after {LIMIT} s") from None
     if done.returncode:
@@ -330,7 +330,7 @@ def main() -> int:
     )
     parser.add_argument("--iso", action="append", type=float, help="may be repeated [1600, 6400]")
     parser.add_argument(
-        "-o", "--output", type=Path, default=REPO / "build/converters", metavar="OUT"
+        "-o", "--output", type=Path, default=ROOT / "build/converters", metavar="OUT"
     )
     given = parser.parse_args()
     configs = ("default", *given.config)

@@ -1,7 +1,6 @@
-#!/usr/bin/env python
 """Run batches under bad luck, go on with each, and compare all files with an undisturbed run's.
 
-    .venv/bin/python tools/faults [--images N] [--repeats N] [--seed N] [--device SEL] [FAULT...]
+    tools/run stress faults [--images N] [--repeats N] [--seed N] [--device SEL] [FAULT...]
 
 Each fault strikes a batch at a random moment, in a new output folder each time: pictures of three
 kinds with sidecars, or tars. What the summary called done must be there; then the same command goes
@@ -31,7 +30,8 @@ from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parent.parent
+from tools import ROOT
+
 FOREIGN = {
     "notes.txt": b"not clpipe's",
     "pictures/other.jpg": b"\xff\xd8 somebody's",
@@ -64,7 +64,7 @@ class Trial:
 
     def command(self, driver: str = "") -> list[str]:
         """The command line; ``driver`` is the name of what is patched in the program."""
-        start = [__file__, "--driver", driver] if driver else ["-m", "clpipe"]
+        start = ["-m", "tools.stress.faults", "--driver", driver] if driver else ["-m", "clpipe"]
         return [sys.executable, *start, *self.arguments]
 
     def start(self, driver: str = "", **environment: str) -> subprocess.Popen:
@@ -377,7 +377,6 @@ FAULTS: dict[str, Callable[[Trial, float, int], None]] = {
 
 def drive(name: str, arguments: list[str]) -> None:
     """Run the program with one thing in it that fails once, or a clock that jumps."""
-    sys.path.insert(0, str(ROOT))
     left = int(os.environ["FAULTS_COUNT"])
 
     def failing(real: Callable, error: Exception) -> Callable:
@@ -413,7 +412,6 @@ def drive(name: str, arguments: list[str]) -> None:
 
 def prepare(folder: Path, count: int) -> None:
     """Write the inputs and compile the faults."""
-    sys.path.insert(0, str(ROOT))
     from clpipe.images.write import write_exr
 
     pixels = np.random.default_rng(0).random((24, 32, 3)).astype(np.float32)

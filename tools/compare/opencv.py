@@ -1,12 +1,11 @@
-#!/usr/bin/env python3
 """Time clpipe's default chain against the same work in OpenCV and NumPy, in turns, in one run.
 
-    tools/compare_opencv [--device N] [--arrays WxH ...] [--files COUNTxWxH ...] [--methods]
+    tools/run compare opencv [--device N] [--arrays WxH ...] [--files COUNTxWxH ...] [--methods]
 
-It needs pip install 'clpipe[compare]'. tools/opencv_chain.py says, stage by stage, what stands for
-what, and where OpenCV does less. The script runs in two ways: on whole images with OpenCV's own
-threads, as most would write it; and in bands of rows that stay in the cache, in a pool of threads,
-the fastest that was found.
+It needs the extra "compare" (.venv/bin/pip install -e '.[compare]'). opencv_chain.py says, stage by
+stage, what stands for what, and where OpenCV does less. The script runs in two ways: on whole
+images with OpenCV's own threads, as most would write it; and in bands of rows that stay in the
+cache, in a pool of threads, the fastest that was found.
 
 Arrays: a render of half floats in memory becomes a picture of eight bits in memory; for clpipe also
 from device to device, as `clpipe bench` measures.
@@ -18,7 +17,7 @@ cv2.imencode, which is faster than Pillow, and has the fastest of some numbers o
 a few renders stand for many.
 
 Methods: colour-demosaicing, scikit-image and HDRutils beside clpipe's methods of the same name; see
-tools/other_methods.py.
+methods.py.
 
 Each turn runs all once. Speeds are medians; ratios are those within a turn, their median and
 quartiles. First both develop the test image, and their pictures and noise are compared.
@@ -38,7 +37,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from turns import Comparison, Work, in_turns
 
 from clpipe.base.errors import ClpipeError
 from clpipe.base.processors import available_processors
@@ -56,8 +54,9 @@ from clpipe.images.read import read_image
 from clpipe.inputs.find import find_jobs
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.writer import OutputWriter
+from tools import RENDER
+from tools.compare.turns import Comparison, Work, in_turns
 
-RENDER = Path(__file__).resolve().parent.parent / "tests" / "data" / "still_life.exr"
 NEEDED = ("cv2", "OpenEXR")
 WHOLE, BANDS = "opencv_whole", "opencv_bands"
 HEADINGS = (
@@ -79,7 +78,7 @@ class Likeness(NamedTuple):
 
 def likeness(device: Device) -> Likeness:
     """Compare what both make."""
-    from opencv_chain import OpenCVChain
+    from tools.compare.opencv_chain import OpenCVChain
 
     chain = Request.from_options().chain()
     script = OpenCVChain(chain)
@@ -102,7 +101,8 @@ def variance(raw: Array) -> float:
 def compare_arrays(device: Device, width: int, height: int, repeat: int) -> list[Comparison]:
     """Arrays to arrays, on the device alone and from memory to memory."""
     import cv2
-    from opencv_chain import OpenCVChain, pool
+
+    from tools.compare.opencv_chain import OpenCVChain, pool
 
     chain = Request.from_options().chain()
     runner, script = Runner(chain, device), OpenCVChain(chain)
@@ -137,7 +137,7 @@ class Files:
     """A load of files in a folder, and what clpipe and the script make of them."""
 
     def __init__(self, device: Device, load: Load, folder: Path) -> None:
-        from opencv_chain import OpenCVChain
+        from tools.compare.opencv_chain import OpenCVChain
 
         self.out = folder / "out"
         write_renders(folder / "in", load)
@@ -170,7 +170,8 @@ class Files:
         """Develop the first ``count`` files with the script."""
         import cv2
         import OpenEXR
-        from opencv_chain import pool
+
+        from tools.compare.opencv_chain import pool
 
         cv2.setNumThreads(1)
         quality = cv2.IMWRITE_JPEG_QUALITY, 97
@@ -283,7 +284,9 @@ def main() -> int:
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args()
     if missing := [name for name in NEEDED if not importlib.util.find_spec(name)]:
-        print(f"{', '.join(missing)}: missing; pip install 'clpipe[compare]'", file=sys.stderr)
+        print(
+            f"{', '.join(missing)}: missing; .venv/bin/pip install -e '.[compare]'", file=sys.stderr
+        )
         return 1
     try:
         return compare(options)
@@ -310,7 +313,7 @@ def compare(options: argparse.Namespace) -> int:
     rows += [compare_files(device, load, options.repeat) for load in options.files]
     methods = []
     if options.methods:
-        from other_methods import compare_methods
+        from tools.compare.methods import compare_methods
 
         methods = compare_methods(device, options.repeat)
     record = {

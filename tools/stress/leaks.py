@@ -1,10 +1,10 @@
-#!/usr/bin/env python3
 """Put thousands of small images through one process and print what it holds every 1,000.
 
 Images have many sizes and are half, float, mosaics and kept; some are damaged or too large, some go
-through in tiles; outputs are JPEG, EXR and DNG. Half of them go through ``clpipe run``, half through
-one ``clpipe.Pipeline``. Memory, file descriptors, threads and OpenCL objects must stay flat: the exit
-status is 1 where the second half of the run holds much more at its end than at its beginning.
+through in tiles; outputs are JPEG, EXR and DNG. Half of them go through ``clpipe run``, half
+through one ``clpipe.Pipeline``. Memory, file descriptors, threads and OpenCL objects must stay
+flat: the exit status is 1 where the second half of the run holds much more at its end than at its
+beginning.
 """
 
 import argparse
@@ -89,12 +89,12 @@ def run(folder: Path, name: str, options: list[str]) -> None:
     """A thousand images through ``clpipe run``."""
     inputs = folder / ("mosaics" if name == "kept" else "renders")
     arguments = ["run", str(inputs), "-o", str(folder / "out"), "--max-pixels", "30000", *options]
-    with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):
+    with open(os.devnull, "w", encoding="utf-8") as nowhere, contextlib.redirect_stderr(nowhere):
         try:
             command([*arguments, "--quiet"], prog_name="clpipe")
         except SystemExit as end:
             status = end.code
-    log = (folder / "out" / "run.jsonl").read_text()
+    log = (folder / "out" / "run.jsonl").read_text("utf-8")
     failed = log.count('"status": "failed"')
     if status != 1 or not 0 < failed < BATCH // 2:
         sys.exit(f"leaks: {name}: exit status {status}, {failed} images failed")
@@ -115,7 +115,7 @@ def process(pipeline: clpipe.Pipeline, number: int) -> None:
 def held() -> dict[str, int]:
     """What this process holds: memory in KiB, and numbers of things."""
     gc.collect()
-    status = Path("/proc/self/status").read_text()
+    status = Path("/proc/self/status").read_text("utf-8")
     return {
         "rss_kib": int(status.partition("VmRSS:")[2].split()[0]),
         "fds": len(os.listdir("/proc/self/fd")),

@@ -1,8 +1,8 @@
-"""Make the scene of tools/reconstruction: surfaces with strong, weak and no texture, evenly lit.
+"""Make the scene of the experiment: surfaces with strong, weak and no texture, evenly lit.
 
-    python tools/reconstruction_scene.py FOLDER
+    python tools/reconstruction/scene.py FOLDER
 
-It needs Blender's package bpy, or Blender itself: blender -b -P tools/reconstruction_scene.py --
+It needs Blender's package bpy, or Blender itself: blender -b -P tools/reconstruction/scene.py --
 FOLDER. It writes FOLDER/colour.blend and FOLDER/centres.blend, the same scene: the first is
 antialiased; in the second a pixel is the ray through its centre, for depth and object numbers.
 

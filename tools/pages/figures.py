@@ -1,6 +1,6 @@
-"""Make the paper's figures; "sh tools/figures" installs what this needs and runs it.
+"""Make the figures of the paper.
 
-    sh tools/figures [-o FOLDER] [--render FILE.exr] [--raw FILE]
+    tools/run pages figures [-o FOLDER] [--render FILE.exr] [--raw FILE]
 
 The paper is Bielova, Haensch, Ley and Hellwich, "A Digital Image Processing Pipeline for Modelling
 of Realistic Noise in Synthetic Images" (CVPR Workshops 2019). Every command of clpipe is printed as
@@ -38,9 +38,8 @@ from clpipe.analysis.pictures import WHOLE, load_picture
 from clpipe.analysis.spatial import LAGS
 from clpipe.analysis.statistics import Channel
 from clpipe.base.errors import ClpipeError
+from tools import RENDER
 
-ROOT = Path(__file__).resolve().parent.parent
-RENDER = ROOT / "tests" / "data" / "still_life.exr"
 SUFFIXES = (".pdf", ".png")
 LEVELS = 255
 

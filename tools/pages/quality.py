@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """Measure how good demosaicing and denoising are: CPSNR against pictures whose truth is known.
 
 Demosaicing: eight of the Kodak pictures (kodim01.png and so on, in a folder that is named or lies
@@ -26,13 +25,12 @@ from rich.table import Table
 import clpipe
 from clpipe.analysis.charts import slanted_edge
 from clpipe.analysis.fidelity import sharpness
-from clpipe.images.read import read_image
-from clpipe.chain.registry import all_stages
-from clpipe.stages import DEFAULT_CHAIN
 from clpipe.base.types import Array
+from clpipe.chain.registry import all_stages
+from clpipe.images.read import read_image
+from clpipe.stages import DEFAULT_CHAIN
+from tools import RENDER, ROOT
 
-ROOT = Path(__file__).resolve().parent.parent
-RENDER = ROOT / "tests" / "data" / "still_life.exr"
 KODAK = ROOT.parent / "shared" / "data" / "kodak"
 BORDER = 10
 ISOS = (400, 1600, 6400)

@@ -1,8 +1,7 @@
-#!/usr/bin/env python3
 """Put known noise in, measure it again, and print the page docs/validation.md.
 
-    tools/validate --real FOLDER > docs/validation.md
-    tools/validate --only cameras [RENDER ...]
+    tools/run pages validate --real FOLDER > docs/validation.md
+    tools/run pages validate --only cameras [RENDER ...]
 
 The closed loop: frames with known parameters are made, for every camera, ISO and pattern, and
 calibrated as if nothing were known of them. Poisson numbers against their exact law. Finished
@@ -23,10 +22,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-import real_cameras
 from PIL import Image
 from scipy.stats import chi2, poisson
-from side_by_side import COLUMNS, markdown
 
 import clpipe
 from clpipe.analysis.calibration.calibrate import calibrate
@@ -40,10 +37,11 @@ from clpipe.camera.profile import load_camera
 from clpipe.images.read import read_image
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.reference.poisson import poisson_of
+from tools import RENDER, ROOT
+from tools.pages import real_cameras
+from tools.pages.side_by_side import COLUMNS, markdown
 
-ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
-RENDER = ROOT / "tests" / "data" / "still_life.exr"
 CAMERAS = ("sony-a7r2", "sony-a7s2", "canon-5d2")
 ISOS = (100, 400, 1600, 3200, 6400, 12800)
 FRAMES = 8
@@ -324,7 +322,7 @@ def main() -> int:
 
 PAGE = """# Validation
 
-Made by `tools/validate`; run it to see these figures on your machine.
+Made by `tools/run pages validate`; run it to see these figures on your machine.
 """
 
 LOOP = """## Known noise in, the same figures out

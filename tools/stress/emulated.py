@@ -1,4 +1,4 @@
-"""For ``tools/portability``: PoCL on CPUs that are not here, emulated by qemu-user.
+"""PoCL, for portability.py, on CPUs that are not here, emulated by qemu-user.
 
 ``clpipe run`` makes a small picture there, files to files, and NumPy makes it here: the raw must be
 the same, bit for bit. qemu's emulation (TCG) has AVX2 and no AVX-512. Linux's list of features,
@@ -18,8 +18,8 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from portability_runs import (
-    REPO,
+from tools import ROOT
+from tools.stress.runtimes import (
     BrokenError,
     Run,
     Runtime,
@@ -138,7 +138,7 @@ def arm64_packages(work: Path, python: str) -> Path:
         to = ("--target", packages, "--no-deps", "--only-binary=:all:")
         pip_install(work / "venv", *to, *platforms, f"--python-version={python}", *versions)
         done.write_text("\n".join(versions), "utf-8")
-    pip_install(work / "venv", "--target", packages, "--no-deps", "--upgrade", REPO)
+    pip_install(work / "venv", "--target", packages, "--no-deps", "--upgrade", ROOT)
     return packages
 
 

@@ -1,7 +1,6 @@
-#!/usr/bin/env python
-"""Read mutated files: each is read or clearly refused, without traceback, hang, crash or much memory.
+"""Read mutated files: each is read or clearly refused, without traceback, crash or much memory.
 
-    .venv/bin/python tools/fuzz [--cases N] [--seed N] [--keep FOLDER] [FILE...]
+    tools/run stress fuzz [--cases N] [--seed N] [--keep FOLDER] [FILE...]
 
 Every reader of the package is tried, by the ending of a file's name; without files, small ones of
 each kind are made first. Cases run in a process of their own, which is started again after a crash
@@ -36,7 +35,6 @@ LIMITS["PYTHONWARNINGS"] = "error"
 NUMBERS = (0, 1, 2, 255, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 10**9, 0x7FC00000)
 WORDS = (b"nan", b"inf", b"-1", b"1e999", b"[]", b"{}", b'""', b"true", b"=", b"[", b"\n", b"\xff")
 TEXTS = (".toml", ".csv", ".cube", ".jsonl", ".json", ".c")
-ROOT = Path(__file__).resolve().parent.parent
 
 
 def mutated(data: bytes, random_: random.Random, text: bool) -> bytes:
@@ -178,7 +176,6 @@ def attempt(path: Path) -> str:
 
 def make_seeds(folder: Path) -> list[Path]:
     """Small files of every kind that is read."""
-    sys.path.insert(0, str(ROOT))
     import numpy as np
     import OpenImageIO as oiio
 
@@ -232,7 +229,9 @@ def make_seeds(folder: Path) -> list[Path]:
     view = {"file": "a.exr", "K": [[9, 0, 2], [0, 9, 1.5], [0, 0, 1]], "R": rows, "t": [0, 0, 1]}
     view |= {"model": "PINHOLE", "distortion": {"k1": 0}}
     frame = {"file_path": "./a", "transform_matrix": [*([*row, 2] for row in rows), [0, 0, 0, 1]]}
-    coefficients = "".join(f"noise_model_{key}[] = {{ 1e-6, 2e-6, 3e-6, 4e-6 }};\n" for key in "ABCD")
+    coefficients = "".join(
+        f"noise_model_{key}[] = {{ 1e-6, 2e-6, 3e-6, 4e-6 }};\n" for key in "ABCD"
+    )
     texts = {
         "noiseprofiles.json": json.dumps({"noiseprofiles": [{"maker": "M", "models": models}]}),
         "model.c": f"for (int sens = 100; sens <= 6400; sens += 100)\n{coefficients}sens / 800.0",
@@ -316,7 +315,8 @@ def supervise(
     """Do cases in a process until it is done, crashes or hangs; the next case, and what was bad."""
     said = folder / "said"
     options = [f"--cases={asked.cases}", f"--seed={asked.seed}", f"--from={first}"]
-    command = [sys.executable, __file__, *options, f"--folder={folder}", *map(str, asked.files)]
+    command = [sys.executable, "-m", "tools.stress.fuzz", *options, f"--folder={folder}"]
+    command += map(str, asked.files)
     number, bad, at = first, [], 0
     said.write_text("", "utf-8")
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | LIMITS) as child:

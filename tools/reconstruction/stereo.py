@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scene_views import SAME, View, seen_from, visible
 
 from clpipe.base.types import Array, Doubles, Floats, Mask
+from tools.reconstruction.views import SAME, View, seen_from, visible
 
 BLOCK = 5  # px, a side of the block whose costs are added up
 MARGIN = 5  # px of disparity that are searched beyond those of the scene, on either side

@@ -1,4 +1,4 @@
-"""The kinds of picture that tools/reconstruction compares, and how clpipe makes them."""
+"""The kinds of picture that the experiment compares, and how clpipe makes them."""
 
 import os
 import subprocess
@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
-from stereo import halved
 
 from clpipe.base.types import Array, Doubles
+from tools.reconstruction.stereo import halved
 
 
 class Kind(NamedTuple):

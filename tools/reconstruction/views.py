@@ -1,6 +1,6 @@
 """The views of a scene, with what is true of them: cameras, depth, and the texture of each pixel.
 
-A folder of views is what tools/reconstruction reads and --render makes: cameras.json, as clpipe
+A folder of views is what the experiment reads and --render makes: cameras.json, as clpipe
 writes it, and an EXR of half floats for each view: R, G and B (linear Rec. 709; DWAA bends them by
 0.3 %), Z (depth along the optical axis in m, rounded by 0.05 % at most, which is 0.1 px of
 disparity) and texture (a number of TEXTURES).
@@ -23,7 +23,7 @@ import OpenImageIO as oiio
 from clpipe.base.types import Array, Doubles, Floats, Mask
 from clpipe.scenes.blender import Renderer, Rendering
 
-SCRIPT = Path(__file__).with_name("reconstruction_scene.py")
+SCRIPT = Path(__file__).with_name("scene.py")
 TEXTURES = {"strong": 1, "weak": 2, "none": 3}  # as SCRIPT numbers its objects
 CAMERAS = "cameras.json"
 CHANNELS = ("R", "G", "B", "Z", "texture")

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from scene_views import SAME, View
 
 from clpipe.base.types import Array, Doubles, Mask
 from clpipe.outputs.views import COLMAP, Photograph, colmap
 from clpipe.reference.intrinsics import PINHOLE, Intrinsics
+from tools.reconstruction.views import SAME, View
 
 THRESHOLDS = (0.7, 0.9)  # of PMVS2's correlation; its own default, and one for few and sure points
 # All others are PMVS2's defaults: a patch each 2x2 pixels, windows of 7x7, three views at least.

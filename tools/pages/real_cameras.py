@@ -1,4 +1,4 @@
-"""Real cameras' finished pictures beside clpipe's: signatures, plots, crops; for tools/validate."""
+"""Real cameras' finished pictures beside clpipe's: signatures, plots, crops; for validate.py."""
 
 import re
 from collections import defaultdict
@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from PIL import Image
-from side_by_side import COLUMNS, cells, sheet, telling_places
 
 import clpipe
 from clpipe.analysis.signature import (
@@ -28,6 +27,7 @@ from clpipe.analysis.spatial import LAGS, autocorrelation, count_pairs
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Runner
+from tools.pages.side_by_side import COLUMNS, cells, sheet, telling_places
 
 ISOS = (800, 1600, 3200, 6400)
 TRUTH, PICTURE = "_mean.png", "_real.png"

@@ -1,9 +1,7 @@
 """Make docs/before_after.png, the README's picture: crops of the render and of what comes out.
 
-Usage: .venv/bin/python tools/readme_picture.py
+Usage: tools/run pages readme_picture
 """
-
-from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -13,9 +11,8 @@ from clpipe.base.types import Array
 from clpipe.images.read import read_image
 from clpipe.reference.curve import to_8_bit
 from clpipe.reference.transfer import srgb_curve
+from tools import RENDER, ROOT
 
-ROOT = Path(__file__).resolve().parent.parent
-RENDER = ROOT / "tests" / "data" / "still_life.exr"
 CROPS = ((112, 226, 110, 80), (560, 300, 110, 80), (420, 470, 110, 80))  # x, y, width, height
 SCALE = 3
 ISOS = (800, 6400)

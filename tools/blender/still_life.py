@@ -5,7 +5,7 @@ by Blender's Cycles on the CPU.  Values are scene linear Rec.709, scaled so that
 at EV 0.  Blender is not a dependency of the project: it goes into a Python 3.11 venv of its own.
 
     pip install bpy==5.0.1
-    python tools/render_scene.py tests/data/still_life.exr
+    python tools/blender/still_life.py tests/data/still_life.exr
 
 One unit is ten centimetres; x points right, y into the picture, z up; the table top is z = 0.
 """

@@ -1,21 +1,20 @@
-#!/usr/bin/env python3
 """Reconstruct a scene from six views with a camera's noise and with others', over the ISO.
 
-    tools/reconstruction -o OUT [--iso ISO ...] [--seeds N] [-c CONFIG] [--pmvs PATH]
+    tools/run reconstruction experiment -o OUT [--iso ISO ...] [--seeds N] [-c CONFIG] [--pmvs PATH]
         [--colmap PATH] [--data FOLDER] [--render BLENDER]
 
 It needs pip install 'clpipe[calibrate,compare]'. This is the experiment of section 3.2 of the paper
 (Bielova, Haensch, Ley and Hellwich, CVPR Workshops 2019), on a scene whose depth is known; see
 docs/reconstruction.md for what was found.
 
-clpipe develops the views (tools/picture_kinds.py): clean; clean and denoised; with the camera's
+clpipe develops the views (pictures.py): clean; clean and denoised; with the camera's
 noise; with independent noise of the same variance, the same everywhere or following intensity,
 added to the clean picture; with independent noise that has the camera's variance after averaging
 2x2; and with the camera's noise without denoising.
 
 OpenCV's semi-global matching finds the depth of neighbouring views at full and half resolution
-(tools/stereo.py). With --pmvs, PMVS2 finds points in all views, too; with --colmap, COLMAP's dense
-stereo, where CUDA is (tools/multiview.py).
+(stereo.py). With --pmvs, PMVS2 finds points in all views, too; with --colmap, COLMAP's dense
+stereo, where CUDA is (multiview.py).
 
 Tables are printed and written to OUT as Markdown and CSV, beside the figures and the pictures.
 """
@@ -34,9 +33,13 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from multiview import THRESHOLDS, ProgramError, run_colmap, run_pmvs, true_of
-from picture_kinds import CAMERA, CLEAN, HALF, IID, KINDS, Pictures, energy_left
-from reconstruction_report import (
+
+from clpipe.base.errors import ClpipeError
+from clpipe.base.processors import available_processors
+from tools.pages.side_by_side import markdown
+from tools.reconstruction.multiview import THRESHOLDS, ProgramError, run_colmap, run_pmvs, true_of
+from tools.reconstruction.pictures import CAMERA, CLEAN, HALF, IID, KINDS, Pictures, energy_left
+from tools.reconstruction.report import (
     as_markdown,
     cloud_picture,
     depth_picture,
@@ -46,14 +49,10 @@ from reconstruction_report import (
     sheet,
     table_of,
 )
-from scene_views import TEXTURES, View, read_views, render_views
-from side_by_side import markdown
-from stereo import Pair, halved, pairs, score
+from tools.reconstruction.stereo import Pair, halved, pairs, score
+from tools.reconstruction.views import TEXTURES, View, read_views, render_views
 
-from clpipe.base.errors import ClpipeError
-from clpipe.base.processors import available_processors
-
-DATA = Path(__file__).with_name("reconstruction_data")
+DATA = Path(__file__).with_name("data")
 NEEDED = ("cv2", "matplotlib")
 ISOS = (100, 400, 1600, 3200, 6400, 12800)
 SEEDS = 3
@@ -336,7 +335,7 @@ def main() -> int:
     options = parser.parse_args()
     for module in NEEDED:
         if importlib.util.find_spec(module) is None:
-            print(f"{module}: missing; pip install 'clpipe[calibrate,compare]'", file=sys.stderr)
+            print(f"{module}: missing; .venv/bin/pip install -e '.[compare]'", file=sys.stderr)
             return 1
     try:
         if options.render:

@@ -17,7 +17,6 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from turns import Comparison, in_turns
 
 from clpipe.base.types import Array
 from clpipe.chain.chain import make_chain
@@ -26,6 +25,7 @@ from clpipe.chain.settings import settings_from
 from clpipe.engine.bench import scene
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
+from tools.compare.turns import Comparison, in_turns
 
 SIZE = 1536, 1024  # px: width, height
 SIGMA = 0.05  # of differences in value

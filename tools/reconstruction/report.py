@@ -1,4 +1,4 @@
-"""What tools/reconstruction prints and draws: tables over the ISO, figures, depth, points."""
+"""What the experiment prints and draws: tables over the ISO, figures, depth, points."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from picture_kinds import CAMERA, CLEAN, HALF, IID, KINDS
 from PIL import Image, ImageDraw, ImageFont
-from scene_views import View
-from side_by_side import markdown
 
 from clpipe.base.types import Array, Doubles, Floats
+from tools.pages.side_by_side import markdown
+from tools.reconstruction.pictures import CAMERA, CLEAN, HALF, IID, KINDS
+from tools.reconstruction.views import View
 
 COLOURS = dict(
     zip(

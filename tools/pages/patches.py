@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """Time training patches: samples a second through ``clpipe.Dataset``, by workers as PyTorch's are.
 
 Each sample is a noisy and a clean raw and a noisy and a clean picture, of a camera and an ISO that

@@ -1,7 +1,6 @@
-#!/usr/bin/env python3
 """Compile the kernels of the usual chains for GPUs that are not here, and print what came of it.
 
-    tools/gpu_compile [--only TEXT] [--target NAME ...]
+    tools/run stress gpu_compile [--only TEXT] [--target NAME ...]
 
 The chains: the default and the paper's development, the raw with every source of noise, and each
 method of each stage alone. The targets: NVIDIA sm_80 and sm_90, AMD gfx1030 and gfx1100, Intel DG2.
@@ -147,8 +146,8 @@ def for_nvidia(arch: str, source: Path) -> Compiled:
     said = output_of(assembler, f"-arch={arch}", "-v", "-o", cubin, ptx)
     text = output_of(disassembler, "-c", cubin)
     registers = number_in(said, r"Used (\d+) registers")
-    # A multiprocessor has room for 32 groups, 64 warps and 65536 registers, which a warp takes 256 at
-    # a time.
+    # A multiprocessor has room for 32 groups, 64 warps and 65536 registers, of which a warp takes
+    # 256 at a time.
     group = -(-number_in(source.read_text("utf-8"), r"reqd_work_group_size\((\d+)") // 32)
     warps = 65536 // (-(-registers * 32 // 256) * 256)
     warps = min(warps // group, 64 // group, 32) * group

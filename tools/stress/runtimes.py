@@ -1,4 +1,4 @@
-"""What ``tools/portability`` installs and runs OpenCL runtimes with."""
+"""What portability.py installs and runs OpenCL runtimes with."""
 
 import contextlib
 import os
@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-REPO = Path(__file__).resolve().parent.parent
 LIMIT = 1800  # seconds a runtime; race detection takes the longest
 FOREIGN = ("OCL", "OPENCL_", "POCL_", "PYOPENCL_", "CL_", "CLPIPE_", "RUSTICL_", "MESA_", "PYTHON")
 FOREIGN += ("LD_LIBRARY",)

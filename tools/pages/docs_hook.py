@@ -16,8 +16,8 @@ from click.testing import CliRunner
 from clpipe.chain.registry import all_stages
 from clpipe.commands.main import main
 from clpipe.stage import Method
+from tools import ROOT
 
-ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOK = "first_steps"
 
 

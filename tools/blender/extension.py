@@ -1,10 +1,9 @@
-#!/usr/bin/env python3
 """Build clpipe-blender.zip: an extension of Blender that develops its renders; see docs/blender.md.
 
-Its source is tools/blender. Wheels are those of the machine that this runs on, of clpipe as it is
-in the checkout and of what it depends on, as pip finds it.
+Its source is tools/blender/source. Wheels are those of the machine that this runs on, of clpipe as
+it is in the checkout and of what it depends on, as pip finds it.
 
-Usage: .venv/bin/python tools/blender_extension [-o clpipe-blender.zip]
+Usage: tools/run blender extension [-o clpipe-blender.zip]
 """
 
 import argparse
@@ -23,9 +22,9 @@ from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.files import built_in_configs
 from clpipe.chain.settings import Settings
 from clpipe.commands.cameras import make_and_model
+from tools import ROOT
 
-ROOT = Path(__file__).resolve().parent.parent
-SOURCE = ROOT / "tools" / "blender"
+SOURCE = ROOT / "tools" / "blender" / "source"
 # The first Blender that has a Python, and the first one that has it no longer.
 BLENDERS = {"3.11": ("4.2.0", "5.1.0"), "3.13": ("5.1.0", None)}
 # What Blender itself has, in versions that may be others. A wheel of it would take the place of

@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """Run clpipe on every OpenCL runtime, and with PoCL on every kind of CPU, that Debian can offer.
 
 Installs PoCL from pip and from Debian, Intel's CPU runtime, Mesa's rusticl on llvmpipe and
@@ -19,9 +18,9 @@ import sys
 import time
 from pathlib import Path
 
-from portability_cpus import EMULATED, EmulatedCPU, measure_emulated
-from portability_runs import (
-    REPO,
+from tools import ROOT
+from tools.stress.emulated import EMULATED, EmulatedCPU, measure_emulated
+from tools.stress.runtimes import (
     BrokenError,
     Run,
     Runtime,
@@ -60,7 +59,7 @@ def oclgrind(work: Path) -> str:
 
 def intel(work: Path) -> None:
     """Nothing: clpipe finds it, as with the extra ``intel``."""
-    pip_install(work / "venv", f"{REPO}[intel]")
+    pip_install(work / "venv", f"{ROOT}[intel]")
 
 
 def rusticl(work: Path) -> str:
@@ -121,7 +120,7 @@ def measure(runtime: Runtime, work: Path, row: list[str]) -> bool:
 def main() -> int:
     """Install, run, print the table."""
     parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
-    parser.add_argument("--work", type=Path, default=REPO / "build/portability", metavar="DIR")
+    parser.add_argument("--work", type=Path, default=ROOT / "build/portability", metavar="DIR")
     parser.add_argument(
         "--only", default="", metavar="TEXT", help="those with TEXT in the name, as in cpus"
     )
@@ -129,7 +128,7 @@ def main() -> int:
     work: Path = options.work.resolve()
     work.mkdir(parents=True, exist_ok=True)
     try:
-        pip_install(work / "venv", REPO)
+        pip_install(work / "venv", ROOT)
     except UnavailableError as error:
         print(f"portability: the project cannot be installed: {error}", file=sys.stderr)
         return 1
