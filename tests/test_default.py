@@ -26,7 +26,7 @@ from clpipe.reference.cfa import PATTERNS, red_site
 from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.reference.curve import curve_index, to_8_bit
 from clpipe.reference.roots import root_of
-from clpipe.stage import Context, Frame, run_reference
+from clpipe.stage import Context, ReferenceContext, run_reference
 from clpipe.stages.demosaic.bounded import Bounded
 from clpipe.stages.demosaic.edge_directed_median import EdgeDirectedMedian
 from clpipe.stages.denoise.bilateral import Bilateral
@@ -194,7 +194,7 @@ def test_the_configuration_paper_is_the_papers_pipeline():
 
     def reference(method, name, before):
         context = chain.step_named(name).context
-        return method.resolve(context).reference(kept[before], Frame(context, {}, {}))
+        return method.resolve(context).reference(kept[before], ReferenceContext(context, {}, {}))
 
     full = reference(EdgeDirectedMedian(), "demosaic", "white_balance")
     assert np.array_equal(kept["demosaic"], full)

@@ -98,7 +98,7 @@ def needed(project, extra):
         yield from needed(project, "")
 
 
-@pytest.mark.parametrize("extra", ["", "calibrate", "dev", "docs"])
+@pytest.mark.parametrize("extra", ["", "dev", "docs"])
 def test_a_lock_has_all_that_is_asked_for(extra):
     lock = (ROOT / "locks" / f"{extra or 'clpipe'}.txt").read_text()
     versions = {}
@@ -119,7 +119,7 @@ def test_a_lock_has_all_that_is_asked_for(extra):
 
 def test_a_lock_names_no_index_and_no_folder():
     locks = sorted((ROOT / "locks").iterdir())
-    assert {lock.stem for lock in locks} == {"calibrate", "clpipe", "dev", "docs"}
+    assert {lock.stem for lock in locks} == {"clpipe", "dev", "docs"}
     for lock in locks:
         assert not re.search(r"://|--(extra-)?index|--find-links|@ |\s/", lock.read_text())
 

@@ -20,10 +20,10 @@ from pydantic import ValidationError
 from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.base.reading import check_regular
 from clpipe.chain.keys import NOISE
-from clpipe.stage import Context, Literal, Method, Stage
+from clpipe.stage import CompileTime, Context, Method, Stage
 from clpipe.stages import own_stages
 
-ARGUMENT_TYPES = (np.float32, np.int32, np.uint32, np.ndarray, Literal)
+ARGUMENT_TYPES = (np.float32, np.int32, np.uint32, np.ndarray, CompileTime)
 
 ENTRY_POINTS = "clpipe.stages"
 

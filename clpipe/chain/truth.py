@@ -11,7 +11,7 @@ from clpipe.base.types import Floats
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.registry import user_code_errors
 from clpipe.chain.rendition import CLEAN
-from clpipe.stage import Frame, Kind
+from clpipe.stage import Kind, ReferenceContext
 
 
 def picture_without_noise(truth: str, chain: Chain) -> Chain:
@@ -105,7 +105,7 @@ def variance_of(noise: Sequence[Step], signal: Floats) -> Floats:
             # Behind the last noise no variance depends on the signal.
             clean = step.method.without_noise() if i < last else None
             if clean and clean.passes():
-                signal = clean.reference(signal, Frame(step.context, {}, {}))
+                signal = clean.reference(signal, ReferenceContext(step.context, {}, {}))
         if after is None:
             raise RequestError(
                 f"--truth variance: {step.name} ({step.method.method}) does not say what it makes "

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from clpipe.chain.chain import Chain, Step
-from clpipe.stage import Argument, Kind, Literal, Pass
+from clpipe.stage import Argument, CompileTime, Kind, Pass
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def undone(
 
 def bytes_of(argument: Argument) -> bytes:
     """An argument's value, to compare it."""
-    return argument.text.encode() if isinstance(argument, Literal) else argument.tobytes()
+    return argument.text.encode() if isinstance(argument, CompileTime) else argument.tobytes()
 
 
 def ops_of(step: Step, arguments: Mapping[str, Argument]) -> tuple[Op, ...]:
@@ -67,7 +67,7 @@ def ops_of(step: Step, arguments: Mapping[str, Argument]) -> tuple[Op, ...]:
         return ()
     types, literals = [], []
     for name, value in arguments.items():
-        if isinstance(value, Literal):
+        if isinstance(value, CompileTime):
             literals.append((name, value.text))
         elif isinstance(value, np.ndarray):
             types.append((name, "__global const float *"))

@@ -10,7 +10,17 @@ from pydantic import BeforeValidator, field_validator
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Doubles, Floats
 from clpipe.camera.profile import IDENTITY, Camera, Matrix
-from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, Unchanged, parameter
+from clpipe.stage import (
+    Argument,
+    Context,
+    Kind,
+    Method,
+    Pass,
+    ReferenceContext,
+    Stage,
+    Unchanged,
+    parameter,
+)
 
 NAMES = tuple(f"{row}_{column}" for row in "rgb" for column in "rgb")
 
@@ -95,7 +105,7 @@ class FixedMatrix(Method):
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return dict(zip(NAMES, self._array.ravel(), strict=True))
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         return apply_matrix(image, self._array)
 
 

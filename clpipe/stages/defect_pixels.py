@@ -8,7 +8,17 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.math import negative_log
 from clpipe.reference.random import word_at
-from clpipe.stage import Argument, Context, Frame, Kind, Method, NoiseScope, Pass, Stage, parameter
+from clpipe.stage import (
+    Argument,
+    Context,
+    Kind,
+    Method,
+    NoiseScope,
+    Pass,
+    ReferenceContext,
+    Stage,
+    parameter,
+)
 
 WORDS = 1 << 31  # the number of different random words that choose the pixels
 DEFAULT_LEVEL = 0.1  # signal units; chosen to be visible, where the camera gives no charge
@@ -78,9 +88,9 @@ class Random(Method):
         """The variance without the defect pixels: they are few, and not part of the noise model."""
         return before
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         hot_limit, dead_limit = self._limits()
-        words = word_at(image.shape, 0, frame.stream[NoiseScope.CAMERA])
+        words = word_at(image.shape, 0, given.stream[NoiseScope.CAMERA])
         bits = (words >> np.uint32(1)).view(np.int32)
         u = (bits.astype(np.float32) + np.float32(0.5)) * np.float32(1 / max(hot_limit, 1))
         excess = np.maximum(negative_log(u), np.float32(0))

@@ -12,10 +12,10 @@ from clpipe.stage import (
     Access,
     Argument,
     Context,
-    Frame,
     Kind,
     Method,
     Pass,
+    ReferenceContext,
     Stage,
     Unchanged,
     parameter,
@@ -149,9 +149,9 @@ class ThinLens(Method):
             "count": np.int32(len(taps)),
         }
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        taps = self.arguments(frame.context)["taps"]
-        depth = np.broadcast_to(_depth_in(frame.context).pixels, image.shape[:2])
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        taps = self.arguments(given.context)["taps"]
+        depth = np.broadcast_to(_depth_in(given.context).pixels, image.shape[:2])
         radii = self.clipped(depth)
         assert isinstance(taps, np.ndarray)
         return defocus(image, radii, taps)

@@ -22,16 +22,16 @@ from clpipe.reference.radial import Radial
 from clpipe.stage import (
     Access,
     Argument,
+    CompileTime,
     Context,
-    Frame,
     Kind,
     Method,
     Pass,
+    ReferenceContext,
     Stage,
     Unchanged,
     parameter,
 )
-from clpipe.stage import Literal as Text
 
 
 class NoDistortion(Unchanged):
@@ -150,9 +150,13 @@ class Distortion(HasPicture):
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         filter_ = warp.FILTERS[self.filter]
         taps, powers = filter_.shape
-        return {"filter": filter_, "taps": Text(str(taps)), "powers": Text(str(powers))}
+        return {
+            "filter": filter_,
+            "taps": CompileTime(str(taps)),
+            "powers": CompileTime(str(powers)),
+        }
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         return self.resampling.reference(image) if self.passes() else image
 
 

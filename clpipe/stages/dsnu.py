@@ -6,7 +6,7 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.random import normal_at
-from clpipe.stage import Context, Frame, GaussianNoise, Kind, NoiseScope, Pass, Stage
+from clpipe.stage import Context, GaussianNoise, Kind, NoiseScope, Pass, ReferenceContext, Stage
 
 
 class Gaussian(GaussianNoise):
@@ -31,8 +31,8 @@ class Gaussian(GaussianNoise):
     def draw(self) -> tuple[Pass, ...]:
         return (Pass("dsnu", arguments=("sigma",), random=NoiseScope.CAMERA),)
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        normals = normal_at(image.shape, 0, frame.stream[NoiseScope.CAMERA])
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        normals = normal_at(image.shape, 0, given.stream[NoiseScope.CAMERA])
         return image + normals * np.float32(self.sigma)
 
 

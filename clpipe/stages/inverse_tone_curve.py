@@ -13,10 +13,10 @@ from clpipe.stage import (
     Argument,
     Context,
     Curve,
-    Frame,
     Kind,
     Method,
     Pass,
+    ReferenceContext,
     Stage,
     Unchanged,
     parameter,
@@ -55,7 +55,7 @@ class Filmic(Method):
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"a": A, "b": B, "c": C, "d": D}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         return keep_hue(image, inverse_filmic)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import by_site
-from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.stage import Argument, Context, Kind, Method, Pass, ReferenceContext, Stage, parameter
 
 
 class Gains(Method):
@@ -51,10 +51,10 @@ class Gains(Method):
         red, blue = np.float32(self.red_gain**-2), np.float32(self.blue_gain**-2)
         return before * by_site(signal.shape[:2], context.pattern, red, np.float32(1), blue)
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         assert self.red_gain is not None and self.blue_gain is not None
         red, blue = np.float32(1 / self.red_gain), np.float32(1 / self.blue_gain)
-        return image * by_site(image.shape, frame.context.pattern, red, np.float32(1), blue)
+        return image * by_site(image.shape, given.context.pattern, red, np.float32(1), blue)
 
 
 STAGE = Stage(

@@ -8,7 +8,7 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
-from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.stage import Argument, Context, Kind, Method, Pass, ReferenceContext, Stage, parameter
 
 
 class Bayer(Method):
@@ -37,7 +37,7 @@ class Bayer(Method):
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"pattern": replace(context, pattern=self.pattern).cfa}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         red, green, blue = np.moveaxis(image, -1, 0)
         return by_site(image.shape, self.pattern, red, green, blue)
 

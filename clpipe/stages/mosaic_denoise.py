@@ -15,20 +15,20 @@ from clpipe.reference.patch import bias_of, decay_of, patch_distances
 from clpipe.stage import (
     Access,
     Argument,
+    CompileTime,
     Context,
-    Frame,
     Kind,
-    Literal,
     Method,
     Noiseless,
     Pass,
+    ReferenceContext,
     Stage,
     odd_size,
     parameter,
 )
 
 # h = FACTOR * strength * noise. Found by trying: at strength 1 it is within 0.1 dB of the highest
-# PSNR of the picture in tests/data, ISO 1600 to 12800. tools/quality measures that PSNR.
+# PSNR of the picture in tests/data, ISO 1600 to 12800. tools/pages/quality.py measures that PSNR.
 FACTOR = 1.3
 LARGEST = 15  # px, of the window
 
@@ -140,13 +140,13 @@ class NonLocalMeans(Method):
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {
             "pattern": context.cfa,
-            "reach": Literal(str(self.reach)),
+            "reach": CompileTime(str(self.reach)),
             **self.numbers(context),
         }
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        n = self.numbers(frame.context)
-        shape, pattern = image.shape, frame.context.pattern
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        n = self.numbers(given.context)
+        shape, pattern = image.shape, given.context.pattern
         one = np.float32(1)
         sensor = image * by_site(shape, pattern, n["red_inverse"], one, n["blue_inverse"])
         stable = stabilized(sensor, n["a"], n["offset"], n["root_of_offset"])

@@ -11,7 +11,17 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.reference.convolve import convolve, reach_of, taps_of
 from clpipe.reference.turning import BILINEAR, Turning
-from clpipe.stage import Access, Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.stage import (
+    Access,
+    Argument,
+    Context,
+    Kind,
+    Method,
+    Pass,
+    ReferenceContext,
+    Stage,
+    parameter,
+)
 
 LONGEST = 200.0  # px
 PARTS = 64  # of a pixel of a streak's length, that are placed one by one
@@ -128,7 +138,7 @@ class Linear(Method):
             return {}
         return {"taps": self.taps, "count": np.int32(len(self.taps))}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         return convolve(image, self.taps) if self.pixels else image
 
 
@@ -192,7 +202,7 @@ class Perspective(Method):
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"filter": BILINEAR} if self.rotation else {}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         return self.turning.reference(image) if self.rotation else image
 
 

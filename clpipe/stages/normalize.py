@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.stage import Argument, Context, Kind, Method, Pass, ReferenceContext, Stage, parameter
 
 
 class Linear(Method):
@@ -69,7 +69,7 @@ class Linear(Method):
         assert self.black_level is not None and self.white_level is not None
         return before * np.float32((self.white_level - self.black_level) ** -2)
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         assert self.black_level is not None and self.white_level is not None
         scale = np.float32(1 / (self.white_level - self.black_level))
         return (image - np.float32(self.black_level)) * scale

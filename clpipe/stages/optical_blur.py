@@ -15,12 +15,12 @@ from clpipe.reference.convolve import NEGLIGIBLE, blur, convolve, reach_of, taps
 from clpipe.stage import (
     Access,
     Argument,
+    CompileTime,
     Context,
-    Frame,
     Kind,
-    Literal,
     Method,
     Pass,
+    ReferenceContext,
     Stage,
     Unchanged,
     parameter,
@@ -272,12 +272,12 @@ class Lens(Method):
             return {"taps": self._taps, "count": np.int32(len(self._taps))}
         weights = half_of(*lines)
         if len(weights) - 1 <= UNROLLED:
-            return {"reach": Literal(str(len(weights) - 1)), "weights": weights}
+            return {"reach": CompileTime(str(len(weights) - 1)), "weights": weights}
         across, down = line_taps(*lines)
         return {"across": across, "down": down, "count": np.int32(len(across))}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        own = self.resolve(frame.context)
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        own = self.resolve(given.context)
         lines = own._by_lines
         if lines is None:
             return convolve(image, own._taps)

@@ -21,11 +21,11 @@ from clpipe.reference.curve import to_8_bit
 from clpipe.stage import (
     Argument,
     Context,
-    Frame,
     Kind,
     Method,
     NoiseScope,
     Pass,
+    ReferenceContext,
     Stage,
     Unchanged,
     parameter,
@@ -160,10 +160,10 @@ class IndependentNoise(Matched):
             )
         return self.filled(correlation=self.noise(iso).correlation)
 
-    def normals(self, image: Floats, frame: Frame) -> Floats:
+    def normals(self, image: Floats, given: ReferenceContext) -> Floats:
         """The normals of each sample, (height, width, 3), of the image's stream."""
         assert self.correlation is not None
-        stream = frame.stream[NoiseScope.IMAGE]
+        stream = given.stream[NoiseScope.IMAGE]
         return correlated_normals(image.shape, stream, mixing(*self.correlation))
 
     def mixing_arguments(self) -> dict[str, Argument]:
@@ -210,8 +210,8 @@ class IidGaussian(IndependentNoise):
         sigmas = zip(("red", "green", "blue"), map(np.float32, self.sigma), strict=True)
         return {**dict(sigmas), **self.mixing_arguments()}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        return image + self.normals(image, frame) * np.array(self.sigma, np.float32)
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        return image + self.normals(image, given) * np.array(self.sigma, np.float32)
 
 
 class IntensityDependent(IndependentNoise):
@@ -264,9 +264,9 @@ class IntensityDependent(IndependentNoise):
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"sigmas": self.table(), **self.mixing_arguments()}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         place = to_8_bit(image) + np.arange(3) * ENTRIES
-        return image + self.normals(image, frame) * self.table()[place]
+        return image + self.normals(image, given) * self.table()[place]
 
 
 @lru_cache(maxsize=16)

@@ -6,7 +6,16 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.random import normal_at
-from clpipe.stage import Context, Frame, GaussianNoise, Kind, NoiseScope, Pass, Stage, parameter
+from clpipe.stage import (
+    Context,
+    GaussianNoise,
+    Kind,
+    NoiseScope,
+    Pass,
+    ReferenceContext,
+    Stage,
+    parameter,
+)
 
 
 class Gaussian(GaussianNoise):
@@ -42,8 +51,8 @@ class Gaussian(GaussianNoise):
         """(1 + sigma^2) * before + sigma^2 * signal^2, exact for independent noise."""
         return (signal * signal + before) * np.float32(self.sigma) ** 2 + before
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        normals = normal_at(image.shape, 0, frame.stream[NoiseScope.CAMERA])
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        normals = normal_at(image.shape, 0, given.stream[NoiseScope.CAMERA])
         return image * (normals * np.float32(self.sigma) + np.float32(1))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.stage import Argument, Context, Kind, Method, Pass, ReferenceContext, Stage, parameter
 
 
 class Linear(Method):
@@ -86,7 +86,7 @@ class Linear(Method):
         """In DN^2; rounding adds 1/12, and clipping, which reduces variance, is not modelled."""
         return before * np.float32(self._range**2) + np.float32(1 / 12)
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         dn = np.rint(image * np.float32(self._range) + np.float32(self.black_level))
         return np.minimum(np.maximum(dn, np.float32(0)), np.float32(self.white_level))
 

@@ -5,7 +5,7 @@ from typing import ClassVar
 from clpipe.base.types import Floats
 from clpipe.reference.geometry import Scaling
 from clpipe.reference.resample import Resampling, Weight, lanczos3, overlap, resample
-from clpipe.stage import Access, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.stage import Access, Kind, Method, Pass, ReferenceContext, Stage, parameter
 
 
 class Filter(Method):
@@ -42,7 +42,7 @@ class Filter(Method):
             Resampling("columns", self.scale, weight, support),
         )
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         if self.scale == 1:
             return image
         rows, columns = self.resamplings

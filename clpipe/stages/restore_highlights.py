@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.stage import Argument, Context, Kind, Method, Pass, ReferenceContext, Stage, parameter
 
 
 class Brooks2019(Method):
@@ -48,7 +48,7 @@ class Brooks2019(Method):
             "blue_gain": np.float32(self.blue_gain),
         }
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         one = np.float32(1)
         red, green, blue = np.moveaxis(image, -1, 0)
         grey = ((red + green) + blue) * np.float32(1 / 3)

@@ -6,7 +6,16 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.random import normal_of_line
-from clpipe.stage import Access, Context, Frame, GaussianNoise, Kind, NoiseScope, Pass, Stage
+from clpipe.stage import (
+    Access,
+    Context,
+    GaussianNoise,
+    Kind,
+    NoiseScope,
+    Pass,
+    ReferenceContext,
+    Stage,
+)
 
 
 class Gaussian(GaussianNoise):
@@ -39,8 +48,8 @@ class Gaussian(GaussianNoise):
             Pass("row_noise", arguments=("lines",)),
         )
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        normals = normal_of_line(image.shape[0], frame.stream[NoiseScope.IMAGE])
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        normals = normal_of_line(image.shape[0], given.stream[NoiseScope.IMAGE])
         return image + (normals * np.float32(self.sigma))[:, None]
 
 

@@ -13,12 +13,12 @@ from clpipe.reference.roots import noise_in_roots
 from clpipe.stage import (
     Access,
     Argument,
+    CompileTime,
     Context,
-    Frame,
     Kind,
-    Literal,
     Method,
     Pass,
+    ReferenceContext,
     Stage,
     Unchanged,
     parameter,
@@ -125,8 +125,8 @@ class Unsharp(Method):
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {
-            "reach": Literal(str(self.reach)),
-            "step": Literal(str(blur_step(self.radius))),
+            "reach": CompileTime(str(self.reach)),
+            "step": CompileTime(str(blur_step(self.radius))),
             "weights": blur_weights(self.radius),
             "amount": np.float32(self.amount),
             "threshold": np.float32(self.threshold),
@@ -134,7 +134,7 @@ class Unsharp(Method):
             "offset": np.float32(self.offset),
         }
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         if not self.amount:
             return image
         offset = np.float32(self.offset)

@@ -6,7 +6,17 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Doubles, Floats
-from clpipe.stage import Access, Argument, Context, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.stage import (
+    Access,
+    Argument,
+    Context,
+    Kind,
+    Method,
+    Pass,
+    ReferenceContext,
+    Stage,
+    parameter,
+)
 
 
 class Rows(Method):
@@ -98,7 +108,7 @@ class Rows(Method):
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"cycles": self.cycles, "start": self.start, "swing": self.swing}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         if not self.swing:
             return image
         turns = np.arange(image.shape[0], dtype=np.float32) * self.cycles + self.start

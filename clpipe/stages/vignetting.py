@@ -11,12 +11,12 @@ from clpipe.base.types import Floats
 from clpipe.reference.math import inverse_root
 from clpipe.stage import (
     Argument,
+    CompileTime,
     Context,
-    Frame,
     Kind,
-    Literal,
     Method,
     Pass,
+    ReferenceContext,
     Stage,
     Unchanged,
     parameter,
@@ -74,9 +74,9 @@ class Pa(Method):
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         ks = {name: np.float32(getattr(self, name)) for name in ("k1", "k2", "k3")}
-        return {"extent": Literal("e"), **ks}
+        return {"extent": CompileTime("e"), **ks}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         sides: Floats = np.maximum(np.array(image.shape[:2], np.float32) - 1, 1)
         corner = (sides * sides).sum(keepdims=True) * np.float32(0.25)
         r2 = _squared_radius(image) * _reciprocal(corner)
@@ -133,7 +133,7 @@ class CosineFourth(Method):
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         per_px, per_side = self._units()
-        return {"extent": Literal("e"), "per_px": per_px, "per_side": per_side}
+        return {"extent": CompileTime("e"), "per_px": per_px, "per_side": per_side}
 
     def _units(self) -> tuple[np.float32, np.float32]:
         """1 over the squared focal length in px, or in longer sides; the other is 0."""
@@ -142,7 +142,7 @@ class CosineFourth(Method):
         assert self.focal_length and self.sensor_width
         return np.float32(0), np.float32((self.sensor_width / self.focal_length) ** 2)
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         per_px, per_side = self._units()
         side: Floats = np.full(1, max(image.shape[:2]), np.float32)
         unit = per_px or per_side * _reciprocal(side * side)

@@ -18,7 +18,7 @@ from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
 from clpipe.images.jpeg import through_jpeg
-from clpipe.stage import Frame, Method
+from clpipe.stage import Method, ReferenceContext
 
 UNDONE = ("gamma", "tone_curve")  # by the stage of that name with "inverse_" before it
 # Stages that the light of a picture has gone through.
@@ -73,7 +73,7 @@ class Simulator:
         if key not in self._linear:
             image = (scene.clean / 255).astype(np.float32)
             for method in methods:
-                image = method.reference(image, Frame(chain.steps[0].context, {}, {}))
+                image = method.reference(image, ReferenceContext(chain.steps[0].context, {}, {}))
             self._linear[key] = np.ascontiguousarray(enlarged(image / np.float32(gain), scale))
         return self._linear[key]
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
-from clpipe.stage import Access, Argument, Context, Frame, Method, Pass
+from clpipe.stage import Access, Argument, Context, Method, Pass, ReferenceContext
 from clpipe.stages.demosaic.common import (
     HALF,
     QUARTER,
@@ -47,5 +47,5 @@ class Bilinear(Method):
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"pattern": context.cfa}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        return bilinear(image, frame.context.pattern)
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        return bilinear(image, given.context.pattern)

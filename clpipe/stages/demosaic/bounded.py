@@ -10,7 +10,7 @@ from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
 from clpipe.reference.roots import from_root, in_steps, noise_in_roots, root_of
-from clpipe.stage import Access, Argument, Context, Frame, Kind, Method, Pass, parameter
+from clpipe.stage import Access, Argument, Context, Kind, Method, Pass, ReferenceContext, parameter
 from clpipe.stages.demosaic.common import (
     QUARTER,
     from_differences,
@@ -161,8 +161,8 @@ class Bounded(Method):
             "offset": np.float32(self.offset),
         }
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        pattern, offset = frame.context.pattern, np.float32(self.offset)
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        pattern, offset = given.context.pattern, np.float32(self.offset)
         roots = root_of(image, offset)
         known = green_or_difference(roots, pattern)
         differences = spread_differences(known, pattern)

@@ -9,7 +9,17 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
-from clpipe.stage import Access, Argument, Context, Frame, Kind, Literal, Method, Pass, parameter
+from clpipe.stage import (
+    Access,
+    Argument,
+    CompileTime,
+    Context,
+    Kind,
+    Method,
+    Pass,
+    ReferenceContext,
+    parameter,
+)
 from clpipe.stages.demosaic.common import (
     HALF,
     QUARTER,
@@ -89,9 +99,9 @@ class EdgeDirected(Method):
         )
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
-        return {"pattern": context.cfa, "classifier": Literal(self.classifier.upper())}
+        return {"pattern": context.cfa, "classifier": CompileTime(self.classifier.upper())}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        pattern = frame.context.pattern
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        pattern = given.context.pattern
         sparse = green_or_difference(image, pattern, self.classifier)
         return from_differences(image, pattern, *spread_differences(sparse, pattern))

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 from clpipe.base.types import Floats
 from clpipe.reference.median import median_filter
-from clpipe.stage import Access, Argument, Context, Frame, Kind, Pass
+from clpipe.stage import Access, Argument, Context, Kind, Pass, ReferenceContext
 from clpipe.stages.demosaic.common import from_differences, spread_differences
 from clpipe.stages.demosaic.edge_directed import EdgeDirected, green_or_difference
 from clpipe.stages.demosaic.median import Median
@@ -37,8 +37,8 @@ class EdgeDirectedMedian(Median, EdgeDirected):
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {**EdgeDirected.arguments(self, context), **Median.arguments(self, context)}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        pattern = frame.context.pattern
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        pattern = given.context.pattern
         sparse = green_or_difference(image, pattern, self.classifier)
         differences = spread_differences(sparse, pattern)
         return from_differences(image, pattern, *(median_filter(d, self.size) for d in differences))

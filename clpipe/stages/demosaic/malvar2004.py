@@ -8,7 +8,7 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
-from clpipe.stage import Access, Argument, Context, Frame, Method, Pass
+from clpipe.stage import Access, Argument, Context, Method, Pass, ReferenceContext
 from clpipe.stages.demosaic.common import EIGHTH, HALF, red_and_blue, sum_of_corners
 
 TWO, FOUR, FIVE, SIX = np.float32(2), np.float32(4), np.float32(5), np.float32(6)
@@ -51,5 +51,5 @@ class Malvar2004(Method):
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"pattern": context.cfa}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        return malvar2004(image, frame.context.pattern)
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        return malvar2004(image, given.context.pattern)

@@ -8,7 +8,17 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.median import median_filter
-from clpipe.stage import Access, Argument, Context, Frame, Kind, Literal, Method, Pass, parameter
+from clpipe.stage import (
+    Access,
+    Argument,
+    CompileTime,
+    Context,
+    Kind,
+    Method,
+    Pass,
+    ReferenceContext,
+    parameter,
+)
 from clpipe.stages.demosaic.bilinear import bilinear
 from clpipe.stages.demosaic.common import from_differences
 
@@ -47,10 +57,10 @@ class Median(Method):
         return Pass("freeman", Access.STENCIL, arguments, reads, radius=self.size // 2)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
-        return {"pattern": context.cfa, "size": Literal(str(self.size))}
+        return {"pattern": context.cfa, "size": CompileTime(str(self.size))}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        pattern = frame.context.pattern
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        pattern = given.context.pattern
         red, green, blue = np.moveaxis(bilinear(image, pattern), -1, 0)
         differences = (median_filter(d, self.size) for d in (red - green, blue - green))
         return from_differences(image, pattern, *differences)

@@ -13,7 +13,7 @@ import numpy as np
 from clpipe.base.types import Floats, Mask
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
-from clpipe.stage import Access, Argument, Context, Frame, Kind, Method, Pass
+from clpipe.stage import Access, Argument, Context, Kind, Method, Pass, ReferenceContext
 from clpipe.stages.demosaic.common import HALF, QUARTER, mean_above_below, mean_beside, red_and_blue
 
 THIRD = np.float32(1 / 3)
@@ -123,5 +123,5 @@ class Menon2007(Method):
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"pattern": context.cfa}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        return menon2007(image, frame.context.pattern)
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        return menon2007(image, given.context.pattern)

@@ -9,11 +9,11 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.reference.image import tap
-from clpipe.stage import Context, Frame, parameter
+from clpipe.stage import Context, ReferenceContext, parameter
 from clpipe.stages.denoise.strength import WindowDenoiser
 
-# Sigma of the range weight, in multiples of strength * noise. Chosen, not derived; tools/quality
-# measures the PSNR that it gives, and no test holds it to be the best.
+# Sigma of the range weight, in multiples of strength * noise. Chosen, not derived;
+# tools/pages/quality.py measures the PSNR that it gives, and no test holds it to be the best.
 RANGE = 3.0
 
 
@@ -48,9 +48,9 @@ class Bilateral(WindowDenoiser):
             "chroma_scale": gaussian_scale(RANGE * chroma),
         }
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         planes = rgb_to_ycbcr(image)
-        numbers = self.numbers(frame.context)
+        numbers = self.numbers(given.context)
         luma, chroma = planes[..., :1], planes[..., 1:]
         near = numbers["spatial_scale"]
         luma = bilateral(luma, self.reaches[0], near, numbers["luma_scale"])

@@ -10,7 +10,7 @@ from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.reference.image import tap
 from clpipe.reference.roots import from_root, in_steps, noise_in_roots, root_of
-from clpipe.stage import Access, Argument, Context, Frame, Kind, Pass, parameter
+from clpipe.stage import Access, Argument, Context, Kind, Pass, ReferenceContext, parameter
 from clpipe.stages.denoise.strength import MID_GREY, Denoiser, offset_of_roots, offset_parameter
 
 # The difference that weighs nothing, in multiples of strength * noise. Found by trying: at 6 in
@@ -155,7 +155,7 @@ class Biweight(Denoiser):
             "offset": np.float32(self.offset),
         }
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         if self.is_off:
             return image
         luma_range, chroma_range = (np.float32(each) for each in self.ranges)

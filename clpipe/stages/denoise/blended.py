@@ -7,11 +7,11 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
-from clpipe.stage import Context, Frame
+from clpipe.stage import Context, ReferenceContext
 from clpipe.stages.denoise.strength import WindowDenoiser
 
 # Assumed standard deviation of detail against its neighbours, signal units. Chosen, not derived;
-# tools/quality measures the PSNR that it gives, and no test holds it to be the best.
+# tools/pages/quality.py measures the PSNR that it gives, and no test holds it to be the best.
 DETAIL = 0.02
 
 
@@ -46,7 +46,7 @@ class BlendedFilter(WindowDenoiser):
         luma, chroma = self.amounts
         return {"luma_share": blend_share(luma), "chroma_share": blend_share(chroma)}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         planes = rgb_to_ycbcr(image)
         luma, chroma = (blend_share(amount) for amount in self.amounts)
         y, c = planes[..., :1], planes[..., 1:]

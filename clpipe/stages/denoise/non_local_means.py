@@ -10,7 +10,7 @@ from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.reference.image import tap
 from clpipe.reference.patch import bias_of, decay_of, patch_distances, patch_sum
-from clpipe.stage import Context, Frame, Kind, Pass
+from clpipe.stage import Context, Kind, Pass, ReferenceContext
 from clpipe.stages.denoise.strength import (
     MID_GREY,
     WindowDenoiser,
@@ -19,7 +19,7 @@ from clpipe.stages.denoise.strength import (
 )
 
 # h = FACTOR * strength * noise. Found by trying: at strength 1 it is within 0.1 dB of the highest
-# PSNR of the picture in tests/data, ISO 1600 to 12800. tools/quality measures that PSNR.
+# PSNR of the picture in tests/data, ISO 1600 to 12800. tools/pages/quality.py measures that PSNR.
 FACTOR = 1.1
 PATCH = 9  # pixels of a patch
 
@@ -87,8 +87,8 @@ class NonLocalMeans(WindowDenoiser):
             "chroma_scale": decay_of(FACTOR * self.chroma_strength),
         }
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        n = self.numbers(frame.context)
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        n = self.numbers(given.context)
         units = np.array([n["luma_unit"], n["chroma_unit"], n["chroma_unit"]], np.float32)
         planes = rgb_to_ycbcr(image) / units
         level = np.maximum(patch_sum(planes[..., 0]), np.float32(0))

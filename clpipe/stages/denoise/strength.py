@@ -19,9 +19,9 @@ from clpipe.reference.colour import LUMA
 from clpipe.stage import (
     Access,
     Argument,
+    CompileTime,
     Context,
     Kind,
-    Literal,
     Method,
     Noiseless,
     Pass,
@@ -227,5 +227,5 @@ class WindowDenoiser(Denoiser):
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         luma, chroma = self.reaches
-        reaches = {"luma_reach": Literal(str(luma)), "chroma_reach": Literal(str(chroma))}
+        reaches = {"luma_reach": CompileTime(str(luma)), "chroma_reach": CompileTime(str(chroma))}
         return {**reaches, **self.numbers(context)}

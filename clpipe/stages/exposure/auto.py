@@ -9,8 +9,7 @@ from pydantic import model_validator
 
 from clpipe.base.types import Floats, Mask
 from clpipe.reference.math import negative_log, power_of_two
-from clpipe.stage import Access, Argument, Context, Frame, Pass, parameter
-from clpipe.stage import Literal as Text
+from clpipe.stage import Access, Argument, CompileTime, Context, Pass, ReferenceContext, parameter
 from clpipe.stages.exposure.gain import Gain
 
 STEPS = 4096  # of the logarithm to base 2, in which it is an integer
@@ -154,7 +153,7 @@ class Auto(Gain):
         assert self.target is not None
         inside, outside = WEIGHTS[self.metering]
         return {
-            "extent": Text("e"),
+            "extent": CompileTime("e"),
             "share": np.uint32(CIRCLES[self.metering]),
             "inside": np.uint32(inside),
             "outside": np.uint32(outside),
@@ -170,7 +169,7 @@ class Auto(Gain):
     def _millionths(self) -> int:
         return max(1, round(self.percentile * 10_000))
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         found = self._percentile(image) if self.rule == "percentile" else self._log_average(image)
         ev = 0
         if found is not None:
@@ -180,7 +179,7 @@ class Auto(Gain):
         stops = np.array([ev / STEPS], np.float32)
         whole, rest = power_of_two(stops)
         (gain,) = (whole + whole * rest) * self.gain
-        frame.estimates["metered_ev"], frame.estimates["gain"] = float(stops[0]), float(gain)
+        given.estimates["metered_ev"], given.estimates["gain"] = float(stops[0]), float(gain)
         return image * gain
 
     def _circle(self, image: Floats) -> Mask:

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, Frame, Method, Pass, parameter
+from clpipe.stage import Argument, Context, Method, Pass, ReferenceContext, parameter
 
 
 class Gain(Method):
@@ -51,5 +51,5 @@ class Gain(Method):
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"gain": self.gain}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         return image * self.gain

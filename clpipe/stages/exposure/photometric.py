@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, Frame, parameter
+from clpipe.stage import Argument, Context, ReferenceContext, parameter
 from clpipe.stages.exposure.gain import Gain
 
 SATURATION = 78.0  # lx s, over the ISO: the exposure that fills the sensor
@@ -70,5 +70,5 @@ class Photometric(Gain):
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"gain": self.factor(context.iso)}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        return image * self.factor(frame.context.iso)
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        return image * self.factor(given.context.iso)

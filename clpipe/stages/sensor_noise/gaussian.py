@@ -7,7 +7,7 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.math import square_root
 from clpipe.reference.random import normal_at
-from clpipe.stage import Context, Frame, NoiseScope, Pass
+from clpipe.stage import Context, NoiseScope, Pass, ReferenceContext
 from clpipe.stages.sensor_noise.common import NEVER_FULL, or_default
 from clpipe.stages.sensor_noise.model import SensorNoise
 
@@ -49,12 +49,12 @@ class Gaussian(SensorNoise):
             return {**numbers, "b": np.float32(self.b)}
         return {**numbers, **self.read_noise_numbers()}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         n = self.numbers()
-        normals = normal_at(image.shape, 0, frame.stream[NoiseScope.IMAGE])
+        normals = normal_at(image.shape, 0, given.stream[NoiseScope.IMAGE])
         variance = n["a"] * image + n.get("b", np.float32(0))
         noise = normals * square_root(np.maximum(variance, np.float32(0)))
         noisy = np.minimum(image + noise, n["full_well"])
         if self.tukey_lambda is None:
             return noisy
-        return noisy + self.unit_read_noise(image, frame) * n["read_noise"]
+        return noisy + self.unit_read_noise(image, given) * n["read_noise"]

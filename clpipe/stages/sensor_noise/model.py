@@ -13,7 +13,7 @@ from clpipe.base.types import Floats
 from clpipe.camera.noise import Emva, NoiseModel, Paper
 from clpipe.reference.random import normal_at, word_at
 from clpipe.reference.tukey_lambda import shape_and_scale, tukey_lambda_of
-from clpipe.stage import Argument, Context, Frame, Method, NoiseScope, parameter
+from clpipe.stage import Argument, Context, Method, NoiseScope, ReferenceContext, parameter
 from clpipe.stages.sensor_noise.common import NEVER_FULL, or_default
 from clpipe.stages.sensor_noise.no_noise import NoNoise
 
@@ -203,9 +203,9 @@ class SensorNoise(Method):
         shape, scale = shape_and_scale(self.tukey_lambda)
         return {**sigma, "shape": shape, "scale": scale}
 
-    def unit_read_noise(self, image: Floats, frame: Frame) -> Floats:
+    def unit_read_noise(self, image: Floats, given: ReferenceContext) -> Floats:
         """Read noise of variance 1 for each pixel, in NumPy; (height, width)."""
-        stream = frame.stream[NoiseScope.IMAGE]
+        stream = given.stream[NoiseScope.IMAGE]
         if self.tukey_lambda is None:
             return normal_at(image.shape, 1, stream)
         words = word_at(image.shape, 1, stream)

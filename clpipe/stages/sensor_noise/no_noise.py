@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, Frame, Method, Pass, parameter
+from clpipe.stage import Argument, Context, Method, Pass, ReferenceContext, parameter
 from clpipe.stages.sensor_noise.common import NEVER_FULL, or_default
 
 
@@ -45,5 +45,5 @@ class NoNoise(Method):
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
         return before
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         return np.minimum(image, np.float32(or_default(self.full_signal, NEVER_FULL)))

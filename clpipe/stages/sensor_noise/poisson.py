@@ -8,7 +8,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.reference.poisson import poisson_of
 from clpipe.reference.random import word_at
-from clpipe.stage import Context, Frame, NoiseScope, Pass
+from clpipe.stage import Context, NoiseScope, Pass, ReferenceContext
 from clpipe.stages.sensor_noise.common import NEVER_FULL
 from clpipe.stages.sensor_noise.model import SensorNoise
 
@@ -61,9 +61,9 @@ class Poisson(SensorNoise):
             **self.read_noise_numbers(),
         }
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         n = self.numbers()
-        words = word_at(image.shape, 0, frame.stream[NoiseScope.IMAGE])
+        words = word_at(image.shape, 0, given.stream[NoiseScope.IMAGE])
         mean = np.maximum(image, np.float32(0)) * n["chi"]
         electrons = np.minimum(poisson_of(mean, words), n["full_well"])
-        return electrons * n["a"] + self.unit_read_noise(image, frame) * n["read_noise"]
+        return electrons * n["a"] + self.unit_read_noise(image, given) * n["read_noise"]

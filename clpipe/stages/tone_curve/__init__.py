@@ -8,7 +8,17 @@ import numpy as np
 from pydantic import field_validator
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, Curve, Frame, Kind, Method, Pass, Stage, parameter
+from clpipe.stage import (
+    Argument,
+    Context,
+    Curve,
+    Kind,
+    Method,
+    Pass,
+    ReferenceContext,
+    Stage,
+    parameter,
+)
 from clpipe.stages.tone_curve.filmic import Filmic
 from clpipe.stages.tone_curve.table import table_of
 
@@ -56,7 +66,7 @@ class Linear(Method):
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"gain": self.gain}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         return image * self.gain
 
 

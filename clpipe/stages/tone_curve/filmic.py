@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, Frame, Method, Pass
+from clpipe.stage import Argument, Context, Method, Pass, ReferenceContext
 
 # y = x (a x + b) / (x (c x + d) + 1); a + b = c + d + 1, so that 1 stays 1. Fitted (in roots of y)
 # to three fifths of Camera Raw's default curve and two fifths of the render's own light, which is
@@ -74,5 +74,5 @@ class Filmic(Method):
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"a": A, "b": B, "c": C, "d": D, "twist": A * D - B * C}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         return keep_hue(image, filmic)

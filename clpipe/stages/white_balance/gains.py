@@ -8,7 +8,7 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
-from clpipe.stage import Argument, Context, Frame, Method, Pass, Unchanged, parameter
+from clpipe.stage import Argument, Context, Method, Pass, ReferenceContext, Unchanged, parameter
 
 
 def apply_gains(image: Floats, context: Context, red: np.float32, blue: np.float32) -> Floats:
@@ -39,10 +39,10 @@ class EstimatedGains(Method):
         apply = Pass("white_balance", arguments=("pattern", *search.estimates), cheap=True)
         return search, apply
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
-        red, blue = self.gains(image, frame.context.pattern)
-        frame.estimates["red_gain"], frame.estimates["blue_gain"] = float(red), float(blue)
-        return apply_gains(image, frame.context, red, blue)
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        red, blue = self.gains(image, given.context.pattern)
+        given.estimates["red_gain"], given.estimates["blue_gain"] = float(red), float(blue)
+        return apply_gains(image, given.context, red, blue)
 
 
 class AsShot(Method):
@@ -80,9 +80,9 @@ class AsShot(Method):
         red, blue = np.float32(self.red_gain), np.float32(self.blue_gain)
         return {"pattern": context.cfa, "red_gain": red, "blue_gain": blue}
 
-    def reference(self, image: Floats, frame: Frame) -> Floats:
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         return apply_gains(
-            image, frame.context, np.float32(self.red_gain), np.float32(self.blue_gain)
+            image, given.context, np.float32(self.red_gain), np.float32(self.blue_gain)
         )
 
 

@@ -1,0 +1,40 @@
+"""What a stage is: the image kinds it reads and writes, how it touches pixels, its parameters.
+
+A stage is declared once, in ``clpipe/stages/<name>.py``, as a :class:`Stage` with one or more
+:class:`Method` classes. The fields of a method are its parameters; their validation, help,
+``--set``, kernel arguments and sidecar entries are all derived from that declaration.
+
+What a stage file may import is all in ``__all__`` here, and only from here. The room imports
+``camera``, ``reference`` and ``base``; it knows nothing of chains, devices and files.
+"""
+
+from clpipe.base.types import Array, Floats
+from clpipe.stage.bases import Curve, GaussianNoise, Noiseless, Unchanged, odd_size
+from clpipe.stage.checking import run_reference, variant_label, variants
+from clpipe.stage.context import Context, ReferenceContext
+from clpipe.stage.method import Method, Stage, parameter
+from clpipe.stage.passes import Access, Argument, CompileTime, Kind, NoiseScope, Pass
+
+__all__ = [
+    "Access",
+    "Argument",
+    "Array",
+    "CompileTime",
+    "Context",
+    "Curve",
+    "Floats",
+    "GaussianNoise",
+    "Kind",
+    "Method",
+    "NoiseScope",
+    "Noiseless",
+    "Pass",
+    "ReferenceContext",
+    "Stage",
+    "Unchanged",
+    "odd_size",
+    "parameter",
+    "run_reference",
+    "variant_label",
+    "variants",
+]

@@ -1,0 +1,47 @@
+"""Methods apart from any chain: their variants, their references run alone."""
+
+import typing
+from collections.abc import Iterator, Mapping
+from typing import Any, get_args, get_origin
+
+from clpipe.base.types import Floats
+from clpipe.camera.profile import DEFAULT_CAMERA, load_camera
+from clpipe.reference.cfa import PATTERNS, Pattern
+from clpipe.reference.random import stream_of
+from clpipe.stage.context import Context, ReferenceContext
+from clpipe.stage.method import Method
+from clpipe.stage.passes import NoiseScope
+
+
+def variants(method: type[Method]) -> Iterator[dict[str, Any]]:
+    """Parameters for each variant of a method that is compiled differently.
+
+    The first is the defaults; then each other choice of a structural parameter; then the method's
+    other examples. CFA patterns are no variants here, since they go with every variant.
+    """
+    yield {}
+    for name, declared in method.model_fields.items():
+        extra: Any = declared.json_schema_extra
+        choices = get_args(declared.annotation)
+        named = get_origin(declared.annotation) is typing.Literal and choices != PATTERNS
+        if extra["structural"] and named:
+            yield from ({name: choice} for choice in choices if choice != declared.default)
+    yield from map(dict, method.other_examples)
+
+
+def variant_label(method: type[Method], values: Mapping[str, Any]) -> str:
+    """The name of a method with the parameters that are not at their defaults."""
+    return " ".join([method.method, *(f"{name}={value}" for name, value in values.items())])
+
+
+def run_reference(
+    method: Method, image: Floats, iso: float = 100, pattern: Pattern = "RGGB"
+) -> Floats:
+    """The reference of a method on an image of the default camera, for examples and experiments.
+
+    The noise is that of the image key "".
+    """
+    context = Context(load_camera(DEFAULT_CAMERA), iso, pattern)
+    resolved = method.resolve(context)
+    stream = {owner: stream_of(owner.value, resolved.method) for owner in NoiseScope}
+    return resolved.reference(image, ReferenceContext(context, stream, {}))

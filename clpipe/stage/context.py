@@ -1,0 +1,61 @@
+"""What a stage knows besides its image and its parameters."""
+
+import weakref
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from clpipe.camera.noise import NoiseModel
+from clpipe.camera.profile import IDENTITY, Camera, Matrix
+from clpipe.reference.cfa import Pattern, red_site
+from clpipe.reference.defocus import Depth
+from clpipe.reference.random import Stream
+from clpipe.stage.passes import CompileTime, NoiseScope
+
+
+@dataclass(frozen=True)
+class Context:
+    """What the steps before a stage say of the image that it reads."""
+
+    camera: Camera
+    iso: float
+    pattern: Pattern = "RGGB"
+    gains: tuple[float, float] = (1.0, 1.0)  # red, blue: taken out by inverse_white_balance
+    applied_gains: tuple[float, float] = (1.0, 1.0)  # red, blue: put back by white_balance
+    headroom: float = 0.0  # stops by which exposure darkened the scene
+    colours: Matrix = IDENTITY  # linear sRGB to what red, green and blue are, white-balanced
+    noise: NoiseModel | None = None  # of the sensor noise that was added
+    lens: Mapping[str, Mapping[str, Any]] | None = None  # tables of stages, by their names
+    # Of the render's camera: what [output] says, as Intrinsics.of_render takes it.
+    render: Mapping[str, float] = field(default_factory=dict, compare=False, repr=False)
+    clean: bool = False  # the image has no noise, and nothing may follow from what it would have
+    black_level: float | None = None  # DN, as quantize used them
+    white_level: float | None = None
+    # Of the image, which holds it: chains are kept longer. Chains of one structure are alike.
+    depth: weakref.ref[Depth] | None = field(default=None, compare=False, repr=False)
+
+    def noise_parameters(self) -> tuple[float, float]:
+        """The a and b of the noise that was added, else the camera's; of a clean image, zeros."""
+        if self.clean:
+            return 0.0, 0.0
+        model = self.noise or self.camera.noise(self.iso)
+        return model.a, model.b
+
+    @property
+    def cfa(self) -> CompileTime:
+        """The pattern as a compiled-in kernel argument."""
+        red_x, red_y = red_site(self.pattern)
+        return CompileTime(f"(cfa){{{red_x}, {red_y}}}")
+
+
+@dataclass
+class ReferenceContext:
+    """What a reference gets besides the image and its parameters.
+
+    ``stream`` has the random streams by scope. A reference stores the numbers that it estimates
+    from the image, such as gains, in ``estimates``.
+    """
+
+    context: Context
+    stream: Mapping[NoiseScope, Stream]
+    estimates: dict[str, float]
