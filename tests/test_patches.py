@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import clpipe as api
+from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.dataset.arrays import packed
 from clpipe.dataset.numbering import Numbering
-from clpipe.dataset.recent import Recent
 from clpipe.images.tags import FLIPS, upright
 from clpipe.outputs.patches import Cutting, first_place
 from clpipe.reference.cfa import PATTERNS
@@ -223,7 +223,7 @@ def test_decoded_renders_are_kept_while_they_fit(renders, write_exr, monkeypatch
 
 
 def test_what_is_larger_than_the_room_is_not_kept():
-    kept = Recent(3, len)
+    kept = BoundedCache(3, len)
     assert [kept.get(text, lambda text=text: text) for text in ("ab", "long", "c")]
     assert kept.taken == 3
     kept.get("de", lambda: "de")

@@ -15,8 +15,8 @@ from clpipe.base.errors import RequestError
 from clpipe.batch.run_log import Summary
 from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
+from clpipe.chain.rendition import CLEAN, TRUTHS
 from clpipe.chain.request import Request
-from clpipe.chain.truth import CLEAN, TRUTHS
 from clpipe.commands.chain_options import carry_option, format_option, series_options
 from clpipe.commands.input_options import poses_option
 from clpipe.commands.options import GroupedCommand, device_option, options_set

@@ -62,8 +62,8 @@ def replay(
     follow(made, made.outcomes(made.jobs), quiet)
     if made.summary.exit_status:
         sys.exit(made.summary.exit_status)
-    (name,) = made.writer.names_of(again.job)
-    existing = made.writer.existing(again.job, name)
+    (rendition,) = made.writer.renditions_of(again.job)
+    existing = made.writer.existing(again.job, rendition)
     try:
         same, text = again.comparison(existing.sidecar)
     except ImageError as error:

@@ -10,10 +10,9 @@ import click
 from clpipe.base.memory import parse_size
 from clpipe.batch.session import Images, Run, patch_count
 from clpipe.batch.where import Where
-from clpipe.chain.baseline import BASELINES
 from clpipe.chain.identity import MAX_FRAMES
+from clpipe.chain.rendition import BASELINES, TRUTHS, parse_bracket
 from clpipe.chain.request import Request
-from clpipe.chain.truth import TRUTHS
 from clpipe.commands.chain_options import (
     carry_option,
     depth_png_option,
@@ -34,7 +33,6 @@ from clpipe.commands.progress import follow, print_line
 from clpipe.inputs.find import Shard, parse_shard
 from clpipe.inputs.series import Series, parse_isos
 from clpipe.outputs.existing import Redo
-from clpipe.outputs.renditions import parse_bracket
 
 
 @click.command("run", cls=GroupedCommand)

@@ -16,8 +16,8 @@ from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import one_of
 from clpipe.base.types import plain
 from clpipe.base.validation import typed
+from clpipe.chain.rendition import DEVELOPMENT
 from clpipe.chain.request import Request
-from clpipe.chain.truth import DEVELOPMENT
 from clpipe.dataset.arrays import Form, dtype_named
 from clpipe.dataset.developer import Sample, Wanted
 from clpipe.dataset.numbering import Numbering

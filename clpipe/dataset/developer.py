@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.truth import noisy_mosaic, picture_without_noise
 from clpipe.dataset.arrays import Form
-from clpipe.dataset.recent import Recent
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
 from clpipe.outputs.patches import Patch, facts_of, pattern_of, variance_at, variance_steps
@@ -96,7 +96,7 @@ class Developer:
         self._device = device
         self._wanted = wanted
         self._lock = threading.Lock()
-        self._prepared: Recent[Prepared] = Recent(KEPT)
+        self._prepared: BoundedCache[Prepared] = BoundedCache(KEPT)
         self._latest: dict[str, Runner] = {}
 
     def begin(

@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
+from clpipe.base.cache import BoundedCache
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.carry import VALID
 from clpipe.chain.identity import noise_key, of_frame
 from clpipe.dataset.developer import KEPT, Developer, Sample, Wanted
-from clpipe.dataset.recent import Recent
 from clpipe.engine.device import open_device
 from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import Carried
@@ -59,9 +59,9 @@ class Maker:
         device: str | None,
     ) -> None:
         self.patches = patches
-        self.renders: Recent[SourceImage] = Recent(cache, pixel_bytes)
+        self.renders: BoundedCache[SourceImage] = BoundedCache(cache, pixel_bytes)
         self._loader = loader
-        self._loaders: Recent[ImageLoader] = Recent(KEPT)
+        self._loaders: BoundedCache[ImageLoader] = BoundedCache(KEPT)
         self._wanted = wanted
         self._device = device
         self._opened: Developer | None = None
