@@ -129,10 +129,10 @@ def test_it_is_made_again_alone_the_same(clpipe, render, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--skip", "picture_noise"], "that of picture_noise, and this chain has none"),
+        (["--skip", "picture_noise"], "has the noise of picture_noise, which this chain has not"),
         (["--set", "picture_noise.method=iid_gaussian", "--set", "picture_noise.sigma=0.1"],
          "picture_noise adds noise already"),
-        (["--until", "normalize"], "this chain has none"),
+        (["--until", "normalize"], "which this chain has not"),
         (["--skip", "sensor_noise", "--skip", "row_noise"], "no stage of this chain adds noise"),
     ],
 )  # fmt: skip

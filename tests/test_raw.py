@@ -403,7 +403,7 @@ def test_a_dump_by_configuration_and_what_it_does_not_say(tmp_path):
     assert "c.toml, line 3: dump: unknown type 'uint12'" in clpipe(*command, status=2)
 
 
-def test_a_parse_dump_another_size_is_told_what_would_fit(tmp_path):
+def test_a_dump_of_another_size_is_told_what_would_fit(tmp_path):
     (tmp_path / "a.raw").write_bytes(bytes(64 * 48 * 2))
     options = ("--dump", "64x40:uint16le")
     output = clpipe("run", tmp_path / "a.raw", "-o", tmp_path, *options, status=1)
@@ -476,7 +476,7 @@ def test_four_phases_of_one_picture(shared_data, tmp_path):
         picture = developed(tmp_path / f"{path.stem}.png")[8:-8, 8:-8]
         pictures.append(picture.reshape(124, 4, 188, 4, 3).mean((1, 3)))
         pattern = name[-8:-4].upper()
-        dn = parse_dump("768x512", "uint16le").unpack(path.read_bytes())
+        dn = parse_dump("768x512:uint16le").unpack(path.read_bytes())
         samples = dn.reshape(256, 2, 384, 2).transpose(0, 2, 1, 3).reshape(256, 384, 4)
         cells.append(np.stack([samples[..., pattern.index(c)] for c in "RB"], axis=-1))
     for picture, cell in zip(pictures[1:], cells[1:], strict=True):

@@ -121,8 +121,6 @@ def test_a_sidecar_makes_its_picture_again(clpipe, renders):
     Path("one.json").write_bytes(sample["json"])
     clpipe("replay", "one.json", "-o", "again")
     assert Path("again/r_004.jpg").read_bytes() == sample["jpg"]
-    result = clpipe("replay", "one.json", *RUN[:2], *RUN[4:], status=2)
-    assert "--webdataset: the sidecar says it" in result.stderr
 
 
 def test_a_manifest(clpipe, renders):

@@ -13,7 +13,7 @@ from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
 from clpipe.base.validation import first_fault
-from clpipe.chain.carry import Carry, check_companion, parse_carry
+from clpipe.chain.carry import Carry, parse_carry
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.files import load_config
 from clpipe.chain.formats import EVERY_FORMAT, NPY
@@ -26,9 +26,6 @@ from clpipe.chain.truth import noisy_mosaic
 from clpipe.stage import Kind
 
 DEFAULTS = Settings()
-
-# What goes along with the first picture of an image.
-CARRY = ("carry", "companions", "depth_png")
 
 MOST_PATCHES = 9999  # of an image; the names of their files have four digits
 
@@ -56,8 +53,6 @@ class Recorded(BaseModel):
     patches_per_image: Annotated[int, Field(ge=0, le=MOST_PATCHES)] | Literal["grid"]
     augment: bool
     carry: list[str]
-    companions: list[str]
-    depth_png: bool
 
     @model_validator(mode="after")
     def _has_patches(self) -> "Recorded":
@@ -92,8 +87,6 @@ class Request:
         truths: which of :data:`clpipe.chain.rendition.TRUTHS` are written beside each picture.
         carry: layers that go along with each picture, as :func:`clpipe.chain.carry.parse_carry`
             reads them.
-        companions: patterns of the names of files that hold them; () are those beside an image.
-        depth_png: write carried depth as PNG, too.
         bracket: what is added to the exposure's EV, for each exposure that is made of each image;
             () is one exposure.
         baselines: which of :data:`clpipe.chain.rendition.BASELINES` are made beside each picture.
@@ -115,8 +108,6 @@ class Request:
     formats: tuple[str, ...] = ()
     keep: tuple[str, ...] = ()
     carry: tuple[str, ...] = ()
-    companions: tuple[str, ...] = ()
-    depth_png: bool = False
     frames: int | None = None
     truths: tuple[str, ...] = ()
     bracket: tuple[float, ...] = ()
@@ -243,16 +234,9 @@ class Request:
         """The layers that go along with each picture.
 
         Raises:
-            RequestError: a layer or a pattern is wrong, or there is no depth for a PNG.
+            RequestError: one is wrong.
         """
-        layers = parse_carry(self.carry)
-        for pattern in self.companions:
-            check_companion(pattern)
-        if self.companions and not layers:
-            raise RequestError("--companion: it says where layers are, but none is asked for")
-        if self.depth_png and not any(each.kind == "depth" for each in layers):
-            raise RequestError("--depth-png: no depth is carried; say --carry Depth as well")
-        return layers
+        return parse_carry(self.carry)
 
     def settings(self, carried: Settings | None = None) -> Settings:
         """The settings that are asked for, drawn for the image where there is one.

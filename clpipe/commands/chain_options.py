@@ -186,26 +186,13 @@ def patch_count(text: str) -> int | str:
 carry_option = click.option(
     "--carry",
     multiple=True,
-    metavar="NAME[:KIND]",
+    metavar="NAME[:KIND][=FILE]",
     help="Move a layer as the picture's pixels are moved. It goes to OUT/NAME.carried.exr: "
-    "depth, normals, flow, object numbers, of the image's own file or of one beside it. "
-    f"KIND is {', '.join(RESAMPLING)}, where its name does not say it; may be repeated.",
-)
-
-companion_option = click.option(
-    "--companion",
-    "companions",
-    multiple=True,
-    metavar="PATTERN",
-    help="Where a carried layer is that is not in the image's file, as '../depth/{name}.exr', from "
-    "the image's folder; may be repeated. [default: {name}_LAYER.exr and the like]",
-)
-
-depth_png_option = click.option(
-    "--depth-png",
-    is_flag=True,
-    help="Write carried depth, which is in metres, as OUT/NAME.LAYER.png, too: 16 bits, in "
-    "millimetres.",
+    "depth, normals, flow, object numbers, of the image's own file or of one beside it. KIND is "
+    f"{', '.join(RESAMPLING)}, where its name does not say it, or png: depth in metres, which goes "
+    "to OUT/NAME.LAYER.png, too, with 16 bits, in millimetres. FILE is where it is, as "
+    "'../depth/{name}.exr', from the image's folder. [default: {name}_LAYER.exr and the like] May "
+    "be repeated.",
 )
 
 format_option = click.option(

@@ -15,7 +15,6 @@ from clpipe.chain.rendition import BASELINES, TRUTHS, parse_bracket
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import (
     carry_option,
-    depth_png_option,
     format_option,
     keep_option,
     patch_options,
@@ -59,7 +58,6 @@ from clpipe.outputs.existing import Redo
     "repeated.",
 )
 @carry_option
-@depth_png_option
 @click.option(
     "--frames",
     type=click.IntRange(1, MAX_FRAMES),

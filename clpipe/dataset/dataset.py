@@ -82,7 +82,6 @@ class Dataset(ReadOnly):
             with ``patch``, where the chain adds noise, else False.
         carry: layers that go along with the picture, such as "Depth" or "nn:normal", as ``--carry``
             of ``clpipe run``.
-        companions: where they are, as ``--companion``.
         layer: the layer of an EXR that is the picture; None chooses.
         transfer: the transfer curve of renders in whole numbers: "srgb" or "linear".
         exclude: patterns of files that are not taken from folders and globs, such as depth.
@@ -123,7 +122,6 @@ class Dataset(ReadOnly):
         until: str | None = None,
         truth: bool | Literal["development", "clean"] | None = None,
         carry: str | Sequence[str] = (),
-        companions: str | Sequence[str] = (),
         layer: str | None = None,
         transfer: str | None = None,
         exclude: str | Sequence[str] = (),
@@ -155,7 +153,6 @@ class Dataset(ReadOnly):
             layer=layer,
             transfer=transfer,
             carry=(carry,) if isinstance(carry, str) else tuple(carry),
-            companions=(companions,) if isinstance(companions, str) else tuple(companions),
         )
         loader = ImageLoader(request)
         several = [inputs] if isinstance(inputs, str | Path) else inputs

@@ -218,7 +218,7 @@ class ImageLoader:
             return loaded
         chain, source, request = loaded.chain, loaded.source, self.request
         most = request.max_pixels or USUAL_MAX_PIXELS
-        depth = read_depth(job.path, source, chain, request.companions, most)
+        depth = read_depth(job.path, source, chain, request.carried(), most)
         warnings = (*source.warnings, *warnings_of(chain, depth))
         source = replace(source, depth=depth, warnings=warnings)
         return LoadedImage(with_depth(chain, depth), source, loaded.key)
@@ -250,8 +250,8 @@ class ImageLoader:
         """
         request = self.request
         most = request.max_pixels or USUAL_MAX_PIXELS
-        layers, patterns = request.carried(), request.companions
-        return carry(job.path, loaded.source, loaded.chain, layers, patterns, most, orientation)
+        layers = request.carried()
+        return carry(job.path, loaded.source, loaded.chain, layers, most, orientation)
 
     def is_left_out(self, job: Job, error: Exception) -> bool:
         """Whether an image that cannot enter was only found in a folder, beside others that can."""

@@ -18,7 +18,7 @@ from clpipe.chain.rendition import (
     VARIANCE,
     Rendition,
 )
-from clpipe.chain.request import CARRY, ResolvedRequest
+from clpipe.chain.request import ResolvedRequest
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.dng import write_dng
@@ -111,8 +111,8 @@ class OutputWriter:
             request: the record for its image.
             rendition: which it is.
         """
-        carries = {} if self.carries(rendition) else dict(zip(CARRY, ([], [], False), strict=True))
-        return {**request, "keep": list(self.keep_of(rendition)), **carries}
+        record = {**request, "keep": list(self.keep_of(rendition))}
+        return record if self.carries(rendition) else record | {"carry": []}
 
     def carries(self, rendition: Rendition) -> bool:
         """Whether layers go along with a rendition: they do with an image's first."""
@@ -123,10 +123,10 @@ class OutputWriter:
         """The files of carried layers: that of all, "", and the PNG of each depth by its name."""
         if not self.carries(rendition):
             return {}
-        depths = [each.name for each in self.request.carried() if each.kind == "depth"]
+        depths = [each.name for each in self.request.carried() if each.png]
         return {
             "": self.path(job, f"{CARRIED}.exr"),
-            **{each: self.path(job, f"{each}.png") for each in depths if self.request.depth_png},
+            **{name: self.path(job, f"{name}.png") for name in depths},
         }
 
     def _kept_steps(self, recipe: Recipe) -> list[str]:
