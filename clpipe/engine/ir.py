@@ -34,8 +34,8 @@ class Launch:
 
     ``reads`` has the images of the stencil if the first op is one, else the one image that is
     loaded or resampled; it is empty if the launch reads the source. ``writes`` is the image that is
-    stored, ``encodes`` whether eight-bit pixels are written, ``sums`` a reduction to sums of the result.
-    ``level`` is that of the result.
+    stored, ``encodes`` whether eight-bit pixels are written, ``sums`` a reduction of the result to
+    sums. ``level`` is that of the result.
     """
 
     name: str
