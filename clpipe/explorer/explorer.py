@@ -20,8 +20,9 @@ from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
 from clpipe.chain.truth import picture_without_noise
 from clpipe.engine.clipping import clipped_share
-from clpipe.engine.device import Device, Timing
-from clpipe.engine.plan import AnyLaunch
+from clpipe.engine.device import Device
+from clpipe.engine.ir import AnyLaunch
+from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.runner import Result, Runner
 from clpipe.explorer.controls import steps_of
 from clpipe.explorer.named import check_named, files_in
@@ -284,15 +285,17 @@ class Explorer:
         key = noise_key(chain.settings, loaded.key)
         with self._lock:
             runner = self._runner(chain)
-            result = runner.submit(pixels, key, timings, unchanged=True)()
+            result = runner.run(pixels, key, RunOptions(timings, unchanged=True))
         return chain, result, runner.plan_for(pixels).launches
 
     def _runner(self, chain: Chain) -> Runner:
         """A runner of a chain, which shares plans with those before it."""
         encode = chain.result is Kind.DISPLAY
         if encode not in self._runners:
-            self._runners[encode] = Runner(chain, self.device, (), encode, not encode, hold=True)
-        return self._runners[encode].of(chain)
+            self._runners[encode] = Runner(
+                chain, self.device, (), encode, not encode, incremental=True
+            )
+        return self._runners[encode].for_chain(chain)
 
 
 def _steps(settings: Settings, chain: Chain) -> list[dict[str, Any]]:

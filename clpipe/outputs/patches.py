@@ -17,7 +17,7 @@ from clpipe.engine.extents import Box
 from clpipe.images.tags import FLIPS, upright
 from clpipe.outputs.negative import negative_of
 from clpipe.reference.cfa import Pattern
-from clpipe.stage import Access
+from clpipe.stage import Stencil
 
 PER_IMAGE = 16  # patches, unless another number is asked for
 
@@ -252,7 +252,7 @@ def variance_steps(chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
     """
     signal, noise = signal_and_noise(chain)
     for step in noise:
-        if any(pass_.access is Access.STENCIL for pass_ in step.method.passes()):
+        if any(isinstance(pass_.access, Stencil) for pass_ in step.method.passes()):
             raise RequestError(
                 f"variance: {step.name} mixes the noise of neighbours; move it before the noise or "
                 "behind the raw"

@@ -9,7 +9,6 @@ from pydantic import field_validator, model_validator
 from clpipe.base.types import Floats
 from clpipe.reference.defocus import NOWHERE, Depth, aperture_taps, defocus, reach_of
 from clpipe.stage import (
-    Access,
     Argument,
     Context,
     Kind,
@@ -17,6 +16,7 @@ from clpipe.stage import (
     Pass,
     ReferenceContext,
     Stage,
+    Stencil,
     Unchanged,
     parameter,
 )
@@ -111,7 +111,7 @@ class ThinLens(Method):
 
     def passes(self) -> tuple[Pass, ...]:
         given = ("radii", "columns", "rows", "reach", "taps", "count")
-        return (Pass("defocus", Access.STENCIL, given, radius=self.max_radius),)
+        return (Pass("defocus", Stencil(self.max_radius), given),)
 
     def radii(self, depth: Floats) -> Floats:
         """The radii of discs in px, below 0 in front of the focus, as large as they may be.
