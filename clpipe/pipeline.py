@@ -121,7 +121,7 @@ class Pipeline(ReadOnly):
         margins = margins_of_array(overscan, checked)
         if margins and steps_of_overscan(chain):
             chain = with_overscan(chain, margins)
-            runner = runner.of(chain)
+            runner = runner.for_chain(chain)
         elif margins:
             checked = np.ascontiguousarray(margins.cropped(checked))
             depth = None if depth is None else margins.cropped(np.asarray(depth))
@@ -130,7 +130,7 @@ class Pipeline(ReadOnly):
             for warning in warnings_of(chain, far):
                 warnings.warn(f"{key}: {warning}", stacklevel=2)
             chain = with_depth(chain, far)
-            runner = runner.of(chain)
+            runner = runner.for_chain(chain)
         own_key = image_key(key, "" if chain.settings.noise_key else digest_of(checked))
         with self._lock:
             result = runner.run(checked, noise_key(chain.settings, own_key))
@@ -188,7 +188,9 @@ class Pipeline(ReadOnly):
         """The runner for an image, with what is drawn and set for it alone."""
         own = overlay(self._settings, plain(settings)) if settings else self._settings
         return (
-            self._runner.of(self._chain(own.drawn(key))) if settings or own.draws else self._runner
+            self._runner.for_chain(self._chain(own.drawn(key)))
+            if settings or own.draws
+            else self._runner
         )
 
     def process_many(

@@ -51,7 +51,7 @@ def test_what_cannot_be_is_refused_at_once(renders):
     for options, message in (
         ({"iso": [100, 100]}, "--iso: found 100, 100, with 100 twice"),
         ({"truth": "cleen"}, r"unknown truth 'cleen' \(did you mean 'clean'"),
-        ({"augment": True}, "--augment: it is about patches"),
+        ({"patch": 0}, "patch"),
         ({"redo": "some"}, "found redo 'some'"),
         ({"frames": "2"}, "found frames '2'; expected int"),
         (

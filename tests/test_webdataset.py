@@ -286,7 +286,7 @@ def test_the_disk_is_full(clpipe, renders, when):
         def write(path, pixels, tags):
             count.append(path)
             if len(count) > 5:
-                patch.setattr(output_folders, "ROOM", 2**62)  # more than any disk has
+                patch.setattr(output_folders, "LEAST_FREE", 2**62)  # more than any disk has
                 full(path)
             return real(path, pixels, tags)
 
@@ -368,7 +368,7 @@ def test_patches_are_samples_as_dataset_makes_them(clpipe, renders):
     found = [s for s in samples("out/000000.tar") if not s["__key__"].startswith("__clpipe__/")]
     keys = [f"r_00{i}_000{n}" for i in range(3) for n in range(3)]
     assert [s.pop("__key__") for s in found] == keys
-    given = {"iso": 3200, "patch": 12, "patches_per_image": 3, "augment": True, "truth": "clean"}
+    given = {"iso": 3200, "patch": api.Patches(12, 3, augment=True), "truth": "clean"}
     floats = api.Dataset("in", **given, dtype="float16")
     raws = api.Dataset("in", **given, raw="mosaic")
     for sample, pictures, made in zip(found, floats, raws, strict=True):

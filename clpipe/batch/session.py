@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from clpipe.base.about import full_version
 from clpipe.base.errors import OutputError, RequestError
 from clpipe.base.memory import parse_size
+from clpipe.base.text import several
 from clpipe.base.types import plain
 from clpipe.base.validation import typed
 from clpipe.batch.outcome import Outcome
@@ -32,11 +33,11 @@ from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.poses import with_views
 from clpipe.inputs.series import Series, check_isos
+from clpipe.outputs.camera_files import check_camera_files, write_camera_files
 from clpipe.outputs.existing import Redo
 from clpipe.outputs.folder import output_folder, remove_unfinished
 from clpipe.outputs.gone import pictures_without_input
-from clpipe.outputs.patches import PER_IMAGE
-from clpipe.outputs.views import check_view_files, write_views
+from clpipe.outputs.patches import Patches
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
@@ -179,7 +180,7 @@ class Run:
             stack.enter_context(output_folder(where.output, images.shard))
             folders = images.series.under(where.output) if images.poses and images.is_whole else []
             for folder in folders:
-                check_view_files(folder)
+                check_camera_files(folder)
             trace = stack.enter_context(Trace(where.trace)) if where.trace else None
             remove_unfinished(where.output, self.jobs, self._request.patch is not None)
             log = RunLog(where.output / log_name(images.shard), start, self._echo)
@@ -222,7 +223,7 @@ class Run:
         if self.summary.interrupted:
             return
         for folder in folders:
-            self.notes += write_views(folder).lines(folder)
+            self.notes += write_camera_files(folder).lines(folder)
         if self._images.is_whole and (
             count := pictures_without_input(self.writer, self.jobs, self._images.inputs)
         ):
@@ -278,20 +279,6 @@ def check_render_options(request: Request, source: Kind) -> None:
             raise RequestError(f"{option}: it is for renders, but the chain reads {source.label}")
 
 
-def patch_count(
-    patch: int | None, per_image: int | Literal["grid"] | None, augment: bool
-) -> int | Literal["grid"]:
-    """How many patches of an image are made; 0 is none.
-
-    Raises:
-        RequestError: something is asked of patches, but there are none.
-    """
-    if patch is None and (per_image is not None or augment):
-        option = "--augment" if augment else "--patches-per-image"
-        raise RequestError(f"{option}: it is about patches; say --patch SIZE as well")
-    return 0 if patch is None else per_image or PER_IMAGE
-
-
 Texts = str | Path | Sequence[str | Path]  # one, or several
 
 
@@ -312,9 +299,7 @@ def run(
     truth: Texts = (),
     frames: int | None = None,
     bracket: Sequence[float] = (),
-    patch: int | None = None,
-    patches_per_image: int | Literal["grid"] | None = None,
-    augment: bool = False,
+    patch: int | Patches | None = None,
     exclude: Texts = (),
     poses: str | Path | None = None,
     layer: str | None = None,
@@ -347,9 +332,9 @@ def run(
         stage_files, format, keep, carry, truth, exclude, device: one, or several.
         memory: of a device, in bytes or as "2G".
         **settings: what a configuration file may hold, over ``config``.
-        start_at, until, frames, bracket, patch, patches_per_image, augment: as the options of
-            ``clpipe run``; so are
-        poses, layer, transfer, max_pixels, redo, webdataset, shard, jobs, dask, trace: these.
+        patch: the sides of patches in px, or with how many and how: ``Patches(128, per_image=4)``.
+        start_at, until, frames, bracket, poses, layer, transfer, max_pixels, redo, webdataset,
+            shard, jobs, dask, trace: as the options of ``clpipe run``.
 
     Returns:
         A run that begins when it is iterated.
@@ -359,7 +344,8 @@ def run(
             that would overwrite something. One image's failure is its outcome, and no error.
     """
     isos = (iso,) if isinstance(iso, int | float) else () if isinstance(iso, Mapping) else iso
-    series = Series(texts(camera), check_isos(isos))
+    series = Series(several(camera), check_isos(isos))
+    patches = Patches(patch) if isinstance(patch, int) else patch
     values = plain(settings)
     if isinstance(iso, Mapping):
         values["iso"] = plain(iso)
@@ -367,26 +353,26 @@ def run(
         config=None if config is None else str(config),
         camera=series.camera,
         iso=series.iso,
-        stage_files=[Path(file) for file in texts(stage_files)],
+        stage_files=[Path(file) for file in several(stage_files)],
         values=values,
         start_at=start_at,
         until=until,
-        formats=texts(format),
-        keep=texts(keep),
-        carry=texts(carry),
-        truth=texts(truth),
+        formats=several(format),
+        keep=several(keep),
+        carry=several(carry),
+        truth=several(truth),
         frames=frames,
         bracket=tuple(bracket),
-        patch=patch,
-        patches_per_image=patch_count(patch, patches_per_image, augment),
-        augment=augment,
+        patch=patches.size if patches else None,
+        patches_per_image=patches.per_image if patches else 0,
+        augment=bool(patches and patches.augment),
         layer=layer,
         transfer=transfer,
         max_pixels=max_pixels,
     )
     images = Images(
-        texts(inputs),
-        texts(exclude),
+        several(inputs),
+        several(exclude),
         None if poses is None else Path(poses),
         series,
         parse_shard(shard),
@@ -394,19 +380,10 @@ def run(
     )
     where = Where(
         Path(output),
-        texts(device),
+        several(device),
         parse_size(memory) if isinstance(memory, str) else memory,
         jobs,
         Redo(redo),
         None if trace is None else Path(trace),
     )
     return Run(request, images, where, dask)
-
-
-def texts(values: str | int | Path | Sequence[str | int | Path]) -> tuple[str, ...]:
-    """One value or several as texts.
-
-    >>> texts("a"), texts((0, Path("b")))
-    (('a',), ('0', 'b'))
-    """
-    return tuple(map(str, [values] if isinstance(values, str | int | Path) else values))

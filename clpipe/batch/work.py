@@ -21,8 +21,9 @@ from clpipe.chain.depth import lenses_of
 from clpipe.chain.formats import DNG
 from clpipe.chain.rendition import FIRST, Rendition
 from clpipe.engine.clipping import clipped_share
-from clpipe.engine.device import Device, Timing
+from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
+from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import Carried
@@ -220,8 +221,8 @@ class ImageWorker:
             height, width = loaded.source.pixels.shape[:2]
             task.patches = every_patch(patches, loaded.chain, width, height, job.key)
         if any(map(self.writer.carries, renditions)):
-            turn = self.writer.turn_of(loaded.source, loaded.chain)
-            task.carried = task.loader.carried(job, loaded, turn)
+            orientation = self.writer.picture_orientation(loaded.source, loaded.chain)
+            task.carried = task.loader.carried(job, loaded, orientation)
         task.source = loaded.source
         recipes = self.writer.plan_of(job).recipes(loaded.chain, loaded.key)
         task.recipes = [recipe for recipe in recipes if recipe.rendition in renditions]
@@ -291,7 +292,8 @@ class ImageWorker:
         reused = runner.encode and runner.device and not boxes
         into = self._spare.take(shape) if reused else None
         key = recipe.noise_key
-        return runner.submit(pixels, key, timings, into=into, unchanged=True, boxes=boxes)
+        options = RunOptions(timings, into=into, unchanged=True, boxes=boxes)
+        return runner.submit(pixels, key, options)
 
     @staticmethod
     def _tried(task: Task, work: Callable[[], T]) -> T | None:
@@ -362,7 +364,7 @@ class Runners:
         self._device = device
         first = writer.runner(Recipe(FIRST, chain, (), ""), device)
         try:
-            first.warm_up(half)
+            first.compile(half)
         except ImageError as error:  # not even one of 8x8 pixels fits
             raise RequestError(f"--memory: too little for any image: {error}") from None
         self._latest = [(chain, first)]
@@ -376,7 +378,7 @@ class Runners:
         runner = self._writer.runner(recipe, self._device)
         alike = self._by_results.setdefault((runner.keep, runner.encode, runner.final), runner)
         if alike is not runner:
-            runner = alike.of(recipe.chain)  # shares the plans
+            runner = alike.for_chain(recipe.chain)  # shares the plans
         self._latest.insert(1, (recipe.chain, runner))
         del self._latest[4:]
         return runner

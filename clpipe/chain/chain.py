@@ -17,7 +17,7 @@ from clpipe.chain.settings import Settings
 from clpipe.reference.geometry import NO_MARGINS, Composition, Margins
 from clpipe.reference.intrinsics import Intrinsics
 from clpipe.reference.resample import Resampler, sizes
-from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
+from clpipe.stage import Context, Kind, Method, Noiseless, Resample, Stage, Unchanged
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Chain:
     @cached_property
     def _resamplings(self) -> tuple[Resampler, ...]:
         passes = (p for step in self.steps for p in step.method.passes())
-        return tuple(p.resampling for p in passes if p.resampling)
+        return tuple(p.access.resampler for p in passes if isinstance(p.access, Resample))
 
     @property
     def noise(self) -> NoiseModel | None:

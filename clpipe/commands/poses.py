@@ -7,7 +7,7 @@ import click
 from clpipe.base.errors import RequestError
 from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show_json
-from clpipe.outputs.views import write_views
+from clpipe.outputs.camera_files import write_camera_files
 
 
 @click.command("poses", cls=Command)
@@ -28,7 +28,7 @@ def poses(folder: Path, as_json: bool) -> None:
     """
     if not folder.is_dir():
         raise RequestError(f"{folder}: there is no such folder; name the output folder of a run")
-    written = write_views(folder)
+    written = write_camera_files(folder)
     if not written.files:
         reasons = "; ".join(written.left_out) or "found no sidecar of one"
         raise RequestError(

@@ -3,12 +3,13 @@
 import logging
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 
+from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
-from clpipe.batch.session import Images, Run, patch_count
+from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
 from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.rendition import BASELINES, TRUTHS, parse_bracket
@@ -32,6 +33,7 @@ from clpipe.commands.progress import follow, print_line
 from clpipe.inputs.find import Shard, parse_shard
 from clpipe.inputs.series import Series, parse_isos
 from clpipe.outputs.existing import Redo
+from clpipe.outputs.patches import PER_IMAGE
 
 
 @click.command("run", cls=GroupedCommand)
@@ -188,3 +190,17 @@ def run(
         return
     follow(made, made.outcomes(made.jobs), quiet or json_lines)
     sys.exit(made.summary.exit_status)
+
+
+def patch_count(
+    patch: int | None, per_image: int | Literal["grid"] | None, augment: bool
+) -> int | Literal["grid"]:
+    """How many patches of an image are made; 0 is none.
+
+    Raises:
+        RequestError: something is asked of patches, but there are none.
+    """
+    if patch is None and (per_image is not None or augment):
+        option = "--augment" if augment else "--patches-per-image"
+        raise RequestError(f"{option}: it is about patches; say --patch SIZE as well")
+    return 0 if patch is None else per_image or PER_IMAGE

@@ -20,7 +20,6 @@ from clpipe.reference import warp
 from clpipe.reference.lens import Lens
 from clpipe.reference.radial import Radial
 from clpipe.stage import (
-    Access,
     Argument,
     CompileTime,
     Context,
@@ -28,6 +27,7 @@ from clpipe.stage import (
     Method,
     Pass,
     ReferenceContext,
+    Resample,
     Stage,
     Unchanged,
     parameter,
@@ -133,10 +133,8 @@ class Distortion(HasPicture):
         return (
             Pass(
                 "distortion",
-                Access.RESAMPLE,
+                Resample(resampling, resampling.support),
                 arguments,
-                radius=resampling.support,
-                resampling=resampling,
             ),
         )
 

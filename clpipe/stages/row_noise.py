@@ -7,10 +7,10 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.random import normal_of_line
 from clpipe.stage import (
-    Access,
     Context,
     GaussianNoise,
     Kind,
+    LineTable,
     NoiseScope,
     Pass,
     ReferenceContext,
@@ -39,11 +39,10 @@ class Gaussian(GaussianNoise):
         return (
             Pass(
                 "noise_of_lines",
-                Access.LINES,
+                LineTable("rows"),
                 arguments=("sigma",),
                 writes="lines",
                 random=NoiseScope.IMAGE,
-                lines="rows",
             ),
             Pass("row_noise", arguments=("lines",)),
         )

@@ -8,13 +8,25 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
-from clpipe.stage import Argument, Context, Method, Pass, ReferenceContext, Unchanged, parameter
+from clpipe.stage import (
+    Argument,
+    Context,
+    Method,
+    Pass,
+    Pointwise,
+    ReferenceContext,
+    Unchanged,
+    parameter,
+)
 
 
 def apply_gains(image: Floats, context: Context, red: np.float32, blue: np.float32) -> Floats:
     """min(y * gain, 1), with the gain of each site's colour (green = 1); (height, width)."""
     gains = by_site(image.shape, context.pattern, red, np.float32(1), blue)
     return np.minimum(image * gains, np.float32(1))
+
+
+APPLY = Pass("white_balance", Pointwise(inline_at_taps=True), ("pattern", "red_gain", "blue_gain"))
 
 
 class EstimatedGains(Method):
@@ -36,8 +48,7 @@ class EstimatedGains(Method):
 
     def passes(self) -> tuple[Pass, ...]:
         search = self.search()
-        apply = Pass("white_balance", arguments=("pattern", *search.estimates), cheap=True)
-        return search, apply
+        return search, APPLY
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         red, blue = self.gains(image, given.context.pattern)
@@ -74,7 +85,7 @@ class AsShot(Method):
         return replace(context, applied_gains=(self.red_gain, self.blue_gain))
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("white_balance", arguments=("pattern", "red_gain", "blue_gain"), cheap=True),)
+        return (APPLY,)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         red, blue = np.float32(self.red_gain), np.float32(self.blue_gain)
