@@ -221,8 +221,8 @@ class ImageWorker:
             height, width = loaded.source.pixels.shape[:2]
             task.patches = every_patch(patches, loaded.chain, width, height, job.key)
         if any(map(self.writer.carries, renditions)):
-            turn = self.writer.turn_of(loaded.source, loaded.chain)
-            task.carried = task.loader.carried(job, loaded, turn)
+            orientation = self.writer.picture_orientation(loaded.source, loaded.chain)
+            task.carried = task.loader.carried(job, loaded, orientation)
         task.source = loaded.source
         recipes = self.writer.plan_of(job).recipes(loaded.chain, loaded.key)
         task.recipes = [recipe for recipe in recipes if recipe.rendition in renditions]

@@ -4,7 +4,6 @@ It is what synthetic data usually has, to be compared with a camera's noise.
 """
 
 from dataclasses import replace
-from functools import lru_cache
 
 from clpipe.base.errors import RequestError
 from clpipe.chain.chain import Chain
@@ -15,7 +14,6 @@ from clpipe.stages.picture_noise import IidGaussian, IntensityDependent, NoNoise
 STEP = "picture_noise"  # the step that adds it
 
 
-@lru_cache(maxsize=64)
 def baseline_of(chain: Chain) -> Chain:
     """The chain of a baseline: the clean picture's, with noise behind it that is not known yet.
 

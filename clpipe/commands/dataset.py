@@ -32,7 +32,7 @@ from clpipe.outputs.writer import OutputWriter
 from clpipe.scenes.blender import Rendering
 from clpipe.scenes.card import write_card
 from clpipe.scenes.source import RENDERS, Source, from_folder, from_scene
-from clpipe.scenes.views import PATHS, asked_views, parse_box, parse_frames, parse_resolution
+from clpipe.scenes.view_request import PATHS, asked_views, parse_box, parse_frames, parse_resolution
 
 # Options that are for a scene alone.
 VIEW_OPTIONS = ("views", "path", "box", "frames")

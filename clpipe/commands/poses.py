@@ -10,7 +10,7 @@ from clpipe.base.errors import RequestError
 from clpipe.batch.run_log import Summary
 from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show_json
-from clpipe.outputs.views import Written, check_view_files, write_views
+from clpipe.outputs.camera_files import Written, check_camera_files, write_camera_files
 
 
 @click.command("poses", cls=Command)
@@ -31,7 +31,7 @@ def poses(folder: Path, as_json: bool) -> None:
     """
     if not folder.is_dir():
         raise RequestError(f"{folder}: there is no such folder; name the output folder of a run")
-    written = write_views(folder)
+    written = write_camera_files(folder)
     if not written.files:
         reasons = "; ".join(written.left_out) or "found no sidecar of one"
         raise RequestError(
@@ -54,10 +54,10 @@ def views_behind(folders: Sequence[Path], summary: Summary, quiet: bool) -> Iter
         ImageError: a file cannot be written or, before the run, is somebody else's.
     """
     for folder in folders:
-        check_view_files(folder)
+        check_camera_files(folder)
     yield
     if not summary.interrupted:
-        lines = [line for each in folders for line in lines_of(each, write_views(each))]
+        lines = [line for each in folders for line in lines_of(each, write_camera_files(each))]
         for line in () if quiet else lines:
             click.echo(line, err=True)
 

@@ -190,7 +190,7 @@ class Developer:
             variance = patch.turned(variance) if patch else variance
             sample["variance"] = arrays.variance(variance, pattern)
         if patch:
-            sample |= {"place": np.array([patch.left, patch.top]), "turn": patch.turn}
+            sample |= {"place": np.array([patch.left, patch.top]), "turn": patch.orientation}
         facts = prepared.facts.items()
         return sample | {name: v.copy() if isinstance(v, np.ndarray) else v for name, v in facts}
 

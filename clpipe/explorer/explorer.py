@@ -26,7 +26,7 @@ from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.runner import Result, Runner
 from clpipe.explorer.controls import steps_of
 from clpipe.explorer.named import check_named, files_in
-from clpipe.explorer.views import UNITS, Sample, View, cut, part_as_read, shown_of
+from clpipe.explorer.view import UNITS, Sample, View, cut, part_as_read, shown_of
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import upright
 from clpipe.inputs.find import Job
@@ -152,8 +152,8 @@ class Explorer:
         loaded, settings = self._loaded(image, values)
         timings: list[Timing] = []
         chain, result, launches = self._run(loaded, view, timings)
-        turn = OutputWriter.turn_of(loaded.source, chain)
-        shown = upright(shown_of(chain, result), turn)
+        orientation = OutputWriter.picture_orientation(loaded.source, chain)
+        shown = upright(shown_of(chain, result), orientation)
         facts = {
             "width": shown.shape[1],
             "height": shown.shape[0],
@@ -172,7 +172,7 @@ class Explorer:
         unit = "of 255" if is_shown else UNITS[chain.result]
         with self._lock:
             self._number += 1
-            values_of = shown if is_shown else upright(result.image, turn)
+            values_of = shown if is_shown else upright(result.image, orientation)
             sample = Sample(values_of, unit, shown, facts | {"number": self._number})
             self._samples[self._number] = sample
             while len(self._samples) > SAMPLES and self._kept > KEPT:
@@ -232,7 +232,7 @@ class Explorer:
         pair = []
         for truth in ("", DEVELOPMENT):
             chain, result, _ = self._run(loaded, View(view.step, truth), None)
-            picture = upright(result.image, OutputWriter.turn_of(loaded.source, chain))
+            picture = upright(result.image, OutputWriter.picture_orientation(loaded.source, chain))
             pair.append(part_as_read(truth or "picture", cut(picture, box), chain))
         return measure(pair[:1], pair[1])
 

@@ -254,7 +254,7 @@ class OutputWriter:
             raise OutputError(f"{self.folder}: {reason}; {RESUMABLE}")
 
     @staticmethod
-    def turn_of(source: SourceImage, chain: Chain) -> int:
+    def picture_orientation(source: SourceImage, chain: Chain) -> int:
         """EXIF's orientation by which a picture is turned; a mosaic, whose pattern would change, is
         not turned.
 
@@ -309,7 +309,7 @@ class OutputWriter:
         The last image of a variance map is the variance.
         """
         chain, rendition, camera = recipe.chain, recipe.rendition, recipe.chain.camera
-        tags, orientation = from_attributes(
+        tags, source_orientation = from_attributes(
             source.attributes, Tags(camera.make, camera.model, chain.iso)
         )
         output = chain.settings.output.filled({**source.shot, **tags.shot})
@@ -319,7 +319,7 @@ class OutputWriter:
         tag_attributes = {
             name: source.attributes[name] for name in TAG_ATTRIBUTES if name in source.attributes
         }
-        turn = self.turn_of(source, chain) if patch is None else 1
+        orientation = self.picture_orientation(source, chain) if patch is None else 1
         outputs: dict[Path, Stored] = {}
         whose = recipe.key, rendition.frame
         for step in (chain.step_named(name) for name in self._kept_steps(recipe)):
@@ -341,22 +341,22 @@ class OutputWriter:
                 outputs[path] = write_exr(path, result.final, ("Y",), attributes)
             elif format_ == NPY:
                 assert result.final is not None
-                image = upright(result.final, turn)
+                image = upright(result.final, orientation)
                 outputs[path] = write_npy(path, typed(image, chain.result))
             elif format_ == DNG:
                 negative = negative_of(chain)
                 raw = result.kept[negative.step] if negative.step else source.pixels
-                outputs[path] = write_dng(path, raw, negative, tags, orientation)
+                outputs[path] = write_dng(path, raw, negative, tags, source_orientation)
             elif FORMATS[format_].ending == "exr":
                 assert result.final is not None
                 attributes = attributes_of(chain.steps[-1], chain, *whose) | tag_attributes
-                if turn != 1:
+                if orientation != 1:
                     attributes |= {"orientation": "1"}
                 half = FORMATS[format_].bits == 16
-                image = upright(result.final, turn)
+                image = upright(result.final, orientation)
                 outputs[path] = write_exr(path, image, chain.result.channels, attributes, half)
             else:
-                pixels = upright(samples(result, FORMATS[format_]), turn)
+                pixels = upright(samples(result, FORMATS[format_]), orientation)
                 outputs[path] = write_display(path, pixels, tags)
         return outputs
 

@@ -15,8 +15,8 @@ from clpipe.base.files import write_new
 from clpipe.chain.rendition import Rendition
 from clpipe.images.sheet import SHOWN, contact_sheet
 from clpipe.inputs.find import Job
+from clpipe.outputs.camera_files import FILES
 from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, read_sidecar
-from clpipe.outputs.views import FILES
 from clpipe.outputs.writer import OutputWriter
 from clpipe.scenes.record import RECORD
 

@@ -132,14 +132,14 @@ class ThinLens(Method):
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         depth = _depth_in(context)
-        if self not in depth.held:
+        if self not in depth.derived:
             radii = self.clipped(depth.pixels)
             largest = float(np.ceil(abs(radii).max() * 4)) / 4  # few tables for many images
             reach = reach_of(largest)
             around = ((reach, reach), (reach, reach + VECTOR))
             taps = aperture_taps(self.blades, largest)
-            depth.held[self] = np.pad(radii, around, "reflect"), reach, taps
-        radii, reach, taps = depth.held[self]
+            depth.derived[self] = np.pad(radii, around, "reflect"), reach, taps
+        radii, reach, taps = depth.derived[self]
         return {
             "radii": radii,
             "columns": np.int32(radii.shape[1]),

@@ -187,9 +187,9 @@ def _from_kept(
     """The frame in a mosaic that clpipe kept."""
     kind = attributes.get("kind", "")
     if kind not in (Kind.RAW.label, Kind.MOSAIC.label):
-        held = one_line(f"{kind}, kept after {attributes.get('stage')}")
+        found = one_line(f"{kind}, kept after {attributes.get('stage')}")
         raise ImageError(
-            f"{path}: holds {held}; a mosaic is needed, such as clpipe run --until quantize writes"
+            f"{path}: holds {found}; a mosaic is needed, such as clpipe run --until quantize writes"
         )
     try:
         settings = carried_settings(attributes)
