@@ -1,7 +1,7 @@
 """CPU time by step, from the clocks of the threads that do it; for benchmarks.
 
-A step is marked where it is done, with :class:`CpuTimer`. That costs well under a microsecond unless
-:class:`CpuTimes` counts.
+A step is marked where it is done, with :class:`CpuTimer`. That costs well under a microsecond
+unless :class:`CpuTimes` counts.
 """
 
 import threading

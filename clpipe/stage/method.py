@@ -101,7 +101,7 @@ class Method(BaseModel):
         return None
 
     def estimates_for(self, width: int, height: int) -> Mapping[str, float]:
-        """Numbers that follow from the size of the image that it reads, for the sidecar's estimates."""
+        """Numbers that follow from the size of the image that is read; a sidecar's estimates."""
         return {}
 
     def without_noise(self) -> "Method | None":
