@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from clpipe.base.cpu_time import CpuTimer, CpuTimes
 from clpipe.base.errors import ImageError
 from clpipe.base.memory import peak_memory
 from clpipe.base.processors import available_processors
-from clpipe.base.steps import Step, StepTimes
 from clpipe.batch.outcome import DONE, STEPS, Span
 from clpipe.batch.threads import Batch
 from clpipe.batch.work import ImageWorker
@@ -117,7 +117,7 @@ def bench_batch(device: Device, request: Request, load: Load) -> BatchSpeed:
         forget_peak_memory()
         timed = batch()
         start = time.perf_counter()
-        with StepTimes() as times, Step("Python"):
+        with CpuTimes() as times, CpuTimer("Python"):
             outcomes = list(timed.run(jobs))
         seconds = time.perf_counter() - start
         peak = peak_memory()

@@ -107,7 +107,7 @@ class ThinLens(Method):
                 f"sensor_width: the size of pixels is needed, and camera {context.camera.name} "
                 "does not say it; set it in mm, or pixel_pitch in um"
             )
-        return self.filled(pixel_pitch=pitch)
+        return self.with_defaults(pixel_pitch=pitch)
 
     def passes(self) -> tuple[Pass, ...]:
         given = ("radii", "columns", "rows", "reach", "taps", "count")

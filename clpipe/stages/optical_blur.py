@@ -233,7 +233,7 @@ class Lens(Method):
                 f"pixel_pitch: diffraction needs it, and camera {context.camera.name} does not "
                 "say; set it in um"
             )
-        return self.filled(sigma=0.0 if self.psf else GOOD_LENS, pixel_pitch=pitch)
+        return self.with_defaults(sigma=0.0 if self.psf else GOOD_LENS, pixel_pitch=pitch)
 
     @property
     def _by_lines(self) -> tuple[float, float, float] | None:

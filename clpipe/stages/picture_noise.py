@@ -152,13 +152,13 @@ class IndependentNoise(Matched):
             RequestError: it is to be the measured one, and no report is set.
         """
         if self.correlation is not None or not self.correlated:
-            return self.filled(correlation=(0.0, 0.0, 0.0))
+            return self.with_defaults(correlation=(0.0, 0.0, 0.0))
         if not self.measured:
             raise RequestError(
                 "picture_noise: correlated is true, but nothing is measured; set correlation, or "
                 "measured, a report of clpipe measure --json"
             )
-        return self.filled(correlation=self.noise(iso).correlation)
+        return self.with_defaults(correlation=self.noise(iso).correlation)
 
     def normals(self, image: Floats, given: ReferenceContext) -> Floats:
         """The normals of each sample, (height, width, 3), of the image's stream."""
@@ -199,7 +199,7 @@ class IidGaussian(IndependentNoise):
         correlated = self.with_correlation(context.iso)
         if self.sigma is not None:
             return correlated
-        return correlated.filled(sigma=self.noise(context.iso).sigma)
+        return correlated.with_defaults(sigma=self.noise(context.iso).sigma)
 
     def passes(self) -> tuple[Pass, ...]:
         names = ("red", "green", "blue", *MIXING)
@@ -250,7 +250,8 @@ class IntensityDependent(IndependentNoise):
             return correlated
         places = np.linspace(0, 1, RESOLVED)
         curves = (np.interp(places, *c).clip(0, 1) for c in self.noise(context.iso).curves)
-        return correlated.filled(sigma=tuple(tuple(curve.round(6).tolist()) for curve in curves))
+        sigma = tuple(tuple(curve.round(6).tolist()) for curve in curves)
+        return correlated.with_defaults(sigma=sigma)
 
     def table(self) -> Floats:
         """Sigma at the 256 intensities v = i / 255 of red, of green and of blue, (768,)."""
