@@ -13,7 +13,7 @@ import reconstruction_report as report
 import scene_views
 import stereo
 
-from clpipe.inputs.views import read_views as read_poses
+from clpipe.inputs.render_cameras import read_views as read_poses
 from tests.conftest import ROOT
 
 LOADER = SourceFileLoader("reconstruction", str(ROOT / "tools" / "reconstruction"))

@@ -212,7 +212,7 @@ def develop(
     """
     loader = ImageLoader(request)
     found = renders.jobs() or loader.exposures(find_jobs(renders.inputs, output, loader.endings()))
-    given = with_views(found, renders.poses, loader.settings.output) if renders.poses else found
+    given = with_views(found, renders.poses, loader.settings.render) if renders.poses else found
     jobs = series.jobs(given, loader.settings)
     loader.check(jobs)
     chain = loader.first_chain(jobs)

@@ -258,7 +258,7 @@ def run(
         )
         loader = ImageLoader(request)
         found = find_jobs(inputs, output, loader.endings(), exclude, keep_suffix)
-        jobs = with_views(loader.exposures(found), poses, loader.settings.output)
+        jobs = with_views(loader.exposures(found), poses, loader.settings.render)
         jobs = series.jobs(jobs, loader.settings)
         tars = shard.take(cut(jobs, per_tar, output)) if per_tar else []
         jobs = [job for tar in tars for job in tar.jobs] if per_tar else shard.take(jobs)

@@ -11,7 +11,7 @@ import numpy as np
 
 from clpipe.base.types import Array, Doubles, Floats, Mask
 from clpipe.chain.baseline import IID
-from clpipe.images.encoding import Output
+from clpipe.images.encoding import Encoding
 from clpipe.images.jpeg import JpegEncoding, through_jpeg
 from clpipe.outputs.places import FLAT, HALVED, covariance, halved, select_flat
 from clpipe.reference.curve import to_8_bit
@@ -41,7 +41,7 @@ class Spread:
 
     names: tuple[str, ...]
     matching: NoNoise
-    output: Output
+    encoding: Encoding
     _noisy: Floats | None = None
     _clean: Floats | None = None  # where noise must be tried on it
     _mask: Mask | None = None  # the pixels where noise is matched; None is all
@@ -80,7 +80,7 @@ class Spread:
         """A picture as it is shown: cut off at black and white, or as its JPEG leaves it."""
         if not self.matching.jpeg:
             return np.clip(picture, 0, 1)
-        encoding = JpegEncoding(self.output.jpeg_quality, self.output.jpeg_subsampling)
+        encoding = JpegEncoding(self.encoding.jpeg_quality, self.encoding.jpeg_subsampling)
         return np.asarray(through_jpeg(to_8_bit(picture), encoding) / np.float32(255), np.float32)
 
     def _selected(self, picture: Floats) -> Floats:
