@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from clpipe.base.errors import ClpipeError, DeviceError, ImageError, RequestError
     from clpipe.camera.noise import NoiseModel
     from clpipe.camera.profile import Camera, built_in_cameras, load_camera
-    from clpipe.dataset import Dataset, RawNoise
+    from clpipe.dataset import Dataset, Patches, RawNoise
     from clpipe.engine.runner import Result
     from clpipe.pipeline import Pipeline
 
@@ -24,6 +24,7 @@ _MODULES = {
     "DeviceError": "clpipe.base.errors",
     "ImageError": "clpipe.base.errors",
     "NoiseModel": "clpipe.camera.noise",
+    "Patches": "clpipe.dataset",
     "Pipeline": "clpipe.pipeline",
     "RawNoise": "clpipe.dataset",
     "RequestError": "clpipe.base.errors",
@@ -39,6 +40,7 @@ __all__ = [
     "DeviceError",
     "ImageError",
     "NoiseModel",
+    "Patches",
     "Pipeline",
     "RawNoise",
     "RequestError",

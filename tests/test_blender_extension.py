@@ -23,6 +23,7 @@ from clpipe.camera.profile import DEFAULT_CAMERA, built_in_cameras
 from clpipe.chain.files import built_in_configs
 from clpipe.commands.main import main
 from tests.conftest import ROOT
+from tools.blender import extension as builder
 
 
 def load(name, path):
@@ -33,8 +34,7 @@ def load(name, path):
     return module
 
 
-builder = load("blender_extension", ROOT / "tools" / "blender_extension")
-development = load("blender_development", ROOT / "tools" / "blender" / "development.py")
+development = load("blender_development", ROOT / "tools" / "blender" / "source" / "development.py")
 
 WHEELS = {
     "clpipe-0.1.0-py3-none-any.whl": "clpipe/__init__.py",

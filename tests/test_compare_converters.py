@@ -1,23 +1,14 @@
-"""tools/compare_converters, and what it shares with tools/validate; no converter is needed here."""
-
-import sys
-from importlib.machinery import SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
+"""tools/compare/converters.py and side_by_side.py; no converter is needed here."""
 
 import numpy as np
 import pytest
-import side_by_side
 from PIL import Image
 
 from clpipe.analysis.charts import chart_image, chart_patches, saturated_image
 from clpipe.analysis.crops import HEIGHT, WIDTH
 from clpipe.analysis.fidelity import colour_errors
-from tests.conftest import ROOT
-
-LOADER = SourceFileLoader("compare_converters", str(ROOT / "tools" / "compare_converters"))
-tool = module_from_spec(spec_from_loader("compare_converters", LOADER))
-sys.modules["compare_converters"] = tool  # its dataclasses look themselves up there
-LOADER.exec_module(tool)
+from tools.compare import converters as tool
+from tools.pages import side_by_side
 
 COPY = tool.Converter("copy", "none", "cp DNG PICTURE")
 PRINT = tool.Converter("print", "none", "cat DNG")

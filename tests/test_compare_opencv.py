@@ -1,24 +1,16 @@
-"""tools/compare_opencv and what it uses; the script itself only where OpenCV is installed."""
+"""tools/compare/opencv.py and what it uses; the script itself only where OpenCV is installed."""
 
-import sys
 from argparse import ArgumentTypeError
-from importlib.machinery import SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
 
 import numpy as np
-import other_methods
 import pytest
-import turns
 
 from clpipe.batch.bench import Load
 from clpipe.chain.request import Request
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding
-from tests.conftest import ROOT
-
-LOADER = SourceFileLoader("compare_opencv", str(ROOT / "tools" / "compare_opencv"))
-tool = module_from_spec(spec_from_loader("compare_opencv", LOADER))
-sys.modules["compare_opencv"] = tool
-LOADER.exec_module(tool)
+from tools.compare import methods as other_methods
+from tools.compare import opencv as tool
+from tools.compare import turns
 
 
 def test_works_take_turns_and_what_comes_before_is_not_counted(monkeypatch):
@@ -57,7 +49,10 @@ def test_what_is_missing_is_named(monkeypatch, capsys):
     monkeypatch.setattr(tool, "NEEDED", ("numpy", "no_such_module"))
     monkeypatch.setattr("sys.argv", ["compare_opencv"])
     assert tool.main() == 1
-    assert capsys.readouterr().err == "no_such_module: missing; pip install 'clpipe[compare]'\n"
+    assert (
+        capsys.readouterr().err
+        == "no_such_module: missing; .venv/bin/pip install -e '.[compare]'\n"
+    )
 
 
 def test_methods_run_on_one_image_and_a_missing_package_is_named(monkeypatch, capsys):
@@ -91,7 +86,7 @@ def test_the_methods_that_are_compared_exist():
 @pytest.fixture
 def script():
     pytest.importorskip("cv2", reason="needs OpenCV, of the extra compare")
-    from opencv_chain import OpenCVChain
+    from tools.compare.opencv_chain import OpenCVChain
 
     return OpenCVChain(Request.from_options().chain())
 
@@ -103,7 +98,7 @@ def test_the_script_makes_the_same_picture_and_noise(script, device):
 
 
 def test_bands_join_without_seams(script, monkeypatch):
-    import opencv_chain
+    from tools.compare import opencv_chain
 
     monkeypatch.setattr(opencv_chain, "BAND", 64 * 40)
     monkeypatch.setattr(script, "expose", lambda light: np.rint(light[..., 0]).astype(np.uint16))
@@ -112,7 +107,7 @@ def test_bands_join_without_seams(script, monkeypatch):
 
 
 def test_threads_draw_different_noise(script):
-    from opencv_chain import pool
+    from tools.compare.opencv_chain import pool
 
     grey = np.full((8, 8, 3), 0.2, np.float16)
     raws = []

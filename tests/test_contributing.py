@@ -2,6 +2,7 @@
 
 import pkgutil
 import re
+import subprocess
 from dataclasses import replace
 
 from click.testing import CliRunner
@@ -59,6 +60,15 @@ def test_the_walks_are_true_to_the_code():
     for name in names:
         if name != "denoise.luma_strength":
             assert pkgutil.resolve_name(f"clpipe.{name}") is not None
+
+
+def test_the_tools_that_are_named_are_those_that_are_there():
+    table = TEXT[TEXT.index("| `tools/run` |") : TEXT.index("## Dependencies")]
+    rows = set(re.findall(r"^\| `(\w+ \w+)` \|", table, re.MULTILINE))
+    listed = subprocess.run([ROOT / "tools" / "run"], capture_output=True, text=True)
+    assert set(re.findall(r"^ +tools/run (\w+ \w+)$", listed.stderr, re.MULTILINE)) == rows
+    for path in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")):
+        assert set(re.findall(r"tools/run ([a-z]\w+ \w+)", path.read_text())) <= rows, path
 
 
 def test_the_map_names_every_room():

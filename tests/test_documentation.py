@@ -168,7 +168,7 @@ def test_each_block_says_what_it_is(page):
 
 @pytest.fixture(scope="module")
 def hook():
-    spec = spec_from_file_location("docs_hook", ROOT / "tools" / "docs_hook.py")
+    spec = spec_from_file_location("docs_hook", ROOT / "tools" / "pages" / "docs_hook.py")
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

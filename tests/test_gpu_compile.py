@@ -1,20 +1,12 @@
-"""tools/gpu_compile, on a few kernels, for each target whose compilers are here."""
+"""tools/stress/gpu_compile.py, on a few kernels, for each target whose compilers are here."""
 
 import re
 import subprocess
 from dataclasses import replace
-from importlib.machinery import SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
 
 import pytest
 
-from tests.conftest import ROOT
-
-LOADER = SourceFileLoader("gpu_compile", str(ROOT / "tools" / "gpu_compile"))
-SPEC = spec_from_loader("gpu_compile", LOADER)
-assert SPEC
-tool = module_from_spec(SPEC)
-LOADER.exec_module(tool)
+from tools.stress import gpu_compile as tool
 
 FUSED = {  # the same line with a fused multiply-add of floats, and one of integers
     tool.NVIDIA_FUSED: ("FFMA R1, R2, R3, R4 ;", "IMAD R1, R2, R3, R4 ;"),

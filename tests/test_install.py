@@ -7,9 +7,11 @@ import sys
 import tomllib
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from clpipe import __version__
 from clpipe.base import extras
 from tests.conftest import ROOT, STILL_LIFE
 
@@ -98,7 +100,7 @@ def needed(project, extra):
         yield from needed(project, "")
 
 
-@pytest.mark.parametrize("extra", ["", "calibrate", "dev", "docs"])
+@pytest.mark.parametrize("extra", ["", "dev", "docs"])
 def test_a_lock_has_all_that_is_asked_for(extra):
     lock = (ROOT / "locks" / f"{extra or 'clpipe'}.txt").read_text()
     versions = {}
@@ -119,7 +121,7 @@ def test_a_lock_has_all_that_is_asked_for(extra):
 
 def test_a_lock_names_no_index_and_no_folder():
     locks = sorted((ROOT / "locks").iterdir())
-    assert {lock.stem for lock in locks} == {"calibrate", "clpipe", "dev", "docs"}
+    assert {lock.stem for lock in locks} == {"clpipe", "dev", "docs"}
     for lock in locks:
         assert not re.search(r"://|--(extra-)?index|--find-links|@ |\s/", lock.read_text())
 
@@ -132,6 +134,31 @@ def test_what_a_tool_installs_is_locked():
         for line in path.read_text().splitlines()
         if line.startswith("extra=") and path.name != "setup"
     ]
-    assert len(found) == 4
+    assert len(found) == 5
     for path, extra in found:
         assert (ROOT / "locks" / f"{extra or 'clpipe'}.txt").is_file(), path
+
+
+def test_what_checks_a_commit_is_what_the_tests_run_first():
+    checks = (ROOT / "tools" / "lint").read_text()
+    for name in ("ruff format --check", "ruff check", "mypy", "lint-imports"):
+        assert f".venv/bin/{name}" in checks
+    assert "\nsh tools/lint\n" in (ROOT / "tools" / "test").read_text()
+    (repository,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    (hook,) = repository["hooks"]
+    assert (repository["repo"], hook["language"]) == ("local", "system")
+    assert (hook["entry"], hook["pass_filenames"]) == ("sh tools/lint", False)
+
+
+def test_the_citation_is_of_this_version_and_of_the_paper():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert (cited["cff-version"], cited["type"], cited["title"]) == ("1.2.0", "software", "clpipe")
+    assert cited["message"] and cited["authors"] == [{"name": "The clpipe developers"}]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert (cited["version"], cited["license"]) == (__version__, project["license"])
+    paper = cited["preferred-citation"]
+    assert paper["title"] in " ".join((ROOT / "docs" / "paper.md").read_text("utf-8").split())
+    assert [author["family-names"] for author in paper["authors"]] == [
+        *("Bielova", "Hänsch", "Ley", "Hellwich"),
+    ]
+    assert (paper["type"], paper["year"]) == ("conference-paper", 2019)

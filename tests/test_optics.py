@@ -156,7 +156,7 @@ def point(write_exr):
     write_exr("in/a_depth.exr", np.full((240, 360, 1), 1.5), "Z")
 
 
-RUN = ("run", "in/a.exr", "-o", "o", "--stages", "defocus", "--format", "exr", "--device", "numpy")
+RUN = ("run", "in/a.exr", "--stages", "defocus", "--format", "exr", "--device", "numpy")
 DEFOCUS = ("--set", "defocus.method=thin_lens", "--aperture", 0.5)
 POSE = {"R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "t": [0, 0, 0]}
 VIEW = {"file": "a.exr", "K": [[350, 0, 180], [0, 350, 120], [0, 0, 1]], **POSE}
@@ -165,17 +165,17 @@ VIEW = {"file": "a.exr", "K": [[350, 0, 180], [0, 350, 120], [0, 0, 1]], **POSE}
 def test_the_poses_of_a_35_mm_render_are_those_of_its_depth_of_field(clpipe, point):
     Path("cameras.json").write_text(json.dumps({"views": [VIEW]}))
     posed = (*RUN, *DEFOCUS, "--poses", "cameras.json")
-    clpipe(*posed, "--set", "render.sensor_width=36")
+    clpipe(*posed, "-o", "o", "--set", "render.sensor_width=36")
     assert spread_of(Path("o/a.exr")) == pytest.approx(disc(35, 0.5, 0.1), abs=0.3)
     clpipe(*posed, "-o", "p", "--focal-length", 35)
     assert spread_of(Path("p/a.exr")) == pytest.approx(disc(35, 0.5, 0.1), abs=0.3)
-    said = clpipe(*posed, status=1).stderr
+    said = clpipe(*posed, "-o", "q", status=2).stderr
     assert "the focal length is 350 px, but what that is in mm is not known: set" in said
 
 
 def test_a_lens_is_that_of_the_depth_of_field(clpipe, point):
     set_ = ("--focal-length", 50, "--focus-distance", 3, "--set", "render.sensor_width=36")
-    clpipe(*RUN, *DEFOCUS, *set_)
+    clpipe(*RUN, *DEFOCUS, *set_, "-o", "o")
     assert spread_of(Path("o/a.exr")) == pytest.approx(disc(50, 0.5, 0.1), abs=0.3)
 
 

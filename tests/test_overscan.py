@@ -133,7 +133,8 @@ def test_stages_before_the_lens_see_the_overscan():
     own = {
         "stages": ["shutter", "defocus", "motion_blur", "distortion"],
         "shutter": {"flicker_depth": 0.5, "line_time": 1e-3, "exposure_time": 1e-3},
-        "defocus": {"method": "thin_lens", "focal_length": 50.0, "focus_distance": 1.0},
+        "defocus": {"method": "thin_lens", "focal_length": 200.0, "f_number": 0.5},
+        "focus_distance": 1.0,
         "motion_blur": {"length": 5.0},
     }
     x, y = places(WIDTH, HEIGHT, AROUND)

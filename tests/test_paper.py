@@ -1,9 +1,7 @@
-"""tools/figures makes the paper's figures; docs/paper.md names what there is."""
+"""tools/pages/figures.py makes the paper's figures; docs/paper.md names what there is."""
 
 import re
 import typing
-from importlib.machinery import SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
 
 import numpy as np
 import pytest
@@ -18,11 +16,9 @@ from clpipe.images.encoding import Encoding
 from clpipe.images.read import read_image
 from tests.conftest import ROOT, STILL_LIFE
 from tests.dng import write_dng
+from tools.pages import figures
 
 PAGE = ROOT / "docs" / "paper.md"
-LOADER = SourceFileLoader("paper_figures", str(ROOT / "tools" / "paper_figures.py"))
-figures = module_from_spec(spec_from_loader("paper_figures", LOADER))
-LOADER.exec_module(figures)
 
 
 def test_the_figures_are_made(clpipe, tmp_path, write_exr, monkeypatch):
@@ -92,8 +88,8 @@ def names_something(text):
             return load_camera(value) is not None
         case _ if word.startswith("-"):
             return word in options and (not value or value in options[word].type.choices)
-        case _ if word.startswith("tools/"):
-            return (ROOT / word).exists()
+        case "tools/run":
+            return (ROOT / "tools" / value.replace(" ", "/")).with_suffix(".py").exists()
         case _:
             return names_a_parameter(text)
 
@@ -114,7 +110,7 @@ def test_what_the_table_names_is_there():
     "text",
     [
         *("demosaic.method=none", "gamma.chi", "denoise.method", "demosaic.classifier=canny"),
-        *("clpipe develop", "--iid", "--baseline poisson", "-c papers", "tools/figure"),
+        *("clpipe develop", "--iid", "--baseline poisson", "-c papers", "tools/run pages figure"),
     ],
 )
 def test_what_is_not_there_is_noticed(text):

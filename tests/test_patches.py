@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import clpipe as api
+from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.dataset.arrays import packed
 from clpipe.dataset.numbering import Numbering
-from clpipe.dataset.recent import Recent
 from clpipe.images.tags import FLIPS, upright
 from clpipe.outputs.patches import Cutting, first_place
 from clpipe.reference.cfa import PATTERNS
@@ -63,7 +63,7 @@ def test_all_that_a_sample_has_is_that_of_the_whole_picture(renders):
     for number, key in ((0, "r0.exr"), (1, "r1.exr")):
         (whole,) = api.Dataset(f"in/{key}", **given)
         patches = api.Dataset(
-            renders, **given, patch=24, patches_per_image=60, augment=True
+            renders, **given, patch=api.Patches(24, 60, augment=True)
         ).__getitems__(range(60 * number, 60 * number + 60))
         assert {patch["key"] for patch in patches} == {key}
         assert check_against_whole(whole, patches) == set(FLIPS)
@@ -84,7 +84,7 @@ def test_each_pattern_and_the_variance(renders, pattern):
     }
     (whole,) = api.Dataset("in/r1.exr", **given)
     assert whole["cfa"] == pattern and whole["variance"].dtype == np.float32
-    patches = api.Dataset("in/r1.exr", patch=17, patches_per_image=60, augment=True, **given)
+    patches = api.Dataset("in/r1.exr", patch=api.Patches(17, 60, augment=True), **given)
     assert len(check_against_whole(whole, patches)) == 8
 
 
@@ -129,7 +129,7 @@ def test_a_grid_covers_the_picture(augment):
 
 
 def test_a_grid_over_images_of_several_sizes(renders):
-    grid = api.Dataset(renders, device="numpy", patch=16, patches_per_image="grid", until="mosaic")
+    grid = api.Dataset(renders, device="numpy", patch=api.Patches(16, "grid"), until="mosaic")
     assert len(grid) == 12 + 3 * 4 + 12
     places = [(s["key"], *s["place"]) for s in grid]
     assert len(set(places)) == len(grid)
@@ -148,7 +148,7 @@ def test_numbers_of_samples():
 
 
 def test_samples_do_not_depend_on_order_shards_and_epochs(renders):
-    made = api.Dataset(renders, iso=ISO, patch=16, patches_per_image=3, epochs=2)
+    made = api.Dataset(renders, iso=ISO, patch=api.Patches(16, 3), epochs=2)
     assert len(made) == 18
     listed = list(made)
     for i in (17, 4, -18):
@@ -159,18 +159,18 @@ def test_samples_do_not_depend_on_order_shards_and_epochs(renders):
         own = [s for s in listed if s["key"] in (("r0.exr", "r2.exr"), ("r1.exr",))[i]]
         for one, two in zip(part, own, strict=True):
             same(one, two)
-    later = api.Dataset(renders, iso=ISO, patch=16, patches_per_image=3, epoch=1)
+    later = api.Dataset(renders, iso=ISO, patch=api.Patches(16, 3), epoch=1)
     for one, two in zip(later, listed[9:], strict=True):
         same(one, two)
     places = [tuple(s["place"]) for s in listed]
     assert len(set(places)) > 12 and places[:9] != places[9:]
-    other = api.Dataset(renders, iso=ISO, patch=16, patches_per_image=3, seed=1)
+    other = api.Dataset(renders, iso=ISO, patch=api.Patches(16, 3), seed=1)
     assert [tuple(s["place"]) for s in other] != places[:9]
 
 
 def test_training_goes_on_where_it_was(renders):
     def dataset(**changes):
-        given = {"device": "numpy", "until": "mosaic", "patch": 16, "patches_per_image": 4}
+        given = {"device": "numpy", "until": "mosaic", "patch": api.Patches(16, 4)}
         return api.Dataset(renders, epochs=2, **{**given, **changes})
 
     whole = list(dataset())
@@ -189,7 +189,11 @@ def test_training_goes_on_where_it_was(renders):
     assert list(third) == []  # nothing is left of that one
     third.set_epoch(1)
     same(next(iter(third)), whole[12])
-    for other in (dataset(patch=8), dataset(patches_per_image=5), first.shard(0, 2)):
+    for other in (
+        dataset(patch=api.Patches(8, 4)),
+        dataset(patch=api.Patches(16, 5)),
+        first.shard(0, 2),
+    ):
         with pytest.raises(RequestError, match="of other images, or of other patches"):
             other.load_state_dict(state)
 
@@ -209,7 +213,7 @@ def test_decoded_renders_are_kept_while_they_fit(renders, write_exr, monkeypatch
         made.__getitems__(order[:2])
         for i in order[2:]:
             made[i]
-        assert made._maker.renders.taken <= 2**20
+        assert made._loader.renders.taken <= 2**20
         return "".join(name[1] for name in read)
 
     one = 48 * 64 * 6  # bytes, half
@@ -223,7 +227,7 @@ def test_decoded_renders_are_kept_while_they_fit(renders, write_exr, monkeypatch
 
 
 def test_what_is_larger_than_the_room_is_not_kept():
-    kept = Recent(3, len)
+    kept = BoundedCache(3, len)
     assert [kept.get(text, lambda text=text: text) for text in ("ab", "long", "c")]
     assert kept.taken == 3
     kept.get("de", lambda: "de")
@@ -273,8 +277,7 @@ def test_the_variance_is_that_of_the_noise(write_exr, tmp_path):
         raw="packed",
         variance=True,
         dtype="float32",
-        patch=180,
-        patches_per_image=1,
+        patch=api.Patches(180, per_image=1),
         skip=["row_noise"],
     )
     (sample,) = made
@@ -290,7 +293,7 @@ def test_layers_go_along(write_exr, tmp_path):
     write_exr("a.exr", pixels, "R,G,B,Z", half=False)
     given = {"device": "numpy", "until": "mosaic", "carry": "Z:depth"}
     (whole,) = api.Dataset(tmp_path / "a.exr", **given)
-    for s in api.Dataset(tmp_path / "a.exr", patch=16, augment=True, **given):
+    for s in api.Dataset(tmp_path / "a.exr", patch=api.Patches(16, augment=True), **given):
         left, top = s["place"]
         part = whole["carried.Z"][top : top + 16, left : left + 16]
         assert np.array_equal(s["carried.Z"], upright(part, s["turn"]))
@@ -298,7 +301,7 @@ def test_layers_go_along(write_exr, tmp_path):
     given["carry"] = "Z:normal"
     write_exr("a.exr", rng.random((40, 48, 6)), "R,G,B,Z.X,Z.Y,Z.Z", half=False)
     with pytest.raises(ImageError, match=r"a\.exr: .*Z: augment flips and turns patches, but not"):
-        api.Dataset(tmp_path / "a.exr", patch=16, augment=True, **given)[0]
+        api.Dataset(tmp_path / "a.exr", patch=api.Patches(16, augment=True), **given)[0]
 
 
 def test_what_is_refused(renders):
@@ -306,12 +309,6 @@ def test_what_is_refused(renders):
     for wrong, message in (
         ({"patch": 0}, "found patch 0; expected 1 or more"),
         ({"patch": 9, "raw": "packed"}, "found patch 9; a packed raw has planes of half the size"),
-        ({"augment": True}, "augment: .* set patch=SIZE"),
-        ({"patch": 8, "patches_per_image": 0}, "found patches_per_image 0; expected 1 or more"),
-        (
-            {"patch": 8, "patches_per_image": "all"},
-            "found patches_per_image 'all'; exp.*grid",
-        ),
         ({"dtype": "int8"}, "unknown dtype 'int8'.*; allowed: float16, float32, uint16"),
         ({"dtype": "half float"}, "unknown dtype 'half float'"),
         ({"dtype": "uint16", **mosaic}, "dtype uint16: the chain ends in mosaic"),
@@ -325,6 +322,9 @@ def test_what_is_refused(renders):
     ):
         with pytest.raises(RequestError, match=message):
             api.Dataset(renders, device="numpy", **wrong)
+    for per_image in (0, "all"):
+        with pytest.raises(RequestError, match=f"found per_image {per_image!r}; exp.* or 'grid'"):
+            api.Patches(8, per_image)
     with pytest.raises(ImageError, match=r"in/r1\.exr: .*57x41 pixels, .* 48x48; make them smal"):
         list(api.Dataset(renders, device="numpy", patch=48, until="mosaic"))
     with pytest.raises(ImageError, match=r"in/r1\.exr: .*57x41 .*an odd width or height"):

@@ -1,14 +1,14 @@
-"""tools/portability, as far as it needs no emulator."""
+"""tools/stress/portability.py, as far as it needs no emulator."""
 
 import os
 import subprocess
 from types import SimpleNamespace
 
 import pytest
-from portability_cpus import EMULATED, measure_emulated, script
-from portability_runs import UnavailableError
 
 from clpipe.engine.cpu_target import TARGETS, row_of
+from tools.stress.emulated import EMULATED, measure_emulated, script
+from tools.stress.runtimes import UnavailableError
 
 X86 = [cpu for cpu in EMULATED if cpu.machine == "x86_64"]
 

@@ -1,17 +1,11 @@
-"""tools/quality: the figures it measures are those of independent implementations."""
-
-from importlib.machinery import SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
+"""tools/pages/quality.py: the figures it measures are those of independent implementations."""
 
 import numpy as np
 import pytest
 
 from clpipe.images.read import read_image
-from tests.conftest import ROOT, STILL_LIFE
-
-LOADER = SourceFileLoader("quality", str(ROOT / "tools" / "quality"))
-quality = module_from_spec(spec_from_loader("quality", LOADER))
-LOADER.exec_module(quality)
+from tests.conftest import STILL_LIFE
+from tools.pages import quality
 
 
 @pytest.mark.parametrize("name", [n for n, (_, figure) in quality.DEMOSAIC.items() if figure])

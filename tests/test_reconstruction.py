@@ -1,25 +1,15 @@
 """tools/reconstruction, its data and what it measures; the run itself only where OpenCV is."""
 
 import json
-import sys
-from importlib.machinery import SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
 
-import multiview
 import numpy as np
-import picture_kinds
 import pytest
-import reconstruction_report as report
-import scene_views
-import stereo
 
 from clpipe.inputs.render_cameras import read_views as read_poses
-from tests.conftest import ROOT
-
-LOADER = SourceFileLoader("reconstruction", str(ROOT / "tools" / "reconstruction"))
-tool = module_from_spec(spec_from_loader("reconstruction", LOADER))
-sys.modules["reconstruction"] = tool
-LOADER.exec_module(tool)
+from tools.reconstruction import experiment as tool
+from tools.reconstruction import multiview, report, stereo
+from tools.reconstruction import pictures as picture_kinds
+from tools.reconstruction import views as scene_views
 
 
 @pytest.fixture(scope="module")
@@ -212,7 +202,7 @@ def test_what_is_missing_or_wrong_is_named(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(tool, "NEEDED", ("numpy", "no_such_module"))
     monkeypatch.setattr("sys.argv", ["reconstruction", "-o", str(tmp_path)])
     assert tool.main() == 1
-    said = "no_such_module: missing; pip install 'clpipe[calibrate,compare]'\n"
+    said = "no_such_module: missing; .venv/bin/pip install -e '.[compare]'\n"
     assert capsys.readouterr().err == said
     monkeypatch.setattr(tool, "NEEDED", ())
     monkeypatch.setattr(

@@ -13,11 +13,12 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
+from clpipe.chain.rendition import FIRST
 from clpipe.commands.main import main
 from clpipe.images.write import write_exr as write
 from clpipe.reports.figures import last_failures, sessions
 from clpipe.reports.run import read_run
-from clpipe.reports.shown import places_of
+from clpipe.reports.shown import Budget, large, places_of
 from tests.conftest import reseal
 
 pytest.importorskip("jinja2")
@@ -360,11 +361,20 @@ def test_in_a_browser(browser_page, out):
     assert page.evaluate("document.documentElement.dataset.theme") in ("dark", "light")
 
 
+def test_each_exposure_of_a_bracket_is_a_picture_of_its_own(renders, tmp_path):
+    bracket = ("--bracket=-1,1", "--frames", 2, "--truth", "clean")
+    clpipe("run", renders / "a.exr", "-o", tmp_path / "out", *NUMPY, *bracket)
+    run = read_run(tmp_path / "out")
+    assert [made.name for made in run.pictures] == ["a.ev+1.frame0", "a.ev-1.frame0"]
+    shown = large([run], [""], run.pictures[1], Budget(1 << 24), [])
+    assert [view["label"] for view in shown.views] == ["picture", "truth", "truth_clean"]
+
+
 def test_a_run_is_read_from_its_sidecars(out):
     run = read_run(out)
     assert [made.name for made in run.pictures] == [HOSTILE, "a", "b"]
-    assert sorted(run.of_image("a")) == ["", ".truth", ".truth_mosaic"]
-    assert run.of_image("a")[""].files.keys() == {"jpg", "normalize.exr"}
+    assert sorted(each.suffix for each in run.of_image("a")) == ["", ".truth", ".truth_mosaic"]
+    assert run.of_image("a")[FIRST].files.keys() == {"jpg", "normalize.exr"}
     steps = [{step["name"]: step for step in made.steps} for made in run.pictures]
     assert steps[0]["gamma"] is steps[1]["gamma"]  # lines that are alike are held once
     assert steps[0]["exposure"] != steps[1]["exposure"]
@@ -373,4 +383,4 @@ def test_a_run_is_read_from_its_sidecars(out):
     assert list(steps[1].values()) == whole["stages"]
     reseal(sidecar, {**whole, "stages": tuple(whole["stages"])})  # in one line
     again = next(made for made in read_run(out).pictures if made.name == "a")
-    assert again.record == run.of_image("a")[""].record
+    assert again.record == run.of_image("a")[FIRST].record

@@ -146,8 +146,8 @@ def test_6_a_batch_goes_on_and_the_terminal_is_safe(clpipe, render):
 
 
 def test_faults_of_all_kinds_in_small():
-    """A few of the faults of tools/faults; the whole of it takes an hour."""
-    command = [sys.executable, ROOT / "tools/faults", "--images", "8", "--repeats", "2"]
+    """A few of the faults of tools/stress/faults.py; the whole of it takes an hour."""
+    command = [sys.executable, "-m", "tools.stress.faults", "--images", "8", "--repeats", "2"]
     faults = ("full", "power")
     done = subprocess.run([*map(str, command), "--device", "numpy", *faults], capture_output=True)
     assert done.returncode == 0, done.stdout.decode()[-2000:] + done.stderr.decode()[-2000:]

@@ -11,18 +11,12 @@ from clpipe.base.errors import RequestError
 from clpipe.camera.profile import DEFAULT_CAMERA, load_camera
 from clpipe.chain.chain import make_chain
 from clpipe.chain.registry import all_stages
+from clpipe.chain.rendition import CLEAN, DEVELOPMENT, MOSAIC, VARIANCE
 from clpipe.chain.settings import settings_from
-from clpipe.chain.truth import (
-    CLEAN,
-    DEVELOPMENT,
-    MOSAIC,
-    VARIANCE,
-    noisy_mosaic,
-    variance_of,
-)
+from clpipe.chain.truth import noisy_mosaic, variance_of
 from clpipe.engine.runner import Runner
 from clpipe.images.read import read_image
-from clpipe.outputs.renditions import truth_of
+from clpipe.outputs.recipes import chain_and_noise
 from clpipe.reference.cfa import PATTERNS
 from clpipe.stage import Context, Kind, Method
 from clpipe.stages import DEFAULT_CHAIN
@@ -52,10 +46,10 @@ def chain_of(**settings):
 def known(image, device=None, **settings):
     """A noisy mosaic, the clean one, and the variance between them; in NumPy, it is the same."""
     chain = chain_of(**settings)
-    clean, noise = truth_of(MOSAIC, chain), truth_of(VARIANCE, chain)
-    chains = (noisy_mosaic(chain), clean.chain, noise.chain)
+    (clean, _), (signal, noise) = (chain_and_noise(role, chain) for role in (MOSAIC, VARIANCE))
+    chains = (noisy_mosaic(chain), clean, signal)
     images = [Runner(c, device, encode=False, final=True).run(image, "k").final for c in chains]
-    return images[0], images[1], variance_of(noise.noise, images[2])
+    return images[0], images[1], variance_of(noise, images[2])
 
 
 def agree(noisy, clean, variance, axis=1):
@@ -220,8 +214,8 @@ def test_the_clean_picture_is_the_same_at_every_iso():
     cleans, developments = [], []
     for iso in (100, 25600):
         chain = chain_of(iso=iso, denoise={"luma_noise": 0.1 if iso > 100 else None})
-        cleans.append(picture(truth_of(CLEAN, chain).chain, image))
-        developments.append(picture(truth_of(DEVELOPMENT, chain).chain, image))
+        cleans.append(picture(chain_and_noise(CLEAN, chain)[0], image))
+        developments.append(picture(chain_and_noise(DEVELOPMENT, chain)[0], image))
     assert np.array_equal(*cleans)
     assert np.abs(developments[0] - developments[1]).max() > 0.05
 
@@ -230,7 +224,9 @@ def test_without_noise_to_take_away_development_and_clean_picture_are_one():
     image = np.random.default_rng(0).random((12, 16, 3)).astype(np.float32)
     quiet = {"skip": ["denoise", "sharpen"], "demosaic": {"method": "bilinear"}}
     chain = chain_of(**quiet, sensor_noise={"full_well": 3e3})
-    clean, development = (picture(truth_of(t, chain).chain, image) for t in (CLEAN, DEVELOPMENT))
+    clean, development = (
+        picture(chain_and_noise(t, chain)[0], image) for t in (CLEAN, DEVELOPMENT)
+    )
     assert np.array_equal(clean, development)
 
 
@@ -240,7 +236,7 @@ def test_what_follows_from_the_noise_follows_from_none_in_the_clean_picture(monk
 
     monkeypatch.setattr(Gain, "resolve", resolve)
     chain = chain_of(stages=["mosaic", "sensor_noise", "demosaic", "exposure"])
-    strengths = {t: truth_of(t, chain).chain.steps[-1] for t in (CLEAN, DEVELOPMENT)}
+    strengths = {t: chain_and_noise(t, chain)[0].steps[-1] for t in (CLEAN, DEVELOPMENT)}
     assert strengths[CLEAN].method.ev == 0 < strengths[DEVELOPMENT].method.ev
     assert strengths[CLEAN].context.noise_parameters() == (0, 0)
 
@@ -336,8 +332,8 @@ def test_noise_behind_the_mosaic_alone_has_no_clean_mosaic(clpipe, write_exr):
 def test_a_stage_that_does_not_say_its_variance_is_named(monkeypatch):
     monkeypatch.setattr(RowNoise, "variance", Method.variance)
     with pytest.raises(RequestError, match=r"row_noise \(gaussian\) does not say"):
-        truth_of(VARIANCE, chain_of())
-    truth_of(MOSAIC, chain_of())
+        chain_and_noise(VARIANCE, chain_of())
+    chain_and_noise(MOSAIC, chain_of())
 
 
 def test_a_raw_among_renders_has_no_truth(clpipe, write_exr, tmp_path):

@@ -1,28 +1,18 @@
-"""tools/validate: known noise comes back, and finished pictures are like a real camera's."""
+"""tools/pages/validate.py: known noise comes back; finished pictures are like a real camera's."""
 
 import doctest
-import sys
 from dataclasses import replace
-from importlib.machinery import SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
 
 import numpy as np
 import pytest
-import real_cameras
-import side_by_side
 from PIL import Image
 from scipy import ndimage
 
 from clpipe.camera.profile import load_camera
 from clpipe.images.read import read_image
-from tests.conftest import ROOT
+from tools.pages import real_cameras, side_by_side, validate
 
-LOADER = SourceFileLoader("validate", str(ROOT / "tools" / "validate"))
-validate = module_from_spec(spec_from_loader("validate", LOADER))
-sys.modules["validate"] = validate  # its dataclasses look themselves up there
-LOADER.exec_module(validate)
-
-# Every camera, pattern and method, ISOs from end to end; tools/validate closes all 68 loops.
+# Every camera, pattern and method, ISOs from end to end; the tool closes all 68 loops.
 LOOPS = [
     ("sony-a7r2", 100, "RGGB", "poisson"),
     ("sony-a7r2", 12800, "GRBG", "gaussian"),

@@ -370,7 +370,7 @@ def test_patches_are_samples_as_dataset_makes_them(clpipe, renders):
     found = [s for s in samples("out/000000.tar") if not s["__key__"].startswith("__clpipe__/")]
     keys = [f"r_00{i}_000{n}" for i in range(3) for n in range(3)]
     assert [s.pop("__key__") for s in found] == keys
-    given = {"iso": 3200, "patch": 12, "patches_per_image": 3, "augment": True, "truth": "clean"}
+    given = {"iso": 3200, "patch": api.Patches(12, 3, augment=True), "truth": "clean"}
     floats = api.Dataset("in", **given, dtype="float16")
     raws = api.Dataset("in", **given, raw="mosaic")
     for sample, pictures, made in zip(found, floats, raws, strict=True):

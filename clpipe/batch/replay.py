@@ -9,12 +9,11 @@ from typing import Any
 from clpipe.base.about import __version__
 from clpipe.base.digests import digests
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.registry import code_files
+from clpipe.chain.rendition import BASELINES, TRUTHS, Rendition
 from clpipe.chain.request import Request
 from clpipe.inputs.find import Job
 from clpipe.inputs.manifest import check_output_name
-from clpipe.outputs.renditions import RenditionPlan, baseline_named, bracket_in, truth_named
 from clpipe.outputs.sealed import SidecarError, outputs_in, read_sidecar
 
 CODE = (".py", ".cl")  # the endings of files that are run
@@ -165,20 +164,19 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
     Raises:
         RequestError, KeyError, TypeError, ValueError, AttributeError: they are damaged.
     """
-    name, picture, frames = str(values["name"]), str(values["picture"]), values["frames"]
+    name, rendition = str(values["name"]), Rendition.from_record(values)
     check_output_name(name)
-    if not (frames is None or (type(frames) is int and 0 < frames <= MAX_FRAMES)):
-        raise RequestError(f"found frames {frames}")
-    truths = tuple(filter(None, [truth_named(picture)]))
-    bracket = bracket_in(picture)
-    baselines = tuple(filter(None, [baseline_named(picture)]))
-    if picture not in RenditionPlan(frames, truths, bracket, baselines).names():
-        raise RequestError(f"found picture {picture!r}")
     request = Request.from_record(values["request"])
     if not request.formats:
         raise RequestError("found no formats")
-    request = replace(request, max_pixels=max_pixels, frames=frames, truths=truths, bracket=bracket)
-    request = replace(request, baselines=baselines)
+    request = replace(
+        request,
+        max_pixels=max_pixels,
+        frames=rendition.frames,
+        bracket=() if rendition.ev is None else (rendition.ev,),
+        truths=(rendition.role,) if rendition.role in TRUTHS else (),
+        baselines=(rendition.role,) if rendition.role in BASELINES else (),
+    )
     path = inputs[0] if inputs else Path(values["input"])
     others = tuple(path.parent / str(each["file"]) for each in values.get("subframes", ())[1:])
     job = Job(
@@ -186,7 +184,7 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
         request.image_name,
         name,
         values=request.image,
-        pictures=(picture,),
+        renditions=(rendition,),
         subframes=others,
     )
     return Replay(request, job, surroundings_in(values), digests_in(values))

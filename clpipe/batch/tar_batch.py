@@ -23,6 +23,7 @@ from clpipe.batch.tars import OF_PATCHES, STAGING, Members, Tar, prepare
 from clpipe.batch.threads import Batch
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.chain import Chain
+from clpipe.chain.rendition import FIRST, Rendition
 from clpipe.engine.device import Device
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
@@ -44,15 +45,17 @@ class StagedWriter(OutputWriter):
 
     folders: Mapping[str, str] = field(default_factory=dict)  # by the stem of a job
 
-    def path(self, job: Job, ending: str, name: str = "", patch: int | None = None) -> Path:
+    def path(
+        self, job: Job, ending: str, rendition: Rendition = FIRST, patch: int | None = None
+    ) -> Path:
         """The file of a job with an ending, until it is packed."""
-        path = super().path(job, ending, name, patch).relative_to(self.folder)
+        path = super().path(job, ending, rendition, patch).relative_to(self.folder)
         return self.folder / self.folders[job.stem] / path
 
-    def existing(self, job: Job, name: str) -> Existing:
+    def existing(self, job: Job, rendition: Rendition) -> Existing:
         """The files of a rendition, in a folder that is clpipe's own."""
         # One that was passing at a loss of power may not even say whose it is.
-        return replace(super().existing(job, name), is_ours=True)
+        return replace(super().existing(job, rendition), is_ours=True)
 
     def write(self, *arguments: Any) -> dict[Path, Stored]:
         """Write the images of one rendition, which pass into the tar; its sidecar is to last."""
@@ -74,26 +77,28 @@ class Packer:
     def _old(self) -> Members:
         return Members(self._tar.path)
 
-    def _member(self, job: Job, name: str) -> str:
+    def _member(self, job: Job, rendition: Rendition) -> str:
         """The name of a rendition's sidecar in the tar."""
         folder = OF_PATCHES if self._writer.patches else ""
-        return folder + self._packed_as(self._writer.path(job, SIDECAR, name))
+        return folder + self._packed_as(self._writer.path(job, SIDECAR, rendition))
 
     def _packed_as(self, path: Path) -> str:
         return path.relative_to(self._tar.staging).as_posix()
 
-    def found(self, job: Job, name: str, request: Mapping[str, Any], resuming: Resuming) -> Found:
+    def found(
+        self, job: Job, rendition: Rendition, request: Mapping[str, Any], resuming: Resuming
+    ) -> Found:
         """Whether the tar holds a rendition that was made by the same request.
 
         If it is kept, it is reused. A tar does not say when its files were touched, so their
         SHA-256 is always compared. Arguments as for
         :meth:`clpipe.outputs.existing.Existing.found`.
         """
-        member = self._member(job, name)
+        member = self._member(job, rendition)
         with self._lock:
             values = self._old.sidecar(member)
         listed = outputs_in(values)
-        pictures = {path.name for path in self._writer.existing(job, name).pictures}
+        pictures = {path.name for path in self._writer.existing(job, rendition).pictures}
         if not pictures <= listed.keys():
             return Found.NOTHING
         found = found_in(values, job, request, resuming.verify)
@@ -152,13 +157,13 @@ class Packer:
                 yield from self._by_patch(job, members) if self._writer.patches else members
 
     def _members_of(self, job: Job) -> Iterator[tuple[str, Source]]:
-        for name in self._writer.names_of(job):
-            member = self._member(job, name)
+        for rendition in self._writer.renditions_of(job):
+            member = self._member(job, rendition)
             if files := self._reused.get(member):
                 for file in (*files, member):
                     yield file, self._old.places[file]
                 continue
-            sidecar = self._writer.path(job, SIDECAR, name)
+            sidecar = self._writer.path(job, SIDECAR, rendition)
             for path in (sidecar.with_name(n) for n in outputs_in(read_sidecar(sidecar))):
                 yield self._packed_as(path), path
             yield member, sidecar
@@ -167,7 +172,8 @@ class Packer:
         self, job: Job, members: Iterator[tuple[str, Source]]
     ) -> Iterator[tuple[str, Source]]:
         """The same with the files of each patch together, and what is said of it behind them."""
-        first, *_ = names = [self._member(job, name) for name in self._writer.names_of(job)]
+        renditions = self._writer.renditions_of(job)
+        first, *_ = names = [self._member(job, each) for each in renditions]
         samples: dict[str, list[tuple[str, Source]]] = {}
         for member, source in members:
             if member in names:
@@ -178,7 +184,7 @@ class Packer:
         if first in self._reused:
             values = self._old.sidecar(first)
         else:
-            values = read_sidecar(self._writer.path(job, SIDECAR, self._writer.names_of(job)[0]))
+            values = read_sidecar(self._writer.path(job, SIDECAR, renditions[0]))
         for number, (key, files) in enumerate(samples.items()):
             yield from files
             yield f"{key}.{SIDECAR}", patch_text(values, number)
@@ -217,13 +223,13 @@ class TarWorker(ImageWorker):
         super().__init__(*arguments)
         self._packers = packers
 
-    def found(self, job: Job, name: str, request: Mapping[str, Any]) -> Found:
+    def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> Found:
         """Whether a rendition is done, in its tar or in the folder that will be packed."""
-        packed = self._packers.of(job).found(job, name, request, self._resuming)
+        packed = self._packers.of(job).found(job, rendition, request, self._resuming)
         if packed is not Found.NOTHING:
             return packed
         # After a loss of power a passing file may have its size and time, but not its bytes.
-        return self.writer.existing(job, name).found(job, request, verify=True)
+        return self.writer.existing(job, rendition).found(job, request, verify=True)
 
 
 class Packers:

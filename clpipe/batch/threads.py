@@ -25,13 +25,13 @@ from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.find import Job
-from clpipe.outputs.renditions import Rendition
+from clpipe.outputs.recipes import Recipe
 
 # A task and those of its renditions that are not developed yet.
-Decoded = tuple[Task, deque[Rendition]]
+Decoded = tuple[Task, deque[Recipe]]
 
 # A rendition between a device and its files.
-Developed = tuple[Task, Rendition, Result, Device | None]
+Developed = tuple[Task, Recipe, Result, Device | None]
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Begun:
     """A rendition that a device works on, and what waits for its result."""
 
     decoded: Decoded
-    rendition: Rendition
+    recipe: Recipe
     finish: Callable[[], Result | None]
 
 
@@ -239,8 +239,8 @@ class Batch:
                 (span,) = task.spans
                 start = span.start + seconds
                 task.spans = [replace(span, start=start, seconds=span.seconds - seconds)]
-            if task.renditions:
-                self._decoded.put((task, deque(task.renditions)))
+            if task.recipes:
+                self._decoded.put((task, deque(task.recipes)))
             else:
                 self._outcomes.put(task.outcome())
             del task
@@ -257,7 +257,7 @@ class Batch:
         if not self._begun.is_set():
             writer.check_folder()
         self._begun.set()
-        results = min(len(writer.names_of(job)), self.threads + len(self.devices))
+        results = min(len(writer.renditions_of(job)), self.threads + len(self.devices))
         beside = 2 * worker.layers + bool(job.subframes)
         # Baselines are measured on floats.
         formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
@@ -327,17 +327,17 @@ class Batch:
             finish: Callable[[], Result | None] = no_result
             while asked.spread and begun:  # its noise is measured on those before it
                 self._finish(begun, device)
-            rendition = asked
+            recipe = asked
             try:
                 if not task.error:
-                    rendition = self._worker.measured(task, asked)
-                    finish = self._worker.begin(task, rendition, runners.of(rendition))
+                    recipe = self._worker.measured(task, asked)
+                    finish = self._worker.begin(task, recipe, runners.of(recipe))
             except DeviceError:
                 self._results.release()
                 raise
             except BaseException as error:
                 task.error = failure_text(task.job, error)
-            begun.append(Begun(decoded, rendition, finish))
+            begun.append(Begun(decoded, recipe, finish))
             if len(begun) >= depth_of(device):
                 self._finish(begun, device)
 
@@ -355,10 +355,10 @@ class Batch:
             raise
         except BaseException as error:
             task.error = failure_text(task.job, error)
-        rendition = begun.popleft().rendition
+        recipe = begun.popleft().recipe
         left.popleft()
         if result:
-            self._developed.put((task, rendition, result, device))
+            self._developed.put((task, recipe, result, device))
         else:
             self._count_written(task)
 

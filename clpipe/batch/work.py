@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -19,6 +19,7 @@ from clpipe.chain.baseline import STEP, with_noise
 from clpipe.chain.chain import Chain
 from clpipe.chain.depth import depth_steps
 from clpipe.chain.formats import DNG
+from clpipe.chain.rendition import FIRST, Rendition
 from clpipe.engine.clipping import clipped_share
 from clpipe.engine.device import Device, Timing
 from clpipe.engine.extents import Box
@@ -29,7 +30,7 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.existing import AS_USUAL, Found, Resuming
 from clpipe.outputs.patches import Patch, every_patch
-from clpipe.outputs.renditions import Rendition
+from clpipe.outputs.recipes import Recipe
 from clpipe.outputs.sealed import SIDECAR, write_sidecar
 from clpipe.outputs.sidecar import intrinsics_of, sidecar
 from clpipe.outputs.writer import OutputWriter
@@ -49,7 +50,7 @@ class Task:
     source: SourceImage | None = None
     stamps: Sequence[tuple[int, int]] = ()  # of the files of its exposure
     request: Mapping[str, Any] = field(default_factory=dict)  # its record
-    renditions: list[Rendition] = field(default_factory=list)
+    recipes: list[Recipe] = field(default_factory=list)
     unwritten: int = 0  # renditions
     status: str = DONE
     error: str = ""
@@ -149,10 +150,10 @@ class ImageWorker:
             try:
                 task.loader = self.loader.for_job(job)
                 task.request = self._request_of(task)
-                names = self._missing(task)
-                if names:
+                renditions = self._missing(task)
+                if renditions:
                     begin()
-                    self._load(task, names)
+                    self._load(task, renditions)
                 else:
                     task.status = SKIPPED
             except (ImageError, RequestError, MemoryError) as error:
@@ -174,34 +175,33 @@ class ImageWorker:
     def _general_request(self) -> Mapping[str, Any]:
         return self.writer.request.record()
 
-    def _missing(self, task: Task) -> list[str]:
-        """The names of a job's renditions that are to be made."""
-        names = self.writer.names_of(task.job)
+    def _missing(self, task: Task) -> Set[Rendition]:
+        """A job's renditions that are to be made."""
+        renditions = self.writer.renditions_of(task.job)
         if self._resuming.overwrite:
-            return list(names)
+            return set(renditions)
         found = {
-            name: self.found(task.job, name, self.writer.record_of(task.job, task.request, name))
-            for name in names
+            each: self.found(task.job, each, self.writer.record_of(task.request, each))
+            for each in renditions
         }
         task.old = sum(there is Found.OLD for there in found.values())
-        missing = [name for name, there in found.items() if not self._resuming.is_kept(there)]
-        needed = self.writer.plan_of(task.job).needed(missing)
-        return [name for name in self.writer.plan_of(task.job).names() if name in needed]
+        missing = [each for each, there in found.items() if not self._resuming.is_kept(there)]
+        return self.writer.plan_of(task.job).needed(missing)
 
-    def found(self, job: Job, name: str, request: Mapping[str, Any]) -> Found:
+    def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> Found:
         """Whether a rendition is there already, made by the same request.
 
         Args:
             job: the image.
-            name: of the rendition.
+            rendition: which it is.
             request: its record, see :meth:`OutputWriter.record_of`.
 
         Raises:
             ImageError: a file of its name is somebody else's.
         """
-        return self.writer.existing(job, name).found(job, request, self._resuming.verify)
+        return self.writer.existing(job, rendition).found(job, request, self._resuming.verify)
 
-    def _load(self, task: Task, names: Sequence[str]) -> None:
+    def _load(self, task: Task, renditions: Set[Rendition]) -> None:
         """Load a task's image, and decide which renditions are made of it.
 
         Raises:
@@ -219,32 +219,30 @@ class ImageWorker:
         if patches := self.writer.patches:
             height, width = loaded.source.pixels.shape[:2]
             task.patches = every_patch(patches, loaded.chain, width, height, job.key)
-        if any(self.writer.carries(job, name) for name in names):
+        if any(map(self.writer.carries, renditions)):
             turn = self.writer.turn_of(loaded.source, loaded.chain)
             task.carried = task.loader.carried(job, loaded, turn)
         task.source = loaded.source
-        renditions = self.writer.plan_of(job).renditions(loaded.chain, loaded.key)
-        task.renditions = [rendition for rendition in renditions if rendition.name in names]
-        task.unwritten = len(task.renditions)
+        recipes = self.writer.plan_of(job).recipes(loaded.chain, loaded.key)
+        task.recipes = [recipe for recipe in recipes if recipe.rendition in renditions]
+        task.unwritten = len(task.recipes)
 
     @staticmethod
-    def measured(task: Task, rendition: Rendition) -> Rendition:
-        """A rendition with its noise, where that is measured on the results of those before it."""
-        if not rendition.spread:
-            return rendition
-        method, estimates = rendition.spread.method(rendition.baseline)
-        chain = with_noise(rendition.chain, method)
-        known = replace(rendition, chain=chain, spread=None, estimates=estimates)
-        task.renditions[task.renditions.index(rendition)] = known
+    def measured(task: Task, recipe: Recipe) -> Recipe:
+        """A recipe with its noise, where that is measured on the results of those before it."""
+        if not recipe.spread:
+            return recipe
+        method, estimates = recipe.spread.method(recipe.rendition.role)
+        chain = with_noise(recipe.chain, method)
+        known = replace(recipe, chain=chain, spread=None, estimates=estimates)
+        task.recipes[task.recipes.index(recipe)] = known
         return known
 
-    def develop(self, task: Task, rendition: Rendition, runner: Runner) -> Result | None:
+    def develop(self, task: Task, recipe: Recipe, runner: Runner) -> Result | None:
         """Develop one rendition; None where it fails."""
-        return self.begin(task, rendition, runner)()
+        return self.begin(task, recipe, runner)()
 
-    def begin(
-        self, task: Task, rendition: Rendition, runner: Runner
-    ) -> Callable[[], Result | None]:
+    def begin(self, task: Task, recipe: Recipe, runner: Runner) -> Callable[[], Result | None]:
         """Begin to develop one rendition.
 
         Returns:
@@ -257,20 +255,20 @@ class ImageWorker:
         start, pixels = time.perf_counter(), task.source.pixels
         timings: list[Timing] | None = [] if self._trace and runner.device else None
         boxes = [patch.box for patch in task.patches]
-        work = partial(self._submit, pixels, rendition, runner, timings, boxes)
+        work = partial(self._submit, pixels, recipe, runner, timings, boxes)
         wait = self._tried(task, work)
 
         def finish() -> Result | None:
             result = self._tried(task, wait) if wait else None
             task.note("device", start)
             if result and result.final is not None:
-                for spread in {each.spread for each in task.renditions if each.spread}:
-                    spread.take(rendition.name, result.final)
-            if result and rendition.estimates:
-                result.estimates[STEP] = dict(rendition.estimates)
+                for spread in {each.spread for each in task.recipes if each.spread}:
+                    spread.take(recipe.rendition, result.final)
+            if result and recipe.estimates:
+                result.estimates[STEP] = dict(recipe.estimates)
             name = threading.current_thread().name
             task.spans += [Span(t.name, name, t.start, t.seconds) for t in timings or []]
-            if result and rendition is task.renditions[-1] and DNG not in self.writer.formats:
+            if result and recipe is task.recipes[-1] and DNG not in self.writer.formats:
                 # Of the pixels only their shape is still needed; their memory is not.
                 assert task.source
                 empty = np.broadcast_to(np.float16(0), task.source.pixels.shape)
@@ -282,7 +280,7 @@ class ImageWorker:
     def _submit(
         self,
         pixels: Array,
-        rendition: Rendition,
+        recipe: Recipe,
         runner: Runner,
         timings: list[Timing] | None,
         boxes: Sequence[Box],
@@ -292,7 +290,7 @@ class ImageWorker:
         shape = (height, width, *pixels.shape[2:])
         reused = runner.encode and runner.device and not boxes
         into = self._spare.take(shape) if reused else None
-        key = rendition.noise_key
+        key = recipe.noise_key
         return runner.submit(pixels, key, timings, into=into, unchanged=True, boxes=boxes)
 
     @staticmethod
@@ -304,9 +302,7 @@ class ImageWorker:
             task.error = task.loader.error_text(task.job, error)
             return None
 
-    def encode(
-        self, task: Task, rendition: Rendition, result: Result, device: Device | None
-    ) -> None:
+    def encode(self, task: Task, recipe: Recipe, result: Result, device: Device | None) -> None:
         """Write one rendition and then its sidecar.
 
         Raises:
@@ -317,18 +313,17 @@ class ImageWorker:
         with task.timed("encode"):
             try:
                 carried = None
-                if writer.carries(job, rendition.name):
+                if writer.carries(recipe.rendition):
                     carried, task.carried = task.carried, None
-                files = writer.write(job, rendition, task.source, result, carried, task.patches)
-                clipped = None if rendition.noise else clipped_share(result, rendition.chain)
+                files = writer.write(job, recipe, task.source, result, carried, task.patches)
+                clipped = None if recipe.noise else clipped_share(result, recipe.chain)
                 task.clipped = max(task.clipped, clipped or 0.0)
-                path = writer.path(job, SIDECAR, rendition.name)
+                path = writer.path(job, SIDECAR, recipe.rendition)
                 record = sidecar(
                     job,
-                    writer.record_of(job, task.request, rendition.name),
+                    writer.record_of(task.request, recipe.rendition),
                     task.stamps,
-                    rendition,
-                    writer.plan_of(job).frames,
+                    recipe,
                     device,
                     task.source,
                     result,
@@ -365,7 +360,7 @@ class Runners:
     ) -> None:
         self._writer = writer
         self._device = device
-        first = writer.runner(Rendition("", chain, ""), device)
+        first = writer.runner(Recipe(FIRST, chain, (), ""), device)
         try:
             first.warm_up(half)
         except ImageError as error:  # not even one of 8x8 pixels fits
@@ -373,16 +368,16 @@ class Runners:
         self._latest = [(chain, first)]
         self._by_results = {(first.keep, first.encode, first.final): first}
 
-    def of(self, rendition: Rendition) -> Runner:
+    def of(self, recipe: Recipe) -> Runner:
         """The runner of a rendition."""
         for chain, runner in self._latest:
-            if chain is rendition.chain:
+            if chain is recipe.chain:
                 return runner
-        runner = self._writer.runner(rendition, self._device)
+        runner = self._writer.runner(recipe, self._device)
         alike = self._by_results.setdefault((runner.keep, runner.encode, runner.final), runner)
         if alike is not runner:
-            runner = alike.of(rendition.chain)  # shares the plans
-        self._latest.insert(1, (rendition.chain, runner))
+            runner = alike.of(recipe.chain)  # shares the plans
+        self._latest.insert(1, (recipe.chain, runner))
         del self._latest[4:]
         return runner
 

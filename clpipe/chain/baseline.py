@@ -8,10 +8,9 @@ from functools import lru_cache
 
 from clpipe.base.errors import RequestError
 from clpipe.chain.chain import Chain
-from clpipe.chain.truth import CLEAN, picture_without_noise
+from clpipe.chain.rendition import CLEAN
+from clpipe.chain.truth import picture_without_noise
 from clpipe.stages.picture_noise import IidGaussian, IntensityDependent, NoNoise
-
-IID, INTENSITY = BASELINES = ("iid", "intensity")
 
 STEP = "picture_noise"  # the step that adds it
 

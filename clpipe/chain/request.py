@@ -19,9 +19,10 @@ from clpipe.chain.files import load_config
 from clpipe.chain.formats import EVERY_FORMAT, NPY
 from clpipe.chain.keys import KEYS, NOISE, TABLES
 from clpipe.chain.registry import code_files, load_stage_file
+from clpipe.chain.rendition import MOSAIC
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import parse_assignment
-from clpipe.chain.truth import MOSAIC, noisy_mosaic
+from clpipe.chain.truth import noisy_mosaic
 from clpipe.stage import Kind
 
 DEFAULTS = Settings()
@@ -86,7 +87,7 @@ class Request:
         formats: of the last image; () follows from the chain, see :meth:`with_outputs`.
         keep: steps whose image is written too, or "all".
         frames: how many frames of each image; None is one picture instead of a burst.
-        truths: which of :data:`clpipe.chain.truth.TRUTHS` are written beside each picture.
+        truths: which of :data:`clpipe.chain.rendition.TRUTHS` are written beside each picture.
         carry: layers that go along with each picture, as :func:`clpipe.chain.carry.parse_carry`
             reads them.
         companions: patterns of the names of files that hold them; () are those beside an image.
@@ -95,7 +96,7 @@ class Request:
             ``keep``. See :meth:`with_outputs`.
         bracket: what is added to the exposure's EV, for each exposure that is made of each image;
             () is one exposure.
-        baselines: which of :data:`clpipe.chain.baseline.BASELINES` are made beside each picture.
+        baselines: which of :data:`clpipe.chain.rendition.BASELINES` are made beside each picture.
         patch: the sides of patches in px, which are written in place of pictures; None is pictures.
         patches_per_image: how many of each picture, at random places, or "grid"; 0 without patches.
         augment: whether patches are flipped and turned.

@@ -10,16 +10,12 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.registry import user_code_errors
+from clpipe.chain.rendition import CLEAN
 from clpipe.stage import Kind, ReferenceContext
-
-DEVELOPMENT, CLEAN, MOSAIC, VARIANCE = TRUTHS = ("development", "clean", "mosaic", "variance")
-
-# What is the same picture without noise; the others are of its mosaic.
-PICTURES = (DEVELOPMENT, CLEAN)
 
 
 def picture_without_noise(truth: str, chain: Chain) -> Chain:
-    """The chain of a truth that is a picture, one of :data:`PICTURES`.
+    """The chain of a truth that is a picture, :data:`~clpipe.chain.rendition.PICTURES`.
 
     "development" is developed exactly as the noisy picture is: denoised as strongly, and sharpened
     as much. So their difference is the noise that is left. "clean" is the picture that is wanted:

@@ -14,8 +14,8 @@ from rich.console import Console
 from clpipe.base.errors import RequestError
 from clpipe.batch.dask_worker import RunSpec
 from clpipe.batch.run_log import RunLog, Summary, log_name
+from clpipe.chain.rendition import CLEAN, TRUTHS
 from clpipe.chain.request import Request
-from clpipe.chain.truth import CLEAN, TRUTHS
 from clpipe.commands.chain_options import carry_option, format_option, series_options
 from clpipe.commands.input_options import poses_option
 from clpipe.commands.options import Command, device_option, options_set

@@ -101,7 +101,7 @@ class Reporter:
             self.print(f"{outcome.job.path} -> {self._files(outcome)}")
 
     def _files(self, outcome: Outcome) -> str:
-        first, *others = self._writer.names_of(outcome.job)
+        first, *others = self._writer.renditions_of(outcome.job)
         text = str(self._writer.existing(outcome.job, first).pictures[0])
         if others:
             text += f" and {len(others)} more"

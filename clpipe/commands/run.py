@@ -19,11 +19,10 @@ from clpipe.batch.replay import Replay, replay_of
 from clpipe.batch.run_log import RunLog, Summary, log_name
 from clpipe.batch.tars import Tar, cut
 from clpipe.batch.trace import Trace, check_trace
-from clpipe.chain.baseline import BASELINES
 from clpipe.chain.chain import Chain
 from clpipe.chain.identity import MAX_FRAMES
+from clpipe.chain.rendition import BASELINES, TRUTHS, parse_bracket
 from clpipe.chain.request import Request
-from clpipe.chain.truth import TRUTHS
 from clpipe.commands.chain_options import (
     carry_option,
     companion_option,
@@ -53,7 +52,6 @@ from clpipe.outputs.existing import Resuming
 from clpipe.outputs.folder import output_folder, remove_unfinished
 from clpipe.outputs.gone import pictures_without_input
 from clpipe.outputs.patches import PER_IMAGE
-from clpipe.outputs.renditions import parse_bracket
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
@@ -351,8 +349,8 @@ def check_read_options(request: Request, chain: Chain) -> None:
 
 def is_the_same(replay: Replay, writer: OutputWriter) -> bool:
     """Say whether a replay has made the bytes that its sidecar lists."""
-    (name,) = writer.names_of(replay.job)
-    existing = writer.existing(replay.job, name)
+    (rendition,) = writer.renditions_of(replay.job)
+    existing = writer.existing(replay.job, rendition)
     try:
         same, text = replay.comparison(existing.sidecar)
     except ImageError as error:

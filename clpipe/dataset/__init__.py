@@ -5,5 +5,6 @@ Nothing is written. It imports ``pipeline`` and below, but not ``batch`` and ``a
 
 from clpipe.dataset.dataset import Dataset
 from clpipe.dataset.raw_noise import RawNoise
+from clpipe.outputs.patches import Patches
 
-__all__ = ["Dataset", "RawNoise"]
+__all__ = ["Dataset", "Patches", "RawNoise"]

@@ -65,7 +65,7 @@ def _sites(pattern: Pattern) -> tuple[tuple[int, int], ...]:
 
 
 @dataclass(frozen=True)
-class Form:
+class ArrayFormat:
     """How the arrays of a sample look.
 
     Args:

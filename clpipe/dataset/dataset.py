@@ -2,7 +2,6 @@
 
 import copy
 import hashlib
-import os
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -10,25 +9,20 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 from clpipe.base.errors import RequestError
-from clpipe.base.memory import parse_size
 from clpipe.base.processors import available_processors
 from clpipe.base.readonly import ReadOnly
-from clpipe.base.text import one_of
 from clpipe.base.validation import typed
+from clpipe.chain.rendition import DEVELOPMENT
 from clpipe.chain.request import Request
-from clpipe.chain.truth import DEVELOPMENT
-from clpipe.dataset.arrays import Form, dtype_named
-from clpipe.dataset.developer import Sample, Wanted
+from clpipe.dataset.arrays import ArrayFormat, dtype_named
+from clpipe.dataset.developer import Sample, SampleSpec
+from clpipe.dataset.inputs import cache_size, jobs_of, several
 from clpipe.dataset.numbering import Numbering
-from clpipe.dataset.samples import Maker, Work
+from clpipe.dataset.samples import SampleBatch, SampleLoader
 from clpipe.images.openimageio import set_codec_threads
-from clpipe.images.read import TRANSFERS
-from clpipe.inputs.find import Job, find_jobs
 from clpipe.inputs.loader import ImageLoader, LoadedImage
-from clpipe.outputs.patches import PER_IMAGE, Patches
+from clpipe.outputs.patches import Patches
 from clpipe.pipeline import plain
-
-NOWHERE = Path(os.devnull)  # nothing is written
 
 
 class Dataset(ReadOnly):
@@ -86,10 +80,7 @@ class Dataset(ReadOnly):
         layer: the layer of an EXR that is the picture; None chooses.
         transfer: the transfer curve of renders in whole numbers: "srgb" or "linear".
         exclude: patterns of files that are not taken from folders and globs, such as depth.
-        patch: the sides of patches, in px; None is whole pictures.
-        patches_per_image: how many, at random places; "grid" is all side by side that cover each
-            picture (but for a last odd column or row), the last ones overlapping.
-        augment: whether patches are flipped and turned by 90 degrees, at random.
+        patch: the sides of patches, in px, or :class:`~clpipe.Patches`; None is whole pictures.
         raw: whether a sample has its raw, too: "mosaic" is (height, width), "packed" is its planes,
             (4, height/2, width/2) in R, Gr, Gb, B, whatever the pattern.
         variance: whether a sample has the variance of its noise, in the form of ``raw``, else as a
@@ -125,11 +116,9 @@ class Dataset(ReadOnly):
         carry: str | Sequence[str] = (),
         companions: str | Sequence[str] = (),
         layer: str | None = None,
-        transfer: str | None = None,
+        transfer: Literal["srgb", "linear"] | None = None,
         exclude: str | Sequence[str] = (),
-        patch: int | None = None,
-        patches_per_image: int | Literal["grid"] = PER_IMAGE,
-        augment: bool = False,
+        patch: int | Patches | None = None,
         raw: Literal["packed", "mosaic"] | None = None,
         variance: bool = False,
         dtype: Any = None,
@@ -140,13 +129,10 @@ class Dataset(ReadOnly):
         threads: int | None = None,
         **settings: Any,
     ) -> None:
-        if transfer is not None and transfer not in TRANSFERS:
-            raise RequestError(one_of("transfer", transfer, TRANSFERS))
-        limited = {"epochs": epochs, "threads": threads, "patch": patch}
-        for name, number in limited.items():
+        for name, number in {"epochs": epochs, "threads": threads}.items():
             if number is not None and number < 1:
                 raise RequestError(f"found {name} {number}; expected 1 or more, or None")
-        self._patches = _patches(patch, patches_per_image, augment, raw)
+        self._patches = Patches(patch) if isinstance(patch, int) else patch
         request = Request.from_options(
             config=None if config is None else str(config),
             values=plain(settings),
@@ -154,30 +140,23 @@ class Dataset(ReadOnly):
             until=until,
             layer=layer,
             transfer=transfer,
-            carry=(carry,) if isinstance(carry, str) else tuple(carry),
-            companions=(companions,) if isinstance(companions, str) else tuple(companions),
+            carry=several(carry),
+            companions=several(companions),
         )
         loader = ImageLoader(request)
-        several = [inputs] if isinstance(inputs, str | Path) else inputs
-        patterns = [exclude] if isinstance(exclude, str) else exclude
-        named = [str(i) for i in several]
-        found = find_jobs(named, NOWHERE, loader.endings(), patterns)
-        self._jobs = loader.exposures(found)
-        loader.check(self._jobs)
-        _check_files(self._jobs)
-        _check_keys(self._jobs)
+        self._jobs = jobs_of(loader, several(inputs), several(exclude))
         chain = loader.first_chain(self._jobs)
         if truth is None and patch and any(step.adds_noise for step in chain.steps):
             truth = "clean"
-        wanted = Wanted(
-            form=Form(dtype_named(dtype), channels_first, raw),
-            keep=chain.select([keep] if isinstance(keep, str) else keep),
+        spec = SampleSpec(
+            arrays=ArrayFormat(dtype_named(dtype), channels_first, raw),
+            keep=chain.select(several(keep)),
             truth=DEVELOPMENT if truth is True else truth or None,
             variance=variance,
         )
-        wanted.check(chain)
+        spec.check(chain, self._patches)
         selector = None if device is None else str(device)
-        self._maker = Maker(loader, wanted, self._patches, _cache_size(cache), selector)
+        self._loader = SampleLoader(loader, spec, self._patches, cache_size(cache), selector)
         self._label = loader.settings.label
         self._epochs = epochs
         self._threads = threads or available_processors()
@@ -267,8 +246,8 @@ class Dataset(ReadOnly):
         for group in groups.values():
             epoch, image, _ = places[group[0]]
             numbers = [places[i][2] for i in group]
-            work = Work(self._jobs[image], self._epoch + epoch, numbers)
-            made = self._maker.begin(work, *self._maker.read(work))()
+            batch = SampleBatch(self._jobs[image], self._epoch + epoch, numbers)
+            made = self._loader.begin(batch, *self._loader.read(batch))()
             for i, sample in zip(group, made, strict=True):
                 samples[i] = sample
         return samples
@@ -286,9 +265,9 @@ class Dataset(ReadOnly):
         developer = ThreadPoolExecutor(1, "device")
         self._next, self._first = self._first, 0
         try:
-            for work in self._work(self._next):
-                read = decoders.submit(self._maker.read, work)
-                ahead.append(developer.submit(self._begin_read, work, read))
+            for batch in self._batches(self._next):
+                read = decoders.submit(self._loader.read, batch)
+                ahead.append(developer.submit(self._begin_read, batch, read))
                 if len(ahead) > self._threads + 1:
                     yield from self._counted(ahead.popleft().result()())
             while ahead:
@@ -296,12 +275,12 @@ class Dataset(ReadOnly):
         finally:
             decoders.shutdown(cancel_futures=True)
             developer.shutdown(cancel_futures=True)
-            self._maker.drain()
+            self._loader.drain()
 
     def _begin_read(
-        self, work: Work, read: Future[tuple[LoadedImage, Sample]]
+        self, batch: SampleBatch, read: Future[tuple[LoadedImage, Sample]]
     ) -> Callable[[], list[Sample]]:
-        return self._maker.begin(work, *read.result())
+        return self._loader.begin(batch, *read.result())
 
     def _counted(self, samples: Sequence[Sample]) -> Iterator[Sample]:
         for sample in samples:
@@ -315,7 +294,7 @@ class Dataset(ReadOnly):
             ImageError: the size of an image is needed, and cannot be read.
         """
         if self._numbered is None:
-            self._numbered = Numbering([self._maker.count(job, self._epoch) for job in self._jobs])
+            self._numbered = Numbering([self._loader.count(job, self._epoch) for job in self._jobs])
         return self._numbered
 
     def _place(self, index: int) -> tuple[int, int, int]:
@@ -329,78 +308,15 @@ class Dataset(ReadOnly):
             raise IndexError(f"found sample {index}; there are {len(self)}")
         return self._numbering().place(number)
 
-    def _work(self, first: int) -> Iterator[Work]:
+    def _batches(self, first: int) -> Iterator[SampleBatch]:
         """What is to be developed, image by image, from a sample on."""
         if self._jobs:
             for epoch, image, numbers in self._numbering().groups(first):
                 if epoch == self._epochs:
                     return
-                yield Work(self._jobs[image], self._epoch + epoch, numbers)
+                yield SampleBatch(self._jobs[image], self._epoch + epoch, numbers)
 
     def _digest(self) -> str:
         """What tells the images and patches of one dataset from those of another."""
         named = [self._patches, *(job.key for job in self._jobs)]
         return hashlib.sha256(repr(named).encode()).hexdigest()
-
-
-def _patches(
-    size: int | None, per_image: int | Literal["grid"], augment: bool, raw: str | None
-) -> Patches | None:
-    """Which patches are asked for; None is whole pictures.
-
-    Raises:
-        RequestError: what is asked for cannot be.
-    """
-    if per_image != "grid" and per_image < 1:
-        raise RequestError(f"found patches_per_image {per_image}; expected 1 or more, or 'grid'")
-    if size is None:
-        if augment:
-            raise RequestError("augment: it flips and turns patches; set patch=SIZE as well")
-        return None
-    if raw == "packed" and size % 2:
-        raise RequestError(
-            f"found patch {size}; a packed raw has planes of half the size, so give an even one"
-        )
-    return Patches(size, per_image, augment)
-
-
-def _cache_size(cache: int | str) -> int:
-    """The bytes of a number, or of a text with a unit.
-
-    Raises:
-        RequestError: it is neither.
-    """
-    try:
-        size = parse_size(cache) if isinstance(cache, str) else cache
-    except RequestError:
-        size = -1
-    if size < 0:
-        raise RequestError(f"found cache {cache!r}; expected bytes, or a size such as 512M or 4G")
-    return size
-
-
-def _check_files(jobs: Sequence[Job]) -> None:
-    """See that the files that are named exist; those of a folder were found there.
-
-    Raises:
-        RequestError: one does not.
-    """
-    for job in jobs:
-        if job.listed and not job.path.exists():
-            raise RequestError(f"{job.label}: no such file or folder")
-
-
-def _check_keys(jobs: Sequence[Job]) -> None:
-    """See that no two images have the same name, and so the same draws.
-
-    Raises:
-        RequestError: two have.
-    """
-    owners: dict[str, Job] = {}
-    for job in jobs:
-        other = owners.setdefault(job.key, job)
-        if other is not job:
-            raise RequestError(
-                f"{other.label} and {job.label} are both called {job.key}, and what is drawn for "
-                "them would be the same; give the folder that both are in"
-            )

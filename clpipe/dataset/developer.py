@@ -2,66 +2,71 @@
 
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
+from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.truth import noisy_mosaic, picture_without_noise
-from clpipe.dataset.arrays import Form
-from clpipe.dataset.recent import Recent
+from clpipe.dataset.arrays import ArrayFormat
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
-from clpipe.outputs.patches import Patch, facts_of, pattern_of, variance_at, variance_steps
+from clpipe.outputs.patches import Patch, Patches, facts_of, pattern_of, variance_at, variance_steps
 from clpipe.stage import Kind
 
 Sample = dict[str, Any]
-KEPT = 1024  # chains, of 50 KB each, since patches of one image may be asked for at any time
+MAX_CHAINS = 1024  # of 50 KB each, since patches of one image may be asked for at any time
 
 
 @dataclass(frozen=True)
-class Wanted:
+class SampleSpec:
     """What a sample has.
 
     Args:
-        form: how its arrays look.
+        arrays: how they look.
         keep: steps whose image it has.
         truth: which picture without noise it has, as :func:`picture_without_noise` takes it.
         variance: whether it has the variance of the noise in its mosaic.
     """
 
-    form: Form
+    arrays: ArrayFormat
     keep: tuple[str, ...]
     truth: str | None
     variance: bool
 
-    def check(self, chain: Chain) -> None:
-        """See that a chain makes it.
+    def check(self, chain: Chain, patches: Patches | None) -> None:
+        """See that a chain makes it, of patches where there are any.
 
         Raises:
             RequestError: it does not.
         """
-        self.form.check(chain.result)
+        if patches and self.arrays.raw == "packed" and patches.size % 2:
+            raise RequestError(
+                f"found patch {patches.size}; a packed raw has planes of half the size, so give an "
+                "even one"
+            )
+        self.arrays.check(chain.result)
         if self.truth:
             picture_without_noise(self.truth, chain)  # refuses a chain that adds no noise
-        if self.form.raw:
-            raw_step(chain, self.form)
+        if self.arrays.raw:
+            raw_step(chain, self.arrays)
         if self.variance:
             variance_steps(chain)
 
 
-def raw_step(chain: Chain, form: Form) -> str:
+def raw_step(chain: Chain, arrays: ArrayFormat) -> str:
     """The step whose image is the raw: the last one in DN, or the noisy mosaic in signal.
 
     Raises:
         RequestError: there is none.
     """
-    if not form.is_in_dn:
+    if not arrays.is_in_dn:
         return noisy_mosaic(chain).steps[-1].name
     names = [step.name for step in chain.steps if step.stage.writes is Kind.RAW]
     if not names:
@@ -88,19 +93,24 @@ class Developer:
 
     Args:
         device: where; None is NumPy.
-        wanted: what of each.
+        spec: what of each.
     """
 
-    def __init__(self, device: Device | None, wanted: Wanted) -> None:
+    def __init__(self, device: Device | None, spec: SampleSpec) -> None:
         self.process = os.getpid()
         self._device = device
-        self._wanted = wanted
+        self._spec = spec
         self._lock = threading.Lock()
-        self._prepared: Recent[Prepared] = Recent(KEPT)
+        self._prepared: BoundedCache[Prepared] = BoundedCache(MAX_CHAINS)
         self._latest: dict[str, Runner] = {}
 
     def begin(
-        self, chain: Chain, pixels: Array, noise_key: str, patches: Sequence[Patch]
+        self,
+        chain: Chain,
+        pixels: Array,
+        noise_key: str,
+        patches: Sequence[Patch],
+        chain_key: Hashable | None,
     ) -> Callable[[], list[Sample]]:
         """Begin with the arrays and facts of samples of one image.
 
@@ -109,6 +119,8 @@ class Developer:
             pixels: the image.
             noise_key: what its noise is made of.
             patches: the parts of the picture that are samples; () is one sample, all of it.
+            chain_key: what the chain follows from, so that it is prepared once; None is more than
+                can be told.
 
         Returns:
             What waits for them and gives them; it raises the same errors.
@@ -118,7 +130,11 @@ class Developer:
         """
         boxes = [patch.box for patch in patches]
         with self._lock:
-            prepared = self._prepared.get(chain, lambda: self._prepare(chain))
+            prepared = (
+                self._prepare(chain)
+                if chain_key is None
+                else self._prepared.get(chain_key, lambda: self._prepare(chain))
+            )
             begun = {
                 name: runner.submit(pixels, noise_key, unchanged=True, boxes=boxes)
                 for name, runner in prepared.runners.items()
@@ -152,26 +168,26 @@ class Developer:
         part: Callable[[Array], Array],
     ) -> Sample:
         """The sample of an image, or of a patch: ``part`` gives that of an image of a result."""
-        form, chain = self._wanted.form, prepared.chain
+        arrays, chain = self._spec.arrays, prepared.chain
         pattern = pattern_of(chain)
 
         def turned(image: Array) -> Array:
             return patch.turned(part(image)) if patch else image
 
         sample: Sample = {}
-        for name in ("image", "truth") if self._wanted.truth else ("image",):
+        for name in ("image", "truth") if self._spec.truth else ("image",):
             result, prefix = results[name], "" if name == "image" else f"{name}."
             for step, image in result.kept.items():
-                if step in self._wanted.keep:
-                    sample[prefix + step] = form.ordered(turned(image))
-            sample[name] = form.picture(turned(result.image), chain.result)
-            if form.raw:
+                if step in self._spec.keep:
+                    sample[prefix + step] = arrays.ordered(turned(image))
+            sample[name] = arrays.picture(turned(result.image), chain.result)
+            if arrays.raw:
                 raw = result.kept[prepared.raws[name]]
-                sample[f"{prefix}raw"] = form.mosaic(turned(raw), pattern)
-        if self._wanted.variance:
+                sample[f"{prefix}raw"] = arrays.mosaic(turned(raw), pattern)
+        if self._spec.variance:
             variance = variance_at(prepared.noise, part(results["signal"].image), patch)
             variance = patch.turned(variance) if patch else variance
-            sample["variance"] = form.variance(variance, pattern)
+            sample["variance"] = arrays.variance(variance, pattern)
         if patch:
             sample |= {"place": np.array([patch.left, patch.top]), "turn": patch.turn}
         facts = prepared.facts.items()
@@ -179,21 +195,21 @@ class Developer:
 
     def _prepare(self, chain: Chain) -> Prepared:
         """What runs a chain."""
-        wanted = self._wanted
+        spec = self._spec
         chains = {"image": chain}
-        if wanted.truth:
-            chains["truth"] = picture_without_noise(wanted.truth, chain)
+        if spec.truth:
+            chains["truth"] = picture_without_noise(spec.truth, chain)
         raws = {}
-        if wanted.form.raw:
-            last = raw_step(chain, wanted.form)
+        if spec.arrays.raw:
+            last = raw_step(chain, spec.arrays)
             raws = {name: last_until(each, chain, last) for name, each in chains.items()}
-        encode = chain.result is Kind.DISPLAY and wanted.form.dtype is None
+        encode = chain.result is Kind.DISPLAY and spec.arrays.dtype is None
         runners = {
-            name: self._runner(name, each, (*wanted.keep, *filter(None, [raws.get(name)])), encode)
+            name: self._runner(name, each, (*spec.keep, *filter(None, [raws.get(name)])), encode)
             for name, each in chains.items()
         }
         noise: tuple[Step, ...] = ()
-        if wanted.variance:
+        if spec.variance:
             signal, noise = variance_steps(chain)
             runners["signal"] = self._runner("signal", signal, (), encode=False)
         return Prepared(chain, runners, raws, noise, facts_of(chain))

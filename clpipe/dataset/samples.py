@@ -3,17 +3,17 @@
 import os
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
+from clpipe.base.cache import BoundedCache
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.carry import VALID
 from clpipe.chain.identity import noise_key, of_frame
-from clpipe.dataset.developer import KEPT, Developer, Sample, Wanted
-from clpipe.dataset.recent import Recent
+from clpipe.dataset.developer import MAX_CHAINS, Developer, Sample, SampleSpec
 from clpipe.engine.device import open_device
 from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import Carried
@@ -26,7 +26,7 @@ _opening = threading.Lock()
 
 
 @dataclass(frozen=True)
-class Work:
+class SampleBatch:
     """Samples of one image that are developed together: the image, the epoch, their numbers."""
 
     job: Job
@@ -39,12 +39,12 @@ def pixel_bytes(source: SourceImage) -> int:
     return source.pixels.nbytes
 
 
-class Maker:
+class SampleLoader:
     """Makes the samples of images, in the order in which they are begun.
 
     Args:
         loader: how images enter.
-        wanted: what samples have.
+        spec: what samples have.
         patches: which patches they are; None is whole pictures.
         cache: bytes that decoded images may take.
         device: as for :func:`open_device`. The process that first makes a sample opens it.
@@ -53,16 +53,16 @@ class Maker:
     def __init__(
         self,
         loader: ImageLoader,
-        wanted: Wanted,
+        spec: SampleSpec,
         patches: Patches | None,
         cache: int,
         device: str | None,
     ) -> None:
         self.patches = patches
-        self.renders: Recent[SourceImage] = Recent(cache, pixel_bytes)
+        self.renders: BoundedCache[SourceImage] = BoundedCache(cache, pixel_bytes)
         self._loader = loader
-        self._loaders: Recent[ImageLoader] = Recent(KEPT)
-        self._wanted = wanted
+        self._loaders: BoundedCache[ImageLoader] = BoundedCache(MAX_CHAINS)
+        self._spec = spec
         self._device = device
         self._opened: Developer | None = None
 
@@ -85,12 +85,12 @@ class Maker:
         if self.patches.per_image != "grid":
             return self.patches.per_image
         with self._errors_of(job):
-            loaded, _ = self.read(Work(job, epoch, ()))
+            loaded, _ = self.read(SampleBatch(job, epoch, ()))
             return self.patches.cutting(loaded.chain, *loaded.source.pixels.shape[1::-1]).count
 
-    def read(self, work: Work) -> tuple[LoadedImage, Sample]:
+    def read(self, batch: SampleBatch) -> tuple[LoadedImage, Sample]:
         """An image, and the layers that go along with its picture."""
-        job, epoch = work.job, work.epoch
+        job, epoch = batch.job, batch.epoch
         loader = self._loader
         carried: Sample = {}
         try:
@@ -124,31 +124,42 @@ class Maker:
         key = job.key, stamp_of(job.path), overscan
         return self.renders.get(key, lambda: loader.read(job))
 
-    def begin(self, work: Work, loaded: LoadedImage, carried: Sample) -> Callable[[], list[Sample]]:
+    def begin(
+        self, batch: SampleBatch, loaded: LoadedImage, carried: Sample
+    ) -> Callable[[], list[Sample]]:
         """Begin to develop samples of an image; what is returned waits for them."""
-        job, chain = work.job, loaded.chain
-        key = noise_key(chain.settings, loaded.key, work.epoch)
+        job, chain = batch.job, loaded.chain
+        key = noise_key(chain.settings, loaded.key, batch.epoch)
         patches: list[Patch] = []
         with self._errors_of(job):
             if self.patches:
                 size = loaded.source.pixels.shape[1::-1]
                 cutting = self.patches.cutting(chain, *size)
-                patches = self.patches.cut(cutting, work.numbers, chain, job.key, work.epoch)
+                patches = self.patches.cut(cutting, batch.numbers, chain, job.key, batch.epoch)
             else:
-                self._wanted.form.check_size(*chain.size(*loaded.source.pixels.shape[1::-1]))
-            begun = self._developer().begin(chain, loaded.source.pixels, key, patches)
+                self._spec.arrays.check_size(*chain.size(*loaded.source.pixels.shape[1::-1]))
+            begun = self._developer().begin(
+                chain, loaded.source.pixels, key, patches, self._chain_key(batch, loaded)
+            )
 
         def finish() -> list[Sample]:
             with self._errors_of(job):
                 samples = begun()
-            form, facts = self._wanted.form, self._facts(work, loaded)
+            arrays, facts = self._spec.arrays, self._facts(batch, loaded)
             for i, sample in enumerate(samples):
                 for name, layer in carried.items():
-                    sample[name] = form.ordered(patches[i].cut_out(layer) if patches else layer)
+                    sample[name] = arrays.ordered(patches[i].cut_out(layer) if patches else layer)
                 sample.update(facts)
             return samples
 
         return finish
+
+    def _chain_key(self, batch: SampleBatch, loaded: LoadedImage) -> Hashable | None:
+        """What the chain of an image follows from; None where that is its depth, too."""
+        if loaded.source.depth:  # of which runners would keep a copy
+            return None
+        own = loaded.chain is not self._loader.chain
+        return (loaded.key, batch.epoch) if own else ()
 
     @contextmanager
     def _errors_of(self, job: Job) -> Iterator[None]:
@@ -159,13 +170,13 @@ class Maker:
             raise ImageError(self._loader.error_text(job, error)) from None
 
     @staticmethod
-    def _facts(work: Work, loaded: LoadedImage) -> Sample:
+    def _facts(batch: SampleBatch, loaded: LoadedImage) -> Sample:
         """What a sample has beside its arrays, of its image."""
         chain = loaded.chain
         adds_noise = chain.is_noisy or not isinstance(loaded.source, RawImage)
         noise = chain.noise if adds_noise else None
         a, b = (noise.a, noise.b) if noise else (0.0, 0.0)
-        return {"key": work.job.key, "epoch": work.epoch, "iso": chain.iso, "a": a, "b": b}
+        return {"key": batch.job.key, "epoch": batch.epoch, "iso": chain.iso, "a": a, "b": b}
 
     def _developer(self) -> Developer:
         """The developer of this process.
@@ -175,7 +186,7 @@ class Maker:
         """
         with _opening:
             if self._opened is None or self._opened.process != os.getpid():
-                self._opened = Developer(open_device(self._device), self._wanted)
+                self._opened = Developer(open_device(self._device), self._spec)
             return self._opened
 
 

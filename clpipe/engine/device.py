@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array
 from clpipe.engine.buffers import HostImages, room_for
@@ -25,11 +26,12 @@ from clpipe.engine.discovery import (
 from clpipe.engine.extents import Box
 from clpipe.engine.flow import Flow, Passage, Work
 from clpipe.engine.patches import with_patches
-from clpipe.engine.plan import Launch, Plan
+from clpipe.engine.plan import AnyLaunch, Launch, Plan
 from clpipe.engine.programs import forget_programs, programs_of
 from clpipe.engine.tiles import Tiling, tiling_of
 
 log = logging.getLogger(__name__)
+PLANS = 64  # whose kernels stay at hand
 FAILURES = 3  # images in a row that a device fails at, before it is given up
 
 
@@ -95,8 +97,8 @@ class Device:
             DeviceError: the device cannot be opened.
         """
         self._programs = programs_of(self.info)
-        self._calls: dict[Plan, list[Call]] = {}
-        self._border_calls: dict[Border, Call] = {}
+        self._calls: BoundedCache[list[Call]] = BoundedCache(PLANS)
+        self._border_calls: BoundedCache[Call] = BoundedCache(PLANS)
         try:
             self._flow = Flow(
                 self._programs.context, self.info.alignment if self.info.in_place else None
@@ -129,10 +131,13 @@ class Device:
         Raises:
             DeviceError: a kernel does not compile; the message is the compiler's.
         """
-        if plan.unscaled not in self._calls:
-            kernels = [write_kernel(plan, launch, self.info.lanes) for launch in plan.launches]
-            self._calls[plan.unscaled] = [Call(k, self._programs.kernel(k)) for k in kernels]
-        return self._calls[plan.unscaled]
+        return self._calls.get(
+            plan.unscaled, lambda: [self._call(plan, launch) for launch in plan.launches]
+        )
+
+    def _call(self, plan: Plan, launch: AnyLaunch | Border) -> Call:
+        kernel = write_kernel(plan, launch, self.info.lanes)
+        return Call(kernel, self._programs.kernel(kernel))
 
     def keep_programs(self) -> None:
         """Keep for later processes what was compiled, and launched once, since the last time."""
@@ -143,10 +148,7 @@ class Device:
         slots = plan.slots[written.writes.number] if written.writes else ()
         for slot in slots:
             border = Border(slot, written.level)
-            if border not in self._border_calls:
-                kernel = write_kernel(plan, border, self.info.lanes)
-                self._border_calls[border] = Call(kernel, self._programs.kernel(kernel))
-            yield self._border_calls[border]
+            yield self._border_calls.get(border, partial(self._call, plan, border))
 
     def submit(
         self,

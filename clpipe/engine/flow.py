@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.steps import Step
 from clpipe.base.types import Array
 from clpipe.engine.buffers import HostImages, Pool, aligned_empty, copy_encoded, copy_plane, core_of
@@ -24,7 +25,12 @@ from clpipe.engine.plan import Launch, Plan
 from clpipe.engine.tiles import Phase, Tiling, source_bytes
 from clpipe.engine.transfers import InPlace, Staged
 
-TABLES = 1 << 26  # bytes of arrays that stay on the device beyond the next image
+TABLES = 1 << 26  # bytes of arrays that are kept on the device, 64 of them at most
+
+
+def room_of_table(buffer: Any) -> int:
+    """What a table's buffer takes of :data:`TABLES`: its bytes, but one may take all."""
+    return min(max(buffer.size, TABLES // 64), TABLES)
 
 
 @dataclass(frozen=True)
@@ -105,7 +111,7 @@ class Flow:
             if alignment
             else Staged(cl, self.queue, self.new_queue, self.pool)
         )
-        self._tables: dict[int, tuple[Array, Any]] = {}
+        self._tables: BoundedCache[Any] = BoundedCache(TABLES, room_of_table)
         self._parts: deque[Part] = deque()  # on the way
         self._reads: list[Any] = []  # events of fetches from buffers that the next part writes
         self._held = Held()
@@ -139,9 +145,6 @@ class Flow:
         """
         # Nothing is known of what buffers hold until all is enqueued.
         known, self._held, after = self._held, Held(), Held()
-        held = sum(table.nbytes for table, _ in self._tables.values())
-        if len(self._tables) > 32 or held > TABLES:
-            self._tables.clear()
         tiling, work = passage.tiling, passage.work
         self.pool.reserve(self._transfers.needs(tiling.sizes), memory)
         if work.plan.hold and passage.is_whole:
@@ -318,10 +321,7 @@ class Flow:
             part.passage.error = part.passage.error or error
 
     def _table(self, table: Array) -> Any:
-        """A small constant array on the device, uploaded once."""
-        cl = self._cl
-        if id(table) not in self._tables:
-            flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
-            # The array is held so that its id stays its own.
-            self._tables[id(table)] = table, cl.Buffer(self.context, flags, hostbuf=table)
-        return self._tables[id(table)][1]
+        """A constant array on the device, uploaded once while it is the same object."""
+        flags = self._cl.mem_flags.READ_ONLY | self._cl.mem_flags.COPY_HOST_PTR
+        upload = partial(self._cl.Buffer, self.context, flags, hostbuf=table)
+        return self._tables.get(Identity(table), upload)

@@ -12,6 +12,7 @@ from hashlib import blake2b
 from typing import Any
 
 import numpy as np
+from xxhash import xxh3_128_digest
 
 from clpipe.base.types import Array
 from clpipe.engine.buffers import Pool
@@ -33,13 +34,11 @@ class Held:
         number: how many sources there were, so that each differs from those before.
         buffers: for each buffer by name, the buffer itself, since another may take its place, and
             the digest of what made its content.
-        arrays: digests of the arrays among arguments, by id. They are held so that it stays theirs.
     """
 
     source: weakref.ref[Array] | None = None
     number: int = 0
     buffers: dict[str, tuple[Any, bytes]] = field(default_factory=dict)
-    arrays: dict[int, tuple[Array, bytes]] = field(default_factory=dict)
 
     def next(
         self,
@@ -74,11 +73,8 @@ class Held:
             return buffer is pool.held[name] and digest == made
 
         def value(argument: Any) -> bytes:
-            if not isinstance(argument, np.ndarray):
-                return argument.tobytes()
-            known = self.arrays.get(id(argument)) or after.arrays.get(id(argument))
-            after.arrays[id(argument)] = known or (argument, digest_of(argument.tobytes()))
-            return after.arrays[id(argument)][1]
+            is_array = isinstance(argument, np.ndarray)
+            return xxh3_128_digest(argument) if is_array else argument.tobytes()
 
         numbers = []
         for i, call in enumerate(calls):

@@ -9,7 +9,7 @@ Images of one size are a level. The source is on level 0; each resampling leads 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 from clpipe.chain.chain import Chain
@@ -133,7 +133,7 @@ class Plan:
     half: bool
     planar: bool  # whether the source is planes one behind the other, not interleaved
     launches: tuple[AnyLaunch, ...]
-    slots: dict[int, tuple[int, ...]]  # image number -> slots of its planes
+    slots: tuple[tuple[int, ...], ...]  # of the planes of each image, by its number
     slot_count: int = 0
     kept: tuple[tuple[str, Image], ...] = ()  # step -> its image
     final: Image | None = None  # the last image as float planes
@@ -148,18 +148,7 @@ class Plan:
     @cached_property
     def _hash(self) -> int:
         # A plan is looked up for each image, and hashing all that is in it takes a while.
-        return hash(
-            (
-                self.source,
-                self.half,
-                self.planar,
-                self.launches,
-                self.kept,
-                self.final,
-                self.encoded,
-                self.hold,
-            )
-        )
+        return hash(tuple(getattr(self, each.name) for each in fields(self)))
 
     @cached_property
     def unscaled(self) -> "Plan":
@@ -395,7 +384,7 @@ def make_plan(
 
 def assign_slots(
     launches: Sequence[AnyLaunch], images: Sequence[Image], pinned: set[int]
-) -> tuple[dict[int, tuple[int, ...]], int]:
+) -> tuple[tuple[tuple[int, ...], ...], int]:
     """Slots for the planes of every image, by liveness.
 
     Args:
@@ -423,4 +412,4 @@ def assign_slots(
         for read in {read.image.number for read in reads_of(launch)}:
             if last_use[read] == i and read not in pinned:
                 free.extend(slots[read])
-    return slots, count
+    return tuple(slots[image.number] for image in images), count

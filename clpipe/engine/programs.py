@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import DeviceError, RequestError
 from clpipe.engine.builders import BinaryBuilder, PoclBuilder
 from clpipe.engine.cache_folder import cache_folder, later_runs, pocl_folder
@@ -24,6 +25,7 @@ from clpipe.engine.store import Store
 # PoCL includes the declarations of all of OpenCL's functions before a program. The first says that
 # it has done so; the second has those that are called declared in kernels/lib/builtins.h.
 DECLARED_HERE = ("-D_OPENCL_H_", "-DDECLARED_HERE")
+PROGRAMS = 1024  # that a process keeps for each device
 LONG = 2.0  # s of compiling after which a user is told what is going on
 log = logging.getLogger(__name__)
 _by_device: dict[int, "Programs"] = {}
@@ -49,7 +51,7 @@ class Programs:
             self.context = cl.Context([info.handle])
         except cl.Error as error:
             raise DeviceError(f"{info.label} cannot be opened: {error}") from None
-        self._programs: dict[str, Any] = {}
+        self._programs: BoundedCache[Any] = BoundedCache(PROGRAMS)
         self._lock = threading.Lock()
         self._options = ["-cl-std=CL1.2", "-w"]
         if info.handle.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
@@ -69,9 +71,8 @@ class Programs:
             DeviceError: another kernel does not compile.
         """
         with self._lock:
-            if kernel.source not in self._programs:
-                self._programs[kernel.source] = self._compile(kernel)
-            return self._cl.Kernel(self._programs[kernel.source], kernel.name)
+            program = self._programs.get(kernel.source, lambda: self._compile(kernel))
+            return self._cl.Kernel(program, kernel.name)
 
     def _compile(self, kernel: Kernel) -> Any:
         cl = self._cl

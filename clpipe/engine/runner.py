@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, Step
@@ -126,8 +127,8 @@ class Runner:
         self._arguments = {s.name: s.method.arguments(s.context) for s in chain.steps}
         self._own_plans: dict[tuple[bool, ...], Plan] = {}
         # Shared with the runners of other chains, by a chain's structure.
-        self._plans: dict[Any, Plan] = {}
-        self._tables: dict[Any, tuple[Sequence[Array], Array]] = {}
+        self._plans: BoundedCache[Plan] = BoundedCache(64)
+        self._tables: BoundedCache[Array] = BoundedCache(32)
 
     def of(self, chain: Chain) -> "Runner":
         """A runner for another chain that shares plans and tables with this one.
@@ -144,14 +145,9 @@ class Runner:
         if key not in self._own_plans:
             ops = chain_ops(chain, self._arguments)
             structure = (*key, chain.source, chain.result, ops)
-            plan = self._plans.get(structure)
-            if plan is None:
-                if len(self._plans) >= 64:
-                    self._plans.clear()
-                results = self.keep, self.encode, self.final
-                plan = make_plan(chain, half, *results, fold, planar, self.hold)
-                self._plans[structure] = plan
-            self._own_plans[key] = plan
+            results = self.keep, self.encode, self.final
+            options = chain, half, *results, fold, planar, self.hold
+            self._own_plans[key] = self._plans.get(structure, lambda: make_plan(*options))
         return self._own_plans[key]
 
     def plan_for(self, image: Array) -> Plan:
@@ -334,17 +330,16 @@ class Runner:
             table = self._arguments[name]["table"]
             assert isinstance(table, np.ndarray)
             curves.append(table)
-        # A curve's table is one object for the same parameters; held, its id stays its own.
-        key = tuple(map(id, curves))
-        if key not in self._tables:
+        key = tuple(map(Identity, curves))  # of which each is one object for the same parameters
+
+        def composed() -> Array:
             *first, last = curves
-            composed: Array = to_8_bit(last)
+            table: Array = to_8_bit(last)
             for curve in reversed(first):
-                composed = compose(curve, composed)
-            if len(self._tables) >= 32:
-                self._tables.clear()
-            self._tables[key] = curves, composed
-        return self._tables[key][1]
+                table = compose(curve, table)
+            return table
+
+        return self._tables.get(key, composed)
 
     def _run_numpy(self, image: Floats, noise_key: str, boxes: Sequence[Box]) -> Result:
         kept: dict[str, Floats] = {}

@@ -15,9 +15,10 @@ from clpipe.analysis.report import NoiseReport
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.chain import Chain
 from clpipe.chain.identity import noise_key
+from clpipe.chain.rendition import DEVELOPMENT, PICTURES
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
-from clpipe.chain.truth import DEVELOPMENT, PICTURES, picture_without_noise
+from clpipe.chain.truth import picture_without_noise
 from clpipe.engine.clipping import clipped_share
 from clpipe.engine.device import Device, Timing
 from clpipe.engine.plan import AnyLaunch

@@ -20,7 +20,7 @@ from clpipe.stage import Context, Kind
 class View:
     """What is looked at: the image after a step ("" is the last), or the truth of it.
 
-    ``truth`` is one of :data:`clpipe.chain.truth.PICTURES`, or "" for the picture with its noise.
+    ``truth`` is one of :data:`~clpipe.chain.rendition.PICTURES`, or "" for the noisy picture.
     """
 
     step: str = ""

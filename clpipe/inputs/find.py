@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 from clpipe.base.errors import RequestError
 from clpipe.base.text import printable
+from clpipe.chain.rendition import Rendition
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import RENDER_SUFFIXES
 from clpipe.inputs.carry import owner_of
@@ -34,7 +35,7 @@ class Job:
         values: settings that hold for it alone, nested as in a configuration.
         frames: how many frames are made of it; None is what the request says.
         place: the manifest and the row that it stands in; "" where it is in none.
-        pictures: names of the renditions to make; None is all.
+        renditions: those to make; None is all.
         written: the path as the user wrote it, where ``path`` has been made absolute.
         subframes: further files of the same exposure.
         size: the width and height in px that it must have; None is any.
@@ -48,7 +49,7 @@ class Job:
     values: Mapping[str, Any] = field(default_factory=dict)
     frames: int | None = None
     place: str = ""
-    pictures: tuple[str, ...] | None = None
+    renditions: tuple[Rendition, ...] | None = None
     written: str = ""
     subframes: tuple[Path, ...] = ()
     size: tuple[int, int] | None = None

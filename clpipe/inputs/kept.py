@@ -14,9 +14,9 @@ from clpipe.chain.chain import Chain, Step
 from clpipe.chain.identity import name_in, of_frame
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
+from clpipe.chain.rendition import CLEAN
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings, settings_from
-from clpipe.chain.truth import CLEAN
 from clpipe.images.attributes import read_attributes
 from clpipe.images.read import SourceImage
 from clpipe.inputs.plausibility import input_warnings

@@ -21,7 +21,7 @@ def pictures_without_input(writer: OutputWriter, jobs: Sequence[Job], inputs: Se
         jobs: all of it.
         inputs: as the user gave them.
     """
-    own = {writer.path(job, SIDECAR, name) for job in jobs for name in writer.names_of(job)}
+    own = {writer.path(job, SIDECAR, each) for job in jobs for each in writer.renditions_of(job)}
     beside = {Path(job.input).parent for job in jobs}
     below = [Path(text) for text in inputs if os.path.isdir(text)]
     count = 0

@@ -10,31 +10,31 @@ from clpipe.base.types import Array, Floats
 from clpipe.chain.formats import Format
 from clpipe.engine.runner import Result
 from clpipe.outputs.patches import Patch, variance_at
-from clpipe.outputs.renditions import Rendition
+from clpipe.outputs.recipes import Recipe
 from clpipe.reference.curve import to_16_bit
 from clpipe.stage import Kind
 
 
 def parts_of(
-    rendition: Rendition, result: Result, patches: Sequence[Patch]
+    recipe: Recipe, result: Result, patches: Sequence[Patch]
 ) -> Iterator[tuple[int | None, Result]]:
     """What is written of a result: all of it, or each of its patches, turned, with its number.
 
     The last image of a variance map becomes the variance.
     """
     if not patches:
-        yield None, with_variance(result, rendition, None)
+        yield None, with_variance(result, recipe, None)
     for number, patch in enumerate(patches):
-        part = with_variance(mapped(result, itemgetter(number)), rendition, patch)
+        part = with_variance(mapped(result, itemgetter(number)), recipe, patch)
         yield number, mapped(part, patch.turned)
 
 
-def with_variance(result: Result, rendition: Rendition, patch: Patch | None) -> Result:
+def with_variance(result: Result, recipe: Recipe, patch: Patch | None) -> Result:
     """A result whose last image is the variance of the noise, if the rendition is a map of it."""
-    if not rendition.noise:
+    if not recipe.noise:
         return result
     assert result.final is not None
-    return replace(result, final=variance_at(rendition.noise, result.final, patch))
+    return replace(result, final=variance_at(recipe.noise, result.final, patch))
 
 
 def mapped(result: Result, change: Callable[[Array], Array]) -> Result:

@@ -160,13 +160,24 @@ class Patches:
 
     Args:
         size: of their sides, in px.
-        per_image: how many, at random places; "grid" is all that cover the picture.
-        augment: whether they are flipped and turned.
+        per_image: how many, at random places; "grid" is all side by side that cover the picture
+            (but for a last odd column or row), the last ones overlapping.
+        augment: whether they are flipped and turned by 90 degrees, at random.
+
+    Raises:
+        RequestError: there would be none.
     """
 
     size: int
-    per_image: int | Literal["grid"]
-    augment: bool
+    per_image: int | Literal["grid"] = PER_IMAGE
+    augment: bool = False
+
+    def __post_init__(self) -> None:
+        least = {"patch": self.size, "per_image": 1 if self.per_image == "grid" else self.per_image}
+        for name, number in least.items():
+            if not isinstance(number, int) or number < 1:
+                or_grid = ", or 'grid'" if name == "per_image" else ""
+                raise RequestError(f"found {name} {number!r}; expected 1 or more{or_grid}")
 
     def cutting(self, chain: Chain, width: int, height: int) -> Cutting:
         """How they are cut of the picture that a chain makes of an image of a size.

@@ -22,7 +22,7 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.raw import RawImage
 from clpipe.outputs.patches import Patch, facts_of
 from clpipe.outputs.program import program_digest
-from clpipe.outputs.renditions import Rendition
+from clpipe.outputs.recipes import Recipe
 from clpipe.outputs.sealed import OWN, sealed
 from clpipe.reference.intrinsics import Intrinsics
 
@@ -64,8 +64,7 @@ def sidecar(
     job: Job,
     request: Mapping[str, Any],
     stamps: Sequence[tuple[int, int]],
-    rendition: Rendition,
-    frames: int | None,
+    recipe: Recipe,
     device: Device | None,
     source: SourceImage,
     result: Result,
@@ -80,8 +79,7 @@ def sidecar(
         job: the image.
         request: the record of the request for the image.
         stamps: the size and the time of change of each file of the input, before it was read.
-        rendition: the picture.
-        frames: how many frames its burst has; None without a burst.
+        recipe: of the picture.
         device: where it was made; None is NumPy.
         source: the image, as it was loaded.
         result: what was made of it.
@@ -90,7 +88,7 @@ def sidecar(
         carried: layers that were written beside it.
         patches: that were written in place of the picture.
     """
-    chain = rendition.whole
+    chain, rendition = recipe.whole, recipe.rendition
     facts = source.facts if isinstance(source, RawImage) else None
     noise = chain.noise if not facts or chain.is_noisy else None
     width, height = chain.size(*source.pixels.shape[1::-1])
@@ -104,10 +102,10 @@ def sidecar(
         **({"subframes": subframe_records(source, stamps)} if source.subframes else {}),
         "layer": source.layer,
         "name": job.stem,
-        "picture": rendition.name,
-        "frames": frames,
-        "image_key": rendition.key,
-        "noise_key": rendition.noise_key,
+        "picture": rendition.suffix,
+        **asdict(rendition),
+        "image_key": recipe.key,
+        "noise_key": recipe.noise_key,
         "seed": chain.seed,
         "width": width,
         "height": height,

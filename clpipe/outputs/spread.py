@@ -10,7 +10,7 @@ from statistics import NormalDist
 import numpy as np
 
 from clpipe.base.types import Array, Doubles, Floats, Mask
-from clpipe.chain.baseline import IID
+from clpipe.chain.rendition import IID, Rendition
 from clpipe.images.encoding import Encoding
 from clpipe.images.jpeg import JpegEncoding, through_jpeg
 from clpipe.outputs.places import FLAT, HALVED, covariance, halved, select_flat
@@ -33,13 +33,13 @@ class Spread:
     """The noise of a noisy picture, and the intensities of its clean one; they come one by one.
 
     Args:
-        names: of the renditions that they are measured on: the noisy picture, its truth as it is
-            developed, and its clean truth, in the order in which they come.
+        renditions: that they are measured on: the noisy picture, its truth as it is developed, and
+            its clean truth, in the order in which they come.
         matching: where, and on what, the baseline's noise is matched.
-        output: how the pictures are encoded.
+        encoding: how the pictures are encoded.
     """
 
-    names: tuple[str, ...]
+    renditions: tuple[Rendition, Rendition, Rendition]
     matching: NoNoise
     encoding: Encoding
     _noisy: Floats | None = None
@@ -49,17 +49,17 @@ class Spread:
     _curves: list[Doubles] = field(default_factory=list)
     _intensities: list[Array] = field(default_factory=list)
 
-    def take(self, name: str, picture: Floats) -> None:
+    def take(self, rendition: Rendition, picture: Floats) -> None:
         """Take what is to be known of a picture; others are left alone.
 
         Args:
-            name: of the rendition.
+            rendition: which it is.
             picture: (height, width, 3) display values, float32.
         """
-        noisy, developed, clean = self.names
-        if name == noisy:
+        noisy, developed, clean = self.renditions
+        if rendition == noisy:
             self._noisy = self._shown(picture)
-        elif name == developed and self._noisy is not None:
+        elif rendition == developed and self._noisy is not None:
             truth = self._shown(picture)
             noise = self._noisy - truth
             self._noisy = None
@@ -68,7 +68,7 @@ class Spread:
             self._covariance = self._covariance_of(noise)
             planes = zip(self._selected(truth).T, self._selected(noise).T, strict=True)
             self._curves = [curve_of(*each) for each in planes]
-        elif name == clean:
+        elif rendition == clean:
             if self.matching.jpeg or self.matching.match == HALVED:
                 self._clean = picture.copy()
             self._intensities = [
@@ -94,7 +94,7 @@ class Spread:
         return covariance(self._selected(noise)[None, None])
 
     def method(self, baseline: str) -> tuple[IidGaussian | IntensityDependent, dict[str, float]]:
-        """The noise of a baseline, one of :data:`clpipe.chain.baseline.BASELINES`.
+        """The noise of a baseline, one of :data:`clpipe.chain.rendition.BASELINES`.
 
         Returns:
             The method, and what was reached where it had to be tried: the variance over that of the

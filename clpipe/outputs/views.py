@@ -20,8 +20,8 @@ from clpipe.base.files import keep_names, make_folder_of, write_whole
 from clpipe.base.reading import read_bytes
 from clpipe.chain.formats import DNG, ending_of
 from clpipe.chain.render_camera import Matrix, Vector
+from clpipe.chain.rendition import TRUTHS, Rendition
 from clpipe.outputs.existing import is_marked
-from clpipe.outputs.renditions import truth_named
 from clpipe.outputs.sealed import (
     SIDECAR,
     SidecarError,
@@ -191,10 +191,10 @@ def _picture(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
     """The picture of a sidecar; None where it is a truth's, or there is none.
 
     Raises:
-        KeyError, TypeError: the values are damaged.
+        KeyError, TypeError, ValueError: the values are damaged.
     """
     formats = [each for each in values["request"]["formats"] if each != DNG]
-    if truth_named(str(values["picture"])) or not formats:
+    if Rendition.from_record(values).role in TRUTHS or not formats:
         return None
     file = sidecar.with_name(f"{sidecar.name.removesuffix(SIDECAR)}{ending_of(formats[0])}")
     return file if file.name in outputs_in(values) and file.exists() else None

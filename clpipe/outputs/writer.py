@@ -10,8 +10,15 @@ from clpipe.base.errors import ImageError, OutputError, RequestError
 from clpipe.base.files import Stored, keep_names
 from clpipe.chain.chain import Chain
 from clpipe.chain.formats import DNG, FORMATS, NPY, ending_of
+from clpipe.chain.rendition import (
+    BASELINES,
+    FIRST,
+    FLOAT_MOSAICS,
+    PICTURES,
+    VARIANCE,
+    Rendition,
+)
 from clpipe.chain.request import CARRY, Request
-from clpipe.chain.truth import PICTURES, VARIANCE
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.dng import write_dng
@@ -27,13 +34,7 @@ from clpipe.outputs.folder import RESUMABLE, write_problem
 from clpipe.outputs.negative import negative_of
 from clpipe.outputs.parts import parts_of, samples, typed
 from clpipe.outputs.patches import Patch, Patches, patch_name, variance_steps
-from clpipe.outputs.renditions import (
-    FLOAT_MOSAICS,
-    Rendition,
-    RenditionPlan,
-    baseline_named,
-    truth_named,
-)
+from clpipe.outputs.recipes import Recipe, RenditionPlan
 from clpipe.outputs.results import results_of
 from clpipe.outputs.sealed import SIDECAR, remove_sidecar
 from clpipe.reference.geometry import NO_MARGINS
@@ -63,24 +64,24 @@ class OutputWriter:
         asked = self.request.truths, self.request.bracket, self.request.baselines
         return RenditionPlan(frames, *asked)
 
-    def names_of(self, job: Job) -> tuple[str, ...]:
-        """The name of each rendition that is made of a job's image."""
-        names = self.plan_of(job).names()
-        return tuple(name for name in names if job.pictures is None or name in job.pictures)
+    def renditions_of(self, job: Job) -> tuple[Rendition, ...]:
+        """The renditions that are made of a job's image."""
+        planned = self.plan_of(job).renditions()
+        return tuple(each for each in planned if job.renditions is None or each in job.renditions)
 
-    def runner(self, rendition: Rendition, device: Device | None) -> Runner:
+    def runner(self, recipe: Recipe, device: Device | None) -> Runner:
         """A runner that makes all of a rendition that is written, and nothing else."""
-        formats, keep = self.formats_of(rendition.name), self.keep_of(rendition.name)
-        results = results_of(rendition.chain, formats, keep)
+        formats, keep = self.formats_of(recipe.rendition), self.keep_of(recipe.rendition)
+        results = results_of(recipe.chain, formats, keep)
         if self.request.baselines:
             results = results._replace(final=True)  # to measure its noise
-        return Runner(rendition.chain, device, *results)
+        return Runner(recipe.chain, device, *results)
 
-    def formats_of(self, name: str) -> tuple[str, ...]:
-        """The formats of a rendition, by its name."""
-        if baseline_named(name):  # it has no raw
+    def formats_of(self, rendition: Rendition) -> tuple[str, ...]:
+        """The formats of a rendition."""
+        if rendition.role in BASELINES:  # it has no raw
             return tuple(format_ for format_ in self.formats if format_ != DNG)
-        return (self.kept_format,) if truth_named(name) in FLOAT_MOSAICS else self.formats
+        return (self.kept_format,) if rendition.role in FLOAT_MOSAICS else self.formats
 
     @property
     def kept_format(self) -> str:
@@ -95,32 +96,32 @@ class OutputWriter:
             return None
         return Patches(request.patch, request.patches_per_image, request.augment)
 
-    def keep_of(self, name: str) -> tuple[str, ...]:
-        """The steps whose image is written beside a rendition, by its name, where it has them."""
-        if truth_named(name) in FLOAT_MOSAICS or baseline_named(name):
+    def keep_of(self, rendition: Rendition) -> tuple[str, ...]:
+        """The steps whose image is written beside a rendition, where it has them."""
+        if rendition.role in (*FLOAT_MOSAICS, *BASELINES):
             return ()
-        if truth_named(name) in PICTURES and self.request.truth_keep is not None:
+        if rendition.role in PICTURES and self.request.truth_keep is not None:
             return self.request.truth_keep
         return self.request.keep
 
-    def record_of(self, job: Job, request: Mapping[str, Any], name: str) -> dict[str, Any]:
+    def record_of(self, request: Mapping[str, Any], rendition: Rendition) -> dict[str, Any]:
         """The record of a request as far as it is about one rendition.
 
         Args:
-            job: the image.
-            request: the record for it.
-            name: of the rendition.
+            request: the record for its image.
+            rendition: which it is.
         """
-        carries = {} if self.carries(job, name) else dict(zip(CARRY, ([], [], False), strict=True))
-        return {**request, "keep": list(self.keep_of(name)), **carries}
+        carries = {} if self.carries(rendition) else dict(zip(CARRY, ([], [], False), strict=True))
+        return {**request, "keep": list(self.keep_of(rendition)), **carries}
 
-    def carries(self, job: Job, name: str) -> bool:
-        """Whether layers go along with a rendition, by its name: they do with an image's first."""
-        return bool(self.request.carry) and name == self.plan_of(job).names()[0]
+    def carries(self, rendition: Rendition) -> bool:
+        """Whether layers go along with a rendition: they do with an image's first."""
+        is_first = rendition.is_first and rendition.ev in (None, *self.request.bracket[:1])
+        return bool(self.request.carry) and is_first
 
-    def _carried_files(self, job: Job, name: str) -> dict[str, Path]:
+    def _carried_files(self, job: Job, rendition: Rendition) -> dict[str, Path]:
         """The files of carried layers: that of all, "", and the PNG of each depth by its name."""
-        if not self.carries(job, name):
+        if not self.carries(rendition):
             return {}
         depths = [each.name for each in self.request.carried() if each.kind == "depth"]
         return {
@@ -128,10 +129,10 @@ class OutputWriter:
             **{each: self.path(job, f"{each}.png") for each in depths if self.request.depth_png},
         }
 
-    def _kept_steps(self, rendition: Rendition) -> list[str]:
+    def _kept_steps(self, recipe: Recipe) -> list[str]:
         """The steps of a rendition's chain whose image is written, too."""
-        keep = self.keep_of(rendition.name)
-        return [step.name for step in rendition.chain.steps if step.name in keep]
+        keep = self.keep_of(recipe.rendition)
+        return [step.name for step in recipe.chain.steps if step.name in keep]
 
     def check(self, chain: Chain, jobs: Sequence[Job]) -> None:
         """See that the formats can hold the results, and that no file is written twice.
@@ -148,7 +149,7 @@ class OutputWriter:
         if DNG in self.formats:
             negative_of(chain)  # refuses a chain without a raw
         for plan in {self.plan_of(job) for job in jobs}:
-            plan.renditions(chain, "")  # refuses a chain that has no such truth
+            plan.recipes(chain, "")  # refuses a chain that has no such truth
         if self.patches:
             self._check_patches(chain)
         endings: dict[str, str] = {}
@@ -197,8 +198,8 @@ class OutputWriter:
         inside = {path for path in inputs if path.startswith(real_folder + os.sep)}
         makers: dict[str, Job] = {}
         for job in jobs:
-            for name in self.names_of(job):
-                files = self.existing(job, name)
+            for rendition in self.renditions_of(job):
+                files = self.existing(job, rendition)
                 for path in map(str, (files.sidecar, *files.pictures, *files.others)):
                     if inside and os.path.realpath(path) in inside:
                         raise RequestError(
@@ -213,12 +214,11 @@ class OutputWriter:
                         )
                     makers[path] = job
 
-    def path(self, job: Job, ending: str, name: str = "", patch: int | None = None) -> Path:
-        """The file of a job with an ending.
-
-        ``name`` is that of the rendition, ``patch`` the number of a patch of it.
-        """
-        return self.folder / f"{job.stem}{patch_name(patch)}{name}.{ending}"
+    def path(
+        self, job: Job, ending: str, rendition: Rendition = FIRST, patch: int | None = None
+    ) -> Path:
+        """The file of a job with an ending; ``patch`` is the number of a patch of the rendition."""
+        return self.folder / f"{job.stem}{patch_name(patch)}{rendition.suffix}.{ending}"
 
     def check_size(self, source: SourceImage, chain: Chain) -> None:
         """See that what a chain makes of an image fits into the formats.
@@ -230,19 +230,19 @@ class OutputWriter:
         if "jpg" in self.formats and max(size) > JPEG_MAX_SIDE:
             raise ImageError(f"JPEG holds at most {JPEG_MAX_SIDE} pixels a side; use --format png")
 
-    def existing(self, job: Job, name: str) -> Existing:
-        """The files of a rendition, by its name. A kept image of a step before ``start_at`` is
+    def existing(self, job: Job, rendition: Rendition) -> Existing:
+        """The files of a rendition. A kept image of a step before ``start_at`` is
         never written, so kept images need not be there. Of a grid of patches, whose number follows
         from the image, the first is named.
         """
         count = self.patches.least if self.patches else 0
         numbers = range(count) if self.patches else (None,)
-        endings = [ending_of(format_) for format_ in self.formats_of(name)]
-        pictures = [self.path(job, ending, name, n) for n in numbers for ending in endings]
-        pictures += self._carried_files(job, name).values()
-        endings = [f"{step}.{self.kept_format}" for step in self.keep_of(name)]
-        kept = [self.path(job, ending, name, n) for n in numbers for ending in endings]
-        return Existing(self.path(job, SIDECAR, name), pictures, kept)
+        endings = [ending_of(format_) for format_ in self.formats_of(rendition)]
+        pictures = [self.path(job, ending, rendition, n) for n in numbers for ending in endings]
+        pictures += self._carried_files(job, rendition).values()
+        endings = [f"{step}.{self.kept_format}" for step in self.keep_of(rendition)]
+        kept = [self.path(job, ending, rendition, n) for n in numbers for ending in endings]
+        return Existing(self.path(job, SIDECAR, rendition), pictures, kept)
 
     def check_folder(self) -> None:
         """See that the output folder can still be written to.
@@ -267,7 +267,7 @@ class OutputWriter:
     def write(
         self,
         job: Job,
-        rendition: Rendition,
+        recipe: Recipe,
         source: SourceImage,
         result: Result,
         carried: Carried | None = None,
@@ -277,9 +277,9 @@ class OutputWriter:
 
         Args:
             job: the image.
-            rendition: the picture of it.
+            recipe: of the picture.
             source: the image, as it was loaded.
-            result: what the rendition's :meth:`runner` made of it.
+            result: what its :meth:`runner` made of it.
             carried: layers that are written beside it.
             patches: of which the result is; () is all of the picture.
 
@@ -292,23 +292,23 @@ class OutputWriter:
         """
         self._make_folder_of(job)
         # A new picture beside an old sidecar would look like one that somebody has changed.
-        remove_sidecar(self.path(job, SIDECAR, rendition.name))
+        remove_sidecar(self.path(job, SIDECAR, recipe.rendition))
         outputs: dict[Path, Stored] = {}
-        for number, part in parts_of(rendition, result, patches):
-            outputs |= self._write(job, rendition, source, part, number)
+        for number, part in parts_of(recipe, result, patches):
+            outputs |= self._write(job, recipe, source, part, number)
         if carried:
-            for layer, path in self._carried_files(job, rendition.name).items():
+            for layer, path in self._carried_files(job, recipe.rendition).items():
                 outputs[path] = write_carried(path, carried, layer)
         return outputs
 
     def _write(
-        self, job: Job, rendition: Rendition, source: SourceImage, result: Result, patch: int | None
+        self, job: Job, recipe: Recipe, source: SourceImage, result: Result, patch: int | None
     ) -> dict[Path, Stored]:
         """Write the images of one rendition, or of a patch of it, by its number; see :meth:`write`.
 
         The last image of a variance map is the variance.
         """
-        chain, camera = rendition.chain, rendition.chain.camera
+        chain, rendition, camera = recipe.chain, recipe.rendition, recipe.chain.camera
         tags, orientation = from_attributes(
             source.attributes, Tags(camera.make, camera.model, chain.iso)
         )
@@ -320,9 +320,9 @@ class OutputWriter:
         }
         turn = self.turn_of(source, chain) if patch is None else 1
         outputs: dict[Path, Stored] = {}
-        whose = rendition.key, rendition.frame
-        for step in (chain.step_named(name) for name in self._kept_steps(rendition)):
-            path = self.path(job, f"{step.name}.{self.kept_format}", rendition.name, patch)
+        whose = recipe.key, rendition.frame
+        for step in (chain.step_named(name) for name in self._kept_steps(recipe)):
+            path = self.path(job, f"{step.name}.{self.kept_format}", rendition, patch)
             if self.kept_format == NPY:
                 outputs[path] = write_npy(path, typed(result.kept[step.name], step.stage.writes))
                 continue
@@ -332,11 +332,11 @@ class OutputWriter:
             outputs[path] = write_exr(
                 path, result.kept[step.name], channels, attributes, margins=beyond
             )
-        for format_ in self.formats_of(rendition.name):
-            path = self.path(job, ending_of(format_), rendition.name, patch)
-            if rendition.noise and format_ != NPY:
+        for format_ in self.formats_of(rendition):
+            path = self.path(job, ending_of(format_), rendition, patch)
+            if recipe.noise and format_ != NPY:
                 assert result.final is not None
-                attributes = variance_attributes(rendition)
+                attributes = variance_attributes(recipe)
                 outputs[path] = write_exr(path, result.final, ("Y",), attributes)
             elif format_ == NPY:
                 assert result.final is not None
@@ -379,9 +379,9 @@ class OutputWriter:
             raise ImageError(f"{folder}: cannot be made: {error.strerror}") from None
 
 
-def variance_attributes(rendition: Rendition) -> dict[str, str]:
+def variance_attributes(recipe: Recipe) -> dict[str, str]:
     """The attributes of a variance map; by their kind it can enter no chain."""
-    own = attributes_of(rendition.noise[-1], rendition.whole, rendition.key, rendition.frame)
+    own = attributes_of(recipe.noise[-1], recipe.whole, recipe.key, recipe.rendition.frame)
     return {**own, "stage": "variance", "kind": "variance"}
 
 

@@ -13,8 +13,7 @@ from clpipe.analysis.pictures import WHOLE, load_picture
 from clpipe.analysis.report import NoiseReport
 from clpipe.analysis.svg import law_svg, noise_svg
 from clpipe.base.errors import ClpipeError
-from clpipe.chain.truth import DEVELOPMENT, MOSAIC
-from clpipe.outputs.renditions import SUFFIXES
+from clpipe.chain.rendition import DEVELOPMENT, MOSAIC
 from clpipe.reports.figures import number
 from clpipe.reports.run import Blob, Made, Run
 from clpipe.reports.shown import checked, picture_file
@@ -97,8 +96,7 @@ def noises(run: Run, pictures: Sequence[Made], problems: list[str], most: int) -
     """
     found: list[Noise] = []
     for made in pictures:
-        exposure = made.rendition.partition(".frame")[0]
-        truth = run.of_image(made.image).get(exposure + SUFFIXES[DEVELOPMENT])
+        truth = run.of_image(made.image).get(made.rendition.beside(DEVELOPMENT))
         pair = picture_file(made), truth and picture_file(truth)
         if len(found) == most or not pair[0] or not pair[1]:
             continue
@@ -133,8 +131,7 @@ def laws(run: Run, problems: list[str]) -> list[Law]:
     pictures = [made for made in run.pictures if NORMALIZED in made.files]
     step = max(len(pictures) // JUDGED, 1)
     for made in pictures[::step][:JUDGED]:
-        exposure = made.rendition.partition(".frame")[0]
-        truth = run.of_image(made.image).get(exposure + SUFFIXES[MOSAIC])
+        truth = run.of_image(made.image).get(made.rendition.beside(MOSAIC))
         asked = made.value("noise", "signal")
         is_known = truth and "exr" in truth.files and isinstance(asked, dict)
         if not truth or not is_known or parameters_of(made, "prnu").get("sigma"):

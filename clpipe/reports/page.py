@@ -137,7 +137,7 @@ def labels_of(runs: Sequence[Run]) -> list[str]:
 
 def same(run: Run, pictures: Sequence[Made]) -> list[Made]:
     """The pictures of a run with the names of those of another."""
-    return [own for made in pictures if (own := run.picture_of(made.image))]
+    return [own for made in pictures if (own := run.picture_beside(made))]
 
 
 def warnings(run: Run) -> list[str]:

@@ -13,6 +13,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.reading import TEXT_BYTES, parse_json, read_bytes
 from clpipe.batch.run_log import read_log
 from clpipe.batch.tars import DAMAGED
+from clpipe.chain.rendition import Rendition
 from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, values_in
 
 TAR = ".tar"
@@ -58,14 +59,14 @@ class Made:
     """One picture of a run, by its sidecar: of an image, a frame, a truth, a baseline."""
 
     image: str  # the name of what it was made of, without ending; with folders of a series
-    rendition: str  # what is behind that name, such as ".truth"; "" is the picture itself
+    rendition: Rendition
     record: dict[str, Any]  # what is needed of the sidecar, in which what is alike is one
     files: Mapping[str, Blob]  # by what is behind the picture's name: "jpg", "demosaic.exr"
 
     @property
     def name(self) -> str:
         """The name of the picture, without ending."""
-        return self.image + self.rendition
+        return self.image + self.rendition.suffix
 
     @property
     def steps(self) -> Sequence[Mapping[str, Any]]:
@@ -93,19 +94,25 @@ class Run:
     @property
     def pictures(self) -> Sequence[Made]:
         """The pictures themselves, in the order of their names; first frames of bursts."""
-        return [each for each in self.made if each.rendition in PICTURES]
+        return [each for each in self.made if each.rendition.is_first]
 
-    def of_image(self, image: str) -> Mapping[str, Made]:
+    def of_image(self, image: str) -> Mapping[Rendition, Made]:
         """All pictures of an image, by their rendition."""
         return self._by_image.get(image, {})
 
-    def picture_of(self, image: str) -> Made | None:
-        """The picture of an image, or its first frame."""
-        found = self.of_image(image)
-        return next((found[name] for name in PICTURES if name in found), None)
+    def picture_beside(self, other: Made) -> Made | None:
+        """The picture of another one's image at its exposure, or its first frame."""
+        return next(
+            (
+                made
+                for rendition, made in self.of_image(other.image).items()
+                if rendition.is_first and rendition.ev == other.rendition.ev
+            ),
+            None,
+        )
 
     def __post_init__(self) -> None:
-        self._by_image: dict[str, dict[str, Made]] = {}
+        self._by_image: dict[str, dict[Rendition, Made]] = {}
         self._alike: dict[str, Any] = {}
         self._steps: dict[bytes, Any] = {}
 
@@ -149,10 +156,6 @@ class Run:
         self._by_image.setdefault(made.image, {})[made.rendition] = made
 
 
-# The renditions that count as the picture of an image: itself, or the first frame of its burst.
-PICTURES = ("", *(f".frame{'0' * digits}" for digits in range(1, 7)))
-
-
 def read_run(folder: Path) -> Run:
     """What an output folder has, finished or not.
 
@@ -162,7 +165,7 @@ def read_run(folder: Path) -> Run:
     if not folder.is_dir():
         raise RequestError(f"{folder}: there is no such folder; name the output folder of a run")
     run = Run(folder)
-    found = sorted(_in_folder(run), key=lambda made: (made.image, made.rendition))
+    found = sorted(_in_folder(run), key=lambda made: (made.image, made.rendition.suffix))
     for made in found:
         run.add(made)
     for path in sorted(folder.glob(LOGS)):
@@ -253,9 +256,12 @@ def _made(
         return
     if record is None:
         return
-    rendition = record.get("picture")
     stem = name.removesuffix(f".{SIDECAR}")
-    if not isinstance(rendition, str) or not stem.endswith(rendition):
+    try:
+        rendition = Rendition.from_record(record)
+    except (KeyError, TypeError, ValueError):
+        rendition = None
+    if not rendition or not stem.endswith(rendition.suffix):
         run.problems.append(f"{_joined(below, name)}: is damaged, or of another version")
         return
     files = {}
@@ -265,7 +271,8 @@ def _made(
         files[file.removeprefix(f"{stem}.")] = Blob(
             there.path, there.name, said, there.offset, there.size
         )
-    yield Made(_joined(below, stem.removesuffix(rendition)), rendition, run.slim(record), files)
+    image = _joined(below, stem.removesuffix(rendition.suffix))
+    yield Made(image, rendition, run.slim(record), files)
 
 
 def _joined(below: str, name: str) -> str:

@@ -16,8 +16,8 @@ import numpy as np
 from clpipe.analysis.crops import HEIGHT, WIDTH, Place, choose_places
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
+from clpipe.chain.rendition import BASELINES, PICTURES
 from clpipe.images.preview import decoded, jpeg_bytes, reduced, thumbnail_bytes
-from clpipe.outputs.renditions import baseline_named, truth_named
 from clpipe.reports.figures import number, oddities
 from clpipe.reports.run import Blob, Made, Run
 
@@ -272,7 +272,7 @@ def large(
     views = [
         (" ".join(filter(None, (label, view))), file)
         for label, run in zip(labels, runs, strict=True)
-        if (own := run.picture_of(made.image))
+        if (own := run.picture_beside(made))
         for view, file in _views(run, own)
     ]
     for label, file in sorted(views, key=lambda view: not view[0].endswith(PICTURE)):
@@ -295,12 +295,10 @@ def _views(run: Run, made: Made) -> Iterator[tuple[str, Blob]]:
     """The picture, its truths and its baselines, with their labels."""
     if file := picture_file(made):
         yield PICTURE, file
-    exposure = made.rendition.partition(".frame")[0]
     for rendition, other in run.of_image(made.image).items():
-        kind = truth_named(rendition) or baseline_named(rendition)
-        of_it = rendition.startswith(exposure) and kind not in ("mosaic", "variance")
-        if kind and of_it and (file := picture_file(other)):
-            yield rendition.removeprefix(exposure).strip("."), file
+        is_shown = rendition.role in (*PICTURES, *BASELINES) and rendition.ev == made.rendition.ev
+        if is_shown and (file := picture_file(other)):
+            yield rendition.label.strip("."), file
 
 
 def _kept(made: Made) -> Iterator[tuple[str, Blob]]:

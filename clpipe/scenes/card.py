@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from clpipe.base.about import __version__
 from clpipe.base.files import write_new
+from clpipe.chain.rendition import Rendition
 from clpipe.images.sheet import SHOWN, contact_sheet
 from clpipe.inputs.find import Job
 from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, read_sidecar
@@ -21,7 +22,7 @@ from clpipe.scenes.record import RECORD
 
 SHEET, MANIFEST, README = "contact_sheet.jpg", "manifest.csv", "README.md"
 MOST_ROWS = 12  # of the contact sheet
-PICTURE, CARRIED = "picture", "carried"
+PICTURE, TRUTH, CARRIED = "picture", Rendition("clean").suffix.removeprefix("."), "carried"
 
 # What is raised for values of a forged sidecar.
 DAMAGED = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
@@ -110,8 +111,8 @@ def _member(writer: OutputWriter, job: Job) -> Member | None:
     """What was made of a job; None where something of it failed, or is not as it was written."""
     files: dict[str, str] = {}
     facts = []
-    for name in writer.names_of(job):
-        path = writer.path(job, SIDECAR, name)
+    for rendition in writer.renditions_of(job):
+        path = writer.path(job, SIDECAR, rendition)
         try:
             values = read_sidecar(path)
             facts.append(_facts(values))
@@ -122,7 +123,7 @@ def _member(writer: OutputWriter, job: Job) -> Member | None:
             log.warning("%s; the card goes without it", SidecarError(path))
             return None
         place = path.parent.relative_to(writer.folder)
-        files.setdefault(name.removeprefix(".") or PICTURE, (place / first).as_posix())
+        files.setdefault(rendition.suffix.removeprefix(".") or PICTURE, (place / first).as_posix())
         for each in others:
             if each.endswith(f".{CARRIED}.exr"):
                 files[CARRIED] = (place / each).as_posix()
@@ -179,7 +180,7 @@ def _sheet(folder: Path, members: Sequence[Member]) -> bytes | None:
 
 def _truths(member: Member, names: bool = False) -> list[str]:
     """A view's picture without noise, where there is one; its path or its name."""
-    found = [(name, path) for name, path in member.files.items() if name == "truth_clean"]
+    found = [(name, path) for name, path in member.files.items() if name == TRUTH]
     return [name if names else path for name, path in found]
 
 

@@ -28,7 +28,7 @@ from clpipe.stage import (
 )
 
 # h = FACTOR * strength * noise. Found by trying: at strength 1 it is within 0.1 dB of the highest
-# PSNR of the picture in tests/data, ISO 1600 to 12800. tools/quality measures that PSNR.
+# PSNR of the picture in tests/data, ISO 1600 to 12800. tools/pages/quality.py measures that PSNR.
 FACTOR = 1.3
 LARGEST = 15  # px, of the window
 

@@ -178,9 +178,7 @@ def main():
             parser.error(f"--real: {' and '.join(given.real)} are not of one size")
     patches = clpipe.Dataset(
         given.renders,
-        patch=given.size,
-        patches_per_image=64,
-        augment=True,
+        patch=clpipe.Patches(given.size, per_image=64, augment=True),
         epochs=given.steps,  # more than are needed
         **settings,
     )

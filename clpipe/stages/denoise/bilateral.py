@@ -12,8 +12,8 @@ from clpipe.reference.image import tap
 from clpipe.stage import Context, ReferenceContext, parameter
 from clpipe.stages.denoise.strength import WindowDenoiser
 
-# Sigma of the range weight, in multiples of strength * noise. Chosen, not derived; tools/quality
-# measures the PSNR that it gives, and no test holds it to be the best.
+# Sigma of the range weight, in multiples of strength * noise. Chosen, not derived;
+# tools/pages/quality.py measures the PSNR that it gives, and no test holds it to be the best.
 RANGE = 3.0
 
 

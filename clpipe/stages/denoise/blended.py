@@ -11,7 +11,7 @@ from clpipe.stage import Context, ReferenceContext
 from clpipe.stages.denoise.strength import WindowDenoiser
 
 # Assumed standard deviation of detail against its neighbours, signal units. Chosen, not derived;
-# tools/quality measures the PSNR that it gives, and no test holds it to be the best.
+# tools/pages/quality.py measures the PSNR that it gives, and no test holds it to be the best.
 DETAIL = 0.02
 
 

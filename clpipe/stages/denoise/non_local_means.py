@@ -19,7 +19,7 @@ from clpipe.stages.denoise.strength import (
 )
 
 # h = FACTOR * strength * noise. Found by trying: at strength 1 it is within 0.1 dB of the highest
-# PSNR of the picture in tests/data, ISO 1600 to 12800. tools/quality measures that PSNR.
+# PSNR of the picture in tests/data, ISO 1600 to 12800. tools/pages/quality.py measures that PSNR.
 FACTOR = 1.1
 PATCH = 9  # pixels of a patch
 

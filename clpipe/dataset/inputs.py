@@ -1,0 +1,58 @@
+"""What a dataset is made of, as its arguments name it: images, texts, bytes."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from clpipe.base.errors import RequestError
+from clpipe.base.memory import parse_size
+from clpipe.inputs.find import Job, find_jobs
+from clpipe.inputs.loader import ImageLoader
+
+NOWHERE = Path(os.devnull)  # nothing is written
+
+
+def several(value: str | Path | Sequence[str | Path]) -> tuple[str, ...]:
+    """The texts of an argument that is one of them or several."""
+    return tuple(map(str, [value] if isinstance(value, str | Path) else value))
+
+
+def cache_size(cache: int | str) -> int:
+    """The bytes of a number, or of a text with a unit.
+
+    Raises:
+        RequestError: it is neither.
+    """
+    try:
+        size = parse_size(cache) if isinstance(cache, str) else cache
+    except RequestError:
+        size = -1
+    if size < 0:
+        raise RequestError(f"found cache {cache!r}; expected bytes, or a size such as 512M or 4G")
+    return size
+
+
+def jobs_of(loader: ImageLoader, inputs: Sequence[str], exclude: Sequence[str]) -> list[Job]:
+    """The images of a dataset.
+
+    Args:
+        loader: how they enter.
+        inputs, exclude: as for :func:`clpipe.inputs.find.find_jobs`.
+
+    Raises:
+        RequestError: none is found, one that is named does not exist, or two have the same name,
+            and so the same draws.
+    """
+    jobs = loader.exposures(find_jobs(inputs, NOWHERE, loader.endings(), exclude))
+    loader.check(jobs)
+    owners: dict[str, Job] = {}
+    for job in jobs:
+        if job.listed and not job.path.exists():  # those of a folder were found there
+            raise RequestError(f"{job.label}: no such file or folder")
+        other = owners.setdefault(job.key, job)
+        if other is not job:
+            raise RequestError(
+                f"{other.label} and {job.label} are both called {job.key}, and what is drawn for "
+                "them would be the same; give the folder that both are in"
+            )
+    return jobs

@@ -1,0 +1,189 @@
+"""Recipes: how each rendition of an image is made, with which chain and which noise."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+from clpipe.base.errors import KeyedError, RequestError
+from clpipe.chain.baseline import baseline_of, matching_of
+from clpipe.chain.chain import Chain, Step
+from clpipe.chain.identity import noise_key, of_bracket
+from clpipe.chain.rendition import (
+    BASELINES,
+    CLEAN,
+    DEVELOPMENT,
+    MOSAIC,
+    NOISY,
+    PICTURES,
+    TRUTHS,
+    VARIANCE,
+    Rendition,
+    Role,
+)
+from clpipe.chain.settings import overlay
+from clpipe.chain.truth import noisy_mosaic, picture_without_noise, signal_and_noise
+from clpipe.outputs.spread import Spread
+
+EXPOSURE = "exposure"  # the step whose ev a bracket adds to
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a rendition of an image is made.
+
+    Args:
+        rendition: which picture of the image.
+        chain: what makes it.
+        noise: for a variance map, the steps whose noise has this variance in the chain's last
+            image, see :func:`clpipe.chain.truth.variance_of`; else ().
+        key: the key of the image.
+        spread: what its noise is measured on, of a baseline; the chain has it when that is known.
+        estimates: what was found about its noise, of a baseline.
+    """
+
+    rendition: Rendition
+    chain: Chain
+    noise: tuple[Step, ...]
+    key: str
+    spread: Spread | None = None
+    estimates: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def noise_key(self) -> str:
+        """What its noise is made of."""
+        return noise_key(self.chain.settings, self.key, self.rendition.frame)
+
+    @property
+    def whole(self) -> Chain:
+        """The chain with the steps of ``noise``."""
+        if not self.noise:
+            return self.chain
+        return replace(self.chain, steps=(*self.chain.steps[:-1], *self.noise))
+
+
+@dataclass(frozen=True)
+class RenditionPlan:
+    """Which renditions are made of each image.
+
+    Args:
+        frames: how many frames; None is one picture. A burst has the truth of its development, too.
+        truths: which of :data:`clpipe.chain.rendition.TRUTHS`.
+        bracket: what is added to the exposure's EV, for each exposure; () is the exposure alone.
+        baselines: which of :data:`clpipe.chain.rendition.BASELINES`; they bring the truths that are
+            pictures along.
+    """
+
+    frames: int | None = None
+    truths: tuple[str, ...] = ()
+    bracket: tuple[float, ...] = ()
+    baselines: tuple[str, ...] = ()
+
+    def renditions(self) -> tuple[Rendition, ...]:
+        """The renditions of an image, exposure by exposure.
+
+        >>> [each.suffix for each in RenditionPlan(2).renditions()]
+        ['.frame0', '.frame1', '.truth']
+        >>> [each.suffix for each in RenditionPlan(None, ("mosaic",), (-2, 0)).renditions()]
+        ['.ev-2', '.ev-2.truth_mosaic', '.ev+0', '.ev+0.truth_mosaic']
+        """
+        return tuple(
+            Rendition(role, ev, frame, self.frames)
+            for ev in self.bracket or (None,)
+            for role in self._roles()
+            for frame in (range(self.frames) if self.frames and role == NOISY else (None,))
+        )
+
+    def _roles(self) -> list[Role]:
+        truths = (*self.truths, *([DEVELOPMENT] if self.frames else []))
+        if self.baselines:
+            truths += PICTURES
+        asked = {NOISY, *truths, *self.baselines}
+        return [role for role in (NOISY, *TRUTHS, *BASELINES) if role in asked]
+
+    def needed(self, renditions: Iterable[Rendition]) -> set[Rendition]:
+        """These renditions, with those that a baseline among them is measured on."""
+        needed = set(renditions)
+        for each in tuple(needed):
+            if each.role in BASELINES:
+                needed |= {*measured_on(each)}
+        return needed
+
+    def recipes(self, chain: Chain, key: str) -> list[Recipe]:
+        """How each of :meth:`renditions` is made of an image.
+
+        The first frame is the same picture as that without a burst, and an exposure at 0 EV as that
+        without a bracket.
+
+        Args:
+            chain: of the noisy picture.
+            key: of the image.
+
+        Raises:
+            RequestError: the chain has no such truth, or no such exposure.
+        """
+        recipes: list[Recipe] = []
+        spreads: dict[float | None, Spread] = {}  # baselines of one exposure share theirs
+        for each in self.renditions():
+            own = chain if each.ev is None else exposed(chain, each.ev)
+            own_key = of_bracket(key, each.ev or 0.0)
+            recipe = Recipe(each, *chain_and_noise(each.role, own), own_key)
+            if each.role in BASELINES:
+                spread = Spread(measured_on(each), matching_of(own), own.settings.output)
+                recipe = replace(recipe, spread=spreads.setdefault(each.ev, spread))
+            recipes.append(recipe)
+        return recipes
+
+
+def measured_on(baseline: Rendition) -> tuple[Rendition, Rendition, Rendition]:
+    """What a baseline is measured on: the noisy picture, and its truths that are pictures."""
+    return baseline.beside(NOISY), baseline.beside(DEVELOPMENT), baseline.beside(CLEAN)
+
+
+@lru_cache(maxsize=64)  # as chain_and_noise
+def exposed(chain: Chain, ev: float) -> Chain:
+    """A chain with so many EV more in its step ``exposure``, and with noise of its own.
+
+    Raises:
+        RequestError: it has no such step, or the sum is not allowed.
+    """
+    place = next((i for i, step in enumerate(chain.steps) if step.name == EXPOSURE), None)
+    before = None if place is None else getattr(chain.steps[place].method, "ev", None)
+    if place is None or before is None:
+        names = ", ".join(step.name for step in chain.steps)
+        raise RequestError(
+            f"--bracket: it adds to {EXPOSURE}.ev, but this chain has no stage {EXPOSURE}: {names}"
+        )
+    if not ev:
+        return chain
+    try:
+        settings = overlay(chain.settings, {EXPOSURE: {"ev": before + ev}})
+    except KeyedError as error:
+        raise RequestError(
+            f"--bracket: {ev:+g} EV on {EXPOSURE}.ev={before:g} is too far; {error}"
+        ) from None
+    if settings.noise_key:
+        settings = replace(settings, noise_key=of_bracket(settings.noise_key, ev))
+    step = chain.steps[place]
+    method = settings.method(EXPOSURE).resolve(step.context)
+    steps = (*chain.steps[:place], replace(step, method=method), *chain.steps[place + 1 :])
+    return replace(chain, steps=steps, settings=settings)
+
+
+@lru_cache(maxsize=64)  # most images of a run share one chain, and plans are cached per chain
+def chain_and_noise(role: Role, chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
+    """The chain of a rendition, and the noise of a variance map, see :class:`Recipe`.
+
+    Args:
+        role: of the rendition.
+        chain: of the noisy picture.
+
+    Raises:
+        RequestError: the chain has no such truth or baseline.
+    """
+    if role == VARIANCE:
+        return signal_and_noise(chain)
+    if role == MOSAIC:
+        return noisy_mosaic(chain).without_noise(), ()
+    if role in BASELINES:
+        return baseline_of(chain), ()
+    return chain if role == NOISY else picture_without_noise(role, chain), ()

@@ -1,0 +1,348 @@
+"""Time clpipe's default chain against the same work in OpenCV and NumPy, in turns, in one run.
+
+    tools/run compare opencv [--device N] [--arrays WxH ...] [--files COUNTxWxH ...] [--methods]
+
+It needs the extra "compare" (.venv/bin/pip install -e '.[compare]'). opencv_chain.py says, stage by
+stage, what stands for what, and where OpenCV does less. The script runs in two ways: on whole
+images with OpenCV's own threads, as most would write it; and in bands of rows that stay in the
+cache, in a pool of threads, the fastest that was found.
+
+Arrays: a render of half floats in memory becomes a picture of eight bits in memory; for clpipe also
+from device to device, as `clpipe bench` measures.
+
+Files: half EXRs become JPEGs of one quality and subsampling. clpipe hashes what it reads, writes
+sidecars and brings each file to the disk before it gets its name; the script does not. It decodes
+with the OpenEXR package, which is faster there than cv2.imread or as fast, encodes with
+cv2.imencode, which is faster than Pillow, and has the fastest of some numbers of threads. Links to
+a few renders stand for many.
+
+Methods: colour-demosaicing, scikit-image and HDRutils beside clpipe's methods of the same name; see
+methods.py.
+
+Each turn runs all once. Speeds are medians; ratios are those within a turn, their median and
+quartiles. First both develop the test image, and their pictures and noise are compared.
+"""
+
+import argparse
+import importlib.util
+import json
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from clpipe.base.errors import ClpipeError
+from clpipe.base.processors import available_processors
+from clpipe.base.types import Array
+from clpipe.batch.bench import Load, write_renders
+from clpipe.batch.outcome import DONE
+from clpipe.batch.threads import Batch
+from clpipe.batch.work import ImageWorker
+from clpipe.chain.request import Request
+from clpipe.commands.printing import show
+from clpipe.engine.bench import scene
+from clpipe.engine.device import Device, open_device
+from clpipe.engine.runner import Runner
+from clpipe.images.read import read_image
+from clpipe.inputs.find import find_jobs
+from clpipe.inputs.loader import ImageLoader
+from clpipe.outputs.writer import OutputWriter
+from tools import RENDER
+from tools.compare.turns import Comparison, Work, in_turns
+
+NEEDED = ("cv2", "OpenEXR")
+WHOLE, BANDS = "opencv_whole", "opencv_bands"
+HEADINGS = (
+    *("work", "clpipe MP/s"),
+    *("OpenCV MP/s", "ratio", "quartiles", "in bands MP/s", "ratio", "quartiles"),
+)
+
+
+class Likeness(NamedTuple):
+    """How alike clpipe and the script are.
+
+    ``difference`` is the mean of that of the pictures of the test image, in levels of 255;
+    ``noise`` is the variance of the script's noise in a grey raw over that of clpipe's.
+    """
+
+    difference: float
+    noise: float
+
+
+def likeness(device: Device) -> Likeness:
+    """Compare what both make."""
+    from tools.compare.opencv_chain import OpenCVChain
+
+    chain = Request.from_options().chain()
+    script = OpenCVChain(chain)
+    render = read_image(RENDER).pixels
+    ours, theirs = Runner(chain, device).run(render, "").image, script.run_in_bands(render)
+    grey = np.full((512, 512, 3), 0.18, np.float16)
+    raw = Request.from_options(until="quantize").chain()
+    own = Runner(raw, None, encode=False, final=True).run(grey, "").image  # the same as on it
+    return Likeness(
+        float(abs(ours.astype(np.int16) - theirs).mean()),
+        variance(script.expose(script.blur(grey))) / variance(own),
+    )
+
+
+def variance(raw: Array) -> float:
+    """The mean variance of the colours of an even mosaic."""
+    return float(np.mean([raw[i::2, j::2].astype(float).var() for i in (0, 1) for j in (0, 1)]))
+
+
+def compare_arrays(device: Device, width: int, height: int, repeat: int) -> list[Comparison]:
+    """Arrays to arrays, on the device alone and from memory to memory."""
+    import cv2
+
+    from tools.compare.opencv_chain import OpenCVChain, pool
+
+    chain = Request.from_options().chain()
+    runner, script = Runner(chain, device), OpenCVChain(chain)
+    image = scene(width, height)
+    with pool(available_processors()) as threads:
+
+        def whole() -> None:
+            cv2.setNumThreads(available_processors())
+            script.run(image)
+
+        def bands() -> None:
+            cv2.setNumThreads(1)
+            script.run_in_bands(image, threads.map)
+
+        works: dict[str, Work] = {
+            "memory": lambda: runner.run(image, "compare"),
+            "device": lambda: runner.run(image, "compare", download=False),
+            WHOLE: whole,
+            BANDS: bands,
+        }
+        in_turns(works, 1)  # compiles, and touches memory
+        seconds = in_turns(works, repeat)
+    theirs = {name: seconds[name] for name in (WHOLE, BANDS)}
+    megapixels, size = width * height / 1e6, f"{width}x{height}"
+    return [
+        Comparison(f"{size}, on the device", megapixels, seconds["device"], theirs),
+        Comparison(f"{size}, memory to memory", megapixels, seconds["memory"], theirs),
+    ]
+
+
+class Files:
+    """A load of files in a folder, and what clpipe and the script make of them."""
+
+    def __init__(self, device: Device, load: Load, folder: Path) -> None:
+        from tools.compare.opencv_chain import OpenCVChain
+
+        self.out = folder / "out"
+        write_renders(folder / "in", load)
+        request = replace(Request.from_options(), formats=("jpg",))
+        self.loader = ImageLoader(request)
+        self.writer = OutputWriter(self.out, request)
+        self.jobs = find_jobs([str(folder / "in")], self.out)
+        self.chain = self.loader.first_chain(self.jobs)
+        self.device = device
+        self.script = OpenCVChain(self.chain, bgr=True)
+        self.threads = available_processors()
+
+    def clear(self) -> None:
+        """An empty folder for what is made."""
+        shutil.rmtree(self.out, ignore_errors=True)
+        self.out.mkdir()
+
+    def clpipe(self, count: int | None = None) -> None:
+        """Develop the first ``count`` files with clpipe.
+
+        Raises:
+            ClpipeError: one fails.
+        """
+        worker = ImageWorker(self.loader, self.writer, self.chain)
+        for outcome in Batch(worker, [self.device]).run(self.jobs[:count]):
+            if outcome.status != DONE:
+                raise ClpipeError(outcome.error)
+
+    def opencv(self, bands: bool, count: int | None = None) -> None:
+        """Develop the first ``count`` files with the script."""
+        import cv2
+        import OpenEXR
+
+        from tools.compare.opencv_chain import pool
+
+        cv2.setNumThreads(1)
+        quality = cv2.IMWRITE_JPEG_QUALITY, 97
+        sampling = cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422
+
+        def one(path: Path) -> None:
+            render = OpenEXR.File(str(path)).channels()["RGB"].pixels
+            picture = self.script.run_in_bands(render) if bands else self.script.run(render)
+            _, data = cv2.imencode(".jpg", picture, (*quality, *sampling))
+            data.tofile(self.out / f"{path.stem}.jpg")
+
+        with pool(self.threads) as threads:
+            list(threads.map(one, [job.path for job in self.jobs[:count]]))
+
+    def choose_threads(self) -> None:
+        """Take the number of threads that is fastest for the script."""
+        processors = available_processors()
+        seconds = {}
+        for self.threads in (processors, processors + 1, 2 * processors):
+            self.clear()
+            start = time.perf_counter()
+            self.opencv(bands=True, count=2 * processors)
+            seconds[self.threads] = time.perf_counter() - start
+        self.threads = min(seconds, key=seconds.__getitem__)
+
+
+@contextmanager
+def files_of(device: Device, load: Load) -> Iterator[Files]:
+    """A load of files in a temporary folder."""
+    with tempfile.TemporaryDirectory(prefix="clpipe-compare-") as name:
+        yield Files(device, load, Path(name))
+
+
+def compare_files(device: Device, load: Load, repeat: int) -> Comparison:
+    """Files to files."""
+    with files_of(device, load) as files:
+        files.clear()
+        files.clpipe(count=8)  # compiles, and brings the files into memory
+        files.choose_threads()
+        works: dict[str, Work] = {
+            "clpipe": files.clpipe,
+            WHOLE: lambda: files.opencv(bands=False),
+            BANDS: lambda: files.opencv(bands=True),
+        }
+        seconds = in_turns(works, repeat, files.clear)
+    return Comparison(
+        f"{load.images} files of {load.width}x{load.height}, {files.threads} threads",
+        load.images * load.width * load.height / 1e6,
+        seconds.pop("clpipe"),
+        seconds,
+    )
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """WxH as two even numbers."""
+    width, height = numbers_of(text, 2)
+    return width, height
+
+
+def load_of(text: str) -> Load:
+    """COUNTxWxH."""
+    return Load(*numbers_of(text, 3))
+
+
+def turns_of(text: str) -> int:
+    """How many turns: at least one."""
+    if not text.isdecimal() or not int(text):
+        raise argparse.ArgumentTypeError(f"found {text!r}; expected a whole number from 1 on")
+    return int(text)
+
+
+def numbers_of(text: str, count: int) -> list[int]:
+    """Whole numbers between x; all but a count are even.
+
+    Raises:
+        argparse.ArgumentTypeError: they are not.
+    """
+    words = text.split("x")
+    if len(words) != count or not all(w.isdecimal() and int(w) for w in words):
+        form = "x".join(("COUNT", "WIDTH", "HEIGHT")[-count:])
+        raise argparse.ArgumentTypeError(f"found {text!r}; expected {form}")
+    numbers = [int(word) for word in words]
+    if any(number % 2 for number in numbers[-2:]):
+        raise argparse.ArgumentTypeError(f"found {text!r}; the script needs even sizes")
+    return numbers
+
+
+def main() -> int:
+    """Compare, print the tables."""
+    parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
+    parser.add_argument("--device", metavar="N|NAME", help="as for clpipe")
+    parser.add_argument(
+        "--arrays",
+        nargs="*",
+        type=size_of,
+        metavar="WxH",
+        default=[(3000, 2000), (6000, 4000)],
+        help="sizes of images in memory; none for no such comparison",
+    )
+    parser.add_argument(
+        "--files",
+        nargs="*",
+        type=load_of,
+        metavar="COUNTxWxH",
+        default=[Load(20, 6000, 4000), Load(1000, 512, 512), Load(200, 1920, 1080)],
+        help="numbers and sizes of files; none for no such comparison",
+    )
+    parser.add_argument("--methods", action="store_true", help="other projects' methods, too")
+    parser.add_argument("--repeat", type=turns_of, default=5, metavar="N", help="turns (default 5)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    options = parser.parse_args()
+    if missing := [name for name in NEEDED if not importlib.util.find_spec(name)]:
+        print(
+            f"{', '.join(missing)}: missing; .venv/bin/pip install -e '.[compare]'", file=sys.stderr
+        )
+        return 1
+    try:
+        return compare(options)
+    except ClpipeError as error:
+        print(f"compare_opencv: {error}", file=sys.stderr)
+        return 1
+
+
+def compare(options: argparse.Namespace) -> int:
+    """All comparisons that are asked for.
+
+    Raises:
+        ClpipeError: there is no such device, or it fails.
+    """
+    import cv2
+
+    device = open_device(options.device)
+    if device is None:
+        raise ClpipeError("numpy is no device to time")
+    alike = likeness(device)
+    rows = []
+    for size in options.arrays:
+        rows += compare_arrays(device, *size, options.repeat)
+    rows += [compare_files(device, load, options.repeat) for load in options.files]
+    methods = []
+    if options.methods:
+        from tools.compare.methods import compare_methods
+
+        methods = compare_methods(device, options.repeat)
+    record = {
+        "device": device.info.label,
+        "opencv": cv2.__version__,
+        "processors": available_processors(),
+        "likeness": alike._asdict(),
+        "chain": [row.record() for row in rows],
+        "methods": [row.record() for row in methods],
+    }
+    if options.json:
+        print(json.dumps(record, indent=2))
+        return 0
+    print(
+        f"{device.info.label}, OpenCV {cv2.__version__}, {available_processors()} CPUs\n"
+        f"pictures of the test image differ by {alike.difference:.1f} levels of 255 on average; "
+        f"noise in the raw: {alike.noise:.3f} of clpipe's variance\n"
+    )
+    if rows:
+        show(HEADINGS, [row.cells() for row in rows], left=1)
+    if methods:
+        print()
+        show(
+            ("method", "clpipe MP/s", "other MP/s", "ratio", "quartiles"),
+            [row.cells() for row in methods],
+            left=1,
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

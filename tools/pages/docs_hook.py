@@ -1,0 +1,291 @@
+"""The pages of the site that are made when it is built: from the stages, the cameras, the commands.
+
+A hook of mkdocs. All that it takes from inside clpipe is imported here, and nothing of mkdocs is
+needed to call :func:`pages`.
+"""
+
+import base64
+import json
+import re
+from inspect import cleandoc
+from pathlib import Path
+from typing import Any
+
+from click.testing import CliRunner
+
+from clpipe.chain.registry import all_stages
+from clpipe.commands.main import main
+from clpipe.stage import Method
+from tools import ROOT
+
+NOTEBOOK = "first_steps"
+
+
+def pages() -> dict[str, str | bytes]:
+    """What the generated files hold, by their paths in docs/."""
+    return {
+        "stages.md": stages_page(),
+        "cameras.md": cameras_page(),
+        "configurations.md": configurations_page(),
+        "cli.md": cli_page(),
+        "changelog.md": (ROOT / "CHANGELOG.md").read_text("utf-8"),
+        "security.md": (ROOT / "SECURITY.md").read_text("utf-8"),
+        "contributing.md": (ROOT / "CONTRIBUTING.md").read_text("utf-8"),
+        **notebook_files(ROOT / "docs" / f"{NOTEBOOK}.ipynb"),
+    }
+
+
+def json_of(*command: str) -> Any:
+    """What a command of clpipe prints with --json."""
+    result = CliRunner().invoke(main, [*command, "--json"], catch_exceptions=False)
+    if result.exit_code:
+        raise RuntimeError(result.output)
+    return json.loads(result.output)
+
+
+def cell(text: object) -> str:
+    """Text for a cell of a table."""
+    return str(text).replace("|", "\\|")
+
+
+def table(headings: list[str], rows: list[list[object]]) -> str:
+    """A table in Markdown."""
+    lines = [headings, ["---"] * len(headings), *rows]
+    return "\n".join("| " + " | ".join(map(cell, line)) + " |" for line in lines) + "\n"
+
+
+def code(text: object) -> str:
+    """Text in code style; nothing where there is none."""
+    return f"`{text}`" if text else ""
+
+
+def prose(text: str) -> str:
+    """A docstring without its doctests; roles of reStructuredText as plain code."""
+    text = re.sub(r"\n\s*>>>.*?(?=\n\s*\n|\Z)", "", cleandoc(text), flags=re.DOTALL)
+    text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text)
+    return text.replace("``", "`").strip()
+
+
+def sources(method: type[Method]) -> str:
+    """The files of a method: its declaration, with the NumPy reference, and its kernel."""
+    files = [f"{method.__module__.replace('.', '/')}.py"]
+    if not (ROOT / files[0]).is_file():
+        files = [f"{method.__module__.replace('.', '/')}/__init__.py"]
+    if method.kernel:
+        files.append(f"kernels/{method.kernel}.cl")
+    for file in files:
+        if not (ROOT / file).is_file():
+            raise FileNotFoundError(file)
+    return ", ".join(map(code, files))
+
+
+def stages_page() -> str:
+    """Every stage with its methods and their parameters, from the declarations."""
+    records = json_of("stages")
+    default = [step["stage"] for step in default_chain()]
+    parts = [
+        "# Stages and methods\n\n"
+        "This page is made from the declarations of the stages; `clpipe stages NAME` prints the "
+        "same, with the values that automatic parameters take for a `--camera` and an `--iso`. "
+        "The first method of a stage is its default. A parameter is set as "
+        "`--set STAGE.PARAMETER=VALUE` or in the table `[STAGE]` of a configuration; "
+        "`--set STAGE.method=NAME` chooses a method. Stages follow in the order of the default "
+        "chain; those after `picture_noise` are not part of it.\n\n"
+        "The kinds of image are *rgb* (linear, 1 = full scale of the sensor at EV 0), *mosaic* "
+        "(one plane, as signal: 0 = black level, 1 = white level), *raw* (the mosaic in DN) and "
+        "*display* (0 to 1, encoded for a screen).\n",
+        table(
+            ["stage", "image", "methods", "what it does"],
+            [
+                [
+                    f"[`{r['name']}`](#{r['name']})" + ("" if r["name"] in default else " \\*"),
+                    kinds(r),
+                    ", ".join(code(m["name"]) for m in r["methods"]),
+                    r["summary"],
+                ]
+                for r in records
+            ],
+        ),
+        "\\* not in the default chain\n",
+        *(stage_part(record) for record in records),
+    ]
+    return "\n".join(parts)
+
+
+def default_chain() -> list[dict[str, Any]]:
+    """The stages of the default chain, as the plan's TOML lists them."""
+    import tomllib
+
+    result = CliRunner().invoke(main, ["plan", "--toml"], catch_exceptions=False)
+    return [{"stage": name} for name in tomllib.loads(result.output)["stages"]]
+
+
+def kinds(record: dict[str, Any]) -> str:
+    """What a stage reads and writes."""
+    reads, writes = record["reads"], record["writes"]
+    return reads if reads == writes else f"{reads} → {writes}"
+
+
+def stage_part(record: dict[str, Any]) -> str:
+    """One stage."""
+    stage = all_stages()[record["name"]]
+    parts = [f"## {stage.name}\n", f"{record['summary']} Image: {kinds(record)}.\n"]
+    for each in record["methods"]:
+        parts.append(f"### {each['name']} {{ #{stage.name}-{each['name']} }}\n")
+        parts.append(f"{sentence(each['summary'])}\n")
+        method = stage.by_name[each["name"]]
+        if own := method.__dict__.get("__doc__"):
+            text = prose(own)
+            if text.strip(" .").lower() != each["summary"].strip(" .").lower():
+                parts.append(f"{text}\n")
+        if each["parameters"]:
+            parts.append(
+                table(
+                    ["parameter", "default", "unit", "allowed", "meaning"],
+                    [
+                        [code(p["name"]), p["default"], p["unit"], p["allowed"], p["text"]]
+                        for p in each["parameters"]
+                    ],
+                )
+            )
+        parts.append(f"Source: {sources(method)}\n")
+    return "\n".join(parts)
+
+
+def sentence(text: str) -> str:
+    """A summary as a sentence."""
+    return text[:1].upper() + text[1:].rstrip(".") + "."
+
+
+def figure(value: object) -> str:
+    """A number with four digits; a dash where none is known."""
+    if value is None:
+        return "-"
+    if isinstance(value, list):
+        return ", ".join(map(figure, value))
+    if isinstance(value, float):
+        return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    return str(value)
+
+
+def nowrap(text: str) -> str:
+    """A number in one line: a hyphen that does not break."""
+    return text.replace("-", "\N{NON-BREAKING HYPHEN}")
+
+
+def cameras_page() -> str:
+    """The built-in cameras, their noise at every measured ISO and where the figures are from."""
+    parts = [
+        "# Cameras\n\n"
+        "This page is made from the built-in profiles. `clpipe cameras NAME` prints one of them, "
+        "`clpipe cameras NAME --iso N` the noise at one ISO. [Noise and cameras](noise.md) "
+        "explains the figures and shows how to write a profile of your own.\n"
+    ]
+    for camera in json_of("cameras"):
+        low, high = camera["iso_range"]
+        make, model = camera["make"], camera["model"]
+        title = model if model.startswith(make) else f"{make} {model}"
+        also = f" ({', '.join(camera['aliases'])})" if camera["aliases"] else ""
+        parts.append(f"## {camera['name']}\n\n{title}{also}, ISO {low:g} to {high:g}.\n")
+        units = {
+            "black_level": "DN",
+            "white_level": "DN",
+            "full_well": "e-",
+            "dsnu": "e-",
+            "hot_pixel_level": "e-",
+        }
+        skip = ("name", "make", "model", "aliases", "iso_range", "noise", "sources")
+        rows: list[list[object]] = [
+            [code(key), figure(value), units.get(key, "") if value is not None else ""]
+            for key, value in camera.items()
+            if key not in skip
+        ]
+        parts.append(table(["", "value", "unit"], rows))
+        headings = ["ISO", "a", "b", "system_gain, DN/e-", "read_noise, e-", "adc_noise, DN"]
+        headings += ["dark noise, DN", "row_noise, DN", "column_noise, DN"]
+        rows = []
+        for noise in camera["noise"]:
+            signal, emva = noise["signal"], noise["emva1288"]
+            values = [noise["iso"], signal["a"], signal["b"], *emva.values()]
+            values += [noise["dark_noise"], noise["row_noise"], noise["column_noise"]]
+            rows.append([nowrap(figure(float(value))) for value in values])
+        parts.append(table(headings, rows))
+        parts.append("Sources:\n")
+        parts += [f"- `{key}`: {text}" for key, text in camera["sources"].items()]
+        parts.append("")
+    return "\n".join(parts)
+
+
+def configurations_page() -> str:
+    """The built-in configurations, as they are."""
+    parts = [
+        "# Configurations\n\n"
+        "The configurations that `-c NAME` takes, as their files are. "
+        "[Configuration and draws](configuration.md) explains the format.\n"
+    ]
+    for path in sorted(ROOT.glob("clpipe/**/configs/*.toml")):
+        parts.append(f"## {path.stem}\n\n```toml\n{path.read_text('utf-8')}```\n")
+    return "\n".join(parts)
+
+
+def cli_page() -> str:
+    """The command line; mkdocs-click fills it in."""
+    module = main.callback.__module__ if main.callback else ""
+    return f"""# Command line
+
+This page is made from the program; `clpipe COMMAND --help` prints the same.
+
+Exit status: 0, all well; 1, some images failed and the others are written; 2, the request was
+wrong and nothing is written; 3, there is no usable device; 130, interrupted.
+
+::: mkdocs-click
+    :module: {module}
+    :command: main
+    :prog_name: clpipe
+    :depth: 1
+    :style: plain
+
+::: mkdocs-click
+    :module: clpipe.commands.cameras
+    :command: import_command
+    :prog_name: clpipe cameras import
+    :depth: 2
+    :style: plain
+"""
+
+
+def notebook_files(path: Path) -> dict[str, str | bytes]:
+    """A notebook with its outputs as a page, and its pictures."""
+    notebook = json.loads(path.read_text("utf-8"))
+    name, parts, files = path.stem, [], {}
+    for cell_number, each in enumerate(notebook["cells"]):
+        source = "".join(each["source"])
+        if each["cell_type"] == "markdown":
+            parts.append(source)
+            continue
+        parts.append(f"```python\n{source}\n```")
+        for number, output in enumerate(each["outputs"]):
+            data = output.get("data", {})
+            if "image/png" in data:
+                picture = f"{name}_{cell_number}_{number}.png"
+                files[picture] = base64.b64decode("".join(data["image/png"]))
+                parts.append(f"![]({picture})")
+            elif text := "".join(output.get("text", data.get("text/plain", ""))):
+                parts.append(f"```text\n{text.rstrip()}\n```")
+    return {f"{name}.md": "\n\n".join(parts) + "\n", **files}
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the generated pages; called by mkdocs."""
+    from mkdocs.structure.files import File
+
+    for path, content in pages().items():
+        files.append(File.generated(config, path, content=content))
+    return files
+
+
+def on_page_content(html: str, page: Any, **_: Any) -> str:
+    """Show roles of reStructuredText and examples of commands as code; called by mkdocs."""
+    if page.file.src_uri == "cli.md":
+        html = re.sub(r"<p>(clpipe [^<]+)</p>", r"<pre><code>\1</code></pre>", html)
+    return re.sub(r":\w+:<code>~?([^<]+)</code>", r"<code>\1</code>", html)

@@ -1,0 +1,225 @@
+"""Real cameras' finished pictures beside clpipe's: signatures, plots, crops; for validate.py."""
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from PIL import Image
+
+import clpipe
+from clpipe.analysis.signature import (
+    BIN,
+    FEWEST,
+    Signature,
+    flat_places,
+    luma,
+    noise_of,
+    signature,
+)
+from clpipe.analysis.spatial import LAGS, autocorrelation, count_pairs
+from clpipe.base.types import Array, Doubles, Floats
+from clpipe.engine.device import open_device
+from clpipe.engine.runner import Runner
+from tools.pages.side_by_side import COLUMNS, cells, sheet, telling_places
+
+ISOS = (800, 1600, 3200, 6400)
+TRUTH, PICTURE = "_mean.png", "_real.png"
+RINGS = 16  # of spatial frequency, up to half a cycle per pixel
+
+# Cameras' own JPEGs in their native size, each less the mean of many of the same scene: medians
+# over pictures, measured by clpipe.analysis.signature. The pictures are not shipped. They are of
+# Nam, Hwang, Matsushita and Kim, "A holistic approach to cross-channel image noise modeling and its
+# application to image denoising" (CVPR 2016).
+MEASURED: dict[str, dict[str, float]] = {
+    name: dict(zip((attribute for _, attribute, _ in COLUMNS), values, strict=True))
+    for name, values in {
+        "Canon 5D Mark III, ISO 3200": (3.9, 5.3, 29, 0.51, 0.47, 0.28, 0.09, 0.57, 0.84, 0.65),
+        "Nikon D800, ISO 1600": (4.0, 3.5, 5, 0.55, 0.55, 0.29, 0.10, 0.59, 0.88, 0.48),
+        "Nikon D800, ISO 3200": (5.3, 3.4, 5, 0.59, 0.60, 0.35, 0.14, 0.63, 0.83, 0.40),
+    }.items()
+}
+
+# What is asked of a camera-like development: around these cameras, lowest and highest.
+RANGES: dict[str, tuple[float, float]] = {
+    "kurtosis": (3.0, 5.5),
+    "beyond_4_sigma": (0, 30),
+    "right": (0.42, 0.68),
+    "below": (0.42, 0.66),
+    "diagonal": (0.22, 0.42),
+    "two_right": (0.04, 0.21),
+    "half": (0.52, 0.70),
+    "chroma_right": (0.75, 0.95),
+    "red_green": (0.20, 0.75),
+}
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A picture and the same without noise, (height, width, 3) uint8."""
+
+    noisy: Array
+    clean: Array
+
+    def signature(self) -> Signature:
+        """The columns."""
+        return signature(self.noisy, self.clean)
+
+
+def read_pairs(folder: Path) -> dict[str, list[Pair]]:
+    """The pairs NAME_NUMBER_real.png and NAME_NUMBER_mean.png of a folder, by NAME.
+
+    Raises:
+        FileNotFoundError: there are none, or one lacks its mean; the message says which.
+    """
+    found: dict[str, list[Pair]] = defaultdict(list)
+    for path in sorted(folder.glob(f"*{PICTURE}")):
+        mean = path.with_name(path.name.removesuffix(PICTURE) + TRUTH)
+        if not mean.exists():
+            raise FileNotFoundError(f"{path} has no {mean.name} beside it")
+        name = re.sub(r"_?\d+$", "", path.name.removesuffix(PICTURE))
+        found[name].append(Pair(_read(path), _read(mean)))
+    if not found:
+        raise FileNotFoundError(f"{folder} has no pairs NAME_1{PICTURE}, NAME_1{TRUTH}")
+    return dict(found)
+
+
+def _read(path: Path) -> Array:
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def develop(render: Floats, iso: float, device: str | None = None) -> Pair:
+    """A render's picture by the default chain, and its truth.
+
+    Args:
+        render: (height, width, 3), linear.
+        iso: the ISO.
+        device: as for :class:`clpipe.Pipeline`.
+    """
+    pipeline = clpipe.Pipeline(iso=iso, device=device)
+    ideal = Runner(pipeline.chain.without_noise(), open_device(device))
+    truth = ideal.run(render, "render").encoded
+    return Pair(pipeline.process(render, "render").image, np.asarray(truth))
+
+
+def medians(pairs: Iterable[Pair]) -> dict[str, float]:
+    """The columns of several pairs: the median of each."""
+    records = [pair.signature().record() for pair in pairs]
+    return {name: float(np.median([record[name] for record in records])) for name in records[0]}
+
+
+def outside(record: Mapping[str, float]) -> list[str]:
+    """The columns that, as the table shows them, are not in the range asked for; NaN never is."""
+    shown = {of: float(format(record[of], form)) for _, of, form in COLUMNS}
+    return [name for name, (low, high) in RANGES.items() if not low <= shown[name] <= high]
+
+
+def row(name: str, record: Mapping[str, float], marked: Sequence[str] = ()) -> list[str]:
+    """A row of the table; columns that are marked are bold."""
+    texts = zip(COLUMNS, cells(record), strict=True)
+    return [name, *(f"**{text}**" if of in marked else text for (_, of, _), text in texts)]
+
+
+def range_row() -> list[str]:
+    """The row of the ranges."""
+    texts = [
+        f"{RANGES[of][0]:{form}} - {RANGES[of][1]:{form}}" if of in RANGES else ""
+        for _, of, form in COLUMNS
+    ]
+    return ["asked for", *texts]
+
+
+def spectrum(pair: Pair) -> tuple[Doubles, Doubles]:
+    """The power spectrum of luma noise in flat places: frequencies in cycles per pixel, power.
+
+    It is the Fourier transform of the autocorrelation up to eight pixels under a Hann window
+    (Blackman and Tukey 1958), the mean over rings of equal frequency. Independent noise has 1.
+
+    >>> grey = np.full((128, 128, 3), 128.0)
+    >>> noisy = grey + np.random.default_rng(0).normal(0, 5, grey.shape)
+    >>> bool(np.allclose(spectrum(Pair(noisy, grey))[1][2:], 1, atol=0.3))
+    True
+    """
+    mask = flat_places(pair.clean)
+    noise = np.where(mask, luma(noise_of(pair.noisy, pair.clean)), 0)
+    lags = np.nan_to_num(autocorrelation(noise[None].astype(np.float32), count_pairs(mask)))
+    window = np.hanning(2 * LAGS + 3)[1:-1]
+    lag = np.arange(-LAGS, LAGS + 1)
+    frequencies = np.linspace(-0.5, 0.5, 4 * RINGS + 1)
+    waves = np.exp(2j * np.pi * np.outer(frequencies, lag))
+    power = (waves @ (lags * np.outer(window, window)) @ waves.T).real
+    ring = (np.hypot(frequencies[:, None], frequencies) * 2 * RINGS).astype(int)
+    inner = ring < RINGS
+    total, count = (np.bincount(ring[inner], weights) for weights in (power[inner], None))
+    return (np.arange(RINGS) + 0.5) / (2 * RINGS), total / count
+
+
+def sigma_by_intensity(pairs: Iterable[Pair]) -> tuple[Doubles, Doubles]:
+    """The sigma of luma noise in flat places by the luma without noise, in levels: luma, sigma.
+
+    >>> ramp = np.repeat(np.linspace(40, 200, 400)[None, :, None], 3, 2).repeat(200, 0)
+    >>> noisy = ramp + np.random.default_rng(0).normal(0, 1, (200, 400, 1)) * ramp / 20
+    >>> levels, sigmas = sigma_by_intensity([Pair(noisy, ramp)])
+    >>> bool(np.allclose(sigmas, levels / 20, rtol=0.2))
+    True
+    """
+    parts = []
+    for pair in pairs:
+        mask = flat_places(pair.clean)
+        noise = luma(noise_of(pair.noisy, pair.clean))
+        parts.append(np.stack([luma(pair.clean)[mask], noise[mask]]))
+    level, noise = np.concatenate(parts, axis=1)
+    bins = (level // BIN).astype(int)
+    count = np.bincount(bins)
+    variance = np.bincount(bins, noise**2) / np.maximum(count, 1)
+    full = np.flatnonzero(count >= FEWEST)
+    return (full + 0.5) * BIN, np.sqrt(variance[full])
+
+
+def draw(
+    real: Mapping[str, Sequence[Pair]], ours: Mapping[str, Sequence[Pair]], path: Path
+) -> None:
+    """Draw power spectra, and sigma over intensity, as an SVG; cameras are dashed."""
+    figure = Figure(figsize=(12, 4.5), layout="constrained")
+    spectra, intensity = figure.subplots(1, 2)
+    for group, style in ((real, "--"), (ours, "-")):
+        for name, pairs in group.items():
+            each = [spectrum(pair) for pair in pairs]
+            power = np.median([power for _, power in each], axis=0)
+            (line,) = spectra.plot(each[0][0], power, style, label=name)
+            levels, sigmas = sigma_by_intensity(pairs)
+            intensity.plot(levels, sigmas, style, color=line.get_color(), label=name)
+    _label(spectra, "Power spectrum of luma noise", "cycles per pixel", "power; independent: 1")
+    spectra.set_yscale("log")
+    spectra.yaxis.set_minor_formatter("")
+    spectra.set_yticks(ticks := (0.1, 0.2, 0.5, 1, 2, 5, 10), [f"{tick:g}" for tick in ticks])
+    _label(intensity, "Noise by intensity", "luma without noise, levels", "sigma of luma, levels")
+    intensity.set_ylim(bottom=0)
+    figure.legend(*spectra.get_legend_handles_labels(), loc="outside right center")
+    FigureCanvasSVG(figure)
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "clpipe"}):  # small, and reproducible
+        figure.savefig(path, metadata={"Date": None})
+
+
+def _label(axes: Axes, title: str, below: str, beside: str) -> None:
+    axes.set_title(title)
+    axes.set_xlabel(below)
+    axes.set_ylabel(beside)
+    axes.grid(alpha=0.3)
+
+
+def crops(groups: Mapping[str, Pair]) -> Image.Image:
+    """Two places of each picture at 400 %, a column each."""
+    columns = {
+        name: {place.name: place.of(pair.noisy) for place in telling_places(pair.clean)}
+        for name, pair in groups.items()
+    }
+    places = next(iter(columns.values()))
+    return sheet([*columns], {what: [of[what] for of in columns.values()] for what in places})

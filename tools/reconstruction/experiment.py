@@ -1,0 +1,367 @@
+"""Reconstruct a scene from six views with a camera's noise and with others', over the ISO.
+
+    tools/run reconstruction experiment -o OUT [--iso ISO ...] [--seeds N] [-c CONFIG] [--pmvs PATH]
+        [--colmap PATH] [--data FOLDER] [--render BLENDER]
+
+It needs pip install 'clpipe[calibrate,compare]'. This is the experiment of section 3.2 of the paper
+(Bielova, Haensch, Ley and Hellwich, CVPR Workshops 2019), on a scene whose depth is known; see
+docs/reconstruction.md for what was found.
+
+clpipe develops the views (pictures.py): clean; clean and denoised; with the camera's
+noise; with independent noise of the same variance, the same everywhere or following intensity,
+added to the clean picture; with independent noise that has the camera's variance after averaging
+2x2; and with the camera's noise without denoising.
+
+OpenCV's semi-global matching finds the depth of neighbouring views at full and half resolution
+(stereo.py). With --pmvs, PMVS2 finds points in all views, too; with --colmap, COLMAP's dense
+stereo, where CUDA is (multiview.py).
+
+Tables are printed and written to OUT as Markdown and CSV, beside the figures and the pictures.
+"""
+
+import argparse
+import csv
+import importlib.util
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from clpipe.base.errors import ClpipeError
+from clpipe.base.processors import available_processors
+from tools.pages.side_by_side import markdown
+from tools.reconstruction.multiview import THRESHOLDS, ProgramError, run_colmap, run_pmvs, true_of
+from tools.reconstruction.pictures import CAMERA, CLEAN, HALF, IID, KINDS, Pictures, energy_left
+from tools.reconstruction.report import (
+    as_markdown,
+    cloud_picture,
+    depth_picture,
+    draw,
+    points_of,
+    reactions,
+    sheet,
+    table_of,
+)
+from tools.reconstruction.stereo import Pair, halved, pairs, score
+from tools.reconstruction.views import TEXTURES, View, read_views, render_views
+
+DATA = Path(__file__).with_name("data")
+NEEDED = ("cv2", "matplotlib")
+ISOS = (100, 400, 1600, 3200, 6400, 12800)
+SEEDS = 3
+SHOWN = 6400  # the ISO of the pictures, or the nearest
+RESOLUTIONS = {"full": False, "half": True}
+ALL = "all"
+Job = tuple[str, int, int]  # kind, ISO, seed
+
+
+@dataclass(frozen=True)
+class StereoRow:
+    """What matching found in the pairs of a kind of picture; see :class:`stereo.Score`."""
+
+    resolution: str
+    kind: str
+    iso: int
+    seed: int
+    texture: str
+    places: int
+    found: float
+    complete: float
+    median_mm: float
+    rms_mm: float
+
+
+@dataclass(frozen=True)
+class PointsRow:
+    """How many points a program found in all views of a kind, and how many are on a surface."""
+
+    program: str
+    resolution: str
+    threshold: float
+    kind: str
+    iso: int
+    seed: int
+    texture: str
+    points: int
+    true: int
+
+
+def compare_stereo(views: Sequence[View], pictures: Pictures) -> Iterator[StereoRow]:
+    """Match the neighbours of all kinds."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    neighbours = pairs(views)
+    made = {
+        name: [Pair(views[a], views[b], half) for a, b in neighbours]
+        for name, half in RESOLUTIONS.items()
+    }
+
+    def rows(job: Job) -> list[StereoRow]:
+        images = pictures.read(*job)
+        found = []
+        for resolution, of_resolution in made.items():
+            depths = [
+                pair.find(images[a], images[b])[pair.seen]
+                for pair, (a, b) in zip(of_resolution, neighbours, strict=True)
+            ]
+            depth = np.concatenate(depths)
+            truth = np.concatenate([pair.depth[pair.seen] for pair in of_resolution])
+            texture = np.concatenate([pair.texture[pair.seen] for pair in of_resolution])
+            for name, number in {ALL: 0, **TEXTURES}.items():
+                one = score(depth, truth, (texture == number) | (number == 0))
+                errors = one.median * 1000, one.rms * 1000
+                shares = one.places, one.found, one.complete
+                found.append(StereoRow(resolution, *job, name, *shares, *errors))
+        return found
+
+    with ThreadPoolExecutor(available_processors()) as threads:
+        for each in threads.map(rows, pictures.all()):
+            yield from each
+
+
+def compare_points(
+    programs: dict[tuple[str, str, float], partial], views: Sequence[View], pictures: Pictures
+) -> Iterator[PointsRow]:
+    """Find the points of all kinds by programs, each of a name, a resolution and a threshold."""
+
+    def rows(work: tuple[tuple[str, str, float], Job]) -> list[PointsRow]:
+        (name, resolution, threshold), job = work
+        kind, iso, seed = job
+        place = f"{name}-{resolution}-{threshold:g}-{kind}-iso{iso}-seed{seed}"
+        folder = pictures.out / "points" / place.replace(", ", "-").replace(" ", "-")
+        points, _ = programs[work[0]](folder, views, pictures.read(*job))
+        is_true, texture = true_of(points, views)
+        counts = []
+        for label, number in {ALL: 0, **TEXTURES}.items():
+            these = (texture == number) | (number == 0)
+            count, true = int(these.sum()), int((these & is_true).sum())
+            counts.append(PointsRow(name, resolution, threshold, *job, label, count, true))
+        print(f"{place}: {len(points)} points", file=sys.stderr, flush=True)
+        return counts
+
+    work = [(program, job) for program in programs for job in pictures.all()]
+    with ThreadPoolExecutor(available_processors()) as threads:
+        for each in threads.map(rows, work):
+            yield from each
+
+
+def points_until_stopped(
+    programs: dict[tuple[str, str, float], partial],
+    views: Sequence[View],
+    pictures: Pictures,
+) -> list[PointsRow]:
+    """All rows of :func:`compare_points`; after Ctrl-C, those of what was run for all pictures.
+
+    Raises:
+        KeyboardInterrupt: there are none.
+    """
+    rows: list[PointsRow] = []
+    try:
+        for row in compare_points(programs, views, pictures):
+            rows.append(row)
+    except KeyboardInterrupt:
+        counts = Counter((row.program, row.resolution, row.threshold) for row in rows)
+        most = len(pictures.all()) * (len(TEXTURES) + 1)
+        whole = {run for run, count in counts.items() if count == most}
+        rows = [row for row in rows if (row.program, row.resolution, row.threshold) in whole]
+        if not rows:
+            raise
+        print(f"stopped; reported is what was run for all pictures: {len(whole)}", file=sys.stderr)
+    return rows
+
+
+def programs_of(pmvs: Path | None, colmap: Path | None) -> dict[tuple[str, str, float], partial]:
+    """What finds points, by its name, resolution and threshold.
+
+    PMVS2 has one thread, with which it found the same points in each run.
+    """
+    found = {}
+    for resolution, half in reversed(RESOLUTIONS.items()):  # the quick ones first
+        if pmvs:
+            for threshold in THRESHOLDS:
+                options = {"level": int(half), "threshold": threshold, "threads": 1}
+                found["PMVS2", resolution, threshold] = partial(run_pmvs, pmvs, **options)
+        if colmap:
+            found["COLMAP", resolution, np.nan] = partial(run_colmap, colmap, half=half)
+    return found
+
+
+def write_csv(path: Path, rows: Sequence[StereoRow | PointsRow]) -> None:
+    """Write rows as CSV, numbers with six digits."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(asdict(rows[0]))
+        for row in rows:
+            values = asdict(row).values()
+            writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in values])
+
+
+def stereo_pictures(
+    views: Sequence[View], pictures: Pictures, kinds: Sequence[str], iso: int
+) -> None:
+    """Write the depth maps of the middle pair, and its points, of some kinds at an ISO."""
+    a, b = pairs(views)[0]
+    view, seed = views[a], pictures.seeds[0]
+    span = view.depth.min(), view.depth.max()
+    at_full, at_half = (Pair(view, views[b], half) for half in RESOLUTIONS.values())
+    maps, clouds = [], []
+    for kind in kinds:
+        own = iso if KINDS[kind].each_iso else pictures.isos[0]
+        title = f"{kind}, ISO {iso}" if KINDS[kind].each_iso else kind
+        images = pictures.read(kind, own, seed)
+        small = halved(images[a])
+        full, half = (pair.find(images[a], images[b]) for pair in (at_full, at_half))
+        maps.append(
+            [
+                (title, small),
+                ("depth", depth_picture(full, *span)[::2, ::2]),
+                ("depth at half resolution", depth_picture(half, *span)),
+            ]
+        )
+        cloud = cloud_picture(*points_of(view, half, small), view)
+        clouds.append((title, cloud))
+    sheet(maps).save(pictures.out / "depth.png")
+    sheet([clouds[i : i + 2] for i in range(0, len(clouds), 2)]).save(pictures.out / "points.png")
+
+
+def report_stereo(out: Path, rows: Sequence[StereoRow], text: list[str]) -> None:
+    """Write the tables and the figure of matching, and append the tables to a text."""
+    write_csv(out / "stereo.csv", rows)
+    panels, weak = [], {}
+    for resolution in RESOLUTIONS:
+        tables = {
+            name: table_of(rows, lambda r: 100 * r.complete, resolution=resolution, texture=name)
+            for name in (*TEXTURES, ALL)
+        }
+        text.append(as_markdown(f"Completeness, {resolution} resolution, %", tables, ".1f"))
+        panels += [
+            (f"texture: {name}, {resolution} resolution", "completeness, %", tables[name])
+            for name in TEXTURES
+        ]
+        weak[f"{resolution} resolution, weak texture"] = tables["weak"]
+        for value, label in (("median_mm", "Median"), ("rms_mm", "RMS")):
+            errors = {
+                name: table_of(
+                    rows, lambda r, v=value: getattr(r, v), resolution=resolution, texture=name
+                )
+                for name in (*TEXTURES, ALL)
+            }
+            text.append(as_markdown(f"{label} error, {resolution} resolution, mm", errors, ".1f"))
+    text.append(reactions(weak))
+    draw(out / "stereo.svg", panels, columns=len(TEXTURES), factor=1)
+
+
+def report_points(out: Path, rows: Sequence[PointsRow], text: list[str]) -> None:
+    """Write the tables and the figure of points, and append the tables to a text."""
+    write_csv(out / "points.csv", rows)
+    panels, counts = [], {}
+    for program, resolution, threshold in dict.fromkeys(
+        (row.program, row.resolution, row.threshold) for row in rows
+    ):
+        name = f"{program}, {resolution} resolution"
+        name += "" if np.isnan(threshold) else f", threshold {threshold:g}"
+        chosen = [
+            row
+            for row in rows
+            if (row.program, row.resolution) == (program, resolution)
+            and row.threshold in {threshold}
+        ]
+        tables = {
+            texture: table_of(chosen, lambda r: r.points, texture=texture)
+            for texture in (*TEXTURES, ALL)
+        }
+        text.append(as_markdown(f"Points: {name}", tables, ".0f"))
+        true = {ALL: table_of(chosen, lambda r: 100 * r.true / max(r.points, 1), texture=ALL)}
+        text.append(as_markdown(f"On a surface: {name}, %", true, ".1f"))
+        counts[name] = tables[ALL]
+        panels.append((name, "points / 1000", tables[ALL]))
+    text.append(reactions(counts))
+    draw(out / "points.svg", panels, columns=2, factor=1e-3)
+
+
+def energies(pictures: Pictures) -> str:
+    """How much of the noise's variance survives averaging 2x2, as a table."""
+    seed = pictures.seeds[0]
+    rows = [
+        [name, *(f"{energy_left(pictures.noise(name, iso, seed)):.2f}" for iso in pictures.isos)]
+        for name in (CAMERA, IID)
+    ]
+    heads = ["noise", *(f"ISO {iso}" for iso in pictures.isos)]
+    return f"### Variance that survives averaging 2x2\n\n{markdown(heads, rows)}\n"
+
+
+def whole(text: str) -> int:
+    """A whole number above 0."""
+    if not text.isdecimal() or not int(text):
+        raise argparse.ArgumentTypeError(f"found {text!r}; expected a whole number above 0")
+    return int(text)
+
+
+def program(text: str) -> Path:
+    """The path of a program."""
+    path = shutil.which(text)
+    if path is None:
+        raise argparse.ArgumentTypeError(f"found {text!r}; expected a program")
+    return Path(path).absolute()
+
+
+def main() -> int:
+    """Run the experiment."""
+    parser = argparse.ArgumentParser(
+        description=(__doc__ or "").split("\n\n", maxsplit=1)[0],
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    add = parser.add_argument
+    add("-o", "--output", type=Path, required=True, metavar="OUT", help="folder of what is made")
+    add("--iso", type=whole, nargs="+", default=ISOS, help="the ISOs")
+    add("--seeds", type=whole, default=SEEDS, help="how many seeds the noise has")
+    add("-c", "--config", default="paper", help="configuration of clpipe's")
+    add("--pmvs", type=program, metavar="PATH", help="the program pmvs2")
+    add("--colmap", type=program, metavar="PATH", help="the program colmap, built with CUDA")
+    add("--data", type=Path, default=DATA, help="folder of the views")
+    add(
+        "--render",
+        metavar="BLENDER",
+        help="render the views into --data; a Blender, or a Python with bpy",
+    )
+    options = parser.parse_args()
+    for module in NEEDED:
+        if importlib.util.find_spec(module) is None:
+            print(f"{module}: missing; .venv/bin/pip install -e '.[compare]'", file=sys.stderr)
+            return 1
+    try:
+        if options.render:
+            render_views(options.data, options.render)
+        views = read_views(options.data)
+        names = [view.name for view in views]
+        isos = sorted(set(options.iso))
+        pictures = Pictures(options.output, names, isos, range(options.seeds))
+        pictures.develop(options.data, options.config)
+        text = [energies(pictures)]
+        report_stereo(options.output, list(compare_stereo(views, pictures)), text)
+        shown = min(isos, key=lambda iso: abs(iso - SHOWN))
+        stereo_pictures(views, pictures, (CLEAN, CAMERA, IID, HALF), shown)
+        programs = programs_of(options.pmvs, options.colmap)
+        if programs:
+            report_points(options.output, points_until_stopped(programs, views, pictures), text)
+    except subprocess.CalledProcessError:
+        return 1  # it has said why
+    except (ClpipeError, ProgramError, ValueError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    report = "\n".join(text)
+    (options.output / "tables.md").write_text(report, encoding="utf-8")
+    print(report)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,211 @@
+"""What the experiment prints and draws: tables over the ISO, figures, depth, points."""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from clpipe.base.types import Array, Doubles, Floats
+from tools.pages.side_by_side import markdown
+from tools.reconstruction.pictures import CAMERA, CLEAN, HALF, IID, KINDS
+from tools.reconstruction.views import View
+
+COLOURS = dict(
+    zip(
+        KINDS,
+        ("black", "grey", "tab:red", "tab:blue", "tab:cyan", "tab:green", "tab:orange"),
+        strict=True,
+    )
+)
+EMPTY = 255, 60  # the grey of places without depth, and behind points
+POINT = 2  # px, the side of what a point covers
+TURN, TILT, ZOOM = 25.0, -15.0, 0.85  # degrees, and of the focal length: where points are seen from
+GAP, HEAD = 6, 24  # px
+
+
+class Mean(NamedTuple):
+    """A value over the seeds: its mean, and its standard deviation, NaN of one seed."""
+
+    value: float
+    deviation: float
+
+    def text(self, form: str) -> str:
+        """It as a cell."""
+        if not np.isfinite(self.deviation):
+            return format(self.value, form)
+        return f"{self.value:{form}} ± {self.deviation:{form}}"
+
+
+class Table:
+    """Values by kind and ISO, over the seeds; kinds that do not depend on the ISO have one."""
+
+    def __init__(self, values: Iterable[tuple[str, int, float]]) -> None:
+        grouped: dict[tuple[str, int], list[float]] = defaultdict(list)
+        for kind, iso, value in values:
+            grouped[kind, iso].append(value)
+        self.isos = sorted({iso for _, iso in grouped})
+        self.kinds = [kind for kind in KINDS if any(kind == name for name, _ in grouped)]
+        self._means = {
+            place: Mean(float(np.mean(each)), float(np.std(each, ddof=1)) if each[1:] else np.nan)
+            for place, each in grouped.items()
+        }
+
+    def mean(self, kind: str, iso: int) -> Mean:
+        """The value of a kind at an ISO."""
+        return self._means[kind, iso if KINDS[kind].each_iso else self.isos[0]]
+
+    def rows(self, form: str) -> list[list[str]]:
+        """A row of cells for each kind, its name first."""
+        return [
+            [kind, *(self.mean(kind, iso).text(form) for iso in self.isos)] for kind in self.kinds
+        ]
+
+
+def table_of(rows: Sequence[Any], value: Callable[[Any], float], **where: object) -> Table:
+    """The values of those rows whose attributes are as they are said."""
+    chosen = [r for r in rows if all(getattr(r, name) == what for name, what in where.items())]
+    return Table((row.kind, row.iso, value(row)) for row in chosen)
+
+
+def as_markdown(title: str, tables: Mapping[str, Table], form: str) -> str:
+    """Tables of one ISO range as one, each below its name."""
+    isos = next(iter(tables.values())).isos
+    rows = [[name, *row] for name, table in tables.items() for row in table.rows(form)]
+    heads = ["texture", "picture", *(f"ISO {iso}" for iso in isos)]
+    return f"### {title}\n\n{markdown(heads, rows)}\n"
+
+
+def reactions(tables: Mapping[str, Table]) -> str:
+    """What noise costs, and how much of the gap its energy after averaging 2x2 explains.
+
+    The cost is the share of what is found in the clean pictures. The gap is between the camera's
+    noise and independent noise of its variance; what is explained of it is the part that is there
+    with independent noise of the camera's variance after averaging, too.
+    """
+    rows = []
+    for name, table in tables.items():
+        for iso in table.isos:
+            clean, camera, iid, half = (
+                table.mean(kind, iso).value for kind in (CLEAN, CAMERA, IID, HALF)
+            )
+            costs = [f"{100 * (1 - each / clean):.1f} %" for each in (camera, iid, half)]
+            gap = iid - camera
+            noise = np.hypot(*(np.nan_to_num(table.mean(k, iso).deviation) for k in (CAMERA, IID)))
+            explained = f"{100 * (iid - half) / gap:.0f} %" if gap > max(3 * noise, 0) else ""
+            rows.append([name, str(iso), *costs, explained])
+    heads = ["", "ISO", "camera costs", "IID costs", f"{HALF}, costs", "explains of the gap"]
+    return f"### What noise costs\n\n{markdown(heads, rows)}\n"
+
+
+def draw(path: Path, panels: Sequence[tuple[str, str, Table]], columns: int, factor: float) -> None:
+    """Draw tables over the ISO, a line for each kind, with the deviation of the seeds.
+
+    Args:
+        path: of an SVG.
+        panels: the title, the axis and the table of each, row by row.
+        columns: panels side by side.
+        factor: what values are multiplied by.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(3.4 * columns, 2.7 * rows + 0.5), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for axis, (title, label, table) in zip(axes.flat, panels, strict=False):
+        for kind in table.kinds:
+            means = [table.mean(kind, iso) for iso in table.isos]
+            axis.errorbar(
+                table.isos,
+                [factor * each.value for each in means],
+                [factor * np.nan_to_num(each.deviation) for each in means],
+                color=COLOURS[kind],
+                linestyle="--" if KINDS[kind].ending.startswith(".truth") and kind != HALF else "-",
+                marker="." if KINDS[kind].each_seed else "",
+                capsize=2,
+                linewidth=1.2,
+                label=kind,
+            )
+        axis.set_title(title, fontsize=10)
+        axis.set(xscale="log", xlabel="ISO", ylabel=label)
+        axis.set_ylim(bottom=0)
+        axis.set_xticks(table.isos, [str(iso) for iso in table.isos], fontsize=7)
+        axis.minorticks_off()
+        axis.grid(alpha=0.3)
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "clpipe"}):  # small, and reproducible
+        figure.savefig(path, metadata={"Date": None})
+
+
+def depth_picture(depth: Floats, nearest: float, farthest: float) -> Array:
+    """Depth in colours, near bright: (height, width), m, to (height, width, 3) uint8."""
+    from matplotlib import colormaps
+
+    share = (1 / depth - 1 / farthest) / (1 / nearest - 1 / farthest)
+    colours = colormaps["viridis"](np.clip(np.nan_to_num(share), 0, 1), bytes=True)[..., :3]
+    return np.where(np.isfinite(depth)[..., None], colours, EMPTY[0]).astype(np.uint8)
+
+
+def points_of(view: View, depth: Floats, picture: Array) -> tuple[Doubles, Array]:
+    """The points of found depth, NaN where there is none: (n, 3) in m, and (n, 3) uint8 colours.
+
+    Args:
+        view: that sees them, of the resolution of the depth or a multiple of it.
+        depth: (height, width), m.
+        picture: (height, width, 3), of the same size.
+    """
+    height, width = depth.shape
+    scale = view.depth.shape[1] / width
+    y, x = (np.mgrid[:height, :width] + 0.5) * scale
+    rays = np.stack([x, y, np.ones_like(x)], axis=2) @ np.linalg.inv(view.k).T
+    seen = np.isfinite(depth)
+    return (rays[seen] * depth[seen, None] - view.t) @ view.r, picture[seen]
+
+
+def cloud_picture(points: Doubles, colours: Array, view: View) -> Array:
+    """Points as they are seen from the side and from above, (height / 2, width / 2, 3) uint8.
+
+    Args:
+        points: (n, 3), m.
+        colours: (n, 3) uint8.
+        view: a camera, which is turned about the middle of what it sees.
+    """
+    height, width = (side // 2 for side in view.depth.shape)
+    turn, tilt = np.radians(TURN), np.radians(TILT)
+    about_y = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
+    about_x = [[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]]
+    middle = np.array([0, 0, np.median(view.depth)])
+    here = points @ view.r.T + view.t - middle
+    here = here @ np.transpose(np.array(about_x) @ about_y) + middle
+    near = here[:, 2] > middle[2] / 4
+    here, colours = here[near], colours[near]
+    scale = ZOOM * view.k[0, 0] / 2
+    x, y = (scale * here[:, :2] / here[:, 2:] + np.array([width, height]) / 2).T
+    image = np.full((height, width, 3), EMPTY[1], np.uint8)
+    order = np.argsort(-here[:, 2], kind="stable")  # the nearest last
+    cell = np.arange(POINT)
+    x, y = (np.floor(each[order]).astype(np.intp)[:, None, None] for each in (x, y))
+    x, y = np.broadcast_arrays(x + cell, y + cell[:, None])
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    shown = np.broadcast_to(colours[order][:, None, None], (*x.shape, 3))
+    image[y[inside], x[inside]] = shown[inside]
+    return image
+
+
+def sheet(rows: Sequence[Sequence[tuple[str, Array]]]) -> Image.Image:
+    """Pictures, (height, width, 3) uint8 of one size, with their names above them."""
+    height, width = rows[0][0][1].shape[:2]
+    columns = max(map(len, rows))
+    size = columns * (width + GAP) - GAP, len(rows) * (height + HEAD)
+    canvas = Image.new("RGB", size, "white")
+    pen, font = ImageDraw.Draw(canvas), ImageFont.load_default(16)
+    for row, pictures in enumerate(rows):
+        for column, (name, picture) in enumerate(pictures):
+            x, y = column * (width + GAP), row * (height + HEAD)
+            pen.text((x + 4, y + 2), name, "black", font)
+            canvas.paste(Image.fromarray(picture), (x, y + HEAD))
+    return canvas
