@@ -16,6 +16,7 @@ import clpipe as package
 from tests.conftest import ROOT, STILL_LIFE, WRITTEN, written
 from tests.dng import write_dng
 from tests.markdown import RUN, PageRunner, blocks
+from tools.pages import architecture
 
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
@@ -208,6 +209,17 @@ def test_every_link_leads_somewhere(page, generated):
         path = (page.parent / target).resolve()
         known = path.is_relative_to(DOCS) and path.relative_to(DOCS).as_posix() in generated
         assert known or path.exists(), target
+
+
+@pytest.mark.parametrize("name", architecture.PAGES)
+def test_the_pictures_of_the_architecture_are_those_of_the_code(name):
+    drawn = architecture.PAGES[name]()
+    assert (DOCS / name).read_text("utf-8") == drawn, "run tools/run pages architecture"
+
+
+def test_the_architecture_counts_its_rooms():
+    count = sum(map(len, architecture.floors()))
+    assert f"clpipe is {count} rooms" in (DOCS / "architecture.md").read_text("utf-8")
 
 
 def test_the_site_builds(tmp_path):

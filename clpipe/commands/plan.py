@@ -11,7 +11,8 @@ from clpipe.chain.request import Request
 from clpipe.commands.chain_options import chain_options, format_option, keep_option
 from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show, show_json
-from clpipe.engine.plan import AnyLaunch, Launch, Lines, Plan, make_plan, reads_of
+from clpipe.engine.ir import AnyLaunch, Launch, Lines, Plan, reads_of
+from clpipe.engine.plan import make_plan
 from clpipe.engine.traffic import bytes_per_pixel, launch_bytes
 from clpipe.outputs.results import results_of
 
@@ -74,10 +75,10 @@ def opener(launch: AnyLaunch, kept: Mapping[int, str]) -> str:
     if isinstance(launch, Lines):
         return "tables of rows and columns"
     if not isinstance(launch, Launch):
-        return f"{launch.op.step}: {launch.op.pass_.access.value}"
+        return f"{launch.op.step}: {'histogram' if launch.op.reduction.bins else 'sums'}"
     if op := launch.opener:
-        radius = f", radius {op.pass_.radius}" if launch.stencil else ""
-        return f"{op.step}: {op.pass_.access.value}{radius}"
+        access = f"stencil, radius {op.radius}" if launch.stencil else "resample"
+        return f"{op.step}: {access}"
     if not launch.reads:
         return "source"
     if name := kept.get(launch.reads[0].image.number):

@@ -27,7 +27,7 @@ def read_depth(
     width: int,
     height: int,
     margins: Margins,
-    patterns: Sequence[str],
+    carried: Sequence[Carry],
     max_pixels: int,
 ) -> Depth:
     """The depth of an image.
@@ -37,14 +37,14 @@ def read_depth(
         chain: with a step that needs depth.
         width, height: of the image, with its margins.
         margins: how far it goes on beyond the picture.
-        patterns: of the names of companions, as for :func:`clpipe.inputs.carry.carry`.
+        carried: layers that go along with it, whose patterns say where it may be.
         max_pixels: a file that claims more is refused before memory is taken.
 
     Raises:
         ImageError: it is missing, damaged, of another size, NaN or negative.
     """
     step, method = next(iter(depth_steps(chain).items()))
-    layer = _find(path, step, method.layer, patterns)
+    layer = _find(path, step, method.layer, [each.pattern for each in carried if each.pattern])
     whole, (width, height) = (width, height), margins.inside(width, height)
     with unchanged(layer.file):
         pixels, (x, y), size = read_layer(layer.file, layer.location, max_pixels)

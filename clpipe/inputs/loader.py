@@ -115,7 +115,7 @@ class ImageLoader:
     @property
     def raw(self) -> RawLoader:
         """How raws and dumps enter."""
-        return RawLoader(self.request, self.settings.dump)
+        return RawLoader(self.request, self.settings.dump_format)
 
     def endings(self) -> tuple[str, ...]:
         """The endings of the files that are taken from folders."""
@@ -162,7 +162,7 @@ class ImageLoader:
         Of one that cannot be opened each byte is taken for a pixel.
         """
         most = self.request.max_pixels or USUAL_MAX_PIXELS
-        dump = self.settings.dump
+        dump = self.settings.dump_format
         if dump and may_be_dump(job.path):
             claim = plain_claim(dump.width, dump.height)
         else:
@@ -217,10 +217,10 @@ class ImageLoader:
         if loaded is None:
             return None
         source, request = loaded.source, self.request
-        patterns, most = request.companions, request.max_pixels or USUAL_MAX_PIXELS
+        carried, most = request.carried(), request.max_pixels or USUAL_MAX_PIXELS
 
         def depth(chain: Chain, width: int, height: int, margins: Margins) -> Depth:
-            return read_depth(job.path, chain, width, height, margins, patterns, most)
+            return read_depth(job.path, chain, width, height, margins, carried, most)
 
         own = enter(loaded.chain, source.pixels, source.margins, depth, source.shot)
         source = replace(
@@ -259,8 +259,8 @@ class ImageLoader:
         """
         request = self.request
         most = request.max_pixels or USUAL_MAX_PIXELS
-        layers, patterns = request.carried(), request.companions
-        return carry(job.path, loaded.source, loaded.chain, layers, patterns, most, orientation)
+        layers = request.carried()
+        return carry(job.path, loaded.source, loaded.chain, layers, most, orientation)
 
     def is_left_out(self, job: Job, error: Exception) -> bool:
         """Whether an image that cannot enter was only found in a folder, beside others that can."""

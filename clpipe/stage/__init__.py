@@ -22,10 +22,21 @@ from clpipe.stage.bases import (
 from clpipe.stage.checking import run_reference, variant_label, variants
 from clpipe.stage.context import Context, ReferenceContext
 from clpipe.stage.method import Method, Stage, parameter
-from clpipe.stage.passes import Access, Argument, CompileTime, Kind, NoiseScope, Pass
+from clpipe.stage.passes import (
+    Argument,
+    CompileTime,
+    Kind,
+    LineTable,
+    NoiseScope,
+    Pass,
+    Pointwise,
+    Reduction,
+    Resample,
+    Stencil,
+    TableLookup,
+)
 
 __all__ = [
-    "Access",
     "Argument",
     "Array",
     "CompileTime",
@@ -36,13 +47,19 @@ __all__ = [
     "GaussianNoise",
     "InFocalLengths",
     "Kind",
+    "LineTable",
     "Method",
     "NoiseScope",
     "Noiseless",
     "OfDepth",
     "Pass",
+    "Pointwise",
+    "Reduction",
     "ReferenceContext",
+    "Resample",
     "Stage",
+    "Stencil",
+    "TableLookup",
     "Unchanged",
     "odd_size",
     "parameter",

@@ -10,7 +10,6 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.reference.defocus import NOWHERE, Depth, aperture_taps, defocus, reach_of
 from clpipe.stage import (
-    Access,
     Argument,
     Context,
     InFocalLengths,
@@ -19,6 +18,7 @@ from clpipe.stage import (
     Pass,
     ReferenceContext,
     Stage,
+    Stencil,
     Unchanged,
     parameter,
 )
@@ -119,26 +119,26 @@ class ThinLens(InFocalLengths, OfDepth):
         """
         metres = context.optics.focus_distance
         distance = 3.0 if metres is None else metres / self.depth_scale
-        own = self.with_optics(context).filled(f_number=2.8, focus_distance=distance)
+        own = self.with_optics(context).with_defaults(f_number=2.8, focus_distance=distance)
         if not own.sensor_width:
             if own.fx and own.focal_length:
-                own = own.filled(pixel_pitch=own.focal_length / own.fx * 1000)
+                own = own.with_defaults(pixel_pitch=own.focal_length / own.fx * 1000)
             elif own.fx and not own.pixel_pitch:
                 raise RequestError(
                     f"defocus: the focal length is {own.fx:g} px, but what that is in mm is not "
                     "known: set focal_length, sensor_width (mm) or pixel_pitch (um), here or in "
                     "render"
                 )
-            own = own.filled(pixel_pitch=context.camera.pixel_pitch)
+            own = own.with_defaults(pixel_pitch=context.camera.pixel_pitch)
             if not own.pixel_pitch:
                 raise RequestError(
                     f"defocus.sensor_width: the size of pixels is needed, and camera "
                     f"{context.camera.name} does not say it; set it in mm, or pixel_pitch in um"
                 )
             if own.fx:
-                own = own.filled(focal_length=own.fx * own.pixel_pitch / 1000)
+                own = own.with_defaults(focal_length=own.fx * own.pixel_pitch / 1000)
         if not own.fx:
-            own = own.filled(focal_length=50.0)
+            own = own.with_defaults(focal_length=50.0)
         if own.focal_length:
             own.check_focus(own.focal_length)
         return own
@@ -184,7 +184,7 @@ class ThinLens(InFocalLengths, OfDepth):
 
     def passes(self) -> tuple[Pass, ...]:
         given = ("radii", "columns", "rows", "reach", "taps", "count")
-        return (Pass("defocus", Access.STENCIL, given, radius=self.max_radius),)
+        return (Pass("defocus", Stencil(self.max_radius), given),)
 
     def radii(self, depth: Floats) -> Floats:
         """The radii of discs in px, below 0 in front of the focus, as large as they may be.
@@ -204,14 +204,14 @@ class ThinLens(InFocalLengths, OfDepth):
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         depth = _depth_in(context)
-        if self not in depth.held:
+        if self not in depth.derived:
             radii = self.clipped(depth.pixels)
             largest = float(np.ceil(abs(radii).max() * 4)) / 4  # few tables for many images
             reach = reach_of(largest)
             around = ((reach, reach), (reach, reach + VECTOR))
             taps = aperture_taps(self.blades, largest)
-            depth.held[self] = np.pad(radii, around, "reflect"), reach, taps
-        radii, reach, taps = depth.held[self]
+            depth.derived[self] = np.pad(radii, around, "reflect"), reach, taps
+        radii, reach, taps = depth.derived[self]
         return {
             "radii": radii,
             "columns": np.int32(radii.shape[1]),

@@ -20,7 +20,6 @@ from clpipe.reference import warp
 from clpipe.reference.lens import DistortionMap
 from clpipe.reference.radial import Radial
 from clpipe.stage import (
-    Access,
     Argument,
     CompileTime,
     Context,
@@ -30,6 +29,7 @@ from clpipe.stage import (
     Method,
     Pass,
     ReferenceContext,
+    Resample,
     Stage,
     Unchanged,
     parameter,
@@ -129,17 +129,15 @@ class Distortion(HasPicture):
         return (
             Pass(
                 "distortion",
-                Access.RESAMPLE,
+                Resample(resampling, resampling.support),
                 arguments,
-                radius=resampling.support,
-                resampling=resampling,
             ),
         )
 
     def geometry(self) -> DistortionMap | None:
         return self.lens() if self.passes() else None
 
-    def of_size(self, width: int, height: int) -> Mapping[str, float]:
+    def estimates_for(self, width: int, height: int) -> Mapping[str, float]:
         """What ``fit`` makes of the focal length: its factor."""
         return {"focal_length_factor": self.lens().scale(width, height)} if self.fit else {}
 
@@ -172,11 +170,11 @@ class OfCamera(InFocalLengths, Distortion):
         """
         own = self.with_optics(context)
         own.check_focal_length("distortion")
-        return own.filled(fy=own.fx)
+        return own.with_defaults(fy=own.fx)
 
-    def of_size(self, width: int, height: int) -> Mapping[str, float]:
+    def estimates_for(self, width: int, height: int) -> Mapping[str, float]:
         """What ``fit`` makes of the focal length: its factor, and the focal length in px."""
-        found = super().of_size(width, height)
+        found = super().estimates_for(width, height)
         if not found:
             return found
         lens = self.lens()

@@ -12,7 +12,6 @@ from clpipe.base.types import Floats
 from clpipe.reference.convolve import convolve, reach_of, taps_of
 from clpipe.reference.turning import BILINEAR, Turning
 from clpipe.stage import (
-    Access,
     Argument,
     Context,
     InFocalLengths,
@@ -20,7 +19,9 @@ from clpipe.stage import (
     Method,
     Pass,
     ReferenceContext,
+    Resample,
     Stage,
+    Stencil,
     parameter,
 )
 
@@ -114,7 +115,7 @@ class Linear(Method):
         """
         own = self.with_optics(context)
         if not own.rotation:
-            return own.filled(length=0.0)
+            return own.with_defaults(length=0.0)
         if not own.fx:
             raise RequestError("motion_blur: rotation needs fx, in px, here or in render")
         length = float(own.fx * np.tan(np.deg2rad(own.rotation)))
@@ -139,7 +140,7 @@ class Linear(Method):
         if not self.pixels:
             return ()
         radius = reach_of(self.taps)
-        return (Pass("convolve", Access.STENCIL, ("taps", "count"), radius=radius),)
+        return (Pass("convolve", Stencil(radius), ("taps", "count")),)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         if not self.pixels:
@@ -211,7 +212,7 @@ class Perspective(InFocalLengths):
         if not self.rotation:
             return ()
         turning = self.turning
-        return (Pass("turned", Access.RESAMPLE, ("filter",), radius=1, resampling=turning),)
+        return (Pass("turned", Resample(turning, 1), ("filter",)),)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"filter": BILINEAR} if self.rotation else {}

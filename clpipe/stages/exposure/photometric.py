@@ -61,9 +61,9 @@ class Photometric(Gain):
     )
 
     def resolve(self, context: Context) -> Self:
-        return self.with_optics(context).filled(f_number=8.0)
+        return self.with_optics(context).with_defaults(f_number=8.0)
 
-    def after(self, context: Context) -> Context:
+    def next_context(self, context: Context) -> Context:
         headroom = context.headroom + self.headroom - math.log2(WHITE)
         return replace(context, headroom=headroom)
 
