@@ -14,6 +14,7 @@ from clpipe.chain.chain import make_chain
 from clpipe.chain.depth import depth_of_array, with_depth
 from clpipe.chain.settings import overlay, settings_from
 from clpipe.images.read import read_image
+from clpipe.stage import Resample
 
 SIZE = 60, 40
 # Stages that need optics, each with what makes it need them.
@@ -88,8 +89,8 @@ def arguments(settings):
     for step in chain.steps:
         found |= {(step.name, k): v for k, v in step.method.arguments(step.context).items()}
         for each in step.method.passes():
-            if each.resampling:
-                values = each.resampling.values(*SIZE)
+            if isinstance(each.access, Resample):
+                values = each.access.resampler.values(*SIZE)
                 found |= {(step.name, each.function, k): v for k, v in values.items()}
     return {key: np.asarray(v, object if isinstance(v, str) else None) for key, v in found.items()}
 
