@@ -441,6 +441,18 @@ def test_a_plan_says_what_opens_a_launch(clpipe):
     assert "white_balance: histogram" in " ".join(white_patch.split())
 
 
+def test_a_plan_prints_the_source_of_a_launch(clpipe):
+    by_number, by_name = (
+        clpipe("plan", "--source", launch).stdout for launch in (4, "demosaic.bounded_green")
+    )
+    assert by_number == by_name and "#define LANES 8" in by_number
+    assert re.search(r"__kernel .*\nvoid launch_[0-9a-f]{16}\(", by_number)
+    for unknown in ("0", "8", "denoise"):
+        said = clpipe("plan", "--source", unknown, status=2).stderr
+        assert f"unknown launch '{unknown}'" in said and "1 lines, 2 load, 3 optical_blur" in said
+    assert "give one" in clpipe("plan", "--source", 4, "--json", status=2).stderr
+
+
 def test_a_chain_printed_as_toml_makes_the_same_picture(clpipe, small, tmp_path):
     options = ("--iso", 1600, "--set", "demosaic.method=menon2007", "--skip", "denoise")
     (tmp_path / "mine.toml").write_text(clpipe("plan", "--toml", "-c", "paper", *options).stdout)
