@@ -432,13 +432,17 @@ def test_a_burst_is_frames_and_one_truth(clpipe, write_exr, tmp_path):
 
 
 def test_a_plan_says_what_opens_a_launch(clpipe):
-    text = clpipe("plan", "-c", "paper", "--keep", "sensor_noise").stdout
-    assert "sensor_noise is kept" in text
-    assert "denoise: stencil, radius 2" in " ".join(text.split())
-    assert "white_balance: sums" in text
-    assert "slots" in text and "bytes a pixel" in text
-    white_patch = clpipe("plan", "--set", "white_balance.method=white_patch").stdout
-    assert "white_balance: histogram" in " ".join(white_patch.split())
+    def opened_by(*options):
+        launches = json.loads(clpipe("plan", *options, "--json").stdout)["launches"]
+        return [launch["opened_by"] for launch in launches]
+
+    options = ("-c", "paper", "--keep", "sensor_noise")
+    opened = opened_by(*options)
+    assert "sensor_noise is kept" in opened and "white_balance: sums" in opened
+    assert "denoise: stencil, radius 2" in opened
+    assert "white_balance: histogram" in opened_by("--set", "white_balance.method=white_patch")
+    text = clpipe("plan", *options).stdout
+    assert "sensor_noise is kept" in text and "slots" in text and "bytes a pixel" in text
 
 
 def test_a_plan_prints_the_source_of_a_launch(clpipe):
