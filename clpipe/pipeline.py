@@ -13,7 +13,7 @@ from xxhash import xxh3_64_hexdigest
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import one_of
-from clpipe.base.types import Array
+from clpipe.base.types import Array, plain
 from clpipe.base.validation import typed
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.depth import depth_of_array, lenses_of, warnings_of, with_depth
@@ -212,15 +212,6 @@ class Pipeline(ReadOnly):
 def digest_of(image: Array) -> str:
     """A digest of an image's samples that takes little time."""
     return xxh3_64_hexdigest(np.ascontiguousarray(image).data)
-
-
-def plain(values: Any) -> Any:
-    """Values without NumPy types, as a configuration file can hold them."""
-    if isinstance(values, Mapping):
-        return {key: plain(value) for key, value in values.items()}
-    if isinstance(values, list | tuple):
-        return list(map(plain, values))
-    return values.tolist() if isinstance(values, np.ndarray | np.generic) else values
 
 
 def _checked(image: Array, kind: Kind) -> Array:

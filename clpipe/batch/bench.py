@@ -102,9 +102,10 @@ def bench_batch(device: Device, request: Request, load: Load) -> BatchSpeed:
         folder = Path(name)
         write_renders(folder / "in", load)
         loader = ImageLoader(request)
-        writer = OutputWriter(folder / "out", replace(request, formats=("jpg",)))
         jobs = find_jobs([str(folder / "in")], folder / "out")
         chain = loader.first_chain(jobs)
+        resolved = replace(request, formats=("jpg",)).with_outputs(chain)
+        writer = OutputWriter(folder / "out", resolved)
 
         def batch() -> Batch:
             shutil.rmtree(folder / "out", ignore_errors=True)

@@ -29,7 +29,7 @@ from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.existing import AS_USUAL, Found, Resuming
+from clpipe.outputs.existing import Found, Redo
 from clpipe.outputs.patches import Patch, every_patch
 from clpipe.outputs.recipes import Recipe
 from clpipe.outputs.sealed import SIDECAR, write_sidecar
@@ -101,7 +101,7 @@ class ImageWorker:
         loader: how images are loaded.
         writer: how pictures are written.
         chain: that of the first image, for which kernels are compiled early.
-        resuming: which pictures that are there already are made again.
+        redo: which pictures that are there already are made again.
         trace: note each launch and transfer.
     """
 
@@ -110,13 +110,13 @@ class ImageWorker:
         loader: ImageLoader,
         writer: OutputWriter,
         chain: Chain,
-        resuming: Resuming = AS_USUAL,
+        redo: Redo = Redo.OLD,
         trace: bool = False,
     ) -> None:
         self.writer = writer
         self.loader = loader
         self.chain = chain
-        self._resuming = resuming
+        self._redo = redo
         self._trace = trace
         self._spare = SpareArrays(0)
 
@@ -179,14 +179,14 @@ class ImageWorker:
     def _missing(self, task: Task) -> Set[Rendition]:
         """A job's renditions that are to be made."""
         renditions = self.writer.renditions_of(task.job)
-        if self._resuming.overwrite:
+        if self._redo is Redo.ALL:
             return set(renditions)
         found = {
             each: self.found(task.job, each, self.writer.record_of(task.request, each))
             for each in renditions
         }
         task.old = sum(there is Found.OLD for there in found.values())
-        missing = [each for each, there in found.items() if not self._resuming.is_kept(there)]
+        missing = [each for each, there in found.items() if not self._redo.keeps(there)]
         return self.writer.plan_of(task.job).needed(missing)
 
     def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> Found:
@@ -200,7 +200,7 @@ class ImageWorker:
         Raises:
             ImageError: a file of its name is somebody else's.
         """
-        return self.writer.existing(job, rendition).found(job, request, self._resuming.verify)
+        return self.writer.existing(job, rendition).found(job, request, self._redo.verifies)
 
     def _load(self, task: Task, renditions: Set[Rendition]) -> None:
         """Load a task's image, and decide which renditions are made of it.

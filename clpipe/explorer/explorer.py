@@ -254,7 +254,7 @@ class Explorer:
 
     def _source(self, image: int, loader: ImageLoader) -> SourceImage:
         """An image's pixels, decoded once for all settings that read it in the same way."""
-        key = image, loader.reads, loader.reads_overscan, loader.settings.dump
+        key = image, loader.reads, loader.reads_overscan, loader.settings.dump_format
         with self._lock:
             if key in self._sources:
                 self._sources.move_to_end(key)

@@ -80,6 +80,14 @@ class Written:
     pictures: int
     left_out: tuple[str, ...]
 
+    def lines(self, folder: Path) -> list[str]:
+        """The same for people; ``folder`` is the one that it was written to."""
+        warnings = [f"warning: {each}" for each in self.left_out]
+        if not self.files:
+            return warnings
+        files = ", ".join(str(folder / name) for name in self.files)
+        return [f"wrote {files}: {self.pictures} picture{'s' * (self.pictures != 1)}", *warnings]
+
 
 def check_camera_files(folder: Path) -> None:
     """See that the files of a folder's views may be written.

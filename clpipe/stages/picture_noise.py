@@ -2,7 +2,7 @@
 
 Real noise arises before the processing, which shapes it; see ``sensor_noise``. Here noise that is
 independent in each pixel is added after the processing, with a sigma of the user's, of ``clpipe
-measure --json``, or of the picture itself (``clpipe run --baseline``).
+measure --json``, or of the picture itself (``clpipe run --truth iid``).
 """
 
 from collections.abc import Mapping
@@ -58,14 +58,14 @@ class Matched(Method):
 
 
 class NoNoise(Unchanged, Matched):
-    """No noise on the finished picture; ``clpipe run --baseline`` is matched as it says."""
+    """No noise on the finished picture; ``clpipe run --truth iid`` is matched as it says."""
 
     method: ClassVar = "none"
     summary: ClassVar = "no noise here; sensor_noise adds it where a sensor does"
 
     jpeg: bool = parameter(
         False,
-        "Match the noise of --baseline in the decoded JPEG, which keeps more of a camera's noise "
+        "Match the noise of --truth in the decoded JPEG, which keeps more of a camera's noise "
         "than of independent noise.",
     )
 
