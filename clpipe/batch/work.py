@@ -17,7 +17,7 @@ from clpipe.batch.outcome import LEFT_OUT, SKIPPED, Span
 from clpipe.batch.runners import Runners, SpareArrays
 from clpipe.chain.baseline import STEP, with_noise
 from clpipe.chain.chain import Chain
-from clpipe.chain.depth import lenses_of
+from clpipe.chain.depth import depth_steps
 from clpipe.chain.formats import DNG
 from clpipe.chain.rendition import Rendition
 from clpipe.engine.clipping import clipped_share
@@ -71,7 +71,7 @@ class ImageWorker:
     @property
     def layers(self) -> int:
         """How many layers are read beside an image: those that go along with it, and its depth."""
-        return len(self.writer.request.carry) + bool(lenses_of(self.chain))
+        return len(self.writer.request.carry) + bool(depth_steps(self.chain))
 
     def runners(self, device: Device | None) -> "Runners":
         """The runners of a device; the kernels of the first chain are compiled here.
