@@ -36,7 +36,7 @@ from clpipe.inputs.find import Job
 from clpipe.outputs.existing import AS_USUAL
 from tests.conftest import ROOT
 
-IMAGES = 40
+IMAGES = 16
 
 
 @pytest.fixture(scope="module")
