@@ -11,6 +11,7 @@ from clpipe.base.about import __version__
 
 if TYPE_CHECKING:
     from clpipe.base.errors import ClpipeError, DeviceError, ImageError, RequestError
+    from clpipe.batch.session import run
     from clpipe.camera.noise import NoiseModel
     from clpipe.camera.profile import Camera, built_in_cameras, load_camera
     from clpipe.dataset import Dataset, Patches, RawNoise
@@ -31,6 +32,7 @@ _MODULES = {
     "Result": "clpipe.engine.runner",
     "built_in_cameras": "clpipe.camera.profile",
     "load_camera": "clpipe.camera.profile",
+    "run": "clpipe.batch.session",
 }
 
 __all__ = [
@@ -48,6 +50,7 @@ __all__ = [
     "__version__",
     "built_in_cameras",
     "load_camera",
+    "run",
 ]
 
 

@@ -13,7 +13,7 @@ from xxhash import xxh3_64_hexdigest
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import one_of
-from clpipe.base.types import Array
+from clpipe.base.types import Array, plain
 from clpipe.base.validation import typed
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.depth import depth_of_array, lenses_of, warnings_of, with_depth
@@ -121,7 +121,7 @@ class Pipeline(ReadOnly):
         margins = margins_of_array(overscan, checked)
         if margins and steps_of_overscan(chain):
             chain = with_overscan(chain, margins)
-            runner = runner.of(chain)
+            runner = runner.for_chain(chain)
         elif margins:
             checked = np.ascontiguousarray(margins.cropped(checked))
             depth = None if depth is None else margins.cropped(np.asarray(depth))
@@ -130,7 +130,7 @@ class Pipeline(ReadOnly):
             for warning in warnings_of(chain, far):
                 warnings.warn(f"{key}: {warning}", stacklevel=2)
             chain = with_depth(chain, far)
-            runner = runner.of(chain)
+            runner = runner.for_chain(chain)
         own_key = image_key(key, "" if chain.settings.noise_key else digest_of(checked))
         with self._lock:
             result = runner.run(checked, noise_key(chain.settings, own_key))
@@ -188,7 +188,9 @@ class Pipeline(ReadOnly):
         """The runner for an image, with what is drawn and set for it alone."""
         own = overlay(self._settings, plain(settings)) if settings else self._settings
         return (
-            self._runner.of(self._chain(own.drawn(key))) if settings or own.draws else self._runner
+            self._runner.for_chain(self._chain(own.drawn(key)))
+            if settings or own.draws
+            else self._runner
         )
 
     def process_many(
@@ -210,15 +212,6 @@ class Pipeline(ReadOnly):
 def digest_of(image: Array) -> str:
     """A digest of an image's samples that takes little time."""
     return xxh3_64_hexdigest(np.ascontiguousarray(image).data)
-
-
-def plain(values: Any) -> Any:
-    """Values without NumPy types, as a configuration file can hold them."""
-    if isinstance(values, Mapping):
-        return {key: plain(value) for key, value in values.items()}
-    if isinstance(values, list | tuple):
-        return list(map(plain, values))
-    return values.tolist() if isinstance(values, np.ndarray | np.generic) else values
 
 
 def _checked(image: Array, kind: Kind) -> Array:

@@ -22,6 +22,7 @@ from clpipe.engine.discovery import choose, choose_all, find_devices
 from clpipe.engine.extents import Extent
 from clpipe.engine.flow import Flow
 from clpipe.engine.hardware import Hardware, hardware_of
+from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Runner
 from clpipe.engine.runtimes import lanes_for
 
@@ -186,7 +187,7 @@ def test_timings_are_those_of_a_trace(device, type_):
     runner.run(image, "k")
     timings = []
     start = time.perf_counter()
-    runner.run(image, "k", timings)
+    runner.run(image, "k", RunOptions(timings))
     end = time.perf_counter()
     names = [t.name for t in timings]
     launches = [launch.name for launch in runner.plan().launches]
@@ -198,7 +199,7 @@ def test_timings_are_those_of_a_trace(device, type_):
         assert two.start >= one.start + one.seconds - 1e-5
     # The device's clock is taken to stand at the end of the last one when the queue is empty.
     assert start - 1e-2 < timings[0].start <= timings[-1].start + timings[-1].seconds <= end
-    runner.run(image, "k", none := [], download=False)
+    runner.run(image, "k", RunOptions(none := [], download=False))
     assert [t.name for t in none] == launches
 
 
@@ -250,7 +251,7 @@ def test_a_second_run_compiles_nothing(device, monkeypatch):
 def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
     fresh = Device(device.info)
     runner = Runner(make_chain(settings_from({})), fresh)
-    runner.warm_up()
+    runner.compile()
     made = []
     make = fresh._flow.pool._make
     monkeypatch.setattr(fresh._flow.pool, "_make", lambda size: made.append(size) or make(size))
@@ -263,7 +264,7 @@ def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
     ]
     most = max(made)
     assert (
-        len(made) == len(fresh._flow.pool.held) + 1
+        len(made) == len(fresh._flow.pool.buffers) + 1
     )  # a line table, for the width of the second one
     # What is held for others goes when it would take more than is allowed.
     fresh.memory = fresh.bytes_held
@@ -273,7 +274,7 @@ def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
     fresh.memory = 8 * most
     runner.run(images[0], "k")
     other.run(images[0], "k")
-    assert len(fresh._flow.pool.held) > 4
+    assert len(fresh._flow.pool.buffers) > 4
 
 
 @pytest.mark.parametrize("byte", [0xFF, 0x7F])  # NaN, and numbers near the largest
@@ -299,11 +300,11 @@ def test_pixels_into_an_array_that_is_there(device):
     runner = Runner(make_chain(settings_from({})), device)
     image = np.full((20, 30, 3), 0.5, np.float16)
     room = np.empty((20, 30, 3), np.uint8)
-    result = runner.run(image, "k", into=room)
+    result = runner.run(image, "k", RunOptions(into=room))
     assert result.encoded is room
     assert np.array_equal(room, runner.run(image, "k").encoded)
     with pytest.raises(ValueError, match=r"into is \(20, 30\)"):
-        runner.run(image, "k", into=room[..., 0])
+        runner.run(image, "k", RunOptions(into=room[..., 0]))
 
 
 @pytest.mark.parametrize("lanes", [1, 8, 16])
@@ -325,12 +326,12 @@ def test_another_chain_of_the_same_structure_is_not_planned_again(device, monkey
     changed = make_chain(settings_from(values))
     alone = Runner(changed, device).run(image, "k").encoded
     other = make_chain(settings_from({"mosaic": {"pattern": "BGGR"}}))
-    assert runner.of(other).plan() is not runner.plan()
-    assert runner.of(changed).plan(fold=False) is not runner.plan()
+    assert runner.for_chain(other).plan() is not runner.plan()
+    assert runner.for_chain(changed).plan(fold=False) is not runner.plan()
 
     def plan_again(*_):
         raise AssertionError("planned again")
 
     monkeypatch.setattr("clpipe.engine.runner.make_plan", plan_again)
-    assert np.array_equal(runner.of(changed).run(image, "k").encoded, alone)
-    assert np.array_equal(runner.of(changed).run(image, "k").encoded, alone)
+    assert np.array_equal(runner.for_chain(changed).run(image, "k").encoded, alone)
+    assert np.array_equal(runner.for_chain(changed).run(image, "k").encoded, alone)

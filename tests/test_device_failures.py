@@ -77,7 +77,7 @@ def runner_on(device):
     """A chain on a device of its own, ready to run."""
     chain = make_chain(settings_from({"stages": ["exposure", "gamma"]}))  # a single launch
     runner = Runner(chain, Device(device.info))
-    runner.warm_up()
+    runner.compile()
     return runner
 
 
@@ -110,7 +110,7 @@ def test_a_device_that_fails_at_everything_is_given_up(device, monkeypatch):
     with pytest.raises(DeviceError, match="failed at 3 images in a row and is given up"):
         runner.run(IMAGE, "k")
     with pytest.raises(DeviceError, match="OUT_OF_RESOURCES"):
-        Runner(runner.chain, Device(device.info)).warm_up()
+        Runner(runner.chain, Device(device.info)).compile()
 
 
 def test_a_lack_of_memory_needs_no_new_context(device, monkeypatch):
@@ -154,8 +154,9 @@ def test_kernels_that_fail_in_a_batch_change_no_byte(device, write_exr, tmp_path
 
     def made(name):
         (tmp_path / name).mkdir()
-        writer = OutputWriter(tmp_path / name, loader.request)
-        worker = ImageWorker(loader, writer, loader.first_chain(jobs))
+        chain = loader.first_chain(jobs)
+        writer = OutputWriter(tmp_path / name, loader.request.with_outputs(chain))
+        worker = ImageWorker(loader, writer, chain)
         # Both have one context, as two on one device have: what breaks it for one does for both.
         batch = Batch(worker, [Device(device.info), Device(device.info)])
         statuses = [outcome.status for outcome in batch.run(jobs)]

@@ -34,7 +34,7 @@ pytest.importorskip("starlette")
 from clpipe.explorer.explorer import Explorer
 from clpipe.explorer.export import exported, inputs_of, options_of, run_command
 from clpipe.explorer.server import Server, in_json
-from clpipe.explorer.views import View
+from clpipe.explorer.view import View
 
 NOISY = {
     "iso": 6400,

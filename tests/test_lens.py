@@ -280,7 +280,7 @@ def test_what_is_said_without_a_lens_or_without_lensfunpy(clpipe, monkeypatch):
 
 def test_kernels_are_not_refused_for_the_image_that_compiles_them(device):
     chain = chain_of(method="brown_conrady", fx=700.0, k1=-0.3, cx=740.0)
-    Runner(chain, device, encode=False, final=True).warm_up()  # 8x8 pixels far from the axis
+    Runner(chain, device, encode=False, final=True).compile()  # 8x8 pixels far from the axis
     with pytest.raises(ImageError, match="the corner of 8x8 pixels"):
         Runner(chain, None, final=True).run(np.ones((8, 8, 3), np.float32), "k")
 

@@ -16,7 +16,7 @@ from clpipe.analysis.matching.columns import (
     figures_of,
     noise_of_frames,
 )
-from clpipe.analysis.matching.scenes import Scenes, expand, held_out, load_scenes
+from clpipe.analysis.matching.scenes import Scenes, expand, load_scenes, with_holdout
 from clpipe.analysis.matching.simulation import Simulator
 from clpipe.analysis.matching.space import (
     Choice,
@@ -248,12 +248,12 @@ def test_a_name_with_brackets_is_no_glob_where_it_exists(tmp_path):
 def test_a_third_is_kept_out_of_the_search(burst, tmp_path):
     names = saved(tmp_path, **{f"{k}": frame for k, frame in enumerate(burst)})
     (one,) = load_scenes(names, []).each
-    assert not (one.mask & one.held).any()
-    assert one.held.sum() / (one.mask | one.held).sum() == pytest.approx(1 / 3, abs=0.12)
-    whole = replace(one, mask=one.mask | one.held, held=np.zeros_like(one.held))
-    kept = held_out([whole] * 6)
+    assert not (one.mask & one.holdout).any()
+    assert one.holdout.sum() / (one.mask | one.holdout).sum() == pytest.approx(1 / 3, abs=0.12)
+    whole = replace(one, mask=one.mask | one.holdout, holdout=np.zeros_like(one.holdout))
+    kept = with_holdout([whole] * 6)
     assert [s.mask.any() for s in kept] == [True, True, False] * 2
-    assert [s.mask.any() and s.held.any() for s in held_out([whole] * 5)] == [True] * 5
+    assert [s.mask.any() and s.holdout.any() for s in with_holdout([whole] * 5)] == [True] * 5
     assert isinstance(Scenes(kept, None, ()), Scenes)
 
 
@@ -326,7 +326,7 @@ def test_looks_are_like_the_cameras(look, device):
     frames, means = (f"{SHARED}/real_noise/{PAIRS[look]}_?_{kind}.png" for kind in ("real", "mean"))
     simulator, residuals, sizes = Simulator(device), [], []
     for one in load_scenes([frames], [means]).each:
-        places = Places(one.mask | one.held)
+        places = Places(one.mask | one.holdout)
         ours = figures_of(simulator.noise(load_settings(look), one, "test"), places)
         theirs = figures_of(one.noise, places)
         residuals.append([ours[name] - theirs[name] for name in WITHIN])

@@ -110,7 +110,7 @@ def test_what_the_table_names_is_there():
     "text",
     [
         *("demosaic.method=none", "gamma.chi", "denoise.method", "demosaic.classifier=canny"),
-        *("clpipe develop", "--iid", "--baseline poisson", "-c papers", "tools/run pages figure"),
+        *("clpipe develop", "--iid", "--truth poisson", "-c papers", "tools/run pages figure"),
     ],
 )
 def test_what_is_not_there_is_noticed(text):

@@ -115,7 +115,7 @@ def test_places_are_everywhere_and_fit():
         for patch in edge.drawn(range(50), "owner"):
             assert patch.left + patch.size <= edge.width and patch.top + patch.size <= edge.height
     plain = Cutting(8, 21, 16, "RGGB", augment=False).drawn(range(50), "owner")
-    assert {(p.left % 2, p.top % 2, p.turn) for p in plain} == {(0, 0, 1)}
+    assert {(p.left % 2, p.top % 2, p.orientation) for p in plain} == {(0, 0, 1)}
 
 
 @pytest.mark.parametrize("augment", [False, True])

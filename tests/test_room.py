@@ -210,7 +210,7 @@ from clpipe.engine.device import open_device
 from clpipe.engine.runner import Runner
 runner = Runner(Request().chain(), open_device(None))
 image = np.full((2000, 4400, 3), 0.2, np.float16)
-runner.warm_up()
+runner.compile()
 hard = resource.getrlimit(resource.RLIMIT_AS)[1]
 least = _listed(Path("/proc/self/status"), "VmSize") + (100 << 20)
 resource.setrlimit(resource.RLIMIT_AS, (least, hard))

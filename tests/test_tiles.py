@@ -12,7 +12,8 @@ from clpipe.chain.registry import all_stages, load_stage_file
 from clpipe.chain.settings import Settings, settings_from
 from clpipe.engine.check import NOISE, chain_for, example
 from clpipe.engine.extents import Box, whole_image
-from clpipe.engine.plan import Plan
+from clpipe.engine.ir import Plan
+from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result, Runner, cut_out
 from clpipe.engine.tiles import (
     LARGEST_TILE,
@@ -75,7 +76,7 @@ def in_tiles(
         assert device.bytes_held <= memory
     same(whole, parts)
     boxes = patches_in(whole)
-    same(cut(whole, boxes), runner.submit(image, "k", boxes=boxes)())
+    same(cut(whole, boxes), runner.submit(image, "k", RunOptions(boxes=boxes))())
     return whole, len(tiling.tiles)
 
 
@@ -322,7 +323,7 @@ def test_buffers_that_cannot_be_made(device, monkeypatch):
         patch.setattr(pool, "_make", scarce)
         same(whole, runner.run(image, "k"))
     assert max(sizes) > 100_000
-    assert max(b.size for b in pool.held.values()) <= 40_000
+    assert max(b.size for b in pool.buffers.values()) <= 40_000
 
 
 def test_a_device_that_fails_is_an_error_of_the_image(device, monkeypatch):

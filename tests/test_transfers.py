@@ -13,8 +13,9 @@ from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine import programs
 from clpipe.engine.check import example
-from clpipe.engine.device import Device, Timing
+from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
+from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.runner import Runner, cut_out
 from clpipe.stage import Kind
 
@@ -50,9 +51,9 @@ def test_a_cpu_uses_an_image_where_it_is(runner, copied):
     image = IMAGES[0].copy()
     image.setflags(write=False)
     into = np.zeros(image.shape, np.uint8)
-    runner.warm_up()
+    runner.compile()
     copied.clear()
-    assert runner.run(image, "k", into=into).encoded is into
+    assert runner.run(image, "k", RunOptions(into=into)).encoded is into
     expected = Runner(runner.chain, None).run(image, "k").encoded
     assert np.abs(into.astype(int) - expected).max() <= 1
     assert not copied
@@ -107,7 +108,7 @@ def test_both_ways_give_the_same(device, type_, memory):
         for name in ("final", "encoded", "kept", "estimates"):
             np.testing.assert_equal(getattr(found, name), getattr(expected, name))
         boxes = [Box(x, 2 * x, x + 20, 2 * x + 16) for x in (0, 7, 25)]
-        patches = two.submit(image, "k", boxes=boxes)()
+        patches = two.submit(image, "k", RunOptions(boxes=boxes))()
         np.testing.assert_equal(patches.encoded, cut_out(expected.encoded, boxes))
 
 
@@ -133,7 +134,7 @@ def queued(device: Device, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, i
 def gpu_runner(runner: Runner) -> Runner:
     """The same on a device with memory of its own, as far as clpipe knows."""
     runner.device = Device(replace(runner.device.info, type="GPU"))
-    runner.warm_up()
+    runner.compile()
     return runner
 
 
@@ -144,7 +145,7 @@ def test_transfers_of_an_image_run_beside_the_kernels_of_its_neighbours(gpu_runn
     # Kernels are held back: the first one's, and so all that follow.
     cl._enqueue_marker_with_wait_list(device._flow.queue, [gate])
     timings: list[list[Timing]] = [[], []]
-    begun = [gpu_runner.submit(IMAGES[i], "k", timings[i]) for i in range(2)]
+    begun = [gpu_runner.submit(IMAGES[i], "k", RunOptions(timings[i])) for i in range(2)]
     wanted = ["enqueue_copy", "enqueue_nd_range_kernel", "enqueue_copy"] * 2
     assert [name for name, _ in seen] == wanted  # and the host did not wait
     up, run, down = (queue for _, queue in seen[:3])
@@ -175,7 +176,7 @@ def test_a_source_that_is_there_is_not_sent_again(gpu_runner):
 
     def sent(unchanged: bool) -> tuple[int, np.ndarray]:
         timings: list[Timing] = []
-        result = gpu_runner.submit(image, "k", timings, unchanged=unchanged)()
+        result = gpu_runner.submit(image, "k", RunOptions(timings, unchanged=unchanged))()
         return [t.name for t in timings].count("upload"), result.encoded
 
     (first, pixels), (again, same) = sent(True), sent(True)

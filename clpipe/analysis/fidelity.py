@@ -66,12 +66,12 @@ def colour_errors(pictured: NDArray[np.number], true: NDArray[np.number]) -> Col
         (np.hypot(lab[:, 1], lab[:, 2]), np.arctan2(lab[:, 2], lab[:, 1])) for lab in (found, asked)
     )
     coloured = chroma >= HAS_HUE
-    turned = np.degrees(np.abs((found_hue - hue + np.pi) % (2 * np.pi) - np.pi))[coloured]
+    hue_errors = np.degrees(np.abs((found_hue - hue + np.pi) % (2 * np.pi) - np.pi))[coloured]
     return ColourErrors(
         grey=float(pictured[GREY, 1]),
         lightness=float((found[:, 0] - asked[:, 0]).mean()),
-        hue=float(np.median(turned)),
-        largest_hue=float(turned.max()),
+        hue=float(np.median(hue_errors)),
+        largest_hue=float(hue_errors.max()),
         chroma=float(np.median(found_chroma[coloured] / chroma[coloured])),
     )
 

@@ -88,7 +88,7 @@ def exposures(
             try:
                 loaded = own.enter(job, own.read(job))
                 assert loaded  # only where a chain starts in its midst it may be None
-                runner = runner.of(loaded.chain) if runner else Runner(loaded.chain, device)
+                runner = runner.for_chain(loaded.chain) if runner else Runner(loaded.chain, device)
                 metered = _metered(loaded, runner)
             except (ImageError, RequestError, MemoryError) as error:
                 raise ImageError(own.error_text(job, error)) from None

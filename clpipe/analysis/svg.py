@@ -44,12 +44,12 @@ SETTINGS = {
 def _figure(width: float, height: float, right: float = 0.2) -> Figure:
     """A figure without ground, in inches; ``right`` is free on that side.
 
-    The room around is fixed: to fit it to the texts takes Matplotlib three times as long.
+    The margins are fixed: to fit it to the texts takes Matplotlib three times as long.
     """
     figure = Figure(figsize=(width, height))
-    room = {"left": 0.75 / width, "right": 1 - right / width}
+    margins = {"left": 0.75 / width, "right": 1 - right / width}
     figure.subplots_adjust(
-        **room, bottom=0.55 / height, top=1 - 0.3 / height, wspace=0.3, hspace=0.5
+        **margins, bottom=0.55 / height, top=1 - 0.3 / height, wspace=0.3, hspace=0.5
     )
     FigureCanvasSVG(figure)
     figure.patch.set_alpha(0)

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.errors import ClpipeError, DeviceError, OutputError, RequestError
 from clpipe.base.processors import available_processors
-from clpipe.base.steps import Step
 from clpipe.batch.outcome import FAILED, Outcome
 from clpipe.batch.room import Room, host_bytes, usual_room
 from clpipe.batch.work import ImageWorker, Runners, Task
@@ -150,7 +150,7 @@ class Batch:
 
         def guarded() -> None:
             try:
-                with Step("Python"):
+                with CpuTimer("Python"):
                     work(*arguments)
             except BaseException as error:
                 self._fail(error if isinstance(error, Exception) else RuntimeError(repr(error)))

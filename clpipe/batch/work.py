@@ -21,14 +21,15 @@ from clpipe.chain.depth import lenses_of
 from clpipe.chain.formats import DNG
 from clpipe.chain.rendition import FIRST, Rendition
 from clpipe.engine.clipping import clipped_share
-from clpipe.engine.device import Device, Timing
+from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
+from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import Carried
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.existing import AS_USUAL, Found, Resuming
+from clpipe.outputs.existing import Found, Redo
 from clpipe.outputs.patches import Patch, every_patch
 from clpipe.outputs.recipes import Recipe
 from clpipe.outputs.sealed import SIDECAR, write_sidecar
@@ -100,7 +101,7 @@ class ImageWorker:
         loader: how images are loaded.
         writer: how pictures are written.
         chain: that of the first image, for which kernels are compiled early.
-        resuming: which pictures that are there already are made again.
+        redo: which pictures that are there already are made again.
         trace: note each launch and transfer.
     """
 
@@ -109,13 +110,13 @@ class ImageWorker:
         loader: ImageLoader,
         writer: OutputWriter,
         chain: Chain,
-        resuming: Resuming = AS_USUAL,
+        redo: Redo = Redo.OLD,
         trace: bool = False,
     ) -> None:
         self.writer = writer
         self.loader = loader
         self.chain = chain
-        self._resuming = resuming
+        self._redo = redo
         self._trace = trace
         self._spare = SpareArrays(0)
 
@@ -178,14 +179,14 @@ class ImageWorker:
     def _missing(self, task: Task) -> Set[Rendition]:
         """A job's renditions that are to be made."""
         renditions = self.writer.renditions_of(task.job)
-        if self._resuming.overwrite:
+        if self._redo is Redo.ALL:
             return set(renditions)
         found = {
             each: self.found(task.job, each, self.writer.record_of(task.request, each))
             for each in renditions
         }
         task.old = sum(there is Found.OLD for there in found.values())
-        missing = [each for each, there in found.items() if not self._resuming.is_kept(there)]
+        missing = [each for each, there in found.items() if not self._redo.keeps(there)]
         return self.writer.plan_of(task.job).needed(missing)
 
     def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> Found:
@@ -199,7 +200,7 @@ class ImageWorker:
         Raises:
             ImageError: a file of its name is somebody else's.
         """
-        return self.writer.existing(job, rendition).found(job, request, self._resuming.verify)
+        return self.writer.existing(job, rendition).found(job, request, self._redo.verifies)
 
     def _load(self, task: Task, renditions: Set[Rendition]) -> None:
         """Load a task's image, and decide which renditions are made of it.
@@ -220,8 +221,8 @@ class ImageWorker:
             height, width = loaded.source.pixels.shape[:2]
             task.patches = every_patch(patches, loaded.chain, width, height, job.key)
         if any(map(self.writer.carries, renditions)):
-            turn = self.writer.turn_of(loaded.source, loaded.chain)
-            task.carried = task.loader.carried(job, loaded, turn)
+            orientation = self.writer.picture_orientation(loaded.source, loaded.chain)
+            task.carried = task.loader.carried(job, loaded, orientation)
         task.source = loaded.source
         recipes = self.writer.plan_of(job).recipes(loaded.chain, loaded.key)
         task.recipes = [recipe for recipe in recipes if recipe.rendition in renditions]
@@ -291,7 +292,8 @@ class ImageWorker:
         reused = runner.encode and runner.device and not boxes
         into = self._spare.take(shape) if reused else None
         key = recipe.noise_key
-        return runner.submit(pixels, key, timings, into=into, unchanged=True, boxes=boxes)
+        options = RunOptions(timings, into=into, unchanged=True, boxes=boxes)
+        return runner.submit(pixels, key, options)
 
     @staticmethod
     def _tried(task: Task, work: Callable[[], T]) -> T | None:
@@ -362,7 +364,7 @@ class Runners:
         self._device = device
         first = writer.runner(Recipe(FIRST, chain, (), ""), device)
         try:
-            first.warm_up(half)
+            first.compile(half)
         except ImageError as error:  # not even one of 8x8 pixels fits
             raise RequestError(f"--memory: too little for any image: {error}") from None
         self._latest = [(chain, first)]
@@ -376,7 +378,7 @@ class Runners:
         runner = self._writer.runner(recipe, self._device)
         alike = self._by_results.setdefault((runner.keep, runner.encode, runner.final), runner)
         if alike is not runner:
-            runner = alike.of(recipe.chain)  # shares the plans
+            runner = alike.for_chain(recipe.chain)  # shares the plans
         self._latest.insert(1, (recipe.chain, runner))
         del self._latest[4:]
         return runner

@@ -17,7 +17,7 @@ from clpipe.chain.settings import Settings
 from clpipe.reference.geometry import NO_MARGINS, Composition, Margins
 from clpipe.reference.intrinsics import Intrinsics
 from clpipe.reference.resample import Resampler, sizes
-from clpipe.stage import Context, Kind, Method, Noiseless, Stage, Unchanged
+from clpipe.stage import Context, Kind, Method, Noiseless, Resample, Stage, Unchanged
 
 
 @dataclass(frozen=True)
@@ -103,13 +103,13 @@ class Chain:
     @cached_property
     def _resamplings(self) -> tuple[Resampler, ...]:
         passes = (p for step in self.steps for p in step.method.passes())
-        return tuple(p.resampling for p in passes if p.resampling)
+        return tuple(p.access.resampler for p in passes if isinstance(p.access, Resample))
 
     @property
     def noise(self) -> NoiseModel | None:
         """The sensor noise in the image that comes out; None where none was added."""
         last = self.steps[-1]
-        return last.method.after(last.context).noise
+        return last.method.next_context(last.context).noise
 
     @property
     def is_noisy(self) -> bool:
@@ -143,8 +143,8 @@ class Chain:
             name, folder = step.name, step.stage.folder
             method, context = self.settings.method(name), replace(step.context, clean=True)
             with validation_errors(name, type(method)), user_code_errors(f"stage {name}", folder):
-                own = method.where_clean(context)
-                left.append((step, own and own.around(step.method.margins)))
+                own = method.noise_free(context)
+                left.append((step, own and own.with_margins(step.method.margins)))
         return self._with(left, clean=True)
 
     def _with(self, methods: Sequence[tuple[Step, Method | None]], clean: bool) -> "Chain":
@@ -287,7 +287,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
             raise RequestError(misfit(name, stage, before, kind or stage.reads))
         with validation_errors(name, type(method)), user_code_errors(f"stage {name}", stage.folder):
             method = method.resolve(context)
-            after = method.after(context)
+            after = method.next_context(context)
         if stage.folder:
             check_passes(name, stage, method, context)
         steps.append(Step(name, stage, method, context))

@@ -91,7 +91,7 @@ def toml_text(chain: Chain) -> str:
         f"iso = {value_text(draws.get('iso', settings.iso))}",
         *(f"{key} = {value_text(v)}" for key, v in settings.record().items() if key in LENS),
         f"seed = {value_text(settings.seed)}",
-        *(f"{key} = {value_text(v)}" for key, v in settings.record().items() if key[:4] == "raw_"),
+        *([f"dump = {value_text(settings.dump)}"] if settings.dump else []),
         "stages = [",
         *(f"    {value_text(step.stage.name)}," for step in chain.steps),
         "]",

@@ -10,7 +10,7 @@ CODE = "stage_files"  # the key that only a configuration file may have
 LENS = ("lens", "focal_length", "aperture", "focus_distance")  # how a lens is named and set
 
 KEYS = (
-    *("camera", "iso", *LENS, "seed", "noise_key", "raw_size", "raw_type", "stages", "skip"),
+    *("camera", "iso", *LENS, "seed", "noise_key", "dump", "stages", "skip"),
     CODE,
 )
 
@@ -34,7 +34,7 @@ TYPES: dict[str, tuple[str, Any]] = {
     "iso": ("a number", int | float),
     "seed": ("a whole number", int),
     **dict.fromkeys(LENS[1:], ("a number", int | float)),
-    **dict.fromkeys(("camera", "lens", "noise_key", "raw_size", "raw_type"), ("text", str)),
+    **dict.fromkeys(("camera", "lens", "noise_key", "dump"), ("text", str)),
 }
 
 # What a value is, for people, and its unit.

@@ -175,14 +175,14 @@ def check_passes(name: str, stage: Stage, method: Method, context: Context) -> N
     with user_code_errors(f"stage {name}", stage.folder):
         passes, arguments = method.passes(), method.arguments(context)
         for pass_ in passes:
-            names = [*arguments, *(n for p in passes for n in (*p.estimates, p.writes))]
-            for argument in (*pass_.arguments, *pass_.finish_arguments):
+            names = [*arguments, *(name for p in passes for name in p.gives)]
+            for argument in pass_.all_arguments:
                 if argument not in names:
                     raise RequestError(
                         f"stage {name}: pass {pass_.function} needs the argument '{argument}'; "
                         f"arguments() gives {', '.join(arguments) or 'none'}"
                     )
-            for function in filter(None, (pass_.function, pass_.finish)):
+            for function in pass_.functions:
                 if not re.search(rf"\b{re.escape(function)}\s*\(", kernel.read_text("utf-8")):
                     raise RequestError(
                         f"stage {name}: {kernel} has no function {function}, which a pass names"

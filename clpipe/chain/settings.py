@@ -30,7 +30,7 @@ from clpipe.chain.methods import (
 )
 from clpipe.chain.paths import file_parameters, from_folder
 from clpipe.chain.registry import all_stages
-from clpipe.images.dump import Dump, dump_of
+from clpipe.images.dump import Dump, parse_dump
 from clpipe.images.encoding import Output
 from clpipe.stage import Method
 from clpipe.stages import DEFAULT_CHAIN
@@ -52,8 +52,7 @@ class Settings:
     focus_distance: float | None = None  # m; None is far away
     seed: int = 0
     noise_key: str = ""  # "" follows from the image and the ISO
-    raw_size: str = ""  # of headerless dumps: WIDTHxHEIGHT
-    raw_type: str = ""  # and how their samples are stored
+    dump: str = ""  # headerless dumps: WIDTHxHEIGHT:TYPE
     stages: tuple[str, ...] = DEFAULT_CHAIN
     skip: tuple[str, ...] = ()
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -77,7 +76,7 @@ class Settings:
         if self.noise_key:
             plain["noise_key"] = self.noise_key
         if self.dump:
-            plain |= {"raw_size": self.raw_size, "raw_type": self.raw_type}
+            plain["dump"] = self.dump
         lists = {"stages": list(self.stages), "skip": list(self.skip)}
         output = self.output.model_dump(exclude_defaults=True)
         tables = {**self.parameters, **({OUTPUT: output} if output else {})}
@@ -136,14 +135,9 @@ class Settings:
         return model
 
     @property
-    def dump(self) -> Dump | None:
-        """The geometry of headerless dumps; None where it is not set.
-
-        Raises:
-            RequestError: only a part of it is set, or it is not allowed.
-        """
-        is_set = self.raw_size or self.raw_type
-        return dump_of(self.raw_size, self.raw_type) if is_set else None
+    def dump_format(self) -> Dump | None:
+        """The format of headerless dumps; None where it is not set."""
+        return parse_dump(self.dump) if self.dump else None
 
     def files(self) -> list[str]:
         """The files that the settings name, whose contents are so a part of them."""
@@ -302,12 +296,11 @@ def _checked_plain(settings: Settings, plain: Mapping[str, Any]) -> dict[str, An
                 stage_named(key, name if key == "stages" else base_name(name))
             checked[key] = (*settings.skip, *names) if key == "skip" else names
     checked |= {key: convert(plain[key]) for key, convert in CONVERSIONS.items() if key in plain}
-    if {"raw_size", "raw_type"} & plain.keys():
-        size = plain.get("raw_size", settings.raw_size)
+    if plain.get("dump"):
         try:
-            dump_of(size, plain.get("raw_type", settings.raw_type))
+            parse_dump(plain["dump"])
         except RequestError as error:
-            raise KeyedError(str(error).partition(":")[0], str(error)) from None
+            raise KeyedError("dump", str(error)) from None
     return checked
 
 

@@ -16,6 +16,7 @@ from clpipe.chain.chain import Chain, Step
 from clpipe.chain.truth import noisy_mosaic, picture_without_noise
 from clpipe.dataset.arrays import ArrayFormat
 from clpipe.engine.device import Device
+from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result, Runner
 from clpipe.outputs.patches import Patch, Patches, facts_of, pattern_of, variance_at, variance_steps
 from clpipe.stage import Kind
@@ -128,7 +129,7 @@ class Developer:
         Raises:
             ImageError, RequestError, MemoryError: the image cannot be developed.
         """
-        boxes = [patch.box for patch in patches]
+        options = RunOptions(unchanged=True, boxes=[patch.box for patch in patches])
         with self._lock:
             prepared = (
                 self._prepare(chain)
@@ -136,7 +137,7 @@ class Developer:
                 else self._prepared.get(chain_key, lambda: self._prepare(chain))
             )
             begun = {
-                name: runner.submit(pixels, noise_key, unchanged=True, boxes=boxes)
+                name: runner.submit(pixels, noise_key, options)
                 for name, runner in prepared.runners.items()
             }
 
@@ -189,7 +190,7 @@ class Developer:
             variance = patch.turned(variance) if patch else variance
             sample["variance"] = arrays.variance(variance, pattern)
         if patch:
-            sample |= {"place": np.array([patch.left, patch.top]), "turn": patch.turn}
+            sample |= {"place": np.array([patch.left, patch.top]), "turn": patch.orientation}
         facts = prepared.facts.items()
         return sample | {name: v.copy() if isinstance(v, np.ndarray) else v for name, v in facts}
 
@@ -218,7 +219,7 @@ class Developer:
         kept = tuple(step.name for step in chain.steps if step.name in keep)
         latest = self._latest.get(name)
         if latest and latest.keep == kept and latest.encode == encode:
-            runner = latest.of(chain)  # shares its plans
+            runner = latest.for_chain(chain)  # shares its plans
         else:
             runner = Runner(chain, self._device, kept, encode, final=not encode)
         self._latest[name] = runner

@@ -9,8 +9,9 @@ import numpy as np
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.settings import Settings
-from clpipe.engine.device import Device, Timing
-from clpipe.engine.plan import Launch
+from clpipe.engine.device import Device
+from clpipe.engine.ir import Launch
+from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.runner import Runner
 from clpipe.engine.traffic import bytes_per_pixel, launch_bytes
 from clpipe.stage import Stage, variant_label, variants
@@ -84,7 +85,7 @@ def bench(
     for _ in range(repeat):
         timings: list[Timing] = []
         start = time.perf_counter()
-        runner.run(image, "bench", timings, download=False)
+        runner.run(image, "bench", RunOptions(timings, download=False))
         whole = min(whole, time.perf_counter() - start)
         timings = [t for t in timings if not t.transfer]
         best = [
@@ -148,7 +149,7 @@ def bench_methods(
         best: list[float] = []
         for _ in range(repeat):
             timings: list[Timing] = []
-            runner.run(image, "bench", timings, download=False)
+            runner.run(image, "bench", RunOptions(timings, download=False))
             seconds = [t.seconds for t in timings if not t.transfer]
             best = [min(pair) for pair in zip(seconds, best or seconds, strict=True)]
         first = runner.plan(half=False).launches[0]

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.types import Array
-from clpipe.engine.codegen import border_left
 from clpipe.engine.extents import Box, Extent
-from clpipe.engine.plan import Finalize, Plan
-from clpipe.engine.writer import Parameter
+from clpipe.engine.ir import Finalize, Plan
+from clpipe.engine.work_items import border_left
 from clpipe.stage import Kind
 
 
@@ -117,7 +116,7 @@ class Pool:
 
     def __init__(self, make: Callable[[int], Any]) -> None:
         self._make = make
-        self.held: dict[str, Any] = {}
+        self.buffers: dict[str, Any] = {}
         self.generation = 0  # counts up when a buffer is replaced
 
     def reserve(self, sizes: Mapping[str, int], memory: int) -> None:
@@ -126,44 +125,30 @@ class Pool:
         Buffers that only earlier images needed are kept while all together take no more than
         ``memory`` bytes.
         """
-        enough = {name: b for name, b in self.held.items() if b.size >= sizes.get(name, 0)}
+        enough = {name: b for name, b in self.buffers.items() if b.size >= sizes.get(name, 0)}
         missing = sum(size for name, size in sizes.items() if name not in enough)
         for spare in (lambda name, _: name not in sizes, lambda name, b: b.size > sizes[name]):
             if sum(b.size for b in enough.values()) + missing > memory:
                 dropped = [name for name, b in enough.items() if spare(name, b)]
                 missing += sum(sizes.get(name, 0) for name in dropped)
                 enough = {name: b for name, b in enough.items() if name not in dropped}
-        if enough.keys() == self.held.keys() >= sizes.keys():
+        if enough.keys() == self.buffers.keys() >= sizes.keys():
             return
         self.generation += 1
-        for name in self.held.keys() - enough.keys():
-            self.held.pop(name).release()
+        for name in self.buffers.keys() - enough.keys():
+            self.buffers.pop(name).release()
         for name, size in sizes.items():
             if name not in enough:
-                self.held[name] = self._make(size)
+                self.buffers[name] = self._make(size)
 
     @property
     def bytes(self) -> int:
         """The size of all buffers together."""
-        return sum(buffer.size for buffer in self.held.values())
+        return sum(buffer.size for buffer in self.buffers.values())
 
     def release(self) -> None:
         """Give all buffers back to the device."""
         self.generation += 1
-        held, self.held = self.held, {}
-        for buffer in held.values():
+        buffers, self.buffers = self.buffers, {}
+        for buffer in buffers.values():
             buffer.release()
-
-
-def buffer_name(parameter: Parameter) -> str | None:
-    """The name, in :func:`~clpipe.engine.tiles.buffer_sizes`, of the buffer of a parameter."""
-    match parameter.role:
-        case "source":
-            return "src"
-        case "encoded":
-            return "dst"
-        case "slot":
-            return f"slot{parameter.number}"
-        case "lines" | "sums" | "partials" | "counts" | "histogram" | "estimates":
-            return f"{parameter.role}.{parameter.step}"
-    return None

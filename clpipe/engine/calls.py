@@ -6,21 +6,24 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.types import Array
-from clpipe.engine.buffers import Pool, buffer_name
-from clpipe.engine.codegen import (
-    PARTIALS,
-    Border,
-    Kernel,
-    columns_of,
-    local_size,
-    round_up,
-    summed_together,
+from clpipe.engine.bindings import (
+    ArgumentValue,
+    Buffer,
+    EncodedCurves,
+    ExtentNumber,
+    ResamplingValue,
+    StreamWord,
+    TileNumber,
+    Value,
 )
+from clpipe.engine.buffers import Pool
+from clpipe.engine.codegen import Kernel
 from clpipe.engine.extents import Extent, Extents
-from clpipe.engine.plan import Finalize, Histogram, Launch, Lines, Reduce
-from clpipe.engine.writer import Parameter
+from clpipe.engine.ir import Border, Finalize, Histogram, Launch, Lines, Reduce
+from clpipe.engine.work_items import PARTIALS, columns_of, local_size, round_up, summed_together
 
-Bind = Callable[[Parameter], Any]
+Bind = Callable[[Value], Any]  # a NumPy scalar or array
+ENDS = ("src", "dst")  # buffers that are an image's own
 
 MANY = 4  # launches, after which there will be more
 
@@ -44,7 +47,7 @@ def index_space(kernel: Kernel, extent: Extent) -> tuple[tuple[int, ...], tuple[
         case Histogram():
             items = PARTIALS * summed_together(lanes)
         case Reduce(op=op):
-            items = op.pass_.bins if lanes == 1 and op.pass_.bins else PARTIALS
+            items = op.reduction.bins if lanes == 1 and op.reduction.bins else PARTIALS
     return (round_up(items, local),), (local,)
 
 
@@ -55,28 +58,36 @@ class Call:
         reads_source: whether it reads the image that is sent.
         reads: the names of buffers that stay on the device, of those that it only reads.
         writes: of those that it writes.
-        values: the parameters whose values an image's chain gives.
+        values: what an image's chain gives.
     """
 
     def __init__(self, kernel: Kernel, compiled: Any) -> None:
         self.kernel = kernel
         self.compiled = compiled
-        numbered = list(enumerate(kernel.parameters))
-        names = [(i, buffer_name(p)) for i, p in numbered]
-        self._ends = [(i, name) for i, name in names if name in ("src", "dst")]
-        self._buffers = [(i, name) for i, name in names if name and name not in ("src", "dst")]
-        is_read = {name: "const " in kernel.parameters[i].declaration for i, name in names}
-        self.reads_source = "src" in is_read
-        self.reads = [name for _, name in self._buffers if is_read[name]]
-        self.writes = [name for _, name in self._buffers if not is_read[name]]
-        tiles = [(i, p.item) for i, p in numbered if p.role == "tile"]
-        self._tile = [i for i, name in tiles if name == "tile"]
-        self._larger = [(i, name[5:]) for i, name in tiles if name.startswith("from_")]
-        others = {*self._tile, *(i for i, _ in self._larger)}
-        self._own = [(i, name) for i, name in tiles if i not in others]
-        self._values = [(i, p) for i, p in numbered if p.role in ("value", "key", "table8", "taps")]
-        self.values = [p for _, p in self._values]
-        self._arguments: list[Any] = [None] * len(numbered)
+        self.reads: list[str] = []
+        self.writes: list[str] = []
+        self._ends: list[tuple[int, str]] = []
+        self._buffers: list[tuple[int, str]] = []
+        self._tile: list[int] = []
+        self._own: list[tuple[int, str]] = []  # numbers of the extent
+        self._larger: list[tuple[int, str]] = []
+        self._values: list[tuple[int, Value]] = []
+        for i, parameter in enumerate(kernel.parameters):
+            match parameter.bound:
+                case Buffer(name) if name in ENDS:
+                    self._ends.append((i, name))
+                case Buffer(name, written):
+                    self._buffers.append((i, name))
+                    (self.writes if written else self.reads).append(name)
+                case ExtentNumber(name, larger):
+                    (self._larger if larger else self._own).append((i, name))
+                case TileNumber():
+                    self._tile.append(i)
+                case ArgumentValue() | StreamWord() | EncodedCurves() | ResamplingValue() as value:
+                    self._values.append((i, value))
+        self.values = [value for _, value in self._values]
+        self.reads_source = "src" in (name for _, name in self._ends)
+        self._arguments: list[Any] = [None] * len(kernel.parameters)
         self._extents: Extents = ()
         self._bound: tuple[Any, ...] = ()
         self._launches = 0
@@ -97,7 +108,7 @@ class Call:
             ends: the buffers "src" and "dst", which are an image's own.
             extents: the tile's.
             tile: its number.
-            bind: the value of a parameter, always the same one.
+            bind: gives the values, always the same ones.
             table: a buffer that holds an array.
         """
         arguments = self._arguments
@@ -112,10 +123,10 @@ class Call:
                     arguments[i] = extents[of].numbers[name]
             self._extents = extents
         for i, name in self._buffers:
-            arguments[i] = pool.held[name]
+            arguments[i] = pool.buffers[name]
         if (pool.generation, bind) != self._bound:
-            for i, parameter in self._values:
-                value = bind(parameter)
+            for i, asked in self._values:
+                value = bind(asked)
                 arguments[i] = table(value) if isinstance(value, np.ndarray) else value
             self._bound = pool.generation, bind
         # PyOpenCL takes 11 us to find out the type of a number, or 2 ms to be told all types.

@@ -117,11 +117,7 @@ def chain_for(
 def depends_on_pattern(stage: Stage, method: type[Method], values: Mapping[str, Any]) -> bool:
     """Whether the kernels of a method are compiled for a CFA pattern."""
     step = chain_for(stage, method, values, PATTERNS[0]).steps[0]
-    return "pattern" in {
-        name
-        for pass_ in step.method.passes()
-        for name in (*pass_.arguments, *pass_.finish_arguments)
-    }
+    return any("pattern" in pass_.all_arguments for pass_ in step.method.passes())
 
 
 def check_method(

@@ -13,9 +13,10 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from clpipe.engine.ops import Op
-from clpipe.engine.plan import (
+from clpipe.engine.bindings import Parameter, step_buffer
+from clpipe.engine.ir import (
     AnyLaunch,
+    Border,
     Finalize,
     Histogram,
     Launch,
@@ -24,28 +25,16 @@ from clpipe.engine.plan import (
     Read,
     Reduce,
 )
+from clpipe.engine.kernel_builder import KernelBuilder
+from clpipe.engine.ops import Op
 from clpipe.engine.sources import LIBRARY, files_text
-from clpipe.engine.writer import Parameter, Writer
-from clpipe.stage import Access, Kind
+from clpipe.engine.work_items import PARTIALS, RUN, columns_of, local_size, summed_together
+from clpipe.stage import Kind, LineTable, TableLookup
 
 # What is known of the origin when compiling: it is in whole blocks, so the rows that share a
 # Philox call and the phase of a Bayer pattern are too.
 EXTENT = "{width, height, pitch, left * LANES, top * 4, columns, rows, border}"
-PARTIALS = 256  # sums or histograms that a reduction's first half leaves
-RUN = 64  # bins of a histogram that are also added up
 UNNAMED = "kernel_without_a_name_yet"
-
-
-@dataclass(frozen=True)
-class Border:
-    """One launch that fills the border of a plane, after stores that do not fill it.
-
-    It is in no plan: only images that are hardly wider than two borders need it.
-    """
-
-    slot: int
-    level: int = 0
-    name: str = "border"
 
 
 @dataclass(frozen=True)
@@ -62,31 +51,6 @@ class Kernel:
     files: tuple[str, ...]
 
 
-def round_up(value: int, step: int) -> int:
-    """The smallest multiple of ``step`` that is not below ``value``."""
-    return -(-value // step) * step
-
-
-def border_left(border: int, lanes: int) -> int:
-    """Columns before the first pixel of a plane's row: the border, in whole blocks of lanes."""
-    return round_up(border, lanes)
-
-
-def local_size(lanes: int) -> int:
-    """Work items of a work-group. On a GPU, 64 would not fill a multiprocessor."""
-    return 128 if lanes == 1 else 64
-
-
-def summed_together(lanes: int) -> int:
-    """Work items that store one sum: on a GPU a work-group, on a CPU, where they are few, one."""
-    return local_size(lanes) if lanes == 1 else 1
-
-
-def columns_of(launch: AnyLaunch | Border, lanes: int) -> int:
-    """Vectors side by side in a work item's block: on a GPU one, so that work items share lines."""
-    return launch.columns if isinstance(launch, Launch) and lanes > 1 else 1
-
-
 def call(op: Op, arguments: Sequence[str]) -> str:
     """The call of a pass's function."""
     return f"{op.pass_.function}({', '.join(arguments)})"
@@ -94,37 +58,37 @@ def call(op: Op, arguments: Sequence[str]) -> str:
 
 def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
     """The OpenCL source of one launch of a plan, for a device with that many lanes."""
-    writer = Writer(plan, lanes)
+    builder = KernelBuilder(plan, lanes)
     for number in ("width", "height", "pitch", "left", "top", "columns", "rows", "border"):
-        writer.tile(number)
+        builder.number(number)
     seen: set[str] = set()
     text = f"#define LANES {lanes}\n#define COLUMNS {columns_of(launch, lanes)}\n"
     text += f"#define RUN {RUN}\n"
     text += files_text([f"lib/{part}.h" for part in LIBRARY], seen)
     match launch:
         case Launch():
-            body = _pixels(writer, launch)
+            body = _pixels(builder, launch)
             # The tap function calls the stages of its prologue, and the stencil calls it.
             text += files_text(kernels_of([op for r in launch.reads for op in r.prologue]), seen)
-            text += _source_image(writer, launch)
+            text += _source_image(builder, launch)
             text += files_text(kernels_of([*launch.ops, launch.sums]), seen)
         case Lines():
-            body = _lines(writer, launch)
+            body = _lines(builder, launch)
             text += files_text(kernels_of(launch.ops), seen)
         case Histogram():
-            body = _count(writer, launch)
+            body = _count(builder, launch)
             text += files_text(kernels_of([launch.op]), seen)
         case Reduce():
-            body = _add_up(writer, launch)
+            body = _add_up(builder, launch)
         case Finalize():
-            body = _find(writer, launch)
+            body = _find(builder, launch)
             text += files_text(kernels_of([launch.op]), seen)
         case Border():
             at = "(uint)get_global_id(0), (uint)get_global_id(1)"
-            body = f"    fill_border({writer.slot(launch.slot, True)}, {at}, e);\n"
-    signature = ",\n    ".join(p.declaration for p in writer.parameters.values())
+            body = f"    fill_border({builder.slot(launch.slot, True)}, {at}, e);\n"
+    signature = ",\n    ".join(p.declaration for p in builder.parameters.values())
     size = 1 if isinstance(launch, Finalize) else local_size(lanes)
-    setup = "".join(f"    {line}\n" for line in writer.setup)
+    setup = "".join(f"    {line}\n" for line in builder.setup)
     # The hint keeps Intel's compiler from making vectors of our vectors, up to nine times slower.
     text += (
         '#line 1 "launch"\n'
@@ -134,7 +98,7 @@ def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
     )
     name = f"launch_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
     source = text.replace(UNNAMED, name)
-    return Kernel(name, source, tuple(writer.parameters.values()), launch, tuple(sorted(seen)))
+    return Kernel(name, source, tuple(builder.parameters.values()), launch, tuple(sorted(seen)))
 
 
 def kernels_of(ops: Sequence[Op | None]) -> list[str]:
@@ -142,24 +106,24 @@ def kernels_of(ops: Sequence[Op | None]) -> list[str]:
     return [op.kernel for op in ops if op]
 
 
-def _prologue(writer: Writer, read: Read) -> list[tuple[Op, list[str], list[str]]]:
+def _prologue(builder: KernelBuilder, read: Read) -> list[tuple[Op, list[str], list[str]]]:
     """Each pass redone at a tap, its arguments, and which of them are run-time values."""
     calls = []
     for op in read.prologue:
-        arguments = writer.arguments(op)
+        arguments = builder.arguments(op)
         literals = dict(op.literals).values()
         calls.append((op, arguments, [a for a in arguments if a not in literals]))
     return calls
 
 
-def _source_image(writer: Writer, launch: Launch) -> str:
+def _source_image(builder: KernelBuilder, launch: Launch) -> str:
     """The type and the tap function of a stencil's ``src``, with the passes redone at each tap."""
     if not launch.stencil:
         return ""
-    reads = dict(zip(launch.stencil.pass_.reads, launch.reads, strict=True))
+    reads = dict(zip(launch.ops[0].pass_.reads, launch.reads, strict=True))
     read = reads.get("src")
     if not read or not read.prologue:
-        kind = read.image.kind if read else launch.stencil.source
+        kind = read.image.kind if read else launch.ops[0].source
         return (
             "typedef image src_image;\n"
             f"INLINE {kind.c_type} src_tap(src_image src, int dx, int dy) "
@@ -167,7 +131,7 @@ def _source_image(writer: Writer, launch: Launch) -> str:
         )
     fields = ""
     value = f"tap_{read.image.kind.c_name}(src.stored, dx, dy)"
-    for op, arguments, values in _prologue(writer, read):
+    for op, arguments, values in _prologue(builder, read):
         fields += "".join(f"float {v}; " for v in values)
         value = call(op, [value, "at", *(f"src.{a}" if a in values else a for a in arguments)])
     return (
@@ -177,81 +141,78 @@ def _source_image(writer: Writer, launch: Launch) -> str:
     )
 
 
-def _load(writer: Writer, launch: Launch) -> tuple[list[str], list[str], Kind]:
+def _load(builder: KernelBuilder, launch: Launch) -> tuple[list[str], list[str], Kind]:
     """What makes ``v0``, from the source, a stored image or the stencil; and its kind.
 
     The first lines come once a work item (for a stencil that gives its whole block), the others
     once a row.
     """
-    plan = writer.plan
-    stencil = launch.stencil
+    plan, op = builder.plan, launch.opener
     if not launch.reads:
         kind, dtype = plan.source, "half" if plan.half else "float"
-        writer.parameter("src", f"__global const {dtype} *restrict ", "source")
+        builder.buffer("src", dtype, "src")
         source = f"source_{kind.c_name}_{dtype}{'_planes' if plan.planar else ''}"
         return [], [f"const {kind.c_type} v0 = {source}(src, at, e);"], kind
-    block = stencil.pass_.block if stencil else 0
+    fills_block = launch.stencil and launch.stencil.vectors_per_row
     images = [
-        f"image_at({', '.join(writer.planes(read))}, e, first, {'0' if block else 'ROW'})"
+        f"image_at({', '.join(builder.planes(read))}, e, first, {'0' if fills_block else 'ROW'})"
         for read in launch.reads
     ]
-    if launch.opener and not stencil:
-        op, larger = launch.opener, writer.larger()
-        planes = [f"image_origin({p}, {larger})" for p in writer.planes(launch.reads[0])]
-        made = call(
-            op, ["at", *planes, larger, *writer.taps(launch.level - 1), *writer.arguments(op)]
-        )
-        return [], [f"const {op.kind.c_type} v0 = {made};"], op.kind
-    if not stencil:
+    if not op:
         kind = launch.reads[0].image.kind
         return [], [f"const {kind.c_type} v0 = tap_{kind.c_name}({images[0]}, 0, 0);"], kind
+    if not launch.stencil:
+        larger = builder.larger()
+        planes = [f"image_origin({p}, {larger})" for p in builder.planes(launch.reads[0])]
+        made = call(
+            op, ["at", *planes, larger, *builder.taps(launch.level - 1), *builder.arguments(op)]
+        )
+        return [], [f"const {op.kind.c_type} v0 = {made};"], op.kind
     lines = []
-    for name, read, stored in zip(stencil.pass_.reads, launch.reads, images, strict=True):
-        values = [v for _, _, own in _prologue(writer, read) for v in own]
+    for name, read, stored in zip(op.pass_.reads, launch.reads, images, strict=True):
+        values = [v for _, _, own in _prologue(builder, read) for v in own]
         type_ = "src_image" if name == "src" else "image"
         made = f"{{{', '.join([stored, *values])}}}" if values else stored
         lines.append(f"const {type_} {name} = {made};")
-    arguments = writer.arguments(stencil)
-    kind, given = stencil.kind, [*stencil.pass_.reads, *arguments]
-    if not block:
-        return [], [*lines, f"const {kind.c_type} v0 = {call(stencil, ['at', *given])};"], kind
-    lines.append(f"{call(stencil, ['first', *given, 'block'])};")
-    size = launch.rows * columns_of(launch, writer.lanes)
+    kind, given = op.kind, [*op.pass_.reads, *builder.arguments(op)]
+    if not fills_block:
+        return [], [*lines, f"const {kind.c_type} v0 = {call(op, ['at', *given])};"], kind
+    lines.append(f"{call(op, ['first', *given, 'block'])};")
+    size = launch.rows * columns_of(launch, builder.lanes)
     once = [f"{kind.c_type} block[{size}];", "{", *(f"    {x}" for x in lines), "}"]
-    place = "ROW" if writer.lanes == 1 else "row * COLUMNS + column"
+    place = "ROW" if builder.lanes == 1 else "row * COLUMNS + column"
     return once, [f"const {kind.c_type} v0 = block[{place}];"], kind
 
 
-def _encode(writer: Writer, value: str, kind: Kind, curves: Sequence[Op]) -> str:
+def _encode(builder: KernelBuilder, value: str, kind: Kind, curves: Sequence[Op]) -> str:
     """The line that writes eight-bit pixels, through one table where curves come last."""
-    writer.parameter("dst", "__global uchar *restrict ", "encoded")
+    builder.buffer("dst", "uchar", "dst", written=True)
     if not curves:
         return f"encode_{'mosaic' if kind.c_type == 'vf' else 'rgb'}({value}, dst, at, e);"
-    steps = ",".join(op.step for op in curves)
-    writer.parameter("table8", "__global const uchar *restrict ", "table8", item=steps)
-    return f"encode_rgb_by_table({value}, table8, dst, at, e);"
+    return f"encode_rgb_by_table({value}, {builder.table8(curves)}, dst, at, e);"
 
 
-def _pixels(writer: Writer, launch: Launch) -> str:
+def _pixels(builder: KernelBuilder, launch: Launch) -> str:
     """The body of a kernel over the image: load, the stages, store."""
-    plan = writer.plan
-    once, lines, kind = _load(writer, launch)
+    plan = builder.plan
+    once, lines, kind = _load(builder, launch)
     ops = list(launch.ops[1:] if launch.opener else launch.ops)
     curves: list[Op] = []
-    while launch.encodes and not launch.writes and ops and ops[-1].pass_.access is Access.CURVE:
-        curves.insert(0, ops.pop())
+    if launch.encodes and not launch.writes:
+        while ops and isinstance(ops[-1].pass_.access, TableLookup):
+            curves.insert(0, ops.pop())
     for i, op in enumerate(ops):
         kind = op.kind
-        made = call(op, [f"v{i}", "at", *writer.arguments(op)])
+        made = call(op, [f"v{i}", "at", *builder.arguments(op)])
         lines.append(f"const {kind.c_type} v{i + 1} = {made};")
     value = f"v{len(ops)}"
     if launch.sums:
-        writer.parameter("sums", "__global int4 *restrict ", "sums", step=launch.sums.step)
-        sample = call(launch.sums, [value, "at", *writer.arguments(launch.sums)])
-        lines.append(f"const vi sample = only_inside({sample}, at, {writer.core()});")
+        builder.buffer("sums", "int4", step_buffer("sums", launch.sums.step), written=True)
+        sample = call(launch.sums, [value, "at", *builder.arguments(launch.sums)])
+        lines.append(f"const vi sample = only_inside({sample}, at, {builder.core()});")
         lines.append("if (ROW & 1) odd_rows += sample; else even_rows += sample;")
         once.append("vi even_rows = (vi)(0), odd_rows = (vi)(0);")
-    wide = launch.stencil and launch.stencil.pass_.block and writer.lanes > 1
+    wide = launch.stencil and launch.stencil.vectors_per_row and builder.lanes > 1
     if not wide:
         # All rows before the first store: what they have in common is then done once, because no
         # store can have changed what they read.
@@ -260,10 +221,10 @@ def _pixels(writer: Writer, launch: Launch) -> str:
         value = "values_ROW"
     writes, encodes = [], []
     if launch.writes:
-        slots = [writer.slot(n, True) for n in plan.slots[launch.writes.number]]
+        slots = [builder.slot(n, True) for n in plan.slots[launch.writes.number]]
         writes.append(f"store_{kind.c_name}({', '.join([value, *slots])}, at, e);")
     if launch.encodes:
-        encodes.append(_encode(writer, value, kind, curves))
+        encodes.append(_encode(builder, value, kind, curves))
     if wide:
         body = _over_block([*lines, *writes, *encodes], launch)
     else:
@@ -278,7 +239,7 @@ def _pixels(writer: Writer, launch: Launch) -> str:
     if not launch.sums:
         return f"{place}    if (x - e.left >= columns) return;\n{rows}"
     own = "(int4)(fold_columns(even_rows, first), fold_columns(odd_rows, first))"
-    if (together := summed_together(writer.lanes)) == 1:
+    if (together := summed_together(builder.lanes)) == 1:
         store = f"    store_sums({own}, sums, e);\n"
         return f"{place}    if (x - e.left >= columns) return;\n{rows}{store}"
     # No work item may leave before a barrier.
@@ -335,26 +296,28 @@ def _store(writes: Sequence[str], kind: Kind, rows: int) -> list[str]:
     ]
 
 
-def _lines(writer: Writer, launch: Lines) -> str:
+def _lines(builder: KernelBuilder, launch: Lines) -> str:
     body = "    const uint i = (uint)get_global_id(0) * LANES;\n"
     body += "    const vu line = lane_indices(i);\n"
     for op in launch.ops:
-        table = writer.lines(op.step, op.pass_.writes, written=True)
-        count = "height" if op.pass_.lines == "rows" else "width"
-        value = call(op, ["line", *writer.arguments(op)])
+        table = builder.lines(op.step, op.pass_.writes, written=True)
+        assert isinstance(op.pass_.access, LineTable)
+        count = "height" if op.pass_.access.axis == "rows" else "width"
+        value = call(op, ["line", *builder.arguments(op)])
         body += f"    if (i < {count}) store({value}, {table} + i);\n"
     return body
 
 
-def _count(writer: Writer, launch: Histogram) -> str:
-    op, bins = launch.op, launch.op.pass_.bins
+def _count(builder: KernelBuilder, launch: Histogram) -> str:
+    op, bins = launch.op, launch.op.reduction.bins
     read = launch.reads[0]
-    planes = writer.planes(read)[: len(read.image.kind.channels)]
+    planes = builder.planes(read)[: len(read.image.kind.channels)]
     origins = [f"origin{i}" for i in range(len(planes))]
-    counts = writer.parameter("counts", "__global uint *", "counts", step=op.step)
-    arguments = [*origins, "x", "y", "e", *writer.arguments(op)]
-    core = writer.core()
-    if writer.lanes == 1:  # a work-group counts together, each of its work items other columns
+    buffer = step_buffer("counts", op.step)
+    counts = builder.buffer("counts", "uint", buffer, written=True, restrict=False)
+    arguments = [*origins, "x", "y", "e", *builder.arguments(op)]
+    core = builder.core()
+    if builder.lanes == 1:  # a work-group counts together, each of its work items other columns
         row, first, step = "get_group_id(0)", "(uint)get_local_id(0)", "(uint)get_local_size(0)"
         wait, count = "    barrier(CLK_GLOBAL_MEM_FENCE);\n", "atomic_inc(own + bin)"
     else:
@@ -375,29 +338,32 @@ def _count(writer: Writer, launch: Histogram) -> str:
     )
 
 
-def _add_up(writer: Writer, launch: Reduce) -> str:
-    tile, step = writer.tile("tile"), launch.op.step
-    if bins := launch.op.pass_.bins:
-        writer.parameter("counts", "__global const uint *", "counts", step=step)
-        writer.parameter("histogram", "__global uint *", "histogram", step=step)
+def _add_up(builder: KernelBuilder, launch: Reduce) -> str:
+    tile, step = builder.tile_number(), launch.op.step
+
+    def buffer(name: str, element: str, written: bool) -> None:
+        builder.buffer(name, element, step_buffer(name, step), written, restrict=False)
+
+    if bins := launch.op.reduction.bins:
+        buffer("counts", "uint", written=False)
+        buffer("histogram", "uint", written=True)
         arguments = f"counts, histogram, {bins}, {PARTIALS}, {tile}"
-        if writer.lanes > 1:
+        if builder.lanes > 1:
             return f"    add_up_counts({arguments});\n"
-        group = f"    __local uint group[{local_size(writer.lanes)}];\n"
+        group = f"    __local uint group[{local_size(builder.lanes)}];\n"
         return f"{group}    add_up_counts({arguments}, group);\n"
-    writer.parameter("sums", "__global const int4 *", "sums", step=step)
-    writer.parameter("partials", "__global long4 *", "partials", step=step)
-    return f"    add_up_blocks(sums, partials, {writer.tile('blocks')}, {tile});\n"
+    buffer("sums", "int4", written=False)
+    buffer("partials", "long4", written=True)
+    return f"    add_up_blocks(sums, partials, {builder.number('blocks')}, {tile});\n"
 
 
-def _find(writer: Writer, launch: Finalize) -> str:
-    pass_, step = launch.op.pass_, launch.op.step
-    if pass_.bins:
-        whole = writer.parameter("histogram", "__global const uint *", "histogram", step=step)
-    else:
-        writer.parameter("partials", "__global const long4 *", "partials", step=step)
+def _find(builder: KernelBuilder, launch: Finalize) -> str:
+    reduction, step = launch.op.reduction, launch.op.step
+    content, element = ("histogram", "uint") if reduction.bins else ("partials", "long4")
+    whole = builder.buffer(content, element, step_buffer(content, step), restrict=False)
+    if not reduction.bins:
         whole = f"add_up_partials(partials, {PARTIALS})"
-    estimates = writer.estimates(step, written=True)
-    arguments = writer.arguments(launch.op, pass_.finish_arguments)
+    estimates = builder.estimates(step, written=True)
+    arguments = builder.arguments(launch.op, reduction.finish_arguments)
     texts = [whole, *arguments, "e", estimates]
-    return f"    {pass_.finish}({', '.join(texts)});\n"
+    return f"    {reduction.finish}({', '.join(texts)});\n"

@@ -3,7 +3,6 @@
 import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -14,7 +13,7 @@ from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array
 from clpipe.engine.buffers import HostImages, room_for
 from clpipe.engine.calls import Bind, Call
-from clpipe.engine.codegen import Border, write_kernel
+from clpipe.engine.codegen import write_kernel
 from clpipe.engine.discovery import (
     DeviceInfo,
     choose,
@@ -23,30 +22,16 @@ from clpipe.engine.discovery import (
     shared_out,
     usable_memory,
 )
-from clpipe.engine.extents import Box
-from clpipe.engine.flow import Flow, Passage, Work
+from clpipe.engine.flow import DeviceImage, Flow, ImageTask
+from clpipe.engine.ir import AnyLaunch, Border, Launch, Plan
+from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.patches import with_patches
-from clpipe.engine.plan import AnyLaunch, Launch, Plan
 from clpipe.engine.programs import forget_programs, programs_of
 from clpipe.engine.tiles import Tiling, tiling_of
 
 log = logging.getLogger(__name__)
 PLANS = 64  # whose kernels stay at hand
 FAILURES = 3  # images in a row that a device fails at, before it is given up
-
-
-@dataclass(frozen=True)
-class Timing:
-    """How long one launch or transfer took, in seconds on the device.
-
-    ``start`` is on the clock of :func:`time.perf_counter`. Transfers are called "upload" and
-    "download".
-    """
-
-    name: str
-    seconds: float
-    start: float
-    transfer: bool
 
 
 def timed(events: Sequence[tuple[str, Any]]) -> list[Timing]:
@@ -121,11 +106,11 @@ class Device:
         """How many images it can work on at a time."""
         return self._flow.depth
 
-    def is_ready(self, plan: Plan) -> bool:
+    def is_compiled(self, plan: Plan) -> bool:
         """Whether the kernels of a plan are compiled."""
         return plan.unscaled in self._calls
 
-    def prepare(self, plan: Plan) -> list[Call]:
+    def compile(self, plan: Plan) -> list[Call]:
         """The compiled kernels of a plan, from the first call on without compiling.
 
         Raises:
@@ -151,35 +136,20 @@ class Device:
             yield self._border_calls.get(border, partial(self._call, plan, border))
 
     def submit(
-        self,
-        plan: Plan,
-        source: Array,
-        bind: Bind,
-        timings: list[Timing] | None = None,
-        download: bool = True,
-        into: Array | None = None,
-        unchanged: bool = False,
-        boxes: Sequence[Box] = (),
+        self, plan: Plan, source: Array, bind: Bind, options: RunOptions
     ) -> Callable[[], HostImages]:
-        """Begin to put one image through a plan, in tiles if it does not fit into the memory.
+        """Enqueue one image for a plan, in tiles if it does not fit into the memory.
 
-        So many images are on the way at a time as :attr:`depth` says; before one more is begun, the
-        oldest is waited for.
+        So many images are on the way at a time as :attr:`depth` says; before one more is enqueued,
+        the oldest is waited for.
 
         Args:
             plan: the plan.
             source: the image, (height, width[, channel]), of a type that converts without loss to
                 what the plan reads, half or float. It must stay as it is until the results are
                 taken.
-            bind: the value of a "value", "key" or "table8" parameter: a NumPy scalar or array.
-            timings: one entry a launch and transfer that is done is appended, in order.
-            download: bring results back; False leaves them on the device, for measuring.
-            into: an array to use for the eight-bit pixels, (height, width[, channel]) uint8,
-                C-contiguous; a used one saves the time that new memory takes.
-            unchanged: the source, if it is the last image's array, still has the same pixels, and
-                need not be sent again.
-            boxes: the parts of the results that are made, all of one size, in their pixels; () is
-                all of them. Results are then stacks of patches.
+            bind: gives the values of kernel parameters.
+            options: what comes back, and how.
 
         Returns:
             What waits for the results and gives them, called once and in the order of images. If
@@ -194,67 +164,67 @@ class Device:
             ImageError: the image does not fit into the device's memory, not even in tiles.
             DeviceError: a kernel does not compile.
         """
-        output = room_for(plan, source.shape[1], source.shape[0], into, boxes)
-        work = Work(plan, source, bind, output, boxes, download, unchanged)
-        begun = self._begin(work, self.memory)
-        return partial(self._result, work, begun, self._generation, timings)
+        output = room_for(plan, source.shape[1], source.shape[0], options.into, options.boxes)
+        task = ImageTask(plan, source, bind, output, options)
+        enqueued = self._enqueue(task, self.memory)
+        return partial(self._result, task, enqueued, self._generation)
 
     def drain(self) -> None:
-        """Wait for what was begun, so that it uses no memory of the host any more."""
+        """Wait for what was enqueued, so that it uses no memory of the host any more."""
         self._flow.drain()
 
-    def _tiling(self, work: Work, memory: int) -> Tiling:
-        height, width = work.source.shape[:2]
+    def _tiling(self, task: ImageTask, memory: int) -> Tiling:
+        height, width = task.source.shape[:2]
         largest = min(memory, self.info.max_buffer)
         lanes = self.info.lanes
-        tiling = tiling_of(work.plan, width, height, lanes, memory, largest, self.depth)
-        if not work.boxes:
+        tiling = tiling_of(task.plan, width, height, lanes, memory, largest, self.depth)
+        if not task.options.boxes:
             return tiling
-        return with_patches(work.plan, work.boxes, tiling, lanes, memory, self.depth)
+        return with_patches(task.plan, task.options.boxes, tiling, lanes, memory, self.depth)
 
-    def _begin(self, work: Work, memory: int) -> Passage | Exception:
+    def _enqueue(self, task: ImageTask, memory: int) -> DeviceImage | Exception:
         """Enqueue an image; what the device raises is returned."""
         try:
-            borders = partial(self._borders, work.plan)
-            passage = Passage(work, self.prepare(work.plan), borders, self._tiling(work, memory))
-            self._flow.start(passage, self.memory)
-            return passage
+            borders = partial(self._borders, task.plan)
+            tiling = self._tiling(task, memory)
+            image = DeviceImage(task, self.compile(task.plan), borders, tiling)
+            self._flow.start(image, self.memory)
+            return image
         except (self._cl.Error, MemoryError) as error:
             return error
 
     def _result(
         self,
-        work: Work,
-        begun: Passage | Exception,
+        task: ImageTask,
+        enqueued: DeviceImage | Exception,
         generation: int,
-        timings: list[Timing] | None,
     ) -> HostImages:
-        """The results of an image that was begun in a generation; see :meth:`submit`."""
+        """The results of an image that was enqueued in a generation; see :meth:`submit`."""
         cl, memory = self._cl, self.memory
         full: Exception | None = None  # the device's error when its memory ran out
         failed = False
         while True:
-            if generation != self._generation:  # what was begun is lost
+            if generation != self._generation:  # what was enqueued is lost
                 try:
-                    begun, generation = self._begin(work, memory), self._generation
+                    enqueued, generation = self._enqueue(task, memory), self._generation
                 except ImageError:
                     if full is None:
                         raise
-                    height, width = work.source.shape[:2]
+                    height, width = task.source.shape[:2]
                     raise ImageError(
                         f"{width}x{height} pixels: {self.info.label} is out of memory, in tiles of "
                         f"any size; others may be using it ({full})"
                     ) from None
             try:
-                if isinstance(begun, Exception):
-                    raise begun
-                self._flow.finish(begun)
+                if isinstance(enqueued, Exception):
+                    raise enqueued
+                self._flow.finish(enqueued)
             except (cl.Error, MemoryError) as error:
                 self._abandon()
                 if not self._works():
                     self._renew()
                 elif isinstance(error, cl.MemoryError | MemoryError):
-                    memory = memory if full is None else self._tiling(work, memory).bytes // 2
+                    memory = memory if full is None else self._tiling(task, memory).bytes // 2
                     full = error
                     continue
                 if not failed:
@@ -263,9 +233,9 @@ class Device:
                 self._count_failure(error)
                 raise DeviceFailedError(f"{self.info.label} failed: {error}") from None
             self._failures = 0
-            if timings is not None:
-                timings += timed(begun.events)
-            return work.output if work.download else HostImages({}, None, {})
+            if task.options.timings is not None:
+                task.options.timings.extend(timed(enqueued.events))
+            return task.output if task.options.download else HostImages({}, None, {})
 
     def _abandon(self) -> None:
         """After a failure: wait for all that is on the way, and give all memory back.

@@ -5,8 +5,8 @@ from functools import cached_property
 
 import numpy as np
 
-from clpipe.engine.codegen import border_left, round_up, summed_together
-from clpipe.engine.plan import Plan
+from clpipe.engine.ir import Plan
+from clpipe.engine.work_items import border_left, round_up, summed_together
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Images on their way through a device: what is enqueued, and what is still to be fetched.
 
-An image goes through in parts: its tiles, once in each phase. A part is sent, launched and fetched;
-it has landed when its results are in the host's arrays. Parts of one image or of neighbours may be
-on the way together.
+An image goes through in tiles, once in each phase. A tile is sent, launched and fetched; it has
+landed when its results are in the host's arrays. Tiles of one image or of neighbours may be on the
+way together.
 """
 
 from collections import deque
@@ -15,13 +15,15 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.cache import BoundedCache, Identity
-from clpipe.base.steps import Step
+from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.types import Array
+from clpipe.engine.bindings import slot_buffer, step_buffer
 from clpipe.engine.buffers import HostImages, Pool, aligned_empty, copy_encoded, copy_plane, core_of
 from clpipe.engine.calls import Bind, Call, index_space
-from clpipe.engine.extents import Box, Extent, Extents
-from clpipe.engine.held import Held
-from clpipe.engine.plan import Launch, Plan
+from clpipe.engine.extents import Extent, Extents
+from clpipe.engine.ir import Launch, Plan
+from clpipe.engine.launch_cache import LaunchCache
+from clpipe.engine.options import RunOptions
 from clpipe.engine.tiles import Phase, Tiling, source_bytes
 from clpipe.engine.transfers import InPlace, Staged
 
@@ -34,46 +36,42 @@ def room_of_table(buffer: Any) -> int:
 
 
 @dataclass(frozen=True)
-class Work:
+class ImageTask:
     """What is to be done to one image.
 
     Args:
         plan: the plan.
         source: the image, (height, width[, channel]).
-        bind: the value of a "value", "key" or "table8" parameter: a NumPy scalar or array.
+        bind: gives the values of kernel parameters.
         output: where the results go.
-        boxes: the patches of the results that are made; () is all of them.
-        download: whether they do.
-        unchanged: whether the source, if it is the array that was sent last, holds the same pixels.
+        options: how, see :class:`RunOptions`.
     """
 
     plan: Plan
     source: Array
     bind: Bind
     output: HostImages
-    boxes: Sequence[Box]
-    download: bool
-    unchanged: bool
+    options: RunOptions
 
 
 @dataclass
-class Passage:
-    """One image on its way: one try to do some work.
+class DeviceImage:
+    """One image on its way: one try to do a task.
 
     Args:
-        work: what is done.
+        task: what is done.
         calls: the compiled kernels of the plan.
         borders: those that fill the borders of what a launch has written, for small images.
         tiling: the tiles.
     """
 
-    work: Work
+    task: ImageTask
     calls: Sequence[Call]
     borders: Callable[[Launch], Iterable[Call]]
     tiling: Tiling
     events: list[tuple[str, Any]] = field(default_factory=list)  # of launches and transfers
-    parts: int = 0  # that have not landed
-    error: Exception | None = None  # the first one of a part that has
+    tiles_left: int = 0  # that have not landed
+    error: Exception | None = None  # the first one of a tile that has
 
     @property
     def is_whole(self) -> bool:
@@ -82,10 +80,10 @@ class Passage:
 
 
 @dataclass(frozen=True)
-class Part:
+class DeviceTile:
     """A tile on its way: the events to wait for, and the copies to make then."""
 
-    passage: Passage
+    image: DeviceImage
     events: list[Any]
     copies: list[Callable[[], None]]
 
@@ -112,9 +110,9 @@ class Flow:
             else Staged(cl, self.queue, self.new_queue, self.pool)
         )
         self._tables: BoundedCache[Any] = BoundedCache(TABLES, room_of_table)
-        self._parts: deque[Part] = deque()  # on the way
-        self._reads: list[Any] = []  # events of fetches from buffers that the next part writes
-        self._held = Held()
+        self._tiles: deque[DeviceTile] = deque()  # on the way
+        self._reads: list[Any] = []  # events of fetches from buffers that the next tile writes
+        self._launch_cache = LaunchCache()
 
     def new_queue(self) -> Any:
         """A queue whose commands are done in order, and timed."""
@@ -134,53 +132,60 @@ class Flow:
 
     @property
     def depth(self) -> int:
-        """How many parts may be on the way at a time."""
+        """How many tiles may be on the way at a time."""
         return self._transfers.depth
 
-    def start(self, passage: Passage, memory: int) -> None:
+    def start(self, image: DeviceImage, memory: int) -> None:
         """Enqueue all of an image, while buffers take no more than ``memory`` bytes.
 
-        Where more than :attr:`depth` parts would be on the way, the oldest ones land. Of a plan
-        that holds its images, launches are left out whose results are on the device.
+        Where more than :attr:`depth` tiles would be on the way, the oldest ones land. Of an
+        incremental plan, launches are left out whose results are on the device.
         """
         # Nothing is known of what buffers hold until all is enqueued.
-        known, self._held, after = self._held, Held(), Held()
-        tiling, work = passage.tiling, passage.work
+        known, self._launch_cache, after = self._launch_cache, LaunchCache(), LaunchCache()
+        tiling, task = image.tiling, image.task
         self.pool.reserve(self._transfers.needs(tiling.sizes), memory)
-        if work.plan.hold and passage.is_whole:
-            options = work.source, work.unchanged, tiling.tiles[0], work.bind
-            numbers, after = known.next(passage.calls, self.pool, *options)
+        if task.plan.incremental and image.is_whole:
+            numbers, after = known.next(
+                image.calls,
+                self.pool,
+                task.source,
+                task.options.unchanged,
+                tiling.tiles[0],
+                task.bind,
+            )
             tiling = replace(tiling, phases=(Phase((), numbers, ()),))
         for phase in tiling.phases:
             tiles = tiling.tiles_of(phase)
-            self._launch(passage, phase.first, tiles[0], 0, {}, [])
+            self._launch(image, phase.first, tiles[0], 0, {}, [])
             for tile, extents in enumerate(tiles):
-                while len(self._parts) >= self.depth:
+                while len(self._tiles) >= self.depth:
                     self._land()
                 is_last = phase is tiling.phases[-1]
-                self._pass(passage, phase.each, extents, tile, work.download and is_last)
-            self._launch(passage, phase.last, tiles[0], 0, {}, [])
-        self._held = after
+                fetches = task.options.download and is_last
+                self._pass(image, phase.each, extents, tile, fetches)
+            self._launch(image, phase.last, tiles[0], 0, {}, [])
+        self._launch_cache = after
 
-    def finish(self, passage: Passage) -> None:
-        """Wait until all parts of an image have landed, and any that were started before it.
+    def finish(self, image: DeviceImage) -> None:
+        """Wait until all tiles of an image have landed, and any that were started before it.
 
         Raises:
             pyopencl.Error: one has failed.
         """
-        while passage.parts:
+        while image.tiles_left:
             self._land()
-        if passage.error:
-            raise passage.error
+        if image.error:
+            raise image.error
 
     def drain(self) -> None:
         """Wait until nothing is on the way."""
-        while self._parts:
+        while self._tiles:
             self._land()
 
     def abandon(self) -> None:
         """After a failure: wait for all that is on the way, and give all memory back."""
-        self._parts.clear()
+        self._tiles.clear()
         self._reads.clear()
         for release in (
             self.queue.finish,
@@ -192,48 +197,48 @@ class Flow:
                 release()
 
     def _pass(
-        self, passage: Passage, numbers: Sequence[int], extents: Extents, tile: int, fetches: bool
+        self, image: DeviceImage, numbers: Sequence[int], extents: Extents, tile: int, fetches: bool
     ) -> None:
         """Send a tile if a kernel reads it, launch kernels, and fetch what they made of it."""
-        plan = passage.work.plan
-        reads_source = any(passage.calls[number].reads_source for number in numbers)
-        sent = self._send(passage, extents) if reads_source else (None, [])
-        whole = passage.work.output.encoded if fetches and passage.is_whole else None
+        plan = image.task.plan
+        reads_source = any(image.calls[number].reads_source for number in numbers)
+        sent = self._send(image, extents) if reads_source else (None, [])
+        whole = image.task.output.encoded if fetches and image.is_whole else None
         size = extents[-1].stored.width * extents[-1].stored.height
         size *= len(plan.encoded.channels) if plan.encoded else 0
         ends = {"src": sent[0], "dst": self._transfers.target(size, whole)}
         wait, self._reads = [*sent[1], *self._reads], []
-        self._launch(passage, numbers, extents, tile, ends, wait)
-        last = [event for _, event in passage.events[-1:]]
-        part = Part(passage, [*wait, *last], [])
+        self._launch(image, numbers, extents, tile, ends, wait)
+        last = [event for _, event in image.events[-1:]]
+        sent_tile = DeviceTile(image, [*wait, *last], [])
         if fetches:
-            self._fetch(part, extents, tile, ends, size, last)
-        passage.parts += 1
-        self._parts.append(part)
+            self._fetch(sent_tile, extents, tile, ends, size, last)
+        image.tiles_left += 1
+        self._tiles.append(sent_tile)
         self._transfers.flush()
 
-    @Step("upload")
-    def _send(self, passage: Passage, extents: Extents) -> tuple[Any, list[Any]]:
+    @CpuTimer("upload")
+    def _send(self, image: DeviceImage, extents: Extents) -> tuple[Any, list[Any]]:
         """Send what a tile stores of the source, unless it is there already."""
-        work, source, box = passage.work, passage.work.source, extents[0].stored
+        task, source, box = image.task, image.task.source, extents[0].stored
         if (
-            passage.is_whole
-            and (work.unchanged or not work.download)
+            image.is_whole
+            and (task.options.unchanged or not task.options.download)
             and (sent := self._transfers.again(source))
         ):
             return sent
         pixels = source[box.top : box.bottom, box.left : box.right]
-        if work.plan.planar:
+        if task.plan.planar:
             pixels = pixels.transpose(2, 0, 1)
-        dtype = np.float16 if work.plan.half else np.float32
-        size = source_bytes(work.plan, extents[0])
+        dtype = np.float16 if task.plan.half else np.float32
+        size = source_bytes(task.plan, extents[0])
         sent = self._transfers.upload(source, pixels, dtype, size)
-        passage.events += [("upload", event) for event in sent[1]]
+        image.events += [("upload", event) for event in sent[1]]
         return sent
 
     def _launch(
         self,
-        passage: Passage,
+        image: DeviceImage,
         numbers: Sequence[int],
         extents: Extents,
         tile: int,
@@ -242,16 +247,16 @@ class Flow:
     ) -> None:
         """Launch kernels of a plan on a tile, the first of them after the events ``wait``."""
         for number in numbers:
-            launch = passage.calls[number].kernel.launch
+            launch = image.calls[number].kernel.launch
             extent = extents[launch.level]
             if extent.is_empty:
                 continue
-            calls = [passage.calls[number]]
+            calls = [image.calls[number]]
             if isinstance(launch, Launch) and extent.is_small:
-                calls += passage.borders(launch)
+                calls += image.borders(launch)
             events = []
             for call in calls:
-                call.set_arguments(self.pool, ends, extents, tile, passage.work.bind, self._table)
+                call.set_arguments(self.pool, ends, extents, tile, image.task.bind, self._table)
                 sizes = index_space(call.kernel, extent)
                 events.append(
                     self._cl.enqueue_nd_range_kernel(
@@ -259,11 +264,11 @@ class Flow:
                     )
                 )
                 wait = []
-            passage.events.append((launch.name, events[0]))  # nothing waits for borders
+            image.events.append((launch.name, events[0]))  # nothing waits for borders
 
     def _fetch(
         self,
-        part: Part,
+        sent: DeviceTile,
         extents: Extents,
         tile: int,
         ends: dict[str, Any],
@@ -271,54 +276,54 @@ class Flow:
         after: list[Any],
     ) -> None:
         """Fetch a tile's results, and with the last tile what was estimated from the image."""
-        passage, transfers, held = part.passage, self._transfers, self.pool.held
-        plan, output = passage.work.plan, passage.work.output
-        patches = passage.tiling.patches
+        image, transfers, buffers = sent.image, self._transfers, self.pool.buffers
+        plan, output = image.task.plan, image.task.output
+        patches = image.tiling.patches
 
         def fetch(name: str, buffer: Any, size: int) -> Array:
             array, event = transfers.fetch(name, buffer, size, after)
-            passage.events.append(("download", event))
-            part.events.append(event)
+            image.events.append(("download", event))
+            sent.events.append(event)
             if name != "dst":
                 self._reads.append(event)
             return array
 
-        def room(image: Array, extent: Extent) -> Array:
-            return image[tile] if patches else core_of(extent, image)
+        def room(result: Array, extent: Extent) -> Array:
+            return result[tile] if patches else core_of(extent, result)
 
         if output.encoded is not None and not extents[-1].core.is_empty:
             pixels = fetch("dst", ends["dst"], size)
             encoded = room(output.encoded, extents[-1])
-            part.copies.append(partial(copy_encoded, extents[-1], pixels, encoded))
-        for number, image in output.images.items():
+            sent.copies.append(partial(copy_encoded, extents[-1], pixels, encoded))
+        for number, result in output.images.items():
             extent = extents[plan.level_of(number)]
             if extent.core.is_empty:
                 continue
             for channel, slot in enumerate(plan.slots[number]):
-                name = f"slot{slot}"
-                plane = fetch(name, held[name], extent.plane_bytes).view(np.float32)
-                to = room(image, extent)
-                part.copies.append(partial(copy_plane, extent, plane, to, channel))
-        if tile == len(patches or passage.tiling.tiles) - 1:
+                name = slot_buffer(slot)
+                plane = fetch(name, buffers[name], extent.plane_bytes).view(np.float32)
+                to = room(result, extent)
+                sent.copies.append(partial(copy_plane, extent, plane, to, channel))
+        if tile == len(patches or image.tiling.tiles) - 1:
             for step, values in output.estimates.items():
-                name = f"estimates.{step}"
-                found = fetch(name, held[name], values.nbytes).view(values.dtype)
-                part.copies.append(partial(np.copyto, values, found))
+                name = step_buffer("estimates", step)
+                found = fetch(name, buffers[name], values.nbytes).view(values.dtype)
+                sent.copies.append(partial(np.copyto, values, found))
 
     def _land(self) -> None:
-        """Wait for the oldest part on the way, and copy its results; an error is its image's."""
-        part = self._parts.popleft()
-        part.passage.parts -= 1
+        """Wait for the oldest tile on the way, and copy its results; an error is its image's."""
+        tile = self._tiles.popleft()
+        tile.image.tiles_left -= 1
         try:
-            if part.events:
-                with Step("kernels"):
-                    self._cl.wait_for_events(part.events)
-            with Step("download"):
-                for copy in part.copies:
+            if tile.events:
+                with CpuTimer("kernels"):
+                    self._cl.wait_for_events(tile.events)
+            with CpuTimer("download"):
+                for copy in tile.copies:
                     copy()
             self._transfers.done()
         except self._cl.Error as error:
-            part.passage.error = part.passage.error or error
+            tile.image.error = tile.image.error or error
 
     def _table(self, table: Array) -> Any:
         """A constant array on the device, uploaded once while it is the same object."""

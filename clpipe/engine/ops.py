@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from clpipe.chain.chain import Chain, Step
-from clpipe.stage import Argument, CompileTime, Kind, Pass
+from clpipe.stage import Argument, CompileTime, Kind, Pass, Pointwise, Reduction, Resample, Stencil
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,25 @@ class Op:
     kind: Kind  # of the image that it writes
     types: tuple[tuple[str, str], ...]  # argument -> OpenCL type
     literals: tuple[tuple[str, str], ...]  # argument -> OpenCL text
-    undoes: bool = False  # the pass before it, of another step
+    undoes_previous: bool = False  # the pass before it, of another step
+
+    @property
+    def is_inlined(self) -> bool:
+        """Whether a stencil after it may redo it at each of its taps."""
+        access = self.pass_.access
+        return isinstance(access, Pointwise) and access.inline_at_taps
+
+    @property
+    def radius(self) -> int:
+        """How far from a place it reads."""
+        access = self.pass_.access
+        return access.radius if isinstance(access, Stencil | Resample) else 0
+
+    @property
+    def reduction(self) -> Reduction:
+        """The access of a reduction."""
+        assert isinstance(self.pass_.access, Reduction)
+        return self.pass_.access
 
 
 def chain_ops(
@@ -39,7 +57,7 @@ def chain_ops(
         ops = ops_of(step, own)
         if ops:
             if last and undone(ops[0].pass_, own, last.pass_, arguments[last.step]):
-                ops = (replace(ops[0], undoes=True), *ops[1:])
+                ops = (replace(ops[0], undoes_previous=True), *ops[1:])
             last = ops[-1]
         steps.append((step.name, ops))
     return tuple(steps)
@@ -49,7 +67,10 @@ def undone(
     pass_: Pass, own: Mapping[str, Argument], before: Pass, others: Mapping[str, Argument]
 ) -> bool:
     """Whether a pass with its step's arguments undoes the pass before, with those of its step."""
-    return pass_.undoes == before.function and all(
+    access = pass_.access
+    if not isinstance(access, Pointwise) or access.inverse_of != before.function:
+        return False
+    return all(
         bytes_of(own[mine]) == bytes_of(others[theirs])
         for mine, theirs in zip(pass_.arguments, before.arguments, strict=True)
     )

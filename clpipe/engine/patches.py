@@ -10,7 +10,7 @@ from dataclasses import replace
 from clpipe.base.errors import ImageError
 from clpipe.base.memory import in_words
 from clpipe.engine.extents import Box
-from clpipe.engine.plan import Plan
+from clpipe.engine.ir import Plan
 from clpipe.engine.tiles import Tiling, buffer_sizes, cutter_of, phases_of
 
 

@@ -12,16 +12,20 @@ from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.registry import user_code_errors
+from clpipe.engine.bindings import ArgumentValue, EncodedCurves, ResamplingValue, StreamWord, Value
 from clpipe.engine.buffers import HostImages
-from clpipe.engine.device import Device, Timing
+from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
+from clpipe.engine.ir import Finalize, Plan
 from clpipe.engine.ops import chain_ops
-from clpipe.engine.plan import Finalize, Plan, make_plan
+from clpipe.engine.options import RunOptions
+from clpipe.engine.plan import make_plan
 from clpipe.engine.programs import announced
-from clpipe.engine.writer import Parameter
 from clpipe.reference.curve import compose, to_8_bit
 from clpipe.reference.random import Stream, stream_of
-from clpipe.stage import NoiseScope, ReferenceContext
+from clpipe.stage import NoiseScope, ReferenceContext, Resample
+
+DEFAULTS = RunOptions()
 
 
 @dataclass(frozen=True)
@@ -104,9 +108,9 @@ class Runner:
         keep: steps whose image is returned.
         encode: whether the last image is returned in eight bits.
         final: whether the last image is returned in float.
-        hold: whether the device holds all images between launches. Where an image goes through
-            whole, and again, only launches are then done that a change touches, and the last one:
-            results are the same, in less time and more memory.
+        incremental: whether the device keeps all images between launches. Where an image goes
+            through whole, and again, only launches are then done that a change touches, and the
+            last one: results are the same, in less time and more memory.
     """
 
     def __init__(
@@ -116,26 +120,26 @@ class Runner:
         keep: Sequence[str] = (),
         encode: bool = True,
         final: bool = False,
-        hold: bool = False,
+        incremental: bool = False,
     ) -> None:
         self.chain = chain
         self.device = device
         self.keep = tuple(keep)
         self.encode = encode
         self.final = final
-        self.hold = hold
+        self.incremental = incremental
         self._arguments = {s.name: s.method.arguments(s.context) for s in chain.steps}
         self._own_plans: dict[tuple[bool, ...], Plan] = {}
         # Shared with the runners of other chains, by a chain's structure.
         self._plans: BoundedCache[Plan] = BoundedCache(64)
         self._tables: BoundedCache[Array] = BoundedCache(32)
 
-    def of(self, chain: Chain) -> "Runner":
+    def for_chain(self, chain: Chain) -> "Runner":
         """A runner for another chain that shares plans and tables with this one.
 
         A chain that differs in run-time values alone is neither planned nor compiled again.
         """
-        other = Runner(chain, self.device, self.keep, self.encode, self.final, self.hold)
+        other = Runner(chain, self.device, self.keep, self.encode, self.final, self.incremental)
         other._plans, other._tables = self._plans, self._tables
         return other
 
@@ -146,7 +150,7 @@ class Runner:
             ops = chain_ops(chain, self._arguments)
             structure = (*key, chain.source, chain.result, ops)
             results = self.keep, self.encode, self.final
-            options = chain, half, *results, fold, planar, self.hold
+            options = chain, half, *results, fold, planar, self.incremental
             self._own_plans[key] = self._plans.get(structure, lambda: make_plan(*options))
         return self._own_plans[key]
 
@@ -155,7 +159,7 @@ class Runner:
         size = self.chain.size(*image.shape[1::-1])
         return self.plan(image.dtype == np.float16, min(size) > 1, is_planar(image))
 
-    def warm_up(self, half: bool = True) -> None:
+    def compile(self, half: bool = True) -> None:
         """Compile everything, so that the first image does not wait for it.
 
         Raises:
@@ -164,17 +168,17 @@ class Runner:
         """
         if self.device:
             try:
-                self._make_ready(self.plan(half))
+                self._compile_plan(self.plan(half))
             except DeviceFailedError as error:
                 raise DeviceError(str(error)) from None
 
-    def _make_ready(self, plan: Plan) -> None:
+    def _compile_plan(self, plan: Plan) -> None:
         """Compile the kernels of a plan, by running it on a tiny image.
 
         PoCL compiles a kernel again when it is first launched.
         """
         assert self.device
-        if not self.device.is_ready(plan):
+        if not self.device.is_compiled(plan):
             width, height = self.chain.margins.around(8, 8)
             shape = (height, width, 3)[: 2 if len(self.chain.source.channels) == 1 else 3]
             tiny = np.zeros(shape, np.float16 if plan.half else np.float32)
@@ -183,43 +187,23 @@ class Runner:
             except ImageError:
                 return  # which larger images need not be refused for
             with announced(self.device.info):
-                self._submit_plan(plan, tiny, "")()
+                self._submit_plan(plan, tiny, "", RunOptions())()
             self.device.keep_programs()
 
-    def run(
-        self,
-        image: Array,
-        noise_key: str,
-        timings: list[Timing] | None = None,
-        download: bool = True,
-        into: Array | None = None,
-    ) -> Result:
+    def run(self, image: Array, noise_key: str, options: RunOptions = DEFAULTS) -> Result:
         """Put one image through, and wait for it; see :meth:`submit`."""
-        return self.submit(image, noise_key, timings, download, into)()
+        return self.submit(image, noise_key, options)()
 
     def submit(
-        self,
-        image: Array,
-        noise_key: str,
-        timings: list[Timing] | None = None,
-        download: bool = True,
-        into: Array | None = None,
-        unchanged: bool = False,
-        boxes: Sequence[Box] = (),
+        self, image: Array, noise_key: str, options: RunOptions = DEFAULTS
     ) -> Callable[[], Result]:
-        """Begin to put one image through; see :meth:`clpipe.engine.device.Device.submit`.
+        """Enqueue one image; see :meth:`clpipe.engine.device.Device.submit`.
 
         Args:
             image: (height, width, 3) linear RGB, or (height, width) for a chain that starts on a
                 mosaic; finite, of float16 or any type that fits into float32.
             noise_key: what the noise is made of, see :func:`clpipe.chain.identity.noise_key`.
-            timings: one entry a launch and transfer that is done is appended (devices only).
-            download: False leaves the results on the device, for measuring.
-            into: an array to use for the eight-bit pixels (devices only), of their shape; a used
-                one saves the time that new memory takes.
-            unchanged: the image, if it is the same array as that before, has the same pixels still.
-            boxes: the parts of the results that are made, all of one size, in their pixels; () is
-                all of them. The images of the result are then stacks of patches.
+            options: what comes back, and how.
 
         Returns:
             What waits for the result and gives it; it raises ImageError, DeviceFailedError and
@@ -237,21 +221,20 @@ class Runner:
                 f"found an image of shape {image.shape}, but the chain starts on "
                 f"{self.chain.source.label} with {channels} channel(s)"
             )
-        if boxes:
+        if options.boxes:
             self._check_sizes(*image.shape[1::-1])
         if not (self.encode or self.final or self.keep):
             return lambda: Result(None, None, {}, {})
         if not self.device:
-            return partial(self._run_numpy, np.asarray(image, np.float32), noise_key, boxes)
+            return partial(self._run_numpy, np.asarray(image, np.float32), noise_key, options.boxes)
         plan = self.plan_for(image)
         try:
-            self._make_ready(plan)
+            self._compile_plan(plan)
         except DeviceFailedError:
             raise
         except ImageError:
             pass  # the tiny image is too large; the one below says it of this image
-        options = timings, download, into, unchanged, boxes
-        return self._submit_plan(plan, image, noise_key, *options)
+        return self._submit_plan(plan, image, noise_key, options)
 
     def _check_sizes(self, width: int, height: int) -> None:
         """See that all images of an image's result are of one size, so that patches are, too.
@@ -269,64 +252,62 @@ class Runner:
                 )
 
     def _submit_plan(
-        self, plan: Plan, image: Array, noise_key: str, *options: Any
+        self, plan: Plan, image: Array, noise_key: str, options: RunOptions
     ) -> Callable[[], Result]:
-        """Begin to put an image through a plan; ``options`` are those of :meth:`submit`."""
+        """Enqueue an image for a plan."""
         assert self.device
         keys: dict[str, dict[NoiseScope, Stream]] = {}
         sizes = plan.sizes(*image.shape[1::-1])
 
-        def bind(parameter: Parameter) -> Any:
-            if parameter.role == "taps":
-                level = parameter.number
-                return plan.resamplings[level].values(*sizes[level])[parameter.item]
-            if parameter.role == "table8":
-                return self._composed(parameter.item)
-            if parameter.role == "value":
-                return self._arguments[parameter.step][parameter.item]
-            if parameter.step not in keys:
-                step = self.chain.step_named(parameter.step)
-                keys[parameter.step] = streams(self.chain, step, noise_key)
-            of = keys[parameter.step]
-            if parameter.item == "stage":
-                return np.uint32(of[NoiseScope.IMAGE].stage)
-            stream = of[NoiseScope(parameter.item[:-1])]
-            return np.uint32(stream.key1 if parameter.item.endswith("1") else stream.key0)
+        def bind(value: Value) -> Any:
+            match value:
+                case ArgumentValue(step, name):
+                    return self._arguments[step][name]
+                case ResamplingValue(level, name):
+                    return plan.resamplings[level].values(*sizes[level])[name]
+                case EncodedCurves(steps):
+                    return self._composed(steps)
+                case StreamWord(step, scope, word):
+                    if step not in keys:
+                        keys[step] = streams(self.chain, self.chain.step_named(step), noise_key)
+                    return np.uint32(getattr(keys[step][scope], word))
 
         check_resamplings(plan, *image.shape[1::-1])
-        results = self.device.submit(plan, image, bind, *options)
-        return lambda: self._result(plan, results(), self._of_size(*image.shape[1::-1]))
+        results = self.device.submit(plan, image, bind, options)
+        return lambda: self._result(plan, results(), self._estimates_for(*image.shape[1::-1]))
 
-    def _of_size(self, width: int, height: int) -> dict[str, dict[str, float]]:
+    def _estimates_for(self, width: int, height: int) -> dict[str, dict[str, float]]:
         """What steps say that follows from the size of their image, by step."""
         found = {}
         for step in self.chain.steps:
-            if values := step.method.of_size(width, height):
+            if values := step.method.estimates_for(width, height):
                 found[step.name] = dict(values)
             for pass_ in step.method.passes():
-                if pass_.resampling:
-                    width, height = pass_.resampling.resized(width, height)
+                if isinstance(pass_.access, Resample):
+                    width, height = pass_.access.resampler.resized(width, height)
         return found
 
     @staticmethod
-    def _result(plan: Plan, output: HostImages, of_size: dict[str, dict[str, float]]) -> Result:
+    def _result(plan: Plan, output: HostImages, from_size: dict[str, dict[str, float]]) -> Result:
         """What the device made of an image, by steps."""
-        names = {x.op.step: x.op.pass_.estimates for x in plan.launches if isinstance(x, Finalize)}
+        names = {
+            x.op.step: x.op.reduction.estimates for x in plan.launches if isinstance(x, Finalize)
+        }
         return Result(
             final=output.images.get(plan.final.number) if plan.final else None,
             encoded=output.encoded,
             kept={name: output.images[i.number] for name, i in plan.kept if output.images},
-            estimates=of_size
+            estimates=from_size
             | {
                 step: dict(zip(names[step], map(float, values), strict=False))
                 for step, values in output.estimates.items()
             },
         )
 
-    def _composed(self, steps: str) -> Array:
+    def _composed(self, steps: Sequence[str]) -> Array:
         """The table of these curves and the conversion to eight bits, all in one."""
         curves: list[Array] = []
-        for name in steps.split(","):
+        for name in steps:
             table = self._arguments[name]["table"]
             assert isinstance(table, np.ndarray)
             curves.append(table)
@@ -347,14 +328,14 @@ class Runner:
         whole = self.encode or self.final
         steps = (self.chain if whole else self.chain.through(self.keep)).steps
         for step in steps:
-            of_size = dict(step.method.of_size(*image.shape[1::-1]))
-            frame = ReferenceContext(step.context, streams(self.chain, step, noise_key), of_size)
+            from_size = dict(step.method.estimates_for(*image.shape[1::-1]))
+            given = ReferenceContext(step.context, streams(self.chain, step, noise_key), from_size)
             with user_code_errors(f"stage {step.name}", step.stage.folder):
-                image = step.method.reference(image, frame)
+                image = step.method.reference(image, given)
             if step.name in self.keep:
                 kept[step.name] = image
-            if frame.estimates:
-                estimates[step.name] = frame.estimates
+            if given.estimates:
+                estimates[step.name] = given.estimates
         if boxes:
             image, *parts = (cut_out(each, boxes) for each in (image, *kept.values()))
             kept = dict(zip(kept, parts, strict=True))

@@ -16,19 +16,11 @@ from functools import lru_cache
 
 from clpipe.base.errors import ImageError
 from clpipe.base.memory import in_words
-from clpipe.engine.codegen import PARTIALS, RUN, columns_of, round_up
+from clpipe.engine.bindings import slot_buffer, step_buffer
 from clpipe.engine.extents import Box, Extent, Extents, whole_image
+from clpipe.engine.ir import AnyLaunch, Finalize, Histogram, Launch, Lines, Plan, Reduce, reads_of
 from clpipe.engine.ops import Op
-from clpipe.engine.plan import (
-    AnyLaunch,
-    Finalize,
-    Histogram,
-    Launch,
-    Lines,
-    Plan,
-    Reduce,
-    reads_of,
-)
+from clpipe.engine.work_items import PARTIALS, RUN, columns_of, round_up
 from clpipe.reference.resample import Axis
 
 # Larger ones are no faster, and memory that is new to a process costs time: 600 megapixels took
@@ -51,7 +43,7 @@ def buffer_sizes(plan: Plan, extents: Extents, ends: int = 1) -> dict[str, int]:
     first, last = extents[0], extents[-1]
     sizes = {f"src{i}": source_bytes(plan, first) for i in range(ends)}
     for number, levels in enumerate(plan.levels_of_slots):
-        sizes[f"slot{number}"] = max(extents[level].plane_bytes for level in levels)
+        sizes[slot_buffer(number)] = max(extents[level].plane_bytes for level in levels)
     if plan.encoded:
         encoded = last.stored.width * last.stored.height * len(plan.encoded.channels)
         sizes |= {f"dst{i}": encoded for i in range(ends)}
@@ -60,16 +52,16 @@ def buffer_sizes(plan: Plan, extents: Extents, ends: int = 1) -> dict[str, int]:
     for launch in plan.launches:
         match launch:
             case Lines(ops=ops):
-                sizes |= {f"lines.{op.step}": longest * 4 for op in ops}
+                sizes |= {step_buffer("lines", op.step): longest * 4 for op in ops}
             case Launch(sums=sums, level=level) if sums:
-                sizes[f"sums.{sums.step}"] = extents[level].blocks * 16
-                sizes[f"partials.{sums.step}"] = PARTIALS * 32
+                sizes[step_buffer("sums", sums.step)] = extents[level].blocks * 16
+                sizes[step_buffer("partials", sums.step)] = PARTIALS * 32
             case Histogram(op=op):
-                bins = op.pass_.bins
-                sizes[f"counts.{op.step}"] = PARTIALS * bins * 4
-                sizes[f"histogram.{op.step}"] = (bins + -(-bins // RUN)) * 4
+                bins = op.reduction.bins
+                sizes[step_buffer("counts", op.step)] = PARTIALS * bins * 4
+                sizes[step_buffer("histogram", op.step)] = (bins + -(-bins // RUN)) * 4
             case Finalize(op=op):
-                sizes[f"estimates.{op.step}"] = 16
+                sizes[step_buffer("estimates", op.step)] = 16
     return sizes
 
 
@@ -158,7 +150,7 @@ def halos_of(plan: Plan) -> tuple[int, ...]:
         own = 0
         if isinstance(launch, Launch):
             own = reach.get(launch.writes.number, 0) if launch.writes else 0
-            own += launch.stencil.pass_.radius if launch.stencil else 0
+            own += launch.stencil.radius if launch.stencil else 0
             if not launch.reads or launch.reads[0].image.level < launch.level:
                 halos[launch.level] = max(halos[launch.level], own)
                 own = 0

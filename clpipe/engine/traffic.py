@@ -2,9 +2,8 @@
 
 import math
 
-from clpipe.engine.codegen import summed_together
-from clpipe.engine.plan import AnyLaunch, Launch, Plan, Reduce, reads_of
-from clpipe.stage import Access
+from clpipe.engine.ir import AnyLaunch, Launch, Plan, Reduce, reads_of
+from clpipe.engine.work_items import summed_together
 
 
 def share(plan: Plan, level: int) -> float:
@@ -30,7 +29,7 @@ def bytes_per_pixel(plan: Plan, lanes: int) -> float:
 
 def launch_bytes(plan: Plan, launch: AnyLaunch, lanes: int) -> float:
     """Bytes per pixel that a launch reads and writes in device memory, each sample once."""
-    if isinstance(launch, Reduce) and launch.op.pass_.access is Access.SUMS:
+    if isinstance(launch, Reduce) and not launch.op.reduction.bins:
         return sum_bytes(lanes) * share(plan, launch.level)
     images = [read.image for read in reads_of(launch)]
     total = sum(4 * len(i.kind.channels) * share(plan, i.level) for i in images)

@@ -108,7 +108,7 @@ class InPlace:
         return array, event
 
     def flush(self) -> None:
-        """Have the device begin."""
+        """Have the device start what is enqueued."""
         self._queue.flush()
 
     def done(self) -> None:
@@ -141,7 +141,7 @@ class Staged:
     """For a device with memory of its own: copies in both directions while kernels run.
 
     Queues of their own copy from and to page-locked memory, since from other memory the host would
-    wait for each copy. There are two of every buffer, in turn.
+    wait for each copy. There are two of every buffer, used alternately.
     """
 
     depth = 2
@@ -152,7 +152,7 @@ class Staged:
         self._pool = pool
         self._up, self._down = new_queue(), new_queue()
         self._pinned: dict[str, tuple[Any, Array]] = {}
-        self._source = self._turn = 0
+        self._source = self._target = 0  # of the two
         self._sent: tuple[weakref.ref[Array], Sent] | None = None
 
     def needs(self, sizes: Mapping[str, int]) -> dict[str, int]:
@@ -165,7 +165,7 @@ class Staged:
         count = pixels.size * np.dtype(dtype).itemsize
         data = self._page_locked(f"src{self._source}", size)[:count]
         np.copyto(data.view(dtype).reshape(pixels.shape), pixels, casting="unsafe")
-        buffer = self._pool.held[f"src{self._source}"]
+        buffer = self._pool.buffers[f"src{self._source}"]
         sent = buffer, [self._cl.enqueue_copy(self._up, buffer, data, is_blocking=False)]
         self._up.flush()
         self._sent = (weakref.ref(source), sent) if pixels.size == source.size else None
@@ -176,17 +176,17 @@ class Staged:
         if not self._sent or self._sent[0]() is not source:
             return None
         sent = self._sent[1]
-        return sent if self._pool.held.get(f"src{self._source}") is sent[0] else None
+        return sent if self._pool.buffers.get(f"src{self._source}") is sent[0] else None
 
     def target(self, size: int, whole: Array | None) -> Any:
         """See :meth:`InPlace.target`."""
-        self._turn = 1 - self._turn
-        return self._pool.held.get(f"dst{self._turn}")
+        self._target = 1 - self._target
+        return self._pool.buffers.get(f"dst{self._target}")
 
     def fetch(self, name: str, buffer: Any, size: int, after: Sequence[Any]) -> Fetched:
         """See :meth:`InPlace.fetch`."""
         self._queue.flush()
-        array = self._page_locked(f"{name}.{self._turn}", size)[:size]
+        array = self._page_locked(f"{name}.{self._target}", size)[:size]
         event = self._cl.enqueue_copy(
             self._down, array, buffer, wait_for=list(after), is_blocking=False
         )

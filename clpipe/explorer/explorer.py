@@ -20,12 +20,13 @@ from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
 from clpipe.chain.truth import picture_without_noise
 from clpipe.engine.clipping import clipped_share
-from clpipe.engine.device import Device, Timing
-from clpipe.engine.plan import AnyLaunch
+from clpipe.engine.device import Device
+from clpipe.engine.ir import AnyLaunch
+from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.runner import Result, Runner
 from clpipe.explorer.controls import steps_of
 from clpipe.explorer.named import check_named, files_in
-from clpipe.explorer.views import UNITS, Sample, View, cut, part_as_read, shown_of
+from clpipe.explorer.view import UNITS, Sample, View, cut, part_as_read, shown_of
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import upright
 from clpipe.inputs.find import Job
@@ -151,8 +152,8 @@ class Explorer:
         loaded, settings = self._loaded(image, values)
         timings: list[Timing] = []
         chain, result, launches = self._run(loaded, view, timings)
-        turn = OutputWriter.turn_of(loaded.source, chain)
-        shown = upright(shown_of(chain, result), turn)
+        orientation = OutputWriter.picture_orientation(loaded.source, chain)
+        shown = upright(shown_of(chain, result), orientation)
         facts = {
             "width": shown.shape[1],
             "height": shown.shape[0],
@@ -171,7 +172,7 @@ class Explorer:
         unit = "of 255" if is_shown else UNITS[chain.result]
         with self._lock:
             self._number += 1
-            values_of = shown if is_shown else upright(result.image, turn)
+            values_of = shown if is_shown else upright(result.image, orientation)
             sample = Sample(values_of, unit, shown, facts | {"number": self._number})
             self._samples[self._number] = sample
             while len(self._samples) > SAMPLES and self._kept > KEPT:
@@ -231,7 +232,7 @@ class Explorer:
         pair = []
         for truth in ("", DEVELOPMENT):
             chain, result, _ = self._run(loaded, View(view.step, truth), None)
-            picture = upright(result.image, OutputWriter.turn_of(loaded.source, chain))
+            picture = upright(result.image, OutputWriter.picture_orientation(loaded.source, chain))
             pair.append(part_as_read(truth or "picture", cut(picture, box), chain))
         return measure(pair[:1], pair[1])
 
@@ -253,7 +254,7 @@ class Explorer:
 
     def _source(self, image: int, loader: ImageLoader) -> SourceImage:
         """An image's pixels, decoded once for all settings that read it in the same way."""
-        key = image, loader.reads, loader.reads_overscan, loader.settings.dump
+        key = image, loader.reads, loader.reads_overscan, loader.settings.dump_format
         with self._lock:
             if key in self._sources:
                 self._sources.move_to_end(key)
@@ -284,15 +285,17 @@ class Explorer:
         key = noise_key(chain.settings, loaded.key)
         with self._lock:
             runner = self._runner(chain)
-            result = runner.submit(pixels, key, timings, unchanged=True)()
+            result = runner.run(pixels, key, RunOptions(timings, unchanged=True))
         return chain, result, runner.plan_for(pixels).launches
 
     def _runner(self, chain: Chain) -> Runner:
         """A runner of a chain, which shares plans with those before it."""
         encode = chain.result is Kind.DISPLAY
         if encode not in self._runners:
-            self._runners[encode] = Runner(chain, self.device, (), encode, not encode, hold=True)
-        return self._runners[encode].of(chain)
+            self._runners[encode] = Runner(
+                chain, self.device, (), encode, not encode, incremental=True
+            )
+        return self._runners[encode].for_chain(chain)
 
 
 def _steps(settings: Settings, chain: Chain) -> list[dict[str, Any]]:

@@ -33,7 +33,7 @@ from clpipe.explorer.controls import (
 from clpipe.explorer.explorer import Explorer
 from clpipe.explorer.export import SAVED, exported
 from clpipe.explorer.patience import ImpatientProtocol
-from clpipe.explorer.views import View
+from clpipe.explorer.view import View
 from clpipe.images.encoding import Output
 from clpipe.images.preview import reduced
 

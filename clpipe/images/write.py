@@ -14,9 +14,9 @@ import OpenImageIO as oiio
 from PIL import ImageCms
 
 from clpipe.base.about import __version__
+from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.errors import ImageError
 from clpipe.base.files import Stored, write_whole
-from clpipe.base.steps import Step
 from clpipe.base.system import largest_file, passing_file
 from clpipe.base.types import Array, Floats
 from clpipe.images.attributes import PREFIX
@@ -207,7 +207,7 @@ def _check_file_limit(size: int) -> None:
         raise OSError(errno.EFBIG, f"{os.strerror(errno.EFBIG)} (ulimit -f)")
 
 
-@Step("encode")
+@CpuTimer("encode")
 def _encode(format_: str, to: str, spec: Any, pixels: Array) -> None:
     """Encode pixels to a file.
 

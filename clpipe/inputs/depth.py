@@ -22,7 +22,7 @@ USUAL = ("Depth", "Z", "ZDepth", "Distance")  # layers, in the order in which th
 
 
 def read_depth(
-    path: Path, source: SourceImage, chain: Chain, patterns: Sequence[str], max_pixels: int
+    path: Path, source: SourceImage, chain: Chain, carried: Sequence[Carry], max_pixels: int
 ) -> Depth:
     """The depth of an image.
 
@@ -30,14 +30,14 @@ def read_depth(
         path: of the image.
         source: the image.
         chain: with a step that needs depth.
-        patterns: of the names of companions, as for :func:`clpipe.inputs.carry.carry`.
+        carried: layers that go along with it, whose patterns say where it may be.
         max_pixels: a file that claims more is refused before memory is taken.
 
     Raises:
         ImageError: it is missing, damaged, of another size, NaN or negative.
     """
     name = next(lens.layer for lens in lenses_of(chain).values())
-    layer = _find(path, name, patterns)
+    layer = _find(path, name, [each.pattern for each in carried if each.pattern])
     whole = source.pixels.shape[1::-1]
     width, height = source.margins.inside(*whole)
     with unchanged(layer.file):

@@ -113,7 +113,7 @@ class ImageLoader:
     @property
     def raw(self) -> RawLoader:
         """How raws and dumps enter."""
-        return RawLoader(self.request, self.settings.dump)
+        return RawLoader(self.request, self.settings.dump_format)
 
     def endings(self) -> tuple[str, ...]:
         """The endings of the files that are taken from folders."""
@@ -160,7 +160,7 @@ class ImageLoader:
         Of one that cannot be opened each byte is taken for a pixel.
         """
         most = self.request.max_pixels or USUAL_MAX_PIXELS
-        dump = self.settings.dump
+        dump = self.settings.dump_format
         if dump and may_be_dump(job.path):
             claim = plain_claim(dump.width, dump.height)
         else:
@@ -218,7 +218,7 @@ class ImageLoader:
             return loaded
         chain, source, request = loaded.chain, loaded.source, self.request
         most = request.max_pixels or USUAL_MAX_PIXELS
-        depth = read_depth(job.path, source, chain, request.companions, most)
+        depth = read_depth(job.path, source, chain, request.carried(), most)
         warnings = (*source.warnings, *warnings_of(chain, depth))
         source = replace(source, depth=depth, warnings=warnings)
         return LoadedImage(with_depth(chain, depth), source, loaded.key)
@@ -250,8 +250,8 @@ class ImageLoader:
         """
         request = self.request
         most = request.max_pixels or USUAL_MAX_PIXELS
-        layers, patterns = request.carried(), request.companions
-        return carry(job.path, loaded.source, loaded.chain, layers, patterns, most, orientation)
+        layers = request.carried()
+        return carry(job.path, loaded.source, loaded.chain, layers, most, orientation)
 
     def is_left_out(self, job: Job, error: Exception) -> bool:
         """Whether an image that cannot enter was only found in a folder, beside others that can."""

@@ -52,7 +52,7 @@ class Row:
         return self.name or str(PurePosixPath(self.key).with_suffix(""))
 
 
-def read_manifest(path: Path, keep_suffix: bool = False) -> list[Row]:
+def read_manifest(path: Path) -> list[Row]:
     """The images of a manifest.
 
     A .csv has a header, commas and UTF-8; its cells are TOML values, else text, and an empty cell
@@ -67,7 +67,6 @@ def read_manifest(path: Path, keep_suffix: bool = False) -> list[Row]:
 
     Args:
         path: the manifest.
-        keep_suffix: a row without a name gets its image key as its name, suffix and all.
 
     Raises:
         RequestError: it cannot be read, has a column that does not exist, or a row is wrong; the
@@ -84,14 +83,11 @@ def read_manifest(path: Path, keep_suffix: bool = False) -> list[Row]:
         try:
             row = _row(path.parent, place, record())
             row = replace(row, values=alike.setdefault(repr(row.values), row.values))
-            if keep_suffix and not row.name:
-                row = replace(row, name=row.key)
             other = makers.setdefault(row.stem, row)
             if other is not row:
-                keep = ", or say --keep-suffix" if other.key != row.key else ""
                 raise RequestError(
                     f"it would make the same outputs as row {other.place.rpartition(' ')[2]}, "
-                    f"{row.stem}; tell them apart in a column called name{keep}"
+                    f"{row.stem}; tell them apart in a column called name"
                 )
             rows.append(row)
         except RequestError as error:

@@ -18,25 +18,25 @@ from clpipe.outputs.patches import without_patch
 RESUMABLE = "what is finished is there, and the same command goes on"
 
 
-ROOM = 8 * 2**20  # bytes; a disk with less counts as full
+LEAST_FREE = 8 * 2**20  # bytes; a disk with less counts as full
 
 LOCK = ".clpipe.lock"
 
 UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # as whole_file names them
 
 
-def write_problem(folder: Path, with_room: bool = True) -> str:
+def write_problem(folder: Path, with_space: bool = True) -> str:
     """Why nothing can be written to a folder, "" where it can.
 
-    Without ``with_room`` a full disk will do, as for a run that may find all done.
+    Without ``with_space`` a full disk will do, as for a run that may find all done.
     """
     probe = folder / f".clpipe.{secrets.token_hex(8)}"
     try:
         with open(probe, "xb") as file:
-            if with_room:
-                reserve(file, ROOM)
+            if with_space:
+                reserve(file, LEAST_FREE)
     except OSError as error:
-        needed = f" ({in_words(ROOM)} are needed)" if error.errno == errno.ENOSPC else ""
+        needed = f" ({in_words(LEAST_FREE)} are needed)" if error.errno == errno.ENOSPC else ""
         return f"cannot write there: {error.strerror}{needed}"
     finally:
         with contextlib.suppress(OSError):
@@ -57,7 +57,7 @@ def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RequestError(f"{folder}: cannot write there: {error.strerror}") from None
-    if reason := write_problem(folder, with_room=False):
+    if reason := write_problem(folder, with_space=False):
         raise RequestError(f"{folder}: {reason}")
     # Each shard holds its part of a file in which nothing is ever written.
     first = HOLDABLE * (shard.number - 1) // shard.of

@@ -17,7 +17,7 @@ from clpipe.engine.extents import Box
 from clpipe.images.tags import FLIPS, upright
 from clpipe.outputs.negative import negative_of
 from clpipe.reference.cfa import Pattern
-from clpipe.stage import Access
+from clpipe.stage import Stencil
 
 PER_IMAGE = 16  # patches, unless another number is asked for
 
@@ -29,14 +29,14 @@ class Patch:
     Args:
         left, top: its first column and row in the picture.
         size: of its sides, in px.
-        turn: how it is turned when it has been cut out: one of EXIF's eight orientations, each of
-            which is a flip, a turn by a multiple of 90 degrees, or both; 1 is none.
+        orientation: how it is turned when it has been cut out, one of EXIF's eight: each is a flip,
+            a turn by a multiple of 90 degrees, or both; 1 is none.
     """
 
     left: int
     top: int
     size: int
-    turn: int = 1
+    orientation: int = 1
 
     @property
     def box(self) -> Box:
@@ -44,17 +44,17 @@ class Patch:
         return Box(self.left, self.top, self.left + self.size, self.top + self.size)
 
     def cut_out(self, image: Array) -> Array:
-        """It, turned, from a whole image, (height, width[, channel])."""
+        """The patch, turned, of a whole image, (height, width[, channel])."""
         box = self.box
         return self.turned(image[box.top : box.bottom, box.left : box.right])
 
     def turned(self, part: Array) -> Array:
-        """That part of an image, turned; C-contiguous."""
-        return upright(part, self.turn)
+        """A part of an image, turned; C-contiguous."""
+        return upright(part, self.orientation)
 
 
 @lru_cache(maxsize=64)
-def first_place(pattern: Pattern, turn: int, size: int) -> tuple[int, int]:
+def first_place(pattern: Pattern, orientation: int, size: int) -> tuple[int, int]:
     """The first column and row, each 0 or 1, of a patch that has the pattern when it is turned.
 
     So a mosaic keeps its pattern, and no pixel is interpolated or thrown away: the CFA-preserving
@@ -70,7 +70,7 @@ def first_place(pattern: Pattern, turn: int, size: int) -> tuple[int, int]:
     return next(
         (x, y)
         for x, y in places
-        if (upright(np.tile(cell, (2, 2))[y:, x:][:side, :side], turn)[:2, :2] == cell).all()
+        if (upright(np.tile(cell, (2, 2))[y:, x:][:side, :side], orientation)[:2, :2] == cell).all()
     )
 
 
@@ -101,11 +101,11 @@ class Cutting:
         draws = self._draws(numbers, owner, ("turn", "left", "top"))
         patches = []
         for u_turn, u_left, u_top in draws:
-            turn = self._turn(u_turn)
-            x, y = first_place(self.pattern, turn, self.size)
+            orientation = self._orientation(u_turn)
+            x, y = first_place(self.pattern, orientation, self.size)
             left = x + 2 * int(u_left * ((self.width - self.size - x) // 2 + 1))
             top = y + 2 * int(u_top * ((self.height - self.size - y) // 2 + 1))
-            patches.append(Patch(left, top, self.size, turn))
+            patches.append(Patch(left, top, self.size, orientation))
         return patches
 
     @property
@@ -116,17 +116,17 @@ class Cutting:
     def in_grid(self, numbers: Sequence[int], owner: str) -> list[Patch]:
         """Some of these, by their numbers, row by row; the last of a row or column ends with it.
 
-        They are moved by up to a pixel where their turns want that. ``owner`` as for :meth:`drawn`.
+        Patches move by up to a pixel where the pattern wants that. ``owner`` as for :meth:`drawn`.
         """
         patches = []
         for number, (u_turn,) in zip(numbers, self._draws(numbers, owner, ("turn",)), strict=True):
             row, column = divmod(number, self._columns)
-            turn = self._turn(u_turn)
-            x, y = first_place(self.pattern, turn, self.size)
+            orientation = self._orientation(u_turn)
+            x, y = first_place(self.pattern, orientation, self.size)
             left = min(column * self.size, self.width - self.size)
             top = min(row * self.size, self.height - self.size)
             left, top = max(left - (left - x) % 2, x), max(top - (top - y) % 2, y)
-            patches.append(Patch(left, top, self.size, turn))
+            patches.append(Patch(left, top, self.size, orientation))
         return patches
 
     @staticmethod
@@ -141,15 +141,15 @@ class Cutting:
     def _columns(self) -> int:
         return -(-self.width // self.size)
 
-    def _turn(self, number: float) -> int:
-        """The turn of a number from 0 to 1, of those for which there is a place."""
+    def _orientation(self, number: float) -> int:
+        """The orientation of a number from 0 to 1, of those for which there is a place."""
         if not self.augment:
             return 1
-        room = self.width - self.size, self.height - self.size
+        spare = self.width - self.size, self.height - self.size
         fits = [
-            turn
-            for turn in FLIPS
-            if all(np.less_equal(first_place(self.pattern, turn, self.size), room))
+            orientation
+            for orientation in FLIPS
+            if all(np.less_equal(first_place(self.pattern, orientation, self.size), spare))
         ]
         return fits[int(number * len(fits))]
 
@@ -230,7 +230,7 @@ def without_patch(name: str) -> str:
 def pattern_of(chain: Chain) -> Pattern:
     """The CFA pattern of a chain's mosaic."""
     last = chain.steps[-1]
-    return last.method.after(last.context).pattern
+    return last.method.next_context(last.context).pattern
 
 
 def every_patch(patches: Patches, chain: Chain, width: int, height: int, key: str) -> list[Patch]:
@@ -252,7 +252,7 @@ def variance_steps(chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
     """
     signal, noise = signal_and_noise(chain)
     for step in noise:
-        if any(pass_.access is Access.STENCIL for pass_ in step.method.passes()):
+        if any(isinstance(pass_.access, Stencil) for pass_ in step.method.passes()):
             raise RequestError(
                 f"variance: {step.name} mixes the noise of neighbours; move it before the noise or "
                 "behind the raw"

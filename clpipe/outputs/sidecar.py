@@ -144,7 +144,7 @@ def sidecar(
 def patch_records(chain: Chain, patches: Sequence[Patch]) -> dict[str, Any]:
     """What a sidecar says of patches, as JSON values: of the raw of all, and where each is."""
     facts = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in facts_of(chain).items()}
-    places = [{"place": [patch.left, patch.top], "turn": patch.turn} for patch in patches]
+    places = [{"place": [patch.left, patch.top], "turn": patch.orientation} for patch in patches]
     return {FACTS: facts, PATCHES: places}
 
 

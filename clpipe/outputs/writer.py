@@ -18,7 +18,7 @@ from clpipe.chain.rendition import (
     VARIANCE,
     Rendition,
 )
-from clpipe.chain.request import CARRY, Request
+from clpipe.chain.request import ResolvedRequest
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.dng import write_dng
@@ -47,11 +47,11 @@ class OutputWriter:
 
     Args:
         folder: where they go.
-        request: with every output named, see :meth:`Request.with_outputs`.
+        request: what is asked for.
     """
 
     folder: Path
-    request: Request
+    request: ResolvedRequest
 
     @property
     def formats(self) -> tuple[str, ...]:
@@ -100,7 +100,7 @@ class OutputWriter:
         """The steps whose image is written beside a rendition, where it has them."""
         if rendition.role in (*FLOAT_MOSAICS, *BASELINES):
             return ()
-        if rendition.role in PICTURES and self.request.truth_keep is not None:
+        if rendition.role in PICTURES:
             return self.request.truth_keep
         return self.request.keep
 
@@ -111,8 +111,8 @@ class OutputWriter:
             request: the record for its image.
             rendition: which it is.
         """
-        carries = {} if self.carries(rendition) else dict(zip(CARRY, ([], [], False), strict=True))
-        return {**request, "keep": list(self.keep_of(rendition)), **carries}
+        record = {**request, "keep": list(self.keep_of(rendition))}
+        return record if self.carries(rendition) else record | {"carry": []}
 
     def carries(self, rendition: Rendition) -> bool:
         """Whether layers go along with a rendition: they do with an image's first."""
@@ -123,10 +123,10 @@ class OutputWriter:
         """The files of carried layers: that of all, "", and the PNG of each depth by its name."""
         if not self.carries(rendition):
             return {}
-        depths = [each.name for each in self.request.carried() if each.kind == "depth"]
+        depths = [each.name for each in self.request.carried() if each.png]
         return {
             "": self.path(job, f"{CARRIED}.exr"),
-            **{each: self.path(job, f"{each}.png") for each in depths if self.request.depth_png},
+            **{name: self.path(job, f"{name}.png") for name in depths},
         }
 
     def _kept_steps(self, recipe: Recipe) -> list[str]:
@@ -182,7 +182,7 @@ class OutputWriter:
         if self.request.baselines:
             raise RequestError(
                 "--patch: the noise of a baseline is measured on whole pictures; leave one of "
-                "--patch and --baseline out"
+                "--patch and --truth out"
             )
         if VARIANCE in self.request.truths:
             variance_steps(chain)  # refuses steps that mix the noise of neighbours
@@ -207,10 +207,9 @@ class OutputWriter:
                             "choose another output folder"
                         )
                     if path in makers:
-                        keep = ", or say --keep-suffix" if makers[path].key != job.key else ""
                         raise RequestError(
                             f"{makers[path].label} and {job.label} would both write {path}; "
-                            f"run them into different folders{keep}"
+                            f"run them into different folders, or name them in a manifest"
                         )
                     makers[path] = job
 
@@ -254,7 +253,7 @@ class OutputWriter:
             raise OutputError(f"{self.folder}: {reason}; {RESUMABLE}")
 
     @staticmethod
-    def turn_of(source: SourceImage, chain: Chain) -> int:
+    def picture_orientation(source: SourceImage, chain: Chain) -> int:
         """EXIF's orientation by which a picture is turned; a mosaic, whose pattern would change, is
         not turned.
 
@@ -309,7 +308,7 @@ class OutputWriter:
         The last image of a variance map is the variance.
         """
         chain, rendition, camera = recipe.chain, recipe.rendition, recipe.chain.camera
-        tags, orientation = from_attributes(
+        tags, source_orientation = from_attributes(
             source.attributes, Tags(camera.make, camera.model, chain.iso)
         )
         output = chain.settings.output.filled({**source.shot, **tags.shot})
@@ -319,7 +318,7 @@ class OutputWriter:
         tag_attributes = {
             name: source.attributes[name] for name in TAG_ATTRIBUTES if name in source.attributes
         }
-        turn = self.turn_of(source, chain) if patch is None else 1
+        orientation = self.picture_orientation(source, chain) if patch is None else 1
         outputs: dict[Path, Stored] = {}
         whose = recipe.key, rendition.frame
         for step in (chain.step_named(name) for name in self._kept_steps(recipe)):
@@ -341,22 +340,22 @@ class OutputWriter:
                 outputs[path] = write_exr(path, result.final, ("Y",), attributes)
             elif format_ == NPY:
                 assert result.final is not None
-                image = upright(result.final, turn)
+                image = upright(result.final, orientation)
                 outputs[path] = write_npy(path, typed(image, chain.result))
             elif format_ == DNG:
                 negative = negative_of(chain)
                 raw = result.kept[negative.step] if negative.step else source.pixels
-                outputs[path] = write_dng(path, raw, negative, tags, orientation)
+                outputs[path] = write_dng(path, raw, negative, tags, source_orientation)
             elif FORMATS[format_].ending == "exr":
                 assert result.final is not None
                 attributes = attributes_of(chain.steps[-1], chain, *whose) | tag_attributes
-                if turn != 1:
+                if orientation != 1:
                     attributes |= {"orientation": "1"}
                 half = FORMATS[format_].bits == 16
-                image = upright(result.final, turn)
+                image = upright(result.final, orientation)
                 outputs[path] = write_exr(path, image, chain.result.channels, attributes, half)
             else:
-                pixels = upright(samples(result, FORMATS[format_]), turn)
+                pixels = upright(samples(result, FORMATS[format_]), orientation)
                 outputs[path] = write_display(path, pixels, tags)
         return outputs
 

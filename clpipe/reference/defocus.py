@@ -21,12 +21,12 @@ class Depth:
     Args:
         pixels: (height, width), above 0, in any unit; infinite where there is nothing.
         record: what a sidecar says of where it is from.
-        held: what follows from it, by what that depends on, so that renditions share it.
+        derived: what follows from it, by what that depends on, so that renditions share it.
     """
 
     pixels: Floats
     record: Mapping[str, Any] = field(default_factory=dict)
-    held: dict[Hashable, Any] = field(default_factory=dict)
+    derived: dict[Hashable, Any] = field(default_factory=dict)
 
 
 NOWHERE = Depth(np.full((1, 1), np.inf, np.float32))

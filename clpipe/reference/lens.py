@@ -19,8 +19,8 @@ from clpipe.reference.radial import (
     Radial,
     even_powers,
     farthest_of,
+    fold_radius,
     grown_by,
-    turn,
 )
 
 
@@ -215,7 +215,7 @@ class _Bend:
             corner: r_d of that of the picture.
             what, unit: for the message.
         """
-        at = None if radial.is_identity else turn(radial, farthest)
+        at = None if radial.is_identity else fold_radius(radial, farthest)
         if at is not None and not radial.bent(np.array(at)) > corner:
             raise self.folded(what, at, at * unit)
 

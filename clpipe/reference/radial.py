@@ -95,10 +95,10 @@ STRAIGHT = Radial()  # every r_d is r
 
 
 @lru_cache(maxsize=64)
-def turn(radial: Radial, farthest: float) -> float | None:
+def fold_radius(radial: Radial, farthest: float) -> float | None:
     """The first radius up to ``farthest`` at which r_d no longer grows; None if it always does.
 
-    >>> round(turn(Radial((0.0, 1.0, 0.0, -0.5)), 1.0), 3)
+    >>> round(fold_radius(Radial((0.0, 1.0, 0.0, -0.5)), 1.0), 3)
     0.816
     """
     r = np.linspace(0, farthest, SAMPLES)
@@ -117,7 +117,7 @@ def turn(radial: Radial, farthest: float) -> float | None:
 
 def farthest_of(radial: Radial, corner: float) -> float:
     """The radius up to which a model is inverted: somewhat beyond the corner."""
-    at = turn(radial, BEYOND * corner)
+    at = fold_radius(radial, BEYOND * corner)
     return BEYOND * corner if at is None else max(0.999 * at, min(corner, at))
 
 

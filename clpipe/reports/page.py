@@ -84,9 +84,9 @@ def html(runs: Sequence[Run]) -> str:
     for svg in [each.svg for _, each in noise] + [svg for _, svg in law_drawings]:
         budget.take(svg)
     share = int(budget.left * SHEET_SHARE) // len(runs)
-    rooms = [Budget(share) for _ in runs]
-    sheets = [contact_sheet(*each) for each in zip(runs, rooms, labels, strict=True)]
-    budget.left -= sum(share - room.left for room in rooms)
+    shares = [Budget(share) for _ in runs]
+    sheets = [contact_sheet(*each) for each in zip(runs, shares, labels, strict=True)]
+    budget.left -= sum(share - each.left for each in shares)
     problems += [text for sheet in sheets for text in sheet.problems]
     entries = [entry for sheet in sheets for entry in sheet.entries]
     found_large = [(made, large(runs, labels, made, budget, problems)) for made in picked]

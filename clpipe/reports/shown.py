@@ -88,12 +88,12 @@ class Sheet:
     problems: list[str] = field(default_factory=list)
 
 
-def contact_sheet(run: Run, room: Budget, label: str) -> Sheet:
+def contact_sheet(run: Run, budget: Budget, label: str) -> Sheet:
     """Small pictures of a run, in its order: as many as there is room and time for.
 
     Args:
         run: the run.
-        room: that they take.
+        budget: that they take from.
         label: stands before the names of its pictures; "" does not.
     """
     pictures = run.pictures
@@ -102,7 +102,7 @@ def contact_sheet(run: Run, room: Budget, label: str) -> Sheet:
     order = telling_order([bool(oddities(made)) for made in pictures])
     for i, image, problem in _small_pictures(pictures, order):
         entry = _entry(pictures[i], image, label)
-        if not room.take(json.dumps(entry)):
+        if not budget.take(json.dumps(entry)):
             break
         entries[i] = entry
         sheet.problems += [problem] if problem else []
@@ -166,8 +166,8 @@ def telling_order(odd: Sequence[bool]) -> list[int]:
 
 def _spread(values: Sequence[int]) -> list[int]:
     bits = max(len(values) - 1, 1).bit_length()
-    turned = (int(f"{i:0{bits}b}"[::-1], 2) for i in range(1 << bits))
-    return [values[i] for i in turned if i < len(values)]
+    reversed_bits = (int(f"{i:0{bits}b}"[::-1], 2) for i in range(1 << bits))
+    return [values[i] for i in reversed_bits if i < len(values)]
 
 
 @dataclass

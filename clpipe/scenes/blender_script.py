@@ -212,10 +212,10 @@ def paths(scene: Any, asked: Mapping[str, Any]) -> Iterator[Any]:
     start, target = scene.camera.matrix_world.copy(), target_of(scene)
     if path in ("orbit", "arc"):
         for number in range(count):
-            turn = 2 * math.pi * number / count
+            angle = 2 * math.pi * number / count
             if path == "arc":
-                turn = SPAN * (number / max(count - 1, 1) - 0.5)
-            about = Matrix.Translation(target) @ Matrix.Rotation(turn, 4, "Z")
+                angle = SPAN * (number / max(count - 1, 1) - 0.5)
+            about = Matrix.Translation(target) @ Matrix.Rotation(angle, 4, "Z")
             yield about @ Matrix.Translation(-target) @ start
         return
     draw = random.Random(asked["seed"])  # noqa: S311 - places, no secrets

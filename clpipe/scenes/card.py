@@ -15,8 +15,8 @@ from clpipe.base.files import write_new
 from clpipe.chain.rendition import Rendition
 from clpipe.images.sheet import SHOWN, contact_sheet
 from clpipe.inputs.find import Job
+from clpipe.outputs.camera_files import FILES
 from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, read_sidecar
-from clpipe.outputs.views import FILES
 from clpipe.outputs.writer import OutputWriter
 from clpipe.scenes.record import RECORD
 
@@ -221,7 +221,7 @@ y is the raw's signal, 1 at the white level.
 
 - `{MANIFEST}`: a row for each picture, with its files ({", ".join(kinds)}), camera, ISO and split.
 - `NAME.json` beside each picture: everything that it was made with. \
-`clpipe run --replay NAME.json` makes it again, byte for byte.
+`clpipe replay NAME.json` makes it again, byte for byte.
 - {cameras} in each folder, where the cameras are known: intrinsics and poses for COLMAP and \
 nerfstudio.
 - `{RECORD}`: what the renders were made of. `run.jsonl`: the log.

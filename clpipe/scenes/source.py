@@ -14,7 +14,7 @@ from clpipe.base.files import write_new
 from clpipe.inputs.find import Job
 from clpipe.scenes.blender import Renderer, RenderError, Rendering, Scene
 from clpipe.scenes.record import read_record, write_record
-from clpipe.scenes.views import made_by
+from clpipe.scenes.view_request import made_by
 
 RENDERS = "renders"
 CAMERAS = "cameras.json"

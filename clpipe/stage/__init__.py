@@ -13,10 +13,21 @@ from clpipe.stage.bases import Curve, GaussianNoise, Noiseless, Unchanged, odd_s
 from clpipe.stage.checking import run_reference, variant_label, variants
 from clpipe.stage.context import Context, ReferenceContext
 from clpipe.stage.method import Method, Stage, parameter
-from clpipe.stage.passes import Access, Argument, CompileTime, Kind, NoiseScope, Pass
+from clpipe.stage.passes import (
+    Argument,
+    CompileTime,
+    Kind,
+    LineTable,
+    NoiseScope,
+    Pass,
+    Pointwise,
+    Reduction,
+    Resample,
+    Stencil,
+    TableLookup,
+)
 
 __all__ = [
-    "Access",
     "Argument",
     "Array",
     "CompileTime",
@@ -25,12 +36,18 @@ __all__ = [
     "Floats",
     "GaussianNoise",
     "Kind",
+    "LineTable",
     "Method",
     "NoiseScope",
     "Noiseless",
     "Pass",
+    "Pointwise",
+    "Reduction",
     "ReferenceContext",
+    "Resample",
     "Stage",
+    "Stencil",
+    "TableLookup",
     "Unchanged",
     "odd_size",
     "parameter",

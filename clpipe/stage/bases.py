@@ -9,7 +9,7 @@ from clpipe.base.types import Floats
 from clpipe.reference.curve import curve_index
 from clpipe.stage.context import Context, ReferenceContext
 from clpipe.stage.method import Method, parameter
-from clpipe.stage.passes import Access, Argument, Pass
+from clpipe.stage.passes import Argument, Pass, TableLookup
 
 
 class Unchanged(Method):
@@ -41,7 +41,7 @@ class Curve(Method):
         raise NotImplementedError(type(self).__name__)
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("curve", Access.CURVE, ("table",)),)
+        return (Pass("curve", TableLookup(), ("table",)),)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"table": self.table()}

@@ -78,8 +78,8 @@ class Method(BaseModel):
         """How far the image that it reads goes on beyond the picture."""
         return self._margins
 
-    def around(self, margins: Margins) -> Self:
-        """This (resolved) method for an image that goes on beyond the picture."""
+    def with_margins(self, margins: Margins) -> Self:
+        """The (resolved) method for an image that goes on beyond the picture."""
         other = self.model_copy()
         other._margins = margins
         return other
@@ -88,7 +88,7 @@ class Method(BaseModel):
         """The method with a value for every parameter that was left to the camera or the chain."""
         return self
 
-    def after(self, context: Context) -> Context:
+    def next_context(self, context: Context) -> Context:
         """The context of the next step, from this (resolved) method's."""
         return context
 
@@ -100,16 +100,16 @@ class Method(BaseModel):
         """How this (resolved) method moves pixels; None if each stays where it is."""
         return None
 
-    def of_size(self, width: int, height: int) -> Mapping[str, float]:
-        """What follows for an image of that size that it reads; a sidecar has it as estimates."""
+    def estimates_for(self, width: int, height: int) -> Mapping[str, float]:
+        """Numbers that follow from the size of the image that is read; a sidecar's estimates."""
         return {}
 
     def without_noise(self) -> "Method | None":
-        """This (resolved) method without its noise; None if nothing is left of it."""
+        """The (resolved) method without its noise; None if nothing is left of it."""
         return None if any(each.random for each in self.passes()) else self
 
-    def where_clean(self, context: Context) -> "Method | None":
-        """What this method, as it was set, becomes in a chain without noise (``--truth clean``).
+    def noise_free(self, context: Context) -> "Method | None":
+        """The method, as it was set, in a chain without noise (``--truth clean``).
 
         It is without its own noise, and what follows from :meth:`Context.noise_parameters` follows
         from zeros. A method that only takes noise away becomes :class:`Noiseless`.
@@ -146,7 +146,7 @@ class Method(BaseModel):
         """The stage in NumPy: (height, width[, channel]) float32 in and out."""
         raise NotImplementedError(type(self).__name__)
 
-    def filled(self, **values: Any) -> Self:
+    def with_defaults(self, **values: Any) -> Self:
         """A copy in which ``values`` replace the parameters that are None."""
         missing = {k: v for k, v in values.items() if getattr(self, k) is None}
         return self.model_copy(update=missing) if missing else self

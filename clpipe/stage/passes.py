@@ -6,7 +6,7 @@ from enum import Enum
 import numpy as np
 
 from clpipe.base.types import Array
-from clpipe.reference.resample import Resampler
+from clpipe.reference.resample import Axis, Resampler
 
 
 class Kind(Enum):
@@ -30,18 +30,6 @@ class Kind(Enum):
         return "mosaic" if self.c_type == "vf" else self.c_type
 
 
-class Access(Enum):
-    """How a pass touches pixels."""
-
-    POINTWISE = "pointwise"  # a pixel from that pixel
-    CURVE = "curve"  # pointwise, each channel through the table named "table"
-    STENCIL = "stencil"  # a pixel from its neighbours
-    RESAMPLE = "resample"  # a pixel of a smaller or bent image from pixels of the image
-    LINES = "lines"  # a table with a value a row or column, from no image
-    SUMS = "sums"  # sums over the whole image, then a few numbers estimated from them
-    HISTOGRAM = "histogram"  # counts over the whole image, then a few numbers estimated from them
-
-
 class NoiseScope(Enum):
     """What a draw of noise belongs to; the random key is made of it."""
 
@@ -50,38 +38,120 @@ class NoiseScope(Enum):
 
 
 @dataclass(frozen=True)
+class Pointwise:
+    """Makes a pixel of that pixel.
+
+    Args:
+        inline_at_taps: whether a stencil after it may redo it at each of its taps, where that costs
+            less than to store the image.
+        inverse_of: of the first pass of a stage, the function that it undoes, bit for bit. If that
+            is the last pass of the stage before, with arguments of the same values, neither is
+            done.
+    """
+
+    inline_at_taps: bool = False
+    inverse_of: str = ""
+
+
+@dataclass(frozen=True)
+class TableLookup:
+    """Takes each channel of a pixel through the argument "table"."""
+
+
+@dataclass(frozen=True)
+class Stencil:
+    """Makes a pixel of its neighbours.
+
+    Args:
+        radius: how far away the neighbours are at most, in rows and in columns.
+        vectors_per_row: 0 where the function returns its pixel. One that does not fills an array,
+            its last argument, with 4 rows of COLUMNS vectors: of that many, on one lane of one.
+    """
+
+    radius: int
+    vectors_per_row: int = 0
+
+
+@dataclass(frozen=True)
+class Resample:
+    """Makes a pixel of a smaller or bent image of pixels of the image.
+
+    Args:
+        resampler: which pixels are of which.
+        radius: how far from these places the function reads.
+    """
+
+    resampler: Resampler
+    radius: int = 0
+
+
+@dataclass(frozen=True)
+class LineTable:
+    """Makes a table, named by ``writes``, with a value for each row or column, from no image."""
+
+    axis: Axis
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """Sums over the whole image, or a histogram of it, and a few numbers estimated from that.
+
+    Args:
+        finish: the function that computes the estimates.
+        estimates: names of the estimated numbers, at most four; passes after it may take them.
+        finish_arguments: of that function, as ``arguments`` of :class:`Pass`.
+        bins: of the histogram; 0 for sums.
+    """
+
+    finish: str
+    estimates: tuple[str, ...]
+    finish_arguments: tuple[str, ...] = ()
+    bins: int = 0
+
+
+Access = Pointwise | TableLookup | Stencil | Resample | LineTable | Reduction
+
+
+@dataclass(frozen=True)
 class Pass:
     """One function of a method's kernel file, and how the planner may place it.
 
-    ``reads`` and ``writes`` name images of the stage: ``src`` is its input, ``dst`` its output, any
-    other name an image between its passes. ``arguments`` are the function's arguments after the
-    pixel, in order: names from :meth:`Method.arguments`, from the ``estimates`` of an earlier SUMS
-    or HISTOGRAM pass, or of the table that an earlier LINES pass writes.
-
-    A function returns its pixel. A STENCIL with a ``block`` instead fills an array, its last
-    argument, with 4 rows of COLUMNS vectors: of that many, on one lane of one.
-
-    The first pass of a stage may undo the last one of the stage before, bit for bit: if ``undoes``
-    names that one's function and both have arguments of the same values, neither is done.
+    Args:
+        function: its name.
+        access: how it touches pixels.
+        arguments: those after the pixel, in order: names from :meth:`Method.arguments`, from the
+            estimates of an earlier :class:`Reduction`, or of the table of an earlier
+            :class:`LineTable`.
+        reads: images of the stage: "src" is its input, any other name an image between its passes.
+        writes: another such name, or "dst", the stage's output.
+        kind: of what it writes; None is what the stage writes.
+        random: what the noise belongs to, for a function whose first argument is a random stream.
     """
 
     function: str
-    access: Access = Access.POINTWISE
+    access: Access = Pointwise()
     arguments: tuple[str, ...] = ()
     reads: tuple[str, ...] = ("src",)
     writes: str = "dst"
-    kind: Kind | None = None  # of what it writes; None: what the stage writes
-    radius: int = 0
-    random: NoiseScope | None = None  # takes a random stream as its first argument
-    block: int = 0  # STENCIL: vectors in a row of the block; 0 returns a pixel
-    cheap: bool = False  # a stencil after it may redo it at each tap
-    undoes: str = ""  # POINTWISE: see above
-    lines: str = ""  # LINES: "rows" or "columns"
-    finish: str = ""  # SUMS, HISTOGRAM: the function that computes the estimates
-    finish_arguments: tuple[str, ...] = ()  # of that function
-    estimates: tuple[str, ...] = ()  # SUMS, HISTOGRAM: names of the numbers, at most four
-    bins: int = 0  # HISTOGRAM: how many
-    resampling: Resampler | None = None  # RESAMPLE: how it is made
+    kind: Kind | None = None
+    random: NoiseScope | None = None
+
+    @property
+    def functions(self) -> tuple[str, ...]:
+        """All functions of the kernel file that it names."""
+        return self.function, *([self.access.finish] if isinstance(self.access, Reduction) else [])
+
+    @property
+    def all_arguments(self) -> tuple[str, ...]:
+        """The arguments of all its functions."""
+        further = self.access.finish_arguments if isinstance(self.access, Reduction) else ()
+        return *self.arguments, *further
+
+    @property
+    def gives(self) -> tuple[str, ...]:
+        """What later passes may take as arguments: its estimates, and its table."""
+        estimates = self.access.estimates if isinstance(self.access, Reduction) else ()
+        return *estimates, self.writes
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.random import normal_of_line
 from clpipe.stage import (
-    Access,
     Context,
     GaussianNoise,
     Kind,
+    LineTable,
     NoiseScope,
     Pass,
     ReferenceContext,
@@ -33,17 +33,16 @@ class Gaussian(GaussianNoise):
     summary: ClassVar = "add a Gaussian offset to each column, the same in every image of a camera"
 
     def resolve(self, context: Context) -> "Gaussian":
-        return self.filled(sigma=context.camera.column_noise(context.iso))
+        return self.with_defaults(sigma=context.camera.column_noise(context.iso))
 
     def draw(self) -> tuple[Pass, ...]:
         return (
             Pass(
                 "noise_of_lines",
-                Access.LINES,
+                LineTable("columns"),
                 arguments=("sigma",),
                 writes="lines",
                 random=NoiseScope.CAMERA,
-                lines="columns",
             ),
             Pass("column_noise", arguments=("lines",)),
         )

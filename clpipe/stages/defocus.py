@@ -9,7 +9,6 @@ from pydantic import field_validator, model_validator
 from clpipe.base.types import Floats
 from clpipe.reference.defocus import NOWHERE, Depth, aperture_taps, defocus, reach_of
 from clpipe.stage import (
-    Access,
     Argument,
     Context,
     Kind,
@@ -17,6 +16,7 @@ from clpipe.stage import (
     Pass,
     ReferenceContext,
     Stage,
+    Stencil,
     Unchanged,
     parameter,
 )
@@ -107,11 +107,11 @@ class ThinLens(Method):
                 f"sensor_width: the size of pixels is needed, and camera {context.camera.name} "
                 "does not say it; set it in mm, or pixel_pitch in um"
             )
-        return self.filled(pixel_pitch=pitch)
+        return self.with_defaults(pixel_pitch=pitch)
 
     def passes(self) -> tuple[Pass, ...]:
         given = ("radii", "columns", "rows", "reach", "taps", "count")
-        return (Pass("defocus", Access.STENCIL, given, radius=self.max_radius),)
+        return (Pass("defocus", Stencil(self.max_radius), given),)
 
     def radii(self, depth: Floats) -> Floats:
         """The radii of discs in px, below 0 in front of the focus, as large as they may be.
@@ -132,14 +132,14 @@ class ThinLens(Method):
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         depth = _depth_in(context)
-        if self not in depth.held:
+        if self not in depth.derived:
             radii = self.clipped(depth.pixels)
             largest = float(np.ceil(abs(radii).max() * 4)) / 4  # few tables for many images
             reach = reach_of(largest)
             around = ((reach, reach), (reach, reach + VECTOR))
             taps = aperture_taps(self.blades, largest)
-            depth.held[self] = np.pad(radii, around, "reflect"), reach, taps
-        radii, reach, taps = depth.held[self]
+            depth.derived[self] = np.pad(radii, around, "reflect"), reach, taps
+        radii, reach, taps = depth.derived[self]
         return {
             "radii": radii,
             "columns": np.int32(radii.shape[1]),

@@ -20,7 +20,6 @@ from clpipe.reference import warp
 from clpipe.reference.lens import Lens
 from clpipe.reference.radial import Radial
 from clpipe.stage import (
-    Access,
     Argument,
     CompileTime,
     Context,
@@ -28,6 +27,7 @@ from clpipe.stage import (
     Method,
     Pass,
     ReferenceContext,
+    Resample,
     Stage,
     Unchanged,
     parameter,
@@ -103,7 +103,7 @@ class Distortion(HasPicture):
 
     def resolve(self, context: Context) -> Self:
         """The method with the render's principal point, where that is known."""
-        return self.filled(cx=context.render.get("cx"), cy=context.render.get("cy"))
+        return self.with_defaults(cx=context.render.get("cx"), cy=context.render.get("cy"))
 
     def radial(self) -> Radial:
         """The model."""
@@ -133,17 +133,15 @@ class Distortion(HasPicture):
         return (
             Pass(
                 "distortion",
-                Access.RESAMPLE,
+                Resample(resampling, resampling.support),
                 arguments,
-                radius=resampling.support,
-                resampling=resampling,
             ),
         )
 
     def geometry(self) -> Lens | None:
         return self.lens() if self.passes() else None
 
-    def of_size(self, width: int, height: int) -> Mapping[str, float]:
+    def estimates_for(self, width: int, height: int) -> Mapping[str, float]:
         """What ``fit`` makes of the focal length: its factor."""
         return {"focal_length_factor": self.lens().scale(width, height)} if self.fit else {}
 
@@ -190,17 +188,17 @@ class InFocalLengths(Distortion):
         own, render = super().resolve(context), context.render
         if not own.fx and not own.focal_length:
             names = ("fx", "fy") if "fx" in render else ("focal_length", "sensor_width")
-            own = own.filled(**{name: render.get(name) for name in names})
+            own = own.with_defaults(**{name: render.get(name) for name in names})
         if not own.fx and not (own.focal_length and own.sensor_width):
             raise RequestError(
                 f"distortion: {self.method} counts in focal lengths: set fx (px), or focal_length "
                 "and sensor_width (mm), here or those of the render in output"
             )
-        return own.filled(fy=own.fx)
+        return own.with_defaults(fy=own.fx)
 
-    def of_size(self, width: int, height: int) -> Mapping[str, float]:
+    def estimates_for(self, width: int, height: int) -> Mapping[str, float]:
         """What ``fit`` makes of the focal length: its factor, and the focal length in px."""
-        found = super().of_size(width, height)
+        found = super().estimates_for(width, height)
         if not found:
             return found
         lens = self.lens()

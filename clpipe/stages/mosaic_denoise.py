@@ -13,7 +13,6 @@ from clpipe.reference.image import tap
 from clpipe.reference.math import square_root
 from clpipe.reference.patch import bias_of, decay_of, patch_distances
 from clpipe.stage import (
-    Access,
     Argument,
     CompileTime,
     Context,
@@ -23,6 +22,7 @@ from clpipe.stage import (
     Pass,
     ReferenceContext,
     Stage,
+    Stencil,
     odd_size,
     parameter,
 )
@@ -83,9 +83,9 @@ class NonLocalMeans(Method):
         if self.a is not None and self.b is not None:
             return self
         a, b = context.noise_parameters()
-        return self.filled(a=a, b=b)
+        return self.with_defaults(a=a, b=b)
 
-    def where_clean(self, context: Context) -> Method:
+    def noise_free(self, context: Context) -> Method:
         return Noiseless()
 
     @property
@@ -110,12 +110,10 @@ class NonLocalMeans(Method):
             ),
             Pass(
                 "mosaic_non_local_means",
-                Access.STENCIL,
+                Stencil(self.reach + 1, vectors_per_row=4),
                 ("reach", "bias", "scale"),
                 reads=("samples",),
                 writes="filtered",
-                radius=self.reach + 1,
-                block=4,
             ),
             Pass("with_gains", arguments=("pattern", "red_gain", "blue_gain"), reads=("filtered",)),
         )

@@ -12,14 +12,15 @@ from clpipe.base.types import Floats
 from clpipe.reference.convolve import convolve, reach_of, taps_of
 from clpipe.reference.turning import BILINEAR, Turning
 from clpipe.stage import (
-    Access,
     Argument,
     Context,
     Kind,
     Method,
     Pass,
     ReferenceContext,
+    Resample,
     Stage,
+    Stencil,
     parameter,
 )
 
@@ -131,7 +132,7 @@ class Linear(Method):
         if not self.pixels:
             return ()
         radius = reach_of(self.taps)
-        return (Pass("convolve", Access.STENCIL, ("taps", "count"), radius=radius),)
+        return (Pass("convolve", Stencil(radius), ("taps", "count")),)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         if not self.pixels:
@@ -197,7 +198,7 @@ class Perspective(Method):
         if not self.rotation:
             return ()
         turning = self.turning
-        return (Pass("turned", Access.RESAMPLE, ("filter",), radius=1, resampling=turning),)
+        return (Pass("turned", Resample(turning, 1), ("filter",)),)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"filter": BILINEAR} if self.rotation else {}

@@ -13,7 +13,6 @@ from clpipe.base.errors import ImageError
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.convolve import NEGLIGIBLE, blur, convolve, reach_of, taps_of
 from clpipe.stage import (
-    Access,
     Argument,
     CompileTime,
     Context,
@@ -22,6 +21,7 @@ from clpipe.stage import (
     Pass,
     ReferenceContext,
     Stage,
+    Stencil,
     Unchanged,
     parameter,
 )
@@ -233,7 +233,7 @@ class Lens(Method):
                 f"pixel_pitch: diffraction needs it, and camera {context.camera.name} does not "
                 "say; set it in um"
             )
-        return self.filled(sigma=0.0 if self.psf else GOOD_LENS, pixel_pitch=pitch)
+        return self.with_defaults(sigma=0.0 if self.psf else GOOD_LENS, pixel_pitch=pitch)
 
     @property
     def _by_lines(self) -> tuple[float, float, float] | None:
@@ -254,16 +254,16 @@ class Lens(Method):
         lines = self._by_lines
         if lines is None:
             radius = reach_of(self._taps)
-            return (Pass("convolve", Access.STENCIL, ("taps", "count"), radius=radius),)
+            return (Pass("convolve", Stencil(radius), ("taps", "count")),)
         reach = len(half_of(*lines)) - 1
         if reach == 0:
             return ()
         if reach <= UNROLLED:
-            return (Pass("blur", Access.STENCIL, ("reach", "weights"), radius=reach),)
+            return (Pass("blur", Stencil(reach), ("reach", "weights")),)
         across, down = (("across", "count"), ("down", "count"))
         return (
-            Pass("convolve", Access.STENCIL, across, writes="rows", radius=reach),
-            Pass("convolve", Access.STENCIL, down, reads=("rows",), radius=reach),
+            Pass("convolve", Stencil(reach), across, writes="rows"),
+            Pass("convolve", Stencil(reach), down, reads=("rows",)),
         )
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:

@@ -5,7 +5,7 @@ from typing import ClassVar
 from clpipe.base.types import Floats
 from clpipe.reference.geometry import Scaling
 from clpipe.reference.resample import Resampling, Weight, lanczos3, overlap, resample
-from clpipe.stage import Access, Kind, Method, Pass, ReferenceContext, Stage, parameter
+from clpipe.stage import Kind, Method, Pass, ReferenceContext, Resample, Stage, parameter
 
 
 class Filter(Method):
@@ -26,8 +26,8 @@ class Filter(Method):
             return ()
         rows, columns = self.resamplings
         return (
-            Pass("resize_rows", Access.RESAMPLE, writes="fewer_rows", resampling=rows),
-            Pass("resize_columns", Access.RESAMPLE, reads=("fewer_rows",), resampling=columns),
+            Pass("resize_rows", Resample(rows), writes="fewer_rows"),
+            Pass("resize_columns", Resample(columns), reads=("fewer_rows",)),
         )
 
     def geometry(self) -> Scaling | None:

@@ -11,7 +11,6 @@ from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.reference.image import tap
 from clpipe.reference.roots import noise_in_roots
 from clpipe.stage import (
-    Access,
     Argument,
     CompileTime,
     Context,
@@ -20,6 +19,7 @@ from clpipe.stage import (
     Pass,
     ReferenceContext,
     Stage,
+    Stencil,
     Unchanged,
     parameter,
 )
@@ -98,7 +98,7 @@ class Unsharp(Method):
         noise = noise_in_roots(predicted_noise(context)[0], MID_GREY, offset)
         x = (noise / SOFTEST) ** 2
         amount = LEAST_AMOUNT + MORE_AMOUNT * 4 * x / (1 + x) ** 2
-        return self.filled(amount=amount, limit=LEAST_LIMIT + noise, offset=offset)
+        return self.with_defaults(amount=amount, limit=LEAST_LIMIT + noise, offset=offset)
 
     @property
     def reach(self) -> int:
@@ -112,13 +112,11 @@ class Unsharp(Method):
             Pass("to_root_and_ratios", arguments=("offset",), writes="planes", kind=Kind.YCBCR),
             Pass(
                 "unsharp",
-                Access.STENCIL,
+                Stencil(self.reach * blur_step(self.radius), vectors_per_row=1),
                 ("reach", "step", "weights", "amount", "threshold", "limit"),
                 reads=("planes",),
                 writes="sharp",
                 kind=Kind.YCBCR,
-                radius=self.reach * blur_step(self.radius),
-                block=1,
             ),
             Pass("from_root_and_ratios", arguments=("offset",), reads=("sharp",)),
         )

@@ -7,10 +7,10 @@ import numpy as np
 
 from clpipe.base.types import Doubles, Floats
 from clpipe.stage import (
-    Access,
     Argument,
     Context,
     Kind,
+    LineTable,
     Method,
     Pass,
     ReferenceContext,
@@ -89,7 +89,7 @@ class Rows(Method):
             return ()
         given = ("cycles", "start", "swing")
         return (
-            Pass("flicker_of_rows", Access.LINES, given, lines="rows", writes="rows"),
+            Pass("flicker_of_rows", LineTable("rows"), given, writes="rows"),
             Pass("flicker", arguments=("rows",)),
         )
 

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from clpipe.base.types import Array, Doubles, Mask
-from clpipe.outputs.views import COLMAP, Photograph, colmap
+from clpipe.outputs.camera_files import COLMAP, Photograph, colmap
 from clpipe.reference.intrinsics import PINHOLE, Intrinsics
 from tools.reconstruction.views import SAME, View
 

@@ -187,9 +187,9 @@ def _from_kept(
     """The frame in a mosaic that clpipe kept."""
     kind = attributes.get("kind", "")
     if kind not in (Kind.RAW.label, Kind.MOSAIC.label):
-        held = one_line(f"{kind}, kept after {attributes.get('stage')}")
+        found = one_line(f"{kind}, kept after {attributes.get('stage')}")
         raise ImageError(
-            f"{path}: holds {held}; a mosaic is needed, such as clpipe run --until quantize writes"
+            f"{path}: holds {found}; a mosaic is needed, such as clpipe run --until quantize writes"
         )
     try:
         settings = carried_settings(attributes)
@@ -198,7 +198,7 @@ def _from_kept(
         step = chain.step_named(attributes.get("stage", ""))
     except RequestError as error:
         raise ImageError(f"{path}: its settings cannot be used: {error}") from None
-    context, camera = step.method.after(step.context), chain.camera
+    context, camera = step.method.next_context(step.context), chain.camera
     black = camera.black_level if context.black_level is None else context.black_level
     white = camera.white_level if context.white_level is None else context.white_level
     ev = next((getattr(s.method, "ev", 0) for s in chain.steps if s.stage.name == "exposure"), 0)

@@ -106,11 +106,11 @@ def measured(search: Search, found: Candidate, scenes: Scenes) -> Match:
     for scene in scenes.each:
         count = len(scene.frames) if scene.own_mean else CHECKED
         noise = search.simulator.noise(settings, scene, "result", count)
-        for mask, is_seen in ((scene.mask, True), (scene.held, False)):
+        for mask, is_seen in ((scene.mask, True), (scene.holdout, False)):
             if mask.any():
                 theirs = target_of(scene, mask)
                 pairs[is_seen].append((theirs, target_at(scene, noise, theirs.places)))
-        noises.append(Compared(scene.noise, noise, scene.mask | scene.held))
+        noises.append(Compared(scene.noise, noise, scene.mask | scene.holdout))
     return Match(
         settings,
         found.numbers,

@@ -27,7 +27,7 @@ CROP = 512  # px; crops begin at multiples of 16, where the blocks of a JPEG do
 CROPS = 4
 FEWEST_FLAT = 4000  # pixels of all scenes that are neither clipped nor near an edge
 FEWEST_OF_EACH = 1000  # and of each
-HELD = 3  # one crop or block in so many is kept out of the search
+HOLDOUT = 3  # one crop or block in so many is kept out of the search
 MANY = 6  # crops, of which whole ones are kept out; of fewer, a whole one would be one odd scene
 SMOOTH = 1.5  # px, over which the mean of a burst is smoothed before it is developed again
 
@@ -43,7 +43,7 @@ class Scene:
     """Frames of one scene, (height, width, 3), 0 to 255, and what they are compared with.
 
     ``mean`` is what was given, or their own mean where ``own_mean``. ``mask`` are the flat places
-    that the search sees, ``held`` those that it does not; one of them may be empty. Columns in
+    that the search sees, ``holdout`` those that it does not; one of them may be empty. Columns in
     ``left_out`` cannot be compared.
     """
 
@@ -52,7 +52,7 @@ class Scene:
     mean: Doubles
     own_mean: bool
     mask: Mask
-    held: Mask
+    holdout: Mask
     jpeg: JpegEncoding | None = None
 
     @cached_property
@@ -158,7 +158,7 @@ def load_scenes(frames: Sequence[str], means: Sequence[str]) -> Scenes:
     if flat < FEWEST_FLAT:
         names, cleans = [scene.name for scene in whole], [scene.mean for scene in whole]
         raise ImageError(too_few(names, cleans, flat, FEWEST_FLAT))
-    return Scenes(held_out(pieces), encodings[0], tuple(notes))
+    return Scenes(with_holdout(pieces), encodings[0], tuple(notes))
 
 
 def read_picture(path: Path) -> Floats:
@@ -332,19 +332,19 @@ def cut(scene: Scene, at: tuple[slice, slice], place: tuple[int, int]) -> Scene:
         frames=tuple(frame[at] for frame in scene.frames),
         mean=scene.mean[at],
         mask=scene.mask[at],
-        held=scene.held[at],
+        holdout=scene.holdout[at],
     )
 
 
-def held_out(pieces: Sequence[Scene]) -> tuple[Scene, ...]:
+def with_holdout(pieces: Sequence[Scene]) -> tuple[Scene, ...]:
     """The crops, with one third kept out of the search: whole crops of six, or blocks of fewer."""
     if len(pieces) >= MANY:
         return tuple(
-            replace(p, mask=p.held, held=p.mask) if k % HELD == HELD - 1 else p
+            replace(p, mask=p.holdout, holdout=p.mask) if k % HOLDOUT == HOLDOUT - 1 else p
             for k, p in enumerate(pieces)
         )
     parted = []
     for piece in pieces:
-        kept = block_numbers(piece.mask.shape) % HELD == HELD - 1
-        parted.append(replace(piece, mask=piece.mask & ~kept, held=piece.mask & kept))
+        kept = block_numbers(piece.mask.shape) % HOLDOUT == HOLDOUT - 1
+        parted.append(replace(piece, mask=piece.mask & ~kept, holdout=piece.mask & kept))
     return tuple(parted)

@@ -56,11 +56,11 @@ class Simulator:
         keys = [f"{key}:{scene.name}:{number}" for number in range(count or len(scene.frames))]
         with self._lock:  # a device is for one thread
             linear = self._linear_light(chain, scene)
-            self._noisy = (self._noisy or Runner(chain, self._device)).of(chain)
+            self._noisy = (self._noisy or Runner(chain, self._device)).for_chain(chain)
             pictures = [self._noisy.run(linear, name).encoded for name in keys]
             if not scene.own_mean:
                 clean = chain.without_noise()
-                self._quiet = (self._quiet or Runner(clean, self._device)).of(clean)
+                self._quiet = (self._quiet or Runner(clean, self._device)).for_chain(clean)
                 pictures.append(self._quiet.run(linear, "").encoded)
         frames = [finished(picture, scene) for picture in pictures]
         mean = None if scene.own_mean else frames.pop()

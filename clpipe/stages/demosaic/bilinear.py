@@ -7,7 +7,7 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
-from clpipe.stage import Access, Argument, Context, Method, Pass, ReferenceContext
+from clpipe.stage import Argument, Context, Method, Pass, ReferenceContext, Stencil
 from clpipe.stages.demosaic.common import (
     HALF,
     QUARTER,
@@ -42,7 +42,7 @@ class Bilinear(Method):
     summary: ClassVar = "mean of the nearest samples of each colour"
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("bilinear", Access.STENCIL, ("pattern",), radius=1),)
+        return (Pass("bilinear", Stencil(1), ("pattern",)),)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"pattern": context.cfa}

@@ -10,7 +10,7 @@ from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
 from clpipe.reference.roots import from_root, in_steps, noise_in_roots, root_of
-from clpipe.stage import Access, Argument, Context, Kind, Method, Pass, ReferenceContext, parameter
+from clpipe.stage import Argument, Context, Kind, Method, Pass, ReferenceContext, Stencil, parameter
 from clpipe.stages.demosaic.common import (
     QUARTER,
     from_differences,
@@ -122,7 +122,7 @@ class Bounded(Method):
 
     def resolve(self, context: Context) -> Self:
         _, green, _ = noise_of_colours(context)
-        return self.filled(noise=sqrt(green.at(MID_GREY)), offset=offset_of_roots(context))
+        return self.with_defaults(noise=sqrt(green.at(MID_GREY)), offset=offset_of_roots(context))
 
     @property
     def doubt(self) -> np.float32:
@@ -135,20 +135,18 @@ class Bounded(Method):
             Pass("to_roots", arguments=("offset",), writes="roots", kind=Kind.MOSAIC),
             Pass(
                 "bounded_green",
-                Access.STENCIL,
+                Stencil(2),
                 ("pattern", "even"),
                 reads=("roots",),
                 writes="known",
                 kind=Kind.MOSAIC,
-                radius=2,
             ),
             Pass(
                 "bounded_red_and_blue",
-                Access.STENCIL,
+                Stencil(1),
                 ("pattern", "noise"),
                 reads=("roots", "known"),
                 writes="colours",
-                radius=1,
             ),
             Pass("roots_to_light", arguments=("offset",), reads=("colours",)),
         )

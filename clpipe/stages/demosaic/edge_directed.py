@@ -10,7 +10,6 @@ from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
 from clpipe.stage import (
-    Access,
     Argument,
     CompileTime,
     Context,
@@ -18,6 +17,7 @@ from clpipe.stage import (
     Method,
     Pass,
     ReferenceContext,
+    Stencil,
     parameter,
 )
 from clpipe.stages.demosaic.common import (
@@ -89,13 +89,12 @@ class EdgeDirected(Method):
         return (
             Pass(
                 "green_or_difference",
-                Access.STENCIL,
+                Stencil(2),
                 ("pattern", "classifier"),
                 writes="known",
                 kind=Kind.MOSAIC,
-                radius=2,
             ),
-            Pass("add_differences", Access.STENCIL, ("pattern",), reads=("src", "known"), radius=1),
+            Pass("add_differences", Stencil(1), ("pattern",), reads=("src", "known")),
         )
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 from clpipe.base.types import Floats
 from clpipe.reference.median import median_filter
-from clpipe.stage import Access, Argument, Context, Kind, Pass, ReferenceContext
+from clpipe.stage import Argument, Context, Kind, Pass, ReferenceContext, Stencil
 from clpipe.stages.demosaic.common import from_differences, spread_differences
 from clpipe.stages.demosaic.edge_directed import EdgeDirected, green_or_difference
 from clpipe.stages.demosaic.median import Median
@@ -25,12 +25,11 @@ class EdgeDirectedMedian(Median, EdgeDirected):
         green, _ = EdgeDirected.passes(self)
         spread = Pass(
             "spread_differences",
-            Access.STENCIL,
+            Stencil(1),
             ("pattern",),
             reads=("known",),
             writes="spread",
             kind=Kind.PAIR,
-            radius=1,
         )
         return green, spread, self.median_pass()
 

@@ -8,7 +8,7 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
-from clpipe.stage import Access, Argument, Context, Method, Pass, ReferenceContext
+from clpipe.stage import Argument, Context, Method, Pass, ReferenceContext, Stencil
 from clpipe.stages.demosaic.common import EIGHTH, HALF, red_and_blue, sum_of_corners
 
 TWO, FOUR, FIVE, SIX = np.float32(2), np.float32(4), np.float32(5), np.float32(6)
@@ -46,7 +46,7 @@ class Malvar2004(Method):
     summary: ClassVar = "linear 5x5 filters with gradient correction (Malvar, He, Cutler)"
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("malvar2004", Access.STENCIL, ("pattern",), radius=2),)
+        return (Pass("malvar2004", Stencil(2), ("pattern",)),)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"pattern": context.cfa}

@@ -9,7 +9,6 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.median import median_filter
 from clpipe.stage import (
-    Access,
     Argument,
     CompileTime,
     Context,
@@ -17,6 +16,7 @@ from clpipe.stage import (
     Method,
     Pass,
     ReferenceContext,
+    Stencil,
     parameter,
 )
 from clpipe.stages.demosaic.bilinear import bilinear
@@ -42,11 +42,10 @@ class Median(Method):
         return (
             Pass(
                 "bilinear_differences",
-                Access.STENCIL,
+                Stencil(1),
                 ("pattern",),
                 writes="spread",
                 kind=Kind.PAIR,
-                radius=1,
             ),
             self.median_pass(),
         )
@@ -54,7 +53,7 @@ class Median(Method):
     def median_pass(self) -> Pass:
         """The pass that filters the colour differences, an image named "spread", and gives RGB."""
         arguments, reads = ("pattern", "size"), ("src", "spread")
-        return Pass("freeman", Access.STENCIL, arguments, reads, radius=self.size // 2)
+        return Pass("freeman", Stencil(self.size // 2), arguments, reads)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"pattern": context.cfa, "size": CompileTime(str(self.size))}

@@ -13,7 +13,7 @@ import numpy as np
 from clpipe.base.types import Floats, Mask
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
-from clpipe.stage import Access, Argument, Context, Kind, Method, Pass, ReferenceContext
+from clpipe.stage import Argument, Context, Kind, Method, Pass, ReferenceContext, Stencil
 from clpipe.stages.demosaic.common import HALF, QUARTER, mean_above_below, mean_beside, red_and_blue
 
 THIRD = np.float32(1 / 3)
@@ -111,7 +111,7 @@ class Menon2007(Method):
     def passes(self) -> tuple[Pass, ...]:
         def stencil(function: str, radius: int, *reads: str, writes: str = "dst") -> Pass:
             kind = None if writes == "dst" else Kind.PAIR
-            return Pass(function, Access.STENCIL, ("pattern",), reads, writes, kind, radius)
+            return Pass(function, Stencil(radius), ("pattern",), reads, writes, kind)
 
         return (
             stencil("directional_differences", 2, "src", writes="both"),

@@ -10,7 +10,16 @@ from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.reference.image import tap
 from clpipe.reference.roots import from_root, in_steps, noise_in_roots, root_of
-from clpipe.stage import Access, Argument, Context, Kind, Pass, ReferenceContext, parameter
+from clpipe.stage import (
+    Argument,
+    Context,
+    Kind,
+    Pass,
+    Pointwise,
+    ReferenceContext,
+    Stencil,
+    parameter,
+)
 from clpipe.stages.denoise.strength import MID_GREY, Denoiser, offset_of_roots, offset_parameter
 
 # The difference that weighs nothing, in multiples of strength * noise. Found by trying: at 6 in
@@ -93,8 +102,8 @@ class Biweight(Denoiser):
         return noise_in_roots(luma, *at), noise_in_roots(chroma, *at)
 
     def resolve(self, context: Context) -> Self:
-        resolved = super().resolve(context).filled(offset=offset_of_roots(context))
-        return resolved.filled(grain=0.35 / (1 + (resolved.roots[0] / 0.03) ** 2))
+        resolved = super().resolve(context).with_defaults(offset=offset_of_roots(context))
+        return resolved.with_defaults(grain=0.35 / (1 + (resolved.roots[0] / 0.03) ** 2))
 
     @property
     def effect(self) -> str:
@@ -123,9 +132,9 @@ class Biweight(Denoiser):
         return (
             Pass(
                 "light_to_roots",
-                arguments=("offset",),
+                Pointwise(inverse_of="roots_to_light"),
+                ("offset",),
                 writes="roots",
-                undoes="roots_to_light",
             ),
             Pass(
                 "roots_to_luma_chroma",
@@ -136,12 +145,11 @@ class Biweight(Denoiser):
             ),
             Pass(
                 "biweight",
-                Access.STENCIL,
+                Stencil(2),
                 ("grain",),
                 reads=("planes",),
                 writes="filtered",
                 kind=Kind.YCBCR,
-                radius=2,
             ),
             Pass("luma_chroma_to_light", arguments=("offset", *units), reads=("filtered",)),
         )

@@ -21,7 +21,7 @@ class Mean(BlendedFilter):
     summary: ClassVar = "mean of a window, blended in more strongly where there is more noise"
     tolerance: ClassVar = 2e-6  # sums come in another order
     function: ClassVar = "mean_filter"
-    block: ClassVar = 1
+    vectors_per_row: ClassVar = 1
 
     luma_size: int = size_parameter("luma", 3, 15)
     chroma_size: int = size_parameter("chroma", 3, 15)

@@ -47,7 +47,7 @@ class NonLocalMeans(WindowDenoiser):
         "chroma_scale",
     )
     extra_reach: ClassVar = 1
-    block: ClassVar = 4
+    vectors_per_row: ClassVar = 4
     enter: ClassVar = Pass(
         "to_noise_units",
         arguments=("luma_unit", "chroma_unit"),

@@ -17,7 +17,6 @@ from pydantic import field_validator
 
 from clpipe.reference.colour import LUMA
 from clpipe.stage import (
-    Access,
     Argument,
     CompileTime,
     Context,
@@ -25,6 +24,7 @@ from clpipe.stage import (
     Method,
     Noiseless,
     Pass,
+    Stencil,
     odd_size,
     parameter,
 )
@@ -161,9 +161,9 @@ class Denoiser(Method):
 
     def resolve(self, context: Context) -> Self:
         luma, chroma = predicted_noise(context)
-        return self.filled(luma_noise=luma, chroma_noise=chroma)
+        return self.with_defaults(luma_noise=luma, chroma_noise=chroma)
 
-    def where_clean(self, context: Context) -> Method:
+    def noise_free(self, context: Context) -> Method:
         return Noiseless()
 
     @property
@@ -190,7 +190,7 @@ class WindowDenoiser(Denoiser):
     enter: ClassVar[Pass] = Pass("to_luma_chroma", writes="planes", kind=Kind.YCBCR)
     leave: ClassVar[Pass] = Pass("from_luma_chroma", reads=("filtered",))
     extra_reach: ClassVar[int] = 0  # px that the stencil reads beyond its window
-    block: ClassVar[int] = 0  # as in Pass
+    vectors_per_row: ClassVar[int] = 0  # as in Stencil
 
     luma_size: int = size_parameter("luma", 5, 15)
     chroma_size: int = size_parameter("chroma", 5, 15)
@@ -214,13 +214,11 @@ class WindowDenoiser(Denoiser):
             self.enter,
             Pass(
                 self.function,
-                Access.STENCIL,
+                Stencil(max(self.reaches) + self.extra_reach, self.vectors_per_row),
                 ("luma_reach", "chroma_reach", *self.names),
                 reads=("planes",),
                 writes="filtered",
                 kind=Kind.YCBCR,
-                radius=max(self.reaches) + self.extra_reach,
-                block=self.block,
             ),
             self.leave,
         )

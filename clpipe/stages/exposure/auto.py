@@ -9,7 +9,15 @@ from pydantic import model_validator
 
 from clpipe.base.types import Floats, Mask
 from clpipe.reference.math import negative_log, power_of_two
-from clpipe.stage import Access, Argument, CompileTime, Context, Pass, ReferenceContext, parameter
+from clpipe.stage import (
+    Argument,
+    CompileTime,
+    Context,
+    Pass,
+    Reduction,
+    ReferenceContext,
+    parameter,
+)
 from clpipe.stages.exposure.gain import Gain
 
 STEPS = 4096  # of the logarithm to base 2, in which it is an integer
@@ -123,7 +131,7 @@ class Auto(Gain):
         return self
 
     def resolve(self, context: Context) -> Self:
-        return self.filled(target=TARGETS[self.rule])
+        return self.with_defaults(target=TARGETS[self.rule])
 
     def passes(self) -> tuple[Pass, ...]:
         limits, found = ("target", "lowest", "highest", "offset"), ("metered_ev", "gain")
@@ -131,21 +139,19 @@ class Auto(Gain):
         if self.rule == "percentile":
             search = Pass(
                 "metered_bin",
-                Access.HISTOGRAM,
+                Reduction(
+                    "meter_percentile",
+                    found,
+                    ("inside", "outside", "millionths", *limits),
+                    bins=2 * BINS,
+                ),
                 ("share", "outside"),
-                finish="meter_percentile",
-                finish_arguments=("inside", "outside", "millionths", *limits),
-                estimates=found,
-                bins=2 * BINS,
             )
         else:
             search = Pass(
                 "metered_log",
-                Access.SUMS,
+                Reduction("meter_log_average", found, (*circle, "delta", *limits)),
                 ("extent", *circle, "delta"),
-                finish="meter_log_average",
-                finish_arguments=(*circle, "delta", *limits),
-                estimates=found,
             )
         return search, Pass("exposure", arguments=("gain",))
 

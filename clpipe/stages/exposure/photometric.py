@@ -58,7 +58,7 @@ class Photometric(Gain):
         le=1e9,
     )
 
-    def after(self, context: Context) -> Context:
+    def next_context(self, context: Context) -> Context:
         headroom = context.headroom + self.headroom - math.log2(WHITE)
         return replace(context, headroom=headroom)
 

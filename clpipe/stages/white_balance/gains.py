@@ -8,7 +8,16 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
-from clpipe.stage import Argument, Context, Method, Pass, ReferenceContext, Unchanged, parameter
+from clpipe.stage import (
+    Argument,
+    Context,
+    Method,
+    Pass,
+    Pointwise,
+    ReferenceContext,
+    Unchanged,
+    parameter,
+)
 
 
 def apply_gains(image: Floats, context: Context, red: np.float32, blue: np.float32) -> Floats:
@@ -17,12 +26,15 @@ def apply_gains(image: Floats, context: Context, red: np.float32, blue: np.float
     return np.minimum(image * gains, np.float32(1))
 
 
+APPLY = Pass("white_balance", Pointwise(inline_at_taps=True), ("pattern", "red_gain", "blue_gain"))
+
+
 class EstimatedGains(Method):
     """Gains that are estimated from the image itself. Subclasses say how."""
 
     tolerance: ClassVar = 1e-6  # division is not exact on every device
 
-    def after(self, context: Context) -> Context:
+    def next_context(self, context: Context) -> Context:
         # The estimates are known only when the image is processed; the as-shot gains stand in.
         return replace(context, applied_gains=context.gains)
 
@@ -36,8 +48,7 @@ class EstimatedGains(Method):
 
     def passes(self) -> tuple[Pass, ...]:
         search = self.search()
-        apply = Pass("white_balance", arguments=("pattern", *search.estimates), cheap=True)
-        return search, apply
+        return search, APPLY
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         red, blue = self.gains(image, given.context.pattern)
@@ -67,14 +78,14 @@ class AsShot(Method):
 
     def resolve(self, context: Context) -> "AsShot":
         red, blue = context.gains
-        return self.filled(red_gain=red, blue_gain=blue)
+        return self.with_defaults(red_gain=red, blue_gain=blue)
 
-    def after(self, context: Context) -> Context:
+    def next_context(self, context: Context) -> Context:
         assert self.red_gain is not None and self.blue_gain is not None
         return replace(context, applied_gains=(self.red_gain, self.blue_gain))
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("white_balance", arguments=("pattern", "red_gain", "blue_gain"), cheap=True),)
+        return (APPLY,)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         red, blue = np.float32(self.red_gain), np.float32(self.blue_gain)
@@ -101,7 +112,7 @@ class Gains(AsShot):
 
     def resolve(self, context: Context) -> "Gains":
         red, blue = context.camera.white_balance_gains
-        return self.filled(red_gain=red, blue_gain=blue)
+        return self.with_defaults(red_gain=red, blue_gain=blue)
 
 
 class Unbalanced(Unchanged):

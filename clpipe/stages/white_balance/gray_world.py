@@ -7,7 +7,7 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
-from clpipe.stage import Access, Argument, Context, Pass
+from clpipe.stage import Argument, Context, Pass, Reduction
 from clpipe.stages.white_balance.gains import EstimatedGains
 
 
@@ -23,13 +23,8 @@ class GrayWorld(EstimatedGains):
     summary: ClassVar = "make the means of the three colours equal"
 
     def search(self) -> Pass:
-        return Pass(
-            "gray_world_sample",
-            Access.SUMS,
-            finish="gray_world",
-            finish_arguments=("pattern",),
-            estimates=("red_gain", "blue_gain"),
-        )
+        find = Reduction("gray_world", ("red_gain", "blue_gain"), ("pattern",))
+        return Pass("gray_world_sample", find)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         return {"pattern": context.cfa}

@@ -7,7 +7,7 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
-from clpipe.stage import Access, Argument, Context, Pass, parameter
+from clpipe.stage import Argument, Context, Pass, Reduction, parameter
 from clpipe.stages.white_balance.gains import EstimatedGains
 
 STEPS = 6144  # bins of each colour: 12 octaves below 1, with 512 bins each
@@ -72,12 +72,8 @@ class WhitePatch(EstimatedGains):
     def search(self) -> Pass:
         return Pass(
             "white_patch_bin",
-            Access.HISTOGRAM,
+            Reduction("white_patch", ("red_gain", "blue_gain"), ("millionths",), bins=3 * STEPS),
             ("pattern", "clip"),
-            finish="white_patch",
-            finish_arguments=("millionths",),
-            estimates=("red_gain", "blue_gain"),
-            bins=3 * STEPS,
         )
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:

@@ -16,7 +16,8 @@ from clpipe.engine.check import example
 from clpipe.engine.codegen import write_kernel
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box, Extent
-from clpipe.engine.held import Held
+from clpipe.engine.launch_cache import LaunchCache
+from clpipe.engine.options import RunOptions
 from clpipe.engine.plan import make_plan
 from clpipe.engine.runner import Runner
 from clpipe.stage import Kind
@@ -38,14 +39,14 @@ class Developer:
         self.runners = {}
 
     def runner(self, chain, keep=(), final=False):
-        first = Runner(chain, self.device, keep, final=final, hold=True)
-        return self.runners.setdefault((keep, final), first).of(chain)
+        first = Runner(chain, self.device, keep, final=final, incremental=True)
+        return self.runners.setdefault((keep, final), first).for_chain(chain)
 
     def launches(self, image, key="k", unchanged=True, **settings):
         """The launches that ran, by the last word of their names."""
         timings = []
         runner = self.runner(chain_of(**settings))
-        runner.submit(image, key, timings, unchanged=unchanged)()
+        runner.submit(image, key, RunOptions(timings, unchanged=unchanged))()
         return [t.name.split(".")[-1] for t in timings if not t.transfer]
 
 
@@ -128,30 +129,30 @@ def a_call(kernel, reads, writes, *values):
 
 def test_a_launch_is_left_out_if_all_that_it_writes_is_there():
     source, extents = np.zeros((4, 4)), (Extent.whole(4, 4, 8, 0),)
-    pool = SimpleNamespace(held={name: object() for name in ("one", "two", "three")})
+    pool = SimpleNamespace(buffers={name: object() for name in ("one", "two", "three")})
     first, second = a_call("load", [], ["one", "two"], np.float32(1)), ("blur", ["two"], ["three"])
     calls = [first, a_call(*second, np.ones(3)), a_call("end", ["three"], [])]
 
-    def launches(held, first=first, second=calls[1]):
+    def launches(cache, first=first, second=calls[1]):
         own = [first, second, calls[2]]
-        return held.next(own, pool, source, True, extents, lambda value: value)[0]
+        return cache.next(own, pool, source, True, extents, lambda value: value)[0]
 
-    numbers, held = Held().next(calls, pool, source, True, extents, lambda value: value)
+    numbers, cache = LaunchCache().next(calls, pool, source, True, extents, lambda value: value)
     assert numbers == (0, 1, 2)
-    assert launches(held) == (2,)
-    assert launches(held, second=a_call(*second, np.ones(3))) == (2,)
-    assert launches(held, second=a_call(*second, np.zeros(3))) == (1, 2)
-    assert launches(held, second=a_call("mean", *second[1:], np.ones(3))) == (1, 2)
-    assert launches(held, a_call("load", [], ["one", "two"], np.float32(2))) == (0, 1, 2)
-    pool.held["three"] = object()
-    assert launches(held) == (1, 2)
-    pool.held["one"] = object()  # the next launch reads the other one
-    assert launches(held) == (0, 1, 2)
+    assert launches(cache) == (2,)
+    assert launches(cache, second=a_call(*second, np.ones(3))) == (2,)
+    assert launches(cache, second=a_call(*second, np.zeros(3))) == (1, 2)
+    assert launches(cache, second=a_call("mean", *second[1:], np.ones(3))) == (1, 2)
+    assert launches(cache, a_call("load", [], ["one", "two"], np.float32(2))) == (0, 1, 2)
+    pool.buffers["three"] = object()
+    assert launches(cache) == (1, 2)
+    pool.buffers["one"] = object()  # the next launch reads the other one
+    assert launches(cache) == (0, 1, 2)
 
 
 def test_planes_lie_alike_where_stencils_differ_a_little():
     borders = {
-        make_plan(chain_of(**settings), hold=True).border
+        make_plan(chain_of(**settings), incremental=True).border
         for settings in ({}, {"skip": ["sharpen"]}, {"demosaic": {"method": "bilinear"}})
     }
     assert borders == {4}
@@ -212,7 +213,7 @@ class Walk:
             case "patches":
                 boxes = [Box(0, 0, 20, 20), Box(20, 10, 40, 30)]
                 runner = self.developer.runner(plain.chain)
-                runner.submit(self.images[0], "k", boxes=boxes)()
+                runner.submit(self.images[0], "k", RunOptions(boxes=boxes))()
             case "tiles":
                 device.memory, memory = 500_000, device.memory
                 image = example(Kind.RGB, (100, 150), half=True)
@@ -222,14 +223,14 @@ class Walk:
             case "failure":
                 runner = self.developer.runner(plain.chain)
                 with failing(self.patch, self.choice(0, 2), cl.RuntimeError("the driver died")):
-                    runner.submit(self.image, "other", unchanged=True)()
+                    runner.submit(self.image, "other", RunOptions(unchanged=True))()
 
     def compare(self, unchanged):
         chain, (keep, final) = chain_of(**self.settings), self.results
         runner = self.developer.runner(chain, keep, final)
         timings = []
-        found = runner.submit(self.image, self.key, timings, unchanged=unchanged)
-        again = runner.submit(self.image, self.key, unchanged=True)
+        found = runner.submit(self.image, self.key, RunOptions(timings, unchanged=unchanged))
+        again = runner.submit(self.image, self.key, RunOptions(unchanged=True))
         expected = Runner(chain, self.plain, keep, final=final).run(self.image, self.key)
         same(found(), expected)
         same(again(), expected)
@@ -249,7 +250,7 @@ def test_the_same_bits_after_any_changes(device, kind, monkeypatch):
 @pytest.mark.parametrize("white_balance", ["gray_world", "white_patch"])
 def test_a_plan_that_holds_its_images_writes_each_buffer_once(white_balance):
     settings = {"exposure": {"method": "auto"}, "white_balance": {"method": white_balance}}
-    plan = make_plan(chain_of(**settings), keep=("mosaic",), final=True, hold=True)
+    plan = make_plan(chain_of(**settings), keep=("mosaic",), final=True, incremental=True)
     calls = [Call(write_kernel(plan, launch, 8), None) for launch in plan.launches]
     written = [name for call in calls for name in call.writes]
     assert len(written) == len(set(written)) > 20

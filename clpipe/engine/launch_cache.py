@@ -26,7 +26,7 @@ def digest_of(*parts: bytes) -> bytes:
 
 
 @dataclass(frozen=True)
-class Held:
+class LaunchCache:
     """What buffers hold after an image that went through whole; at first nothing is known.
 
     Args:
@@ -48,7 +48,7 @@ class Held:
         unchanged: bool,
         extents: Extents,
         bind: Bind,
-    ) -> tuple[tuple[int, ...], "Held"]:
+    ) -> tuple[tuple[int, ...], "LaunchCache"]:
         """What is to be done for the next image, and what buffers hold when it is done.
 
         Args:
@@ -57,7 +57,7 @@ class Held:
             source: the image.
             unchanged: whether it has the same pixels still, if it is the array of the image before.
             extents: the image on each level.
-            bind: the value of a parameter.
+            bind: gives the values of a call.
 
         Returns:
             The numbers of the calls to launch: those whose results are not in their buffers, and
@@ -65,16 +65,15 @@ class Held:
         """
         same = unchanged and self.source is not None and self.source() is source
         number = self.number + (not same)
-        after = Held(weakref.ref(source), number, dict(self.buffers))
+        after = LaunchCache(weakref.ref(source), number, dict(self.buffers))
         planes = [b"".join(n.tobytes() for n in extent.numbers.values()) for extent in extents]
 
         def holds(name: str, made: bytes) -> bool:
-            buffer, digest = after.buffers.get(name, (None, b""))
-            return buffer is pool.held[name] and digest == made
+            buffer, maker = after.buffers.get(name, (None, b""))
+            return buffer is pool.buffers[name] and maker == made
 
-        def value(argument: Any) -> bytes:
-            is_array = isinstance(argument, np.ndarray)
-            return xxh3_128_digest(argument) if is_array else argument.tobytes()
+        def digest(value: Any) -> bytes:
+            return xxh3_128_digest(value.data) if isinstance(value, np.ndarray) else value.tobytes()
 
         numbers = []
         for i, call in enumerate(calls):
@@ -85,9 +84,9 @@ class Held:
                 planes[max(level - 1, 0)],
                 number.to_bytes(8) if call.reads_source else b"",
                 *(after.buffers[name][1] for name in call.reads),
-                *(value(bind(parameter)) for parameter in call.values),
+                *(digest(bind(value)) for value in call.values),
             )
             if call is calls[-1] or not all(holds(name, made) for name in call.writes):
                 numbers.append(i)
-            after.buffers.update((name, (pool.held[name], made)) for name in call.writes)
+            after.buffers.update((name, (pool.buffers[name], made)) for name in call.writes)
         return tuple(numbers), after

@@ -80,8 +80,16 @@ class Written:
     pictures: int
     left_out: tuple[str, ...]
 
+    def lines(self, folder: Path) -> list[str]:
+        """The same for people; ``folder`` is the one that it was written to."""
+        warnings = [f"warning: {each}" for each in self.left_out]
+        if not self.files:
+            return warnings
+        files = ", ".join(str(folder / name) for name in self.files)
+        return [f"wrote {files}: {self.pictures} picture{'s' * (self.pictures != 1)}", *warnings]
 
-def check_view_files(folder: Path) -> None:
+
+def check_camera_files(folder: Path) -> None:
     """See that the files of a folder's views may be written.
 
     Raises:
@@ -95,13 +103,13 @@ def check_view_files(folder: Path) -> None:
             )
 
 
-def write_views(folder: Path) -> Written:
+def write_camera_files(folder: Path) -> Written:
     """Write the views of an output folder, as its sidecars say them.
 
     Raises:
         ImageError: a file cannot be written or is somebody else's.
     """
-    check_view_files(folder)
+    check_camera_files(folder)
     left_out: dict[str, list[str]] = defaultdict(list)
     found = sorted(photographs(folder, left_out), key=lambda each: each.file)
     posed = [each for each in found if each.pose]

@@ -1,10 +1,22 @@
 """The parameters of a kernel, collected while its text is written, under canonical names."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
+from clpipe.engine.bindings import (
+    ArgumentValue,
+    Bound,
+    Buffer,
+    EncodedCurves,
+    ExtentNumber,
+    Parameter,
+    ResamplingValue,
+    StreamWord,
+    TileNumber,
+    slot_buffer,
+    step_buffer,
+)
+from clpipe.engine.ir import Finalize, Plan, Read
 from clpipe.engine.ops import Op
-from clpipe.engine.plan import Finalize, Plan, Read
 from clpipe.stage import NoiseScope
 
 LARGER = (
@@ -13,25 +25,8 @@ LARGER = (
 )
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """One kernel parameter: its OpenCL declaration, and what is bound to it.
-
-    ``role`` is one of tile (a number of :class:`clpipe.engine.extents.Extent`, or the tile's own
-    number), source, slot, encoded, table8 (the composed curve), value, key, lines, estimates, sums,
-    partials, counts, histogram, taps (of the resampling that leads on from the level ``number``).
-    ``step``, ``item`` and ``number`` say which one of that role; they are not part of the text.
-    """
-
-    declaration: str
-    role: str
-    step: str = ""
-    item: str = ""
-    number: int = 0
-
-
-class Writer:
-    """Collects the parameters and the body of one kernel, and gives canonical names to both."""
+class KernelBuilder:
+    """Collects the parameters of one kernel and what is set up of them, under canonical names."""
 
     def __init__(self, plan: Plan, lanes: int) -> None:
         self.plan = plan
@@ -47,33 +42,44 @@ class Writer:
             self._steps.append(step)
         return f"step{self._steps.index(step)}_{item}"
 
-    def parameter(self, name: str, type_: str, role: str, **which: str | int) -> str:
-        """A parameter of the kernel; the fields of :class:`Parameter` say what is bound to it."""
+    def parameter(self, name: str, type_: str, bound: Bound) -> str:
+        """A parameter of the kernel, by its name in the text, and what is bound to it."""
         space = "" if type_.endswith("*") else " "
-        self.parameters[name] = Parameter(f"{type_}{space}{name}", role, **which)  # type: ignore[arg-type]
+        self.parameters[name] = Parameter(f"{type_}{space}{name}", bound)
         return name
 
-    def tile(self, number: str) -> str:
-        """The parameter of a number of the tile, or of the larger image that it is made from."""
-        return self.parameter(number, "uint", "tile", item=number)
+    def buffer(
+        self, name: str, element: str, buffer: str, written: bool = False, restrict: bool = True
+    ) -> str:
+        """The parameter of a buffer, whose elements are of an OpenCL type."""
+        type_ = f"__global {'' if written else 'const '}{element} *{'restrict' if restrict else ''}"
+        return self.parameter(name, type_, Buffer(buffer, written))
+
+    def number(self, name: str) -> str:
+        """The parameter of a number of the tile's extent."""
+        return self.parameter(name, "uint", ExtentNumber(name))
+
+    def tile_number(self) -> str:
+        """The parameter of the tile's own number."""
+        return self.parameter("tile", "uint", TileNumber())
 
     def core(self) -> str:
         """The tile's core."""
-        sides = [self.tile(f"core_{side}") for side in ("left", "top", "right", "bottom")]
+        sides = [self.number(f"core_{side}") for side in ("left", "top", "right", "bottom")]
         self.setup.append(f"const core c = {{{', '.join(sides)}}};")
         return "c"
 
     def larger(self) -> str:
         """The extent of the image that a resampling reads."""
         for number in ("width", "height", "pitch", "left", "top", "columns", "rows"):
-            self.tile(f"from_{number}")
+            self.parameter(f"from_{number}", "uint", ExtentNumber(number, larger=True))
         self.setup.append(f"const extent from = {LARGER};")
         return "from"
 
     def taps(self, level: int) -> list[str]:
         """The parameters of the resampling that leads on from a level."""
         return [
-            self.parameter(f"tap_{item}", type_, "taps", item=item, number=level)
+            self.parameter(f"tap_{item}", type_, ResamplingValue(level, item))
             for item, type_ in self.plan.resamplings[level].parameters
         ]
 
@@ -81,10 +87,9 @@ class Writer:
         """The parameter of a plane."""
         if number not in self._slots:
             self._slots.append(number)
-        const = "" if written else "const "
-        type_ = f"__global {const}float *restrict"
-        name = f"plane{self._slots.index(number)}"
-        return self.parameter(name, type_, "slot", number=number)
+        return self.buffer(
+            f"plane{self._slots.index(number)}", "float", slot_buffer(number), written
+        )
 
     def planes(self, read: Read) -> list[str]:
         """Three plane parameters of an image that is read, the last repeated where it has less."""
@@ -93,22 +98,28 @@ class Writer:
 
     def lines(self, step: str, item: str, written: bool) -> str:
         """The parameter of a step's line table."""
-        type_ = "__global float *" if written else "__global const float *"
-        return self.parameter(self.name(step, item), type_, "lines", step=step, item=item)
+        buffer = step_buffer("lines", step)
+        return self.buffer(self.name(step, item), "float", buffer, written, restrict=False)
 
     def estimates(self, step: str, written: bool) -> str:
         """The parameter of the buffer with the numbers that a step estimates from the image."""
-        type_ = "__global float *" if written else "__global const float *"
-        return self.parameter(self.name(step, "estimates"), type_, "estimates", step=step)
+        name, buffer = self.name(step, "estimates"), step_buffer("estimates", step)
+        return self.buffer(name, "float", buffer, written, restrict=False)
+
+    def table8(self, curves: Sequence[Op]) -> str:
+        """The parameter of the table of curves and the conversion to eight bits."""
+        type_, steps = "__global const uchar *restrict", tuple(op.step for op in curves)
+        return self.parameter("table8", type_, EncodedCurves(steps))
 
     def stream(self, op: Op, scope: NoiseScope) -> str:
         """The random stream of a pass, from three parameters."""
 
-        def word(item: str, name: str) -> str:
-            return self.parameter(self.name(op.step, name), "uint", "key", step=op.step, item=item)
-
-        keys = [word(f"{scope.value}{half}", f"{scope.value}_key{half}") for half in "01"]
-        return f"(stream){{{', '.join([*keys, word('stage', 'stage')])}}}"
+        words = {f"{scope.value}_key0": "key0", f"{scope.value}_key1": "key1", "stage": "stage"}
+        names = [
+            self.parameter(self.name(op.step, name), "uint", StreamWord(op.step, scope, word))
+            for name, word in words.items()
+        ]
+        return f"(stream){{{', '.join(names)}}}"
 
     def arguments(self, op: Op, names: Sequence[str] | None = None) -> list[str]:
         """The actual arguments of a pass, or those ``names``, after the pixel and its site."""
@@ -120,7 +131,7 @@ class Writer:
                 texts.append(literals[item])
             elif item in types:
                 name = self.name(op.step, item)
-                texts.append(self.parameter(name, types[item], "value", step=op.step, item=item))
+                texts.append(self.parameter(name, types[item], ArgumentValue(op.step, item)))
             elif item in estimates:
                 name, buffer = self.name(op.step, item), self.estimates(op.step, written=False)
                 line = f"const float {name} = {buffer}[{estimates.index(item)}];"
@@ -136,5 +147,5 @@ def estimates_of(plan: Plan, step: str) -> tuple[str, ...]:
     """The names of the numbers that a step estimates from the image, in their buffer's order."""
     for launch in plan.launches:
         if isinstance(launch, Finalize) and launch.op.step == step:
-            return launch.op.pass_.estimates
+            return launch.op.reduction.estimates
     return ()

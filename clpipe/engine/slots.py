@@ -1,0 +1,38 @@
+"""Which buffers the planes of a plan's images are in, by liveness. Pure."""
+
+from collections.abc import Sequence
+
+from clpipe.engine.ir import AnyLaunch, Image, Launch, reads_of
+
+
+def assign_slots(
+    launches: Sequence[AnyLaunch], images: Sequence[Image], pinned: set[int]
+) -> tuple[tuple[tuple[int, ...], ...], int]:
+    """Slots for the planes of every image, by liveness.
+
+    Args:
+        launches: in order.
+        images: that they write.
+        pinned: numbers of images whose slots are never reused, since they are results or held.
+
+    Returns:
+        The slots of each image, by its number, and how many slots there are.
+    """
+    last_use = {
+        read.image.number: i for i, launch in enumerate(launches) for read in reads_of(launch)
+    }
+    slots: dict[int, tuple[int, ...]] = {}
+    free: list[int] = []
+    count = 0
+    for i, launch in enumerate(launches):
+        if isinstance(launch, Launch) and launch.writes:
+            planes = len(launch.writes.kind.channels)
+            while len(free) < planes:
+                free.append(count)
+                count += 1
+            slots[launch.writes.number] = tuple(free[:planes])
+            del free[:planes]
+        for read in {read.image.number for read in reads_of(launch)}:
+            if last_use[read] == i and read not in pinned:
+                free.extend(slots[read])
+    return tuple(slots[image.number] for image in images), count
