@@ -29,7 +29,7 @@ def picture(path):
 
 
 def test_it_is_as_strong_as_the_pictures_noise_and_independent(clpipe, render, tmp_path):
-    both = ("--baseline", "iid", "--baseline", "intensity")
+    both = ("--truth", "iid", "--truth", "intensity")
     clpipe("run", render, "-o", "out", *NUMPY, "--format", "png", *both)
     out = {
         name: picture(tmp_path / f"out/view{name}.png")
@@ -66,7 +66,7 @@ def test_where_it_is_matched_and_how_channels_go_together(clpipe, write_exr, tmp
     pixels = np.full((96, 128, 3), 0.2)
     pixels[40:] += np.random.default_rng(4).random((56, 128, 1)) * 0.3
     render = write_exr("view.exr", pixels.astype(np.float32))
-    command = ("run", render, *NUMPY, "--format", "png", "--baseline", "iid")
+    command = ("run", render, *NUMPY, "--format", "png", "--truth", "iid")
     how = {"halved": ["match=halved", "correlated=true"], "flat": ["match=flat"]}
     noise = {}
     for name, values in how.items():
@@ -99,7 +99,7 @@ def test_where_it_is_matched_and_how_channels_go_together(clpipe, write_exr, tmp
 def test_it_is_as_strong_in_jpegs_on_request(clpipe, render, tmp_path, subsampling):
     jpeg = ("--set", f"output.jpeg_subsampling={subsampling}", "--format", "jpg")
     for name, value in (("as_ever", "false"), ("matched", "true")):
-        clpipe("run", render, "-o", name, *NUMPY, *jpeg, "--baseline", "iid",
+        clpipe("run", render, "-o", name, *NUMPY, *jpeg, "--truth", "iid",
                "--set", f"picture_noise.jpeg={value}")  # fmt: skip
         out = {end: picture(tmp_path / f"{name}/view{end}.jpg") for end in ENDS}
         noise, camera = out[".iid"] - out[".truth_clean"], out[""] - out[".truth"]
@@ -114,7 +114,7 @@ def test_it_is_as_strong_in_jpegs_on_request(clpipe, render, tmp_path, subsampli
 
 
 def test_it_is_made_again_alone_the_same(clpipe, render, tmp_path):
-    command = ("run", render, "-o", "out", *NUMPY, "--baseline", "iid", "--bracket=-1,0")
+    command = ("run", render, "-o", "out", *NUMPY, "--truth", "iid", "--bracket=-1,0")
     clpipe(*command, "--format", "png", "--format", "dng")
     path = tmp_path / "out/view.ev-1.iid.png"
     made = path.read_bytes()
@@ -122,20 +122,20 @@ def test_it_is_made_again_alone_the_same(clpipe, render, tmp_path):
     path.unlink()
     clpipe(*command, "--format", "png", "--format", "dng")
     assert path.read_bytes() == made
-    clpipe("run", "--replay", "out/view.ev-1.iid.json", "-o", "again", "--device", "numpy")
+    clpipe("replay", "out/view.ev-1.iid.json", "-o", "again", "--device", "numpy")
     assert (tmp_path / "again/view.ev-1.iid.png").read_bytes() == made
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--skip", "picture_noise"], "that of picture_noise, and this chain has none"),
+        (["--skip", "picture_noise"], "has the noise of picture_noise, which this chain has not"),
         (["--set", "picture_noise.method=iid_gaussian", "--set", "picture_noise.sigma=0.1"],
          "picture_noise adds noise already"),
-        (["--until", "normalize"], "this chain has none"),
+        (["--until", "normalize"], "which this chain has not"),
         (["--skip", "sensor_noise", "--skip", "row_noise"], "no stage of this chain adds noise"),
     ],
 )  # fmt: skip
 def test_what_is_refused(clpipe, render, options, message):
-    command = ("run", render, "-o", "out", *NUMPY, "--baseline", "iid", *options)
+    command = ("run", render, "-o", "out", *NUMPY, "--truth", "iid", *options)
     assert message in clpipe(*command, status=2).stderr

@@ -18,13 +18,13 @@ def short(monkeypatch):
 
 def test_cpu_time_by_step_is_that_of_the_process(clpipe, short, monkeypatch):
     taken = []
-    real = bench_batch.StepTimes.__exit__
+    real = bench_batch.CpuTimes.__exit__
 
     def leave(times, *error):
         real(times, *error)
         taken.append(time.process_time() - times._process)
 
-    monkeypatch.setattr(bench_batch.StepTimes, "__exit__", leave)
+    monkeypatch.setattr(bench_batch.CpuTimes, "__exit__", leave)
     result = json.loads(clpipe("bench", "--batch", "--json").stdout)
     assert [b["images"] for b in result["batches"]] == [6, 5]
     for speed, seconds in zip(result["batches"], taken, strict=True):

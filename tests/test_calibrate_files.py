@@ -156,13 +156,12 @@ def test_headerless_dumps(tmp_path):
     for k, frame in enumerate(frames(scene(96, 128), 3)):
         (tmp_path / f"{k}.raw").write_bytes(frame.astype("<u2").tobytes())
     given = (tmp_path, "-o", tmp_path / "p.toml")
-    assert "--raw-size" in call("calibrate", *given, *LEVELS, status=1).stderr
-    size = ("--raw-type", "uint16le", "--raw-size")
-    message = call("calibrate", *given, *size, "128x96", status=2).stderr
+    assert "--dump" in call("calibrate", *given, *LEVELS, status=1).stderr
+    message = call("calibrate", *given, "--dump", "128x96:uint16le", status=2).stderr
     assert "give --black-level, --white-level, --pattern, --iso" in message
-    message = call("calibrate", *given, *LEVELS, *size, "128x48", status=1).stderr
+    message = call("calibrate", *given, *LEVELS, "--dump", "128x48:uint16le", status=1).stderr
     assert "it would fit 128x96 uint16le" in message
-    call("calibrate", *given, *LEVELS, *size, "128x96")
+    call("calibrate", *given, *LEVELS, "--dump", "128x96:uint16le")
     camera = load_camera(str(tmp_path / "p.toml"))
     assert camera.gain_stages[0].system_gain[0] == pytest.approx(2, rel=0.03)
 

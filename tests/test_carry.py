@@ -95,7 +95,7 @@ def carrying(*names):
 
 def test_every_layer_goes_through_the_pictures_geometry(clpipe, render):
     given = render(height=10, width=14, **{"cryptomatte/ab12/name": "CryptoObject"})
-    clpipe(*RUN, "in", *HALF, *carrying(*ALL), "--depth-png")
+    clpipe(*RUN, "in", *HALF, *carrying(*(f"{n}:png" if n == "Depth" else n for n in ALL)))
     got = planes()
     assert got.keys() == given.keys() - set("RGB") | {"valid"}
     at = np.s_[1::2, 1::2]  # the centre of a pixel of the half picture is the corner of these
@@ -195,21 +195,21 @@ def test_places_at_edges_and_without_weight():
 
 
 @pytest.mark.parametrize(
-    ("file", "options", "channel"),
+    ("file", "pattern", "channel"),
     [
-        ("in/a_depth.exr", (), "depth.Z"),
-        ("in/a.Depth.exr", (), "depth.Z"),
-        ("in/a_aux.exr", (), "depth.Z"),  # by its layers
-        ("depth/a.exr", ("--companion", "../depth/{name}.exr"), "depth.Z"),
+        ("in/a_depth.exr", "", "depth.Z"),
+        ("in/a.Depth.exr", "", "depth.Z"),
+        ("in/a_aux.exr", "", "depth.Z"),  # by its layers
+        ("depth/a.exr", "=../depth/{name}.exr", "depth.Z"),
     ],
 )
-def test_companions(clpipe, write_exr, file, options, channel):
+def test_companions(clpipe, write_exr, file, pattern, channel):
     for name in ("a", "ab"):
         write_exr(f"in/{name}.exr", np.ones((4, 6, 3)))
     depth = np.arange(24.0).reshape(4, 6, 1)
     write_exr(file, depth, "Z", half=False)
     write_exr("in/ab_depth.exr", depth + 1, "Z", half=False)
-    clpipe(*RUN, "in/a.exr", "--until", "exposure", "--carry", "depth", *options)
+    clpipe(*RUN, "in/a.exr", "--until", "exposure", "--carry", f"depth{pattern}")
     np.testing.assert_array_equal(planes()[channel], depth[..., 0])
     assert json.loads(Path("out/a.json").read_text())["carried"][0]["file"] in (
         Path(file).name,
@@ -220,7 +220,7 @@ def test_companions(clpipe, write_exr, file, options, channel):
 def test_a_run_resumes_with_carried_files(clpipe, render):
     render(only=["R", "G", "B"])
     render("in/a_aux.exr", only=["View.Depth.Z", "View.IndexOB.X"])
-    run = (*RUN, "in/a.exr", *HALF, *carrying("Depth"), "--depth-png")
+    run = (*RUN, "in/a.exr", *HALF, *carrying("Depth:png"))
     there = "were there already"
     clpipe(*run)
     files, before = written(Path("out")), OUT.read_bytes()
@@ -230,7 +230,7 @@ def test_a_run_resumes_with_carried_files(clpipe, render):
         Path("out", name).unlink()
         assert there not in clpipe(*run).output
         assert (written(Path("out")), OUT.read_bytes()) == (files, before)
-    assert there in clpipe(*run, "--verify").output
+    assert there in clpipe(*run, "--redo", "damaged").output
     assert there not in clpipe(*run, *carrying("IndexOB")).output
     clpipe(*run)
     render("in/a_aux.exr", only=["View.Depth.Z"])  # another companion
@@ -256,9 +256,9 @@ def test_one_file_for_an_image_and_its_replay(clpipe, render):
     clpipe("run", "in", "-o", "bracket", "--device", "numpy", *stages, *bracket, "--carry", "Depth")
     assert Path("bracket/a.carried.exr").read_bytes() == OUT.read_bytes()
     assert "carried" in json.loads(Path("bracket/a.ev-1.json").read_text())
-    clpipe("run", "--replay", "out/a.frame0.json", "-o", "again", "--device", "numpy")
+    clpipe("replay", "out/a.frame0.json", "-o", "again", "--device", "numpy")
     assert Path("again/a.carried.exr").read_bytes() == OUT.read_bytes()
-    clpipe("run", "--replay", "out/a.frame1.json", "-o", "other", "--device", "numpy")
+    clpipe("replay", "out/a.frame1.json", "-o", "other", "--device", "numpy")
     assert not Path("other/a.carried.exr").exists()
 
 
@@ -316,7 +316,7 @@ def test_a_pipeline_moves_arrays():
         ),
         (("--carry", "two"), "has no layer called two, but several others (b, c); carry one of"),
         (("--carry", "Depth", "--carry", "View.Depth"), "are both the channel View.Depth.Z"),
-        (("--carry", "seg", "--companion", "{name}_no.exr"), "it has no companion in/a_no.exr"),
+        (("--carry", "seg={name}_no.exr"), "it has no companion in/a_no.exr"),
         (("--carry", "broken"), "a_broken.exr: cannot be read as an image"),
     ],
 )
@@ -343,9 +343,8 @@ def test_what_cannot_be_carried_fails_alone(clpipe, render, write_exr, options, 
         (("--carry", ""), "it is the name of a layer, such as Depth"),
         (("--carry", "a/b:label"), "it is the name of a layer, such as Depth"),
         (("--carry", "Z", "--carry", "z"), "--carry z: it is there twice"),
-        (("--carry", "IndexOB", "--depth-png"), "--depth-png: no depth is carried"),
-        (("--companion", "{name}_d.exr"), "--companion: it says where layers are, but none"),
-        (("--carry", "Z", "--companion", "d.exr"), "it has no {name}, which stands for the image"),
+        (("--carry", "Z=d.exr"), "its pattern has no {name}, which stands for the image"),
+        (("--carry", "Z:png="), "its pattern has no {name}"),
     ],
 )
 def test_what_cannot_be_asked_for(clpipe, render, options, message):

@@ -432,13 +432,29 @@ def test_a_burst_is_frames_and_one_truth(clpipe, write_exr, tmp_path):
 
 
 def test_a_plan_says_what_opens_a_launch(clpipe):
-    text = clpipe("plan", "-c", "paper", "--keep", "sensor_noise").stdout
-    assert "sensor_noise is kept" in text
-    assert "denoise: stencil, radius 2" in " ".join(text.split())
-    assert "white_balance: sums" in text
-    assert "slots" in text and "bytes a pixel" in text
-    white_patch = clpipe("plan", "--set", "white_balance.method=white_patch").stdout
-    assert "white_balance: histogram" in " ".join(white_patch.split())
+    def opened_by(*options):
+        launches = json.loads(clpipe("plan", *options, "--json").stdout)["launches"]
+        return [launch["opened_by"] for launch in launches]
+
+    options = ("-c", "paper", "--keep", "sensor_noise")
+    opened = opened_by(*options)
+    assert "sensor_noise is kept" in opened and "white_balance: sums" in opened
+    assert "denoise: stencil, radius 2" in opened
+    assert "white_balance: histogram" in opened_by("--set", "white_balance.method=white_patch")
+    text = clpipe("plan", *options).stdout
+    assert "sensor_noise is kept" in text and "slots" in text and "bytes a pixel" in text
+
+
+def test_a_plan_prints_the_source_of_a_launch(clpipe):
+    by_number, by_name = (
+        clpipe("plan", "--source", launch).stdout for launch in (4, "demosaic.bounded_green")
+    )
+    assert by_number == by_name and "#define LANES 8" in by_number
+    assert re.search(r"__kernel .*\nvoid launch_[0-9a-f]{16}\(", by_number)
+    for unknown in ("0", "8", "denoise"):
+        said = clpipe("plan", "--source", unknown, status=2).stderr
+        assert f"unknown launch '{unknown}'" in said and "1 lines, 2 load, 3 optical_blur" in said
+    assert "give one" in clpipe("plan", "--source", 4, "--json", status=2).stderr
 
 
 def test_a_chain_printed_as_toml_makes_the_same_picture(clpipe, small, tmp_path):

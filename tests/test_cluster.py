@@ -27,13 +27,13 @@ from clpipe.batch.dask_worker import (
     worker_environment,
 )
 from clpipe.batch.run_log import RunLog
-from clpipe.chain.request import Request
+from clpipe.batch.where import Where
+from clpipe.chain.request import ResolvedRequest
 from clpipe.commands.progress import Reporter
 from clpipe.engine.device import open_devices
 from clpipe.engine.discovery import shared_out
 from clpipe.engine.hardware import Hardware
 from clpipe.inputs.find import Job
-from clpipe.outputs.existing import AS_USUAL
 from tests.conftest import ROOT
 
 IMAGES = 40
@@ -181,7 +181,7 @@ def test_interrupted_it_finishes_what_is_in_flight(clpipe, renders, address, mon
         report(self, outcome)
         stops[0]()  # as Ctrl-C does
 
-    monkeypatch.setattr("clpipe.commands.running.interruptible", interruptible)
+    monkeypatch.setattr("clpipe.commands.progress.interruptible", interruptible)
     monkeypatch.setattr(Reporter, "report", interrupting)
     told = clpipe("run", "in", "-o", "out", "--dask", address, status=130)
     assert "not begun" in told.stderr
@@ -270,9 +270,8 @@ def test_a_trace_is_told_by_one_clock(clpipe, renders, address):
 def test_a_worker_sees_the_same_files(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "probe").touch()
-    first = Job(Path("a.exr"), "a.exr")
-    options = (("numpy",), None, None, AS_USUAL, False, "run", tmp_path)
-    spec = RunSpec(Request(formats=("jpg",)), Path("out"), *options).anchored()
+    where, first = Where(Path("out"), ("numpy",)), Job(Path("a.exr"), "a.exr")
+    spec = RunSpec(ResolvedRequest(formats=("jpg",)), where, first, "run", tmp_path).anchored()
     spec = replace(spec, first=spec.anchored_job(first))
     assert probe_worker(spec, "probe", None).startswith("does not see the output folder")
     (tmp_path / "probe").rename(tmp_path / "out" / "probe")

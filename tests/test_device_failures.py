@@ -154,8 +154,9 @@ def test_kernels_that_fail_in_a_batch_change_no_byte(device, write_exr, tmp_path
 
     def made(name):
         (tmp_path / name).mkdir()
-        writer = OutputWriter(tmp_path / name, loader.request)
-        worker = ImageWorker(loader, writer, loader.first_chain(jobs))
+        chain = loader.first_chain(jobs)
+        writer = OutputWriter(tmp_path / name, loader.request.with_outputs(chain))
+        worker = ImageWorker(loader, writer, chain)
         # Both have one context, as two on one device have: what breaks it for one does for both.
         batch = Batch(worker, [Device(device.info), Device(device.info)])
         statuses = [outcome.status for outcome in batch.run(jobs)]

@@ -264,7 +264,7 @@ def test_syb3r():
         ("iso = { normal = [800, -1] }", "the standard deviation is 0 or above"),
         ("iso = { uniform = [100, 200], sigma = 2 }", "unknown key of uniform 'sigma'"),
         ("seed = { choice = [1, 2] }", "line 1: seed: found .*cannot be drawn; iso, camera, lens"),
-        ("raw_size = { choice = ['8x8'] }", "raw_size: found .*cannot be drawn"),
+        ("dump = { choice = ['8x8'] }", "dump: found .*cannot be drawn"),
         ("camera = { uniform = [1, 2] }", "camera: found .*but it is drawn by choice"),
         ("camera = { choice = [3] }", "camera: found 3, but it is text"),
         ("[sensor_noise]\na = { uniform = [-1, 1] }", "line 2: sensor_noise.a: found -1.*greater"),

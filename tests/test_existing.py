@@ -72,13 +72,20 @@ def test_what_is_whole_and_was_changed_is_somebodys(again, clpipe, name, how):
     damaged(path, how)
     os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))  # it looks as old as before
     changed = path.read_bytes()
-    for option in ((), ("--verify",), ("--set", "sharpen.amount=0.3")):
+    for option in (
+        (),
+        (
+            "--redo",
+            "damaged",
+        ),
+        ("--set", "sharpen.amount=0.3"),
+    ):
         said = clpipe("run", "in", *RUN, *option, status=1).stderr
         sidecar = "a.truth_mosaic.json" if "truth" in name else "a.json"
         assert f"{path}: was changed since clpipe wrote it (its SHA-256 is not that in " in said
-        assert f"{sidecar})" in said and "move it, " in said and "say --overwrite" in said
+        assert f"{sidecar})" in said and "move it, " in said and "say --redo all" in said
         assert path.read_bytes() == changed
-    assert name in again("--overwrite")
+    assert name in again("--redo", "all")
     assert path.read_bytes() == before
 
 
@@ -100,7 +107,7 @@ def test_a_picture_that_somebody_edited_is_kept(clpipe, write_exr, format_):
     said = clpipe(*run, status=1).stderr
     assert f"{path}: was changed since clpipe wrote it" in said
     assert path.read_bytes() == changed
-    clpipe(*run, "--overwrite")
+    clpipe(*run, "--redo", "all")
 
 
 @pytest.mark.parametrize("format_", EVERY_FORMAT)
@@ -138,9 +145,9 @@ def test_verify_reads_everything(again):
     damaged(path, "flipped")
     os.utime("out/a.json")  # as if the sidecar had been written after that
     assert again() == []
-    assert again("--verify") != []
+    assert again("--redo", "damaged") != []
     assert path.read_bytes() == before
-    assert again("--verify") == []
+    assert again("--redo", "damaged") == []
 
 
 def test_an_input_that_only_looks_the_same(again, write_exr):
@@ -149,7 +156,7 @@ def test_an_input_that_only_looks_the_same(again, write_exr):
     assert Path("in/a.exr").stat().st_size == status.st_size
     os.utime("in/a.exr", ns=(status.st_atime_ns, status.st_mtime_ns))
     assert again() == []
-    assert again("--verify") != []
+    assert again("--redo", "damaged") != []
 
 
 def test_copied_moved_and_dated_elsewhere_it_is_done_still(again, tmp_path):
@@ -179,7 +186,7 @@ def test_a_picture_beside_our_negative_is_somebody_elses(clpipe, write_exr, tmp_
     result = clpipe(*run, "--format", "jpg", status=1)
     assert "out/a.jpg: clpipe did not write this file" in result.stderr
     assert Path("out/a.jpg").read_bytes() == before
-    clpipe(*run, "--format", "jpg", "--overwrite")
+    clpipe(*run, "--format", "jpg", "--redo", "all")
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.normalize.exr", "a.json"])
@@ -247,7 +254,7 @@ def test_pictures_of_another_program_are_made_again_and_that_is_said(again, clpi
     program("f" * 64)
     stderr = clpipe("run", "in", *RUN).stderr
     assert "2 pictures were made by another clpipe" in stderr
-    assert "and are made again; --keep-old keeps such pictures" in stderr
+    assert "and are made again; --redo missing keeps them" in stderr
     assert again() == []
     assert "another clpipe" not in clpipe("run", "in", *RUN).stderr
     assert read_log(Path("out/run.jsonl"))[-1]["of_another_program"] == 0
@@ -256,12 +263,11 @@ def test_pictures_of_another_program_are_made_again_and_that_is_said(again, clpi
 def test_pictures_of_another_program_can_be_kept(again, clpipe, program):
     before = Path("out/a.jpg").read_bytes()
     program("f" * 64)
-    for options in (("--keep-old",), ("--keep-old", "--verify")):
-        assert "and stay (--keep-old)" in clpipe("run", "in", *RUN, *options).stderr
-        assert again("--keep-old") == []
+    assert "and stay (--redo missing)" in clpipe("run", "in", *RUN, "--redo", "missing").stderr
+    assert again("--redo", "missing") == []
     assert Path("out/a.jpg").read_bytes() == before
     damaged(Path("out/a.jpg"), "cut")
-    assert "a.jpg" in again("--keep-old")  # it is kept where it is whole
+    assert "a.jpg" in again("--redo", "missing")  # it is kept where it is whole
 
 
 def test_a_tar_of_another_program(clpipe, write_exr, program):
@@ -270,7 +276,7 @@ def test_a_tar_of_another_program(clpipe, write_exr, program):
     clpipe(*run)
     program("f" * 64)
     before = Path("out/000000.tar").read_bytes()
-    assert "and stay (--keep-old)" in clpipe(*run, "--keep-old").stderr
+    assert "and stay (--redo missing)" in clpipe(*run, "--redo", "missing").stderr
     assert Path("out/000000.tar").read_bytes() == before
     assert "and are made again" in clpipe(*run).stderr
     assert Path("out/000000.tar").read_bytes() != before

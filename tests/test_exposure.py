@@ -188,7 +188,7 @@ def test_an_exposure_of_a_bracket_is_replayed(clpipe, write_exr, tmp_path, scene
     more = ("--bracket", "-1,0.333333333", "--frames", 2, "--set", "exposure.method=auto")
     clpipe("run", "view.exr", "-o", "out", *NUMPY, *more)
     for name in ("view.ev+0.333333.frame1", "view.ev-1.truth"):
-        clpipe("run", "--replay", f"out/{name}.json", "-o", "again", "--device", "numpy")
+        clpipe("replay", f"out/{name}.json", "-o", "again", "--device", "numpy")
         one, two = (tmp_path / folder / f"{name}.exr" for folder in ("out", "again"))
         assert one.read_bytes() == two.read_bytes()
 

@@ -112,25 +112,20 @@ def test_a_folder_that_cannot_be_read_is_refused(tmp_path):
     assert "in/locked: this folder cannot be read: Permission denied" in done.stderr
 
 
-def test_suffixes_are_kept_on_request(folder, clpipe, write_exr):
+def test_files_of_one_name_need_another(folder, clpipe, write_exr):
     for name in ("in/a.exr", "in/a.hdr"):
         write_exr(name, np.full((4, 6, 3), 0.25))
-    Path("list.csv").write_text("path,name\nin/a.exr,\nin/a.hdr,\nin/a.exr,mine\n")
+    Path("list.csv").write_text("path,name\nin/a.exr,\nin/a.hdr,\n")
     run = ("run", "-o", "out", "--device", "numpy")
     for inputs in (["in"], ["in/a.exr", "in/a.hdr"]):
         refused = clpipe(*run, *inputs, status=2)
-        assert "run them into different folders, or say --keep-suffix" in refused.output
-    assert "called name, or say --keep-suffix" in clpipe(*run, "list.csv", status=2).output
+        assert "run them into different folders, or name them in a manifest" in refused.output
+    assert "tell them apart in a column called name" in clpipe(*run, "list.csv", status=2).output
     refused = clpipe(*run, "in", "--webdataset", 2, status=2)
-    assert "or say --keep-suffix" in refused.output
-    clpipe(*run, "in", "--keep-suffix")
-    assert written(Path("out")) == ["a.exr.jpg", "a.exr.json", "a.hdr.jpg", "a.hdr.json"]
-    clpipe("run", "in/a.exr", "-o", "alone", "--device", "numpy", "--keep-suffix")
-    for name in ("a.exr.jpg", "a.exr.json"):
-        assert Path("alone", name).exists()
-    assert Path("alone/a.exr.jpg").read_bytes() == Path("out/a.exr.jpg").read_bytes()
-    listed = find_jobs(["list.csv"], NOWHERE, keep_suffix=True)
-    assert [job.stem for job in listed] == ["in/a.exr", "in/a.hdr", "mine"]
+    assert "give one of them another name" in refused.output
+    clpipe(*run, "in", "--exclude", "*.hdr")
+    Path("list.csv").write_text("path,name\nin/a.exr,\nin/a.hdr,other\n")
+    assert [job.stem for job in find_jobs(["list.csv"], NOWHERE)] == ["in/a", "other"]
     assert Job(Path("x"), "a.cr2").stem == "a"
 
 

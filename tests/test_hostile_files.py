@@ -165,7 +165,7 @@ def test_max_pixels_on_the_command_line_holds_for_every_reader(tmp_path, clpipe)
     (tmp_path / "a.tif").write_bytes(tiff(96, 80, 1, 16))
     ways = {
         "a.dng": [],
-        "a.raw": ["--raw-size", "96x80", "--raw-type", "uint16le"],
+        "a.raw": ["--dump", "96x80:uint16le"],
         "a.png": ["-c", "unprocess"],
         "./a.png": ["--transfer", "srgb"],
         "a.tif": ["--start-at", "normalize"],
@@ -196,7 +196,7 @@ def test_channels_far_apart_are_read_one_by_one(write_exr, monkeypatch):
 
 def test_a_dump_of_another_size_is_not_read(tmp_path, clpipe):
     os.truncate(os.open(tmp_path / "a.raw", os.O_CREAT | os.O_WRONLY), 1 << 40)  # takes no place
-    dump = ["--raw-size", "96x80", "--raw-type", "uint8", "--device", "numpy"]
+    dump = ["--dump", "96x80:uint8", "--device", "numpy"]
     done = clpipe("run", "a.raw", "-o", "out", *dump, status=1)
     assert "a.raw: 1099511627776 bytes, but 96x80 uint8 has 7680" in done.output
 
@@ -387,7 +387,7 @@ def test_a_pipe_in_the_output_folder_does_not_make_a_run_wait(clpipe, write_exr)
     os.remove("out/a.json")
     os.mkfifo("out/a.jpg")
     assert "did not write this file" in clpipe(*run, "-o", "out", status=1).output
-    clpipe(*run, "-o", "out", "--overwrite")
+    clpipe(*run, "-o", "out", "--redo", "all")
     assert Path("out/a.jpg").is_file()
     assert (
         "did not write this tar" in clpipe(*run, "-o", "tars", "--webdataset", 1, status=2).output

@@ -40,7 +40,7 @@ def test_half_a_character_in_a_sidecar(clpipe, write_exr):
     for key in ('"name": "a', '"input": "', '"image_name": "'):
         assert key in whole
         reseal(sidecar, json.loads(whole.replace(key, key + r"\ud800")))
-        again = clpipe("run", "--replay", sidecar, "-o", "again", "--device", "numpy", status=2)
+        again = clpipe("replay", sidecar, "-o", "again", "--device", "numpy", status=2)
         assert f"{sidecar}: was changed since clpipe wrote it" in again.stderr
         clpipe(*run)
         assert r"\ud800" not in sidecar.read_text()
@@ -100,5 +100,5 @@ def test_a_replay_that_cannot_be_names_its_sidecar(clpipe, write_exr):
     values = json.loads(Path("out/a.json").read_text())
     values["request"]["options"]["camera"] = "/dev/zero"
     reseal(Path("out/a.json"), values)
-    result = clpipe("run", "--replay", "out/a.json", "-o", "b", "--device", "numpy", status=2)
+    result = clpipe("replay", "out/a.json", "-o", "b", "--device", "numpy", status=2)
     assert result.stderr.startswith("clpipe: out/a.json: unknown camera '/dev/zero'")

@@ -33,7 +33,7 @@ def run(clpipe, folder, *options):
 
 def test_the_raw_has_the_noise_of_the_camera(clpipe, measured):
     noisy = run(clpipe, "noisy", "--until", "quantize")
-    clean = run(clpipe, "clean", "--until", "quantize", "--no-noise")
+    clean = run(clpipe, "clean", "--until", "quantize", "--skip", "noise")
     report = measured(f"{noisy}.exr", "--truth", f"{clean}.exr")
     noise = load_camera("sony-a7r2").noise(3200)
     assert list(report["channels"]) == ["R", "G1", "G2", "B", "mosaic"]
@@ -51,7 +51,7 @@ def test_the_raw_has_the_noise_of_the_camera(clpipe, measured):
 
 def test_row_noise_is_found_and_shared_by_the_sites_of_a_row(clpipe, measured):
     noisy = run(clpipe, "noisy", "--until", "quantize", "--set", "row_noise.sigma=0.004")
-    clean = run(clpipe, "clean", "--until", "quantize", "--no-noise")
+    clean = run(clpipe, "clean", "--until", "quantize", "--skip", "noise")
     report = measured(f"{noisy}.exr", "--truth", f"{clean}.exr")
     for one in report["channels"].values():
         assert one["row"]["sigma"] == pytest.approx(0.004, rel=0.1)
@@ -81,7 +81,7 @@ def test_repeats_measure_what_the_truth_does(clpipe, measured):
     names = [
         run(clpipe, str(seed), "--until", "normalize", "--seed", seed) + ".exr" for seed in range(6)
     ]
-    clean = run(clpipe, "clean", "--until", "normalize", "--no-noise")
+    clean = run(clpipe, "clean", "--until", "normalize", "--skip", "noise")
     repeats, against = measured(*names), measured(*names, "--truth", f"{clean}.exr")
     assert repeats["truth"] is None
     for name, one in repeats["channels"].items():
@@ -100,7 +100,7 @@ def test_repeats_measure_what_the_truth_does(clpipe, measured):
 def test_processing_correlates_noise(clpipe, measured):
     formats = ("--format", "jpg", "--format", "png", "--format", "exr", "--keep", "demosaic")
     noisy = run(clpipe, "noisy", *formats)
-    clean = run(clpipe, "clean", *formats, "--no-noise", "--skip", "denoise")
+    clean = run(clpipe, "clean", *formats, "--skip", "noise", "--skip", "denoise")
     reports = {
         ending: measured(f"{noisy}.{ending}", "--truth", f"{clean}.{ending}")
         for ending in ("jpg", "png", "exr", "demosaic.exr")
@@ -126,7 +126,7 @@ def test_processing_correlates_noise(clpipe, measured):
 
 def test_the_tables_and_the_picture(clpipe, tmp_path):
     noisy = run(clpipe, "noisy", "--until", "quantize")
-    clean = run(clpipe, "clean", "--until", "quantize", "--no-noise")
+    clean = run(clpipe, "clean", "--until", "quantize", "--skip", "noise")
     text = clpipe(
         "measure", f"{noisy}.exr", "--truth", f"{clean}.exr", "--plot", "plots/noise.png"
     ).stdout
@@ -315,7 +315,7 @@ def test_a_mosaic_that_says_nothing_is_taken_as_it_is(write_exr, measured):
 
 
 def test_no_noise_is_said_not_divided_by(clpipe, measured):
-    clean = run(clpipe, "clean", "--format", "png", "--no-noise")
+    clean = run(clpipe, "clean", "--format", "png", "--skip", "noise")
     report = measured(f"{clean}.png", "--truth", f"{clean}.png")
     assert "identical" in " ".join(report["notes"])
     for one in report["channels"].values():

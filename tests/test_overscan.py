@@ -133,7 +133,8 @@ def test_stages_before_the_lens_see_the_overscan():
     own = {
         "stages": ["shutter", "defocus", "motion_blur", "distortion"],
         "shutter": {"flicker_depth": 0.5, "line_time": 1e-3, "exposure_time": 1e-3},
-        "defocus": {"method": "thin_lens", "sensor_width": 36.0, "focus_distance": 1.0},
+        "defocus": {"method": "thin_lens", "focal_length": 200.0, "f_number": 0.5},
+        "focus_distance": 1.0,
         "motion_blur": {"length": 5.0},
     }
     x, y = places(WIDTH, HEIGHT, AROUND)
@@ -155,7 +156,7 @@ def test_stages_before_the_lens_see_the_overscan():
 
 
 def test_a_camera_turns_about_the_middle_of_the_picture():
-    turn = {"method": "perspective", "rotation": 3.0, "angle": 20.0, "focal_length": FX}
+    turn = {"method": "perspective", "rotation": 3.0, "angle": 20.0, "fx": FX}
     image = light(*places(WIDTH, HEIGHT, AROUND))
 
     def kept(image, margins):
@@ -184,7 +185,7 @@ def test_where_it_is_of_use():
 
 def test_a_render_with_overscan(clpipe, write_exr):
     write_render(write_exr, "in/a.exr")
-    carry = ("--carry", "Z", "--set", f"output.fx={FX}")
+    carry = ("--carry", "Z", "--set", f"render.fx={FX}")
     clpipe(*BEND, *carry)
     u, v = seen(WIDTH, HEIGHT)
     assert np.abs(read_image(Path("o/a.exr")).pixels - light(u, v)).max() < 0.005
@@ -200,7 +201,7 @@ def test_a_render_with_overscan(clpipe, write_exr):
     }
     # A picture of another size, or without a lens, is that of the display window.
     write_render(write_exr, "in/b.exr", NO_MARGINS)
-    clpipe(*RUN, "--stages", "motion_blur", "--set", "motion_blur.length=5", "--overwrite")
+    clpipe(*RUN, "--stages", "motion_blur", "--set", "motion_blur.length=5", "--redo", "all")
     one, two = (read_image(Path(f"o/{name}.exr")).pixels for name in "ab")
     assert np.array_equal(one, two)
     assert "overscan" not in json.loads(Path("o/a.json").read_text())
@@ -248,7 +249,7 @@ def test_sub_frames_have_the_same_windows(clpipe, write_exr):
     clpipe(*RUN, *SETS, *mean)
     assert np.abs(read_image(Path("o/a.exr")).pixels - light(*seen(WIDTH, HEIGHT))).max() < 0.005
     write_render(write_exr, "in/b.exr", Margins(1))
-    said = clpipe(*RUN, *SETS, *mean, "--overwrite", status=1).stderr
+    said = clpipe(*RUN, *SETS, *mean, "--redo", "all", status=1).stderr
     assert "72x48 with (1, 0, 0, 0) px of overscan" in said and "(15, 11, 9, 12)" in said
 
 
@@ -289,7 +290,7 @@ def test_windows_that_do_not_meet_or_are_too_far_apart(clpipe, write_exr):
     assert (read_image(Path("o/a.exr")).pixels == 0).all()
     assert "overscan" not in json.loads(Path("o/a.json").read_text())
     write_exr("in/a.exr", np.ones((1, 300, 3)), x=-100, **{"full_width": 2, "full_height": 200})
-    said = clpipe(*BEND, "--max-pixels", 1000, "--overwrite", status=1).stderr
+    said = clpipe(*BEND, "--max-pixels", 1000, "--redo", "all", status=1).stderr
     assert "300x200 pixels; at most 1000 are read" in said
 
 

@@ -10,7 +10,7 @@ from PIL import Image
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.commands.main import main
-from clpipe.images.dump import dump_of
+from clpipe.images.dump import parse_dump
 from clpipe.images.raw import read_facts, read_raw
 from clpipe.images.read import read_image
 from clpipe.images.tags import upright
@@ -316,7 +316,7 @@ def test_what_only_looks_like_a_raw(tmp_path, change, message):
         (("--stages", "mosaic,demosaic,gamma"), "no stage of the chain reads a raw"),
         (("--until", "quantize"), "normalize comes after quantize"),
         (("--frames", "2"), "no stage of this chain adds noise"),
-        (("--raw-size", "10x10"), "raw_type: found ''; expected one of uint8"),
+        (("--dump", "10x10"), "dump: found '10x10'; expected WIDTHxHEIGHT:TYPE"),
         (("--iso", "7"), "iso: found 7"),
     ],
 )
@@ -377,7 +377,7 @@ def test_dumps(tmp_path, type_, white, ending):
         "white_balance.blue_gain=1.6",
     )
     options = [o for text in (*levels, *fixed) for o in ("--set", text)]
-    size = ("--raw-size", "64x48", "--raw-type", type_)
+    size = ("--dump", f"64x48:{type_}")
     out = tmp_path / "out"
     output = clpipe("run", path, "-o", out, *size, *options, *MEASURE, "--until", "demosaic")
     assert "warning" not in output
@@ -387,7 +387,7 @@ def test_dumps(tmp_path, type_, white, ending):
 
 def test_a_dump_by_configuration_and_what_it_does_not_say(tmp_path):
     (tmp_path / "a.raw").write_bytes(packed(mosaic(), "uint16le"))
-    (tmp_path / "c.toml").write_text('raw_size = "64x48"\nraw_type = "uint16le"\n')
+    (tmp_path / "c.toml").write_text('dump = "64x48:uint16le"\n')
     command = ("run", tmp_path / "a.raw", "-o", tmp_path / "out", "-c", tmp_path / "c.toml")
     output = clpipe(*command)
     for message in (
@@ -398,18 +398,18 @@ def test_a_dump_by_configuration_and_what_it_does_not_say(tmp_path):
         "its colour matrix is unknown",
     ):
         assert output.count(message) == 1
-    assert clpipe("plan", "-c", tmp_path / "c.toml", "--toml").count('raw_size = "64x48"') == 1
-    (tmp_path / "c.toml").write_text('raw_size = "64x48"\n\nraw_type = "uint12"\n')
-    assert "c.toml, line 3: raw_type: found 'uint12'" in clpipe(*command, status=2)
+    assert clpipe("plan", "-c", tmp_path / "c.toml", "--toml").count('dump = "64x48:uint16le"') == 1
+    (tmp_path / "c.toml").write_text('iso = 200\n\ndump = "64x48:uint12"\n')
+    assert "c.toml, line 3: dump: unknown type 'uint12'" in clpipe(*command, status=2)
 
 
 def test_a_dump_of_another_size_is_told_what_would_fit(tmp_path):
     (tmp_path / "a.raw").write_bytes(bytes(64 * 48 * 2))
-    options = ("--raw-size", "64x40", "--raw-type", "uint16le")
+    options = ("--dump", "64x40:uint16le")
     output = clpipe("run", tmp_path / "a.raw", "-o", tmp_path, *options, status=1)
     assert "a.raw: 6144 bytes, but 64x40 uint16le has 5120; it would fit 64x48 uint16le" in output
     output = clpipe("run", tmp_path / "a.raw", "-o", tmp_path, status=1)
-    assert "not a raw that LibRaw knows" in output or "--raw-size" in output
+    assert "not a raw that LibRaw knows" in output or "--dump" in output
 
 
 @pytest.mark.parametrize(
@@ -417,25 +417,24 @@ def test_a_dump_of_another_size_is_told_what_would_fit(tmp_path):
     [("64", "uint8"), ("0x4", "uint8"), ("4x1", "uint8"), ("6x4", "raw10"), ("5x4", "raw12")],
 )
 def test_geometries_that_cannot_be(size, type_):
-    with pytest.raises(RequestError, match=f"raw_size: found '{size}'"):
-        dump_of(size, type_)
+    with pytest.raises(RequestError, match=f"dump: found '{size}:{type_}'"):
+        parse_dump(f"{size}:{type_}")
 
 
 # Files of real cameras, and of real accidents.
 
-DUMP = ("--raw-type", "uint16le", "--raw-size")
 MUSHFIQ = ("--set", "normalize.black_level=600", "--set", "normalize.white_level=16383")
 REAL = {
     "bep_truncated.cr2": "damaged, or not a raw that LibRaw knows",
     "exiftool_DNG.dng": "holds no pixels",
     "exiftool_Nikon.nef": "damaged, or not a raw that LibRaw knows",
-    "infisp_BlackImage_1920x1080_12bits_BGGR.raw": (*DUMP, "1920x1080"),
+    "infisp_BlackImage_1920x1080_12bits_BGGR.raw": ("--dump", "1920x1080:uint16le"),
     "magicknet_DSC8695.dng": "holds every colour at every pixel",
     "magicknet_RAW_KODAK_DC50.KDC": (),
     "mei_issue247-1.nef": "it is a JPEG, not a camera's raw",
     **{
         f"mushfiq_DSC_1339_768x512_{pattern.lower()}.raw": (
-            *(*DUMP, "768x512", *MUSHFIQ, "--set", f"mosaic.pattern={pattern}"),
+            *("--dump", "768x512:uint16le", *MUSHFIQ, "--set", f"mosaic.pattern={pattern}"),
         )
         for pattern in PATTERNS
     },
@@ -453,7 +452,7 @@ def test_real_files(shared_data, tmp_path, name, expected):
     if isinstance(expected, str):
         assert f"{path}: {expected}" in clpipe("run", path, "-o", tmp_path, status=1)
         return
-    if "--raw-size" in expected:
+    if "--dump" in expected:
         assert "a dump of samples" in clpipe("run", path, "-o", tmp_path, status=1)
     clpipe("run", path, "-o", tmp_path, *expected, "--format", "png")
     picture = developed(tmp_path / f"{path.stem}.png")
@@ -477,7 +476,7 @@ def test_four_phases_of_one_picture(shared_data, tmp_path):
         picture = developed(tmp_path / f"{path.stem}.png")[8:-8, 8:-8]
         pictures.append(picture.reshape(124, 4, 188, 4, 3).mean((1, 3)))
         pattern = name[-8:-4].upper()
-        dn = dump_of("768x512", "uint16le").unpack(path.read_bytes())
+        dn = parse_dump("768x512:uint16le").unpack(path.read_bytes())
         samples = dn.reshape(256, 2, 384, 2).transpose(0, 2, 1, 3).reshape(256, 384, 4)
         cells.append(np.stack([samples[..., pattern.index(c)] for c in "RB"], axis=-1))
     for picture, cell in zip(pictures[1:], cells[1:], strict=True):

@@ -62,7 +62,7 @@ def test_records_differ_where_bytes_do(change):
     assert records[0] != records[1]
 
 
-@pytest.mark.parametrize("change", [{"frames": None}, {"truths": ("mosaic",)}, {"max_pixels": 9}])
+@pytest.mark.parametrize("change", [{"frames": None}, {"truth": ("mosaic",)}, {"max_pixels": 9}])
 def test_records_are_equal_where_the_bytes_of_a_picture_are(change):
     records = [Request.from_options(**{**OPTIONS, **c}).record() for c in ({}, change)]
     assert records[0] == records[1]
@@ -157,7 +157,7 @@ def test_no_code_comes_from_a_sidecar(clpipe, write_exr, monkeypatch):
     write_exr("a.exr", np.full((8, 8, 3), 0.5, np.float32))
     options = ("--stages", "exposure,mine", "--format", "exr", "--device", "numpy")
     clpipe("run", "a.exr", "-o", "out", *options, "--stage-file", "mine.py")
-    replay = ("run", "--device", "numpy", "-o", "again", "--replay")
+    replay = ("replay", "--device", "numpy", "-o", "again")
     record = json.loads(Path("out/a.json").read_text())
     request = record["request"]
     named = {"stage_files": ["mine.py"]}

@@ -58,7 +58,7 @@ def test_1_no_data_runs_code(clpipe, render):
     def replay(**changes):
         edited = {**values, "request": {**values["request"], **changes}}
         reseal(Path("edited.json"), edited)
-        clpipe("run", "--replay", "edited.json", "-o", "r", *NUMPY, status=(0, 2))
+        clpipe("replay", "edited.json", "-o", "r", *NUMPY, status=(0, 2))
 
     named = {"stage_files": ["evil.py"]}
     replay(stage_files=["evil.py"], files={})
@@ -86,10 +86,10 @@ def test_2_pictures_stay_below_out(clpipe, render):
         Path("in.jsonl").write_text(json.dumps({"path": "in.exr", "name": name}))
         clpipe("run", "in.jsonl", "-o", "deep/out", *NUMPY, status=2)
         reseal(Path("deep/e.json"), {**values, "name": name})
-        clpipe("run", "--replay", "deep/e.json", "-o", "deep/out", *NUMPY, status=2)
+        clpipe("replay", "deep/e.json", "-o", "deep/out", *NUMPY, status=2)
         edited = {**values, "picture": name}
         reseal(Path("deep/e.json"), edited)
-        clpipe("run", "--replay", "deep/e.json", "-o", "deep/out", *NUMPY, status=2)
+        clpipe("replay", "deep/e.json", "-o", "deep/out", *NUMPY, status=2)
     for outputs in (["../../in.exr"], [{"name": "../../in.exr", "size": 1, "sha256": ""}]):
         reseal(Path("deep/out/in.json"), {**values, "outputs": outputs})
         clpipe("run", render, "-o", "deep/out", *NUMPY)
@@ -106,7 +106,7 @@ def test_3_no_link_is_written_through(clpipe, render):
         assert Path("victim").read_text() == "keep" and (out / name).is_symlink()
     Path("out").mkdir()
     Path("out/in.jpg").symlink_to("../victim")
-    clpipe("run", render, "-o", "out", "--overwrite", *NUMPY)
+    clpipe("run", render, "-o", "out", "--redo", "all", *NUMPY)
     assert Path("victim").read_text() == "keep" and not Path("out/in.jpg").is_symlink()
     Path("trace.json").symlink_to("victim")
     clpipe("run", render, "-o", "t", "--trace", "trace.json", *NUMPY, status=2)
@@ -130,8 +130,8 @@ def test_4_what_never_ends_is_not_read(clpipe, render, device):
         ("run", "in.exr", "-o", "o", "-c", "c.toml"),
         ("run", "in.exr", "-o", "o", "--camera", "c.toml"),
         ("run", "in.exr", "-o", "o", *CURVE),
-        ("run", "--replay", "s.json", "-o", "o"),
-        ("run", "--replay", "e.json", "-o", "o"),
+        ("replay", "s.json", "-o", "o"),
+        ("replay", "e.json", "-o", "o"),
     ):
         clpipe(*arguments, *NUMPY, status=(1, 2))
 

@@ -34,7 +34,7 @@ def test_each_member_is_as_if_it_were_made_alone(clpipe, renders, tmp_path):
     clpipe("run", "renders", "-o", "all", *NUMPY, *TWO[:4], "--iso", "100,1600,400")
     end = json.loads((tmp_path / "all/run.jsonl").read_text().splitlines()[-1])
     assert (end["done"], end["skipped"]) == (4, 8)
-    clpipe("run", "--replay", "all/canon-5d2/iso400/b/c.json", "-o", "again", *NUMPY[:2])
+    clpipe("replay", "all/canon-5d2/iso400/b/c.json", "-o", "again", *NUMPY[:2])
     again = tmp_path / "again/canon-5d2/iso400/b/c.jpg"
     assert again.read_bytes() == (tmp_path / "all/canon-5d2/iso400/b/c.jpg").read_bytes()
 

@@ -18,7 +18,7 @@ from clpipe.outputs.sealed import SEAL, SidecarError, read_sidecar, sealed, valu
 from tests.conftest import reseal
 
 CHANGED = f"was changed since clpipe wrote it (its {SEAL} does not fit)"
-CAMERA = ("--set", "output.fx=30", "--set", "output.fy=30")
+CAMERA = ("--set", "render.fx=30", "--set", "render.fy=30")
 
 
 @pytest.fixture
@@ -82,7 +82,7 @@ def test_an_edited_sidecar_is_a_missing_one(made, clpipe, edit):
         assert "the same clpipe run makes it again" in said
     views = json.loads(Path("out/cameras.json").read_text())["views"]
     assert [view["file"] for view in views] == ["b.jpg"]
-    said = clpipe("run", "--replay", sidecar, "-o", "again", status=2).stderr
+    said = clpipe("replay", sidecar, "-o", "again", status=2).stderr
     assert said.startswith(f"clpipe: {sidecar}: {CHANGED}")
     assert "options or in a configuration" in said
     assert made() == {"a": "done", "b": "skipped"}
@@ -141,7 +141,7 @@ def edited(values, at, value):
     return values
 
 
-NUMPY = ("-o", "b", "--device", "numpy", "--overwrite")
+NUMPY = ("-o", "b", "--device", "numpy", "--redo", "all")
 
 PATCHES = ("--patch", 4, "--patches-per-image", 2, "--keep", "normalize", "--format", "png")
 
@@ -167,7 +167,7 @@ def test_whatever_a_forged_sidecar_holds_no_command_ends_in_a_traceback(made, cl
     for key in whole["request"]:
         for odd in luck.sample(ODD, 4):
             reseal(Path("e.json"), edited(whole, ("request", key), odd))
-            again = clpipe("run", "--replay", "e.json", *NUMPY, status=(0, 1, 2))
+            again = clpipe("replay", "e.json", *NUMPY, status=(0, 1, 2))
             assert "unexpected" not in again.stderr, (key, odd)
 
 

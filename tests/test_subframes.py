@@ -70,10 +70,10 @@ def test_a_run_is_resumed_and_replayed_with_all_frames(frames, clpipe, write_exr
     options = ("--set", "shutter.subframes=8", "--device", "numpy")
     clpipe("run", "in", "-o", "o", *options)
     assert "there already" in clpipe("run", "in", "-o", "o", *options).stderr
-    clpipe("run", "--replay", "o/f00.json", "-o", "r", "--device", "numpy")
+    clpipe("replay", "o/f00.json", "-o", "r", "--device", "numpy")
     assert Path("r/f00.jpg").read_bytes() == Path("o/f00.jpg").read_bytes()
     write_exr("in/f05.exr", np.full((24, 40, 3), 0.3, np.float16))
-    again = clpipe("run", "--replay", "o/f00.json", "-o", "r2", status=2)
+    again = clpipe("replay", "o/f00.json", "-o", "r2", status=2)
     assert "f05.exr" in again.stderr and "changed" in again.stderr
     assert "there already" not in clpipe("run", "in", "-o", "o", *options).stderr
 

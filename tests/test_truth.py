@@ -158,13 +158,13 @@ def test_what_lies_beside_a_picture(clpipe, write_exr):
     }
     again = ("run", "a.exr", "-o", "o", "--iso", 3200, *ALL, "--keep", "normalize")
     assert "there already" in clpipe(*again).stderr
-    clpipe("run", "--replay", "o/a.truth.json", "-o", "r")
+    clpipe("replay", "o/a.truth.json", "-o", "r")
     assert set(written(Path("r"))) == {"a.truth.jpg", "a.truth.json"}
     noisy, truth, variance = (
         exr(f"o/a.{x}.exr") for x in ("normalize", "truth_mosaic", "truth_variance")
     )
     assert 0.9 < ((noisy.pixels - truth.pixels) ** 2 / variance.pixels).mean() < 1.1
-    clpipe("run", "a.exr", "-o", "q", "--iso", 3200, "--no-noise", "--until", "normalize")
+    clpipe("run", "a.exr", "-o", "q", "--iso", 3200, "--skip", "noise", "--until", "normalize")
     assert np.array_equal(truth.pixels, exr("q/a.exr").pixels)
     assert (truth.attributes["stage"], truth.attributes["kind"]) == ("normalize", "mosaic")
     assert variance.attributes["kind"] == "variance"
@@ -248,7 +248,7 @@ def test_the_clean_picture_is_written_kept_and_entered_again(clpipe, write_exr):
     clpipe("run", "a.exr", "-o", "o", "--iso", 3200, *run, *truths, "--keep", "demosaic")
     clpipe("run", "o/a.truth_clean.demosaic.exr", "-o", "b", "--start-at", "denoise", *run)
     clpipe("run", "o/a.truth.demosaic.exr", "-o", "b", "--start-at", "denoise", *run)
-    clpipe("run", "--replay", "o/a.truth_clean.json", "-o", "c", *run[:2])
+    clpipe("replay", "o/a.truth_clean.json", "-o", "c", *run[:2])
     (clean, *cleans), (other, again) = (
         [read_image(Path(name), False).pixels for name in names]
         for names in (

@@ -119,10 +119,8 @@ def test_a_sidecar_makes_its_picture_again(clpipe, renders):
     clpipe("run", renders(5), *RUN)
     sample = samples("out/000001.tar")[0]
     Path("one.json").write_bytes(sample["json"])
-    clpipe("run", "--replay", "one.json", "-o", "again")
+    clpipe("replay", "one.json", "-o", "again")
     assert Path("again/r_004.jpg").read_bytes() == sample["jpg"]
-    result = clpipe("run", "--replay", "one.json", *RUN[:2], *RUN[4:], status=2)
-    assert "--webdataset: the sidecar says it" in result.stderr
 
 
 def test_a_manifest(clpipe, renders):
@@ -151,7 +149,7 @@ def test_a_second_run_makes_nothing(clpipe, renders):
     clpipe("run", "in", *RUN)
     assert stamps("out") == before
     assert set(statuses("out").values()) == {"skipped"}
-    clpipe("run", "in", *RUN, "--overwrite")
+    clpipe("run", "in", *RUN, "--redo", "all")
     assert all(before[name] != at for name, at in stamps("out").items())
 
 
@@ -247,7 +245,7 @@ def test_a_tar_of_another_hand_is_not_written_over(clpipe, renders, text):
     result = clpipe("run", "in", *RUN, status=2)
     assert "out/000000.tar: clpipe did not write this tar" in result.stderr
     assert path.read_bytes() == before
-    clpipe("run", "in", *RUN, "--overwrite")
+    clpipe("run", "in", *RUN, "--redo", "all")
     assert len(samples(path)) == 2
 
 
@@ -417,7 +415,7 @@ def test_patches_in_a_folder(clpipe, renders):
     clpipe(*run)
     assert list(statuses("plain").values()).count("skipped") == 1
     assert contents("plain") == whole
-    clpipe("run", "--replay", "plain/r.000.json", "-o", "again")
+    clpipe("replay", "plain/r.000.json", "-o", "again")
     assert contents("again") == {n: whole[n] for n in whole if n.startswith("r.000")}
 
 

@@ -116,4 +116,4 @@ def context_after(settings: Settings, stage: str | None) -> Context:
         RequestError: the chain has no such stage.
     """
     step = make_chain(settings).step_named(stage or "")
-    return step.method.after(step.context)
+    return step.method.next_context(step.context)

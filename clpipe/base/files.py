@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.errors import ImageError
 from clpipe.base.reading import check_regular
-from clpipe.base.steps import Step
 from clpipe.base.system import bring_to_disk
 
 
-@Step("hash")
+@CpuTimer("hash")
 def sha256_of(path: Path) -> tuple[str, int]:
     """The SHA-256 of a file, and its size in bytes.
 
@@ -93,7 +93,7 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
         _unfinished.discard(beside)
 
 
-@Step("write")
+@CpuTimer("write")
 def write_whole(path: Path, *parts: bytes | memoryview) -> Stored:
     """Write a file, all of it or nothing; an existing one is replaced.
 
@@ -108,7 +108,7 @@ def write_whole(path: Path, *parts: bytes | memoryview) -> Stored:
     with whole_file(path) as file:
         for part in parts:
             file.write(part)
-            with Step("hash"):
+            with CpuTimer("hash"):
                 digest.update(part)
             size += len(part)
     return Stored(size, digest.hexdigest())

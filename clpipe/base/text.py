@@ -1,7 +1,8 @@
 """Text for messages: suggestions for misspelt names, and text that is safe to print."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
+from pathlib import Path
 
 
 def one_of(what: str, found: str, allowed: Iterable[str], nearest: str | None = None) -> str:
@@ -55,3 +56,12 @@ def duration(seconds: float) -> str:
     if minutes < 60:
         return f"{minutes} min {rest:02} s"
     return f"{minutes // 60} h {minutes % 60:02} min"
+
+
+def several(values: str | int | Path | Sequence[str | int | Path]) -> tuple[str, ...]:
+    """One value or several as texts.
+
+    >>> several("a"), several((0, Path("b")))
+    (('a',), ('0', 'b'))
+    """
+    return tuple(map(str, [values] if isinstance(values, str | int | Path) else values))

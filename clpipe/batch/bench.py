@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from clpipe.base.cpu_time import CpuTimer, CpuTimes
 from clpipe.base.errors import ImageError
 from clpipe.base.memory import peak_memory
 from clpipe.base.processors import available_processors
-from clpipe.base.steps import Step, StepTimes
 from clpipe.batch.outcome import DONE, STEPS, Span
 from clpipe.batch.threads import Batch
 from clpipe.batch.work import ImageWorker
@@ -102,9 +102,10 @@ def bench_batch(device: Device, request: Request, load: Load) -> BatchSpeed:
         folder = Path(name)
         write_renders(folder / "in", load)
         loader = ImageLoader(request)
-        writer = OutputWriter(folder / "out", replace(request, formats=("jpg",)))
         jobs = find_jobs([str(folder / "in")], folder / "out")
         chain = loader.first_chain(jobs)
+        resolved = replace(request, formats=("jpg",)).with_outputs(chain)
+        writer = OutputWriter(folder / "out", resolved)
 
         def batch() -> Batch:
             shutil.rmtree(folder / "out", ignore_errors=True)
@@ -116,7 +117,7 @@ def bench_batch(device: Device, request: Request, load: Load) -> BatchSpeed:
         forget_peak_memory()
         timed = batch()
         start = time.perf_counter()
-        with StepTimes() as times, Step("Python"):
+        with CpuTimes() as times, CpuTimer("Python"):
             outcomes = list(timed.run(jobs))
         seconds = time.perf_counter() - start
         peak = peak_memory()

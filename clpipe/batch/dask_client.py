@@ -141,7 +141,7 @@ class Cluster:
         first = next((job for job in able if not takes(job.path)), able[0])
         spec = replace(self._spec, first=first)
         size = first.path.stat().st_size if first.path.is_file() else None
-        probe = spec.output / f".clpipe.{spec.run}"
+        probe = spec.where.output / f".clpipe.{spec.run}"
         try:
             probe.touch()
             environments = self._client.run(probe_worker, spec, probe.name, size, on_error="return")
@@ -181,7 +181,7 @@ class Cluster:
             self._finish()
             raise
         patches = self._spec.request.patch is not None
-        remove_unfinished(self._spec.output, jobs, patches)  # by workers that died
+        remove_unfinished(self._spec.where.output, jobs, patches)  # by workers that died
         if failure:
             raise failure
 

@@ -20,15 +20,15 @@ from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.room import usual_room
 from clpipe.batch.threads import Batch
+from clpipe.batch.where import Where
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.paths import from_folder
-from clpipe.chain.request import Request
+from clpipe.chain.request import ResolvedRequest
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.discovery import DeviceInfo, choose_all, find_devices
 from clpipe.images.write import versions
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.existing import Resuming
 from clpipe.outputs.folder import write_problem
 from clpipe.outputs.program import program_digest
 from clpipe.outputs.writer import OutputWriter
@@ -40,30 +40,21 @@ class RunSpec:
 
     Args:
         request: what is asked for.
-        output: the output folder.
-        selectors: of the devices, as ``--device`` has them.
-        memory: of a device, in bytes; None is what is free.
-        threads: as for :class:`clpipe.batch.threads.Batch`.
-        resuming, trace: as for :class:`clpipe.batch.work.ImageWorker`.
+        where: to which folder, and with which devices of a worker.
+        first: the job whose chain is compiled early.
         run: a name that no other run has.
         folder: where relative paths start.
         workers: the addresses of all workers there are.
         environment: what every worker must be.
-        first: the job whose chain is compiled early.
     """
 
-    request: Request
-    output: Path
-    selectors: tuple[str, ...]
-    memory: int | None
-    threads: int | None
-    resuming: Resuming
-    trace: bool
+    request: ResolvedRequest
+    where: Where
+    first: Job
     run: str = field(default_factory=lambda: secrets.token_hex(8))
     folder: Path = field(default_factory=Path.cwd)
     workers: tuple[str, ...] = ()
     environment: "WorkerEnvironment | None" = None
-    first: Job | None = None
 
     def anchored(self) -> "RunSpec":
         """The same run with names of files absolute, for workers in other folders."""
@@ -74,7 +65,8 @@ class RunSpec:
             options=from_folder(folder, asked.options),
             image=from_folder(folder, asked.image),
         )
-        return replace(self, request=request, output=folder / self.output)
+        where = replace(self.where, output=folder / self.where.output)
+        return replace(self, request=request, where=where)
 
     def anchored_job(self, job: Job) -> Job:
         """A job of the run with names of files absolute."""
@@ -180,15 +172,14 @@ def probe_worker(spec: RunSpec, probe: str, size: int | None) -> WorkerEnvironme
         size: of the first input, in bytes; None where nobody can see it.
     """
     try:
-        environment = worker_environment(spec.selectors)
+        environment = worker_environment(spec.where.devices)
     except ClpipeError as error:
         return str(error)
-    assert spec.first
-    path = spec.first.path
-    if not (spec.output / probe).exists():
-        return f"does not see the output folder {spec.output}"
-    if reason := write_problem(spec.output):
-        return f"{spec.output}: {reason}"
+    path, output = spec.first.path, spec.where.output
+    if not (output / probe).exists():
+        return f"does not see the output folder {output}"
+    if reason := write_problem(output):
+        return f"{output}: {reason}"
     if size is not None and (not path.exists() or path.stat().st_size != size):
         return f"does not see the input {path}"
     return environment
@@ -210,7 +201,7 @@ def run_chunk(spec: RunSpec, jobs: Sequence[Job]) -> ChunkReport:
     error = None
     with _one_chunk:
         try:
-            environment = worker_environment(spec.selectors)
+            environment = worker_environment(spec.where.devices)
             if environment != spec.environment:
                 check_same_environment(
                     {"the others": spec.environment, worker.address: environment}
@@ -239,12 +230,15 @@ def _batch(spec: RunSpec, threads: int, share: tuple[int, int]) -> Batch:
         threads: where the run does not say how many.
         share: which of the workers of this machine this one is, and of how many.
     """
-    assert spec.first
-    loader, writer = ImageLoader(spec.request, spec.folder), OutputWriter(spec.output, spec.request)
+    where = spec.where
+    loader, writer = (
+        ImageLoader(spec.request, spec.folder),
+        OutputWriter(where.output, spec.request),
+    )
     chain = loader.first_chain([spec.first])
-    worker = ImageWorker(loader, writer, chain, spec.resuming, spec.trace)
-    devices = _devices(spec.selectors, spec.memory, share)
-    return Batch(worker, devices, spec.threads or threads, usual_room(share[1]))
+    worker = ImageWorker(loader, writer, chain, where.redo, where.trace is not None)
+    devices = _devices(where.devices, where.memory, share)
+    return Batch(worker, devices, where.threads or threads, usual_room(share[1]))
 
 
 def halt(run: str) -> None:

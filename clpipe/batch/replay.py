@@ -143,12 +143,12 @@ def _values(path: Path) -> dict[str, Any]:
         values = read_sidecar(path)
     except FileNotFoundError:
         reason = "it is empty" if path.exists() else "no such file"
-        raise RequestError(f"{path}: {reason}; --replay takes a sidecar") from None
+        raise RequestError(f"{path}: {reason}; clpipe replay takes a sidecar") from None
     except SidecarError as error:
         raise RequestError(str(error)) from None
     except ImageError:
         raise RequestError(
-            f"{path}: clpipe did not write this file; --replay takes a sidecar"
+            f"{path}: clpipe did not write this file; clpipe replay takes a sidecar"
         ) from None
     if values["clpipe"] != __version__:
         raise RequestError(

@@ -16,6 +16,7 @@ from clpipe.base.about import full_version
 from clpipe.base.errors import OutputError
 from clpipe.base.memory import peak_memory
 from clpipe.base.system import open_plain
+from clpipe.batch.interrupt import INTERRUPTED
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS, Outcome
 from clpipe.engine.clipping import MUCH
 from clpipe.inputs.find import Shard
@@ -72,9 +73,10 @@ class Summary:
         return sum(self.counts.values())
 
     @property
-    def is_fruitless(self) -> bool:
-        """Whether images were left out, and there is a picture of none."""
-        return self.counts[LEFT_OUT] > 0 == self.counts[DONE] + self.counts[SKIPPED]
+    def exit_status(self) -> int:
+        """What a command ends with: 130 after an interruption, 1 where something is missing."""
+        is_fruitless = self.counts[LEFT_OUT] > 0 == self.counts[DONE] + self.counts[SKIPPED]
+        return INTERRUPTED if self.interrupted else int(bool(self.failures or is_fruitless))
 
     @property
     def elapsed(self) -> float:

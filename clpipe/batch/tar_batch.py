@@ -21,13 +21,14 @@ from clpipe.base.files import Stored, keep_names, passing_files, whole_file
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, Outcome
 from clpipe.batch.tars import OF_PATCHES, STAGING, Members, Tar, prepare
 from clpipe.batch.threads import Batch
+from clpipe.batch.where import Where
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.chain import Chain
 from clpipe.chain.rendition import FIRST, Rendition
 from clpipe.engine.device import Device
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.existing import AS_USUAL, Existing, Found, Resuming, found_in
+from clpipe.outputs.existing import Existing, Found, Redo, found_in
 from clpipe.outputs.folder import RESUMABLE
 from clpipe.outputs.sealed import SIDECAR, outputs_in, read_sidecar
 from clpipe.outputs.sidecar import patch_text
@@ -86,7 +87,7 @@ class Packer:
         return path.relative_to(self._tar.staging).as_posix()
 
     def found(
-        self, job: Job, rendition: Rendition, request: Mapping[str, Any], resuming: Resuming
+        self, job: Job, rendition: Rendition, request: Mapping[str, Any], redo: Redo
     ) -> Found:
         """Whether the tar holds a rendition that was made by the same request.
 
@@ -101,14 +102,14 @@ class Packer:
         pictures = {path.name for path in self._writer.existing(job, rendition).pictures}
         if not pictures <= listed.keys():
             return Found.NOTHING
-        found = found_in(values, job, request, resuming.verify)
+        found = found_in(values, job, request, redo.verifies)
         if found is Found.NOTHING:
             return found
         beside = PurePosixPath(member.removeprefix(OF_PATCHES))
         files = {str(beside.with_name(n)): was for n, was in listed.items()}
         if any(self._old.sha256(file) != was["sha256"] for file, was in files.items()):
             return Found.NOTHING
-        if resuming.is_kept(found):
+        if redo.keeps(found):
             self._reused[member] = list(files)
         return found
 
@@ -225,7 +226,7 @@ class TarWorker(ImageWorker):
 
     def found(self, job: Job, rendition: Rendition, request: Mapping[str, Any]) -> Found:
         """Whether a rendition is done, in its tar or in the folder that will be packed."""
-        packed = self._packers.of(job).found(job, rendition, request, self._resuming)
+        packed = self._packers.of(job).found(job, rendition, request, self._redo)
         if packed is not Found.NOTHING:
             return packed
         # After a loss of power a passing file may have its size and time, but not its bytes.
@@ -253,8 +254,9 @@ class TarBatch(Batch):
 
     Args:
         tars: what is made.
-        loader, writer, chain, resuming, trace: as for :class:`clpipe.batch.work.ImageWorker`.
-        devices, threads: as for the base.
+        loader, writer, chain: as for :class:`clpipe.batch.work.ImageWorker`.
+        where: how the run goes about it.
+        devices: as for the base.
     """
 
     def __init__(
@@ -263,18 +265,18 @@ class TarBatch(Batch):
         loader: ImageLoader,
         writer: OutputWriter,
         chain: Chain,
+        where: Where,
         devices: Sequence[Device | None],
-        threads: int | None = None,
-        resuming: Resuming = AS_USUAL,
-        trace: bool = False,
     ) -> None:
         folders = {job.stem: tar.staging.name for tar in tars for job in tar.jobs}
         staged = StagedWriter(writer.folder, writer.request, folders)
         self._tars = tars
-        self._resuming = resuming
+        self._redo = where.redo
         self._packers = Packers(tars, staged)
-        worker = TarWorker(self._packers, loader, staged, chain, resuming, trace)
-        super().__init__(worker, devices, threads)
+        worker = TarWorker(
+            self._packers, loader, staged, chain, where.redo, where.trace is not None
+        )
+        super().__init__(worker, devices, where.threads)
 
     def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
         """Do every job, as the base does; a tar is packed while the next one is made.
@@ -286,7 +288,7 @@ class TarBatch(Batch):
             OutputError: nothing can be written any more.
             DeviceError: a kernel does not compile.
         """
-        prepare(self._tars, self._resuming.overwrite)
+        prepare(self._tars, self._redo is Redo.ALL)
         packing: Future[None] | None = None
         with ThreadPoolExecutor(1, "pack") as pool:
             for outcome in super().run(jobs):

@@ -70,8 +70,7 @@ def cut(jobs: Sequence[Job], count: int, folder: Path) -> list[Tar]:
         if name in owners:
             raise RequestError(
                 f"{owners[name].label} and {job.label} would both be the sample {name} "
-                "(a key of WebDataset has no dots); give one of them another name, "
-                "or say --keep-suffix"
+                "(a key of WebDataset has no dots); give one of them another name"
             )
         if HIDDEN_BY_READERS.match(name):
             raise RequestError(
@@ -111,7 +110,7 @@ def prepare(tars: Sequence[Tar], overwrite: bool) -> None:
         if not overwrite and os.path.lexists(tar.path) and not is_own(tar.path):
             raise RequestError(
                 f"{tar.path}: clpipe did not write this tar, or it is damaged, and would be "
-                "overwritten; move it, choose another output folder, or say --overwrite"
+                "overwritten; move it, choose another output folder, or say --redo all"
             )
 
 

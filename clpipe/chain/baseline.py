@@ -26,9 +26,9 @@ def baseline_of(chain: Chain) -> Chain:
     """
     step = next((step for step in chain.steps if step.name == STEP), None)
     if step is None:
-        raise RequestError(f"--baseline: its noise is that of {STEP}, and this chain has none")
+        raise RequestError(f"--truth: a baseline has the noise of {STEP}, which this chain has not")
     if step.adds_noise:
-        raise RequestError(f"--baseline: {STEP} adds noise already; leave one of them out")
+        raise RequestError(f"--truth: {STEP} adds noise already; leave one of them out")
     clean = picture_without_noise(CLEAN, chain)
     steps = *(each for each in clean.steps if each.name != STEP), step
     return with_noise(replace(clean, steps=steps), IidGaussian(sigma=(0.0, 0.0, 0.0)))

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import get_args
+from typing import cast, get_args
 
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
@@ -12,49 +12,57 @@ from clpipe.reference.carried import LayerKind
 VALID = "valid"  # the channel that says which pixels are known
 
 
+PNG = "png"  # a kind: depth, which is written as a PNG, too
+
+
 @dataclass(frozen=True)
 class Carry:
-    """A layer to carry: its name, and what it holds; None where only the file may say that."""
+    """A layer to carry.
+
+    Args:
+        name: what it is called.
+        kind: what it holds; None where only the file may say that.
+        pattern: of the name of the file that holds it; "" is one of the usual names.
+        png: whether it is depth that is written as a PNG, too.
+    """
 
     name: str
     kind: LayerKind | None
+    pattern: str = ""
+    png: bool = False
 
 
 def parse_carry(texts: Sequence[str]) -> tuple[Carry, ...]:
-    """Layers from texts of the form NAME or NAME:KIND.
+    """Layers from texts of the form NAME[:KIND][=PATTERN].
 
-    >>> parse_carry(["Depth", "nn:normal"])
-    (Carry(name='Depth', kind='depth'), Carry(name='nn', kind='normal'))
+    >>> parse_carry(["Depth", "nn:normal"])[1]
+    Carry(name='nn', kind='normal', pattern='', png=False)
+    >>> parse_carry(["Z:png=../z/{name}.exr"])
+    (Carry(name='Z', kind='depth', pattern='../z/{name}.exr', png=True),)
 
     Raises:
-        RequestError: a name is empty, cannot be a part of a file's name, or is there twice, or a
-            kind does not exist.
+        RequestError: a name is empty, cannot be a part of a file's name, or is there twice, a kind
+            does not exist, or a pattern has no place for the image's name.
     """
+    kinds = (*get_args(LayerKind), PNG)
     found: dict[str, Carry] = {}
     for text in texts:
-        name, colon, kind = text.rpartition(":")
-        name, kind = (name, kind) if colon else (text, "")
-        if colon and kind not in get_args(LayerKind):
-            raise RequestError(f"--carry {text}: {one_of('kind', kind, get_args(LayerKind))}")
+        layer, equals, pattern = text.partition("=")
+        name, colon, kind = layer.rpartition(":")
+        name, kind = (name, kind) if colon else (layer, "")
+        if colon and kind not in kinds:
+            raise RequestError(f"--carry {text}: {one_of('kind', kind, kinds)}")
         if not name or not name.isprintable() or "/" in name or name.lower() == VALID:
             raise RequestError(
                 f"--carry {text!r}: it is the name of a layer, such as Depth, and not {VALID}"
             )
+        if equals and ("{name}" not in pattern or "\0" in pattern):
+            raise RequestError(
+                f"--carry {text!r}: its pattern has no {{name}}, which stands for the image's name "
+                "without its ending, as in 'Depth={name}_depth.exr' or 'Depth=../depth/{name}.exr'"
+            )
         if name.lower() in found:
             raise RequestError(f"--carry {name}: it is there twice")
-        known = next((each for each in get_args(LayerKind) if each == kind), kind_named(name))
-        found[name.lower()] = Carry(name, known)
+        known = "depth" if kind == PNG else kind or kind_named(name)
+        found[name.lower()] = Carry(name, cast("LayerKind | None", known), pattern, kind == PNG)
     return tuple(found.values())
-
-
-def check_companion(pattern: str) -> None:
-    """See that a pattern names files beside an image.
-
-    Raises:
-        RequestError: it does not.
-    """
-    if "{name}" not in pattern or "\0" in pattern:
-        raise RequestError(
-            f"--companion {pattern!r}: it has no {{name}}, which stands for the image's name "
-            "without its ending, as in '{name}_depth.exr' or '../depth/{name}.exr'"
-        )

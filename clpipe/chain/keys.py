@@ -10,17 +10,18 @@ CODE = "stage_files"  # the key that only a configuration file may have
 LENS = ("lens", "focal_length", "aperture", "focus_distance")  # how a lens is named and set
 
 KEYS = (
-    *("camera", "iso", *LENS, "seed", "noise_key", "raw_size", "raw_type", "stages", "skip"),
+    *("camera", "iso", *LENS, "seed", "noise_key", "dump", "stages", "skip"),
     CODE,
 )
 
-OUTPUT = "output"  # the one table that belongs to no stage
+OUTPUT, RENDER = "output", "render"  # the tables that belong to no stage
+TABLES = (OUTPUT, RENDER)
 
 DRAWABLE = (
     "iso",
     "camera",
     *LENS,
-)  # of the keys; parameters of stages and of the output can be, too
+)  # of the keys; parameters of stages and of other tables can be, too
 
 MAX_ISO = 10**9
 
@@ -34,7 +35,7 @@ TYPES: dict[str, tuple[str, Any]] = {
     "iso": ("a number", int | float),
     "seed": ("a whole number", int),
     **dict.fromkeys(LENS[1:], ("a number", int | float)),
-    **dict.fromkeys(("camera", "lens", "noise_key", "raw_size", "raw_type"), ("text", str)),
+    **dict.fromkeys(("camera", "lens", "noise_key", "dump"), ("text", str)),
 }
 
 # What a value is, for people, and its unit.
@@ -43,8 +44,8 @@ ABOUT: dict[str, tuple[str, str]] = {
         "A lens of lensfun's database: its distortion, lateral colour and vignetting.",
         "",
     ),
-    "focal_length": ("That of a zoom lens.", "mm"),
-    "aperture": ("The lens's f-number; without it, no vignetting.", ""),
+    "focal_length": ("The lens's focal length.", "mm"),
+    "aperture": ("The lens's f-number; without it, a lens by name does not vignette.", ""),
     "focus_distance": ("Where the lens is focused; without it, far away.", "m"),
     "seed": ("The seed of the noise.", ""),
     "noise_key": (

@@ -30,7 +30,7 @@ def with_overscan(chain: Chain, margins: Margins) -> Chain:
     """
     count = steps_of_overscan(chain)
     steps = tuple(
-        replace(step, method=step.method.around(margins)) if number < count else step
+        replace(step, method=step.method.with_margins(margins)) if number < count else step
         for number, step in enumerate(chain.steps)
     )
     return replace(chain, steps=steps, margins=margins)

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -13,22 +13,19 @@ from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
 from clpipe.base.validation import first_fault
-from clpipe.chain.carry import Carry, check_companion, parse_carry
+from clpipe.chain.carry import Carry, parse_carry
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.files import load_config
 from clpipe.chain.formats import EVERY_FORMAT, NPY
-from clpipe.chain.keys import KEYS, NOISE, OUTPUT
+from clpipe.chain.keys import KEYS, TABLES
 from clpipe.chain.registry import code_files, load_stage_file
-from clpipe.chain.rendition import MOSAIC
+from clpipe.chain.rendition import BASELINES, MOSAIC, TRUTHS
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import parse_assignment
 from clpipe.chain.truth import noisy_mosaic
 from clpipe.stage import Kind
 
 DEFAULTS = Settings()
-
-# What goes along with the first picture of an image.
-CARRY = ("carry", "companions", "depth_png")
 
 MOST_PATCHES = 9999  # of an image; the names of their files have four digits
 
@@ -56,8 +53,6 @@ class Recorded(BaseModel):
     patches_per_image: Annotated[int, Field(ge=0, le=MOST_PATCHES)] | Literal["grid"]
     augment: bool
     carry: list[str]
-    companions: list[str]
-    depth_png: bool
 
     @model_validator(mode="after")
     def _has_patches(self) -> "Recorded":
@@ -67,6 +62,8 @@ class Recorded(BaseModel):
 
 
 RECORDED = tuple(Recorded.model_fields)
+
+R = TypeVar("R", bound="Request")
 
 
 @dataclass(frozen=True)
@@ -90,10 +87,6 @@ class Request:
         truths: which of :data:`clpipe.chain.rendition.TRUTHS` are written beside each picture.
         carry: layers that go along with each picture, as :func:`clpipe.chain.carry.parse_carry`
             reads them.
-        companions: patterns of the names of files that hold them; () are those beside an image.
-        depth_png: write carried depth as PNG, too.
-        truth_keep: steps whose image is written beside a truth that is a picture; None is
-            ``keep``. See :meth:`with_outputs`.
         bracket: what is added to the exposure's EV, for each exposure that is made of each image;
             () is one exposure.
         baselines: which of :data:`clpipe.chain.rendition.BASELINES` are made beside each picture.
@@ -115,11 +108,8 @@ class Request:
     formats: tuple[str, ...] = ()
     keep: tuple[str, ...] = ()
     carry: tuple[str, ...] = ()
-    companions: tuple[str, ...] = ()
-    depth_png: bool = False
     frames: int | None = None
     truths: tuple[str, ...] = ()
-    truth_keep: tuple[str, ...] | None = None
     bracket: tuple[float, ...] = ()
     baselines: tuple[str, ...] = ()
     patch: int | None = None
@@ -142,40 +132,41 @@ class Request:
         assignments: Sequence[str] = (),
         stages: str | None = None,
         skip: Sequence[str] = (),
-        no_noise: bool = False,
         stage_files: Sequence[Path] = (),
-        raw_size: str | None = None,
-        raw_type: str | None = None,
+        dump: str | None = None,
         values: Mapping[str, Any] | None = None,
+        truth: Sequence[str] = (),
         **fields_: Any,
     ) -> "Request":
         """The request of command-line options; None and () are options that are not set.
 
         Args:
             config: the name of a built-in configuration, or of a TOML file.
-            camera, iso, seed, noise_key, skip, raw_size, raw_type: settings.
+            camera, iso, seed, noise_key, skip, dump: settings.
             lens, focal_length, aperture, focus_distance: settings.
-            no_noise: skip the noise of every stage.
             assignments: texts of the form ``stage.parameter=value``.
             stages: names, separated by commas.
             stage_files: as for the class.
             values: further settings, nested.
+            truth: truths and baselines that are written beside each picture.
             **fields_: further fields of the class.
 
         Raises:
             RequestError: a name or value that is not allowed.
         """
+        for name in truth:
+            if name not in (*TRUTHS, *BASELINES):
+                raise RequestError(f"--truth: {one_of('truth', name, (*TRUTHS, *BASELINES))}")
         for file in stage_files:
             load_stage_file(file)
-        plain = {"camera": camera, "iso": iso, "seed": seed, "noise_key": noise_key}
+        plain = {"camera": camera, "iso": iso, "seed": seed, "noise_key": noise_key, "dump": dump}
         plain |= {"lens": lens, "focal_length": focal_length, "aperture": aperture}
         plain |= {"focus_distance": focus_distance}
-        plain |= {"raw_size": raw_size, "raw_type": raw_type}
         options: dict[str, Any] = {k: v for k, v in plain.items() if v is not None}
         if stages is not None:
             options["stages"] = [s.strip() for s in stages.split(",") if s.strip()]
-        if skip or no_noise:
-            options["skip"] = [*skip, *([NOISE] if no_noise else [])]
+        if skip:
+            options["skip"] = list(skip)
         for text in assignments:
             stage, parameter, value = parse_assignment(text)
             options.setdefault(stage, {})[parameter] = value
@@ -185,6 +176,8 @@ class Request:
             configuration.values if configuration else None,
             {**options, **(values or {})},
             stage_files=tuple(dict.fromkeys(str(file.resolve()) for file in code)),
+            truths=tuple(each for each in truth if each not in BASELINES),
+            baselines=tuple(each for each in truth if each in BASELINES),
             **fields_,
         )
         if configuration:
@@ -213,11 +206,11 @@ class Request:
         request.carried()  # refuses what is wrong
         return request
 
-    def for_image(self, name: str, values: Mapping[str, Any]) -> "Request":
+    def for_image(self, name: str, values: Mapping[str, Any]) -> Self:
         """The request for one image: its name, and values that hold for it alone."""
-        return self._changed(image_name=name, image=values)
+        return self._shared(replace(self, image_name=name, image=values))
 
-    def with_outputs(self, chain: Chain) -> "Request":
+    def with_outputs(self, chain: Chain) -> "ResolvedRequest":
         """The request with every output named, as a chain has them.
 
         The format, where none is chosen, is JPEG; where ``until`` ends the chain before it comes to
@@ -233,22 +226,17 @@ class Request:
         keep = chain.select(self.keep)
         own = noisy_mosaic(chain).steps[-1].name if MOSAIC in self.truths else ""
         truth_keep = tuple(step for step in keep if step != own)
-        return self._changed(formats=formats, keep=keep, truth_keep=truth_keep)
+        known = {each.name: getattr(self, each.name) for each in fields(Request)}
+        known |= {"formats": formats, "keep": keep, "truth_keep": truth_keep}
+        return self._shared(ResolvedRequest(**known))
 
     def carried(self) -> tuple[Carry, ...]:
         """The layers that go along with each picture.
 
         Raises:
-            RequestError: a layer or a pattern is wrong, or there is no depth for a PNG.
+            RequestError: one is wrong.
         """
-        layers = parse_carry(self.carry)
-        for pattern in self.companions:
-            check_companion(pattern)
-        if self.companions and not layers:
-            raise RequestError("--companion: it says where layers are, but none is asked for")
-        if self.depth_png and not any(each.kind == "depth" for each in layers):
-            raise RequestError("--depth-png: no depth is carried; say --carry Depth as well")
-        return layers
+        return parse_carry(self.carry)
 
     def settings(self, carried: Settings | None = None) -> Settings:
         """The settings that are asked for, drawn for the image where there is one.
@@ -285,7 +273,7 @@ class Request:
             RequestError: it cannot be made, or the options name a stage that is not in it.
         """
         chain = make_chain(settings, start_at=start_at, until=self.until)
-        known = (*chain.names, *self.image.get("skip", ()), OUTPUT)
+        known = (*chain.names, *self.image.get("skip", ()), *TABLES)
         for step, value in self.options.items():
             is_table = isinstance(value, Mapping) and step not in KEYS  # where it is a draw
             if is_table and step not in known:
@@ -317,9 +305,8 @@ class Request:
         """The options over the configuration: the settings of all images, nothing drawn."""
         return overlay(self._configured, self.options) if self.options else self._configured
 
-    def _changed(self, **changes: Any) -> "Request":
-        """A copy with other values for an image or its outputs; general settings are shared."""
-        other = replace(self, **changes)
+    def _shared(self, other: R) -> R:
+        """Another request for the same settings, which shares what was made of them."""
         shared = ("_configured", "_general")
         vars(other).update({name: vars(self)[name] for name in shared if name in vars(self)})
         return other
@@ -327,3 +314,14 @@ class Request:
     def __getstate__(self) -> dict[str, Any]:
         # Settings may hold models of stage files, whose classes cannot be sent.
         return {each.name: getattr(self, each.name) for each in fields(self)}
+
+
+@dataclass(frozen=True)
+class ResolvedRequest(Request):
+    """A request with every output named, see :meth:`Request.with_outputs`.
+
+    Args:
+        truth_keep: steps whose image is written beside a truth that is a picture.
+    """
+
+    truth_keep: tuple[str, ...] = ()

@@ -9,9 +9,9 @@ from clpipe.analysis.calibration.frames import FrameOverrides
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.result import Calibration
 from clpipe.camera.text import check_profile_name
-from clpipe.commands.options import Command, json_option, raw_size_option, raw_type_option
+from clpipe.commands.options import Command, dump_option, json_option
 from clpipe.commands.printing import show, show_json
-from clpipe.images.dump import dump_of
+from clpipe.images.dump import parse_dump
 from clpipe.reference.cfa import PATTERNS, Pattern
 
 CALIBRATION = (
@@ -44,8 +44,7 @@ CALIBRATION = (
     type=click.FloatRange(0, min_open=True),
     help="The ISO of all frames, in place of what the files say.",
 )
-@raw_size_option
-@raw_type_option
+@dump_option
 @json_option
 def calibrate(
     inputs: tuple[str, ...],
@@ -55,8 +54,7 @@ def calibrate(
     white_level: float | None,
     pattern: Pattern | None,
     iso: float | None,
-    raw_size: str | None,
-    raw_type: str | None,
+    dump: str | None,
     as_json: bool,
 ) -> None:
     """Measure a sensor's noise from raw frames, and write it as a camera profile.
@@ -71,8 +69,8 @@ def calibrate(
     clpipe run render.exr -o out --camera my_camera.toml --iso 800
     """
     check_profile_name(output)
-    dump = dump_of(raw_size or "", raw_type or "") if raw_size or raw_type else None
-    overrides = FrameOverrides(black_level, white_level, pattern, iso, dump)
+    dumped = parse_dump(dump) if dump else None
+    overrides = FrameOverrides(black_level, white_level, pattern, iso, dumped)
     frames, calibrations = calibrate_files(inputs, dark, overrides)
     picture = write_profile(output, frames, calibrations)
     if as_json:

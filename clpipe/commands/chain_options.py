@@ -102,12 +102,8 @@ _CHAIN_OPTIONS = (
         multiple=True,
         metavar="STAGE",
         shell_complete=steps,
-        help="Leave a stage out; may be repeated.",
-    ),
-    click.option(
-        "--no-noise",
-        is_flag=True,
-        help="Leave the noise of all stages out; denoising and the rest stay as at that ISO.",
+        help="Leave a stage out, or 'noise': that of all stages, while denoising and the rest stay "
+        "as at that ISO; may be repeated.",
     ),
     click.option(
         "--start-at",
@@ -141,7 +137,7 @@ keep_option = click.option(
     multiple=True,
     metavar="STAGE|all",
     shell_complete=steps_or_all,
-    help="Write the image of a stage, too, as float EXR; may be repeated.",
+    help="Write the image of a stage, too; as float EXR. May be repeated.",
 )
 
 _PATCH_OPTIONS = (
@@ -149,8 +145,8 @@ _PATCH_OPTIONS = (
         "--patch",
         type=click.IntRange(1),
         metavar="SIZE",
-        help="Write square patches, SIZE px a side, in place of pictures, OUT/NAME_0000.jpg and "
-        "so on, with the bits that the picture has there. Images of --keep are .npy.",
+        help="Write patches of SIZE px a side in place of pictures: OUT/NAME_0000.jpg and so on, "
+        "with the bits that the picture has there. Images of --keep are .npy.",
     ),
     click.option(
         "--patches-per-image",
@@ -190,26 +186,13 @@ def patch_count(text: str) -> int | str:
 carry_option = click.option(
     "--carry",
     multiple=True,
-    metavar="NAME[:KIND]",
-    help="Move a layer as the picture's pixels are moved, and write it to OUT/NAME.carried.exr: "
-    "depth, normals, flow, object numbers, of the image's own file or of one beside it. "
-    f"KIND is {', '.join(RESAMPLING)}, where its name does not say it; may be repeated.",
-)
-
-companion_option = click.option(
-    "--companion",
-    "companions",
-    multiple=True,
-    metavar="PATTERN",
-    help="Where a carried layer is that is not in the image's file, as '../depth/{name}.exr', from "
-    "the image's folder; may be repeated. [default: {name}_LAYER.exr and the like]",
-)
-
-depth_png_option = click.option(
-    "--depth-png",
-    is_flag=True,
-    help="Write carried depth, which is in metres, as OUT/NAME.LAYER.png, too: 16 bits, in "
-    "millimetres.",
+    metavar="NAME[:KIND][=FILE]",
+    help="Move a layer as the picture's pixels are moved. It goes to OUT/NAME.carried.exr: "
+    "depth, normals, flow, object numbers, of the image's own file or of one beside it. KIND is "
+    f"{', '.join(RESAMPLING)}, where its name does not say it, or png: depth in metres, which goes "
+    "to OUT/NAME.LAYER.png, too, with 16 bits, in millimetres. FILE is where it is, as "
+    "'../depth/{name}.exr', from the image's folder. [default: {name}_LAYER.exr and the like] May "
+    "be repeated.",
 )
 
 format_option = click.option(

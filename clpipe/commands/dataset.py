@@ -3,7 +3,7 @@
 import logging
 import sys
 from collections.abc import Mapping
-from contextlib import ExitStack, closing, nullcontext
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,23 +12,16 @@ import click
 from rich.console import Console
 
 from clpipe.base.errors import RequestError
-from clpipe.batch.dask_worker import RunSpec
-from clpipe.batch.run_log import RunLog, Summary, log_name
+from clpipe.batch.run_log import Summary
+from clpipe.batch.session import Images, Run
+from clpipe.batch.where import Where
 from clpipe.chain.rendition import CLEAN, TRUTHS
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import carry_option, format_option, series_options
 from clpipe.commands.input_options import poses_option
-from clpipe.commands.options import Command, device_option, options_set
-from clpipe.commands.poses import views_behind
-from clpipe.commands.progress import Reporter
-from clpipe.commands.running import batch_of, follow
-from clpipe.inputs.find import Shard, find_jobs
-from clpipe.inputs.loader import ImageLoader
-from clpipe.inputs.poses import with_views
+from clpipe.commands.options import GroupedCommand, device_option, options_set
+from clpipe.commands.progress import Reporter, follow
 from clpipe.inputs.series import Series, parse_isos
-from clpipe.outputs.existing import AS_USUAL
-from clpipe.outputs.folder import output_folder, remove_unfinished
-from clpipe.outputs.writer import OutputWriter
 from clpipe.scenes.blender import Rendering
 from clpipe.scenes.card import write_card
 from clpipe.scenes.source import RENDERS, Source, from_folder, from_scene
@@ -39,7 +32,7 @@ VIEW_OPTIONS = ("views", "path", "box", "frames")
 RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit", "blender")
 
 
-@click.command("dataset", cls=Command)
+@click.command("dataset", cls=GroupedCommand)
 @click.argument("source", type=click.Path(path_type=Path), metavar="SCENE.blend|FOLDER")
 @click.option(
     "-o",
@@ -109,7 +102,6 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
 @series_options
 @click.option(
     "--truth",
-    "truths",
     multiple=True,
     default=(CLEAN,),
     show_default=True,
@@ -166,9 +158,7 @@ def dataset(
         summary = develop(renders, request, output, series, selector, quiet)
     if renders.failure:
         raise renders.failure
-    if summary.interrupted:
-        sys.exit(130)
-    sys.exit(1 if summary.failures or summary.is_fruitless else 0)
+    sys.exit(summary.exit_status)
 
 
 def rendering_of(
@@ -210,37 +200,20 @@ def develop(
     Raises:
         ClpipeError: the run cannot go on.
     """
-    loader = ImageLoader(request)
-    found = renders.jobs() or loader.exposures(find_jobs(renders.inputs, output, loader.endings()))
-    given = with_views(found, renders.poses, loader.settings.output) if renders.poses else found
-    jobs = series.jobs(given, loader.settings)
-    loader.check(jobs)
-    chain = loader.first_chain(jobs)
-    request = request.with_outputs(chain)
-    writer = OutputWriter(output, request)
-    writer.check(chain, jobs)
-    selectors = () if selector is None else (selector,)
-    spec = RunSpec(request, output, selectors, None, None, AS_USUAL, False, first=jobs[0])
-    summary = Summary(len(jobs))
-    reporter = Reporter(summary, writer, Console(stderr=True), quiet)
+    found = renders.jobs() or ()
+    images = Images(renders.inputs, poses=renders.poses, series=series, found=found)
+    where = Where(output, () if selector is None else (selector,))
+    made = Run(request, images, where, arguments=sys.argv[1:])
+    reporter = Reporter(made, Console(stderr=True), quiet)
     tell = (lambda text: None) if quiet else reporter.print
-    folders = series.under(output)
-    with (
-        batch_of(spec, loader, chain, [], None) as batch,
-        output_folder(output, Shard()),
-        views_behind(folders, summary, quiet) if renders.poses else nullcontext(),
-    ):
-        remove_unfinished(output, jobs)
 
-        def stop() -> None:
-            batch.stop()
-            renders.stop()
+    def stop() -> None:
+        made.stop()
+        renders.stop()
 
-        start = {"arguments": sys.argv[1:], "images": len(jobs)}
-        with closing(RunLog(output / log_name(Shard()), start)) as log:
-            coming = renders.as_rendered(jobs, tell)
-            follow(batch, coming, summary, reporter, log, stop=stop)
-    if not summary.interrupted:
-        written = write_card(writer, jobs, sys.argv[1:], renders.about)
+    outcomes = made.outcomes(renders.as_rendered(made.jobs, tell))
+    follow(made, outcomes, quiet, reporter, stop)
+    if not made.summary.interrupted:
+        written = write_card(made.writer, made.jobs, sys.argv[1:], renders.about)
         tell(f"wrote {', '.join(map(str, written))}")
-    return summary
+    return made.summary

@@ -10,7 +10,7 @@ from clpipe.base.extras import require
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import chain_options
 from clpipe.commands.input_options import layer_option, max_pixels_option, transfer_option
-from clpipe.commands.options import Command, device_option, raw_size_option, raw_type_option
+from clpipe.commands.options import Command, device_option, dump_option
 from clpipe.engine.device import open_device
 from clpipe.inputs.find import find_jobs
 from clpipe.inputs.loader import ImageLoader
@@ -19,8 +19,7 @@ from clpipe.inputs.loader import ImageLoader
 @click.command("explore", cls=Command)
 @click.argument("inputs", nargs=-1, required=True, metavar="RENDER...")
 @chain_options
-@raw_size_option
-@raw_type_option
+@dump_option
 @transfer_option
 @layer_option
 @max_pixels_option

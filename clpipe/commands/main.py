@@ -22,6 +22,7 @@ from clpipe.base.text import one_line
 # In the order of the help. Each is a module of this folder that defines a function of its name.
 COMMANDS = (
     "run",
+    "replay",
     "dataset",
     "poses",
     "report",

@@ -54,7 +54,7 @@ def measure(
 
     \b
     clpipe run render.exr -o noisy --iso 3200 --until quantize
-    clpipe run render.exr -o clean --iso 3200 --until quantize --no-noise
+    clpipe run render.exr -o clean --iso 3200 --until quantize --skip noise
     clpipe measure noisy/render.exr --truth clean/render.exr
     """
     if plot is not None and plot.suffix != ".png":

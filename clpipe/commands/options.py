@@ -3,6 +3,8 @@
 Options that need the stages are in chain_options.
 """
 
+import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
@@ -10,6 +12,18 @@ from click.core import ParameterSource
 
 from clpipe.base.errors import RequestError
 from clpipe.images.dump import TYPES
+
+# The options of commands that have many, by the heading that they stand under. "+" is before those
+# that --help shows, briefly; --help-all shows all in full.
+GROUPS = {
+    "Camera": "+config +camera +iso +lens focal_length aperture focus_distance +seed noise_key",
+    "Chain": "+set +skip stages start_at until stage_file",
+    "Renders": "+views +path box +frames +resolution +samples denoise time_limit blender",
+    "Pictures": "+output +format +keep bracket +patch patches_per_image augment webdataset",
+    "Truth": "+truth +carry",
+    "Inputs": "+poses +exclude layer transfer dump max_pixels",
+    "Batches": "+device +redo jobs memory shard dask quiet json_lines trace +help +help_all",
+}
 
 
 class Command(click.Command):
@@ -29,6 +43,58 @@ class Command(click.Command):
         return super().parse_args(ctx, args)
 
 
+class GroupedCommand(Command):
+    """A command whose help has its options in groups: --help the usual ones, --help-all all."""
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        everything = click.Option(
+            ["--help-all"],
+            is_flag=True,
+            is_eager=True,
+            expose_value=False,
+            callback=self._show_all,
+            help="Show all options and exit.",
+        )
+        return [*super().get_params(ctx), everything]
+
+    def _show_all(self, ctx: click.Context, _: click.Parameter, is_asked: bool) -> None:
+        if is_asked and not ctx.resilient_parsing:
+            ctx.meta[ALL] = True
+            click.echo(self.get_help(ctx), color=ctx.color)
+            ctx.exit()
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        for title, rows in self._groups(ctx):
+            with formatter.section(title):
+                formatter.write_dl(rows)
+
+    def _groups(self, ctx: click.Context) -> Iterator[tuple[str, list[tuple[str, str]]]]:
+        """The headings with the rows below them."""
+        is_whole = ctx.meta.get(ALL, False)
+        records = {
+            option.opts[-1].lstrip("-").replace("-", "_"): record
+            for option in self.get_params(ctx)
+            if isinstance(option, click.Option) and (record := option.get_help_record(ctx))
+        }
+        for title, names in GROUPS.items():
+            shown = [n.lstrip("+") for n in names.split() if is_whole or n[0] == "+"]
+            if rows := [records[name] for name in shown if name in records]:
+                yield title, rows if is_whole else [(names, brief(text)) for names, text in rows]
+
+
+def brief(text: str) -> str:
+    """The first part of a help text, with its default.
+
+    >>> brief("A stage, whole; may be repeated. Others follow. [default: a; else b]")
+    'A stage, whole. [default: a]'
+    """
+    first = re.split(r"[.;:](?=\s|$)", text)[0]
+    default = re.search(r"\[default: ([^];]+)", text)
+    return f"{first}.{f' [default: {default[1]}]' if default else ''}"
+
+
+ALL = "clpipe.help_all"  # of a context: every option is shown
+
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 device_option = click.option(
@@ -47,13 +113,23 @@ stage_file_option = click.option(
     help="Load a stage of your own; may be repeated.",
 )
 
-raw_size_option = click.option(
-    "--raw-size", metavar="WxH", help="Width and height of headerless dumps (.raw)."
+dump_option = click.option(
+    "--dump",
+    metavar="WxH:TYPE",
+    help="Width, height and type of the samples of headerless dumps (.raw), such as "
+    f"1920x1080:uint16le. TYPE is {', '.join(TYPES)}.",
 )
 
-raw_type_option = click.option(
-    "--raw-type", type=click.Choice(list(TYPES)), help="How headerless dumps store a sample."
-)
+
+def folder_named(text: str) -> Path:
+    """The output folder.
+
+    Raises:
+        RequestError: the name is empty.
+    """
+    if not text:
+        raise RequestError("--output: it is empty; name a folder")
+    return Path(text)
 
 
 def options_set() -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""``clpipe plan``: the launches and buffers of a chain, as a table or JSON."""
+"""``clpipe plan``: the launches and buffers of a chain, as a table or JSON; their source."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,15 +6,19 @@ from typing import Any
 import click
 
 from clpipe.base.errors import RequestError
+from clpipe.base.text import one_of
 from clpipe.chain.files import toml_text
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import chain_options, format_option, keep_option
 from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show, show_json
+from clpipe.engine.codegen import write_kernel
 from clpipe.engine.ir import AnyLaunch, Launch, Lines, Plan, reads_of
 from clpipe.engine.plan import make_plan
 from clpipe.engine.traffic import bytes_per_pixel, launch_bytes
 from clpipe.outputs.results import results_of
+
+LANES = 8  # of a CPU, for which sources and bytes are given
 
 
 @click.command("plan", cls=Command)
@@ -23,19 +27,22 @@ from clpipe.outputs.results import results_of
 @format_option
 @json_option
 @click.option("--toml", "as_toml", is_flag=True, help="Print the chain as a configuration.")
-def plan(as_json: bool, as_toml: bool, **options: Any) -> None:
+@click.option("--source", metavar="LAUNCH", help="Print the OpenCL source of a launch.")
+def plan(as_json: bool, as_toml: bool, source: str | None, **options: Any) -> None:
     """Show the launches and buffer slots of a chain, without running it.
 
     A launch is one kernel call over the image. Stages that read only the pixel itself join the
     launch before them; a stencil, a reduction and a kept image open a new one. A slot is a buffer
-    of one plane.
+    of one plane. --source takes a launch's number or name, and prints what a CPU of 8 lanes runs.
     """
+    if (as_json, as_toml, source is not None).count(True) > 1:
+        raise RequestError("plan: --json, --toml and --source each print something else; give one")
     request = Request.from_options(**options)
     if as_toml:
-        if request.start_at or request.until or as_json:
+        if request.start_at or request.until:
             raise RequestError(
-                "plan: --toml prints a whole chain as a configuration; leave out --start-at, "
-                "--until and --json"
+                "plan: --toml prints a whole chain as a configuration; leave out --start-at and "
+                "--until"
             )
         click.echo(toml_text(request.chain()), nl=False)
         return
@@ -43,15 +50,31 @@ def plan(as_json: bool, as_toml: bool, **options: Any) -> None:
     request = request.with_outputs(chain)
     keep, encode, final = results_of(chain, request.formats, request.keep)
     plan = make_plan(chain, half=True, keep=keep, encode=encode, final=final)
+    if source is not None:
+        click.echo(write_kernel(plan, launch_named(plan, source), LANES).source, nl=False)
+        return
     if as_json:
         show_json(plan_record(plan))
         return
-    headings = ("launch", "opened by", "stages", "reads", "writes", "bytes/px")
-    show(headings, plan_rows(plan))
+    headings = ("", "launch", "opened by", "stages", "reads", "writes", "bytes/px")
+    show(headings, [(str(i), *row) for i, row in enumerate(plan_rows(plan), 1)])
     click.echo(
         f"\n{len(plan.launches)} launches, {plan.slot_count} slots, "
-        f"{bytes_per_pixel(plan, 8):.1f} bytes a pixel on the device"
+        f"{bytes_per_pixel(plan, LANES):.1f} bytes a pixel on the device"
     )
+
+
+def launch_named(plan: Plan, wanted: str) -> AnyLaunch:
+    """The launch of a plan with that number, from 1 on, or that name.
+
+    Raises:
+        RequestError: there is none.
+    """
+    for number, launch in enumerate(plan.launches, 1):
+        if wanted in (str(number), launch.name):
+            return launch
+    names = (f"{number} {launch.name}" for number, launch in enumerate(plan.launches, 1))
+    raise RequestError(f"--source: {one_of('launch', wanted, names)}")
 
 
 def plan_rows(plan: Plan) -> list[tuple[str, ...]]:
@@ -64,7 +87,7 @@ def plan_rows(plan: Plan) -> list[tuple[str, ...]]:
             ", ".join(stages_of(launch)),
             reads_text(plan, launch),
             writes_text(plan, launch),
-            f"{launch_bytes(plan, launch, 8):.1f}",
+            f"{launch_bytes(plan, launch, LANES):.1f}",
         )
         for launch in plan.launches
     ]
@@ -133,6 +156,6 @@ def plan_record(plan: Plan) -> dict[str, Any]:
     return {
         "launches": [dict(zip(keys, row, strict=True)) for row in plan_rows(plan)],
         "slots": plan.slot_count,
-        "bytes_per_pixel": bytes_per_pixel(plan, 8),
+        "bytes_per_pixel": bytes_per_pixel(plan, LANES),
         "kept": [name for name, _ in plan.kept],
     }

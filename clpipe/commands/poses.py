@@ -1,16 +1,13 @@
 """``clpipe poses``: the cameras of the pictures of a folder, for COLMAP, nerfstudio and others."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 
 import click
 
 from clpipe.base.errors import RequestError
-from clpipe.batch.run_log import Summary
 from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show_json
-from clpipe.outputs.camera_files import Written, check_camera_files, write_camera_files
+from clpipe.outputs.camera_files import write_camera_files
 
 
 @click.command("poses", cls=Command)
@@ -36,37 +33,11 @@ def poses(folder: Path, as_json: bool) -> None:
         reasons = "; ".join(written.left_out) or "found no sidecar of one"
         raise RequestError(
             f"{folder}: has no picture whose intrinsics are known: {reasons}; run with --poses "
-            "FILE, or set output.focal_length and output.sensor_width, or output.fx"
+            "FILE, or set render.focal_length and render.sensor_width, or render.fx"
         )
     if as_json:
         named = {"files": written.files, "pictures": written.pictures, "warnings": written.left_out}
         show_json({"folder": str(folder), **named})
         return
-    for line in lines_of(folder, written):
+    for line in written.lines(folder):
         click.echo(line)
-
-
-@contextmanager
-def views_behind(folders: Sequence[Path], summary: Summary, quiet: bool) -> Iterator[None]:
-    """Write the views of a run's folders behind the run, unless it was interrupted.
-
-    Raises:
-        ImageError: a file cannot be written or, before the run, is somebody else's.
-    """
-    for folder in folders:
-        check_camera_files(folder)
-    yield
-    if not summary.interrupted:
-        lines = [line for each in folders for line in lines_of(each, write_camera_files(each))]
-        for line in () if quiet else lines:
-            click.echo(line, err=True)
-
-
-def lines_of(folder: Path, written: Written) -> list[str]:
-    """What was written, and what was left out, for people."""
-    warnings = [f"warning: {each}" for each in written.left_out]
-    if not written.files:
-        return warnings
-    files = ", ".join(str(folder / name) for name in written.files)
-    pictures = f"{written.pictures} picture{'s' * (written.pictures != 1)}"
-    return [f"wrote {files}: {pictures}", *warnings]

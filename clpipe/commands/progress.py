@@ -4,15 +4,18 @@ images one every so often."""
 import contextlib
 import shlex
 import time
+from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Self
 
+import click
 from rich.console import Console
 
 from clpipe.base.text import duration, one_line
+from clpipe.batch.interrupt import interruptible
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
-from clpipe.batch.run_log import Summary
+from clpipe.batch.session import Run
 from clpipe.engine.clipping import clipping_text
-from clpipe.outputs.writer import OutputWriter
+from clpipe.outputs.existing import Redo
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -40,26 +43,17 @@ class Reporter:
     """Prints outcomes as they come, and a summary when it is left as a context.
 
     Args:
-        summary: what became of the images so far; the caller adds to it.
-        writer: where the pictures go.
+        run: what is printed of.
         console: where to print; a terminal gets a bar where there are several images.
         quiet: print failures only.
-        keeps_old: whether pictures of another program are kept.
     """
 
-    def __init__(
-        self,
-        summary: Summary,
-        writer: OutputWriter,
-        console: Console,
-        quiet: bool = False,
-        keeps_old: bool = False,
-    ) -> None:
-        self._summary = summary
-        self._writer = writer
+    def __init__(self, run: Run, console: Console, quiet: bool = False) -> None:
+        self._summary = summary = run.summary
+        self._writer = run.writer
         self._console = console
         self._quiet = quiet
-        self._keeps_old = keeps_old
+        self._keeps_old = run.where.redo is Redo.MISSING
         self._several = summary.total > 1
         self._said = time.perf_counter()
         self._bar: Progress | None = None
@@ -139,10 +133,8 @@ class Reporter:
         )
         text += "other libraries for pictures, "
         if self._keeps_old:
-            return f"{text}and {'stay' if count > 1 else 'stays'} (--keep-old)"
-        return (
-            f"{text}and {'are' if count > 1 else 'is'} made again; --keep-old keeps such pictures"
-        )
+            return f"{text}and {'stay' if count > 1 else 'stays'} (--redo missing)"
+        return f"{text}and {'are' if count > 1 else 'is'} made again; --redo missing keeps them"
 
     def _print_passed_over(self) -> None:
         """Print what is said of pictures that are old, and of images that were left out."""
@@ -186,3 +178,36 @@ class Reporter:
         self.print(text)
         if self._bar and counts[DONE]:
             self.print(f"look at it: clpipe report {shlex.quote(str(self._writer.folder))}")
+
+
+def follow(
+    run: Run,
+    outcomes: Generator[Outcome, None, None],
+    quiet: bool = False,
+    reporter: Reporter | None = None,
+    stop: Callable[[], None] | None = None,
+) -> None:
+    """Print what becomes of a run's images, and what there is to say behind it.
+
+    Args:
+        run: the run.
+        outcomes: its outcomes.
+        quiet: print failures only.
+        reporter: what prints; None is one on stderr.
+        stop: is called at Ctrl-C in place of the run's.
+
+    Raises:
+        ClpipeError: the run cannot go on.
+    """
+    shown = reporter or Reporter(run, Console(stderr=True), quiet)
+    with contextlib.closing(outcomes), interruptible(stop or run.stop), shown:
+        for outcome in outcomes:
+            shown.report(outcome)
+    for note in () if quiet else run.notes:
+        click.echo(note, err=True)
+
+
+def print_line(line: bytes) -> None:
+    """Print a line on stdout. One that cannot be printed ends no run."""
+    with contextlib.suppress(OSError):
+        click.echo(line, nl=False)

@@ -11,18 +11,19 @@ from typing import Any, Literal, Self
 from clpipe.base.errors import RequestError
 from clpipe.base.processors import available_processors
 from clpipe.base.readonly import ReadOnly
+from clpipe.base.text import several
+from clpipe.base.types import plain
 from clpipe.base.validation import typed
 from clpipe.chain.rendition import DEVELOPMENT
 from clpipe.chain.request import Request
 from clpipe.dataset.arrays import ArrayFormat, dtype_named
 from clpipe.dataset.developer import Sample, SampleSpec
-from clpipe.dataset.inputs import cache_size, jobs_of, several
+from clpipe.dataset.inputs import cache_size, jobs_of
 from clpipe.dataset.numbering import Numbering
 from clpipe.dataset.samples import SampleBatch, SampleLoader
 from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.outputs.patches import Patches
-from clpipe.pipeline import plain
 
 
 class Dataset(ReadOnly):
@@ -76,7 +77,6 @@ class Dataset(ReadOnly):
             with ``patch``, where the chain adds noise, else False.
         carry: layers that go along with the picture, such as "Depth" or "nn:normal", as ``--carry``
             of ``clpipe run``.
-        companions: where they are, as ``--companion``.
         layer: the layer of an EXR that is the picture; None chooses.
         transfer: the transfer curve of renders in whole numbers: "srgb" or "linear".
         exclude: patterns of files that are not taken from folders and globs, such as depth.
@@ -114,7 +114,6 @@ class Dataset(ReadOnly):
         until: str | None = None,
         truth: bool | Literal["development", "clean"] | None = None,
         carry: str | Sequence[str] = (),
-        companions: str | Sequence[str] = (),
         layer: str | None = None,
         transfer: Literal["srgb", "linear"] | None = None,
         exclude: str | Sequence[str] = (),
@@ -141,7 +140,6 @@ class Dataset(ReadOnly):
             layer=layer,
             transfer=transfer,
             carry=several(carry),
-            companions=several(companions),
         )
         loader = ImageLoader(request)
         self._jobs = jobs_of(loader, several(inputs), several(exclude))

@@ -12,11 +12,6 @@ from clpipe.inputs.loader import ImageLoader
 NOWHERE = Path(os.devnull)  # nothing is written
 
 
-def several(value: str | Path | Sequence[str | Path]) -> tuple[str, ...]:
-    """The texts of an argument that is one of them or several."""
-    return tuple(map(str, [value] if isinstance(value, str | Path) else value))
-
-
 def cache_size(cache: int | str) -> int:
     """The bytes of a number, or of a text with a unit.
 

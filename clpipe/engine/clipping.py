@@ -34,7 +34,7 @@ def clipped_share(result: Result, chain: Chain) -> float | None:
     if kind is Kind.DISPLAY:
         top = 255 if result.encoded is not None else 1
     elif kind is Kind.RAW:
-        top = last.method.after(last.context).white_level
+        top = last.method.next_context(last.context).white_level
     if image is None or top is None:
         return None
     has_channels = len(kind.channels) > 1

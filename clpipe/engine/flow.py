@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.cache import BoundedCache, Identity
-from clpipe.base.steps import Step
+from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.types import Array
 from clpipe.engine.bindings import slot_buffer, step_buffer
 from clpipe.engine.buffers import HostImages, Pool, aligned_empty, copy_encoded, copy_plane, core_of
@@ -217,7 +217,7 @@ class Flow:
         self._tiles.append(sent_tile)
         self._transfers.flush()
 
-    @Step("upload")
+    @CpuTimer("upload")
     def _send(self, image: DeviceImage, extents: Extents) -> tuple[Any, list[Any]]:
         """Send what a tile stores of the source, unless it is there already."""
         task, source, box = image.task, image.task.source, extents[0].stored
@@ -316,9 +316,9 @@ class Flow:
         tile.image.tiles_left -= 1
         try:
             if tile.events:
-                with Step("kernels"):
+                with CpuTimer("kernels"):
                     self._cl.wait_for_events(tile.events)
-            with Step("download"):
+            with CpuTimer("download"):
                 for copy in tile.copies:
                     copy()
             self._transfers.done()

@@ -274,13 +274,13 @@ class Runner:
 
         check_resamplings(plan, *image.shape[1::-1])
         results = self.device.submit(plan, image, bind, options)
-        return lambda: self._result(plan, results(), self._of_size(*image.shape[1::-1]))
+        return lambda: self._result(plan, results(), self._estimates_for(*image.shape[1::-1]))
 
-    def _of_size(self, width: int, height: int) -> dict[str, dict[str, float]]:
+    def _estimates_for(self, width: int, height: int) -> dict[str, dict[str, float]]:
         """What steps say that follows from the size of their image, by step."""
         found = {}
         for step in self.chain.steps:
-            if values := step.method.of_size(width, height):
+            if values := step.method.estimates_for(width, height):
                 found[step.name] = dict(values)
             for pass_ in step.method.passes():
                 if isinstance(pass_.access, Resample):
@@ -288,7 +288,7 @@ class Runner:
         return found
 
     @staticmethod
-    def _result(plan: Plan, output: HostImages, of_size: dict[str, dict[str, float]]) -> Result:
+    def _result(plan: Plan, output: HostImages, from_size: dict[str, dict[str, float]]) -> Result:
         """What the device made of an image, by steps."""
         names = {
             x.op.step: x.op.reduction.estimates for x in plan.launches if isinstance(x, Finalize)
@@ -297,7 +297,7 @@ class Runner:
             final=output.images.get(plan.final.number) if plan.final else None,
             encoded=output.encoded,
             kept={name: output.images[i.number] for name, i in plan.kept if output.images},
-            estimates=of_size
+            estimates=from_size
             | {
                 step: dict(zip(names[step], map(float, values), strict=False))
                 for step, values in output.estimates.items()
@@ -328,14 +328,14 @@ class Runner:
         whole = self.encode or self.final
         steps = (self.chain if whole else self.chain.through(self.keep)).steps
         for step in steps:
-            of_size = dict(step.method.of_size(*image.shape[1::-1]))
-            frame = ReferenceContext(step.context, streams(self.chain, step, noise_key), of_size)
+            from_size = dict(step.method.estimates_for(*image.shape[1::-1]))
+            given = ReferenceContext(step.context, streams(self.chain, step, noise_key), from_size)
             with user_code_errors(f"stage {step.name}", step.stage.folder):
-                image = step.method.reference(image, frame)
+                image = step.method.reference(image, given)
             if step.name in self.keep:
                 kept[step.name] = image
-            if frame.estimates:
-                estimates[step.name] = frame.estimates
+            if given.estimates:
+                estimates[step.name] = given.estimates
         if boxes:
             image, *parts = (cut_out(each, boxes) for each in (image, *kept.values()))
             kept = dict(zip(kept, parts, strict=True))

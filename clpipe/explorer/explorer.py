@@ -257,7 +257,7 @@ class Explorer:
     def _source(self, image: int, loader: ImageLoader) -> SourceImage:
         """An image's pixels, decoded once for all settings that read its file in the same way."""
         stamp = stamp_of(self.jobs[image].path)
-        key = image, stamp, loader.reads, loader.reads_overscan, loader.settings.dump
+        key = image, stamp, loader.reads, loader.reads_overscan, loader.settings.dump_format
         return self._sources.get(key, lambda: loader.read(self.jobs[image]))
 
     def _run(

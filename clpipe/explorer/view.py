@@ -60,7 +60,7 @@ def shown_of(chain: Chain, result: Result) -> Array:
 def context_of(chain: Chain) -> Context:
     """What a chain's steps say of the image that comes out."""
     last = chain.steps[-1]
-    return last.method.after(last.context)
+    return last.method.next_context(last.context)
 
 
 def signal_of(image: Floats, chain: Chain) -> Floats:

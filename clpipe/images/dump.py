@@ -10,6 +10,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_regular
+from clpipe.base.text import one_of
 from clpipe.base.types import Array, Floats
 from clpipe.images.pixels import USUAL_MAX_PIXELS, check_size
 
@@ -73,28 +74,29 @@ class Dump:
         return samples.astype(np.float32).reshape(self.height, self.width)
 
 
-def dump_of(size: str, type_: str) -> Dump:
-    """The format that the settings ``raw_size`` and ``raw_type`` describe.
+def parse_dump(text: str) -> Dump:
+    """The format that the setting ``dump`` describes.
 
-    >>> dump_of("768x512", "uint16le").byte_count
+    >>> parse_dump("768x512:uint16le").byte_count
     786432
 
     Raises:
-        RequestError: a value is missing or not allowed.
+        RequestError: it is of another form, or a value is not allowed.
     """
-    if type_ not in TYPES:
-        raise RequestError(f"raw_type: found {type_!r}; expected one of {', '.join(TYPES)}")
-    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", size)
-    width, height = (int(match[1]), int(match[2])) if match else (0, 0)
-    if not (2 <= width <= MAX_SIDE and 2 <= height <= MAX_SIDE):
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5}):(\w+)", text)
+    if not match:
         raise RequestError(
-            f"raw_size: found {size!r}; expected WIDTHxHEIGHT in pixels, such as 1920x1080, "
-            f"each 2 to {MAX_SIDE}"
+            f"dump: found {text!r}; expected WIDTHxHEIGHT:TYPE, such as 1920x1080:uint16le"
         )
+    width, height, type_ = int(match[1]), int(match[2]), match[3]
+    if type_ not in TYPES:
+        raise RequestError(f"dump: {one_of('type', type_, list(TYPES))}")
+    if not (2 <= width <= MAX_SIDE and 2 <= height <= MAX_SIDE):
+        raise RequestError(f"dump: found {text!r}; width and height are 2 to {MAX_SIDE} pixels")
     group = TYPES[type_].denominator
     if width % group:
         raise RequestError(
-            f"raw_size: found {size!r}; the width of {type_} must be a multiple of {group} pixels"
+            f"dump: found {text!r}; the width of {type_} must be a multiple of {group} pixels"
         )
     return Dump(width, height, type_)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.base.steps import Step
+from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.types import Array
 from clpipe.images.exr_header import read_header
 
@@ -90,7 +90,7 @@ def _joined(channels: dict[str, Any], names: Sequence[str], dtype: np.dtype[Any]
     return planes.transpose(1, 2, 0)
 
 
-@Step("encode")
+@CpuTimer("encode")
 def write_channels(to: str, planes: Mapping[str, Array], attributes: Mapping[str, str]) -> None:
     """Write an OpenEXR file with ZIP compression.
 

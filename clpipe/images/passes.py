@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 
-from clpipe.base.steps import Step
+from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.types import Array
 from clpipe.images.kinds import kind_named
 from clpipe.images.layers import MOST_PARTS, full_name
@@ -130,7 +130,7 @@ def _grouped(names: Sequence[str], in_part: bool = False) -> Mapping[str, list[i
     return groups
 
 
-@Step("decode")
+@CpuTimer("decode")
 def read_layer(
     path: Path, location: LayerLocation, max_pixels: int
 ) -> tuple[Array, tuple[int, int], tuple[int, int]]:

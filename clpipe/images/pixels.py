@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.errors import ImageError
-from clpipe.base.steps import Step
 from clpipe.base.types import Array, Floats
 from clpipe.reference.geometry import NO_MARGINS, Margins
 
@@ -45,7 +45,7 @@ def margins_of(x: int, y: int, data: Sequence[int], display: Sequence[int]) -> M
     return Margins(*(max(each, 0) for each in (-x, -y, right - width, bottom - height)))
 
 
-@Step("convert")
+@CpuTimer("convert")
 def display_window(data: Array, x: int, y: int, width: int, height: int) -> Array:
     """The display window of an image, (height, width, channel), black outside its data window.
 
@@ -60,7 +60,7 @@ def display_window(data: Array, x: int, y: int, width: int, height: int) -> Arra
     return window
 
 
-@Step("convert")
+@CpuTimer("convert")
 def by_rows(convert: Callable[[Array], Array], pixels: Array) -> Floats:
     """A new image in float32, made of some rows of another one at a time.
 
@@ -73,7 +73,7 @@ def by_rows(convert: Callable[[Array], Array], pixels: Array) -> Floats:
     return made
 
 
-@Step("convert")
+@CpuTimer("convert")
 def make_finite(pixels: Array) -> int:
     """Set each NaN and infinity of an image to 0, in place, and count them."""
     infinity = np.array(np.inf, pixels.dtype)
@@ -85,7 +85,7 @@ def make_finite(pixels: Array) -> int:
     return count
 
 
-@Step("convert")
+@CpuTimer("convert")
 def clip_to_half(pixels: Array) -> int:
     """Clip float32 samples to the range of half, in place, and count those that were beyond."""
     count = 0

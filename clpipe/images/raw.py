@@ -44,7 +44,7 @@ EXIF_BYTES = 1 << 20  # the most that a tag has, and where in a file that is no 
 MOST_READS = 200_000  # by exifread, which reads each of a tag's values by itself; usual are 1,000
 DATE_TAGS = ("DateTimeOriginal", "DateTime")
 COLOR_MATRICES = {"0xC622": "0xC65B", "0xC621": "0xC65A"}  # a DNG's, and their illuminants
-DUMP_HINT = "a dump of samples, not a camera's raw, is read with --raw-size and --raw-type"
+DUMP_HINT = "a dump of samples, not a camera's raw, is read with --dump WxH:TYPE"
 OTHERS = {b"\xff\xd8\xff": "a JPEG", b"\x89PNG": "a PNG", b"v/1\x01": "an OpenEXR image"}
 
 

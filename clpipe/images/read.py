@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 
+from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
-from clpipe.base.steps import Step
 from clpipe.base.types import Array, Doubles
 from clpipe.images.attributes import own_attributes, photograph_attributes, shot_attributes
 from clpipe.images.colour import CIE_XYZ, SRGB, to_linear_srgb
@@ -70,11 +70,6 @@ class SourceImage:
     subframes: tuple[tuple[str, str], ...] = ()
     depth: Depth | None = None
     margins: Margins = NO_MARGINS
-
-    def cropped(self) -> "SourceImage":
-        """The picture alone."""
-        pixels = np.ascontiguousarray(self.margins.cropped(self.pixels))
-        return replace(self, pixels=pixels, margins=NO_MARGINS)
 
 
 @dataclass(frozen=True)
@@ -249,7 +244,7 @@ def holds_mosaic(path: Path) -> bool:
     return not any(map(picture_channels, parts)) and any(map(mosaic_channel, parts))
 
 
-@Step("decode")
+@CpuTimer("decode")
 def _decode(
     path: Path, mosaic: bool, layer: str | None, max_pixels: int, overscan: bool
 ) -> _Decoded:
@@ -279,7 +274,7 @@ def _decode(
         )
 
 
-@Step("decode")
+@CpuTimer("decode")
 def _decode_luminance_chroma(path: Path, max_pixels: int, overscan: bool) -> _Decoded:
     """The picture of a file whose chroma is subsampled."""
     window = read_luminance_chroma(path, max_pixels)

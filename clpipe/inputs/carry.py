@@ -95,7 +95,6 @@ def carry(
     source: SourceImage,
     chain: Chain,
     layers: Sequence[Carry],
-    patterns: Sequence[str],
     max_pixels: int,
     orientation: int = 1,
 ) -> Carried:
@@ -106,7 +105,6 @@ def carry(
         source: the image.
         chain: what moves its pixels.
         layers: which.
-        patterns: of the names of companions; none are those that :func:`companions_of` finds.
         max_pixels: a file that claims more is refused before memory is taken.
         orientation: EXIF's, by which the picture is turned in the end; normals are not turned.
 
@@ -116,7 +114,9 @@ def carry(
     """
     whole = source.pixels.shape[1::-1]
     width, height = source.margins.inside(*whole)
-    found = [each for layer in layers for each in Finder(path, patterns).find(layer)]
+    found: list[FoundLayer] = []
+    for layer in layers:
+        found += Finder(path, [layer.pattern] if layer.pattern else []).find(layer)
     _check_names(path, found)
     read: list[Layer] = []
     attributes: dict[str, str] = {}
@@ -185,7 +185,7 @@ class Finder:
 
     Args:
         path: of the image.
-        patterns: as for :func:`carry`.
+        patterns: of the names of companions; none are those that :func:`companions_of` finds.
     """
 
     path: Path

@@ -5,7 +5,7 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, TypeVar
@@ -81,7 +81,6 @@ def find_jobs(
     output: Path,
     endings: Sequence[str] = (*RENDER_SUFFIXES, *RAW_SUFFIXES),
     exclude: Sequence[str] = (),
-    keep_suffix: bool = False,
 ) -> list[Job]:
     """The jobs of a run, in the order of its inputs.
 
@@ -94,7 +93,6 @@ def find_jobs(
         output: the output folder; where it lies inside an input folder, its files are no inputs.
         endings: of the files that are taken from folders.
         exclude: patterns of what is not taken from folders and globs, see :class:`Exclusion`.
-        keep_suffix: name outputs by the whole image key, and not without its suffix.
 
     A file that goes with another one, see :func:`without_companions`, is no job.
 
@@ -123,7 +121,7 @@ def find_jobs(
         elif path.suffix.lower() in MANIFEST_SUFFIXES:
             jobs += [
                 Job(row.path, row.key, row.name, True, row.values, row.frames, row.place)
-                for row in read_manifest(path, keep_suffix)
+                for row in read_manifest(path)
             ]
         elif glob.has_magic(text) and not os.path.exists(text):
             matches = sorted(m for m in glob.glob(text, recursive=True) if os.path.isfile(m))
@@ -137,7 +135,7 @@ def find_jobs(
     jobs = without_companions(jobs)
     if not jobs:
         raise RequestError("every file is excluded")
-    return [replace(job, name=job.name or job.key) for job in jobs] if keep_suffix else jobs
+    return jobs
 
 
 def without_companions(jobs: Sequence[Job]) -> list[Job]:

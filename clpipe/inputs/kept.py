@@ -34,7 +34,7 @@ def attributes_of(step: Step, chain: Chain, key: str, frame: int | None = None) 
         key: the image key.
         frame: the number of the frame in a burst; None is no burst.
     """
-    is_noisy = step.method.after(step.context).noise is not None
+    is_noisy = step.method.next_context(step.context).noise is not None
     settings = chain.settings
     if settings.noise_key:
         settings = replace(settings, noise_key=of_frame(settings.noise_key, frame))
@@ -158,7 +158,7 @@ def _without_input_noise(chain: Chain) -> Chain:
     noise = None
     for step in chain.steps:
         steps.append(replace(step, context=replace(step.context, noise=noise)))
-        noise = step.method.after(steps[-1].context).noise
+        noise = step.method.next_context(steps[-1].context).noise
     return replace(chain, steps=tuple(steps))
 
 

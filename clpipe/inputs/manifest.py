@@ -13,13 +13,12 @@ from clpipe.base.reading import read_bytes
 from clpipe.base.text import one_of
 from clpipe.chain.chain import step_names
 from clpipe.chain.identity import MAX_FRAMES
-from clpipe.chain.keys import OUTPUT
-from clpipe.chain.methods import base_name
+from clpipe.chain.keys import TABLES
+from clpipe.chain.methods import TABLE_MODELS, base_name
 from clpipe.chain.paths import from_folder
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import toml_value, value_text
-from clpipe.images.encoding import Output
 from clpipe.inputs.tables import OWN, PLAIN, TEXTS, csv_records, json_records
 
 MANIFEST_SUFFIXES = (".csv", ".jsonl")
@@ -52,7 +51,7 @@ class Row:
         return self.name or str(PurePosixPath(self.key).with_suffix(""))
 
 
-def read_manifest(path: Path, keep_suffix: bool = False) -> list[Row]:
+def read_manifest(path: Path) -> list[Row]:
     """The images of a manifest.
 
     A .csv has a header, commas and UTF-8; its cells are TOML values, else text, and an empty cell
@@ -67,7 +66,6 @@ def read_manifest(path: Path, keep_suffix: bool = False) -> list[Row]:
 
     Args:
         path: the manifest.
-        keep_suffix: a row without a name gets its image key as its name, suffix and all.
 
     Raises:
         RequestError: it cannot be read, has a column that does not exist, or a row is wrong; the
@@ -84,14 +82,11 @@ def read_manifest(path: Path, keep_suffix: bool = False) -> list[Row]:
         try:
             row = _row(path.parent, place, record())
             row = replace(row, values=alike.setdefault(repr(row.values), row.values))
-            if keep_suffix and not row.name:
-                row = replace(row, name=row.key)
             other = makers.setdefault(row.stem, row)
             if other is not row:
-                keep = ", or say --keep-suffix" if other.key != row.key else ""
                 raise RequestError(
                     f"it would make the same outputs as row {other.place.rpartition(' ')[2]}, "
-                    f"{row.stem}; tell them apart in a column called name{keep}"
+                    f"{row.stem}; tell them apart in a column called name"
                 )
             rows.append(row)
         except RequestError as error:
@@ -181,7 +176,7 @@ def check_rows(
             if not carried:
                 own.check_cameras()
                 for step in row.values:
-                    if step not in (*PLAIN, OUTPUT, *steps):
+                    if step not in (*PLAIN, *TABLES, *steps):
                         raise RequestError(one_of("stage in this chain", step, steps))
             checked.append(own)
             known[id(row.values), carried] = own
@@ -220,17 +215,17 @@ def _check_column(name: str) -> None:
     step, dot, parameter = name.partition(".")
     stage = all_stages().get(base_name(step))
     if not dot and name not in (*OWN, *PLAIN):
-        if stage or step == OUTPUT:
+        if stage or step in TABLES:
             raise RequestError(f"{name}: its parameters have columns of their own: {name}.NAME")
         raise RequestError(one_of("column", name, (*OWN, *PLAIN)) + ", or stage.parameter")
-    if dot and step != OUTPUT:
+    if dot and step not in TABLES:
         if stage is None:
-            raise RequestError(f"{name}: {one_of('stage', step, (*all_stages(), OUTPUT))}")
+            raise RequestError(f"{name}: {one_of('stage', step, (*all_stages(), *TABLES))}")
         names = dict.fromkeys(n for method in stage.methods for n in method.model_fields)
         if parameter not in ("method", *names):
             raise RequestError(one_of(f"parameter of {step}", parameter, ("method", *names)))
-    elif dot and parameter not in Output.model_fields:
-        raise RequestError(one_of(f"key of {OUTPUT}", parameter, Output.model_fields))
+    elif dot and parameter not in (fields := TABLE_MODELS[step].model_fields):
+        raise RequestError(one_of(f"key of {step}", parameter, fields))
 
 
 def _row(folder: Path, place: str, record: Mapping[str, Any]) -> Row:

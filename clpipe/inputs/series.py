@@ -106,13 +106,23 @@ def parse_isos(text: str) -> tuple[float, ...]:
         RequestError: one is no number above 0, or is there twice.
     """
     try:
-        isos = tuple(float(part) for part in text.split(","))
+        isos = [float(part) for part in text.split(",")]
     except ValueError:
-        isos = ()
-    if not isos or not all(math.isfinite(iso) and iso > 0 for iso in isos):
-        raise RequestError(f"--iso: found {text!r}; expected numbers above 0, such as 100,800,3200")
+        isos = [math.nan]
+    return check_isos(isos, text)
+
+
+def check_isos(isos: Sequence[float], text: str = "") -> tuple[float, ...]:
+    """Sensitivities, as they are; ``text`` is what the user wrote.
+
+    Raises:
+        RequestError: one is no number above 0, or is there twice.
+    """
+    found = repr(text) if text else ", ".join(f"{iso:g}" for iso in isos)
+    if not all(math.isfinite(iso) and iso > 0 for iso in isos):
+        raise RequestError(f"--iso: found {found}; expected numbers above 0, such as 100,800,3200")
     names = [f"{iso:g}" for iso in isos]
     for name in names:
         if names.count(name) > 1:
-            raise RequestError(f"--iso: found {text!r}, with {name} twice; give it once")
-    return isos
+            raise RequestError(f"--iso: found {found}, with {name} twice; give it once")
+    return tuple(map(float, isos))

@@ -19,8 +19,8 @@ from clpipe.base.errors import ImageError
 from clpipe.base.files import keep_names, make_folder_of, write_whole
 from clpipe.base.reading import read_bytes
 from clpipe.chain.formats import DNG, ending_of
+from clpipe.chain.render_camera import Matrix, Vector
 from clpipe.chain.rendition import TRUTHS, Rendition
-from clpipe.images.encoding import Matrix, Vector
 from clpipe.outputs.existing import is_marked
 from clpipe.outputs.sealed import (
     SIDECAR,
@@ -79,6 +79,14 @@ class Written:
     files: tuple[str, ...]
     pictures: int
     left_out: tuple[str, ...]
+
+    def lines(self, folder: Path) -> list[str]:
+        """The same for people; ``folder`` is the one that it was written to."""
+        warnings = [f"warning: {each}" for each in self.left_out]
+        if not self.files:
+            return warnings
+        files = ", ".join(str(folder / name) for name in self.files)
+        return [f"wrote {files}: {self.pictures} picture{'s' * (self.pictures != 1)}", *warnings]
 
 
 def check_camera_files(folder: Path) -> None:

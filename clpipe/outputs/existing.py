@@ -22,7 +22,7 @@ from clpipe.outputs.sealed import SidecarError, outputs_in, read_sidecar
 
 MARKED = 1 << 16  # bytes at either end of a file, in which a format of clpipe names clpipe
 
-OVERWRITTEN = "would be overwritten; move it, choose another output folder, or say --overwrite"
+OVERWRITTEN = "would be overwritten; move it, choose another output folder, or say --redo all"
 
 # The tag Software of clpipe, or an attribute of its own. The camera of a DNG is called clpipe, too,
 # and converters repeat it in what they make.
@@ -37,26 +37,25 @@ class Found(Enum):
     DONE = "all"
 
 
-@dataclass(frozen=True)
-class Resuming:
-    """What of the pictures that are there already is made again.
+class Redo(Enum):
+    """Which of the pictures that are there already are made again: each has those before it, too.
 
-    Args:
-        overwrite: all of them, also those of others.
-        verify: what is damaged, which is found by reading everything.
-        keep_old: not those that another program made; else these are.
+    What is missing, or was asked for in another way, is always made.
     """
 
-    overwrite: bool = False
-    verify: bool = False
-    keep_old: bool = False
+    MISSING = "missing"  # no others
+    OLD = "old"  # those that another program made
+    DAMAGED = "damaged"  # those that are damaged, which is found by reading everything
+    ALL = "all"  # all, also files that clpipe did not write
 
-    def is_kept(self, found: Found) -> bool:
+    @property
+    def verifies(self) -> bool:
+        """Whether the SHA-256 of every file decides."""
+        return self is Redo.DAMAGED
+
+    def keeps(self, found: Found) -> bool:
         """Whether what was found stays."""
-        return found is Found.DONE or (found is Found.OLD and self.keep_old)
-
-
-AS_USUAL = Resuming()
+        return found is Found.DONE or (found is Found.OLD and self is Redo.MISSING)
 
 
 @dataclass(frozen=True)

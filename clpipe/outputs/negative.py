@@ -24,8 +24,8 @@ def negative_of(chain: Chain) -> Negative:
             "--format dng writes the raw in DN that quantize makes, but this chain starts on "
             f"{chain.source.label} and has no quantize; put it in, or use another format"
         )
-    context = first.context if is_input else makers[-1].method.after(makers[-1].context)
-    end = last.method.after(last.context)
+    context = first.context if is_input else makers[-1].method.next_context(makers[-1].context)
+    end = last.method.next_context(last.context)
     is_balanced = any(step.stage.name == "white_balance" for step in chain.steps)
     gains = end.applied_gains if is_input and is_balanced else context.gains
     levels = first.method if is_input else context  # normalize has the levels of a raw that enters

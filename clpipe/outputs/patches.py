@@ -230,7 +230,7 @@ def without_patch(name: str) -> str:
 def pattern_of(chain: Chain) -> Pattern:
     """The CFA pattern of a chain's mosaic."""
     last = chain.steps[-1]
-    return last.method.after(last.context).pattern
+    return last.method.next_context(last.context).pattern
 
 
 def every_patch(patches: Patches, chain: Chain, width: int, height: int, key: str) -> list[Patch]:

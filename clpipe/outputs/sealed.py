@@ -107,7 +107,7 @@ def read_sidecar(path: Path) -> dict[str, Any]:
     if values is None:
         raise ImageError(
             f"{path}: clpipe did not write this file, and would overwrite it with its sidecar; "
-            "move it, choose another output folder, or say --overwrite"
+            "move it, choose another output folder, or say --redo all"
         )
     return values
 

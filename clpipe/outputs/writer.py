@@ -18,7 +18,7 @@ from clpipe.chain.rendition import (
     VARIANCE,
     Rendition,
 )
-from clpipe.chain.request import CARRY, Request
+from clpipe.chain.request import ResolvedRequest
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.dng import write_dng
@@ -47,11 +47,11 @@ class OutputWriter:
 
     Args:
         folder: where they go.
-        request: with every output named, see :meth:`Request.with_outputs`.
+        request: what is asked for.
     """
 
     folder: Path
-    request: Request
+    request: ResolvedRequest
 
     @property
     def formats(self) -> tuple[str, ...]:
@@ -100,7 +100,7 @@ class OutputWriter:
         """The steps whose image is written beside a rendition, where it has them."""
         if rendition.role in (*FLOAT_MOSAICS, *BASELINES):
             return ()
-        if rendition.role in PICTURES and self.request.truth_keep is not None:
+        if rendition.role in PICTURES:
             return self.request.truth_keep
         return self.request.keep
 
@@ -111,8 +111,8 @@ class OutputWriter:
             request: the record for its image.
             rendition: which it is.
         """
-        carries = {} if self.carries(rendition) else dict(zip(CARRY, ([], [], False), strict=True))
-        return {**request, "keep": list(self.keep_of(rendition)), **carries}
+        record = {**request, "keep": list(self.keep_of(rendition))}
+        return record if self.carries(rendition) else record | {"carry": []}
 
     def carries(self, rendition: Rendition) -> bool:
         """Whether layers go along with a rendition: they do with an image's first."""
@@ -123,10 +123,10 @@ class OutputWriter:
         """The files of carried layers: that of all, "", and the PNG of each depth by its name."""
         if not self.carries(rendition):
             return {}
-        depths = [each.name for each in self.request.carried() if each.kind == "depth"]
+        depths = [each.name for each in self.request.carried() if each.png]
         return {
             "": self.path(job, f"{CARRIED}.exr"),
-            **{each: self.path(job, f"{each}.png") for each in depths if self.request.depth_png},
+            **{name: self.path(job, f"{name}.png") for name in depths},
         }
 
     def _kept_steps(self, recipe: Recipe) -> list[str]:
@@ -182,7 +182,7 @@ class OutputWriter:
         if self.request.baselines:
             raise RequestError(
                 "--patch: the noise of a baseline is measured on whole pictures; leave one of "
-                "--patch and --baseline out"
+                "--patch and --truth out"
             )
         if VARIANCE in self.request.truths:
             variance_steps(chain)  # refuses steps that mix the noise of neighbours
@@ -207,10 +207,9 @@ class OutputWriter:
                             "choose another output folder"
                         )
                     if path in makers:
-                        keep = ", or say --keep-suffix" if makers[path].key != job.key else ""
                         raise RequestError(
                             f"{makers[path].label} and {job.label} would both write {path}; "
-                            f"run them into different folders{keep}"
+                            f"run them into different folders, or name them in a manifest"
                         )
                     makers[path] = job
 
@@ -312,10 +311,9 @@ class OutputWriter:
         tags, source_orientation = from_attributes(
             source.attributes, Tags(camera.make, camera.model, chain.iso)
         )
-        output = chain.settings.output.filled({**source.shot, **tags.shot})
+        tags = tags_of(chain, source, tags)
         if patch is not None:  # which has not the width of the sensor
-            output = output.model_copy(update={"sensor_width": None})
-        tags = replace(tags, output=output)
+            tags = replace(tags, sensor_width=None)
         tag_attributes = {
             name: source.attributes[name] for name in TAG_ATTRIBUTES if name in source.attributes
         }
@@ -384,3 +382,16 @@ def variance_attributes(recipe: Recipe) -> dict[str, str]:
     """The attributes of a variance map; by their kind it can enter no chain."""
     own = attributes_of(recipe.noise[-1], recipe.whole, recipe.key, recipe.rendition.frame)
     return {**own, "stage": "variance", "kind": "variance"}
+
+
+def tags_of(chain: Chain, source: SourceImage, tags: Tags) -> Tags:
+    """The tags of a picture: what is stated of its camera, then what its image carries or says."""
+    optics, own = chain.optics, {**source.shot, **tags.shot}
+    return replace(
+        tags,
+        exposure=chain.settings.render.exposure_time or own.get("exposure_time"),
+        aperture=optics.f_number or tags.aperture,
+        focal_length=optics.focal_length or own.get("focal_length"),
+        sensor_width=optics.sensor_width or own.get("sensor_width"),
+        encoding=chain.settings.output,
+    )

@@ -221,7 +221,7 @@ y is the raw's signal, 1 at the white level.
 
 - `{MANIFEST}`: a row for each picture, with its files ({", ".join(kinds)}), camera, ISO and split.
 - `NAME.json` beside each picture: everything that it was made with. \
-`clpipe run --replay NAME.json` makes it again, byte for byte.
+`clpipe replay NAME.json` makes it again, byte for byte.
 - {cameras} in each folder, where the cameras are known: intrinsics and poses for COLMAP and \
 nerfstudio.
 - `{RECORD}`: what the renders were made of. `run.jsonl`: the log.

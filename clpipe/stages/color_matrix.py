@@ -91,7 +91,7 @@ class FixedMatrix(Method):
             raise ValueError("the matrix is singular: different colours would become the same")
         return matrix
 
-    def after(self, context: Context) -> Context:
+    def next_context(self, context: Context) -> Context:
         colours = np.array(self.matrix) @ context.colours
         return replace(context, colours=_as_tuples(colours.tolist()))
 
@@ -129,7 +129,7 @@ class CameraToSrgb(FixedMatrix):
         if self.matrix is not None:
             return self
         inverse = np.linalg.inv(srgb_to_camera(context.camera))
-        return self.filled(matrix=_as_tuples(inverse.tolist()))
+        return self.with_defaults(matrix=_as_tuples(inverse.tolist()))
 
 
 class SrgbToCamera(FixedMatrix):
@@ -148,7 +148,7 @@ class SrgbToCamera(FixedMatrix):
     def resolve(self, context: Context) -> "SrgbToCamera":
         if self.matrix is not None:
             return self
-        return self.filled(matrix=_as_tuples(srgb_to_camera(context.camera).tolist()))
+        return self.with_defaults(matrix=_as_tuples(srgb_to_camera(context.camera).tolist()))
 
 
 STAGE = Stage(

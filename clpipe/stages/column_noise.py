@@ -33,7 +33,7 @@ class Gaussian(GaussianNoise):
     summary: ClassVar = "add a Gaussian offset to each column, the same in every image of a camera"
 
     def resolve(self, context: Context) -> "Gaussian":
-        return self.filled(sigma=context.camera.column_noise(context.iso))
+        return self.with_defaults(sigma=context.camera.column_noise(context.iso))
 
     def draw(self) -> tuple[Pass, ...]:
         return (

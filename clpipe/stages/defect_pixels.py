@@ -59,7 +59,7 @@ class Random(Method):
 
     def resolve(self, context: Context) -> "Random":
         camera = context.camera
-        return self.filled(
+        return self.with_defaults(
             hot_share=camera.hot_pixel_share,
             hot_level=camera.signal_of(camera.hot_pixel_level, context.iso) or DEFAULT_LEVEL,
             dead_share=camera.dead_pixel_share,

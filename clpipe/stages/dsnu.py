@@ -26,7 +26,7 @@ class Gaussian(GaussianNoise):
 
     def resolve(self, context: Context) -> "Gaussian":
         camera = context.camera
-        return self.filled(sigma=camera.signal_of(camera.dsnu, context.iso))
+        return self.with_defaults(sigma=camera.signal_of(camera.dsnu, context.iso))
 
     def draw(self) -> tuple[Pass, ...]:
         return (Pass("dsnu", arguments=("sigma",), random=NoiseScope.CAMERA),)

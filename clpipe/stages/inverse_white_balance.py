@@ -32,9 +32,9 @@ class Gains(Method):
 
     def resolve(self, context: Context) -> "Gains":
         red, blue = context.camera.white_balance_gains
-        return self.filled(red_gain=red, blue_gain=blue)
+        return self.with_defaults(red_gain=red, blue_gain=blue)
 
-    def after(self, context: Context) -> Context:
+    def next_context(self, context: Context) -> Context:
         assert self.red_gain is not None and self.blue_gain is not None
         return replace(context, gains=(self.red_gain, self.blue_gain))
 

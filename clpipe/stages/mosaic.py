@@ -28,7 +28,7 @@ class Bayer(Method):
         "RGGB", "Colours of the 2x2 pixels in the upper left corner, row by row.", structural=True
     )
 
-    def after(self, context: Context) -> Context:
+    def next_context(self, context: Context) -> Context:
         return replace(context, pattern=self.pattern)
 
     def passes(self) -> tuple[Pass, ...]:

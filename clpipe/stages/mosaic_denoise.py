@@ -83,9 +83,9 @@ class NonLocalMeans(Method):
         if self.a is not None and self.b is not None:
             return self
         a, b = context.noise_parameters()
-        return self.filled(a=a, b=b)
+        return self.with_defaults(a=a, b=b)
 
-    def where_clean(self, context: Context) -> Method:
+    def noise_free(self, context: Context) -> Method:
         return Noiseless()
 
     @property

@@ -54,7 +54,7 @@ class Linear(Method):
         camera = context.camera
         black = camera.black_level if context.black_level is None else context.black_level
         white = camera.white_level if context.white_level is None else context.white_level
-        filled = self.filled(black_level=black, white_level=white)
+        filled = self.with_defaults(black_level=black, white_level=white)
         return type(self).model_validate(filled.model_dump())
 
     def passes(self) -> tuple[Pass, ...]:

@@ -2,7 +2,7 @@
 
 Real noise arises before the processing, which shapes it; see ``sensor_noise``. Here noise that is
 independent in each pixel is added after the processing, with a sigma of the user's, of ``clpipe
-measure --json``, or of the picture itself (``clpipe run --baseline``).
+measure --json``, or of the picture itself (``clpipe run --truth iid``).
 """
 
 from collections.abc import Mapping
@@ -58,14 +58,14 @@ class Matched(Method):
 
 
 class NoNoise(Unchanged, Matched):
-    """No noise on the finished picture; ``clpipe run --baseline`` is matched as it says."""
+    """No noise on the finished picture; ``clpipe run --truth iid`` is matched as it says."""
 
     method: ClassVar = "none"
     summary: ClassVar = "no noise here; sensor_noise adds it where a sensor does"
 
     jpeg: bool = parameter(
         False,
-        "Match the noise of --baseline in the decoded JPEG, which keeps more of a camera's noise "
+        "Match the noise of --truth in the decoded JPEG, which keeps more of a camera's noise "
         "than of independent noise.",
     )
 
@@ -152,13 +152,13 @@ class IndependentNoise(Matched):
             RequestError: it is to be the measured one, and no report is set.
         """
         if self.correlation is not None or not self.correlated:
-            return self.filled(correlation=(0.0, 0.0, 0.0))
+            return self.with_defaults(correlation=(0.0, 0.0, 0.0))
         if not self.measured:
             raise RequestError(
                 "picture_noise: correlated is true, but nothing is measured; set correlation, or "
                 "measured, a report of clpipe measure --json"
             )
-        return self.filled(correlation=self.noise(iso).correlation)
+        return self.with_defaults(correlation=self.noise(iso).correlation)
 
     def normals(self, image: Floats, given: ReferenceContext) -> Floats:
         """The normals of each sample, (height, width, 3), of the image's stream."""
@@ -199,7 +199,7 @@ class IidGaussian(IndependentNoise):
         correlated = self.with_correlation(context.iso)
         if self.sigma is not None:
             return correlated
-        return correlated.filled(sigma=self.noise(context.iso).sigma)
+        return correlated.with_defaults(sigma=self.noise(context.iso).sigma)
 
     def passes(self) -> tuple[Pass, ...]:
         names = ("red", "green", "blue", *MIXING)
@@ -250,7 +250,8 @@ class IntensityDependent(IndependentNoise):
             return correlated
         places = np.linspace(0, 1, RESOLVED)
         curves = (np.interp(places, *c).clip(0, 1) for c in self.noise(context.iso).curves)
-        return correlated.filled(sigma=tuple(tuple(curve.round(6).tolist()) for curve in curves))
+        sigma = tuple(tuple(curve.round(6).tolist()) for curve in curves)
+        return correlated.with_defaults(sigma=sigma)
 
     def table(self) -> Floats:
         """Sigma at the 256 intensities v = i / 255 of red, of green and of blue, (768,)."""

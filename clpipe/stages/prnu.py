@@ -42,7 +42,7 @@ class Gaussian(GaussianNoise):
     )
 
     def resolve(self, context: Context) -> "Gaussian":
-        return self.filled(sigma=context.camera.prnu)
+        return self.with_defaults(sigma=context.camera.prnu)
 
     def draw(self) -> tuple[Pass, ...]:
         return (Pass("prnu", arguments=("sigma",), random=NoiseScope.CAMERA),)

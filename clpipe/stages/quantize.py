@@ -64,12 +64,12 @@ class Linear(Method):
         if self.bits and self.bits != camera.bits:
             scale = (2**self.bits - 1) / (2**camera.bits - 1)
             black, white = float(round(black * scale)), float(round(white * scale))
-        filled = self.filled(black_level=black, white_level=white)
+        filled = self.with_defaults(black_level=black, white_level=white)
         assert filled.white_level is not None
-        filled = filled.filled(bits=max(int(filled.white_level).bit_length(), 8))
+        filled = filled.with_defaults(bits=max(int(filled.white_level).bit_length(), 8))
         return type(self).model_validate(filled.model_dump())
 
-    def after(self, context: Context) -> Context:
+    def next_context(self, context: Context) -> Context:
         return replace(context, black_level=self.black_level, white_level=self.white_level)
 
     def passes(self) -> tuple[Pass, ...]:

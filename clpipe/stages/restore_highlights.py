@@ -37,7 +37,7 @@ class Brooks2019(Method):
 
     def resolve(self, context: Context) -> "Brooks2019":
         red, blue = context.camera.white_balance_gains
-        return self.filled(red_gain=red, blue_gain=blue)
+        return self.with_defaults(red_gain=red, blue_gain=blue)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("restore_highlights", arguments=("red_gain", "blue_gain")),)

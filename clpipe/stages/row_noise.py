@@ -33,7 +33,7 @@ class Gaussian(GaussianNoise):
     summary: ClassVar = "add a Gaussian offset to each row, new in each image"
 
     def resolve(self, context: Context) -> "Gaussian":
-        return self.filled(sigma=context.camera.row_noise(context.iso))
+        return self.with_defaults(sigma=context.camera.row_noise(context.iso))
 
     def draw(self) -> tuple[Pass, ...]:
         return (

@@ -98,7 +98,7 @@ class Unsharp(Method):
         noise = noise_in_roots(predicted_noise(context)[0], MID_GREY, offset)
         x = (noise / SOFTEST) ** 2
         amount = LEAST_AMOUNT + MORE_AMOUNT * 4 * x / (1 + x) ** 2
-        return self.filled(amount=amount, limit=LEAST_LIMIT + noise, offset=offset)
+        return self.with_defaults(amount=amount, limit=LEAST_LIMIT + noise, offset=offset)
 
     @property
     def reach(self) -> int:

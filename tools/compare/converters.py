@@ -129,7 +129,7 @@ class Comparison:
                 "--format",
                 "png",
             ]
-            run([*map(str, command), *dng, "--quiet", "--overwrite"], os.environ.copy())
+            run([*map(str, command), *dng, "--quiet", "--redo", "all"], os.environ.copy())
         for converter in self.converters:
             for image in images:
                 for name in (image.stem, f"{image.stem}.truth")[not noisy :]:

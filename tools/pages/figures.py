@@ -89,7 +89,7 @@ def outputs(figure: Path) -> list[str]:
 def develop(render: Path, out: Path) -> dict[int, Path]:
     """The pictures of a render by ISO; beside each its baselines, truths and normalised mosaics."""
     isos = ",".join(map(str, ISOS))
-    several = [*options("--keep", ["normalize"]), *options("--baseline", ["iid", "intensity"])]
+    several = [*options("--keep", ["normalize"]), *options("--truth", ["iid", "intensity"])]
     clpipe("run", render, "-o", out, "-c", "paper", "--iso", isos, "--format", "png", *several)
     return {iso: out / f"iso{iso}" / render.with_suffix(".png").name for iso in ISOS}
 

@@ -32,7 +32,7 @@ class Kind(NamedTuple):
 
 DEVELOPED, UNDENOISED = "developed", "undenoised"
 RUNS = {
-    DEVELOPED: ("--baseline", "iid", "--baseline", "intensity"),
+    DEVELOPED: ("--truth", "iid", "--truth", "intensity"),
     UNDENOISED: ("--skip", "denoise"),
 }
 CLEAN, DENOISED, CAMERA, IID = "clean", "clean, denoised", "camera", "IID"

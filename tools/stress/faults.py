@@ -241,7 +241,7 @@ def edited(trial: Trial, seconds: float, whole: int) -> None:
         edits += [text[:at], text[:at] + luck.randbytes(20) + text[at:], text.replace(b": ", b":")]
     place.write_bytes(data[:start] + luck.choice(edits) + data[start + size :])
     trial.edited = place.relative_to(trial.out).as_posix()
-    for command in (["poses", trial.out], ["run", "--replay", place, "-o", trial.place / "again"]):
+    for command in (["poses", trial.out], ["replay", place, "-o", trial.place / "again"]):
         told = subprocess.run(
             [sys.executable, "-m", "clpipe", *command],
             cwd=trial.place.parent,

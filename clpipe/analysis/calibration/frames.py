@@ -198,7 +198,7 @@ def _from_kept(
         step = chain.step_named(attributes.get("stage", ""))
     except RequestError as error:
         raise ImageError(f"{path}: its settings cannot be used: {error}") from None
-    context, camera = step.method.after(step.context), chain.camera
+    context, camera = step.method.next_context(step.context), chain.camera
     black = camera.black_level if context.black_level is None else context.black_level
     white = camera.white_level if context.white_level is None else context.white_level
     ev = next((getattr(s.method, "ev", 0) for s in chain.steps if s.stage.name == "exposure"), 0)

@@ -122,7 +122,7 @@ class Bounded(Method):
 
     def resolve(self, context: Context) -> Self:
         _, green, _ = noise_of_colours(context)
-        return self.filled(noise=sqrt(green.at(MID_GREY)), offset=offset_of_roots(context))
+        return self.with_defaults(noise=sqrt(green.at(MID_GREY)), offset=offset_of_roots(context))
 
     @property
     def doubt(self) -> np.float32:

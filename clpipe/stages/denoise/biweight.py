@@ -102,8 +102,8 @@ class Biweight(Denoiser):
         return noise_in_roots(luma, *at), noise_in_roots(chroma, *at)
 
     def resolve(self, context: Context) -> Self:
-        resolved = super().resolve(context).filled(offset=offset_of_roots(context))
-        return resolved.filled(grain=0.35 / (1 + (resolved.roots[0] / 0.03) ** 2))
+        resolved = super().resolve(context).with_defaults(offset=offset_of_roots(context))
+        return resolved.with_defaults(grain=0.35 / (1 + (resolved.roots[0] / 0.03) ** 2))
 
     @property
     def effect(self) -> str:

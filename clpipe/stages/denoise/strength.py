@@ -161,9 +161,9 @@ class Denoiser(Method):
 
     def resolve(self, context: Context) -> Self:
         luma, chroma = predicted_noise(context)
-        return self.filled(luma_noise=luma, chroma_noise=chroma)
+        return self.with_defaults(luma_noise=luma, chroma_noise=chroma)
 
-    def where_clean(self, context: Context) -> Method:
+    def noise_free(self, context: Context) -> Method:
         return Noiseless()
 
     @property

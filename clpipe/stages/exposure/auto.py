@@ -131,7 +131,7 @@ class Auto(Gain):
         return self
 
     def resolve(self, context: Context) -> Self:
-        return self.filled(target=TARGETS[self.rule])
+        return self.with_defaults(target=TARGETS[self.rule])
 
     def passes(self) -> tuple[Pass, ...]:
         limits, found = ("target", "lowest", "highest", "offset"), ("metered_ev", "gain")

@@ -37,7 +37,7 @@ class Gain(Method):
         le=10,
     )
 
-    def after(self, context: Context) -> Context:
+    def next_context(self, context: Context) -> Context:
         return replace(context, headroom=context.headroom + self.headroom)
 
     @property

@@ -163,10 +163,10 @@ class SensorNoise(Method):
 
     def resolve(self, context: Context) -> Self:
         model, camera = self.model(context), context.camera
-        filled = self.filled(a=model.a, b=model.b, tukey_lambda=camera.tukey_lambda)
-        return filled.filled(full_well=camera.full_well)
+        filled = self.with_defaults(a=model.a, b=model.b, tukey_lambda=camera.tukey_lambda)
+        return filled.with_defaults(full_well=camera.full_well)
 
-    def after(self, context: Context) -> Context:
+    def next_context(self, context: Context) -> Context:
         return replace(context, noise=self.model(context))
 
     def without_noise(self) -> Method | None:

@@ -34,7 +34,7 @@ class NoNoise(Method):
     def resolve(self, context: Context) -> "NoNoise":
         camera = context.camera
         full = camera.signal_of(camera.full_well, context.iso) if camera.full_well else None
-        return self.filled(full_signal=full)
+        return self.with_defaults(full_signal=full)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("full_well", arguments=("full_signal",)),) if self.full_signal else ()

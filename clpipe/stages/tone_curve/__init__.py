@@ -52,7 +52,7 @@ class Linear(Method):
     )
 
     def resolve(self, context: Context) -> Self:
-        return self.filled(headroom=context.headroom)
+        return self.with_defaults(headroom=context.headroom)
 
     @property
     def gain(self) -> np.float32:

@@ -34,7 +34,7 @@ class EstimatedGains(Method):
 
     tolerance: ClassVar = 1e-6  # division is not exact on every device
 
-    def after(self, context: Context) -> Context:
+    def next_context(self, context: Context) -> Context:
         # The estimates are known only when the image is processed; the as-shot gains stand in.
         return replace(context, applied_gains=context.gains)
 
@@ -78,9 +78,9 @@ class AsShot(Method):
 
     def resolve(self, context: Context) -> "AsShot":
         red, blue = context.gains
-        return self.filled(red_gain=red, blue_gain=blue)
+        return self.with_defaults(red_gain=red, blue_gain=blue)
 
-    def after(self, context: Context) -> Context:
+    def next_context(self, context: Context) -> Context:
         assert self.red_gain is not None and self.blue_gain is not None
         return replace(context, applied_gains=(self.red_gain, self.blue_gain))
 
@@ -112,7 +112,7 @@ class Gains(AsShot):
 
     def resolve(self, context: Context) -> "Gains":
         red, blue = context.camera.white_balance_gains
-        return self.filled(red_gain=red, blue_gain=blue)
+        return self.with_defaults(red_gain=red, blue_gain=blue)
 
 
 class Unbalanced(Unchanged):

@@ -1,7 +1,7 @@
 """CPU time by step, from the clocks of the threads that do it; for benchmarks.
 
-A step is marked where it is done, with :class:`Step`. That costs well under a microsecond unless
-:class:`StepTimes` counts.
+A step is marked where it is done, with :class:`CpuTimer`. That costs well under a microsecond
+unless :class:`CpuTimes` counts.
 """
 
 import threading
@@ -10,7 +10,7 @@ from contextlib import ContextDecorator
 from typing import Self
 
 
-class Step(ContextDecorator):
+class CpuTimer(ContextDecorator):
     """Marks what a thread does inside as a step; a context, and a decorator of functions.
 
     A step within another one counts as the inner one alone.
@@ -20,29 +20,29 @@ class Step(ContextDecorator):
         self.name = name
 
     def __enter__(self) -> Self:
-        if times := StepTimes.counting:
-            times.begin(self.name)
+        if times := CpuTimes.counting:
+            times.enter(self.name)
         return self
 
     def __exit__(self, *error: object) -> None:
-        if times := StepTimes.counting:
-            times.end()
+        if times := CpuTimes.counting:
+            times.leave()
 
 
-class StepTimes:
+class CpuTimes:
     """CPU time of this process while it is entered; one at a time.
 
     ``seconds`` is by step, ``elsewhere`` what threads took that were in no step, such as those of a
     device's driver.
 
-    >>> with StepTimes() as times, Step("all"):
-    ...     with Step("part"):
+    >>> with CpuTimes() as times, CpuTimer("all"):
+    ...     with CpuTimer("part"):
     ...         total = sum(range(100_000))
     >>> sorted(times.seconds), times.seconds["part"] > times.seconds["all"] > 0
     (['all', 'part'], True)
     """
 
-    counting: "StepTimes | None" = None
+    counting: "CpuTimes | None" = None
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -52,20 +52,20 @@ class StepTimes:
 
     def __enter__(self) -> Self:
         self._process = time.process_time()
-        StepTimes.counting = self
+        CpuTimes.counting = self
         return self
 
     def __exit__(self, *error: object) -> None:
-        StepTimes.counting = None
+        CpuTimes.counting = None
         self.elsewhere = time.process_time() - self._process - sum(self.seconds.values())
 
-    def begin(self, name: str) -> None:
-        """This thread begins a step, and leaves the one around it until the end."""
+    def enter(self, name: str) -> None:
+        """Begin a step of this thread, in place of the one around it until it is left."""
         self._count()
         self._steps.append(name)
 
-    def end(self) -> None:
-        """This thread ends its latest step; one that began before the counting is not known."""
+    def leave(self) -> None:
+        """End the latest step of this thread; one that began before the counting is not known."""
         if self._steps:
             self._count()
             self._steps.pop()

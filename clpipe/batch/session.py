@@ -1,0 +1,389 @@
+"""A run: images through a chain, from what is asked for to the outcome of each image.
+
+The commands that make pictures and :func:`clpipe.run` all go this way.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from clpipe.base.about import full_version
+from clpipe.base.errors import OutputError, RequestError
+from clpipe.base.memory import parse_size
+from clpipe.base.text import several
+from clpipe.base.types import plain
+from clpipe.base.validation import typed
+from clpipe.batch.outcome import Outcome
+from clpipe.batch.run_log import RunLog, Summary, log_name
+from clpipe.batch.tar_batch import TarBatch
+from clpipe.batch.tars import Tar, cut
+from clpipe.batch.threads import Batch
+from clpipe.batch.trace import Trace, check_trace
+from clpipe.batch.where import Where
+from clpipe.batch.work import ImageWorker
+from clpipe.chain.request import Request
+from clpipe.engine.device import Device, open_devices
+from clpipe.images.pixels import USUAL_MAX_PIXELS
+from clpipe.images.read import PICTURE_SUFFIXES
+from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
+from clpipe.inputs.loader import ImageLoader
+from clpipe.inputs.poses import with_views
+from clpipe.inputs.series import Series, check_isos
+from clpipe.outputs.camera_files import check_camera_files, write_camera_files
+from clpipe.outputs.existing import Redo
+from clpipe.outputs.folder import output_folder, remove_unfinished
+from clpipe.outputs.gone import pictures_without_input
+from clpipe.outputs.patches import Patches
+from clpipe.outputs.writer import OutputWriter
+from clpipe.stage import Kind
+
+if TYPE_CHECKING:
+    from clpipe.batch.dask_client import Cluster
+
+
+@dataclass(frozen=True)
+class Images:
+    """Which images a run is about.
+
+    Args:
+        inputs: files, folders, globs and manifests.
+        exclude: patterns of what is not taken from folders and globs.
+        poses: the file of the renders' cameras; None where they are not known.
+        series: cameras and ISOs, each of which makes pictures of its own.
+        shard: the part of them that is done.
+        per_tar: how many are packed into a tar; None is no tars.
+        found: images that are known already, in place of inputs.
+    """
+
+    inputs: Sequence[str] = ()
+    exclude: Sequence[str] = ()
+    poses: Path | None = None
+    series: Series = field(default_factory=Series)
+    shard: Shard = field(default_factory=Shard)
+    per_tar: int | None = None
+    found: Sequence[Job] = ()
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the output folder has all of the run's pictures, as files, when it has ended."""
+        return bool(self.inputs) and not self.per_tar and self.shard.of == 1
+
+    def jobs(self, loader: ImageLoader, output: Path) -> tuple[list[Job], list[Tar]]:
+        """The jobs of the run's part, and the tars that they go into.
+
+        Raises:
+            RequestError: an input, a camera or an ISO is not there, or a name is there twice.
+        """
+        jobs = self.found
+        if not jobs:
+            found = find_jobs(self.inputs, output, loader.endings(), self.exclude)
+            jobs = loader.exposures(found)
+        jobs = with_views(jobs, self.poses, loader.settings.render)
+        jobs = self.series.jobs(jobs, loader.settings)
+        if self.per_tar:
+            tars = self.shard.take(cut(jobs, self.per_tar, output))
+            return [job for tar in tars for job in tar.jobs], tars
+        return self.shard.take(jobs), []
+
+
+class Run:
+    """Images through a chain: iterate over it for the outcome of each image, as it is finished.
+
+    All that can be refused is refused when it is made; nothing is written before it is iterated.
+    A run is iterated once.
+
+    Args:
+        request: what is asked for.
+        images: of which images.
+        where: with which devices, to which folder.
+        dask: the address of a Dask scheduler whose workers do it; None is this machine.
+        arguments: what the log says that the run was begun with.
+        echo: gets each line of the log, too.
+
+    Attributes:
+        jobs: the images of the run's part; there may be none.
+        summary: counts of what became of them so far.
+        notes: what is to be said of the output folder, once the run has ended.
+
+    Raises:
+        RequestError: a name or value is not allowed, or a result would overwrite something.
+    """
+
+    def __init__(
+        self,
+        request: Request,
+        images: Images,
+        where: Where,
+        dask: str | None = None,
+        arguments: Sequence[str] = (),
+        echo: Callable[[bytes], None] | None = None,
+    ) -> None:
+        # A checkout asks git for the version that log and sidecars have; here nobody waits for it.
+        threading.Thread(target=full_version, daemon=True).start()
+        check_output(where.output)
+        self.where = where
+        self.notes: list[str] = []
+        self._images = images
+        self._dask = dask
+        self._arguments = arguments
+        self._echo = echo
+        self._running: Batch | Cluster | None = None
+        self._is_stopped = False
+        self._loader = ImageLoader(request)
+        self.jobs, self._tars = images.jobs(self._loader, where.output)
+        self.summary = Summary(len(self.jobs))
+        if not self.jobs:
+            return
+        self._loader.check(self.jobs)
+        self._chain = self._loader.first_chain(self.jobs)
+        check_render_options(request, self._chain.source)
+        self._request = request.with_outputs(self._chain)
+        self.writer = OutputWriter(where.output, self._request)
+        self.writer.check(self._chain, self.jobs)
+        if where.trace:
+            check_trace(where.trace)
+        if self._tars and dask is not None:
+            raise RequestError("--dask: it makes no tars; use --webdataset with --shard")
+
+    def __iter__(self) -> Iterator[Outcome]:
+        return self.outcomes(self.jobs)
+
+    def stop(self) -> None:
+        """Let no more images in; those in flight are finished. May be called by a signal."""
+        self._is_stopped = True
+        if self._running:
+            self._running.stop()
+
+    def outcomes(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
+        """The outcome of each image, as it is finished, in any order.
+
+        Args:
+            jobs: those of the run, which may come one after the other.
+
+        Raises:
+            RequestError: the output folder cannot be used, or the cluster.
+            OutputError: nothing can be written any more. What was in flight is reported before.
+            DeviceError: on no device is work possible any more.
+        """
+        if not self.jobs:
+            return
+        images, where = self._images, self.where
+        start = {"arguments": list(self._arguments), "images": len(self.jobs)}
+        with ExitStack() as stack:
+            batch = self._running = stack.enter_context(self._batch())
+            if self._is_stopped:
+                batch.stop()
+            stack.enter_context(output_folder(where.output, images.shard))
+            folders = images.series.under(where.output) if images.poses and images.is_whole else []
+            for folder in folders:
+                check_camera_files(folder)
+            trace = stack.enter_context(Trace(where.trace)) if where.trace else None
+            remove_unfinished(where.output, self.jobs, self._request.patch is not None)
+            log = RunLog(where.output / log_name(images.shard), start, self._echo)
+            stack.enter_context(closing(log))
+            running = stack.enter_context(closing(batch.run(jobs)))
+            self.summary.began = time.perf_counter()
+            yield from self._counted(running, log, trace)
+            self._look_behind(folders)
+
+    def _counted(
+        self, running: Iterable[Outcome], log: RunLog, trace: Trace | None
+    ) -> Iterator[Outcome]:
+        """The outcomes, each counted and noted.
+
+        Raises:
+            OutputError: the log cannot be written any more. What is in flight is finished before.
+        """
+        unlogged: OutputError | None = None
+        try:
+            for outcome in running:
+                self.summary.add(outcome)
+                if not unlogged:
+                    try:
+                        log.add(outcome)
+                    except OutputError as error:
+                        unlogged = error
+                        self.stop()
+                if trace:
+                    trace.add(outcome)
+                yield outcome
+            if unlogged:
+                raise unlogged
+        finally:
+            self.summary.interrupted = self.summary.finished < self.summary.total
+            if not unlogged:
+                log.end(self.summary)
+
+    def _look_behind(self, folders: Sequence[Path]) -> None:
+        """Write the views of a run's folders, and note what else there is to say of it."""
+        if self.summary.interrupted:
+            return
+        for folder in folders:
+            self.notes += write_camera_files(folder).lines(folder)
+        if self._images.is_whole and (
+            count := pictures_without_input(self.writer, self.jobs, self._images.inputs)
+        ):
+            pictures, are = ("picture", "is") if count == 1 else ("pictures", "are")
+            self.notes.append(
+                f"{count} {pictures} in {self.where.output} {are} of inputs that are not there any "
+                "more"
+            )
+
+    def _batch(self) -> "AbstractContextManager[Batch | Cluster]":
+        """What does the jobs: this machine, with or without tars, or a cluster.
+
+        Raises:
+            RequestError: the cluster cannot be used.
+            DeviceError: there is no usable device.
+        """
+        if self._dask is not None:
+            from clpipe.batch.dask_client import connected
+            from clpipe.batch.dask_worker import RunSpec
+
+            return connected(self._dask, RunSpec(self._request, self.where, self.jobs[0]))
+        where = self.where
+        devices: list[Device | None] = [*open_devices(where.devices, where.memory)] or [None]
+        if self._tars:
+            own = self._loader, self.writer, self._chain
+            return nullcontext(TarBatch(self._tars, *own, where, devices))
+        is_traced = where.trace is not None
+        worker = ImageWorker(self._loader, self.writer, self._chain, where.redo, is_traced)
+        return nullcontext(Batch(worker, devices, where.threads))
+
+
+def check_output(folder: Path) -> None:
+    """See that the name of the output folder is not that of a picture.
+
+    Raises:
+        RequestError: it is.
+    """
+    if folder.suffix.lower() in (*PICTURE_SUFFIXES, ".dng") and not folder.is_dir():
+        raise RequestError(
+            f"--output: found {folder}, the name of a picture; name the folder to write to: "
+            "-o FOLDER"
+        )
+
+
+def check_render_options(request: Request, source: Kind) -> None:
+    """See that options about renders are not set for other images.
+
+    Raises:
+        RequestError: one is.
+    """
+    for option, value in (("--layer", request.layer), ("--transfer", request.transfer)):
+        if value is not None and source is not Kind.RGB:
+            raise RequestError(f"{option}: it is for renders, but the chain reads {source.label}")
+
+
+Texts = str | Path | Sequence[str | Path]  # one, or several
+
+
+@typed
+def run(
+    inputs: Texts,
+    output: str | Path,
+    config: str | Path | None = None,
+    *,
+    camera: Texts = (),
+    iso: float | Sequence[float] | Mapping[str, Any] = (),
+    start_at: str | None = None,
+    until: str | None = None,
+    stage_files: Texts = (),
+    format: Texts = (),
+    keep: Texts = (),
+    carry: Texts = (),
+    truth: Texts = (),
+    frames: int | None = None,
+    bracket: Sequence[float] = (),
+    patch: int | Patches | None = None,
+    exclude: Texts = (),
+    poses: str | Path | None = None,
+    layer: str | None = None,
+    transfer: str | None = None,
+    max_pixels: int = USUAL_MAX_PIXELS,
+    redo: Literal["missing", "old", "damaged", "all"] = "old",
+    webdataset: int | None = None,
+    shard: str = "1/1",
+    device: str | int | Sequence[str | int] = (),
+    memory: int | str | None = None,
+    jobs: int | None = None,
+    dask: str | None = None,
+    trace: str | Path | None = None,
+    **settings: Any,
+) -> Run:
+    """Images through a chain, to files: what ``clpipe run`` does, by the same names.
+
+    >>> import clpipe
+    >>> made = clpipe.run("renders/", "out", iso=1600, truth="clean")  # doctest: +SKIP
+    >>> for outcome in made:  # doctest: +SKIP
+    ...     print(outcome.job.path, outcome.status, outcome.outputs)
+    >>> made.summary.counts  # doctest: +SKIP
+    {'done': 24, 'skipped': 0, 'left out': 0, 'failed': 0}
+
+    Args:
+        inputs: files, folders, globs and manifests.
+        output: the folder that the pictures go to; it is made where it is missing.
+        config: a built-in configuration or a TOML file.
+        camera, iso: one, or several, whose pictures go to folders of their own.
+        stage_files, format, keep, carry, truth, exclude, device: one, or several.
+        memory: of a device, in bytes or as "2G".
+        **settings: what a configuration file may hold, over ``config``.
+        patch: the sides of patches in px, or with how many and how: ``Patches(128, per_image=4)``.
+        start_at, until, frames, bracket, poses, layer, transfer, max_pixels, redo, webdataset,
+            shard, jobs, dask, trace: as the options of ``clpipe run``.
+
+    Returns:
+        A run that begins when it is iterated.
+
+    Raises:
+        RequestError: a name or value that is not allowed, an input that is not there, or a result
+            that would overwrite something. One image's failure is its outcome, and no error.
+    """
+    isos = (iso,) if isinstance(iso, int | float) else () if isinstance(iso, Mapping) else iso
+    series = Series(several(camera), check_isos(isos))
+    patches = Patches(patch) if isinstance(patch, int) else patch
+    values = plain(settings)
+    if isinstance(iso, Mapping):
+        values["iso"] = plain(iso)
+    request = Request.from_options(
+        config=None if config is None else str(config),
+        camera=series.camera,
+        iso=series.iso,
+        stage_files=[Path(file) for file in several(stage_files)],
+        values=values,
+        start_at=start_at,
+        until=until,
+        formats=several(format),
+        keep=several(keep),
+        carry=several(carry),
+        truth=several(truth),
+        frames=frames,
+        bracket=tuple(bracket),
+        patch=patches.size if patches else None,
+        patches_per_image=patches.per_image if patches else 0,
+        augment=bool(patches and patches.augment),
+        layer=layer,
+        transfer=transfer,
+        max_pixels=max_pixels,
+    )
+    images = Images(
+        several(inputs),
+        several(exclude),
+        None if poses is None else Path(poses),
+        series,
+        parse_shard(shard),
+        webdataset,
+    )
+    where = Where(
+        Path(output),
+        several(device),
+        parse_size(memory) if isinstance(memory, str) else memory,
+        jobs,
+        Redo(redo),
+        None if trace is None else Path(trace),
+    )
+    return Run(request, images, where, dask)

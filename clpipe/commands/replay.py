@@ -1,0 +1,72 @@
+"""``clpipe replay``: a picture again, from its sidecar."""
+
+import sys
+from pathlib import Path
+
+import click
+
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.memory import parse_size
+from clpipe.batch.replay import replay_of
+from clpipe.batch.session import Images, Run
+from clpipe.batch.where import Where
+from clpipe.commands.input_options import max_pixels_option
+from clpipe.commands.options import Command, device_option, folder_named, stage_file_option
+from clpipe.commands.progress import follow
+
+
+@click.command("replay", cls=Command)
+@click.argument("sidecar", type=click.Path(path_type=Path), metavar="SIDECAR")
+@click.argument("image", required=False, type=click.Path(path_type=Path), metavar="[INPUT]")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    callback=lambda _context, _option, text: folder_named(text),
+    metavar="OUT",
+    help="The output folder; it is made where it is missing.",
+)
+@stage_file_option
+@device_option
+@click.option("--memory", metavar="SIZE", help="Memory of the device, such as 2G.")
+@max_pixels_option
+@click.option("--quiet", is_flag=True, help="Print failures only.")
+def replay(
+    sidecar: Path,
+    image: Path | None,
+    output: Path,
+    stage_files: tuple[Path, ...],
+    selector: str | None,
+    memory: str | None,
+    max_pixels: int,
+    quiet: bool,
+) -> None:
+    """Make a sidecar's picture again, byte for byte, or say what has changed.
+
+    INPUT is its input, where that has moved. Files that the picture was made with, a camera profile
+    or a curve, must be as they were. A sidecar is data: code that it names is run only where
+    --stage-file names it, too.
+
+    The exit status is 0 where the bytes are the same.
+
+    \b
+    clpipe replay out/render.json -o again
+    """
+    again = replay_of(sidecar, [image] if image else [], max_pixels, stage_files)
+    selectors = () if selector is None else (selector,)
+    where = Where(output, selectors, parse_size(memory) if memory else None)
+    try:
+        made = Run(again.request, Images(found=[again.job]), where, arguments=sys.argv[1:])
+    except RequestError as error:
+        raise RequestError(f"{sidecar}: {error}") from None
+    follow(made, made.outcomes(made.jobs), quiet)
+    if made.summary.exit_status:
+        sys.exit(made.summary.exit_status)
+    (rendition,) = made.writer.renditions_of(again.job)
+    existing = made.writer.existing(again.job, rendition)
+    try:
+        same, text = again.comparison(existing.sidecar)
+    except ImageError as error:
+        raise RequestError(str(error)) from None
+    click.echo(f"{existing.pictures[0]}: {text}", err=True)
+    sys.exit(0 if same else 1)
