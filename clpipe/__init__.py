@@ -11,7 +11,8 @@ from clpipe.base.about import __version__
 
 if TYPE_CHECKING:
     from clpipe.base.errors import ClpipeError, DeviceError, ImageError, RequestError
-    from clpipe.batch.session import run
+    from clpipe.batch.outcome import Outcome
+    from clpipe.batch.session import Run, run
     from clpipe.camera.noise import NoiseModel
     from clpipe.camera.profile import Camera, built_in_cameras, load_camera
     from clpipe.dataset import Dataset, Patches, RawNoise
@@ -25,11 +26,13 @@ _MODULES = {
     "DeviceError": "clpipe.base.errors",
     "ImageError": "clpipe.base.errors",
     "NoiseModel": "clpipe.camera.noise",
+    "Outcome": "clpipe.batch.outcome",
     "Patches": "clpipe.dataset",
     "Pipeline": "clpipe.pipeline",
     "RawNoise": "clpipe.dataset",
     "RequestError": "clpipe.base.errors",
     "Result": "clpipe.engine.runner",
+    "Run": "clpipe.batch.session",
     "built_in_cameras": "clpipe.camera.profile",
     "load_camera": "clpipe.camera.profile",
     "run": "clpipe.batch.session",
@@ -42,11 +45,13 @@ __all__ = [
     "DeviceError",
     "ImageError",
     "NoiseModel",
+    "Outcome",
     "Patches",
     "Pipeline",
     "RawNoise",
     "RequestError",
     "Result",
+    "Run",
     "__version__",
     "built_in_cameras",
     "load_camera",

@@ -16,17 +16,19 @@ from clpipe.base.text import one_of
 from clpipe.base.types import Array, plain
 from clpipe.base.validation import typed
 from clpipe.chain.chain import Chain, make_chain
-from clpipe.chain.depth import depth_of_array, lenses_of, warnings_of, with_depth
+from clpipe.chain.depth import depth_of_array
+from clpipe.chain.entering import enter
 from clpipe.chain.files import load_settings
 from clpipe.chain.identity import image_key, noise_key
-from clpipe.chain.overscan import margins_of_array, steps_of_overscan, with_overscan
+from clpipe.chain.overscan import margins_of_array
 from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.clipping import MUCH, clipped_share, clipping_text
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.kinds import CHANNELS, vectors_of
 from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
-from clpipe.reference.geometry import NO_MARGINS
+from clpipe.reference.defocus import Depth
+from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.stage import Kind
 
 
@@ -117,23 +119,21 @@ class Pipeline(ReadOnly):
             RequestError: a name or value that is not allowed.
         """
         runner = self._runner_for(key, settings)
-        checked, chain = _checked(image, runner.chain.source), runner.chain
+        checked = _checked(image, runner.chain.source)
         margins = margins_of_array(overscan, checked)
-        if margins and steps_of_overscan(chain):
-            chain = with_overscan(chain, margins)
-            runner = runner.for_chain(chain)
-        elif margins:
-            checked = np.ascontiguousarray(margins.cropped(checked))
-            depth = None if depth is None else margins.cropped(np.asarray(depth))
-        if checked.ndim == 3 and lenses_of(chain):
-            far = depth_of_array(depth, *checked.shape[1::-1])
-            for warning in warnings_of(chain, far):
-                warnings.warn(f"{key}: {warning}", stacklevel=2)
-            chain = with_depth(chain, far)
-            runner = runner.for_chain(chain)
-        own_key = image_key(key, "" if chain.settings.noise_key else digest_of(checked))
+
+        def depth_of(chain: Chain, width: int, height: int, kept: Margins) -> Depth:
+            cropped = depth if depth is None or kept else margins.cropped(np.asarray(depth))
+            return depth_of_array(cropped, width, height)
+
+        own = enter(runner.chain, checked, margins, depth_of)
+        for warning in own.warnings:
+            warnings.warn(f"{key}: {warning}", stacklevel=2)
+        chain, pixels = own.chain, own.pixels
+        runner = runner if chain is runner.chain else runner.for_chain(chain)
+        own_key = image_key(key, "" if chain.settings.noise_key else digest_of(pixels))
         with self._lock:
-            result = runner.run(checked, noise_key(chain.settings, own_key))
+            result = runner.run(pixels, noise_key(chain.settings, own_key))
         share = clipped_share(result, chain) or 0.0
         if share >= MUCH:
             warnings.warn(f"{key}: {clipping_text(share)}", stacklevel=2)
@@ -174,14 +174,10 @@ class Pipeline(ReadOnly):
         if pixels.shape[2] < (least := CHANNELS.get(kind, 1)):
             raise ImageError(f"found {pixels.shape[2]} channels; {kind} has {least} or more")
         vectors = vectors_of("", ("",) * pixels.shape[2]) if kind == "flow" else ()
-        chain = self._runner_for(key, settings).chain
         margins = margins_of_array(overscan, layer)
-        if margins and steps_of_overscan(chain):
-            chain = with_overscan(chain, margins)
-        else:
-            pixels = margins.cropped(pixels)
-        along = Layer(kind, pixels, vectors=vectors)
-        (moved,), valid = warp([along], chain.geometry, *pixels.shape[1::-1])
+        own = enter(self._runner_for(key, settings).chain, pixels, margins)
+        along = Layer(kind, own.pixels, vectors=vectors)
+        (moved,), valid = warp([along], own.chain.geometry, *own.pixels.shape[1::-1])
         return moved if layer.ndim == 3 else moved[..., 0], valid
 
     def _runner_for(self, key: str, settings: Mapping[str, Any]) -> Runner:

@@ -1,8 +1,8 @@
-// Light that falls off towards the corners, by the distance to the middle of the image. Only * and +, so
-// that NumPy gives the same bits.
-INLINE vf squared_radius(site at, extent e) {
-    const vf dx = to_float(iota() * 2 + (vi)(2 * (int)at.x + 1 - (int)e.width)) * 0.5f;
-    const float dy = (float)(2 * (int)at.y + 1 - (int)e.height) * 0.5f;
+// Light that falls off towards the corners, by the distance to the place x, y. Only * and +, so that NumPy
+// gives the same bits.
+INLINE vf squared_radius(site at, float x, float y) {
+    const vf dx = to_float(iota() + (vi)((int)at.x)) + 0.5f - x;
+    const float dy = (float)at.y + 0.5f - y;
     return dx * dx + dy * dy;
 }
 
@@ -22,15 +22,15 @@ INLINE rgb vignetting_pa(rgb c, site at, extent e, float k1, float k2, float k3)
     const float width = e.width > 1 ? (float)(e.width - 1) : 1.0f;
     const float height = e.height > 1 ? (float)(e.height - 1) : 1.0f;
     const vf corner = (vf)((width * width + height * height) * 0.25f);
-    const vf r2 = squared_radius(at, e) * reciprocal(corner);
+    const vf r2 = squared_radius(at, 0.5f * (float)e.width, 0.5f * (float)e.height) * reciprocal(corner);
     return times(c, vmax(((r2 * k3 + k2) * r2 + k1) * r2 + 1.0f, (vf)(0.0f)));
 }
 
 // r is the tangent of the angle to the axis, and so 1 / (1 + r^2) its cosine squared. A focal length in
 // px is `per_px`; one that counts in longer sides is `per_side`, and the other is 0.
-INLINE rgb vignetting_cosine(rgb c, site at, extent e, float per_px, float per_side) {
+INLINE rgb vignetting_cosine(rgb c, site at, extent e, float x, float y, float per_px, float per_side) {
     const float side = (float)(e.width > e.height ? e.width : e.height);
     const vf unit = per_px > 0.0f ? (vf)(per_px) : (vf)(per_side) * reciprocal((vf)(side * side));
-    const vf cosine = reciprocal(squared_radius(at, e) * unit + 1.0f);
+    const vf cosine = reciprocal(squared_radius(at, x, y) * unit + 1.0f);
     return times(c, cosine * cosine);
 }

@@ -20,7 +20,8 @@ import numpy as np
 import pytest
 
 from clpipe.base.errors import DeviceError, ImageError, OutputError, RequestError
-from clpipe.batch import replay, work
+from clpipe.batch import replay
+from clpipe.batch.job_state import JobState
 from clpipe.batch.outcome import DONE, Outcome, Span
 from clpipe.batch.room import host_bytes
 from clpipe.batch.run_log import read_log
@@ -205,13 +206,13 @@ def test_several_devices_share_a_run(clpipe, renders, tmp_path):
 def test_devices_develop_at_the_same_time(renders, tmp_path, monkeypatch):
     renders(8)
     (tmp_path / "out").mkdir()
-    begin, both = ImageWorker.begin, threading.Barrier(2)
+    start, both = ImageWorker.start, threading.Barrier(2)
 
-    def together(self, task, rendition, runner):
+    def together(self, state, recipe, runner):
         both.wait(timeout=20)  # for the other device's image
-        return begin(self, task, rendition, runner)
+        return start(self, state, recipe, runner)
 
-    monkeypatch.setattr(ImageWorker, "begin", together)
+    monkeypatch.setattr(ImageWorker, "start", together)
     worker, jobs = worker_of(tmp_path)
     batch = Batch(worker, [None, None])
     outcomes = list(batch.run(jobs))
@@ -227,9 +228,9 @@ def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, m
     batch = Batch(worker, [None], threads=2)
     decode, decoded, seen = ImageWorker.decode, [], []
 
-    def counted(self, job, begin):
+    def counted(self, job, admit):
         decoded.append(job)
-        return decode(self, job, begin)
+        return decode(self, job, admit)
 
     monkeypatch.setattr(ImageWorker, "decode", counted)
     for done, _ in enumerate(batch.run(jobs)):
@@ -582,7 +583,7 @@ def test_killed_and_resumed_again_and_again(clpipe, renders, tmp_path):
     clpipe("run", "in", "-o", "whole", *RUN[2:])
     rng = random.Random(0)
     finished = {}
-    for _ in range(6):
+    for _ in range(3):
         process = start(tmp_path, "in", *RUN)
         time.sleep(rng.uniform(0.3, 1.6))
         process.kill()
@@ -813,7 +814,7 @@ def test_a_thread_that_dies_ends_the_run(renders, tmp_path, monkeypatch):
                 caught.append(str(error))
 
         with monkeypatch.context() as patch:
-            patch.setattr(work.Task, "outcome", die)  # of what is done behind an image's back
+            patch.setattr(JobState, "outcome", die)  # of what is done behind an image's back
             thread = threading.Thread(target=run, args=(Batch(worker, [None], 1),), daemon=True)
             thread.start()
             thread.join(20)
@@ -827,16 +828,16 @@ def test_what_a_device_leaves_another_does(renders, tmp_path, monkeypatch, caplo
     worker, jobs = worker_of(tmp_path)
     broken = []
 
-    def begin(self, task, rendition, runner):
+    def start(self, state, recipe, runner):
         if threading.current_thread().name == "device 0":
-            broken.append(task.job)
+            broken.append(state.job)
             raise DeviceError("it is given up")
         while not broken:
             time.sleep(0.01)
-        return right(self, task, rendition, runner)
+        return right(self, state, recipe, runner)
 
-    right = ImageWorker.begin
-    monkeypatch.setattr(ImageWorker, "begin", begin)
+    right = ImageWorker.start
+    monkeypatch.setattr(ImageWorker, "start", start)
     outcomes = list(Batch(worker, [None, None]).run(jobs))
     assert [o.status for o in outcomes] == ["done"] * 8
     assert len(broken) == 1

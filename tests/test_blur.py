@@ -104,7 +104,7 @@ def test_a_streak_is_as_long_and_lies_as_is_said(device):
     assert (seen * along_it).sum() == pytest.approx(0, abs=0.01)
     assert (seen * along_it**2).sum() == pytest.approx(24**2 / 12, rel=0.02)
     assert (seen * across**2).sum() < 0.4  # bilinear shares
-    turned = {"rotation": 1.2, "focal_length": 24 / np.tan(np.deg2rad(1.2)), "angle": 30.0}
+    turned = {"rotation": 1.2, "fx": 24 / np.tan(np.deg2rad(1.2)), "angle": 30.0}
     assert blurred(dot(), None, motion_blur=turned)[..., 0] == pytest.approx(seen, abs=5e-4)
     assert len(streak(200.0, 45.0)) < 600
 
@@ -114,7 +114,7 @@ def test_streaks_in_perspective_follow_the_turned_camera(device):
     places = [(80, 60), (20, 20), (140, 30), (30, 100)]
     for x, y in places:
         image[y, x] = 1
-    turn = {"rotation": 8.0, "angle": 25.0, "focal_length": 90.0}
+    turn = {"rotation": 8.0, "angle": 25.0, "fx": 90.0}
     seen = blurred(image, device, motion_blur={"method": "perspective", **turn})[..., 0]
     a = np.deg2rad(25.0)
     way = np.array([np.cos(a), -np.sin(a), 0])
@@ -165,14 +165,14 @@ def test_the_default_has_a_good_lens_and_the_paper_none():
         ({"optical_blur": {"psf": "dark.exr"}}, "dark.exr: a channel has no light"),
         ({"optical_blur": {"psf": "minus.exr"}}, "minus.exr: light cannot be negative"),
         ({"motion_blur": {"length": 300.0}}, "motion_blur.length.*200"),
-        ({"motion_blur": {"rotation": 1.0}}, "rotation needs focal_length"),
+        ({"motion_blur": {"rotation": 1.0}}, "rotation needs fx"),
         (
             {"motion_blur": {"method": "perspective", "rotation": 1.0}},
-            "perspective needs focal_length",
+            "perspective counts in focal lengths: set fx",
         ),
-        ({"motion_blur": {"rotation": 9.0, "focal_length": 5000.0}}, "a streak of 792 px"),
+        ({"motion_blur": {"rotation": 9.0, "fx": 5000.0}}, "a streak of 792 px"),
         (
-            {"motion_blur": {"rotation": 1.0, "focal_length": 99.0, "length": 1.0}},
+            {"motion_blur": {"rotation": 1.0, "fx": 99.0, "length": 1.0}},
             "length and rotation both say",
         ),
         ({"camera": "sony-imx686", "optical_blur": {"f_number": 2.0}}, "diffraction needs it"),

@@ -18,7 +18,6 @@ from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.commands.main import main
 from clpipe.images.dng import write_dng
-from clpipe.images.encoding import Output
 from clpipe.images.raw import read_facts, read_raw
 from clpipe.images.read import read_image
 from clpipe.images.tags import Tags
@@ -109,7 +108,7 @@ def test_libraw_reads_the_very_dn(clpipe, scene, tmp_path, pattern, size):
 
 def test_what_it_says_of_itself(clpipe, tmp_path):
     shot = {"focal_length": 24, "sensor_width": 18, "exposure_time": 0.008}
-    options = [o for k, v in shot.items() for o in ("--set", f"output.{k}={v}")]
+    options = [o for k, v in shot.items() for o in ("--set", f"render.{k}={v}")]
     clpipe("run", STILL_LIFE, "-o", tmp_path, "--iso", 1600, "--format", "dng", *options)
     path = tmp_path / "still_life.dng"
     first, raw = directories(path)
@@ -135,8 +134,8 @@ def test_what_it_says_of_itself(clpipe, tmp_path):
 
 def test_it_has_every_tag_of_a_jpeg(tmp_path):
     mosaic = np.arange(4096, dtype=np.float32).reshape(64, 64)
-    shot = Output(exposure_time=0.01, focal_length=24.0, sensor_width=18.0)
-    tags = Tags("Sony", "A", 100, aperture=2.8, taken="2024:05:06 07:08:09", output=shot)
+    shot = {"exposure": 0.01, "aperture": 2.8, "focal_length": 24.0, "sensor_width": 18.0}
+    tags = Tags("Sony", "A", 100, **shot, taken="2024:05:06 07:08:09")
     write_dng(tmp_path / "a.dng", mosaic, negative_of(make_chain(settings_from({}))), tags)
     write_display(tmp_path / "a.jpg", np.zeros((64, 64, 3), np.uint8), tags)
 

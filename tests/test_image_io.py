@@ -8,7 +8,6 @@ import pytest
 from PIL import Image, ImageCms
 
 from clpipe.base.errors import ImageError
-from clpipe.images.encoding import Output
 from clpipe.images.layers import picture_channels
 from clpipe.images.pixels import display_window
 from clpipe.images.read import holds_mosaic, read_finished, read_image
@@ -190,8 +189,7 @@ def test_a_picture_that_may_not_be_written_does_not_end_the_process(tmp_path, na
     "size", [(400, 400), (300, 400), (800, 1200), (1080, 1920), (400, 300), (1200, 800)]
 )
 def test_the_equivalent_focal_length_is_by_diagonals(size):
-    shot = Output(focal_length=50.0, sensor_width=23.0)
-    values = exif(Tags("", "", 100, output=shot), *size)
+    values = exif(Tags("", "", 100, focal_length=50.0, sensor_width=23.0), *size)
     pixels = 50 / 23 * max(size)  # the focal length
     equivalent = pixels / np.hypot(*size) * 43.27  # 43.27 mm: the diagonal of 36 mm by 24 mm
     assert values["FocalLengthIn35mmFilm"] == pytest.approx(equivalent, abs=0.501)

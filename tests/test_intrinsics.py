@@ -87,7 +87,7 @@ def test_what_is_not_known_is_not_told():
 def test_the_sidecar_has_them(clpipe, write_exr, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_exr("a.exr", np.full((20, 30, 3), 0.2, np.float16))
-    Path("list.csv").write_text("path,output.fx,output.cx\na.exr,45.0,14.0\n")
+    Path("list.csv").write_text("path,render.fx,render.cx\na.exr,45.0,14.0\n")
     clpipe("run", "list.csv", "-o", "o", "--device", "numpy")
     found = json.loads(Path("o/a.json").read_text())["intrinsics"]
     assert found == {
@@ -96,5 +96,5 @@ def test_the_sidecar_has_them(clpipe, write_exr, tmp_path, monkeypatch):
     }
     contradictory = [f"distortion.{k}={v}" for k, v in (BROWN | {"fx": 45.0, "cx": 15.0}).items()]
     sets = [x for each in contradictory for x in ("--set", each)]
-    told = clpipe("run", "list.csv", "-o", "p", "--device", "numpy", *sets, status=1).stderr
-    assert "distortion: its cx is 15 px, but that of the render is 14 px" in told
+    told = clpipe("run", "list.csv", "-o", "p", "--device", "numpy", *sets, status=2).stderr
+    assert "distortion.cx: 15, but render.cx: 14; set one" in told

@@ -38,7 +38,7 @@ def manifest(tmp_path):
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 def test_a_csv(manifest, tmp_path, bom, end):
     lines = [
-        "path, name,frames,iso,camera,seed,sensor_noise.a,demosaic.method,output.focal_length",
+        "path, name,frames,iso,camera,seed,sensor_noise.a,demosaic.method,render.focal_length",
         "a.exr,,,,,,,,",
         "",
         "b/c.0001.exr,view1/c.0001,3, 800 ,canon-5d2,7,1e-4,bilinear,35",
@@ -57,7 +57,7 @@ def test_a_csv(manifest, tmp_path, bom, end):
                 "seed": 7,
                 "sensor_noise": {"a": 1e-4},
                 "demosaic": {"method": "bilinear"},
-                "output": {"focal_length": 35},
+                "render": {"focal_length": 35},
             },
             3,
             f"{tmp_path}/frames.csv, row 4",

@@ -128,8 +128,8 @@ def test_light_beyond_half_is_clipped_in_half(write_exr, tmp_path):
         (("--set", "output.jpeg_quality=101"), "output.jpeg_quality: found 101: .* less than or"),
         (("--set", "output.jpeg_qualty=9"), "unknown key of output 'jpeg_qualty'.*jpeg_quality"),
         (("--set", "output.jpeg_subsampling=4:1:1"), "found '4:1:1': .*'4:4:4', '4:2:2' or"),
-        (("--set", "output.focal_length=0"), "output.focal_length: found 0: .* greater than 0"),
-        (("--set", "output.exposure_time=fast"), "output.exposure_time: found 'fast': .* number"),
+        (("--set", "render.focal_length=0"), "render.focal_length: found 0: .* greater than 0"),
+        (("--set", "render.exposure_time=fast"), "render.exposure_time: found 'fast': .* number"),
     ],
 )
 def test_refusals(scene, tmp_path, options, message):
@@ -141,7 +141,7 @@ def test_refusals(scene, tmp_path, options, message):
 def test_a_configuration_says_how_files_are_written(scene, tmp_path):
     config = tmp_path / "c.toml"
     lines = ("jpeg_quality = 60", 'jpeg_subsampling = "4:2:0"', "jpeg_progressive = true")
-    config.write_text("\n".join(["iso = 400", "[output]", *lines, "focal_length = 35"]))
+    config.write_text("\n".join(["iso = 400", "[output]", *lines, "[render]", "focal_length = 35"]))
     clpipe("run", scene, "-o", tmp_path / "o", "-c", config, "--set", "output.jpeg_quality=50")
     with Image.open(tmp_path / "o" / "scene.jpg") as image:
         assert image.quantization[0][0] == 16  # that of the standard's table, quality 50
@@ -153,7 +153,8 @@ def test_a_configuration_says_how_files_are_written(scene, tmp_path):
     assert record["output"]["focal_length"] == 35
     text = clpipe("plan", "--toml", "-c", config)
     (tmp_path / "again.toml").write_text(text)
-    assert load_settings(str(tmp_path / "again.toml")).output == load_settings(str(config)).output
+    again, first = load_settings(str(tmp_path / "again.toml")), load_settings(str(config))
+    assert (again.output, again.render) == (first.output, first.render)
 
 
 def test_a_kept_image_knows_how_it_was_to_be_written(scene, tmp_path):
@@ -166,13 +167,13 @@ def test_a_kept_image_knows_how_it_was_to_be_written(scene, tmp_path):
     )
 
 
-def test_settings_of_output_are_overlaid_and_recorded():
+def test_settings_of_a_render_are_overlaid_and_recorded():
     settings = overlay(
-        settings_from({"output": {"focal_length": 24}}), {"output": {"sensor_width": 36}}
+        settings_from({"render": {"focal_length": 24}}), {"render": {"sensor_width": 36}}
     )
-    assert settings.record()["output"] == {"focal_length": 24, "sensor_width": 36}
+    assert settings.record()["render"] == {"focal_length": 24, "sensor_width": 36}
     assert settings_from(settings.record()) == settings
-    assert "output" not in settings_from({}).record()
+    assert not {"output", "render"} & settings_from({}).record().keys()
 
 
 @pytest.mark.parametrize(("text", "line"), [("output = 3", 1), ("[output]\nquality = 3", 2)])
@@ -185,7 +186,7 @@ def test_a_bad_output_table_is_named_with_its_line(tmp_path, text, line):
 @pytest.mark.parametrize("name", ["jpg", "png", "tif"])
 def test_exif_and_profile(scene, tmp_path, name):
     shot = {"focal_length": 50, "sensor_width": 24, "exposure_time": 0.01}
-    options = [o for key, value in shot.items() for o in ("--set", f"output.{key}={value}")]
+    options = [o for key, value in shot.items() for o in ("--set", f"render.{key}={value}")]
     clpipe("run", scene, "-o", tmp_path, "--iso", 25600, "--format", name, *options)
     with Image.open(tmp_path / f"scene.{name}") as image:
         exif = image.getexif()
@@ -216,7 +217,7 @@ def test_a_render_may_say_its_shot_and_a_request_wins(tmp_path):
         "focal_length": 35.0,
         "sensor_width": 36.0,
     }
-    clpipe("run", path, "-o", tmp_path / "o", "--set", "output.focal_length=70")
+    clpipe("run", path, "-o", tmp_path / "o", "--set", "render.focal_length=70")
     with Image.open(tmp_path / "o" / "shot.jpg") as image:
         inner = image.getexif().get_ifd(0x8769)
     assert (inner[0x829A], inner[0x920A], inner[0xA405]) == (0.5, 70, 70)

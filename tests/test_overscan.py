@@ -133,7 +133,8 @@ def test_stages_before_the_lens_see_the_overscan():
     own = {
         "stages": ["shutter", "defocus", "motion_blur", "distortion"],
         "shutter": {"flicker_depth": 0.5, "line_time": 1e-3, "exposure_time": 1e-3},
-        "defocus": {"method": "thin_lens", "sensor_width": 36.0, "focus_distance": 1.0},
+        "defocus": {"method": "thin_lens", "focal_length": 200.0, "f_number": 0.5},
+        "focus_distance": 1.0,
         "motion_blur": {"length": 5.0},
     }
     x, y = places(WIDTH, HEIGHT, AROUND)
@@ -155,7 +156,7 @@ def test_stages_before_the_lens_see_the_overscan():
 
 
 def test_a_camera_turns_about_the_middle_of_the_picture():
-    turn = {"method": "perspective", "rotation": 3.0, "angle": 20.0, "focal_length": FX}
+    turn = {"method": "perspective", "rotation": 3.0, "angle": 20.0, "fx": FX}
     image = light(*places(WIDTH, HEIGHT, AROUND))
 
     def kept(image, margins):
@@ -184,7 +185,7 @@ def test_where_it_is_of_use():
 
 def test_a_render_with_overscan(clpipe, write_exr):
     write_render(write_exr, "in/a.exr")
-    carry = ("--carry", "Z", "--set", f"output.fx={FX}")
+    carry = ("--carry", "Z", "--set", f"render.fx={FX}")
     clpipe(*BEND, *carry)
     u, v = seen(WIDTH, HEIGHT)
     assert np.abs(read_image(Path("o/a.exr")).pixels - light(u, v)).max() < 0.005

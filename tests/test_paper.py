@@ -12,7 +12,7 @@ from clpipe.chain.files import built_in_configs
 from clpipe.chain.registry import all_stages
 from clpipe.commands.main import COMMANDS
 from clpipe.commands.run import run
-from clpipe.images.encoding import Output
+from clpipe.images.encoding import Encoding
 from clpipe.images.read import read_image
 from tests.conftest import ROOT, STILL_LIFE
 from tests.dng import write_dng
@@ -64,7 +64,7 @@ def names_a_parameter(text):
     key, _, value = text.partition("=")
     stage, _, parameter = key.partition(".")
     if stage == "output":
-        return parameter in Output.model_fields
+        return parameter in Encoding.model_fields
     by_name = all_stages()[stage].by_name
     if parameter == "method":
         return value in by_name

@@ -33,7 +33,7 @@ RUNS = {
     "lens": "--format png --carry Depth --set distortion.method=brown_conrady"
     " --set distortion.k1=-0.1 --set distortion.fx=70 --set vignetting.method=pa"
     " --set vignetting.k1=-0.3 --set defocus.method=thin_lens --set defocus.f_number=2"
-    " --set defocus.focus_distance=2 --set defocus.sensor_width=36",
+    " --set defocus.focus_distance=2 --set defocus.sensor_width=74.68711",
     "draws": "--format png --camera sony-a7r2 --iso 800 --set 'exposure.ev={uniform=[-1, 1]}'"
     " --set 'sensor_noise.a={log_uniform=[1e-4, 0.01]}' --seed 7",
     "patches": "--format npy --patch 24 --patches-per-image 3 --augment --truth mosaic",

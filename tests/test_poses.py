@@ -183,7 +183,7 @@ def test_an_angle_of_view_and_a_row_of_a_manifest(clpipe, renders):
     assert made["intrinsics"]["fx"] == pytest.approx(FX)
     assert made["intrinsics"]["fy"] == pytest.approx(FX)
     r = POSES["a"][0].tolist()
-    row = {"output": {"fx": 9, "rotation": r, "translation": [1, 2, 3]}}
+    row = {"render": {"fx": 9, "rotation": r, "translation": [1, 2, 3]}}
     Path("list.jsonl").write_text(json.dumps({"path": "renders/a.exr", "name": "a", **row}))
     clpipe("run", "list.jsonl", "-o", "p", *RUN, "exposure")
     assert json.loads(Path("p/a.json").read_text())["pose"] == {"R": r, "t": [1, 2, 3]}
@@ -216,8 +216,8 @@ def test_a_run_in_parts_makes_the_same_bytes(clpipe, renders):
 def test_photographs_are_in_it_and_truths_are_not(clpipe, write_exr):
     write_exr("in/x/a b.exr", np.full((6, 8, 3), 0.2))
     write_exr("in/x/c.exr", np.full((6, 8, 3), 0.2))
-    lens = sets("output", fx=9)
-    pose = sets("output", rotation="[[1, 0, 0], [0, 1, 0], [0, 0, 1]]", translation="[0, 0, 1]")
+    lens = sets("render", fx=9)
+    pose = sets("render", rotation="[[1, 0, 0], [0, 1, 0], [0, 0, 1]]", translation="[0, 0, 1]")
     run = ("run", "in", "-o", "o", "--device", "numpy", "--frames", 2, "--bracket=-1,0", *lens)
     clpipe(*run, "--format", "dng", "--format", "png", "--truth", "clean")
     told = clpipe("poses", "o", "--json").stdout
@@ -260,7 +260,7 @@ def test_a_lens_that_nerfstudio_cannot_hold(clpipe, renders):
         ({"t": [1, 2]}, "t: found [1, 2], but it is 3 numbers"),
         ({"t": [1, 2, float("nan")]}, "but it is 3 numbers"),
         ({"K": [[9, 1, 3], [0, 9, 3], [0, 0, 1]]}, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"),
-        ({"K": [[-9, 0, 3], [0, 9, 3], [0, 0, 1]]}, "output.fx: found -9.0"),
+        ({"K": [[-9, 0, 3], [0, 9, 3], [0, 0, 1]]}, "render.fx: found -9.0"),
         ({"distortion": {"k1": 0.1}}, "has distortion (k1 0.1), but a render is straight"),
         ({"model": "OPENCV_FISHEYE"}, "is of the model OPENCV_FISHEYE"),
         ({"width": WIDTH / 2, "height": HEIGHT / 2}, "its camera in --poses is of 120x80"),
@@ -292,10 +292,10 @@ def test_what_is_wrong_with_all_is_refused(clpipe, renders):
     def refused(*arguments, status=2):
         return clpipe(*run, *arguments, status=status).stderr
 
-    told = refused("cameras.json", *sets("output", fx=1000))
-    assert f"has fx {FX}, but the configuration has output.fx 1000" in told
-    told = refused("cameras.json", *sets("output", focal_length=50, sensor_width=36), status=1)
-    assert "output.fx makes the focal length of this render of 240x160 pixels 230 px" in told
+    told = refused("cameras.json", *sets("render", fx=1000))
+    assert f"has fx {FX}, but the configuration has render.fx 1000" in told
+    told = refused("cameras.json", *sets("render", focal_length=50, sensor_width=36), status=1)
+    assert "render.fx makes the focal length of this render of 240x160 pixels 230 px" in told
     assert "no such file" in refused("missing.json").lower()
     assert "has no images.txt" in refused("renders")
     Path("other.json").write_text('{"frames": 3}')
@@ -311,7 +311,7 @@ def test_what_is_wrong_with_all_is_refused(clpipe, renders):
 def test_renders_that_are_named_as_the_files_of_cameras(clpipe, write_exr):
     for name in ("cameras", "transforms", "a"):
         write_exr(f"in/{name}.exr", np.full((8, 8, 3), 0.25))
-    run = ("run", "in", "-o", "out", "--device", "numpy", *sets("output", fx=30, fy=30))
+    run = ("run", "in", "-o", "out", "--device", "numpy", *sets("render", fx=30, fy=30))
     clpipe(*run)
     before = {path: path.read_bytes() for path in Path("out").glob("*.json")}
     for _ in range(2):

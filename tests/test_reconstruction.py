@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from clpipe.inputs.views import read_views as read_poses
+from clpipe.inputs.render_cameras import read_views as read_poses
 from tools.reconstruction import experiment as tool
 from tools.reconstruction import multiview, report, stereo
 from tools.reconstruction import pictures as picture_kinds

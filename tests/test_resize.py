@@ -165,7 +165,7 @@ LINEAR, FINISHED = f"{DEVELOP},resize,tone_curve,gamma", f"{DEVELOP},tone_curve,
 
 def test_all_that_is_written_of_a_smaller_picture(clpipe, write_exr):
     write_exr("a.exr", np.random.default_rng(0).random((20, 30, 3)))
-    lens = ("--set", "output.focal_length=24", "--set", "output.sensor_width=36")
+    lens = ("--set", "render.focal_length=24", "--set", "render.sensor_width=36")
     clpipe("run", "a.exr", "-o", "o", "--stages", LINEAR, *RUN, *lens, "--keep", "normalize",
            "--keep", "resize", "--format", "jpg", "--format", "tif16", "--truth", "development",
            "--truth", "mosaic", "--truth", "variance")  # fmt: skip

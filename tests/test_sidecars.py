@@ -18,7 +18,7 @@ from clpipe.outputs.sealed import SEAL, SidecarError, read_sidecar, sealed, valu
 from tests.conftest import reseal
 
 CHANGED = f"was changed since clpipe wrote it (its {SEAL} does not fit)"
-CAMERA = ("--set", "output.fx=30", "--set", "output.fy=30")
+CAMERA = ("--set", "render.fx=30", "--set", "render.fy=30")
 
 
 @pytest.fixture

@@ -82,7 +82,7 @@ class Images:
         if not jobs:
             found = find_jobs(self.inputs, output, loader.endings(), self.exclude)
             jobs = loader.exposures(found)
-        jobs = with_views(jobs, self.poses, loader.settings.output)
+        jobs = with_views(jobs, self.poses, loader.settings.render)
         jobs = self.series.jobs(jobs, loader.settings)
         if self.per_tar:
             tars = self.shard.take(cut(jobs, self.per_tar, output))

@@ -18,24 +18,26 @@ from typing import Any
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.errors import ClpipeError, DeviceError, OutputError, RequestError
 from clpipe.base.processors import available_processors
+from clpipe.batch.job_state import JobState
 from clpipe.batch.outcome import FAILED, Outcome
 from clpipe.batch.room import Room, host_bytes, usual_room
-from clpipe.batch.work import ImageWorker, Runners, Task
+from clpipe.batch.runners import Runners
+from clpipe.batch.work import ImageWorker
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.find import Job
 from clpipe.outputs.recipes import Recipe
 
-# A task and those of its renditions that are not developed yet.
-Decoded = tuple[Task, deque[Recipe]]
+# A job and those of its renditions that are not developed yet.
+Decoded = tuple[JobState, deque[Recipe]]
 
 # A rendition between a device and its files.
-Developed = tuple[Task, Recipe, Result, Device | None]
+Developed = tuple[JobState, Recipe, Result, Device | None]
 
 
 @dataclass(frozen=True)
-class Begun:
+class Started:
     """A rendition that a device works on, and what waits for its result."""
 
     decoded: Decoded
@@ -99,7 +101,7 @@ class Batch:
         self._failure: Exception | None = None
         self._stopping = threading.Event()
         self._broken = self._closing = False
-        self._begun = threading.Event()  # there is something to develop
+        self._is_needed = threading.Event()  # there is something to develop
         self._lock = threading.Lock()
         self._taking = threading.Lock()  # held while a job is waited for
         self._places = threading.Semaphore(self.in_flight)
@@ -196,7 +198,7 @@ class Batch:
         """Let all threads end, also those that wait."""
         self.stop()
         self._closing = True
-        self._begun.set()
+        self._is_needed.set()
         self._room.open()
         for _ in decoders:
             self._places.release()
@@ -227,7 +229,7 @@ class Batch:
         while job := self._next():
             waits: list[float] = []
             try:
-                task = self._worker.decode(job, partial(self._begin, job, waits))
+                state = self._worker.decode(job, partial(self._admit, job, waits))
             except OutputError as error:
                 self._outcomes.put(Outcome(job, FAILED, error=failure_text(job, error)))
                 self._fail(error)
@@ -236,27 +238,27 @@ class Batch:
                 self._outcomes.put(Outcome(job, FAILED, error=failure_text(job, error)))
                 continue
             for seconds in waits:  # for room, which is no decoding
-                (span,) = task.spans
+                (span,) = state.spans
                 start = span.start + seconds
-                task.spans = [replace(span, start=start, seconds=span.seconds - seconds)]
-            if task.recipes:
-                self._decoded.put((task, deque(task.recipes)))
+                state.spans = [replace(span, start=start, seconds=span.seconds - seconds)]
+            if state.recipes:
+                self._decoded.put((state, deque(state.recipes)))
             else:
-                self._outcomes.put(task.outcome())
-            del task
+                self._outcomes.put(state.outcome())
+            del state
         self._places.release()  # for the next thread, which has no job to wait for either
         self._outcomes.put(None)
 
-    def _begin(self, job: Job, waits: list[float]) -> None:
+    def _admit(self, job: Job, waits: list[float]) -> None:
         """Wait until there is room for a job's image, and note how long: it is decoded next.
 
         Raises:
             OutputError: the first image of the run is to be made, but cannot be written.
         """
         worker, writer = self._worker, self._worker.writer
-        if not self._begun.is_set():
+        if not self._is_needed.is_set():
             writer.check_folder()
-        self._begun.set()
+        self._is_needed.set()
         results = min(len(writer.renditions_of(job)), self.threads + len(self.devices))
         beside = 2 * worker.layers + bool(job.subframes)
         # Baselines are measured on floats.
@@ -268,18 +270,18 @@ class Batch:
         waits.append(time.perf_counter() - start)
 
     def _develop_all(self, device: Device | None) -> None:
-        self._begun.wait()  # a run that makes nothing compiles nothing
+        self._is_needed.wait()  # a run that makes nothing compiles nothing
         if self._closing:
             return
         decoded: Decoded | None = None
-        begun: deque[Begun] = deque()
+        started: deque[Started] = deque()
         try:
             try:
                 runners = self._worker.runners(device)
             finally:
                 self._room.started()
-            while decoded := self._next_decoded(begun, device):
-                self._develop(decoded, begun, runners, device)
+            while decoded := self._next_decoded(started, device):
+                self._develop(decoded, started, runners, device)
                 decoded = None  # or its memory would be held until there is another one
         except DeviceError as error:
             with self._lock:
@@ -288,98 +290,98 @@ class Batch:
             if is_last:
                 raise
             log.warning("%s; the other devices go on", error)
-            left = [each.decoded for each in begun] + ([decoded] if decoded else [])
+            left = [each.decoded for each in started] + ([decoded] if decoded else [])
             for each in {id(each): each for each in left}.values():
                 self._decoded.put(each)
-            for _ in begun:
+            for _ in started:
                 self._results.release()
         finally:
             if device:
                 device.drain()
 
-    def _next_decoded(self, begun: deque[Begun], device: Device | None) -> Decoded | None:
-        """The next task, None at the end; what is begun does not wait for it."""
-        while begun:
+    def _next_decoded(self, started: deque[Started], device: Device | None) -> Decoded | None:
+        """The next job, None at the end; what is started does not wait for it."""
+        while started:
             try:
                 decoded = self._decoded.get_nowait()
             except queue.Empty:
-                self._finish(begun, device)
+                self._finish(started, device)
                 continue
-            while begun and not decoded:
-                self._finish(begun, device)
+            while started and not decoded:
+                self._finish(started, device)
             return decoded
         return self._decoded.get()
 
     def _develop(
-        self, decoded: Decoded, begun: deque[Begun], runners: Runners, device: Device | None
+        self, decoded: Decoded, started: deque[Started], runners: Runners, device: Device | None
     ) -> None:
-        """Begin what is left of a task, and finish what a device cannot have beside that.
+        """Start what is left of a job, and finish what a device cannot have beside that.
 
         Raises:
             DeviceError: the device cannot be used any more; what it did not finish is left.
         """
-        task, left = decoded
+        state, left = decoded
         for asked in tuple(left):
-            while not self._results.acquire(blocking=not begun):
-                self._finish(begun, device)
+            while not self._results.acquire(blocking=not started):
+                self._finish(started, device)
             if self._broken:
                 return
             finish: Callable[[], Result | None] = no_result
-            while asked.spread and begun:  # its noise is measured on those before it
-                self._finish(begun, device)
+            while asked.spread and started:  # its noise is measured on those before it
+                self._finish(started, device)
             recipe = asked
             try:
-                if not task.error:
-                    recipe = self._worker.measured(task, asked)
-                    finish = self._worker.begin(task, recipe, runners.of(recipe))
+                if not state.error:
+                    recipe = self._worker.measured(state, asked)
+                    finish = self._worker.start(state, recipe, runners.of(recipe))
             except DeviceError:
                 self._results.release()
                 raise
             except BaseException as error:
-                task.error = failure_text(task.job, error)
-            begun.append(Begun(decoded, recipe, finish))
-            if len(begun) >= depth_of(device):
-                self._finish(begun, device)
+                state.error = failure_text(state.job, error)
+            started.append(Started(decoded, recipe, finish))
+            if len(started) >= depth_of(device):
+                self._finish(started, device)
 
-    def _finish(self, begun: deque[Begun], device: Device | None) -> None:
-        """Wait for the oldest rendition that was begun, and hand it on.
+    def _finish(self, started: deque[Started], device: Device | None) -> None:
+        """Wait for the oldest rendition that was started, and hand it on.
 
         Raises:
-            DeviceError: the device cannot be used any more; the rendition stays begun.
+            DeviceError: the device cannot be used any more; the rendition stays started.
         """
-        task, left = begun[0].decoded
+        state, left = started[0].decoded
         result = None
         try:
-            result = begun[0].finish()
+            result = started[0].finish()
         except DeviceError:
             raise
         except BaseException as error:
-            task.error = failure_text(task.job, error)
-        recipe = begun.popleft().recipe
+            state.error = failure_text(state.job, error)
+        recipe = started.popleft().recipe
         left.popleft()
         if result:
-            self._developed.put((task, recipe, result, device))
+            self._developed.put((state, recipe, result, device))
         else:
-            self._count_written(task)
+            self._count_written(state)
 
     def _encode_all(self) -> None:
         while developed := self._developed.get():
-            task = developed[0]
+            state = developed[0]
             try:
                 self._worker.encode(*developed)
             except OutputError as error:
-                task.error = f"{task.job.path}: {error}"
+                state.error = f"{state.job.path}: {error}"
                 self._fail(error)
             except BaseException as error:
-                task.error = failure_text(task.job, error)
-            self._count_written(task)
-            del developed, task
+                state.error = failure_text(state.job, error)
+            self._count_written(state)
+            del developed, state
 
-    def _count_written(self, task: Task) -> None:
+    def _count_written(self, state: JobState) -> None:
         """One rendition less to wait for; with the last one the job is finished."""
         self._results.release()
         with self._lock:
-            task.unwritten -= 1
-            is_finished = task.unwritten == 0
+            state.unwritten -= 1
+            is_finished = state.unwritten == 0
         if is_finished:
-            self._outcomes.put(task.outcome())
+            self._outcomes.put(state.outcome())

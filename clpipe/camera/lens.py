@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache, lru_cache
 from math import hypot
@@ -18,17 +19,30 @@ FAR = 1000.0  # m, at which lensfun's calibrations for infinity stand
 OTHERS = 2  # words of a lens's name, beside the maker, that may be left out
 ASPECT = 1.5  # of the pictures that a lens was calibrated with, where the database says nothing
 
-Tables = Mapping[str, Mapping[str, Any]]
+
+@dataclass(frozen=True)
+class LensCalibration:
+    """What lensfun knows of a lens, set in some way.
+
+    Args:
+        focal_length: in mm.
+        distortion, vignetting: the method of the stage and its parameters; empty where lensfun
+            knows none.
+    """
+
+    focal_length: float
+    distortion: Mapping[str, Any]
+    vignetting: Mapping[str, Any]
 
 
-def lens_tables(
+def calibration_of(
     name: str,
     camera: Camera,
     focal_length: float | None = None,
     aperture: float | None = None,
     focus_distance: float | None = None,
-) -> Tables:
-    """The tables of the stages ``distortion`` and ``vignetting`` that describe a lens.
+) -> LensCalibration:
+    """The calibration of a lens, as parameters of the stages that bend and darken a picture.
 
     Args:
         name: the model, or a part of it that belongs to no other.
@@ -43,35 +57,33 @@ def lens_tables(
     """
     # A camera is no key of a cache.
     models = camera.make, camera.model, *camera.aliases
-    return _tables(name, models, focal_length, aperture, focus_distance)
+    return _calibration(name, models, focal_length, aperture, focus_distance)
 
 
 @lru_cache(maxsize=256)
-def _tables(
+def _calibration(
     name: str,
     models: tuple[str, ...],
     focal_length: float | None,
     aperture: float | None,
     focus_distance: float | None,
-) -> Tables:
+) -> LensCalibration:
     database = _database()
     crop = _crop_factor(database, *models)
     lens = _found(database, name, crop)
     focal = _focal_length(lens, focal_length)
     ratio = lens.crop_factor / (crop or lens.crop_factor)
-    tables: dict[str, dict[str, Any]] = {"distortion": {}, "vignetting": {}}
+    falloff: dict[str, Any] = {}
     if bend := _bend(lens, focal):
         # lensfun's r = 1 is half the short side of the picture that the lens was calibrated with.
-        tables["distortion"] = bend | {"unit": 1 / (hypot(1, _aspect(lens)) * ratio)}
+        bend |= {"unit": 1 / (hypot(1, _aspect(lens)) * ratio)}
     if aperture is not None:
         _check_aperture(lens, aperture)
         found = lens.interpolate_vignetting(focal, aperture, focus_distance or FAR)
         if found and found.model.name == "PA":
             terms = (term * ratio ** (2 * i) for i, term in enumerate(found.terms, 1))
-            tables["vignetting"] = {"method": "pa"} | dict(
-                zip(("k1", "k2", "k3"), terms, strict=True)
-            )
-    return tables
+            falloff = {"method": "pa"} | dict(zip(("k1", "k2", "k3"), terms, strict=True))
+    return LensCalibration(focal, bend, falloff)
 
 
 def _bend(lens: Any, focal: float) -> dict[str, Any]:

@@ -6,18 +6,19 @@ from functools import cached_property
 
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
-from clpipe.camera.lens import Tables, lens_tables
+from clpipe.camera.lens import calibration_of
 from clpipe.camera.noise import NoiseModel
+from clpipe.camera.optics import Optics
 from clpipe.camera.profile import Camera, load_camera
 from clpipe.chain.draws import Draw
-from clpipe.chain.keys import LENS, NOISE
+from clpipe.chain.keys import LENS, NOISE, RENDER
 from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
 from clpipe.reference.geometry import NO_MARGINS, Composition, Margins
 from clpipe.reference.intrinsics import Intrinsics
 from clpipe.reference.resample import Resampler, sizes
-from clpipe.stage import Context, Kind, Method, Noiseless, Resample, Stage, Unchanged
+from clpipe.stage import Context, FromLens, Kind, Method, Noiseless, Resample, Stage, Unchanged
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,11 @@ class Chain:
         return self.settings.seed
 
     @property
+    def optics(self) -> Optics:
+        """What is known of the camera's optics."""
+        return self.steps[0].context.optics
+
+    @property
     def result(self) -> Kind:
         """The kind of image that comes out."""
         return self.steps[-1].stage.writes if self.steps else self.source
@@ -92,13 +98,20 @@ class Chain:
 
         Args:
             width, height: of what enters, in px.
-            shot: what is known of it without its margins, see :meth:`Intrinsics.of_render`.
+            shot: what the image says itself, see :meth:`Intrinsics.of_render`.
 
         Raises:
-            RequestError: they contradict those of a lens.
+            RequestError: what is known contradicts itself.
         """
-        known = Intrinsics.of_render(*self.margins.inside(width, height), shot)
+        known = self.intrinsics_of_render(*self.margins.inside(width, height), shot)
         return self.geometry.intrinsics(known, width, height) if self.geometry else known
+
+    def intrinsics_of_render(
+        self, width: int, height: int, shot: Mapping[str, float]
+    ) -> Intrinsics | None:
+        """The intrinsics of what enters, of its size without margins; see :meth:`intrinsics`."""
+        optics = self.optics
+        return Intrinsics.of_render(width, height, {**shot, **optics.known}, optics.places)
 
     @cached_property
     def _resamplings(self) -> tuple[Resampler, ...]:
@@ -274,41 +287,70 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     Raises:
         RequestError: image kinds do not fit.
     """
-    lens, render = lens_of(settings, camera), settings.output.camera
-    context = Context(camera=camera, iso=settings.iso, lens=lens, render=render)
+    names = step_names(settings)
+    optics = optics_of(settings, camera, names)
+    context = Context(camera=camera, iso=settings.iso, optics=optics)
     steps: list[Step] = []
-    before = "the input"
-    for name in step_names(settings):
+    before, takes_lens = "the input", not settings.lens
+    for name in names:
         stage = all_stages()[base_name(name)].reading(kind)
         method = settings.method(name)
-        if stage.reads is not (kind or stage.reads):
-            if isinstance(method, Unchanged) and stage.reads is stage.writes:
-                continue  # so that gamma can be skipped without picture_noise, which does nothing
-            raise RequestError(misfit(name, stage, before, kind or stage.reads))
         with validation_errors(name, type(method)), user_code_errors(f"stage {name}", stage.folder):
-            method = method.resolve(context)
+            fits = stage.reads is (kind or stage.reads)
+            if fits or isinstance(method, FromLens):
+                own, method = method, method.resolve(context)
+                takes_lens |= isinstance(own, FromLens) and not isinstance(method, Unchanged)
+            if not fits:
+                if isinstance(method, Unchanged) and stage.reads is stage.writes:
+                    continue  # so that gamma can be skipped without what does nothing behind it
+                raise RequestError(misfit(name, stage, before, kind or stage.reads))
             after = method.next_context(context)
         if stage.folder:
             check_passes(name, stage, method, context)
         steps.append(Step(name, stage, method, context))
         context = after
         kind, before = stage.writes, name
+    if not takes_lens:
+        raise KeyedError("lens", _unused_lens(settings, names))
     return steps
 
 
-def lens_of(settings: Settings, camera: Camera) -> Tables | None:
-    """What the lens of settings does to a picture; None where they name none.
+def optics_of(settings: Settings, camera: Camera, names: Sequence[str]) -> Optics:
+    """What is known of the optics: stated in settings, of the render, or by the steps of a chain.
 
     Raises:
-        RequestError: it cannot be found, or set so; or it is set and not named.
+        RequestError: two statements contradict each other, or the lens that is named cannot be
+            found, or set so.
     """
-    focal, aperture, distance = settings.focal_length, settings.aperture, settings.focus_distance
-    if settings.lens:
-        return lens_tables(settings.lens, camera, focal, aperture, distance)
-    for key in LENS[1:]:
-        if getattr(settings, key) is not None:
-            raise KeyedError(key, f"{key}: it is that of a lens, and none is named; set lens")
-    return None
+    stated = [
+        (key, name, value)
+        for key, name in SETTINGS.items()
+        if (value := getattr(settings, key)) is not None
+    ]
+    stated += [(f"{RENDER}.{name}", name, v) for name, v in settings.render.optics.items()]
+    for step in names:
+        own = settings.method(step).optics()
+        stated += [(f"{step}.{name}", name, value) for name, value in own.items()]
+    optics = Optics.of(stated)
+    if not settings.lens:
+        return optics
+    set_to = optics.focal_length, optics.f_number, optics.focus_distance
+    lens = calibration_of(settings.lens, camera, *set_to)
+    places = {"focal_length": "lens", **optics.places}
+    return replace(optics, calibration=lens, focal_length=lens.focal_length, places=places)
+
+
+# By the keys of settings that state optics: what they state.
+SETTINGS = dict(zip(LENS[1:], ("focal_length", "f_number", "focus_distance"), strict=True))
+
+
+def _unused_lens(settings: Settings, names: Sequence[str]) -> str:
+    """The message for a lens that is named, and that no step takes."""
+    taking = [name for name in names if isinstance(settings.method(name), FromLens)]
+    known = "lensfun knows neither distortion nor vignetting of it as it is set"
+    stages = " or ".join(s.name for s in all_stages().values() if "lens" in s.by_name)
+    why = known if taking else f"no step takes it; that is done by {stages} with method lens"
+    return f"lens: found {settings.lens}, but {why}; leave it out"
 
 
 def misfit(name: str, stage: Stage, before: str, kind: Kind) -> str:

@@ -9,12 +9,12 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
 from clpipe.reference.defocus import Depth, checked_depth
-from clpipe.stages.defocus import ThinLens
+from clpipe.stage import OfDepth
 
 
-def lenses_of(chain: Chain) -> dict[str, ThinLens]:
-    """The steps of a chain that need depth, by their names."""
-    return {s.name: s.method for s in chain.steps if isinstance(s.method, ThinLens)}
+def depth_steps(chain: Chain) -> dict[str, OfDepth]:
+    """The methods of the steps of a chain that need depth, by the names of the steps."""
+    return {s.name: s.method for s in chain.steps if isinstance(s.method, OfDepth)}
 
 
 def with_depth(chain: Chain, depth: Depth) -> Chain:
@@ -26,17 +26,17 @@ def with_depth(chain: Chain, depth: Depth) -> Chain:
         RequestError: pixels were moved before, and depth was not.
     """
     reference = weakref.ref(depth)
-    lenses = lenses_of(chain)
+    needing = depth_steps(chain)
     names = [step.name for step in chain.steps]
-    for step in chain.steps[: max(map(names.index, lenses))]:
+    for step in chain.steps[: max(map(names.index, needing))]:
         if step.method.geometry():
             raise RequestError(
-                f"stages: {step.name} moves pixels before {[*lenses][-1]}, whose depth stays where "
-                "it is; put it behind"
+                f"stages: {step.name} moves pixels before {[*needing][-1]}, whose depth stays "
+                "where it is; put it behind"
             )
     steps = tuple(
         replace(step, context=replace(step.context, depth=reference))
-        if step.name in lenses
+        if step.name in needing
         else step
         for step in chain.steps
     )
@@ -44,16 +44,13 @@ def with_depth(chain: Chain, depth: Depth) -> Chain:
 
 
 def warnings_of(chain: Chain, depth: Depth) -> list[str]:
-    """What is to be said of an image's discs: how many are larger than they may be."""
-    found = []
-    for name, lens in lenses_of(chain).items():
-        radii = abs(lens.radii(depth.pixels))
-        if count := np.count_nonzero(radii > lens.max_radius):
-            found.append(
-                f"{name}: {count} of {radii.size} pixels are spread over radii up to "
-                f"{radii.max():.1f} px; {name}.max_radius makes them {lens.max_radius} px"
-            )
-    return found
+    """What the steps that need depth have to say of an image's.
+
+    Raises:
+        RequestError: one cannot use it.
+    """
+    found = {name: method.check_depth(depth) for name, method in depth_steps(chain).items()}
+    return [f"{name}: {text}" for name, text in found.items() if text]
 
 
 def depth_of_array(pixels: Array | None, width: int, height: int) -> Depth:
@@ -63,7 +60,7 @@ def depth_of_array(pixels: Array | None, width: int, height: int) -> Depth:
         ImageError: it is missing, of another size, or no depth.
     """
     if pixels is None:
-        raise ImageError("defocus needs depth, (height, width): process(image, key, depth=depth)")
+        raise ImageError("the chain needs depth, (height, width): process(image, key, depth=depth)")
     found = np.shape(pixels)
     if found != (height, width):
         raise ImageError(f"found depth of shape {found}; the image's is {(height, width)}")

@@ -58,8 +58,8 @@ class Limits:
 def limits_of(model: type[BaseModel], name: str) -> Limits | None:
     """The limits of a field of a model; None where the field holds no number.
 
-    >>> from clpipe.images.encoding import Output
-    >>> limits_of(Output, "jpeg_quality"), limits_of(Output, "jpeg_subsampling")
+    >>> from clpipe.images.encoding import Encoding
+    >>> limits_of(Encoding, "jpeg_quality"), limits_of(Encoding, "jpeg_subsampling")
     (Limits(low=1, high=100, whole=True), None)
     """
     schema = model.model_json_schema()["properties"][name]

@@ -10,7 +10,7 @@ from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.reading import parse_toml, read_text
 from clpipe.base.text import one_of
 from clpipe.chain.chain import Chain, Step
-from clpipe.chain.keys import CODE, KEYS, LENS, OUTPUT, names_in
+from clpipe.chain.keys import CODE, KEYS, LENS, TABLES, names_in
 from clpipe.chain.paths import from_folder
 from clpipe.chain.registry import load_stage_file
 from clpipe.chain.settings import Settings, settings_from
@@ -152,9 +152,10 @@ def _step_lines(step: Step, settings: Settings, draws: Mapping[str, Any]) -> lis
 
 
 def _other_tables(chain: Chain, draws: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The tables that belong to no step of a chain: the output, and what a draw may follow."""
+    """The tables that belong to no step of a chain, and what a draw may follow."""
     settings = chain.settings
-    tables = {OUTPUT: settings.output.model_dump(exclude_defaults=True)}
+    record = settings.record()
+    tables = {name: dict(record.get(name, {})) for name in TABLES}
     if draws:
         steps = {step.name for step in chain.steps}
         tables |= {k: dict(t) for k, t in settings.parameters.items() if k not in steps}

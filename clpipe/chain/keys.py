@@ -14,13 +14,14 @@ KEYS = (
     CODE,
 )
 
-OUTPUT = "output"  # the one table that belongs to no stage
+OUTPUT, RENDER = "output", "render"  # the tables that belong to no stage
+TABLES = (OUTPUT, RENDER)
 
 DRAWABLE = (
     "iso",
     "camera",
     *LENS,
-)  # of the keys; parameters of stages and of the output can be, too
+)  # of the keys; parameters of stages and of other tables can be, too
 
 MAX_ISO = 10**9
 
@@ -43,8 +44,8 @@ ABOUT: dict[str, tuple[str, str]] = {
         "A lens of lensfun's database: its distortion, lateral colour and vignetting.",
         "",
     ),
-    "focal_length": ("That of a zoom lens.", "mm"),
-    "aperture": ("The lens's f-number; without it, no vignetting.", ""),
+    "focal_length": ("The lens's focal length.", "mm"),
+    "aperture": ("The lens's f-number; without it, a lens by name does not vignette.", ""),
     "focus_distance": ("Where the lens is focused; without it, far away.", "m"),
     "seed": ("The seed of the noise.", ""),
     "noise_key": (

@@ -11,9 +11,10 @@ from pydantic import BaseModel, ValidationError
 from clpipe.base.errors import KeyedError
 from clpipe.base.text import one_of
 from clpipe.base.validation import first_fault
-from clpipe.chain.keys import OUTPUT
+from clpipe.chain.keys import OUTPUT, RENDER
 from clpipe.chain.registry import all_stages
-from clpipe.images.encoding import Output
+from clpipe.chain.render_camera import RenderCamera
+from clpipe.images.encoding import Encoding
 from clpipe.stage import Method, Stage
 
 
@@ -89,14 +90,18 @@ def method_named(stage: Stage, name: str, chosen: Any) -> type[Method]:
     return stage.by_name[chosen]
 
 
-def make_output(table: Mapping[str, Any]) -> Output:
-    """How results are written, from the table of that name.
+# The models of the tables that belong to no stage.
+TABLE_MODELS: dict[str, type[BaseModel]] = {OUTPUT: Encoding, RENDER: RenderCamera}
+
+
+def make_table(name: str, table: Mapping[str, Any]) -> Any:
+    """The model of a table that belongs to no stage, one of :data:`TABLE_MODELS`.
 
     Raises:
         KeyedError: an unknown key, or a value that is not allowed.
     """
-    with validation_errors(OUTPUT, Output):
-        return Output.model_validate(dict(table))
+    with validation_errors(name, model := TABLE_MODELS[name]):
+        return model.model_validate(dict(table))
 
 
 @contextmanager
@@ -104,7 +109,7 @@ def validation_errors(name: str, model: type[BaseModel]) -> Iterator[None]:
     """Turn what pydantic refuses in a table into a message that names the table.
 
     Args:
-        name: of the step, or of the table of output.
+        name: of the step, or of another table.
         model: what declares the table's keys.
 
     Raises:
@@ -122,7 +127,7 @@ def validation_errors(name: str, model: type[BaseModel]) -> Iterator[None]:
 
 
 def unknown_parameter(step: str, model: type[BaseModel], parameter: str) -> KeyedError:
-    """The error for a parameter that a step, or the table of output, does not have."""
+    """The error for a parameter that a step, or another table, does not have."""
     key = f"{step}.{parameter}"
     if not issubclass(model, Method):
         return KeyedError(key, one_of(f"key of {step}", parameter, model.model_fields))

@@ -17,7 +17,7 @@ from clpipe.chain.carry import Carry, parse_carry
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.files import load_config
 from clpipe.chain.formats import EVERY_FORMAT, NPY
-from clpipe.chain.keys import KEYS, OUTPUT
+from clpipe.chain.keys import KEYS, TABLES
 from clpipe.chain.registry import code_files, load_stage_file
 from clpipe.chain.rendition import BASELINES, MOSAIC, TRUTHS
 from clpipe.chain.settings import Settings, overlay
@@ -273,7 +273,7 @@ class Request:
             RequestError: it cannot be made, or the options name a stage that is not in it.
         """
         chain = make_chain(settings, start_at=start_at, until=self.until)
-        known = (*chain.names, *self.image.get("skip", ()), OUTPUT)
+        known = (*chain.names, *self.image.get("skip", ()), *TABLES)
         for step, value in self.options.items():
             is_table = isinstance(value, Mapping) and step not in KEYS  # where it is a draw
             if is_table and step not in known:

@@ -18,20 +18,22 @@ from clpipe.base.text import one_of
 from clpipe.camera.profile import DEFAULT_CAMERA, built_in_name, load_camera
 from clpipe.chain.drawing import draw_of, extremes_of, values_of
 from clpipe.chain.draws import TINY, Choice, Draw, Limits, limits_of
-from clpipe.chain.keys import CODE, KEYS, LENS, MAX_STAGES, NOISE, OUTPUT, check_type, names_in
+from clpipe.chain.keys import CODE, KEYS, LENS, MAX_STAGES, NOISE, TABLES, check_type, names_in
 from clpipe.chain.methods import (
+    TABLE_MODELS,
     base_name,
     chosen_method,
     make_method,
-    make_output,
+    make_table,
     method_named,
     stage_named,
     unknown_parameter,
 )
 from clpipe.chain.paths import file_parameters, from_folder
 from clpipe.chain.registry import all_stages
+from clpipe.chain.render_camera import RenderCamera
 from clpipe.images.dump import Dump, parse_dump
-from clpipe.images.encoding import Output
+from clpipe.images.encoding import Encoding
 from clpipe.stage import Method
 from clpipe.stages import DEFAULT_CHAIN
 
@@ -47,16 +49,17 @@ class Settings:
     camera: str = DEFAULT_CAMERA
     iso: float = 100.0
     lens: str = ""  # a name in lensfun's database
-    focal_length: float | None = None  # mm; None is that of a lens that has one alone
-    aperture: float | None = None  # f-number; None is no vignetting
-    focus_distance: float | None = None  # m; None is far away
+    focal_length: float | None = None  # mm
+    aperture: float | None = None  # f-number
+    focus_distance: float | None = None  # m
     seed: int = 0
     noise_key: str = ""  # "" follows from the image and the ISO
     dump: str = ""  # headerless dumps: WIDTHxHEIGHT:TYPE
     stages: tuple[str, ...] = DEFAULT_CHAIN
     skip: tuple[str, ...] = ()
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    output: Output = field(default_factory=Output)
+    output: Encoding = field(default_factory=Encoding)
+    render: RenderCamera = field(default_factory=RenderCamera)
     draws: Mapping[str, Draw] = field(default_factory=dict)
     # By step: the table that overlay() validated, and the model that it made of it.
     validated: Mapping[str, tuple[Mapping[str, Any], Method]] = field(
@@ -78,8 +81,8 @@ class Settings:
         if self.dump:
             plain["dump"] = self.dump
         lists = {"stages": list(self.stages), "skip": list(self.skip)}
-        output = self.output.model_dump(exclude_defaults=True)
-        tables = {**self.parameters, **({OUTPUT: output} if output else {})}
+        others = {name: own for name in TABLES if (own := self._set_in(name))}
+        tables = {**self.parameters, **others}
         record = {**plain, **lists, **{name: dict(t) for name, t in tables.items()}}
         for key, draw in self.draws.items():
             table, _, name = key.rpartition(".")
@@ -110,17 +113,22 @@ class Settings:
 
     def constants(self) -> dict[str, Any]:
         """The values that are set and not drawn, by their dotted names."""
-        tables = {**self.parameters, OUTPUT: self.output.model_dump(exclude_defaults=True)}
+        tables = {**self.parameters, **{name: self._set_in(name) for name in TABLES}}
         named = {f"{name}.{key}": v for name, table in tables.items() for key, v in table.items()}
         lens = {key: value for key in LENS if (value := getattr(self, key))}
         return {"iso": self.iso, "camera": self.camera, **lens, **named}
 
     def table(self, step: str) -> dict[str, Any]:
-        """The values and draws of a step, or of the output."""
-        output = self.output.model_dump(exclude_defaults=True) if step == OUTPUT else {}
+        """The values and draws of a step, or of another table."""
+        others = self._set_in(step) if step in TABLES else {}
         names = {key: key.removeprefix(f"{step}.") for key in self.draws}
         drawn = {names[key]: draw for key, draw in self.draws.items() if names[key] != key}
-        return {**self.parameters.get(step, output), **drawn}
+        return {**self.parameters.get(step, others), **drawn}
+
+    def _set_in(self, table: str) -> dict[str, Any]:
+        """What is set in a table that belongs to no stage."""
+        model: BaseModel = getattr(self, table)
+        return model.model_dump(exclude_defaults=True)
 
     def method(self, step: str) -> Method:
         """The method of a step with its parameters, validated.
@@ -154,8 +162,8 @@ class Settings:
         Raises:
             KeyedError: there is no such method.
         """
-        if step == OUTPUT:
-            return [Output]
+        if step in TABLE_MODELS:
+            return [TABLE_MODELS[step]]
         stage, draw = stage_named(step, base_name(step)), self.draws.get(f"{step}.method")
         chosen = chosen_method(step, self.parameters.get(step, {}))
         names = draw.choice if isinstance(draw, Choice) else [chosen]
@@ -239,22 +247,19 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
     draws = {k: draw for k, draw in settings.draws.items() if k.partition(".")[0] not in values}
     draws |= {key: draw_of(key, tables.pop(key)) for key in KEYS if key in tables}
     parameters, validated = dict(settings.parameters), dict(settings.validated)
-    output = settings.output
     for step, table in tables.items():
-        stage = None if step == OUTPUT else stage_named(step, base_name(step))
+        stage = None if step in TABLES else stage_named(step, base_name(step))
         merged = _merged(settings, step, table)
         step_draws = {f"{step}.{k}": v for k, v in merged.items() if isinstance(v, Draw)}
         draws |= step_draws
         constants = {k: v for k, v in merged.items() if not isinstance(v, Draw)}
         if stage is None:
-            output = make_output(constants)
+            plain[step] = make_table(step, constants)
             continue
         parameters[step] = constants
         if not step_draws:
             validated[step] = constants, make_method(stage, step, constants)
-    changed = replace(
-        settings, parameters=parameters, validated=validated, output=output, draws=draws, **plain
-    )
+    changed = replace(settings, parameters=parameters, validated=validated, draws=draws, **plain)
     if draws:
         _check_draws(changed, values)
     return changed
@@ -278,12 +283,12 @@ def _checked_plain(settings: Settings, plain: Mapping[str, Any]) -> dict[str, An
     for key, value in plain.items():
         if key in all_stages():
             raise KeyedError(key, f"{key}: found {value!r}, but a stage is a table: [{key}]")
-        if key == OUTPUT:
+        if key in TABLES:
             raise KeyedError(key, f"{key}: found {value!r}, but it is a table: [{key}]")
         if key == CODE:
             raise KeyedError(key, f"{key}: code comes from --stage-file or a configuration file")
         if key not in KEYS:
-            raise KeyedError(key, one_of("key", key, (*KEYS, OUTPUT, *all_stages())))
+            raise KeyedError(key, one_of("key", key, (*KEYS, *TABLES, *all_stages())))
         check_type(key, value)
     for key in ("stages", "skip"):
         if key in plain:
@@ -351,8 +356,8 @@ def _check_draws(settings: Settings, changed: Container[str]) -> None:
         constants = {k: v for k, v in settings.table(step).items() if not isinstance(v, Draw)}
         for example in _examples(drawn):
             table = {**constants, **example}
-            if step == OUTPUT:
-                make_output(table)
+            if step in TABLES:
+                make_table(step, table)
             else:
                 make_method(stage_named(step, base_name(step)), step, table)
 

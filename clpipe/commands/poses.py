@@ -33,7 +33,7 @@ def poses(folder: Path, as_json: bool) -> None:
         reasons = "; ".join(written.left_out) or "found no sidecar of one"
         raise RequestError(
             f"{folder}: has no picture whose intrinsics are known: {reasons}; run with --poses "
-            "FILE, or set output.focal_length and output.sensor_width, or output.fx"
+            "FILE, or set render.focal_length and render.sensor_width, or render.fx"
         )
     if as_json:
         named = {"files": written.files, "pictures": written.pictures, "warnings": written.left_out}

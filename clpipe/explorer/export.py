@@ -7,7 +7,7 @@ from typing import Any
 
 from clpipe.chain.chain import step_names
 from clpipe.chain.files import config_text
-from clpipe.chain.keys import KEYS, OUTPUT
+from clpipe.chain.keys import KEYS, TABLES
 from clpipe.chain.request import Request
 from clpipe.chain.toml import value_text
 from clpipe.explorer.explorer import Explorer
@@ -26,7 +26,7 @@ def exported(explorer: Explorer, image: int, values: Mapping[str, Any]) -> dict[
     """
     request = explorer.request(values)
     steps = step_names(request.settings())
-    used = {key: v for key, v in values.items() if key in (*KEYS, OUTPUT, *steps)}
+    used = {key: v for key, v in values.items() if key in (*KEYS, *TABLES, *steps)}
     job, reading = explorer.job(image), _reading(request)
     files = [Path(file) for file in request.stage_files]
     loading = [part for file in files for part in ("--stage-file", str(file))]

@@ -24,6 +24,7 @@ from clpipe.analysis.svg import noise_svg
 from clpipe.base.errors import ClpipeError, KeyedError, RequestError
 from clpipe.base.reading import parse_json
 from clpipe.base.types import Array
+from clpipe.chain.methods import TABLE_MODELS
 from clpipe.explorer.controls import (
     camera_controls,
     key_controls,
@@ -34,7 +35,6 @@ from clpipe.explorer.explorer import Explorer
 from clpipe.explorer.export import SAVED, exported
 from clpipe.explorer.patience import ImpatientProtocol
 from clpipe.explorer.view import View
-from clpipe.images.encoding import Output
 from clpipe.images.preview import reduced
 
 HOST = "127.0.0.1"
@@ -128,7 +128,7 @@ class Server:
                 "values": explorer.initial,
                 "keys": key_controls(),
                 "stages": stage_controls(),
-                "output": parameters_of(Output),
+                "tables": {name: parameters_of(model) for name, model in TABLE_MODELS.items()},
                 "cameras": camera_controls(explorer.cameras),
                 "device": device.info.label if device else "NumPy",
                 "saved": SAVED,

@@ -32,7 +32,7 @@ def read_attributes(path: Path) -> dict[str, str]:
 def shot_attributes(spec: Any) -> dict[str, float]:
     """What OpenEXR's standard attributes say of the shot; values that cannot be are left out.
 
-    The names are those of :class:`clpipe.images.encoding.Output`: exposure_time in s, focal_length
+    The names are those of a render's camera (``[render]``): exposure_time in s, focal_length
     and sensor_width in mm.
     """
     size = spec.getattribute("sensorOverallDimensions")

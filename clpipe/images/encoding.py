@@ -1,23 +1,14 @@
-"""How pictures are encoded and tagged: the ``[output]`` table of a configuration."""
+"""How pictures are encoded: the ``[output]`` table of a configuration."""
 
-import math
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
-
-from clpipe.reference.pose import rotation
+from pydantic import BaseModel, ConfigDict, Field
 
 SIMULATED = "clpipe "  # prefix of the camera's model in a DNG that clpipe writes
-Length = Annotated[float, Field(gt=0, le=10000, allow_inf_nan=False)]
-Pixels = Annotated[float, Field(gt=0, le=1e7, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Vector = Annotated[tuple[Finite, Finite, Finite], Field(strict=False)]  # or a list
-Matrix = Annotated[tuple[Vector, Vector, Vector], Field(strict=False), AfterValidator(rotation)]
 
 
-class Output(BaseModel):
-    """How JPEGs and PNGs are encoded, and the exposure data for EXIF; None leaves a tag out."""
+class Encoding(BaseModel):
+    """How JPEGs and PNGs are encoded."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
@@ -25,53 +16,3 @@ class Output(BaseModel):
     jpeg_subsampling: Literal["4:4:4", "4:2:2", "4:2:0"] = "4:2:2"
     jpeg_progressive: bool = False
     png_compression: Annotated[int, Field(ge=0, le=9)] = 4  # of noise, 6 leaves 1.5 % less, slowly
-    exposure_time: Annotated[float, Field(gt=0, le=86400, allow_inf_nan=False)] | None = None  # s
-    focal_length: Length | None = None  # mm
-    sensor_width: Length | None = None  # mm, along the longer side of the image
-    # Of the render, in px, the first pixel's centre at 0.5; None follows from the lengths in mm
-    # and the middle of the image.
-    fx: Pixels | None = None
-    fy: Pixels | None = None
-    cx: Finite | None = None
-    cy: Finite | None = None
-    # Radians, across the width of the render, as transforms.json has it.
-    camera_angle_x: Annotated[float, Field(gt=0, lt=math.pi)] | None = None
-    # From the world to the camera, in OpenCV's axes: x_cam = rotation x + translation.
-    rotation: Matrix | None = None
-    translation: Vector | None = None
-
-    @model_validator(mode="after")
-    def _check_pose(self) -> Self:
-        if (self.rotation is None) != (self.translation is None):
-            raise ValueError("rotation and translation belong together; give both, or neither")
-        return self
-
-    @property
-    def pose(self) -> dict[str, Any] | None:
-        """R and t of x_cam = R X + t; None where they are not known."""
-        if self.rotation is None or self.translation is None:
-            return None
-        return {"R": [list(row) for row in self.rotation], "t": list(self.translation)}
-
-    @property
-    def camera(self) -> dict[str, float]:
-        """What is set of the render's camera, by the names of the fields."""
-        return self.model_dump(include=CAMERA, exclude_none=True)
-
-    def filled(self, shot: Mapping[str, float]) -> "Output":
-        """A copy in which ``shot``, what a source says of itself, fills the fields that are None.
-
-        >>> Output(focal_length=24.0).filled({"focal_length": 50.0, "exposure_time": 0.5}).shot
-        {'exposure_time': 0.5, 'focal_length': 24.0}
-        """
-        return self.model_copy(update={**shot, **self.shot})
-
-    @property
-    def shot(self) -> dict[str, float]:
-        """The exposure data that is set, by the names of the fields."""
-        return self.model_dump(include=SHOT, exclude_none=True)
-
-
-SHOT = {"exposure_time", "focal_length", "sensor_width"}
-CAMERA = {"fx", "fy", "cx", "cy", "focal_length", "sensor_width"}
-POSE = {"rotation", "translation"}

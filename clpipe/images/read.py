@@ -71,11 +71,6 @@ class SourceImage:
     depth: Depth | None = None
     margins: Margins = NO_MARGINS
 
-    def cropped(self) -> "SourceImage":
-        """The picture alone."""
-        pixels = np.ascontiguousarray(self.margins.cropped(self.pixels))
-        return replace(self, pixels=pixels, margins=NO_MARGINS)
-
 
 @dataclass(frozen=True)
 class _Decoded:

@@ -12,11 +12,12 @@ from pydantic import TypeAdapter
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
 from clpipe.camera.profile import Positive
-from clpipe.images.encoding import Output
+from clpipe.images.encoding import Encoding
 
 FILM_DIAGONAL = math.hypot(36, 24)  # mm, of a frame of 35 mm film
 TAG_ATTRIBUTES = ("exif", "orientation")  # the attributes by which an image carries its tags
 DATE = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")  # as EXIF has it
+NOT_CARRIED = ("sensor_width", "encoding")  # the fields of tags that no image carries
 DAMAGED = "its attributes clpipe:exif and clpipe:orientation are damaged"
 
 
@@ -31,17 +32,18 @@ class Tags:
     aperture: Positive | None = None  # f-number
     focal_length: Positive | None = None  # mm
     taken: str = ""  # "YYYY:MM:DD HH:MM:SS"
-    output: Output = field(default_factory=Output)
+    sensor_width: Positive | None = None  # mm, along the longer side
+    encoding: Encoding = field(default_factory=Encoding)
 
     @property
     def shot(self) -> dict[str, float]:
-        """Exposure time and focal length where known, by the names of ``Output``'s fields."""
+        """Exposure time and focal length where known, by the names that a render's camera has."""
         values = {"exposure_time": self.exposure, "focal_length": self.focal_length}
         return {name: value for name, value in values.items() if value}
 
 
 def exif(tags: Tags, height: int, width: int) -> dict[str, float | str]:
-    """EXIF tags (EXIF 2.3, 2010) by their names; the shot is that of ``tags.output``.
+    """EXIF tags (EXIF 2.3, 2010) by their names.
 
     The equivalent focal length is by the ratio of diagonals (CIPA DCG-001, 2018), as
     structure-from-motion tools take it; EXIF holds whole mm.
@@ -51,8 +53,8 @@ def exif(tags: Tags, height: int, width: int) -> dict[str, float | str]:
         height: of the image, px.
         width: of the image, px.
 
-    >>> shot = Output(focal_length=24.0, sensor_width=24.0)
-    >>> for name, value in exif(Tags("", "", 800, output=shot), 4000, 6000).items():
+    >>> tags = Tags("", "", 800, focal_length=24.0, sensor_width=24.0)
+    >>> for name, value in exif(tags, 4000, 6000).items():
     ...     print(name, value)
     PhotographicSensitivity 800
     FocalLength 24.0
@@ -61,21 +63,20 @@ def exif(tags: Tags, height: int, width: int) -> dict[str, float | str]:
     FocalPlaneYResolution 2500.0
     FocalPlaneResolutionUnit 3
     """
-    shot = tags.output
     values: dict[str, float | str] = {"PhotographicSensitivity": min(round(tags.iso), 65535)}
-    if shot.exposure_time:
-        values["ExposureTime"] = shot.exposure_time
+    if tags.exposure:
+        values["ExposureTime"] = tags.exposure
     if tags.aperture:
         values["FNumber"] = tags.aperture
     if tags.taken:
         values["DateTimeOriginal"] = tags.taken
-    if shot.focal_length:
-        values["FocalLength"] = shot.focal_length
-    if shot.sensor_width:
-        per_mm = max(height, width) / shot.sensor_width
-        if shot.focal_length:
+    if tags.focal_length:
+        values["FocalLength"] = tags.focal_length
+    if tags.sensor_width:
+        per_mm = max(height, width) / tags.sensor_width
+        if tags.focal_length:
             diagonal = math.hypot(height, width) / per_mm
-            equivalent = round(shot.focal_length * FILM_DIAGONAL / diagonal)
+            equivalent = round(tags.focal_length * FILM_DIAGONAL / diagonal)
             values["FocalLengthIn35mmFilm"] = min(max(equivalent, 1), 65535)
         values |= {"FocalPlaneXResolution": per_mm * 10, "FocalPlaneYResolution": per_mm * 10}
         values["FocalPlaneResolutionUnit"] = 3  # cm
@@ -84,7 +85,7 @@ def exif(tags: Tags, height: int, width: int) -> dict[str, float | str]:
 
 def to_attributes(tags: Tags, orientation: int) -> dict[str, str]:
     """The attributes by which an image carries its tags and its orientation (EXIF's, 1 to 8)."""
-    values = {name: value for name, value in asdict(tags).items() if name != "output"}
+    values = {name: value for name, value in asdict(tags).items() if name not in NOT_CARRIED}
     return shot_to_attributes(values, orientation)
 
 

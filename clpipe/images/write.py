@@ -20,7 +20,7 @@ from clpipe.base.files import Stored, write_whole
 from clpipe.base.system import largest_file, passing_file
 from clpipe.base.types import Array, Floats
 from clpipe.images.attributes import PREFIX
-from clpipe.images.encoding import Output
+from clpipe.images.encoding import Encoding
 from clpipe.images.openexr import write_channels
 from clpipe.images.openimageio import error_text
 from clpipe.images.pixels import HALF_MAX
@@ -43,9 +43,9 @@ def srgb_profile() -> bytes:
 def write_display(path: Path, pixels: Array, tags: Tags) -> Stored:
     """Write a picture, (height, width[, 3]), as JPEG, PNG or TIFF, with EXIF.
 
-    Whole numbers of 8 or 16 bits get an sRGB profile; float samples (TIFF) do not. ``tags.output``
-    says how a JPEG and a PNG are encoded. The EXIF of a TIFF lacks the ISO, which OpenImageIO
-    cannot write.
+    Whole numbers of 8 or 16 bits get an sRGB profile; float samples (TIFF) do not.
+    ``tags.encoding`` says how a JPEG and a PNG are encoded. The EXIF of a TIFF lacks the ISO, which
+    OpenImageIO cannot write.
 
     Raises:
         ImageError: the file cannot be written.
@@ -54,13 +54,13 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> Stored:
     channels = pixels.shape[2] if pixels.ndim == 3 else 1
     samples = "float" if pixels.dtype.kind == "f" else pixels.dtype.name
     spec = oiio.ImageSpec(width, height, channels, samples)
-    output = tags.output
+    encoding = tags.encoding
     jpeg = path.suffix == ".jpg"
-    spec.attribute("compression", f"jpeg:{output.jpeg_quality}" if jpeg else "zip")
-    spec.attribute("png:compressionLevel", output.png_compression)
+    spec.attribute("compression", f"jpeg:{encoding.jpeg_quality}" if jpeg else "zip")
+    spec.attribute("png:compressionLevel", encoding.png_compression)
     if jpeg:
-        spec.attribute("jpeg:subsampling", output.jpeg_subsampling)
-        spec.attribute("jpeg:progressive", int(output.jpeg_progressive))
+        spec.attribute("jpeg:subsampling", encoding.jpeg_subsampling)
+        spec.attribute("jpeg:progressive", int(encoding.jpeg_progressive))
     if channels == 3 and pixels.dtype.kind == "u":
         icc = np.frombuffer(srgb_profile(), np.uint8)
         spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(icc)}]"), icc)
@@ -155,7 +155,7 @@ def write_grey_png(path: Path, pixels: Array) -> Stored:
         ImageError: the file cannot be written.
     """
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 1, pixels.dtype.name)
-    spec.attribute("png:compressionLevel", Output().png_compression)
+    spec.attribute("png:compressionLevel", Encoding().png_compression)
     spec.attribute("Software", f"clpipe {__version__}")
     return _write(path, spec, pixels[..., np.newaxis])
 

@@ -1,4 +1,4 @@
-"""The depth that defocus needs: found in an image's file or beside it."""
+"""The depth that a step needs: found in an image's file or beside it."""
 
 import os
 from collections.abc import Sequence
@@ -12,34 +12,40 @@ from clpipe.base.reading import unchanged
 from clpipe.base.types import Array, Floats
 from clpipe.chain.carry import Carry
 from clpipe.chain.chain import Chain
-from clpipe.chain.depth import lenses_of
+from clpipe.chain.depth import depth_steps
 from clpipe.images.passes import read_layer
-from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import Finder, FoundLayer
 from clpipe.reference.defocus import Depth, checked_depth
+from clpipe.reference.geometry import Margins
 
 USUAL = ("Depth", "Z", "ZDepth", "Distance")  # layers, in the order in which they are looked for
 
 
 def read_depth(
-    path: Path, source: SourceImage, chain: Chain, carried: Sequence[Carry], max_pixels: int
+    path: Path,
+    chain: Chain,
+    width: int,
+    height: int,
+    margins: Margins,
+    carried: Sequence[Carry],
+    max_pixels: int,
 ) -> Depth:
     """The depth of an image.
 
     Args:
         path: of the image.
-        source: the image.
         chain: with a step that needs depth.
+        width, height: of the image, with its margins.
+        margins: how far it goes on beyond the picture.
         carried: layers that go along with it, whose patterns say where it may be.
         max_pixels: a file that claims more is refused before memory is taken.
 
     Raises:
         ImageError: it is missing, damaged, of another size, NaN or negative.
     """
-    name = next(lens.layer for lens in lenses_of(chain).values())
-    layer = _find(path, name, [each.pattern for each in carried if each.pattern])
-    whole = source.pixels.shape[1::-1]
-    width, height = source.margins.inside(*whole)
+    step, method = next(iter(depth_steps(chain).items()))
+    layer = _find(path, step, method.layer, [each.pattern for each in carried if each.pattern])
+    whole, (width, height) = (width, height), margins.inside(width, height)
     with unchanged(layer.file):
         pixels, (x, y), size = read_layer(layer.file, layer.location, max_pixels)
         digest = digests([str(layer.file)]).get(str(layer.file), "")
@@ -49,7 +55,7 @@ def read_depth(
             f"{path} has {width}x{height}; render both at one size"
         )
     try:
-        place = x + source.margins.left, y + source.margins.top
+        place = x + margins.left, y + margins.top
         depth = checked_depth(_on_image(pixels[..., 0], *place, *whole))
     except ImageError as error:
         raise ImageError(f"{layer.file}: layer {layer.name}: {error}") from None
@@ -64,7 +70,7 @@ def read_depth(
     return Depth(depth, record)
 
 
-def _find(path: Path, name: str, patterns: Sequence[str]) -> FoundLayer:
+def _find(path: Path, step: str, name: str, patterns: Sequence[str]) -> FoundLayer:
     """The layer of that name; of "" the first of the usual ones that is there."""
     errors = []
     for asked in (name,) if name else USUAL:
@@ -74,8 +80,8 @@ def _find(path: Path, name: str, patterns: Sequence[str]) -> FoundLayer:
             errors.append(str(error))
     usual = "" if name else f" (nor {', '.join(USUAL[1:])})"
     raise ImageError(
-        f"{errors[0].replace('--carry', 'defocus needs depth')}{usual}; name it with "
-        "defocus.layer, or turn defocus off with defocus.method=none"
+        f"{errors[0].replace('--carry', f'{step} needs depth')}{usual}; name it with "
+        f"{step}.layer, or turn {step} off with {step}.method=none"
     )
 
 

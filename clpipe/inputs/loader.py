@@ -10,11 +10,11 @@ from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, KindError, NoPictureError, RequestError
 from clpipe.base.reading import unchanged
 from clpipe.chain.chain import Chain, entry
-from clpipe.chain.depth import lenses_of, warnings_of, with_depth
+from clpipe.chain.entering import enter
 from clpipe.chain.identity import image_key
-from clpipe.chain.keys import OUTPUT
+from clpipe.chain.keys import RENDER
 from clpipe.chain.methods import base_name, stage_named
-from clpipe.chain.overscan import steps_of_overscan, with_overscan
+from clpipe.chain.overscan import steps_of_overscan
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
 from clpipe.images.claims import Claim, claim_of, plain_claim
@@ -34,6 +34,8 @@ from clpipe.inputs.kept import KeptLoader, kind_message
 from clpipe.inputs.manifest import check_rows
 from clpipe.inputs.raw import RawImage, RawLoader, may_be_dump
 from clpipe.inputs.subframes import average, exposures, shutter_of
+from clpipe.reference.defocus import Depth
+from clpipe.reference.geometry import Margins
 from clpipe.stage import Kind
 
 
@@ -150,7 +152,7 @@ class ImageLoader:
             RequestError: they are not; the message says in which row.
         """
         # What is only of a camera's file was checked when it was found there.
-        if rows := [job for job in jobs if job.place or job.values.keys() - {OUTPUT}]:
+        if rows := [job for job in jobs if job.place or job.values.keys() - {RENDER}]:
             carries = self.raw.takes if self.kept is None else lambda path: True
             check_rows(rows, self.settings, carries)
 
@@ -212,16 +214,23 @@ class ImageLoader:
             RequestError: its chain cannot be made.
         """
         loaded = self._entered(job, source)
-        if loaded and loaded.source.margins:
-            loaded = _with_overscan(loaded)
-        if loaded is None or not lenses_of(loaded.chain):
-            return loaded
-        chain, source, request = loaded.chain, loaded.source, self.request
-        most = request.max_pixels or USUAL_MAX_PIXELS
-        depth = read_depth(job.path, source, chain, request.carried(), most)
-        warnings = (*source.warnings, *warnings_of(chain, depth))
-        source = replace(source, depth=depth, warnings=warnings)
-        return LoadedImage(with_depth(chain, depth), source, loaded.key)
+        if loaded is None:
+            return None
+        source, request = loaded.source, self.request
+        carried, most = request.carried(), request.max_pixels or USUAL_MAX_PIXELS
+
+        def depth(chain: Chain, width: int, height: int, margins: Margins) -> Depth:
+            return read_depth(job.path, chain, width, height, margins, carried, most)
+
+        own = enter(loaded.chain, source.pixels, source.margins, depth, source.shot)
+        source = replace(
+            source,
+            pixels=own.pixels,
+            margins=own.margins,
+            depth=own.depth,
+            warnings=(*source.warnings, *own.warnings),
+        )
+        return LoadedImage(own.chain, source, loaded.key)
 
     def _entered(self, job: Job, source: SourceImage) -> LoadedImage | None:
         """See :meth:`enter`; without depth."""
@@ -268,11 +277,3 @@ class ImageLoader:
     def __getstate__(self) -> dict[str, Any]:
         # Cached values stay with the process: they may hold classes of stage files.
         return {each.name: getattr(self, each.name) for each in fields(self)}
-
-
-def _with_overscan(loaded: LoadedImage) -> LoadedImage:
-    """An image with overscan, and the chain for it; cropped where that is of no use."""
-    chain, source = loaded.chain, loaded.source
-    if not steps_of_overscan(chain):
-        return replace(loaded, source=source.cropped())
-    return replace(loaded, chain=with_overscan(chain, source.margins))

@@ -13,13 +13,12 @@ from clpipe.base.reading import read_bytes
 from clpipe.base.text import one_of
 from clpipe.chain.chain import step_names
 from clpipe.chain.identity import MAX_FRAMES
-from clpipe.chain.keys import OUTPUT
-from clpipe.chain.methods import base_name
+from clpipe.chain.keys import TABLES
+from clpipe.chain.methods import TABLE_MODELS, base_name
 from clpipe.chain.paths import from_folder
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import toml_value, value_text
-from clpipe.images.encoding import Output
 from clpipe.inputs.tables import OWN, PLAIN, TEXTS, csv_records, json_records
 
 MANIFEST_SUFFIXES = (".csv", ".jsonl")
@@ -177,7 +176,7 @@ def check_rows(
             if not carried:
                 own.check_cameras()
                 for step in row.values:
-                    if step not in (*PLAIN, OUTPUT, *steps):
+                    if step not in (*PLAIN, *TABLES, *steps):
                         raise RequestError(one_of("stage in this chain", step, steps))
             checked.append(own)
             known[id(row.values), carried] = own
@@ -216,17 +215,17 @@ def _check_column(name: str) -> None:
     step, dot, parameter = name.partition(".")
     stage = all_stages().get(base_name(step))
     if not dot and name not in (*OWN, *PLAIN):
-        if stage or step == OUTPUT:
+        if stage or step in TABLES:
             raise RequestError(f"{name}: its parameters have columns of their own: {name}.NAME")
         raise RequestError(one_of("column", name, (*OWN, *PLAIN)) + ", or stage.parameter")
-    if dot and step != OUTPUT:
+    if dot and step not in TABLES:
         if stage is None:
-            raise RequestError(f"{name}: {one_of('stage', step, (*all_stages(), OUTPUT))}")
+            raise RequestError(f"{name}: {one_of('stage', step, (*all_stages(), *TABLES))}")
         names = dict.fromkeys(n for method in stage.methods for n in method.model_fields)
         if parameter not in ("method", *names):
             raise RequestError(one_of(f"parameter of {step}", parameter, ("method", *names)))
-    elif dot and parameter not in Output.model_fields:
-        raise RequestError(one_of(f"key of {OUTPUT}", parameter, Output.model_fields))
+    elif dot and parameter not in (fields := TABLE_MODELS[step].model_fields):
+        raise RequestError(one_of(f"key of {step}", parameter, fields))
 
 
 def _row(folder: Path, place: str, record: Mapping[str, Any]) -> Row:

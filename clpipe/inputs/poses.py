@@ -11,16 +11,16 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from clpipe.base.errors import RequestError
-from clpipe.chain.keys import OUTPUT
-from clpipe.chain.methods import make_output
-from clpipe.images.encoding import Output
+from clpipe.chain.keys import RENDER
+from clpipe.chain.methods import make_table
+from clpipe.chain.render_camera import RenderCamera
 from clpipe.inputs.find import Job
-from clpipe.inputs.views import View, read_views
+from clpipe.inputs.render_cameras import View, read_views
 
 ENDING = re.compile(r"\.[A-Za-z]\w{1,4}$")  # of an image's name; frame.0001 has none
 
 
-def with_views(jobs: Sequence[Job], path: Path | None, settings: Output) -> list[Job]:
+def with_views(jobs: Sequence[Job], path: Path | None, settings: RenderCamera) -> list[Job]:
     """The jobs of a run, each with the camera that a file has for it.
 
     A view and a render belong together where their paths are equal but for their endings, that of
@@ -53,7 +53,7 @@ def with_views(jobs: Sequence[Job], path: Path | None, settings: Output) -> list
     return given
 
 
-def _with_view(job: Job, view: View, settings: Output) -> Job:
+def _with_view(job: Job, view: View, settings: RenderCamera) -> Job:
     """A job with the values of a view.
 
     Raises:
@@ -62,20 +62,20 @@ def _with_view(job: Job, view: View, settings: Output) -> Job:
     try:
         if view.problem:
             raise RequestError(view.problem)
-        checked = make_output(view.values)
+        checked = make_table(RENDER, view.values)
     except RequestError as error:
         raise RequestError(f"view {view.name}: {error}") from None
-    own = job.values.get(OUTPUT, {})
+    own = job.values.get(RENDER, {})
     others = {**settings.model_dump(), **own}
     for key, value in checked.model_dump(include=set(view.values)).items():
         other = others.get(key)
         if other is not None and not np.array_equal(np.array(other), np.array(value)):
             place = job.place if key in own else "the configuration"
             raise RequestError(
-                f"view {view.name} has {key} {value}, but {place} has {OUTPUT}.{key} {other}; "
+                f"view {view.name} has {key} {value}, but {place} has {RENDER}.{key} {other}; "
                 "leave one of them out"
             )
-    values = {**job.values, OUTPUT: {**own, **view.values}}
+    values = {**job.values, RENDER: {**own, **view.values}}
     return replace(job, values=values, size=view.size)
 
 

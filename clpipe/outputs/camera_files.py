@@ -19,8 +19,8 @@ from clpipe.base.errors import ImageError
 from clpipe.base.files import keep_names, make_folder_of, write_whole
 from clpipe.base.reading import read_bytes
 from clpipe.chain.formats import DNG, ending_of
+from clpipe.chain.render_camera import Matrix, Vector
 from clpipe.chain.rendition import TRUTHS, Rendition
-from clpipe.images.encoding import Matrix, Vector
 from clpipe.outputs.existing import is_marked
 from clpipe.outputs.sealed import (
     SIDECAR,

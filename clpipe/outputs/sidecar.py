@@ -11,9 +11,9 @@ from typing import Any
 from clpipe.base.about import __version__, full_version
 from clpipe.base.files import Stored
 from clpipe.chain.chain import Chain
+from clpipe.chain.render_camera import POSE
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
-from clpipe.images.encoding import POSE
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import FLIPS, orientation_of
 from clpipe.images.write import versions
@@ -47,8 +47,7 @@ def intrinsics_of(chain: Chain, source: SourceImage) -> Intrinsics | None:
     *_, is_transposed = FLIPS[orientation_of(source.attributes)]
     if is_transposed:
         width, height = height, width
-    shot = chain.settings.output.filled(source.shot).model_dump(exclude_none=True)
-    return chain.intrinsics(width, height, shot)
+    return chain.intrinsics(width, height, source.shot)
 
 
 def subframe_records(
@@ -112,9 +111,10 @@ def sidecar(
         "height": height,
         "camera": chain.camera.name,
         "iso": chain.iso,
-        "output": chain.settings.output.filled(source.shot).model_dump(exclude=POSE),
+        "output": chain.settings.output.model_dump()
+        | chain.settings.render.filled(source.shot).model_dump(exclude=POSE),
         "intrinsics": intrinsics.record() if intrinsics else None,
-        "pose": chain.settings.output.pose,
+        "pose": chain.settings.render.pose,
         "noise": noise.record() if noise else None,
         "starts_on": chain.source.label,
         **({"raw": asdict(facts)} if facts else {}),

@@ -11,7 +11,7 @@ import numpy as np
 
 from clpipe.base.types import Array, Doubles, Floats, Mask
 from clpipe.chain.rendition import IID, Rendition
-from clpipe.images.encoding import Output
+from clpipe.images.encoding import Encoding
 from clpipe.images.jpeg import JpegEncoding, through_jpeg
 from clpipe.outputs.places import FLAT, HALVED, covariance, halved, select_flat
 from clpipe.reference.curve import to_8_bit
@@ -36,12 +36,12 @@ class Spread:
         renditions: that they are measured on: the noisy picture, its truth as it is developed, and
             its clean truth, in the order in which they come.
         matching: where, and on what, the baseline's noise is matched.
-        output: how the pictures are encoded.
+        encoding: how the pictures are encoded.
     """
 
     renditions: tuple[Rendition, Rendition, Rendition]
     matching: NoNoise
-    output: Output
+    encoding: Encoding
     _noisy: Floats | None = None
     _clean: Floats | None = None  # where noise must be tried on it
     _mask: Mask | None = None  # the pixels where noise is matched; None is all
@@ -80,7 +80,7 @@ class Spread:
         """A picture as it is shown: cut off at black and white, or as its JPEG leaves it."""
         if not self.matching.jpeg:
             return np.clip(picture, 0, 1)
-        encoding = JpegEncoding(self.output.jpeg_quality, self.output.jpeg_subsampling)
+        encoding = JpegEncoding(self.encoding.jpeg_quality, self.encoding.jpeg_subsampling)
         return np.asarray(through_jpeg(to_8_bit(picture), encoding) / np.float32(255), np.float32)
 
     def _selected(self, picture: Floats) -> Floats:

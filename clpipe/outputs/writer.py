@@ -311,10 +311,9 @@ class OutputWriter:
         tags, source_orientation = from_attributes(
             source.attributes, Tags(camera.make, camera.model, chain.iso)
         )
-        output = chain.settings.output.filled({**source.shot, **tags.shot})
+        tags = tags_of(chain, source, tags)
         if patch is not None:  # which has not the width of the sensor
-            output = output.model_copy(update={"sensor_width": None})
-        tags = replace(tags, output=output)
+            tags = replace(tags, sensor_width=None)
         tag_attributes = {
             name: source.attributes[name] for name in TAG_ATTRIBUTES if name in source.attributes
         }
@@ -383,3 +382,16 @@ def variance_attributes(recipe: Recipe) -> dict[str, str]:
     """The attributes of a variance map; by their kind it can enter no chain."""
     own = attributes_of(recipe.noise[-1], recipe.whole, recipe.key, recipe.rendition.frame)
     return {**own, "stage": "variance", "kind": "variance"}
+
+
+def tags_of(chain: Chain, source: SourceImage, tags: Tags) -> Tags:
+    """The tags of a picture: what is stated of its camera, then what its image carries or says."""
+    optics, own = chain.optics, {**source.shot, **tags.shot}
+    return replace(
+        tags,
+        exposure=chain.settings.render.exposure_time or own.get("exposure_time"),
+        aperture=optics.f_number or tags.aperture,
+        focal_length=optics.focal_length or own.get("focal_length"),
+        sensor_width=optics.sensor_width or own.get("sensor_width"),
+        encoding=chain.settings.output,
+    )

@@ -6,6 +6,7 @@ The first pixel's centre is at (0.5, 0.5); OpenCV's cx and cy are smaller by 0.5
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 from clpipe.base.errors import RequestError
@@ -46,13 +47,20 @@ class Intrinsics:
     residual: float = 0.0
 
     @classmethod
-    def of_render(cls, width: int, height: int, shot: Mapping[str, float]) -> "Intrinsics | None":
+    def of_render(
+        cls,
+        width: int,
+        height: int,
+        shot: Mapping[str, float],
+        places: Mapping[str, str] = MappingProxyType({}),
+    ) -> "Intrinsics | None":
         """Those of a render, which has no distortion; None where its focal length is not known.
 
         Args:
             width, height: in px.
             shot: what is known: fx, fy, cx, cy in px, or focal_length and sensor_width in mm, the
-                latter along the longer side, or camera_angle_x in radians.
+                latter along the longer side, or pixel_pitch in um, or camera_angle_x in radians.
+            places: where it is stated, for the message.
 
         Raises:
             RequestError: the focal length is known in several ways, which contradict each other.
@@ -60,20 +68,25 @@ class Intrinsics:
         >>> Intrinsics.of_render(400, 300, {"focal_length": 50.0, "sensor_width": 40.0}).fx
         500.0
         """
-        found = {"fx": shot["fx"]} if "fx" in shot else {}
+        said = {name: places.get(name, name) for name in shot}
+        found = {said["fx"]: shot["fx"]} if "fx" in shot else {}
         if "camera_angle_x" in shot:
-            found["camera_angle_x"] = width / 2 / math.tan(shot["camera_angle_x"] / 2)
-        if {"focal_length", "sensor_width"} <= shot.keys():
-            per_mm = max(width, height) / shot["sensor_width"]
-            found["focal_length and sensor_width"] = shot["focal_length"] * per_mm
+            found[said["camera_angle_x"]] = width / 2 / math.tan(shot["camera_angle_x"] / 2)
+        pitches = {}
+        if "sensor_width" in shot:
+            pitches["sensor_width"] = shot["sensor_width"] / max(width, height)
+        if "pixel_pitch" in shot:
+            pitches["pixel_pitch"] = shot["pixel_pitch"] / 1000
+        for name, pitch in pitches.items() if "focal_length" in shot else ():
+            found[f"{said['focal_length']} and {said[name]}"] = shot["focal_length"] / pitch
         if not found:
             return None
         (first, fx), *others = found.items()
         for other, length in others:
             if abs(length - fx) > AGREEMENT * fx:
                 raise RequestError(
-                    f"output.{first} makes the focal length of this render of {width}x{height} "
-                    f"pixels {fx:g} px, but {other} {length:g} px; correct one, or leave it out"
+                    f"{first} makes the focal length of this render of {width}x{height} pixels "
+                    f"{fx:g} px, but {other} {length:g} px; correct one, or leave it out"
                 )
         cx, cy = shot.get("cx", width / 2), shot.get("cy", height / 2)
         return cls(width, height, fx, shot.get("fy", fx), cx, cy)

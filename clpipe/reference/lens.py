@@ -25,7 +25,7 @@ from clpipe.reference.radial import (
 
 
 @dataclass(frozen=True)
-class Lens:
+class DistortionMap:
     """A lens as a map of an image: from where each pixel of the picture gets its light.
 
     Args:
@@ -136,7 +136,7 @@ class Lens:
             if not np.isclose(value, known := getattr(before, name), rtol=1e-6):
                 raise RequestError(
                     f"distortion: its {name} is {value:g} px, but that of the render is {known:g} "
-                    f"px; set output.{name} and distortion to the same, or one of them"
+                    f"px; set render.{name} and distortion to the same, or one of them"
                 )
         is_square = counts or np.isclose(before.fx, before.fy, rtol=1e-4)
         bend = _Bend(self, width, height, longer)
@@ -177,14 +177,14 @@ class Lens:
         return scale
 
     @property
-    def _without_margins(self) -> "Lens":
+    def _without_margins(self) -> "DistortionMap":
         return replace(self, margins=NO_MARGINS)
 
 
 class _Bend:
     """A lens and a picture of some size, scaled by ``scale``; margins are beside it."""
 
-    def __init__(self, lens: Lens, width: int, height: int, scale: float) -> None:
+    def __init__(self, lens: DistortionMap, width: int, height: int, scale: float) -> None:
         self.lens, self.scale, self.side = lens, scale, lens.side(width, height)
         self.unit = lens.unit(width, height)
         middle = width / 2, height / 2
@@ -231,7 +231,7 @@ class _Bend:
         )
 
     def seen(self, x: Array, y: Array, lateral: Radial) -> tuple[Array, Array]:
-        """See :meth:`Lens.seen`."""
+        """See :meth:`DistortionMap.seen`."""
         lens = self.lens
         dx, dy = (x - self.centre[0]) / self.scale, (y - self.centre[1]) / self.scale
         # The radius of green where that of the channel is the pixel's.
@@ -279,7 +279,7 @@ class _Bend:
 
 
 @lru_cache(maxsize=256)
-def fitting_scale(lens: Lens, width: int, height: int) -> float:
+def fitting_scale(lens: DistortionMap, width: int, height: int) -> float:
     """The scale of the picture at which it shows as much of the render as leaves no void.
 
     Args:

@@ -32,7 +32,10 @@ class Turning:
     Args:
         rotation: degrees in all, above 0.
         angle: the way of the middle of the picture, in degrees, from the right upwards.
-        focal_length: px.
+        focal_length: px; None is ``share``.
+        share: the focal length over the longer side of the picture.
+        centre: the principal point in px from the picture's corner; None, or None of one of them,
+            is the middle.
         margins: how far the image goes on beyond the picture, about whose middle it turns.
     """
 
@@ -48,7 +51,9 @@ class Turning:
 
     rotation: float
     angle: float
-    focal_length: float
+    focal_length: float | None = None
+    share: float | None = None
+    centre: tuple[float | None, float | None] = (None, None)
     margins: Margins = NO_MARGINS
 
     @property
@@ -71,13 +76,21 @@ class Turning:
         across, down = self.middle(width, height)
         places = {"x": x, "y": y, "middle_x": across - 0.5, "middle_y": down - 0.5}
         numbers = {name: np.float32(n) for name, n in places.items()}
-        focal = np.float32(self.focal_length)
+        focal = np.float32(self.focal(width, height))
         return {"turns": turns, "count": np.uint32(len(turns) // 3), "focal": focal, **numbers}
 
+    def focal(self, width: int, height: int) -> float:
+        """The focal length in px, of an image of that size."""
+        if self.focal_length:
+            return self.focal_length
+        assert self.share
+        return self.share * max(self.margins.inside(width, height))
+
     def middle(self, width: int, height: int) -> tuple[float, float]:
-        """That of the picture, from the image's corner, px."""
-        across, down = self.margins.inside(width, height)
-        return self.margins.left + across / 2, self.margins.top + down / 2
+        """The principal point, from the image's corner, px."""
+        middle = (side / 2 for side in self.margins.inside(width, height))
+        x, y = (m if c is None else c for m, c in zip(middle, self.centre, strict=True))
+        return self.margins.left + x, self.margins.top + y
 
     def farthest(self, width: int, height: int) -> float:
         """How far, in px, what a pixel shows is at most from its place in the middle of the turn.
@@ -87,17 +100,18 @@ class Turning:
         """
         turn = math.radians(self.rotation) / 2
         x, y = self.middle(width, height)
-        u = math.hypot(max(x, width - x), max(y, height - y)) / self.focal_length  # of a corner
+        focal = self.focal(width, height)
+        u = math.hypot(max(x, width - x), max(y, height - y)) / focal  # of a corner
         if math.atan(u) + turn > math.radians(85):
             raise ImageError(
-                f"motion_blur: a turn of {self.rotation:g} degrees at focal_length "
-                f"{self.focal_length:g} takes the corners of {width}x{height} pixels to "
+                f"motion_blur: a turn of {self.rotation:g} degrees at a focal length of "
+                f"{focal:g} px takes the corners of {width}x{height} pixels to "
                 f"{math.degrees(math.atan(u) + turn):.0f} degrees from the axis; expected at most "
                 "85; set a smaller rotation or a longer focal length"
             )
         w = math.cos(turn) - u * math.sin(turn)
         along, aside = math.sin(turn) * (1 + u * u) / w, u * (1 / w - 1)
-        return math.hypot(along, aside) * self.focal_length
+        return math.hypot(along, aside) * focal
 
     def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
         """See :meth:`Resampler.needed`."""

@@ -16,7 +16,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.reference.image import mirrored
-from clpipe.reference.lens import Lens
+from clpipe.reference.lens import DistortionMap
 from clpipe.reference.radial import Radial
 from clpipe.reference.resample import Axis, Parameters, lanczos3
 
@@ -119,7 +119,7 @@ class Warp:
         ("down", "uint"),
     )
 
-    lens: Lens
+    lens: DistortionMap
     filter: str
 
     @property
@@ -223,7 +223,7 @@ def _horner(polynomial: Floats, x: Floats) -> Floats:
 
 
 @lru_cache(maxsize=16)
-def _grid(lens: Lens, width: int, height: int) -> Grid:
+def _grid(lens: DistortionMap, width: int, height: int) -> Grid:
     for step in STEPS:
         down, across = (max(-(-size // step) + 1, 4) for size in lens.size(width, height)[::-1])
         if down * across > MOST_NODES:
@@ -241,7 +241,9 @@ def _grid(lens: Lens, width: int, height: int) -> Grid:
     )
 
 
-def _distances(lens: Lens, width: int, height: int, rows: Array, columns: Array) -> Iterator[Array]:
+def _distances(
+    lens: DistortionMap, width: int, height: int, rows: Array, columns: Array
+) -> Iterator[Array]:
     """The fields of a grid at these rows and columns, exactly: (row, column) float64."""
     x, y = columns + 0.5, rows[:, None] + 0.5
     x, y = np.broadcast_arrays(x, y)
@@ -254,7 +256,7 @@ def _distances(lens: Lens, width: int, height: int, rows: Array, columns: Array)
         yield place[1] - y
 
 
-def _error(lens: Lens, width: int, height: int, grid: Grid) -> float:
+def _error(lens: DistortionMap, width: int, height: int, grid: Grid) -> float:
     """How far, in px, a grid is off in the middle of its cells, where the lens sees the image."""
     rows, columns = (
         np.minimum(np.arange(0, size, grid.step) + grid.step // 2, size - 1)

@@ -6,7 +6,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.base.errors import RequestError
-from clpipe.inputs.views import read_views
+from clpipe.inputs.render_cameras import read_views
 
 PATHS = ("orbit", "arc", "random")
 USUAL_VIEWS = 24

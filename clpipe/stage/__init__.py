@@ -9,7 +9,16 @@ What a stage file may import is all in ``__all__`` here, and only from here. The
 """
 
 from clpipe.base.types import Array, Floats
-from clpipe.stage.bases import Curve, GaussianNoise, Noiseless, Unchanged, odd_size
+from clpipe.stage.bases import (
+    Curve,
+    FromLens,
+    GaussianNoise,
+    InFocalLengths,
+    Noiseless,
+    OfDepth,
+    Unchanged,
+    odd_size,
+)
 from clpipe.stage.checking import run_reference, variant_label, variants
 from clpipe.stage.context import Context, ReferenceContext
 from clpipe.stage.method import Method, Stage, parameter
@@ -34,12 +43,15 @@ __all__ = [
     "Context",
     "Curve",
     "Floats",
+    "FromLens",
     "GaussianNoise",
+    "InFocalLengths",
     "Kind",
     "LineTable",
     "Method",
     "NoiseScope",
     "Noiseless",
+    "OfDepth",
     "Pass",
     "Pointwise",
     "Reduction",

@@ -5,8 +5,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
+from clpipe.camera.lens import LensCalibration
 from clpipe.reference.curve import curve_index
+from clpipe.reference.defocus import Depth
 from clpipe.stage.context import Context, ReferenceContext
 from clpipe.stage.method import Method, parameter
 from clpipe.stage.passes import Argument, Pass, TableLookup
@@ -22,6 +25,76 @@ class Unchanged(Method):
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         return image
+
+
+class FromLens(Method):
+    """What lensfun knows of the lens that ``--lens`` names."""
+
+    method: ClassVar = "lens"
+    kernel: ClassVar = ""
+
+    def of_lens(self, lens: LensCalibration | None) -> Method:
+        """The method that does it; one that leaves the image as it is where nothing is known."""
+        raise NotImplementedError(type(self).__name__)
+
+    def resolve(self, context: Context) -> Method:
+        return self.of_lens(context.optics.calibration).resolve(context)
+
+
+class InFocalLengths(Method):
+    """Counts in focal lengths: px, or mm over the width of the sensor."""
+
+    alternatives: ClassVar = frozenset({"fx", "focal_length"})
+
+    fx: float | None = parameter(
+        None, "Focal length across.", "px", "the camera's", optics=True, gt=0, le=1e7
+    )
+    focal_length: float | None = parameter(
+        None, "Focal length.", "mm", "the camera's", optics=True, gt=0, le=1e4
+    )
+    sensor_width: float | None = parameter(
+        None,
+        "Of the sensor, along the longer side of the image.",
+        "mm",
+        "the camera's",
+        optics=True,
+        gt=0,
+        le=1e4,
+    )
+
+    @property
+    def share(self) -> float | None:
+        """The focal length over the longer side; None where it is in px, or not known."""
+        if self.fx or not (self.focal_length and self.sensor_width):
+            return None
+        return self.focal_length / self.sensor_width
+
+    def check_focal_length(self, stage: str) -> None:
+        """See that the focal length is known, in one of the two ways.
+
+        Raises:
+            RequestError: it is not. It is refused when a chain is resolved because options may
+                choose the method, and each row of a manifest its camera.
+        """
+        if not self.fx and not self.share:
+            raise RequestError(
+                f"{stage}: {self.method} counts in focal lengths: set fx (px), or focal_length "
+                "and sensor_width (mm), here or in render"
+            )
+
+
+class OfDepth(Method):
+    """Needs the depth of its image, which :attr:`Context.depth` then has."""
+
+    layer: str = parameter("", "The layer that has the depth; else one of a usual name.")
+
+    def check_depth(self, depth: Depth) -> str:
+        """See that this (resolved) method can use a depth: a warning, or "".
+
+        Raises:
+            RequestError: it cannot.
+        """
+        raise NotImplementedError(type(self).__name__)
 
 
 class Noiseless(Unchanged):

@@ -3,9 +3,9 @@
 import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from clpipe.camera.noise import NoiseModel
+from clpipe.camera.optics import Optics
 from clpipe.camera.profile import IDENTITY, Camera, Matrix
 from clpipe.reference.cfa import Pattern, red_site
 from clpipe.reference.defocus import Depth
@@ -25,9 +25,7 @@ class Context:
     headroom: float = 0.0  # stops by which exposure darkened the scene
     colours: Matrix = IDENTITY  # linear sRGB to what red, green and blue are, white-balanced
     noise: NoiseModel | None = None  # of the sensor noise that was added
-    lens: Mapping[str, Mapping[str, Any]] | None = None  # tables of stages, by their names
-    # Of the render's camera: what [output] says, as Intrinsics.of_render takes it.
-    render: Mapping[str, float] = field(default_factory=dict, compare=False, repr=False)
+    optics: Optics = field(default_factory=Optics, compare=False, repr=False)
     clean: bool = False  # the image has no noise, and nothing may follow from what it would have
     black_level: float | None = None  # DN, as quantize used them
     white_level: float | None = None

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -21,6 +21,7 @@ def parameter(
     auto: str = "",
     structural: bool = False,
     file: bool = False,
+    optics: bool = False,
     **limits: Any,
 ) -> Any:
     """Declare a parameter: default, one sentence, unit, limits (ge, gt, le, lt).
@@ -33,6 +34,8 @@ def parameter(
         structural: whether it is compiled into the kernel; any other parameter may change from
             image to image at no cost.
         file: whether it is the name of a file, which a configuration gives relative to itself.
+        optics: whether it states what :class:`~clpipe.camera.optics.Optics` has under that name,
+            for all stages; left at None, it is what another states.
         **limits: ge, gt, le, lt.
     """
     if unknown := limits.keys() - {"ge", "gt", "le", "lt"}:
@@ -42,6 +45,7 @@ def parameter(
         "auto": auto,
         "structural": structural,
         "file": file,
+        "optics": optics,
     }
     return Field(default, description=text, json_schema_extra=extra, **limits)
 
@@ -84,9 +88,19 @@ class Method(BaseModel):
         other._margins = margins
         return other
 
+    def optics(self) -> Mapping[str, float]:
+        """What this method, as it was set, states of the optics, by the names that they have."""
+        return {n: v for n in optics_names(type(self)) if (v := getattr(self, n)) is not None}
+
     def resolve(self, context: Context) -> "Method":
         """The method with a value for every parameter that was left to the camera or the chain."""
-        return self
+        return self.with_optics(context)
+
+    def with_optics(self, context: Context) -> Self:
+        """A copy in which what is known of the optics replaces the parameters that are None."""
+        return self.with_defaults(
+            **{n: getattr(context.optics, n) for n in optics_names(type(self))}
+        )
 
     def next_context(self, context: Context) -> Context:
         """The context of the next step, from this (resolved) method's."""
@@ -148,8 +162,15 @@ class Method(BaseModel):
 
     def with_defaults(self, **values: Any) -> Self:
         """A copy in which ``values`` replace the parameters that are None."""
-        missing = {k: v for k, v in values.items() if getattr(self, k) is None}
+        missing = {k: v for k, v in values.items() if getattr(self, k) is None and v is not None}
         return self.model_copy(update=missing) if missing else self
+
+
+@cache
+def optics_names(method: type[Method]) -> tuple[str, ...]:
+    """The parameters of a method that state its camera's optics; see :func:`parameter`."""
+    extras: dict[str, Any] = {k: f.json_schema_extra for k, f in method.model_fields.items()}
+    return tuple(name for name, extra in extras.items() if extra and extra.get("optics"))
 
 
 @dataclass(frozen=True)

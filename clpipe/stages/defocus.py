@@ -6,13 +6,15 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from pydantic import field_validator, model_validator
 
+from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.reference.defocus import NOWHERE, Depth, aperture_taps, defocus, reach_of
 from clpipe.stage import (
     Argument,
     Context,
+    InFocalLengths,
     Kind,
-    Method,
+    OfDepth,
     Pass,
     ReferenceContext,
     Stage,
@@ -32,7 +34,7 @@ class InFocus(Unchanged):
     summary: ClassVar = "everything is in focus"
 
 
-class ThinLens(Method):
+class ThinLens(InFocalLengths, OfDepth):
     """A thin lens: a point at distance z is spread over a disc of diameter c.
 
     c = f^2 |z - zf| / (N z (zf - f)), with focal length f, f-number N and focus distance zf
@@ -52,20 +54,33 @@ class ThinLens(Method):
     example: ClassVar = {"max_radius": 3}
     alternatives: ClassVar = frozenset({"sensor_width", "pixel_pitch"})
 
-    focal_length: float = parameter(50.0, "Focal length.", "mm", gt=0, le=2000)
-    f_number: float = parameter(2.8, "f-number of the aperture.", ge=0.5, le=64)
-    focus_distance: float = parameter(
-        3.0, "Distance that is in focus, in the unit of the depth.", gt=0, le=1e9
+    focal_length: float | None = parameter(
+        None,
+        "Focal length.",
+        "mm",
+        "the camera's, from fx and the pixels' size, else 50",
+        optics=True,
+        gt=0,
+        le=2000,
+    )
+    f_number: float | None = parameter(
+        None, "f-number of the aperture.", "", "aperture, else 2.8", optics=True, ge=0.5, le=64
+    )
+    focus_distance: float | None = parameter(
+        None,
+        "Distance that is in focus, in the unit of the depth.",
+        "",
+        "focus_distance, which is in m, else 3",
+        gt=0,
+        le=1e9,
     )
     depth_scale: float = parameter(1.0, "Metres in a unit of the depth.", "m", gt=0, le=1e6)
-    sensor_width: float | None = parameter(
-        None, "Width of the sensor, all of which the picture shows.", "mm", "none", gt=0, le=1000
-    )
     pixel_pitch: float | None = parameter(
         None,
         "Distance of the image's pixels on the sensor, in place of its width.",
         "um",
-        "from sensor_width, else the camera",
+        "from sensor_width or the focal lengths, else the camera",
+        optics=True,
         gt=0,
         le=1000,
     )
@@ -78,7 +93,6 @@ class ThinLens(Method):
         ge=1,
         le=LARGEST,
     )
-    layer: str = parameter("", "The layer that has the depth; else one of a usual name.")
 
     @field_validator("blades")
     @classmethod
@@ -88,26 +102,85 @@ class ThinLens(Method):
         return blades
 
     @model_validator(mode="after")
-    def _in_front(self) -> "ThinLens":
-        distance = self.focus_distance * self.depth_scale * 1000
-        if distance <= self.focal_length:
-            raise ValueError(
-                f"focus_distance {self.focus_distance:g} is {distance:g} mm, which is not beyond "
-                f"the focal length of {self.focal_length:g} mm; is depth_scale right?"
-            )
+    def _one_size(self) -> "ThinLens":
         if self.sensor_width and self.pixel_pitch:
             raise ValueError("sensor_width and pixel_pitch both give the pixels' size; set one")
         return self
 
+    def optics(self) -> Mapping[str, float]:
+        in_metres = {"focus_distance": (self.focus_distance or 0.0) * self.depth_scale}
+        return {**super().optics(), **(in_metres if self.focus_distance else {})}
+
     def resolve(self, context: Context) -> Self:
-        if self.sensor_width:
-            return self
-        if not (pitch := self.pixel_pitch or context.camera.pixel_pitch):
-            raise ValueError(
-                f"sensor_width: the size of pixels is needed, and camera {context.camera.name} "
-                "does not say it; set it in mm, or pixel_pitch in um"
+        """The method with a size of pixels, and a focal length in mm or, with a sensor, in px.
+
+        Raises:
+            RequestError: one of them is not known, or nothing is in focus.
+        """
+        metres = context.optics.focus_distance
+        distance = 3.0 if metres is None else metres / self.depth_scale
+        own = self.with_optics(context).with_defaults(f_number=2.8, focus_distance=distance)
+        if not own.sensor_width:
+            if own.fx and own.focal_length:
+                own = own.with_defaults(pixel_pitch=own.focal_length / own.fx * 1000)
+            elif own.fx and not own.pixel_pitch:
+                raise RequestError(
+                    f"defocus: the focal length is {own.fx:g} px, but what that is in mm is not "
+                    "known: set focal_length, sensor_width (mm) or pixel_pitch (um), here or in "
+                    "render"
+                )
+            own = own.with_defaults(pixel_pitch=context.camera.pixel_pitch)
+            if not own.pixel_pitch:
+                raise RequestError(
+                    f"defocus.sensor_width: the size of pixels is needed, and camera "
+                    f"{context.camera.name} does not say it; set it in mm, or pixel_pitch in um"
+                )
+            if own.fx:
+                own = own.with_defaults(focal_length=own.fx * own.pixel_pitch / 1000)
+        if not own.fx:
+            own = own.with_defaults(focal_length=50.0)
+        if own.focal_length:
+            own.check_focus(own.focal_length)
+        return own
+
+    @property
+    def focus(self) -> float:
+        """The distance that is in focus, in mm."""
+        return (self.focus_distance or 0.0) * self.depth_scale * 1000
+
+    def check_focus(self, focal_length: float) -> None:
+        """See that what is in focus lies beyond a focal length in mm.
+
+        Raises:
+            RequestError: it does not.
+        """
+        if self.focus <= focal_length:
+            raise RequestError(
+                f"defocus: focus_distance {self.focus_distance:g} is {self.focus:g} mm, which is "
+                f"not beyond the focal length of {focal_length:g} mm; is depth_scale right?"
             )
-        return self.with_defaults(pixel_pitch=pitch)
+
+    def check_depth(self, depth: Depth) -> str:
+        """A warning where discs are larger than they may be, with how many.
+
+        Raises:
+            RequestError: what is in focus is nearer than the focal length.
+        """
+        height, width = depth.pixels.shape
+        self.check_focus(self.camera(width, height)[0])
+        radii = abs(self.radii(depth.pixels))
+        if not (count := np.count_nonzero(radii > self.max_radius)):
+            return ""
+        return (
+            f"{count} of {radii.size} pixels are spread over radii up to {radii.max():.1f} px; "
+            f"max_radius makes them {self.max_radius} px"
+        )
+
+    def camera(self, width: int, height: int) -> tuple[float, float]:
+        """The focal length and the distance of pixels, in mm, of an image of that size."""
+        side = max(self.margins.inside(width, height))
+        pitch = self.sensor_width / side if self.sensor_width else (self.pixel_pitch or 0.0) / 1000
+        return self.focal_length or (self.fx or 0.0) * pitch, pitch
 
     def passes(self) -> tuple[Pass, ...]:
         given = ("radii", "columns", "rows", "reach", "taps", "count")
@@ -119,11 +192,10 @@ class ThinLens(Method):
         Args:
             depth: (height, width) of the whole image, above 0; it may be infinite.
         """
-        focus, metre = self.focus_distance * self.depth_scale * 1000, 1000.0
-        width, _ = self.margins.inside(depth.shape[1], depth.shape[0])
-        pitch = self.sensor_width / width if self.sensor_width else (self.pixel_pitch or 0.0) / 1000
-        widest = self.focal_length**2 / (self.f_number * (focus - self.focal_length)) / pitch / 2
-        nearness = np.float32(focus / (self.depth_scale * metre)) / depth
+        assert self.f_number
+        length, pitch = self.camera(depth.shape[1], depth.shape[0])
+        widest = length**2 / (self.f_number * (self.focus - length)) / pitch / 2
+        nearness = np.float32(self.focus / (self.depth_scale * 1000.0)) / depth
         return np.asarray(np.float32(widest) * (1 - nearness))
 
     def clipped(self, depth: Floats) -> Floats:

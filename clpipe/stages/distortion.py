@@ -14,15 +14,17 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
 
-from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
+from clpipe.camera.lens import LensCalibration
 from clpipe.reference import warp
-from clpipe.reference.lens import Lens
+from clpipe.reference.lens import DistortionMap
 from clpipe.reference.radial import Radial
 from clpipe.stage import (
     Argument,
     CompileTime,
     Context,
+    FromLens,
+    InFocalLengths,
     Kind,
     Method,
     Pass,
@@ -48,13 +50,15 @@ class HasPicture(Method):
         None,
         "Principal point, from the left edge: OpenCV's cx + 0.5.",
         "px",
-        "output.cx, the middle",
+        "render.cx, the middle",
+        optics=True,
     )
     cy: float | None = parameter(
         None,
         "Principal point, from the upper edge: OpenCV's cy + 0.5.",
         "px",
-        "output.cy, the middle",
+        "render.cy, the middle",
+        optics=True,
     )
     fit: bool = parameter(
         False, "Scale the picture so that it shows as much of the render as leaves no void."
@@ -66,20 +70,16 @@ class HasPicture(Method):
     )
 
 
-class FromLens(Unchanged, HasPicture):
+class DistortionOfLens(FromLens, HasPicture):
     """What lensfun knows of the lens that ``--lens`` names; without it, no distortion."""
 
-    method: ClassVar = "lens"
     summary: ClassVar = "that of the lens which --lens names; none without it"
 
-    def resolve(self, context: Context) -> Method:
-        """The model of the lens with its coefficients."""
-        table = context.lens.get("distortion") if context.lens else None
-        if not table:
+    def of_lens(self, lens: LensCalibration | None) -> Method:
+        if lens is None or not lens.distortion:
             return NoDistortion()
-        own = {name: getattr(self, name) for name in HasPicture.model_fields}
-        values = {name: value for name, value in table.items() if name != "method"}
-        return STAGE.by_name[table["method"]](**own, **values).resolve(context)
+        own, table = self.model_dump(), dict(lens.distortion)
+        return STAGE.by_name[table.pop("method")](**own, **table)
 
 
 class Distortion(HasPicture):
@@ -101,17 +101,13 @@ class Distortion(HasPicture):
     cb: float = parameter(0.0, "See vb.", ge=-1, le=1)
     bb: float = parameter(0.0, "See vb.", ge=-1, le=1)
 
-    def resolve(self, context: Context) -> Self:
-        """The method with the render's principal point, where that is known."""
-        return self.with_defaults(cx=context.render.get("cx"), cy=context.render.get("cy"))
-
     def radial(self) -> Radial:
         """The model."""
         raise NotImplementedError(type(self).__name__)
 
-    def lens(self) -> Lens:
+    def lens(self) -> DistortionMap:
         """The map of places, of all channels."""
-        return Lens(
+        return DistortionMap(
             radial=self.radial(),
             centre=(self.cx, self.cy),
             red=Radial.of(self.kr * self.vr, self.kr * self.cr, self.kr * self.br),
@@ -138,7 +134,7 @@ class Distortion(HasPicture):
             ),
         )
 
-    def geometry(self) -> Lens | None:
+    def geometry(self) -> DistortionMap | None:
         return self.lens() if self.passes() else None
 
     def estimates_for(self, width: int, height: int) -> Mapping[str, float]:
@@ -161,39 +157,19 @@ class Distortion(HasPicture):
 Coefficient = Annotated[float, Field(ge=-1e4, le=1e4)]
 
 
-class InFocalLengths(Distortion):
+class OfCamera(InFocalLengths, Distortion):
     """A model that counts in focal lengths."""
 
-    alternatives: ClassVar = frozenset({"fx", "focal_length"})
-
-    fx: float | None = parameter(None, "Focal length across.", "px", "focal_length", gt=0, le=1e7)
-    fy: float | None = parameter(None, "Focal length down.", "px", "fx", gt=0, le=1e7)
-    focal_length: float | None = parameter(None, "Focal length, without fx.", "mm", gt=0, le=1e4)
-    sensor_width: float | None = parameter(
-        None, "Of the sensor, along the longer side of the image.", "mm", gt=0, le=1e4
-    )
+    fy: float | None = parameter(None, "Focal length down.", "px", "fx", optics=True, gt=0, le=1e7)
 
     def resolve(self, context: Context) -> Self:
-        """The method with fy; where it has no focal length, with the render's.
+        """The method with the camera's focal length.
 
         Raises:
-            RequestError: the focal length is not known, or twice. It is refused as late as here
-                because options may choose the method, and each row of a manifest its lens.
+            RequestError: it is not known.
         """
-        if self.fx and self.focal_length:
-            raise RequestError(
-                "distortion: found both fx and focal_length; set fx in px, or focal_length with "
-                "sensor_width in mm"
-            )
-        own, render = super().resolve(context), context.render
-        if not own.fx and not own.focal_length:
-            names = ("fx", "fy") if "fx" in render else ("focal_length", "sensor_width")
-            own = own.with_defaults(**{name: render.get(name) for name in names})
-        if not own.fx and not (own.focal_length and own.sensor_width):
-            raise RequestError(
-                f"distortion: {self.method} counts in focal lengths: set fx (px), or focal_length "
-                "and sensor_width (mm), here or those of the render in output"
-            )
+        own = self.with_optics(context)
+        own.check_focal_length("distortion")
         return own.with_defaults(fy=own.fx)
 
     def estimates_for(self, width: int, height: int) -> Mapping[str, float]:
@@ -206,15 +182,14 @@ class InFocalLengths(Distortion):
         fx, fy = (found["focal_length_factor"] * each for each in unit)
         return {**found, "fx": fx, "fy": fy}
 
-    def lens(self) -> Lens:
+    def lens(self) -> DistortionMap:
         lens = super().lens()
         if self.fx and self.fy:
             return replace(lens, focal=(self.fx, self.fy))
-        assert self.focal_length and self.sensor_width
-        return replace(lens, share=self.focal_length / self.sensor_width)
+        return replace(lens, share=self.share)
 
 
-class BrownConrady(InFocalLengths):
+class BrownConrady(OfCamera):
     """x_d = x R(r) + 2 p1 x y + p2 (r^2 + 2 x^2), y_d likewise: OpenCV's and COLMAP's model.
 
     R = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6); x and y count from the
@@ -248,11 +223,11 @@ class BrownConrady(InFocalLengths):
         below = (0.0, self.k4, 0.0, self.k5, 0.0, self.k6)
         return Radial.of(1.0, 0.0, self.k1, 0.0, self.k2, 0.0, self.k3, below=below)
 
-    def lens(self) -> Lens:
+    def lens(self) -> DistortionMap:
         return replace(super().lens(), tangential=(self.p1, self.p2))
 
 
-class Fisheye(InFocalLengths):
+class Fisheye(OfCamera):
     """r_d = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8), a = atan(r): OpenCV's fisheye model.
 
     r counts from the principal point in focal lengths (Kannala and Brandt, PAMI 2006; COLMAP calls
@@ -285,7 +260,7 @@ class OfLensfun(Distortion):
         le=100,
     )
 
-    def lens(self) -> Lens:
+    def lens(self) -> DistortionMap:
         return replace(super().lens(), half_diagonals=self.unit)
 
 
@@ -336,5 +311,5 @@ STAGE = Stage(
     "Bend the picture as a lens does, and part its colours.",
     Kind.RGB,
     Kind.RGB,
-    (FromLens, NoDistortion, BrownConrady, Fisheye, Poly3, Poly5, PtLens),
+    (DistortionOfLens, NoDistortion, BrownConrady, Fisheye, Poly3, Poly5, PtLens),
 )

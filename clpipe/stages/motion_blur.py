@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 from pydantic import model_validator
@@ -14,6 +14,7 @@ from clpipe.reference.turning import BILINEAR, Turning
 from clpipe.stage import (
     Argument,
     Context,
+    InFocalLengths,
     Kind,
     Method,
     Pass,
@@ -90,37 +91,44 @@ class Linear(Method):
         ge=0,
         lt=45,
     )
-    focal_length: float | None = parameter(
-        None, "Focal length, for the streak of a rotation.", "px", gt=0, le=1e6
+    fx: float | None = parameter(
+        None,
+        "Focal length, for the streak of a rotation.",
+        "px",
+        "the camera's",
+        optics=True,
+        gt=0,
+        le=1e6,
     )
 
-    @model_validator(mode="before")
-    @classmethod
-    def _one_measure(cls, values: Any) -> Any:
-        if isinstance(values, dict) and values.get("rotation") is not None:
-            if values.get("length") is not None:
-                raise ValueError("length and rotation both say how long the streak is; set one")
-            if values.get("focal_length") is None:
-                raise ValueError("rotation needs focal_length, in px")
-        return values
-
     @model_validator(mode="after")
-    def _short_enough(self) -> "Linear":
-        if self.pixels > LONGEST:
-            raise ValueError(
-                f"rotation {self.rotation:g} at focal_length {self.focal_length:g} is a streak of "
-                f"{self.pixels:.0f} px; at most {LONGEST:g} are possible"
-            )
+    def _one_measure(self) -> "Linear":
+        if self.length is not None and self.rotation is not None:
+            raise ValueError("length and rotation both say how long the streak is; set one")
         return self
 
     def resolve(self, context: Context) -> Self:
-        return self.model_copy(update={"length": self.pixels, "rotation": None})
+        """The method with a length: f tan(rotation), in the middle of the picture.
+
+        Raises:
+            RequestError: the focal length is not known in px, or the streak is too long.
+        """
+        own = self.with_optics(context)
+        if not own.rotation:
+            return own.with_defaults(length=0.0)
+        if not own.fx:
+            raise RequestError("motion_blur: rotation needs fx, in px, here or in render")
+        length = float(own.fx * np.tan(np.deg2rad(own.rotation)))
+        if length > LONGEST:
+            raise RequestError(
+                f"motion_blur: rotation {own.rotation:g} at fx {own.fx:g} is a streak of "
+                f"{length:.0f} px; at most {LONGEST:g} are possible"
+            )
+        return own.model_copy(update={"length": length, "rotation": None})
 
     @property
     def pixels(self) -> float:
-        """The length of the streak in px: f tan(rotation), in the middle of the picture."""
-        if self.rotation is not None and self.focal_length is not None:
-            return float(self.focal_length * np.tan(np.deg2rad(self.rotation)))
+        """The length of the streak in px."""
         return self.length or 0.0
 
     @property
@@ -143,7 +151,7 @@ class Linear(Method):
         return convolve(image, self.taps) if self.pixels else image
 
 
-class Perspective(Method):
+class Perspective(InFocalLengths):
     """The streaks of a camera that turns, as they are in each place of a picture in perspective.
 
     It turns evenly about an axis in the plane of its picture, and shows the render as it is in the
@@ -153,7 +161,7 @@ class Perspective(Method):
     >>> from clpipe.stage import run_reference
     >>> dots = np.zeros((1, 201, 3), np.float32)
     >>> dots[0, [30, 100]] = 1
-    >>> turning = Perspective(rotation=1.6, focal_length=100.0)
+    >>> turning = Perspective(rotation=1.6, fx=100.0)
     >>> streaks = run_reference(turning, dots)[0, :, 0].astype(float)  # 2.8 and 4.2 px long
     >>> streaks[98:103].round(2).tolist(), streaks[28:33].round(2).tolist()
     ([0.03, 0.29, 0.36, 0.29, 0.03], [0.14, 0.24, 0.24, 0.24, 0.13])
@@ -163,8 +171,8 @@ class Perspective(Method):
     kernel: ClassVar = "motion_blur"
     overscan: ClassVar = True
     summary: ClassVar = "longer and bent away from the middle, as a turning camera's are"
-    example: ClassVar = {"rotation": 4.0, "angle": 30.0, "focal_length": 90.0}
-    alternatives: ClassVar = frozenset({"focal_length"})
+    example: ClassVar = {"rotation": 4.0, "angle": 30.0, "fx": 90.0}
+    other_examples: ClassVar = ({"fx": None, "focal_length": 40.0, "sensor_width": 20.0},)
 
     rotation: float = parameter(
         0.0, "How far the camera turns while the shutter is open; 0 is off.", "degrees", ge=0, lt=45
@@ -176,23 +184,29 @@ class Perspective(Method):
         ge=-360,
         le=360,
     )
-    focal_length: float | None = parameter(None, "Focal length.", "px", "needed", gt=0, le=1e6)
+    cx: float | None = parameter(
+        None, "Principal point, from the left edge.", "px", "render.cx, the middle", optics=True
+    )
+    cy: float | None = parameter(
+        None, "Principal point, from the upper edge.", "px", "render.cy, the middle", optics=True
+    )
 
     def resolve(self, context: Context) -> Self:
-        """The method as it is.
+        """The method with the camera's focal length and principal point.
 
         Raises:
-            RequestError: the focal length is missing.
+            RequestError: the focal length is not known, and it turns.
         """
-        if self.rotation and self.focal_length is None:
-            raise RequestError("motion_blur: perspective needs focal_length, in px")
-        return self
+        own = self.with_optics(context)
+        if own.rotation:
+            own.check_focal_length("motion_blur")
+        return own
 
     @property
     def turning(self) -> Turning:
         """How the picture is made of the render."""
-        assert self.focal_length
-        return Turning(self.rotation, self.angle, self.focal_length, self.margins)
+        centre = self.cx, self.cy
+        return Turning(self.rotation, self.angle, self.fx, self.share, centre, self.margins)
 
     def passes(self) -> tuple[Pass, ...]:
         if not self.rotation:

@@ -200,10 +200,16 @@ class Lens(Method):
         le=8,
     )
     f_number: float | None = parameter(
-        None, "Diffraction at this f-number.", "", "no diffraction", ge=0.5, le=64
+        None, "Diffraction at this f-number.", "", "no diffraction", optics=True, ge=0.5, le=64
     )
     pixel_pitch: float | None = parameter(
-        None, "Distance of photosites, for diffraction.", "um", "from the camera", gt=0, le=100
+        None,
+        "Distance of photosites, for diffraction.",
+        "um",
+        "from the camera",
+        optics=True,
+        gt=0,
+        le=100,
     )
     low_pass: float = parameter(
         0.0, "Distance of the spots of an optical low-pass filter; 0 is none.", "px", ge=0, le=4
@@ -227,7 +233,7 @@ class Lens(Method):
         return psf
 
     def resolve(self, context: Context) -> Self:
-        pitch = context.camera.pixel_pitch
+        pitch = context.optics.pixel_pitch or context.camera.pixel_pitch
         if self.f_number and not (pitch or self.pixel_pitch):
             raise ValueError(
                 f"pixel_pitch: diffraction needs it, and camera {context.camera.name} does not "

@@ -6,13 +6,15 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 from pydantic import Field
 
-from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
+from clpipe.camera.lens import LensCalibration
 from clpipe.reference.math import inverse_root
 from clpipe.stage import (
     Argument,
     CompileTime,
     Context,
+    FromLens,
+    InFocalLengths,
     Kind,
     Method,
     Pass,
@@ -32,18 +34,16 @@ class NoVignetting(Unchanged):
     summary: ClassVar = "the corners are as bright as the middle"
 
 
-class FromLens(Unchanged):
+class VignettingOfLens(FromLens):
     """What lensfun knows of the lens that ``--lens`` names, at the f-number of ``--aperture``."""
 
-    method: ClassVar = "lens"
     summary: ClassVar = "that of the lens which --lens names, at --aperture; none without these"
 
-    def resolve(self, context: Context) -> Method:
-        """The model of the lens with its coefficients."""
-        table = context.lens.get("vignetting") if context.lens else None
-        if not table:
+    def of_lens(self, lens: LensCalibration | None) -> Method:
+        if lens is None or not lens.vignetting:
             return NoVignetting()
-        return Pa(**{name: value for name, value in table.items() if name != "method"})
+        table = dict(lens.vignetting)
+        return STAGE.by_name[table.pop("method")](**table)
 
 
 class Pa(Method):
@@ -85,8 +85,8 @@ class Pa(Method):
         return image * np.maximum(gain, np.float32(0))[..., None]
 
 
-class CosineFourth(Method):
-    """v * cos^4 of the angle to the optical axis, which leaves the image in its middle.
+class CosineFourth(InFocalLengths):
+    """v * cos^4 of the angle to the optical axis, which passes through the principal point.
 
     What falls on a sensor behind a lens without vignetting of its own, cos^4 = 1 / (1 + r^2)^2 with
     r in focal lengths (Reiss, "The cos^4 law of illumination", J. Opt. Soc. Am. 1945).
@@ -101,39 +101,36 @@ class CosineFourth(Method):
     kernel: ClassVar = "vignetting"
     summary: ClassVar = "the fourth power of the cosine of the angle to the axis"
     example: ClassVar = {"fx": 40.0}
-    other_examples: ClassVar = ({"fx": None, "focal_length": 20.0, "sensor_width": 36.0},)
-    alternatives: ClassVar = frozenset({"fx", "focal_length"})
+    other_examples: ClassVar = (
+        {"fx": None, "focal_length": 20.0, "sensor_width": 36.0},
+        {"cx": 12.3, "cy": 9.0},
+    )
 
-    fx: float | None = parameter(None, "Focal length.", "px", "focal_length", gt=0, le=1e7)
-    focal_length: float | None = parameter(None, "Focal length, without fx.", "mm", gt=0, le=1e4)
-    sensor_width: float | None = parameter(
-        None, "Of the sensor, along the longer side of the image.", "mm", gt=0, le=1e4
+    cx: float | None = parameter(
+        None, "Principal point, from the left edge.", "px", "render.cx, the middle", optics=True
+    )
+    cy: float | None = parameter(
+        None, "Principal point, from the upper edge.", "px", "render.cy, the middle", optics=True
     )
 
     def resolve(self, context: Context) -> Self:
-        """The method, checked.
+        """The method with the camera's focal length and principal point.
 
         Raises:
-            RequestError: the focal length is not known, or twice.
+            RequestError: the focal length is not known.
         """
-        if self.fx and self.focal_length:
-            raise RequestError(
-                "vignetting: found both fx and focal_length; set fx in px, or focal_length with "
-                "sensor_width in mm"
-            )
-        if not self.fx and not (self.focal_length and self.sensor_width):
-            raise RequestError(
-                "vignetting: cosine_fourth counts in focal lengths: set fx (px), or focal_length "
-                "and sensor_width (mm)"
-            )
-        return self
+        own = self.with_optics(context)
+        own.check_focal_length("vignetting")
+        return own
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("vignetting_cosine", arguments=("extent", "per_px", "per_side")),)
+        given = ("extent", "x", "y", "per_px", "per_side")
+        return (Pass("vignetting_cosine", arguments=given),)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         per_px, per_side = self._units()
-        return {"extent": CompileTime("e"), "per_px": per_px, "per_side": per_side}
+        places = {"x": _place(self.cx, "width"), "y": _place(self.cy, "height")}
+        return {"extent": CompileTime("e"), **places, "per_px": per_px, "per_side": per_side}
 
     def _units(self) -> tuple[np.float32, np.float32]:
         """1 over the squared focal length in px, or in longer sides; the other is 0."""
@@ -146,15 +143,21 @@ class CosineFourth(Method):
         per_px, per_side = self._units()
         side: Floats = np.full(1, max(image.shape[:2]), np.float32)
         unit = per_px or per_side * _reciprocal(side * side)
-        cosine = _reciprocal(_squared_radius(image) * unit + np.float32(1))
+        cosine = _reciprocal(_squared_radius(image, self.cx, self.cy) * unit + np.float32(1))
         return image * (cosine * cosine)[..., None]
 
 
-def _squared_radius(image: Floats) -> Floats:
-    """The squared distance of each pixel to the middle of the image, in px."""
+def _squared_radius(image: Floats, cx: float | None = None, cy: float | None = None) -> Floats:
+    """The squared distance of each pixel to a place, in px; None is the middle of the image."""
     height, width = image.shape[:2]
-    dx, dy = ((np.arange(n) - (n - 1) / 2).astype(np.float32) for n in (width, height))
+    places = (width, width / 2 if cx is None else cx), (height, height / 2 if cy is None else cy)
+    dx, dy = (np.arange(n, dtype=np.float32) + np.float32(0.5) - np.float32(c) for n, c in places)
     return dx * dx + (dy * dy)[:, None]
+
+
+def _place(centre: float | None, side: str) -> Argument:
+    """A coordinate of the principal point; None is the middle, which a kernel knows."""
+    return CompileTime(f"0.5f * (float)e.{side}") if centre is None else np.float32(centre)
 
 
 def _reciprocal(x: Floats) -> Floats:
@@ -167,5 +170,5 @@ STAGE = Stage(
     "Darken the corners as a lens does.",
     Kind.RGB,
     Kind.RGB,
-    (FromLens, NoVignetting, Pa, CosineFourth),
+    (VignettingOfLens, NoVignetting, Pa, CosineFourth),
 )

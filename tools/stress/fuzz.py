@@ -85,10 +85,10 @@ def ways(suffix: str) -> tuple[Callable[[Path], object], ...]:
     from clpipe.camera.profile import load_camera
     from clpipe.chain.chain import make_chain
     from clpipe.chain.files import load_settings
+    from clpipe.chain.render_camera import RenderCamera
     from clpipe.chain.request import Request
     from clpipe.chain.settings import settings_from
     from clpipe.images.attributes import read_attributes
-    from clpipe.images.encoding import Output
     from clpipe.images.passes import find_layers, read_layer
     from clpipe.inputs.find import Job
     from clpipe.inputs.loader import ImageLoader
@@ -123,7 +123,7 @@ def ways(suffix: str) -> tuple[Callable[[Path], object], ...]:
         return check_rows(read_manifest(path), settings_from({}))
 
     def poses(path: Path) -> object:
-        return with_views([Job(Path("a.exr"), "a.exr")], path, Output())
+        return with_views([Job(Path("a.exr"), "a.exr")], path, RenderCamera())
 
     noise_model = partial(import_camera, camera=None, output=None)
     report = setting("picture_noise", "intensity_dependent", "measured")

@@ -194,13 +194,15 @@ const asAsked = (facts) => {
   return { ...facts, steps };
 };
 
+const tableKeys = () => Object.entries(known.tables).flatMap(([table, keys]) => Object.entries(keys).map(([name, schema]) => [`${table}.${name}`, name, schema]));
+
 const showControls = (facts) => {
   const now = JSON.stringify(facts.steps.map((each) => [each.name, each.on, each.here, each.method]));
   if (now !== structure) {
     rows.length = 0;
     makeKeys(facts);
     makeStages(facts);
-    byId("output").replaceChildren(...Object.entries(known.output).map(([name, schema]) => keyRow(`output.${name}`, name.replaceAll("_", " "), schema, schema.default)));
+    byId("output").replaceChildren(...tableKeys().map(([key, name, schema]) => keyRow(key, name.replaceAll("_", " "), schema, schema.default)));
     structure = now;
   }
   if (facts.camera !== isoCamera) {
@@ -219,7 +221,7 @@ const showControls = (facts) => {
     const item = document.querySelector(`.step[data-step="${each.name}"]`);
     if (item) item.classList.toggle("idle", each.idle);
   }
-  for (const [name, schema] of Object.entries(known.output)) resolved[`output.${name}`] = schema.default;
+  for (const [key, , schema] of tableKeys()) resolved[key] = schema.default;
   for (const element of rows) {
     const { key } = element.dataset;
     const own = valueAt(key);

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -45,7 +45,9 @@ class Photometric(Gain):
         le=10,
     )
     exposure_time: float = parameter(0.01, "Exposure time, t.", "s", gt=0, le=86400)
-    f_number: float = parameter(8.0, "F-number of the lens, N.", gt=0, le=1000)
+    f_number: float | None = parameter(
+        None, "F-number of the lens, N.", "", "aperture, else 8", optics=True, gt=0, le=1000
+    )
     q: float = parameter(
         0.65, "What the lens and its geometry leave of the light.", gt=0, le=math.pi / 4
     )
@@ -58,12 +60,16 @@ class Photometric(Gain):
         le=1e9,
     )
 
+    def resolve(self, context: Context) -> Self:
+        return self.with_optics(context).with_defaults(f_number=8.0)
+
     def next_context(self, context: Context) -> Context:
         headroom = context.headroom + self.headroom - math.log2(WHITE)
         return replace(context, headroom=headroom)
 
     def factor(self, iso: float) -> np.float32:
         """What a render's unit becomes, over the sensor's full scale, at an ISO."""
+        assert self.f_number
         exposure = self.q * self.scale * self.exposure_time / self.f_number**2  # lx s
         return np.float32(exposure * iso / SATURATION * 2.0 ** (self.ev - self.headroom))
 

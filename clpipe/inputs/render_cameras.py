@@ -35,7 +35,7 @@ class View:
 
     Args:
         name: of the image, as the file has it.
-        values: by the keys of :class:`~clpipe.images.encoding.Output`.
+        values: by the keys of :class:`~clpipe.chain.render_camera.RenderCamera`.
         size: width and height in px; None where it does not say them.
         problem: why it can be no render's; "" where it can.
     """

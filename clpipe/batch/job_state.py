@@ -1,0 +1,70 @@
+"""A job from the start of its decoding to its outcome."""
+
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from clpipe.batch.outcome import DONE, FAILED, Outcome, Span
+from clpipe.images.read import SourceImage
+from clpipe.inputs.carry import Carried
+from clpipe.inputs.find import Job
+from clpipe.inputs.loader import ImageLoader
+from clpipe.outputs.patches import Patch
+from clpipe.outputs.recipes import Recipe
+
+
+@dataclass
+class JobState:
+    """What is known of a job so far."""
+
+    job: Job
+    loader: ImageLoader
+    began: float = field(default_factory=time.time)
+    spans: list[Span] = field(default_factory=list)
+    source: SourceImage | None = None
+    stamps: Sequence[tuple[int, int]] = ()  # of the files of its exposure
+    request: Mapping[str, Any] = field(default_factory=dict)  # its record
+    recipes: list[Recipe] = field(default_factory=list)
+    unwritten: int = 0  # renditions
+    status: str = DONE
+    error: str = ""
+    reason: str = ""
+    outputs: list[str] = field(default_factory=list)
+    carried: Carried | None = None  # until it is written
+    clipped: float = 0.0  # the share of clipped pixels, of the rendition that has most
+    patches: list[Patch] = field(default_factory=list)  # that are made in place of pictures
+    old: int = 0  # renditions that another program has made
+
+    @contextmanager
+    def timed(self, step: str) -> Iterator[None]:
+        """Note when a step was done, and by which thread."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.note(step, start)
+
+    def note(self, step: str, start: float) -> None:
+        """Note that this thread has done a step that was begun at ``start``."""
+        name = threading.current_thread().name
+        self.spans.append(Span(step, name, start, time.perf_counter() - start))
+
+    def outcome(self) -> Outcome:
+        """What became of the job."""
+        width, height = self.source.pixels.shape[1::-1] if self.source else (0, 0)
+        return Outcome(
+            self.job,
+            FAILED if self.error else self.status,
+            width * height / 1e6,
+            self.source.warnings if self.source else (),
+            self.error,
+            self.reason,
+            tuple(self.outputs),
+            self.began,
+            tuple(self.spans),
+            self.clipped,
+            self.old,
+        )

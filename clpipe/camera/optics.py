@@ -1,0 +1,78 @@
+"""One camera's optics: focal length, aperture, focus and principal point, each stated once.
+
+Settings, the render's camera and the parameters of stages may state them; what one of them states
+holds for all, and what two of them state must be the same.
+"""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from clpipe.base.errors import KeyedError
+from clpipe.camera.lens import LensCalibration
+
+ROUNDING = 0.01  # of a length or an f-number; those of lenses are nominal
+PLACES = 1e-4  # of what counts in px
+
+IN_PIXELS = ("fx", "fy", "cx", "cy")
+
+
+@dataclass(frozen=True)
+class Optics:
+    """What is known of a camera's optics; None is not known.
+
+    Args:
+        fx, fy: focal lengths in px of the render.
+        focal_length: in mm.
+        sensor_width: in mm, along the longer side of the image.
+        pixel_pitch: distance of the image's pixels on the sensor, um.
+        camera_angle_x: angle of view in radians, across the width of the render.
+        cx, cy: the principal point in px from the upper left corner of the render.
+        f_number: of the aperture.
+        focus_distance: in m.
+        calibration: of the lens that is named.
+        places: where each of them is stated.
+    """
+
+    fx: float | None = None
+    fy: float | None = None
+    focal_length: float | None = None
+    sensor_width: float | None = None
+    pixel_pitch: float | None = None
+    camera_angle_x: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    f_number: float | None = None
+    focus_distance: float | None = None
+    calibration: LensCalibration | None = None
+    places: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, stated: Iterable[tuple[str, str, float]]) -> "Optics":
+        """The optics of statements: the place of each, the name of what it states, its value.
+
+        Raises:
+            KeyedError: two contradict each other; the message names both places.
+
+        >>> Optics.of([("render.focal_length", "focal_length", 35.0)]).focal_length
+        35.0
+        """
+        values: dict[str, Any] = {}
+        places: dict[str, str] = {}
+        for place, name, value in stated:
+            known = values.setdefault(name, value)
+            first = places.setdefault(name, place)
+            in_px = name in IN_PIXELS
+            tolerance, least = (PLACES, 0.01) if in_px else (ROUNDING, 0.0)
+            if not math.isclose(value, known, rel_tol=tolerance, abs_tol=least):
+                raise KeyedError(place, f"{place}: {value:g}, but {first}: {known:g}; set one")
+        return cls(**values, places=places)
+
+    @property
+    def known(self) -> dict[str, float]:
+        """The numbers that are known, by their names."""
+        return {name: value for name in NUMBERS if (value := getattr(self, name)) is not None}
+
+
+NUMBERS = tuple(f.name for f in fields(Optics) if f.name not in ("calibration", "places"))

@@ -1,0 +1,81 @@
+"""One way for an image into its chain: its camera, its overscan and its depth."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from clpipe.base.types import Array
+from clpipe.chain.chain import Chain, make_chain
+from clpipe.chain.depth import depth_steps, warnings_of, with_depth
+from clpipe.chain.keys import RENDER
+from clpipe.chain.overscan import steps_of_overscan, with_overscan
+from clpipe.chain.settings import overlay
+from clpipe.reference.defocus import Depth
+from clpipe.reference.geometry import NO_MARGINS, Margins
+from clpipe.stage.method import optics_names
+
+
+@dataclass(frozen=True)
+class Entered:
+    """An image in its chain: the chain for it, and what of the image goes through that.
+
+    ``margins`` say how far ``pixels``, and depth, go on beyond the picture.
+    """
+
+    chain: Chain
+    pixels: Array
+    margins: Margins = NO_MARGINS
+    depth: Depth | None = None
+    warnings: tuple[str, ...] = ()
+
+
+def enter(
+    chain: Chain,
+    pixels: Array,
+    margins: Margins = NO_MARGINS,
+    depth: Callable[[Chain, int, int, Margins], Depth] | None = None,
+    shot: Mapping[str, float] | None = None,
+) -> Entered:
+    """An image with the chain for it.
+
+    Args:
+        chain: for images of its kind.
+        pixels: of the image, (height, width[, channel]).
+        margins: how far they go on beyond the picture; cropped where the chain makes no use of it.
+        depth: gives the depth for a chain that needs it, of an image of some width and height with
+            some margins; None leaves it out.
+        shot: what the image says of its camera, which holds where nothing else is stated.
+
+    Raises:
+        ImageError: what ``depth`` raises.
+        RequestError: what is known of the camera contradicts itself, or the depth is of no use.
+    """
+    if chain.steps[0].name == chain.names[0] and pixels.ndim == 3:
+        said = {k: v for k, v in (shot or {}).items() if k not in chain.optics.known}
+        chain = _with_shot(chain, tuple(said.items())) if said else chain
+        width, height = margins.inside(*pixels.shape[1::-1])
+        chain.intrinsics_of_render(width, height, said)
+    if margins and not steps_of_overscan(chain):
+        pixels, margins = np.ascontiguousarray(margins.cropped(pixels)), NO_MARGINS
+    elif margins:
+        chain = with_overscan(chain, margins)
+    if depth is None or pixels.ndim != 3 or not depth_steps(chain):
+        return Entered(chain, pixels, margins)
+    height, width = pixels.shape[:2]
+    found = depth(chain, width, height, margins)
+    warnings = tuple(warnings_of(chain, found))
+    return Entered(with_depth(chain, found), pixels, margins, found, warnings)
+
+
+@lru_cache(maxsize=64)
+def _with_shot(chain: Chain, shot: tuple[tuple[str, float], ...]) -> Chain:
+    """The chain with what an image says of its camera; the same one where no step needs that."""
+    active = [chain.settings.method(s.name) for s in chain.steps if s.method.passes()]
+    needed = {n for own in active for n in optics_names(type(own)) if getattr(own, n) is None}
+    said = {name: value for name, value in shot if name in needed}
+    if not said:
+        return chain
+    settings = overlay(chain.settings, {RENDER: said})
+    return make_chain(settings, chain.source, until=chain.steps[-1].name)

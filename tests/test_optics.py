@@ -1,0 +1,227 @@
+"""One optics: what is stated of a camera anywhere reaches all stages, and contradicts nothing."""
+
+import json
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clpipe as clpipe_api
+from clpipe.base.errors import RequestError
+from clpipe.camera import lens as by_name
+from clpipe.chain.chain import make_chain
+from clpipe.chain.depth import depth_of_array, with_depth
+from clpipe.chain.settings import overlay, settings_from
+from clpipe.images.read import read_image
+from clpipe.stage import Resample
+
+SIZE = 60, 40
+# Stages that need optics, each with what makes it need them.
+ALL = {
+    "stages": ["exposure", "defocus", "motion_blur", "distortion", "vignetting"],
+    "exposure": {"method": "photometric"},
+    "defocus": {"method": "thin_lens"},
+    "motion_blur": {"method": "perspective", "rotation": 1.0},
+    "distortion": {"method": "brown_conrady", "k1": -0.1},
+    "vignetting": {"method": "cosine_fourth"},
+}
+# By what they state: the places that may, with the key of each and a value; the last is another.
+PLACES = {
+    "focal_length": (
+        [
+            ("", "focal_length"),
+            ("render", "focal_length"),
+            ("distortion", "focal_length"),
+            ("vignetting", "focal_length"),
+            ("motion_blur", "focal_length"),
+            ("defocus", "focal_length"),
+        ],
+        (35.0, 50.0),
+    ),
+    "fx": (
+        [(table, "fx") for table in ("render", "distortion", "vignetting", "motion_blur")]
+        + [("defocus", "fx")],
+        (58.0, 70.0),
+    ),
+    "f_number": (
+        [("", "aperture"), ("exposure", "f_number"), ("defocus", "f_number")],
+        (2.0, 2.8),
+    ),
+    "sensor_width": (
+        [(table, "sensor_width") for table in ("render", "distortion", "vignetting")]
+        + [("motion_blur", "sensor_width"), ("defocus", "sensor_width")],
+        (36.0, 24.0),
+    ),
+    "cx": (
+        [(table, "cx") for table in ("render", "distortion", "vignetting", "motion_blur")],
+        (31.5, 29.0),
+    ),
+}
+CASES = [(fact, place) for fact, (places, _) in PLACES.items() for place in places]
+PAIRS = [(fact, pair) for fact, (places, _) in PLACES.items() for pair in combinations(places, 2)]
+
+
+def stated(*places, **others):
+    """Settings in which each (table, key, value) is set; the rest is what all stages need."""
+    values = {**others}
+    for table, key, value in places:
+        at = values.setdefault(table, {}) if table else values
+        at[key] = value
+    return overlay(settings_from(ALL), values)
+
+
+def others_for(fact):
+    """What else must be known: a focal length in px or mm."""
+    lengths = {"render": {"focal_length": 35.0, "sensor_width": 36.0}}
+    return {
+        "fx": {"render": {"sensor_width": 36.0}},
+        "focal_length": {"render": {"sensor_width": 36.0}},
+        "sensor_width": {"render": {"focal_length": 35.0}},
+    }.get(fact, lengths)
+
+
+def arguments(settings):
+    """The arguments of all kernels for an image, and where they gather it."""
+    depth = depth_of_array(np.linspace(1, 9, SIZE[0] * SIZE[1]).reshape(SIZE[::-1]), *SIZE)
+    chain = with_depth(make_chain(settings), depth)
+    found = {}
+    for step in chain.steps:
+        found |= {(step.name, k): v for k, v in step.method.arguments(step.context).items()}
+        for each in step.method.passes():
+            if isinstance(each.access, Resample):
+                values = each.access.resampler.values(*SIZE)
+                found |= {(step.name, each.function, k): v for k, v in values.items()}
+    return {key: np.asarray(v, object if isinstance(v, str) else None) for key, v in found.items()}
+
+
+def same(one, other):
+    return one.keys() == other.keys() and all(
+        np.array_equal(one[k], other[k]) if one[k].dtype != object else one[k] == other[k]
+        for k in one
+    )
+
+
+@pytest.mark.parametrize(("fact", "place"), CASES, ids=str)
+def test_a_fact_that_one_place_states_reaches_all_stages(fact, place):
+    places, (value, another) = PLACES[fact]
+    everywhere = arguments(stated(*((*each, value) for each in places), **others_for(fact)))
+    assert same(arguments(stated((*place, value), **others_for(fact))), everywhere)
+    different = arguments(stated((*place, another), **others_for(fact)))
+    assert not same(different, everywhere)
+
+
+@pytest.mark.parametrize(("fact", "pair"), PAIRS, ids=str)
+def test_places_that_contradict_each_other_are_named(fact, pair):
+    _, values = PLACES[fact]
+    names = [f"{table}.{key}" if table else key for table, key in pair]
+    both = stated(*((*place, v) for place, v in zip(pair, values, strict=True)), **others_for(fact))
+    with pytest.raises(RequestError, match="set one") as refused:
+        make_chain(both)
+    assert all(f"{name}: " in str(refused.value) for name in names)
+    near = stated((*pair[0], values[0]), (*pair[1], values[0] * 1.00001), **others_for(fact))
+    assert make_chain(near)
+
+
+def test_px_and_mm_that_contradict_each_other_are_named(clpipe, write_exr):
+    write_exr("a.exr", np.full((40, 60, 3), 0.5))
+    run = ("run", "a.exr", "-o", "o", "--device", "numpy", "--set", "motion_blur.fx=90")
+    said = clpipe(*run, "--focal-length", 35, "--set", "render.sensor_width=36", status=1).stderr
+    assert "motion_blur.fx makes the focal length of this render of 60x40 pixels 90 px" in said
+    assert "but focal_length and render.sensor_width 58.3333 px" in said
+    pipeline = clpipe_api.Pipeline(
+        focal_length=35, render={"sensor_width": 36}, motion_blur={"fx": 90.0}, device="numpy"
+    )
+    with pytest.raises(RequestError, match=r"but focal_length and render\.sensor_width"):
+        pipeline.process(np.ones((40, 60, 3), np.float32), "a")
+
+
+# A point that is 1.5 m away, with a focus at 3 m: f^2 (3 - 1.5) / (N 1.5 (3 - f)), and its square.
+def disc(focal_length, f_number, pitch):
+    return focal_length**2 * 1500 / (f_number * 1500 * (3000 - focal_length)) / pitch
+
+
+def spread_of(path):
+    """The diameter of the disc that a point in the middle became: its mean square is d^2 / 8."""
+    seen = read_image(path).pixels[..., 1].astype(np.float64)
+    y, x = np.indices(seen.shape) - np.array([120, 180])[:, None, None]
+    return np.sqrt(8 * (seen * (x**2 + y**2)).sum() / seen.sum())
+
+
+@pytest.fixture
+def point(write_exr):
+    """A render of a point at 1.5 m: 360 px across, of 36 mm, so 0.1 mm apart."""
+    image = np.zeros((240, 360, 3), np.float32)
+    image[120, 180] = 1
+    write_exr("in/a.exr", image)
+    write_exr("in/a_depth.exr", np.full((240, 360, 1), 1.5), "Z")
+
+
+RUN = ("run", "in/a.exr", "--stages", "defocus", "--format", "exr", "--device", "numpy")
+DEFOCUS = ("--set", "defocus.method=thin_lens", "--aperture", 0.5)
+POSE = {"R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "t": [0, 0, 0]}
+VIEW = {"file": "a.exr", "K": [[350, 0, 180], [0, 350, 120], [0, 0, 1]], **POSE}
+
+
+def test_the_poses_of_a_35_mm_render_are_those_of_its_depth_of_field(clpipe, point):
+    Path("cameras.json").write_text(json.dumps({"views": [VIEW]}))
+    posed = (*RUN, *DEFOCUS, "--poses", "cameras.json")
+    clpipe(*posed, "-o", "o", "--set", "render.sensor_width=36")
+    assert spread_of(Path("o/a.exr")) == pytest.approx(disc(35, 0.5, 0.1), abs=0.3)
+    clpipe(*posed, "-o", "p", "--focal-length", 35)
+    assert spread_of(Path("p/a.exr")) == pytest.approx(disc(35, 0.5, 0.1), abs=0.3)
+    said = clpipe(*posed, "-o", "q", status=2).stderr
+    assert "the focal length is 350 px, but what that is in mm is not known: set" in said
+
+
+def test_a_lens_is_that_of_the_depth_of_field(clpipe, point):
+    set_ = ("--focal-length", 50, "--focus-distance", 3, "--set", "render.sensor_width=36")
+    clpipe(*RUN, *DEFOCUS, *set_, "-o", "o")
+    assert spread_of(Path("o/a.exr")) == pytest.approx(disc(50, 0.5, 0.1), abs=0.3)
+
+
+CALIBRATED = by_name.LensCalibration(
+    24.0,
+    {"method": "ptlens", "b": -0.03, "unit": 0.5},
+    {"method": "pa", "k1": -0.5},
+)
+
+
+@pytest.fixture
+def lensfun(monkeypatch):
+    """A database of one lens."""
+
+    def use(calibration):
+        monkeypatch.setattr("clpipe.chain.chain.calibration_of", lambda *given: calibration)
+
+    use(CALIBRATED)
+    return use
+
+
+def test_a_lens_by_name_states_its_focal_length(lensfun):
+    steps = make_chain(settings_from({"lens": "a", "render": {"sensor_width": 36.0}})).steps
+    assert steps[0].context.optics.focal_length == 24.0
+    assert {s.name: s.method.method for s in steps}["distortion"] == "ptlens"
+
+
+def test_a_lens_that_no_step_takes_is_refused(lensfun):
+    without = {"skip": ["distortion", "vignetting"]}
+    replaced = {"distortion": {"method": "none"}, "vignetting": {"method": "none"}}
+    for each in (without, replaced):
+        with pytest.raises(RequestError, match="lens: found a, but no step takes it"):
+            make_chain(settings_from({"lens": "a", **each}))
+        assert make_chain(settings_from(each))
+    assert make_chain(settings_from({"lens": "a", "skip": ["vignetting"]}))
+
+
+def test_a_lens_that_does_not_fit_is_refused(lensfun):
+    behind = {"stages": ["mosaic", "vignetting", "demosaic"]}
+    with pytest.raises(RequestError, match="stage vignetting reads rgb, but mosaic gives mosaic"):
+        make_chain(settings_from({"lens": "a", **behind}))
+    assert [s.name for s in make_chain(settings_from(behind)).steps] == ["mosaic", "demosaic"]
+
+
+def test_a_lens_of_which_nothing_is_known_is_refused(lensfun):
+    lensfun(by_name.LensCalibration(24.0, {}, {}))
+    with pytest.raises(RequestError, match="knows neither distortion nor vignetting of it"):
+        make_chain(settings_from({"lens": "a"}))
