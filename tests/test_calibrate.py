@@ -115,7 +115,7 @@ def _plain(record):
 
 def test_standard_errors_are_the_scatter_of_repetitions():
     light = scene(64, 96)
-    found = [calibrate(100, frames(light, 4, row=0.8, seed=s), None, SENSOR) for s in range(120)]
+    found = [calibrate(100, frames(light, 4, row=0.8, seed=s), None, SENSOR) for s in range(60)]
     for get in (
         lambda c: c.pooled.gain,
         lambda c: c.pooled.floor,
@@ -139,7 +139,7 @@ def test_two_noisy_frames_give_no_flat_line(poisson):
     light[:, 128:] = 0.02
     many = [
         calibrate(100, frames(light, 2, 40.0, 40.0, poisson=poisson, seed=s), None, SENSOR)
-        for s in range(30)
+        for s in range(15)
     ]
     gains = np.array([c.pooled.gain.value for c in many])
     assert abs(gains.mean() / 40 - 1) < 3 * gains.std() / 40 / len(gains) ** 0.5

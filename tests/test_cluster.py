@@ -36,7 +36,7 @@ from clpipe.engine.hardware import Hardware
 from clpipe.inputs.find import Job
 from tests.conftest import ROOT
 
-IMAGES = 40
+IMAGES = 16
 
 
 @pytest.fixture(scope="module")

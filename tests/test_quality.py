@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import clpipe
 from clpipe.images.read import read_image
 from tests.conftest import STILL_LIFE
 from tools.pages import quality
@@ -24,6 +25,9 @@ def test_cpsnr():
 
 
 def test_the_tables(tmp_path, capsys, monkeypatch):
+    for table in (quality.DEMOSAIC, quality.DENOISE, quality.SHARPNESS):
+        for name in [*table][1:-1]:  # test_demosaicing runs those of demosaicing
+            monkeypatch.delitem(table, name)
     monkeypatch.setattr(quality, "ISOS", (1600,))
     monkeypatch.setattr("sys.argv", ["quality", "--pictures", str(tmp_path)])
     crop = np.ascontiguousarray(read_image(STILL_LIFE).pixels[200:330, 300:460])
@@ -31,5 +35,12 @@ def test_the_tables(tmp_path, capsys, monkeypatch):
     assert quality.main() == 0
     out = capsys.readouterr().out
     assert "Kodak pictures are not there; skipped" in out
-    for name in (*quality.DEMOSAIC, "bilateral", "none"):
+    for name in (*quality.DEMOSAIC, *quality.DENOISE, *quality.SHARPNESS):
         assert name in out
+
+
+def test_every_chain_can_be_made():
+    for choice, _ in quality.DEMOSAIC.values():
+        assert clpipe.Pipeline(stages=["mosaic", "demosaic"], demosaic=choice).chain
+    for settings in (*quality.DENOISE.values(), *quality.SHARPNESS.values()):
+        assert clpipe.Pipeline(**settings).chain

@@ -12,21 +12,16 @@ from clpipe.camera.profile import load_camera
 from clpipe.images.read import read_image
 from tools.pages import real_cameras, side_by_side, validate
 
-# Every camera, pattern and method, ISOs from end to end; the tool closes all 68 loops.
+# Two of the 68 loops that the tool closes.
 LOOPS = [
-    ("sony-a7r2", 100, "RGGB", "poisson"),
     ("sony-a7r2", 12800, "GRBG", "gaussian"),
     ("sony-a7s2", 1600, "BGGR", "poisson"),
-    ("sony-a7s2", 100, "GBRG", "gaussian"),
-    ("canon-5d2", 6400, "RGGB", "poisson"),
 ]
 
 
 @pytest.mark.parametrize(("camera", "iso", "pattern", "method"), LOOPS)
 def test_noise_that_goes_in_comes_back(camera, iso, pattern, method):
-    # The Canon's row noise is a thirtieth of its read noise: only long rows tell it to 3 %.
-    width = 3072 if camera == "canon-5d2" else 1024
-    loop = validate.close_loop(camera, iso, pattern, 800, width, method)
+    loop = validate.close_loop(camera, iso, pattern, 800, 1024, method)
     assert loop.good, loop
 
 

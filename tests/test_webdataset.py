@@ -312,7 +312,7 @@ def test_killed_and_resumed_again_and_again(clpipe, renders, tmp_path):
     clpipe("run", "in", "-o", "whole", *RUN[2:])
     rng = random.Random(0)
     done = []
-    for _ in range(5):
+    for _ in range(3):
         process = start(tmp_path, "in", *RUN)
         time.sleep(rng.uniform(0.4, 1.2))
         process.kill()
