@@ -127,10 +127,8 @@ def dataset(
     rendered; and writes the cameras of the pictures (cameras.json, transforms.json, COLMAP's
     sparse/0), manifest.csv, train.txt and val.txt, a contact sheet and a README.
 
-    A folder of renders is taken as it is, with the cameras.json or transforms.json in it.
-
-    The same command goes on where it was interrupted. It makes other ISOs and cameras of the same
-    views without rendering them again.
+    A folder of renders is taken as it is, with the cameras.json or transforms.json in it. The same
+    command goes on where it was interrupted, and renders no view twice for other ISOs and cameras.
 
     \b
     clpipe dataset scene.blend -o set --iso 100,800,3200 --views 24
