@@ -114,7 +114,7 @@ class Cutting:
         return self._columns * -(-self.height // self.size)
 
     def in_grid(self, numbers: Sequence[int], owner: str) -> list[Patch]:
-        """Patches side by side, by their numbers, row by row; the last ones end where the picture does.
+        """Patches side by side, by their numbers, row by row; the last end where the picture does.
 
         Patches move by up to a pixel where the pattern wants that. ``owner`` as for :meth:`drawn`.
         """
