@@ -228,6 +228,7 @@ def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, m
     assert max(seen) <= batch.in_flight + 1
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_number_of_images(renders, tmp_path):
     renders(1)
     code = (
@@ -538,6 +539,7 @@ def wait_for(folder, count):
     raise AssertionError(f"{folder} never held {count} pictures")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopped_once_what_is_begun_is_finished(clpipe, renders, tmp_path, number):
     renders(60)
@@ -566,6 +568,7 @@ def test_stopped_twice_it_ends_now(renders, tmp_path):
     assert not [p for p in (tmp_path / "out").iterdir() if ".part." in p.name]
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_again_and_again(clpipe, renders, tmp_path):
     renders(24)
     clpipe("run", "in", "-o", "whole", *RUN[2:])

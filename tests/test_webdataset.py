@@ -301,6 +301,7 @@ def start(folder, *arguments):
     return subprocess.Popen(command, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_again_and_again(clpipe, renders, tmp_path):
     renders(24)
     clpipe("run", "in", "-o", "whole", *RUN[2:])
@@ -320,6 +321,7 @@ def test_killed_and_resumed_again_and_again(clpipe, renders, tmp_path):
     assert len(done) == len(set(done)), "an image was made twice"
 
 
+@pytest.mark.slow
 def test_stopped_and_gone_on_with(clpipe, renders, tmp_path):
     renders(60)
     process = start(tmp_path, "in", *RUN, "--jobs", 1)
