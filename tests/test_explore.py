@@ -3,6 +3,7 @@
 import http.client
 import json
 import logging
+import os
 import shlex
 import shutil
 import signal
@@ -20,7 +21,7 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from clpipe.base.errors import ClpipeError, KeyedError, RequestError
+from clpipe.base.errors import ClpipeError, ImageError, KeyedError, RequestError
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings, overlay
 from clpipe.commands.main import main
@@ -28,6 +29,7 @@ from clpipe.engine.device import open_device
 from clpipe.images.write import write_exr as write
 from clpipe.inputs.find import find_jobs
 from tests.conftest import ROOT
+from tests.conftest import cli_output as clpipe
 
 pytest.importorskip("starlette")
 
@@ -66,12 +68,6 @@ def explorer_of(*inputs, device=None, **options) -> Explorer:
 @pytest.fixture(scope="module")
 def explorer(renders):
     return explorer_of(renders)
-
-
-def clpipe(*arguments) -> str:
-    result = CliRunner().invoke(main, [str(each) for each in arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 @pytest.mark.parametrize("image", [0, 1])
@@ -219,6 +215,29 @@ def test_what_was_made_is_kept_as_far_as_memory_goes(explorer, monkeypatch):
     assert explorer.sample(numbers[-2]).facts["seed"] == 3
     with pytest.raises(RequestError, match="not kept any more"):
         explorer.sample(numbers[-3])
+
+
+@pytest.mark.parametrize("device", [None, "numpy"])
+def test_a_render_that_is_replaced_is_read_again(renders, tmp_path, device):
+    path = Path(shutil.copy(renders / "a.exr", tmp_path / "a.exr"))
+    explorer = explorer_of(path, device=device)
+    before = explorer.develop(0, NOISY, View())
+    for size in ((63, 96), (20, 33)):
+        pixels = np.random.default_rng(0).random((*size, 3), np.float32)
+        write(tmp_path / "new.exr", pixels, ("R", "G", "B"), {})
+        os.replace(tmp_path / "new.exr", path)
+        after = explorer.develop(0, NOISY, View())
+        alone = explorer_of(path, device=device).develop(0, NOISY, View())
+        np.testing.assert_array_equal(after.shown, alone.shown)
+    # What was shown stays what it was, whatever the file has become.
+    said = explorer.values_at(before.facts["number"], 5, 7)
+    assert said["values"] == before.shown[7, 5].tolist()
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(ImageError, match=r"a\.exr"):
+        explorer.develop(0, NOISY, View())
+    path.unlink()
+    with pytest.raises(ImageError, match=r"a\.exr: .*[Nn]o such file"):
+        explorer.develop(0, NOISY, View())
 
 
 def test_steps_say_what_is_on_and_which_values_follow(explorer):

@@ -136,8 +136,11 @@ class _Planner:
     def add_step(self, ops: Sequence[Op]) -> None:
         """Add the passes of a step."""
         local: dict[str, Read] = {}
+        over_pixels = [op for op in ops if not isinstance(op.pass_.access, LineTable)]
         if any(isinstance(op.pass_.access, Stencil) and "src" in op.pass_.reads for op in ops):
-            local["src"] = self.input_of_stencil()
+            # A pass before the stencil goes on from the image, not from what its taps redo.
+            is_first = isinstance(over_pixels[0].pass_.access, Stencil)
+            local["src"] = self.input_of_stencil() if is_first else Read(self.close())
         written = "src"
         for op in ops:
             pass_ = op.pass_

@@ -12,6 +12,8 @@ import numpy as np
 
 from clpipe.analysis.measure import measure
 from clpipe.analysis.report import NoiseReport
+from clpipe.base.cache import BoundedCache
+from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.chain import Chain
 from clpipe.chain.identity import noise_key
@@ -70,7 +72,7 @@ class Explorer:
         self.device = device
         self._request = request
         self._lock = threading.Lock()
-        self._sources: OrderedDict[Any, SourceImage] = OrderedDict()
+        self._sources: BoundedCache[SourceImage] = BoundedCache(SOURCES)
         self._runners: dict[bool, Runner] = {}
         self._samples: OrderedDict[int, Sample] = OrderedDict()
         self._number = 0
@@ -253,18 +255,10 @@ class Explorer:
         return loaded, loaded.chain.settings
 
     def _source(self, image: int, loader: ImageLoader) -> SourceImage:
-        """An image's pixels, decoded once for all settings that read it in the same way."""
-        key = image, loader.reads, loader.reads_overscan, loader.settings.dump_format
-        with self._lock:
-            if key in self._sources:
-                self._sources.move_to_end(key)
-                return self._sources[key]
-        source = loader.read(self.jobs[image])
-        with self._lock:
-            self._sources[key] = source
-            while len(self._sources) > SOURCES:
-                self._sources.popitem(last=False)
-        return source
+        """An image's pixels, decoded once for all settings that read its file in the same way."""
+        stamp = stamp_of(self.jobs[image].path)
+        key = image, stamp, loader.reads, loader.reads_overscan, loader.settings.dump_format
+        return self._sources.get(key, lambda: loader.read(self.jobs[image]))
 
     def _run(
         self, loaded: LoadedImage, view: View, timings: list[Timing] | None

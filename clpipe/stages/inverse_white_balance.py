@@ -8,7 +8,17 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import by_site
-from clpipe.stage import Argument, Context, Kind, Method, Pass, ReferenceContext, Stage, parameter
+from clpipe.stage import (
+    Argument,
+    Context,
+    Kind,
+    Method,
+    Pass,
+    ReferenceContext,
+    Stage,
+    StageRole,
+    parameter,
+)
 
 
 class Gains(Method):
@@ -63,4 +73,5 @@ STAGE = Stage(
     Kind.MOSAIC,
     Kind.MOSAIC,
     (Gains,),
+    role=StageRole.BALANCE_OF_LIGHT,
 )

@@ -27,6 +27,7 @@ CROP = 512  # px; crops begin at multiples of 16, where the blocks of a JPEG do
 CROPS = 4
 FEWEST_FLAT = 4000  # pixels of all scenes that are neither clipped nor near an edge
 FEWEST_OF_EACH = 1000  # and of each
+ALIKE = 1e-9  # squares of DN of 255, from rounding in a mean; noise has more
 HOLDOUT = 3  # one crop or block in so many is kept out of the search
 MANY = 6  # crops, of which whole ones are kept out; of fewer, a whole one would be one odd scene
 SMOOTH = 1.5  # px, over which the mean of a burst is smoothed before it is developed again
@@ -227,12 +228,18 @@ def still_places(path: Path, frame: Floats, clean: Doubles, against: str, flat: 
     """Where a frame shows what its mean shows, (height, width).
 
     Raises:
-        RequestError: it shows another scene, or has moved as a whole or in wide parts.
+        RequestError: it shows another scene, has moved as a whole or in wide parts, or is the same.
     """
     from scipy import ndimage
 
     difference = luma(frame) - luma(clean)
     difference -= difference.mean()
+    energy = float((difference**2).mean())
+    if energy < ALIKE:
+        raise RequestError(
+            f"{path} has the same pixels as {against}, and so no noise; give pictures that were "
+            "taken one by one"
+        )
     sharp = difference - ndimage.gaussian_filter(difference, DRIFT)
     slopes = np.gradient(ndimage.gaussian_filter(luma(clean), 1.0))
     design = np.stack([slope.ravel() for slope in slopes], axis=1)
@@ -244,9 +251,8 @@ def still_places(path: Path, frame: Floats, clean: Doubles, against: str, flat: 
             f"{path} lies {right:+.1f} px to the right and {down:+.1f} px below {against}; "
             "a scene that moves tells nothing of noise; use a tripod"
         )
-    energy = float((difference**2).mean())
     wide = block_means(difference, SCENE_BLOCK)
-    if energy and (share := float((wide**2).mean()) / energy) > SCENE_SHARE:
+    if (share := float((wide**2).mean()) / energy) > SCENE_SHARE:
         raise RequestError(
             f"{path} does not show the same scene as {against}: averaged over "
             f"{SCENE_BLOCK}x{SCENE_BLOCK} pixels, {share:.0%} of the difference remains, of noise "
