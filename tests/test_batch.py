@@ -39,7 +39,7 @@ from clpipe.outputs import folder as output_folders
 from clpipe.outputs import sidecar
 from clpipe.outputs.folder import LOCK, output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
-from tests.conftest import ROOT, reseal, written
+from tests.conftest import ROOT, contents, reseal, statuses, written
 
 # A chain that other tests compile too.
 RUN = ("-o", "out", "--iso", 3200)
@@ -66,18 +66,6 @@ def worker_of(folder):
     chain = loader.first_chain(jobs)
     writer = OutputWriter(folder / "out", loader.request.with_outputs(chain))
     return ImageWorker(loader, writer, chain), jobs
-
-
-def contents(folder):
-    """Each file's bytes, by name."""
-    return {name: (Path(folder) / name).read_bytes() for name in written(Path(folder))}
-
-
-def statuses(folder):
-    """What the last run in a folder made of each image, by its log."""
-    lines = read_log(Path(folder) / "run.jsonl")
-    last = max(i for i, line in enumerate(lines) if line["event"] == "start")
-    return {x["name"]: x["status"] for x in lines[last:] if x["event"] == "image"}
 
 
 def stamps(folder):
@@ -240,6 +228,7 @@ def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, m
     assert max(seen) <= batch.in_flight + 1
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_number_of_images(renders, tmp_path):
     renders(1)
     code = (
@@ -550,6 +539,7 @@ def wait_for(folder, count):
     raise AssertionError(f"{folder} never held {count} pictures")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopped_once_what_is_begun_is_finished(clpipe, renders, tmp_path, number):
     renders(60)
@@ -578,6 +568,7 @@ def test_stopped_twice_it_ends_now(renders, tmp_path):
     assert not [p for p in (tmp_path / "out").iterdir() if ".part." in p.name]
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_again_and_again(clpipe, renders, tmp_path):
     renders(24)
     clpipe("run", "in", "-o", "whole", *RUN[2:])

@@ -25,6 +25,8 @@ from clpipe.commands.main import main
 from tests.conftest import ROOT
 from tools.blender import extension as builder
 
+pytestmark = pytest.mark.tools
+
 
 def load(name, path):
     loader = SourceFileLoader(name, str(path))

@@ -113,6 +113,7 @@ def _plain(record):
     return {"value": record["value"], "error": record["error"]}
 
 
+@pytest.mark.slow
 def test_standard_errors_are_the_scatter_of_repetitions():
     light = scene(64, 96)
     found = [calibrate(100, frames(light, 4, row=0.8, seed=s), None, SENSOR) for s in range(60)]
@@ -131,6 +132,7 @@ def test_standard_errors_are_the_scatter_of_repetitions():
     assert abs(floors.mean() - 6.25) < 3 * floors.std() / len(floors) ** 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("poisson", [False, True])
 def test_two_noisy_frames_give_no_flat_line(poisson):
     # The mean of two frames is as noisy as can be; a plain least-squares line through it would be

@@ -117,6 +117,7 @@ class DieOf(WorkerPlugin):
         work.ImageWorker.decode = planted
 
 
+@pytest.mark.slow
 def test_one_machine_three_shards_and_a_cluster_that_loses_a_worker(
     clpipe, renders, workers, address
 ):
@@ -145,6 +146,7 @@ def test_one_machine_three_shards_and_a_cluster_that_loses_a_worker(
     assert contents("dask") == whole
 
 
+@pytest.mark.slow
 def test_an_image_that_kills_workers_fails_alone(clpipe, renders, workers, address):
     Path("in/damaged.exr").write_bytes(b"no EXR")
     Path("in/f05.exr").rename("in/deadly.exr")
@@ -346,6 +348,7 @@ def test_an_environment_names_driver_and_libraries(device):
         assert f"{library} " in environment.libraries
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_cannot_be_reached(clpipe, renders, monkeypatch):
     monkeypatch.setattr(cluster, "TIMEOUT", 0.4)
     with socket.create_server(("127.0.0.1", 0)) as silent:

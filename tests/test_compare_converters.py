@@ -10,6 +10,8 @@ from clpipe.analysis.fidelity import colour_errors
 from tools.compare import converters as tool
 from tools.pages import side_by_side
 
+pytestmark = pytest.mark.tools
+
 COPY = tool.Converter("copy", "none", "cp DNG PICTURE")
 PRINT = tool.Converter("print", "none", "cat DNG")
 FAIL = tool.Converter("fail", "none", "cat HOME/missing")

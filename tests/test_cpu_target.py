@@ -204,6 +204,7 @@ def raw_for(target, device="pocl"):
     return done.stdout.split()
 
 
+@pytest.mark.slow
 def test_a_narrow_target_makes_the_same_raw_of_a_half_render(pip_pocl):
     # PoCL's library is still the one for this CPU: vload_half8 of it is called in other registers.
     (expected,) = raw_for("", "numpy")

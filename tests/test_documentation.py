@@ -134,6 +134,7 @@ CHECKS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_EXAMPLES, ids=name_of)
 def test_the_examples_work(page, run_page):
     folder = run_page(page)
@@ -222,6 +223,7 @@ def test_the_architecture_counts_its_rooms():
     assert f"clpipe is {count} rooms" in (DOCS / "architecture.md").read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_the_site_builds(tmp_path):
     """As tools/docs does it: a link, an anchor or a name that leads nowhere is an error."""
     pytest.importorskip("mkdocs", reason="needs the extra docs: sh tools/docs")
@@ -232,6 +234,7 @@ def test_the_site_builds(tmp_path):
         assert (tmp_path / f"{page}.html").is_file()
 
 
+@pytest.mark.slow
 def test_the_notebook_runs(tmp_path, material):
     """Its code cells, one after the other in one process."""
     path = DOCS / "first_steps.ipynb"

@@ -10,6 +10,8 @@ from PIL import Image
 
 from tests.conftest import ROOT, STILL_LIFE
 
+pytestmark = pytest.mark.tools
+
 EXAMPLES = ROOT / "tools" / "examples"
 
 

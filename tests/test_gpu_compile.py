@@ -8,6 +8,8 @@ import pytest
 
 from tools.stress import gpu_compile as tool
 
+pytestmark = pytest.mark.tools
+
 FUSED = {  # the same line with a fused multiply-add of floats, and one of integers
     tool.NVIDIA_FUSED: ("FFMA R1, R2, R3, R4 ;", "IMAD R1, R2, R3, R4 ;"),
     tool.AMD_FUSED: ("v_fmac_f32_e32 v1, v2, v3", "v_mad_u64_u32 v[5:6], null, s3, s4, v[5:6]"),

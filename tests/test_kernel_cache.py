@@ -145,6 +145,7 @@ def test_without_room_to_compile_pocl_is_not_asked(tmp_path, monkeypatch):
         builder.build(TEXT, [])
 
 
+@pytest.mark.slow
 def test_a_second_process_compiles_nothing(device, tmp_path):
     """Nor does one after damage compile more than was damaged."""
     if "Portable Computing" not in device.info.platform:
@@ -184,6 +185,7 @@ def test_another_users_folder_is_not_used(tmp_path, monkeypatch, caplog):
     assert "belongs to another user" in caplog.text
 
 
+@pytest.mark.slow
 def test_kernels_are_not_kept_there_and_that_is_said_once(device, tmp_path):
     shared = tmp_path / "shared"
     shared.mkdir()

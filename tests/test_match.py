@@ -136,6 +136,7 @@ def found(burst, tmp_path_factory):
     return json.loads(result.stdout), folder
 
 
+@pytest.mark.slow
 def test_a_known_development_comes_back(found):
     report, _ = found
     for name, column in report["columns"].items():

@@ -18,6 +18,8 @@ from tests.conftest import ROOT, STILL_LIFE
 from tests.dng import write_dng
 from tools.pages import figures
 
+pytestmark = pytest.mark.tools
+
 PAGE = ROOT / "docs" / "paper.md"
 
 

@@ -8,6 +8,8 @@ from clpipe.images.read import read_image
 from tests.conftest import STILL_LIFE
 from tools.pages import quality
 
+pytestmark = pytest.mark.tools
+
 
 @pytest.mark.parametrize("name", [n for n, (_, figure) in quality.DEMOSAIC.items() if figure])
 def test_demosaicing_is_as_good_as_published(shared_data, name):

@@ -11,6 +11,8 @@ from tools.reconstruction import multiview, report, stereo
 from tools.reconstruction import pictures as picture_kinds
 from tools.reconstruction import views as scene_views
 
+pytestmark = pytest.mark.tools
+
 
 @pytest.fixture(scope="module")
 def views():

@@ -319,6 +319,7 @@ def test_other_formats(tmp_path, ending):
     assert found.dtype == np.float32
 
 
+@pytest.mark.slow
 def test_mutated_files_make_no_traceback_hang_or_crash():
     """A few of every kind; ``tools/stress/fuzz.py --cases 20000`` tries more."""
     command = [sys.executable, "-m", "tools.stress.fuzz", "--cases", "400"]

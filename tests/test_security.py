@@ -145,6 +145,7 @@ def test_6_a_batch_goes_on_and_the_terminal_is_safe(clpipe, render):
     assert Path("out/good.jpg").exists()
 
 
+@pytest.mark.slow
 def test_faults_of_all_kinds_in_small():
     """A few of the faults of tools/stress/faults.py; the whole of it takes an hour."""
     command = [sys.executable, "-m", "tools.stress.faults", "--images", "8", "--repeats", "2"]

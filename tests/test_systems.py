@@ -94,6 +94,7 @@ def test_every_module_loads(tmp_path):
     assert int(done.stdout) == len(modules) - 1  # the package itself
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("taken", "device", "shards"),
     [(TAKE_AWAY, ("--device", "numpy"), ("1/2", "2/2")), (FOR_POCL, (), ("1/1",))],

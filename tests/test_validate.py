@@ -12,6 +12,8 @@ from clpipe.camera.profile import load_camera
 from clpipe.images.read import read_image
 from tools.pages import real_cameras, side_by_side, validate
 
+pytestmark = pytest.mark.tools
+
 # Two of the 68 loops that the tool closes.
 LOOPS = [
     ("sony-a7r2", 12800, "GRBG", "gaussian"),

@@ -15,7 +15,7 @@ from clpipe.base.types import Array
 from clpipe.batch.job_state import JobState
 from clpipe.batch.outcome import LEFT_OUT, SKIPPED, Span
 from clpipe.batch.runners import Runners, SpareArrays
-from clpipe.chain.baseline import STEP, with_noise
+from clpipe.chain.baseline import with_noise
 from clpipe.chain.chain import Chain
 from clpipe.chain.depth import depth_steps
 from clpipe.chain.formats import DNG
@@ -210,7 +210,7 @@ class ImageWorker:
                 for spread in {each.spread for each in state.recipes if each.spread}:
                     spread.take(recipe.rendition, result.final)
             if result and recipe.estimates:
-                result.estimates[STEP] = dict(recipe.estimates)
+                result.estimates[recipe.chain.steps[-1].name] = dict(recipe.estimates)
             name = threading.current_thread().name
             state.spans += [Span(t.name, name, t.start, t.seconds) for t in timings or []]
             if result and recipe is state.recipes[-1] and DNG not in self.writer.formats:

@@ -8,7 +8,7 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import by_site
-from clpipe.stage import Argument, Context, Kind, Pass, ReferenceContext, Stage
+from clpipe.stage import Argument, Context, Kind, Pass, ReferenceContext, Stage, StageRole
 from clpipe.stages.white_balance.gains import CameraGains
 
 
@@ -55,4 +55,5 @@ STAGE = Stage(
     Kind.MOSAIC,
     Kind.MOSAIC,
     (Gains,),
+    role=StageRole.BALANCE_OF_LIGHT,
 )

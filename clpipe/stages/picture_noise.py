@@ -27,6 +27,7 @@ from clpipe.stage import (
     Pass,
     ReferenceContext,
     Stage,
+    StageRole,
     Unchanged,
     parameter,
 )
@@ -377,4 +378,5 @@ STAGE = Stage(
     Kind.DISPLAY,
     Kind.DISPLAY,
     (NoNoise, IidGaussian, IntensityDependent),
+    role=StageRole.BASELINE,
 )

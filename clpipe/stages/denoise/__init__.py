@@ -1,6 +1,6 @@
 """Denoising of luma and, more strongly, of chroma; the strength follows the predicted noise."""
 
-from clpipe.stage import Context, Kind, Stage
+from clpipe.stage import Context, Kind, Stage, StageRole
 from clpipe.stages.denoise import strength
 from clpipe.stages.denoise.bilateral import Bilateral
 from clpipe.stages.denoise.biweight import Biweight
@@ -24,4 +24,5 @@ STAGE = Stage(
     Kind.RGB,
     METHODS,
     explain,
+    role=StageRole.DENOISING,
 )
