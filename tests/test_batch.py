@@ -39,7 +39,7 @@ from clpipe.outputs import folder as output_folders
 from clpipe.outputs import sidecar
 from clpipe.outputs.folder import LOCK, output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
-from tests.conftest import ROOT, reseal, written
+from tests.conftest import ROOT, contents, reseal, statuses, written
 
 # A chain that other tests compile too.
 RUN = ("-o", "out", "--iso", 3200)
@@ -66,18 +66,6 @@ def worker_of(folder):
     chain = loader.first_chain(jobs)
     writer = OutputWriter(folder / "out", loader.request.with_outputs(chain))
     return ImageWorker(loader, writer, chain), jobs
-
-
-def contents(folder):
-    """Each file's bytes, by name."""
-    return {name: (Path(folder) / name).read_bytes() for name in written(Path(folder))}
-
-
-def statuses(folder):
-    """What the last run in a folder made of each image, by its log."""
-    lines = read_log(Path(folder) / "run.jsonl")
-    last = max(i for i, line in enumerate(lines) if line["event"] == "start")
-    return {x["name"]: x["status"] for x in lines[last:] if x["event"] == "image"}
 
 
 def stamps(folder):

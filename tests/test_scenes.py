@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from clpipe.scenes.card import split_of
-from tests.conftest import ROOT, written
+from tests.conftest import ROOT, contents, written
 
 NUMPY = ("--device", "numpy", "-c", "paper")
 
@@ -33,10 +33,6 @@ def scene(tmp_path):
     path = tmp_path / "room.blend"
     path.write_text("a room")
     return path
-
-
-def contents(folder):
-    return {name: (folder / name).read_bytes() for name in written(folder)}
 
 
 def test_a_scene_becomes_a_dataset(clpipe, scene, blender, tmp_path):

@@ -101,7 +101,7 @@ class RenditionPlan:
         return [role for role in (NOISY, *TRUTHS, *BASELINES) if role in asked]
 
     def needed(self, renditions: Iterable[Rendition]) -> set[Rendition]:
-        """These renditions, with those that a baseline among them is measured on."""
+        """Renditions, with those that a baseline among them is measured on."""
         needed = set(renditions)
         for each in tuple(needed):
             if each.role in BASELINES:
