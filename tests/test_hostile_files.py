@@ -29,7 +29,7 @@ from clpipe.chain.toml import toml_value
 from clpipe.images.dump import dump_of, read_dump
 from clpipe.images.raw import read_exif, read_facts
 from clpipe.images.read import ReadOptions, holds_mosaic, read_source
-from clpipe.inputs.kept import carried_settings
+from clpipe.inputs.kept import embedded_settings
 from clpipe.inputs.manifest import read_manifest
 from clpipe.stage import Kind
 from tests.conftest import ROOT
@@ -254,7 +254,7 @@ def test_json_that_is_nested_too_deeply_is_refused(tmp_path):
             {"picture_noise": {"method": "iid_gaussian", "measured": str(tmp_path / "a.json")}}
         )
     with pytest.raises(RequestError, match="nested too deeply"):
-        carried_settings({"settings": deep})
+        embedded_settings({"settings": deep})
     (tmp_path / "a.jsonl").write_text(deep)
     with pytest.raises(RequestError, match="row 1: not valid JSON"):
         read_manifest(tmp_path / "a.jsonl")

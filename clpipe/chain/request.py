@@ -13,7 +13,7 @@ from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
 from clpipe.base.validation import first_fault
-from clpipe.chain.carry import Carry, parse_carry
+from clpipe.chain.carry import AovSpec, parse_carry
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.files import load_config
 from clpipe.chain.formats import EVERY_FORMAT, NPY
@@ -183,7 +183,7 @@ class Request:
         if configuration:
             vars(request)["_configured"] = configuration.settings  # is validated already
         request.settings()
-        request.carried()  # refuses what is wrong
+        request.aov_specs()  # refuses what is wrong
         return request
 
     @classmethod
@@ -203,7 +203,7 @@ class Request:
             raise RequestError(f"found formats {', '.join(values['formats'])}")
         lists = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
         request = cls(**{**values, **lists})
-        request.carried()  # refuses what is wrong
+        request.aov_specs()  # refuses what is wrong
         return request
 
     def for_image(self, name: str, values: Mapping[str, Any]) -> Self:
@@ -230,7 +230,7 @@ class Request:
         known |= {"formats": formats, "keep": keep, "truth_keep": truth_keep}
         return self._shared(ResolvedRequest(**known))
 
-    def carried(self) -> tuple[Carry, ...]:
+    def aov_specs(self) -> tuple[AovSpec, ...]:
         """The layers that go along with each picture.
 
         Raises:
@@ -238,11 +238,11 @@ class Request:
         """
         return parse_carry(self.carry)
 
-    def settings(self, carried: Settings | None = None) -> Settings:
+    def settings(self, embedded: Settings | None = None) -> Settings:
         """The settings that are asked for, drawn for the image where there is one.
 
         Args:
-            carried: the settings that an image carries, which hold where nothing else is set.
+            embedded: the settings that an image carries, which hold where nothing else is set.
 
         Raises:
             RequestError: a name or value that is not allowed.
@@ -250,21 +250,21 @@ class Request:
         for file in self.stage_files:
             load_stage_file(Path(file))
         settings = self._general
-        if carried is not None:
+        if embedded is not None:
             for values in (self.config, self.options):
-                carried = overlay(carried, values) if values else carried
-            settings = carried
+                embedded = overlay(embedded, values) if values else embedded
+            settings = embedded
         if self.image:
             settings = overlay(settings, self.image)
         return settings.drawn(self.image_name) if self.image_name else settings
 
-    def chain(self, carried: Settings | None = None) -> Chain:
-        """The chain that is asked for; ``carried`` as for :meth:`settings`.
+    def chain(self, embedded: Settings | None = None) -> Chain:
+        """The chain that is asked for; ``embedded`` as for :meth:`settings`.
 
         Raises:
             RequestError: it cannot be made.
         """
-        return self.chain_from(self.settings(carried), self.start_at)
+        return self.chain_from(self.settings(embedded), self.start_at)
 
     def chain_from(self, settings: Settings, start_at: str | None) -> Chain:
         """The chain of settings, from a step on.
