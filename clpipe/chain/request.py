@@ -3,12 +3,12 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
@@ -63,7 +63,7 @@ class Recorded(BaseModel):
 
 RECORDED = tuple(Recorded.model_fields)
 
-R = TypeVar("R", bound="Request")
+MADE = 8  # settings that a request, and those that it is replaced by, keep
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,8 @@ class Request:
         patch: the sides of patches in px, which are written in place of pictures; None is pictures.
         patches_per_image: how many of each picture, at random places, or "grid"; 0 without patches.
         augment: whether patches are flipped and turned.
+        made: the settings that were made of ``config`` and ``options``; requests that are replaced
+            by others share them.
     """
 
     config: Mapping[str, Any] | None = None
@@ -115,6 +117,9 @@ class Request:
     patch: int | None = None
     patches_per_image: int | Literal["grid"] = 0
     augment: bool = False
+    made: BoundedCache[Settings] = field(
+        default_factory=lambda: BoundedCache(MADE), compare=False, repr=False
+    )
 
     @classmethod
     def from_options(
@@ -181,7 +186,8 @@ class Request:
             **fields_,
         )
         if configuration:
-            vars(request)["_configured"] = configuration.settings  # is validated already
+            # They are validated already.
+            request.made.get(Identity(request.config), lambda: configuration.settings)
         request.settings()
         request.aov_specs()  # refuses what is wrong
         return request
@@ -208,7 +214,7 @@ class Request:
 
     def for_image(self, name: str, values: Mapping[str, Any]) -> Self:
         """The request for one image: its name, and values that hold for it alone."""
-        return self._shared(replace(self, image_name=name, image=values))
+        return replace(self, image_name=name, image=values)
 
     def with_outputs(self, chain: Chain) -> "ResolvedRequest":
         """The request with every output named, as a chain has them.
@@ -228,7 +234,7 @@ class Request:
         truth_keep = tuple(step for step in keep if step != own)
         known = {each.name: getattr(self, each.name) for each in fields(Request)}
         known |= {"formats": formats, "keep": keep, "truth_keep": truth_keep}
-        return self._shared(ResolvedRequest(**known))
+        return ResolvedRequest(**known)
 
     def aov_specs(self) -> tuple[AovSpec, ...]:
         """The layers that go along with each picture.
@@ -249,7 +255,7 @@ class Request:
         """
         for file in self.stage_files:
             load_stage_file(Path(file))
-        settings = self._general
+        settings = self._general()
         if embedded is not None:
             for values in (self.config, self.options):
                 embedded = overlay(embedded, values) if values else embedded
@@ -295,25 +301,17 @@ class Request:
         record: dict[str, Any] = json.loads(json.dumps(values))  # as it is read back
         return record
 
-    @cached_property
-    def _configured(self) -> Settings:
-        """The configuration over the defaults."""
-        return overlay(DEFAULTS, self.config) if self.config else DEFAULTS
-
-    @cached_property
     def _general(self) -> Settings:
         """The options over the configuration: the settings of all images, nothing drawn."""
-        return overlay(self._configured, self.options) if self.options else self._configured
-
-    def _shared(self, other: R) -> R:
-        """Another request for the same settings, which shares what was made of them."""
-        shared = ("_configured", "_general")
-        vars(other).update({name: vars(self)[name] for name in shared if name in vars(self)})
-        return other
-
-    def __getstate__(self) -> dict[str, Any]:
-        # Settings may hold models of stage files, whose classes cannot be sent.
-        return {each.name: getattr(self, each.name) for each in fields(self)}
+        config, options = Identity(self.config), Identity(self.options)
+        configured = (
+            self.made.get(config, lambda: overlay(DEFAULTS, self.config or {}))
+            if self.config
+            else DEFAULTS
+        )
+        if not self.options:
+            return configured
+        return self.made.get((config, options), lambda: overlay(configured, self.options))
 
 
 @dataclass(frozen=True)
