@@ -126,7 +126,7 @@ class Bounded(Method):
 
     @property
     def doubt(self) -> np.float32:
-        """The difference that noise may make to green, in roots: three sigma, and what no eye sees."""
+        """The noise that green may have, in roots: three sigma, and what no eye would see."""
         assert self.noise is not None and self.offset is not None
         return np.float32(0.01 + 3 * noise_in_roots(self.noise, MID_GREY, self.offset))
 
