@@ -1,4 +1,4 @@
-"""What is bound to the parameters of a kernel at a launch."""
+"""Bindings: the values and buffers that the parameters of a kernel stand for at a launch."""
 
 from dataclasses import dataclass
 
@@ -29,7 +29,7 @@ class ExtentNumber:
 
 @dataclass(frozen=True)
 class TileNumber:
-    """How many tiles come before this one."""
+    """The number of tiles before this one."""
 
 
 @dataclass(frozen=True)

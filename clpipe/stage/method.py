@@ -80,7 +80,7 @@ class Method(BaseModel):
 
     @property
     def margins(self) -> Margins:
-        """How far the image that it reads goes on beyond the picture."""
+        """The margins of the image that it reads, beyond the picture."""
         return self._margins
 
     def with_margins(self, margins: Margins) -> Self:
@@ -112,7 +112,7 @@ class Method(BaseModel):
         raise NotImplementedError(type(self).__name__)
 
     def geometry(self) -> Geometry | None:
-        """How this (resolved) method moves pixels; None if each stays where it is."""
+        """The way this (resolved) method moves pixels; None if each stays where it is."""
         return None
 
     def estimates_for(self, width: int, height: int) -> Mapping[str, float]:

@@ -26,7 +26,7 @@ class Gains(CameraGains):
 
     @property
     def factors(self) -> tuple[np.float32, np.float32]:
-        """What red and blue are multiplied by."""
+        """The factors of red and blue."""
         red, blue = self.gains
         return np.float32(1 / red), np.float32(1 / blue)
 

@@ -12,7 +12,7 @@ METHODS = (Biweight, Bilateral, NonLocalMeans, Median, Mean)
 
 
 def explain(context: Context) -> str:
-    """How the strength follows from the noise, and its effect in each method, in a few lines."""
+    """Lines about how the strength follows from the noise, and its effect in each method."""
     effects = [f"  {m.method}: {m().resolve(context).effect}" for m in METHODS]
     return "\n".join([strength.explain(context), *effects])
 
