@@ -31,7 +31,7 @@ COEFFICIENT = re.compile(r"[kp][1-6]")
 
 @dataclass(frozen=True)
 class View:
-    """What a file says of one render's camera.
+    """A render's camera, as a file says it.
 
     Args:
         name: of the image, as the file has it.
