@@ -157,7 +157,7 @@ class Settings:
         return files
 
     def models(self, step: str) -> list[type[BaseModel]]:
-        """The classes that declare a step's parameters: of its method, or all that it is drawn from.
+        """The classes that declare a step's parameters: its method, or all that are drawn from.
 
         Raises:
             KeyedError: there is no such method.
