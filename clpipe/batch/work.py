@@ -166,7 +166,7 @@ class ImageWorker:
             state.patches = every_patch(patches, loaded.chain, width, height, job.key)
         if any(map(self.writer.carries, renditions)):
             orientation = self.writer.picture_orientation(loaded.source, loaded.chain)
-            state.carried = state.loader.carried(job, loaded, orientation)
+            state.aovs = state.loader.aovs(job, loaded, orientation)
         state.source = loaded.source
         recipes = self.writer.plan_of(job).recipes(loaded.chain, loaded.key)
         state.recipes = [recipe for recipe in recipes if recipe.rendition in renditions]
@@ -262,10 +262,11 @@ class ImageWorker:
             try:
                 carried = None
                 if writer.carries(recipe.rendition):
-                    carried, state.carried = state.carried, None
+                    carried, state.aovs = state.aovs, None
                 files = writer.write(job, recipe, state.source, result, carried, state.patches)
                 clipped = None if recipe.noise else clipped_share(result, recipe.chain)
-                state.clipped = max(state.clipped, clipped or 0.0)
+                if recipe.chain.source is not Kind.DISPLAY:  # a photograph was clipped before
+                    state.clipped = max(state.clipped, clipped or 0.0)
                 path = writer.path(job, SIDECAR, recipe.rendition)
                 record = sidecar(
                     job,

@@ -116,13 +116,13 @@ class RawLoader:
 
     def _chain(self, path: Path, facts: RawFacts | Dump) -> tuple[Chain, list[str]]:
         """The chain for a raw, and warnings about what its file does not say, or says wrongly."""
-        carried, warnings = settings_of(facts)
-        parameters = dict(carried.parameters)
+        embedded, warnings = settings_of(facts)
+        parameters = dict(embedded.parameters)
         own = self.request.settings().drawn("")  # an example, where there is no image yet
         balance = name_of(StageRole.BALANCE)
         if balance in warnings and own.parameters.get(balance):
             del parameters[balance]  # the user's own replaces what stands in for the file's
-        settings = self.request.settings(replace(carried, parameters=parameters)).drawn("")
+        settings = self.request.settings(replace(embedded, parameters=parameters)).drawn("")
         camera = load_camera(settings.camera)
         low, high = camera.iso_range
         iso = min(max(settings.iso, low), high)
@@ -135,7 +135,7 @@ class RawLoader:
             settings = replace(settings, iso=iso)
         chain = self._chain_from(settings)
         self._check(path, facts, chain)
-        return chain, _remaining(warnings, chain, carried)
+        return chain, _remaining(warnings, chain, embedded)
 
     def _check(self, path: Path, facts: RawFacts | Dump, chain: Chain) -> None:
         """See that a chain can take a raw.
@@ -166,22 +166,22 @@ class RawLoader:
             )
 
 
-def _remaining(warnings: dict[str, str], chain: Chain, carried: Settings) -> list[str]:
+def _remaining(warnings: dict[str, str], chain: Chain, embedded: Settings) -> list[str]:
     """The warnings that still hold: not about what the user set, or what no step of the chain uses.
 
     Args:
         warnings: by what they are about.
         chain: the chain for the raw.
-        carried: the settings that the raw carries.
+        embedded: the settings that the raw carries.
     """
     settings, stages = chain.settings, {step.stage.name for step in chain.steps}
     is_denoised = chain.step_in(StageRole.DENOISING) is not None
     is_current = {
-        "no_iso": is_denoised and settings.iso == carried.iso,
-        "camera": is_denoised and settings.camera == carried.camera,
+        "no_iso": is_denoised and settings.iso == embedded.iso,
+        "camera": is_denoised and settings.camera == embedded.camera,
     }
     for name in map(name_of, (StageRole.BALANCE, StageRole.COLOURS)):
-        same = settings.parameters.get(name) == carried.parameters.get(name)
+        same = settings.parameters.get(name) == embedded.parameters.get(name)
         is_current[name] = same and name in stages
     return [text for about, text in warnings.items() if is_current.get(about, True)]
 
