@@ -138,7 +138,7 @@ class Pipeline(ReadOnly):
         with self._lock:
             result = runner.run(pixels, noise_key(chain.settings, own_key))
         share = clipped_share(result, chain) or 0.0
-        if share >= MUCH:
+        if share >= MUCH and chain.source is not Kind.DISPLAY:  # a photograph was clipped before
             warnings.warn(f"{key}: {clipping_text(share)}", stacklevel=2)
         return result
 

@@ -265,7 +265,8 @@ class ImageWorker:
                     carried, state.aovs = state.aovs, None
                 files = writer.write(job, recipe, state.source, result, carried, state.patches)
                 clipped = None if recipe.noise else clipped_share(result, recipe.chain)
-                state.clipped = max(state.clipped, clipped or 0.0)
+                if recipe.chain.source is not Kind.DISPLAY:  # a photograph was clipped before
+                    state.clipped = max(state.clipped, clipped or 0.0)
                 path = writer.path(job, SIDECAR, recipe.rendition)
                 record = sidecar(
                     job,
