@@ -306,13 +306,12 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     context = Context(camera=camera, iso=settings.iso, optics=optics)
     steps: list[Step] = []
     before, takes_lens = "the input", not settings.lens
-    for name, method in methods.items():
+    for name, own in methods.items():
         stage = all_stages()[base_name(name)].reading(kind)
-        with validation_errors(name, type(method)), user_code_errors(f"stage {name}", stage.folder):
+        with validation_errors(name, type(own)), user_code_errors(f"stage {name}", stage.folder):
             fits = stage.reads is (kind or stage.reads)
-            if fits or isinstance(method, FromLens):
-                own, method = method, method.resolve(context)
-                takes_lens |= isinstance(own, FromLens) and not isinstance(method, Unchanged)
+            method = own.resolve(context) if fits or isinstance(own, FromLens) else own
+            takes_lens |= isinstance(own, FromLens) and not isinstance(method, Unchanged)
             if not fits:
                 if isinstance(method, Unchanged) and stage.reads is stage.writes:
                     continue  # so that gamma can be skipped without what does nothing behind it
