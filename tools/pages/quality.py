@@ -24,10 +24,11 @@ from rich.table import Table
 
 import clpipe
 from clpipe.analysis.charts import slanted_edge
-from clpipe.analysis.fidelity import sharpness
+from clpipe.analysis.fidelity import psnr, sharpness
 from clpipe.base.types import Array
 from clpipe.chain.registry import all_stages
 from clpipe.images.read import read_image
+from clpipe.reference.curve import to_8_bit
 from clpipe.stages import DEFAULT_CHAIN
 from tools import RENDER, ROOT
 
@@ -91,13 +92,7 @@ NOISE = ("sensor_noise", "row_noise", "column_noise", "quantize", "normalize")
 def cpsnr(one: Array, two: Array) -> float:
     """Colour peak signal-to-noise ratio of two (height, width, 3) eight-bit images, in dB."""
     inside = slice(BORDER, -BORDER)
-    error = one[inside, inside].astype(np.float64) - two[inside, inside]
-    return float(10 * np.log10(255**2 / (error**2).mean()))
-
-
-def to_8_bit(image: Array) -> Array:
-    """0..1 to 0..255, rounded."""
-    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    return psnr(one[inside, inside], two[inside, inside])
 
 
 def kodak(folder: Path) -> list[Array]:
