@@ -5,7 +5,7 @@ import threading
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from xxhash import xxh3_64_hexdigest
@@ -30,6 +30,9 @@ from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
 from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.stage import Kind
+
+if TYPE_CHECKING:
+    from clpipe.chain.keywords import Keywords
 
 
 class Pipeline(ReadOnly):
@@ -59,7 +62,7 @@ class Pipeline(ReadOnly):
         keep: str | Sequence[str] = (),
         start_at: str | None = None,
         until: str | None = None,
-        **settings: Any,
+        **settings: "Unpack[Keywords]",
     ) -> None:
         self._settings = overlay(load_settings(str(config)), plain(settings))
         self._ends = start_at, until
@@ -91,7 +94,7 @@ class Pipeline(ReadOnly):
         key: str,
         depth: Array | None = None,
         overscan: tuple[int, int, int, int] = NO_MARGINS,
-        **settings: Any,
+        **settings: "Unpack[Keywords]",
     ) -> Result:
         """Run the chain on one image.
 
@@ -135,7 +138,7 @@ class Pipeline(ReadOnly):
         with self._lock:
             result = runner.run(pixels, noise_key(chain.settings, own_key))
         share = clipped_share(result, chain) or 0.0
-        if share >= MUCH:
+        if share >= MUCH and chain.source is not Kind.DISPLAY:  # a photograph was clipped before
             warnings.warn(f"{key}: {clipping_text(share)}", stacklevel=2)
         return result
 
@@ -145,7 +148,7 @@ class Pipeline(ReadOnly):
         kind: LayerKind,
         key: str = "",
         overscan: tuple[int, int, int, int] = NO_MARGINS,
-        **settings: Any,
+        **settings: "Unpack[Keywords]",
     ) -> tuple[Array, Array]:
         """Move a layer that goes along with an image as :meth:`process` moves its pixels.
 

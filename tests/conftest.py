@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 from click.testing import Result as ClickResult
 
+from clpipe.batch.run_log import read_log
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.commands.main import main
@@ -34,6 +35,39 @@ def written(folder: Path) -> list[str]:
     """The files in a folder at any depth, sorted, but for the run's log."""
     files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
     return sorted(files - {"run.jsonl"})
+
+
+def contents(folder: str | Path) -> dict[str, bytes]:
+    """Each file's bytes, by its name, but for the run's log."""
+    return {name: (Path(folder) / name).read_bytes() for name in written(Path(folder))}
+
+
+def statuses(folder: str | Path) -> dict[str, str]:
+    """What the last run in a folder made of each image, by its log."""
+    lines = read_log(Path(folder) / "run.jsonl")
+    last = max(i for i, line in enumerate(lines) if line["event"] == "start")
+    return {line["name"]: line["status"] for line in lines[last:] if line["event"] == "image"}
+
+
+def same_samples(one: Mapping[str, Any], two: Mapping[str, Any]) -> None:
+    """See that two samples of a dataset are equal."""
+    assert one.keys() == two.keys()
+    assert all(np.array_equal(one[name], two[name]) for name in one)
+
+
+def run_cli(*arguments: object, status: int | tuple[int, ...] = 0) -> ClickResult:
+    """The command line: arguments in, the result out, its status checked."""
+    result = CliRunner().invoke(main, [str(a) for a in arguments])
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    allowed = status if isinstance(status, tuple) else (status,)
+    assert result.exit_code in allowed, result.output
+    return result
+
+
+def cli_output(*arguments: object, status: int = 0) -> str:
+    """What the command line prints."""
+    return run_cli(*arguments, status=status).output
 
 
 def noise_report(*sigmas: float, **changes: Any) -> dict[str, Any]:
@@ -155,18 +189,9 @@ def write_exr(tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture
 def clpipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., ClickResult]:
-    """The command line in an empty folder: arguments in, the result out, its status checked."""
+    """The command line in an empty folder, see :func:`run_cli`."""
     monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: object, status: int | tuple[int, ...] = 0) -> ClickResult:
-        result = CliRunner().invoke(main, [str(a) for a in arguments])
-        if result.exception and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        allowed = status if isinstance(status, tuple) else (status,)
-        assert result.exit_code in allowed, result.output
-        return result
-
-    return call
+    return run_cli
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from clpipe.analysis.calibration.repeats import CHANNELS, Sensor, neighbours
 from clpipe.analysis.calibration.result import Calibration
 from clpipe.base.errors import ImageError
 from clpipe.camera.profile import load_camera
-from clpipe.reference.cfa import PATTERNS
+from clpipe.reference.cfa import PATTERNS, sites
 
 SENSOR = Sensor("RGGB", 512, 16383)
 
@@ -293,9 +293,11 @@ def test_frames_that_cannot_tell_are_refused():
     with pytest.raises(ImageError, match=r"ISO 100: \d+% of the pixels are clipped"):
         calibrate(100, frames(scene() + 1.5), None, SENSOR)
     falling = frames(scene())
-    light = scene()[SENSOR.sites()["G2"]]
+    light = scene()[sites(SENSOR.pattern)["G2"]]
     quieter = np.random.default_rng(6).standard_normal((8, *light.shape)) * (200 - 250 * light)
-    falling[(slice(None), *SENSOR.sites()["G2"])] = np.rint(600 + light * SENSOR.unit + quieter)
+    falling[(slice(None), *sites(SENSOR.pattern)["G2"])] = np.rint(
+        600 + light * SENSOR.unit + quieter
+    )
     with pytest.raises(ImageError, match="ISO 100: channel G2: variance does not rise with light"):
         calibrate(100, falling, None, SENSOR)
     flat = frames(np.full((64, 64), 0.001), 4, gain=0.1)

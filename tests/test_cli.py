@@ -569,3 +569,15 @@ def test_many_images_have_a_line_every_so_often(small, clpipe, monkeypatch):
     monkeypatch.setattr("clpipe.commands.progress.EVERY", 60)
     said = clpipe("run", small, "-o", "again", "--device", "numpy", *more).stderr
     assert "of 3 images;" not in said
+
+
+@pytest.mark.parametrize("name", ["run", "dataset"])
+def test_help_is_short_and_there_is_all_of_it(clpipe, name):
+    short, whole = (clpipe(name, option).output for option in ("--help", "--help-all"))
+    assert len(short.splitlines()) <= 60
+    command = main.get_command(click.Context(main), name)
+    options = [o.opts[-1] for o in command.params if isinstance(o, click.Option)]
+    assert [o for o in options if not re.search(rf"^  (-\w, )?{o}\b", whole, re.M)] == []
+    shown = [o for o in options if re.search(rf"^  (-\w, )?{o}\b", short, re.M)]
+    assert {"--iso", "--camera", "--set", "--truth", "--output"} <= set(shown) < set(options)
+    assert "--help-all" in short

@@ -1,13 +1,16 @@
 """tools/compare/converters.py and side_by_side.py; no converter is needed here."""
 
+import doctest
+
 import numpy as np
 import pytest
 from PIL import Image
 
-from clpipe.analysis.charts import chart_image, chart_patches, saturated_image
 from clpipe.analysis.crops import HEIGHT, WIDTH
-from clpipe.analysis.fidelity import colour_errors
+from tools.compare import charts, fidelity
 from tools.compare import converters as tool
+from tools.compare.charts import chart_image, chart_patches, saturated_image
+from tools.compare.fidelity import colour_errors
 from tools.pages import side_by_side
 
 pytestmark = pytest.mark.tools
@@ -72,6 +75,11 @@ def test_a_sheet_holds_the_crops_at_400_percent():
     high, wide = (side * 4 for side in (HEIGHT, WIDTH))
     top, left = side_by_side.HEAD, side_by_side.SIDE
     assert np.array_equal(page[top : top + high : 4, left : left + wide : 4], crop)
+
+
+@pytest.mark.parametrize("module", [charts, fidelity])
+def test_the_examples_in_docstrings(module):
+    assert doctest.testmod(module).failed == 0
 
 
 def test_the_charts_fit_the_sensor():

@@ -26,7 +26,7 @@ def values(*words):
 
 
 def test_commands():
-    assert values("c") == ["cameras", "compare", "calibrate", "check"]
+    assert values("c") == ["compare", "cameras", "calibrate", "check"]
 
 
 @pytest.mark.parametrize("words", [("run", "--camera"), ("cameras",), ("stages", "--camera")])

@@ -15,6 +15,7 @@ from PIL import Image
 import clpipe as api
 from clpipe.base.errors import DeviceError, ImageError, RequestError
 from clpipe.dataset.samples import SampleLoader
+from tests.conftest import same_samples as same
 
 ISO = 3200  # a chain that other tests compile too
 
@@ -33,11 +34,6 @@ def renders(write_exr, tmp_path, monkeypatch):
 @pytest.fixture
 def dataset(renders):
     return api.Dataset(renders, iso=ISO)
-
-
-def same(one, two):
-    assert one.keys() == two.keys()
-    assert all(np.array_equal(one[name], two[name]) for name in one)
 
 
 def test_a_sample_is_what_a_run_makes(clpipe, renders):

@@ -7,15 +7,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from clpipe.analysis.charts import (
-    chart_image,
-    chart_patches,
-    patch_image,
-    patch_means,
-    patch_places,
-    saturated_patches,
-)
-from clpipe.analysis.fidelity import colour_errors, dots
 from clpipe.analysis.signature import signature
 from clpipe.camera.profile import DEFAULT_CAMERA, load_camera
 from clpipe.chain.chain import make_chain
@@ -32,6 +23,15 @@ from clpipe.stages.demosaic.edge_directed_median import EdgeDirectedMedian
 from clpipe.stages.denoise.bilateral import Bilateral
 from clpipe.stages.sharpen import Unsharp
 from clpipe.stages.tone_curve import CameraRaw
+from tools.compare.charts import (
+    chart_image,
+    chart_patches,
+    patch_image,
+    patch_means,
+    patch_places,
+    saturated_patches,
+)
+from tools.compare.fidelity import colour_errors, dots
 
 QUIET = ("sensor_noise", "row_noise")
 

@@ -8,7 +8,6 @@ import exifread
 import numpy as np
 import pytest
 import rawpy
-from click.testing import CliRunner
 from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
@@ -16,7 +15,6 @@ from clpipe.base.errors import ImageError
 from clpipe.camera.profile import SRGB_TO_XYZ, load_camera
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
-from clpipe.commands.main import main
 from clpipe.images.dng import write_dng
 from clpipe.images.raw import read_facts, read_raw
 from clpipe.images.read import read_image
@@ -25,6 +23,7 @@ from clpipe.images.write import write_display
 from clpipe.outputs.negative import negative_of
 from clpipe.reference.cfa import PATTERNS
 from tests.conftest import STILL_LIFE, written
+from tests.conftest import cli_output as clpipe
 from tests.dng import write_dng as write_raw
 
 LINEAR = ("--skip", "denoise", "--skip", "tone_curve", "--skip", "sharpen")
@@ -33,17 +32,6 @@ THROUGH_FILTERS = (
     *("--stages", "color_matrix,mosaic,inverse_white_balance,quantize,normalize,white_balance"),
     *("--set", "color_matrix.method=inverse_camera"),
 )
-
-
-@pytest.fixture
-def clpipe():
-    def run(*arguments, status=0):
-        result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
-        assert result.exit_code == status, result.output
-        assert "Traceback" not in result.output
-        return result.output
-
-    return run
 
 
 @pytest.fixture
@@ -82,7 +70,7 @@ def strip(path):
 
 @pytest.mark.parametrize("pattern", PATTERNS)
 @pytest.mark.parametrize("size", [(24, 30), (37, 51)])
-def test_libraw_reads_the_very_dn(clpipe, scene, tmp_path, pattern, size):
+def test_libraw_reads_the_very_dn(scene, tmp_path, pattern, size):
     options = ("--iso", 3200, "--set", f"mosaic.pattern={pattern}", "--keep", "quantize")
     options += ("--set", "exposure.headroom=0")  # so that some samples are white
     clpipe("run", scene(*size), "-o", tmp_path / "o", *options, "--format", "dng")
@@ -106,7 +94,7 @@ def test_libraw_reads_the_very_dn(clpipe, scene, tmp_path, pattern, size):
     assert thumb.data.shape == (size[0] // 2, size[1] // 2, 3)
 
 
-def test_what_it_says_of_itself(clpipe, tmp_path):
+def test_what_it_says_of_itself(tmp_path):
     shot = {"focal_length": 24, "sensor_width": 18, "exposure_time": 0.008}
     options = [o for k, v in shot.items() for o in ("--set", f"render.{k}={v}")]
     clpipe("run", STILL_LIFE, "-o", tmp_path, "--iso", 1600, "--format", "dng", *options)
@@ -185,7 +173,7 @@ def blocks(picture):
         ("-c", "canon-5d2-jpeg", "--iso", 100),
     ],
 )
-def test_a_converter_gives_the_colours_of_our_own_picture(clpipe, tmp_path, options):
+def test_a_converter_gives_the_colours_of_our_own_picture(tmp_path, options):
     formats = ("--format", "dng", "--format", "exr")
     clpipe("run", STILL_LIFE, "-o", tmp_path, *LINEAR, *formats, *options)
     ours = read_image(tmp_path / "still_life.exr").pixels
@@ -222,7 +210,7 @@ def test_the_colour_matrix_is_of_what_the_mosaic_holds():
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (2, 3), (3, 1100)])
-def test_any_size_is_written(clpipe, scene, tmp_path, size):
+def test_any_size_is_written(scene, tmp_path, size):
     clpipe(
         *("run", scene(*size), "-o", tmp_path / "o", "--keep", "quantize", "--format", "dng"),
         *("--device", "numpy"),
@@ -233,7 +221,7 @@ def test_any_size_is_written(clpipe, scene, tmp_path, size):
     assert 1 <= first[256] <= 512
 
 
-def test_the_same_file_whatever_else_is_written(clpipe, scene, tmp_path):
+def test_the_same_file_whatever_else_is_written(scene, tmp_path):
     render = scene(30, 40)
     others = ("jpg", "png16", "tif", "exr")
     every = [o for name in others for o in ("--format", name)]
@@ -252,14 +240,14 @@ def test_the_same_file_whatever_else_is_written(clpipe, scene, tmp_path):
     assert {"scene.dng", "scene.jpg", "scene.png"} <= {each["name"] for each in record["outputs"]}
 
 
-def test_only_what_it_takes_is_run(clpipe):
+def test_only_what_it_takes_is_run():
     launches = json.loads(clpipe("plan", "--format", "dng", "--json"))["launches"]
     assert launches[-1]["stages"].endswith("quantize")
     whole = json.loads(clpipe("plan", "--format", "dng", "--format", "jpg", "--json"))["launches"]
     assert len(whole) > len(launches)
 
 
-def test_a_burst_has_a_dng_of_each_frame_and_of_the_truth(clpipe, scene, tmp_path):
+def test_a_burst_has_a_dng_of_each_frame_and_of_the_truth(scene, tmp_path):
     clpipe("run", scene(24, 30), "-o", tmp_path / "o", "--frames", 2, "--format", "dng")
     names = {name: tmp_path / "o" / f"scene.{name}.dng" for name in ("truth", "frame0", "frame1")}
     assert set((tmp_path / "o").glob("*.dng")) == set(names.values())
@@ -270,7 +258,7 @@ def test_a_burst_has_a_dng_of_each_frame_and_of_the_truth(clpipe, scene, tmp_pat
     assert np.abs(np.mean(frames, axis=0) - truth).mean() < 100
 
 
-def test_a_kept_raw_as_a_dng_loses_nothing(clpipe, scene, tmp_path):
+def test_a_kept_raw_as_a_dng_loses_nothing(scene, tmp_path):
     options = ("--iso", 800, "--set", "mosaic.pattern=GRBG", "--keep", "quantize")
     clpipe("run", scene(24, 30), "-o", tmp_path / "a", *options, "--format", "dng")
     kept = tmp_path / "a" / "scene.quantize.exr"
@@ -280,7 +268,7 @@ def test_a_kept_raw_as_a_dng_loses_nothing(clpipe, scene, tmp_path):
     assert one.read_bytes() == two.read_bytes()
 
 
-def test_a_mosaic_from_elsewhere_as_a_dng(clpipe, write_exr, tmp_path):
+def test_a_mosaic_from_elsewhere_as_a_dng(write_exr, tmp_path):
     dn = np.random.default_rng(0).integers(0, 4096, (25, 31, 1)).astype(np.float32)
     mosaic = write_exr("m.exr", dn, "Y", half=False)
     matrix = "[[1.8, -0.6, -0.2], [-0.2, 1.5, -0.3], [0, -0.5, 1.5]]"
@@ -317,14 +305,14 @@ def test_a_mosaic_from_elsewhere_as_a_dng(clpipe, write_exr, tmp_path):
         (("--set", "quantize.white_level=1000.5"), r"white level of 1000\.5, but DNG wants whole"),
     ],
 )
-def test_a_chain_without_a_raw_is_refused(clpipe, scene, tmp_path, options, message):
+def test_a_chain_without_a_raw_is_refused(scene, tmp_path, options, message):
     out = tmp_path / "o"
     output = clpipe("run", scene(8, 8), "-o", out, "--format", "dng", *options, status=2)
     assert re.search(message, output), output
     assert not out.exists()
 
 
-def test_entering_after_the_raw_is_refused(clpipe, write_exr, tmp_path):
+def test_entering_after_the_raw_is_refused(write_exr, tmp_path):
     mosaic = write_exr("m.exr", np.full((8, 8, 1), 0.5, np.float32), "Y")
     options = ("--start-at", "white_balance", "--format", "dng")
     output = clpipe("run", mosaic, "-o", tmp_path / "o", *options, status=2)
@@ -341,7 +329,7 @@ def test_samples_that_are_no_dn_are_refused(tmp_path, value):
     assert not list(tmp_path.iterdir())
 
 
-def test_one_that_cannot_be_written_leaves_nothing(clpipe, scene, tmp_path):
+def test_one_that_cannot_be_written_leaves_nothing(scene, tmp_path):
     (tmp_path / "o" / "scene.dng" / "in the way").mkdir(parents=True)
     output = clpipe("run", scene(8, 8), "-o", tmp_path / "o", "--format", "dng", status=1)
     assert "scene.dng: clpipe did not write this file" in output
@@ -349,7 +337,7 @@ def test_one_that_cannot_be_written_leaves_nothing(clpipe, scene, tmp_path):
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
-def test_a_cameras_raw_as_a_dng_loses_nothing(clpipe, tmp_path, pattern):
+def test_a_cameras_raw_as_a_dng_loses_nothing(tmp_path, pattern):
     dn = np.random.default_rng(4).integers(400, 16384, (46, 62)).astype(np.uint16)
     write_raw(tmp_path / "shot.dng", dn, pattern, orientation=6)
     clpipe("run", tmp_path / "shot.dng", "-o", tmp_path / "out", "--format", "dng")
@@ -366,14 +354,14 @@ def test_a_cameras_raw_as_a_dng_loses_nothing(clpipe, tmp_path, pattern):
 
 
 @pytest.mark.parametrize("headroom", [1, 0, 1.5])
-def test_a_converter_is_told_of_the_headroom(tmp_path, scene, clpipe, headroom):
+def test_a_converter_is_told_of_the_headroom(tmp_path, scene, headroom):
     option = ("--set", f"exposure.headroom={headroom}")
     clpipe("run", scene(8, 8), "-o", tmp_path, "--format", "dng", "--device", "numpy", *option)
     first, _ = directories(tmp_path / "scene.dng")
     assert float(first[50730]) == headroom  # BaselineExposure
 
 
-def test_of_a_raw_alone_the_clipped_pixels_are_counted(tmp_path, write_exr, clpipe):
+def test_of_a_raw_alone_the_clipped_pixels_are_counted(tmp_path, write_exr):
     pixels = np.full((8, 8, 3), 0.1, np.float32)
     pixels[:2] = 100
     path = write_exr("bright.exr", pixels)

@@ -29,6 +29,7 @@ from clpipe.engine.device import open_device
 from clpipe.images.write import write_exr as write
 from clpipe.inputs.find import find_jobs
 from tests.conftest import ROOT
+from tests.conftest import cli_output as clpipe
 
 pytest.importorskip("starlette")
 
@@ -67,12 +68,6 @@ def explorer_of(*inputs, device=None, **options) -> Explorer:
 @pytest.fixture(scope="module")
 def explorer(renders):
     return explorer_of(renders)
-
-
-def clpipe(*arguments) -> str:
-    result = CliRunner().invoke(main, [str(each) for each in arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 @pytest.mark.parametrize("image", [0, 1])

@@ -26,10 +26,10 @@ from clpipe.chain.files import load_config
 from clpipe.chain.registry import load_stage_file
 from clpipe.chain.settings import settings_from
 from clpipe.chain.toml import toml_value
-from clpipe.images.dump import dump_of, read_dump
+from clpipe.images.dump import parse_dump, read_dump
 from clpipe.images.raw import read_exif, read_facts
 from clpipe.images.read import ReadOptions, holds_mosaic, read_source
-from clpipe.inputs.kept import carried_settings
+from clpipe.inputs.kept import embedded_settings
 from clpipe.inputs.manifest import read_manifest
 from clpipe.stage import Kind
 from tests.conftest import ROOT
@@ -43,14 +43,14 @@ from pathlib import Path
 resource.setrlimit(resource.RLIMIT_AS, (3 << 29, 3 << 29))
 from clpipe.base.errors import ImageError
 from clpipe.images.attributes import read_attributes
-from clpipe.images.dump import dump_of, read_dump
+from clpipe.images.dump import parse_dump, read_dump
 from clpipe.images.raw import read_facts, read_raw
 from clpipe.images.read import ReadOptions, read_source
 from clpipe.stage import Kind
 
 WAYS = [
     lambda path: read_raw(path, read_facts(path)),
-    lambda path: read_dump(path, dump_of("60000x60000", "uint8")),
+    lambda path: read_dump(path, parse_dump("60000x60000:uint8")),
     lambda path: read_source(path, Kind.RGB, ReadOptions()),
     lambda path: read_source(path, Kind.RGB, ReadOptions(transfer="srgb")),
     lambda path: read_source(path, Kind.DISPLAY, ReadOptions()),
@@ -254,7 +254,7 @@ def test_json_that_is_nested_too_deeply_is_refused(tmp_path):
             {"picture_noise": {"method": "iid_gaussian", "measured": str(tmp_path / "a.json")}}
         )
     with pytest.raises(RequestError, match="nested too deeply"):
-        carried_settings({"settings": deep})
+        embedded_settings({"settings": deep})
     (tmp_path / "a.jsonl").write_text(deep)
     with pytest.raises(RequestError, match="row 1: not valid JSON"):
         read_manifest(tmp_path / "a.jsonl")
@@ -286,7 +286,7 @@ READERS = {
     "mosaic.exr": lambda path: read_source(path, Kind.RAW, ReadOptions()),
     ".png": lambda path: read_source(path, Kind.DISPLAY, ReadOptions()),
     ".dng": read_facts,
-    ".raw": lambda path: read_dump(path, dump_of("96x80", "uint8")),
+    ".raw": lambda path: read_dump(path, parse_dump("96x80:uint8")),
 }
 
 

@@ -7,23 +7,15 @@ import re
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
 from clpipe.chain.files import load_settings
 from clpipe.chain.settings import overlay, settings_from
-from clpipe.commands.main import main
 from clpipe.images.read import read_image
 from tests.conftest import STILL_LIFE
+from tests.conftest import cli_output as clpipe
 
 FORMATS = ("jpg", "png", "png16", "tif", "tif16", "tif32", "exr", "exr16")
-
-
-def clpipe(*arguments, status=0):
-    result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
-    assert result.exit_code == status, result.output
-    assert "Traceback" not in result.output
-    return result.output
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from clpipe.dataset.numbering import Numbering
 from clpipe.images.tags import FLIPS, upright
 from clpipe.outputs.patches import Cutting, first_place
 from clpipe.reference.cfa import PATTERNS
+from tests.conftest import same_samples as same
 
 ISO = 3200  # a chain that other tests compile too
 
@@ -32,11 +33,6 @@ def renders(write_exr, tmp_path, monkeypatch):
 def arrays(sample):
     """The images of a sample."""
     return {name: v for name, v in sample.items() if np.ndim(v) > 1 and name != "xyz_to_camera"}
-
-
-def same(one, two):
-    assert one.keys() == two.keys()
-    assert all(np.array_equal(one[name], two[name]) for name in one)
 
 
 def check_against_whole(whole, patches):

@@ -213,7 +213,27 @@ def test_a_run_in_parts_makes_the_same_bytes(clpipe, renders):
     assert json.loads(Path("o/cameras.json").read_text())["views"][0]["t"] == [0, 0, 9.0]
 
 
-def test_photographs_are_in_it_and_truths_are_not(clpipe, write_exr):
+def test_each_kind_of_picture_is_a_model_of_its_own(clpipe, renders):
+    roles = {"": "", "truth": ".truth", "truth_clean": ".truth_clean", "iid": ".iid"}
+    run = ("run", renders, "--poses", "cameras.json", "--device", "numpy", "--format", "png")
+    clpipe(*run, "-o", "o", "--truth", "clean", "--truth", "iid", "--truth", "variance")
+    for model, suffix in roles.items():
+        folder = Path("o/models", model) if model else Path("o")
+        views = json.loads((folder / "cameras.json").read_text())["views"]
+        frames = json.loads((folder / "transforms.json").read_text())["frames"]
+        for names in ([v["file"] for v in views], [f["file_path"] for f in frames]):
+            found = [(folder / name).resolve(strict=True) for name in names]
+            assert found == [Path("o", f"{name}{suffix}.png").resolve() for name in "ab"]
+        lines = (folder / "sparse/0/images.txt").read_text().splitlines()[1::2]
+        assert [line.split()[9] for line in lines] == [f"{name}{suffix}.png" for name in "ab"]
+    for path in Path("o").glob("*.iid.*"):
+        path.unlink()
+    clpipe("poses", "o")  # a kind that is not there any more leaves no model
+    assert not Path("o/models/iid/cameras.json").exists()
+    assert Path("o/models/truth_clean/cameras.json").exists()
+
+
+def test_frames_and_exposures_are_in_it(clpipe, write_exr):
     write_exr("in/x/a b.exr", np.full((6, 8, 3), 0.2))
     write_exr("in/x/c.exr", np.full((6, 8, 3), 0.2))
     lens = sets("render", fx=9)
@@ -221,11 +241,14 @@ def test_photographs_are_in_it_and_truths_are_not(clpipe, write_exr):
     run = ("run", "in", "-o", "o", "--device", "numpy", "--frames", 2, "--bracket=-1,0", *lens)
     clpipe(*run, "--format", "dng", "--format", "png", "--truth", "clean")
     told = clpipe("poses", "o", "--json").stdout
-    assert json.loads(told)["files"] == ["cameras.json", "sparse/0/cameras.txt"]  # without poses
+    assert json.loads(told)["files"][:2] == [
+        "cameras.json",
+        "sparse/0/cameras.txt",
+    ]  # without poses
     clpipe(*run, *pose, "--format", "dng", "--format", "png")
     told = clpipe("poses", "o").stdout
     assert (
-        "a blank in the name, which images.txt cannot hold: 4 pictures" in told
+        "a blank in the name, which images.txt cannot hold: 6 pictures" in told
         and "x/a b.ev+0.frame0" in told
     )
     views = json.loads(Path("o/cameras.json").read_text())["views"]
@@ -316,7 +339,7 @@ def test_renders_that_are_named_as_the_files_of_cameras(clpipe, write_exr):
     before = {path: path.read_bytes() for path in Path("out").glob("*.json")}
     for _ in range(2):
         said = clpipe("poses", "out").output
-        assert "wrote out/sparse/0/cameras.txt: 3 pictures" in said
+        assert "wrote out/sparse/0: 3 pictures" in said
         assert "warning: out/cameras.json is the sidecar of a picture" in said
         assert {path: path.read_bytes() for path in Path("out").glob("*.json")} == before
     assert "there already" in clpipe(*run).stderr

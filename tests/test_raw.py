@@ -5,11 +5,9 @@ import json
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.commands.main import main
 from clpipe.images.dump import parse_dump
 from clpipe.images.raw import read_facts, read_raw
 from clpipe.images.read import read_image
@@ -17,16 +15,10 @@ from clpipe.images.tags import upright
 from clpipe.images.write import write_exr
 from clpipe.reference.cfa import PATTERNS, by_site
 from tests.conftest import STILL_LIFE, written
+from tests.conftest import cli_output as clpipe
 from tests.dng import field, write_dng
 
 MEASURE = ("--device", "numpy", "--skip", "denoise")  # so that colours can be compared exactly
-
-
-def clpipe(*arguments, status=0):
-    result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
-    assert result.exit_code == status, result.output
-    assert "Traceback" not in result.output
-    return result.output
 
 
 def colours(height=48, width=64):

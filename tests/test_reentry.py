@@ -8,25 +8,17 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from click.testing import CliRunner
 
-from clpipe.commands.main import main
 from clpipe.images.read import read_image
 from clpipe.images.write import write_exr
 from clpipe.stages import DEFAULT_CHAIN
 from clpipe.stages.sharpen import Unsharp
 from tests.conftest import STILL_LIFE, written
+from tests.conftest import cli_output as clpipe
 
 OPTIONS = ("--iso", "3200", "--seed", "5", "--set", "mosaic.pattern=GBRG")
 OPTIONS += ("--set", "white_balance.method=gray_world", "--set", "row_noise.sigma=0.01")
 OPTIONS += ("--set", "sharpen.radius=2.1", "--set", "gamma.method=power")
-
-
-def clpipe(*arguments, status=0):
-    result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
-    assert result.exit_code == status, result.output
-    assert "Traceback" not in result.output
-    return result.output
 
 
 def crop(folder: Path, name: str = "crop.exr") -> Path:

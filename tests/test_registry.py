@@ -1,5 +1,6 @@
 """Stages of other people: from a file, and from an installed package."""
 
+import ast
 import re
 import subprocess
 import sys
@@ -8,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from clpipe.chain import registry
+from clpipe.chain.registry import all_stages
 from clpipe.commands.main import main
 from tests.conftest import ROOT, STILL_LIFE
 from tests.test_contributing import block
@@ -173,3 +175,42 @@ def test_a_package_whose_stage_cannot_be_loaded(tmp_path):
     assert "package lens-stages" in done.stderr
     assert "numpi" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+# What these name is no stage: a truth, an attribute of kept images, a kind, a key of cameras.json.
+NO_STAGES = {
+    ("chain/rendition.py", "mosaic"),
+    ("inputs/kept.py", "sensor_noise"),
+    ("explorer/view.py", "mosaic"),
+    ("inputs/render_cameras.py", "distortion"),
+    ("outputs/camera_files.py", "distortion"),
+}
+
+
+def strings_of(path):
+    """The strings in code, docstrings apart."""
+    if path.suffix != ".py":
+        return re.findall(r'"([^"\n]*)"|`([^`]*)`', path.read_text())
+    tree = ast.parse(path.read_text())
+    texts = [node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)]
+    return [
+        (node.value,)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in texts
+    ]
+
+
+@pytest.mark.parametrize("room", ["chain", "inputs", "outputs", "explorer"])
+def test_no_stage_is_known_by_its_name(room):
+    """Clpipe's own stages are found by what they declare, as those of others are."""
+    folder = ROOT / "clpipe" / room
+    names = [name for name, stage in all_stages().items() if stage.folder is None]
+    parameter = re.compile(rf"\b({'|'.join(names)})\.[a-z_]+")
+    found = [
+        (path.relative_to(folder.parent).as_posix(), text)
+        for path in sorted(folder.rglob("*"))
+        if path.suffix in (".py", ".js")
+        for text in {text for groups in strings_of(path) for text in groups}
+        if text in names or parameter.search(text)
+    ]
+    assert not {*found} - NO_STAGES

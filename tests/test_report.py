@@ -10,15 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
 from clpipe.chain.rendition import FIRST
-from clpipe.commands.main import main
 from clpipe.images.write import write_exr as write
 from clpipe.reports.figures import last_failures, sessions
 from clpipe.reports.run import read_run
 from clpipe.reports.shown import Budget, large, places_of
+from tests.conftest import cli_output as clpipe
 from tests.conftest import reseal
 
 pytest.importorskip("jinja2")
@@ -53,12 +52,6 @@ class Page(HTMLParser):
     @property
     def said(self) -> str:
         return " ".join(" ".join(self.words).split())
-
-
-def clpipe(*arguments, status=0) -> str:
-    result = CliRunner().invoke(main, [str(each) for each in arguments], catch_exceptions=False)
-    assert result.exit_code == status, result.output
-    return result.output
 
 
 def report(*arguments) -> Page:

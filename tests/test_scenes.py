@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from clpipe.scenes.card import split_of
-from tests.conftest import ROOT, written
+from tests.conftest import ROOT, contents, written
 
 NUMPY = ("--device", "numpy", "-c", "paper")
 
@@ -35,10 +35,6 @@ def scene(tmp_path):
     return path
 
 
-def contents(folder):
-    return {name: (folder / name).read_bytes() for name in written(folder)}
-
-
 def test_a_scene_becomes_a_dataset(clpipe, scene, blender, tmp_path):
     said = clpipe("dataset", scene, "-o", "set", *blender, *NUMPY, "--views", 5, "--iso", "100,400")
     assert "rendered view_004  5 of 5" in said.stderr
@@ -47,6 +43,7 @@ def test_a_scene_becomes_a_dataset(clpipe, scene, blender, tmp_path):
     each = ("jpg", "json", "truth_clean.jpg", "truth_clean.json", "carried.exr")
     models = ("cameras.json", "transforms.json")
     models += tuple(f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D"))
+    models += tuple(f"models/truth_clean/{name}" for name in models)
     assert set(written(made)) == {
         *(f"iso{iso}/view_00{n}.{end}" for iso in (100, 400) for n in range(5) for end in each),
         *(f"iso{iso}/{name}" for iso in (100, 400) for name in models),

@@ -9,7 +9,7 @@ import pytest
 import clpipe as package
 from clpipe.base.errors import RequestError
 from clpipe.batch.run_log import read_log
-from tests.conftest import written
+from tests.conftest import contents, written
 
 DEVICE = {"device": "numpy", "stages": ["exposure", "gamma"]}
 OPTIONS = ("--device", "numpy", "--stages", "exposure,gamma")
@@ -20,10 +20,6 @@ def renders(write_exr, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in "abc":
         write_exr(f"in/{name}.exr", np.full((8, 12, 3), 0.25))
-
-
-def contents(folder):
-    return {name: (Path(folder) / name).read_bytes() for name in written(Path(folder))}
 
 
 def test_a_script_and_the_command_make_the_same_bytes(renders, clpipe):

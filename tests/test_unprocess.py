@@ -183,3 +183,13 @@ def test_a_camera_without_a_matrix_says_what_can_be_set():
 def test_a_chain_that_does_not_fit_a_picture():
     with pytest.raises(RequestError, match="mosaic"):
         Pipeline(stages=["inverse_gamma", "sensor_noise"])
+
+
+def test_white_of_a_photograph_is_no_warning(tmp_path, recwarn):
+    Image.fromarray(np.full((24, 32, 3), 255, np.uint8)).save(tmp_path / "white.png")
+    command = ["run", str(tmp_path / "white.png"), "-o", str(tmp_path / "out"), "-c", "unprocess"]
+    made = CliRunner().invoke(main, [*command, "--device", "numpy"])
+    assert made.exit_code == 0 and "clipped" not in made.stderr
+    assert json.loads((tmp_path / "out/white.json").read_text())["clipped"] > 0.9
+    Pipeline("unprocess", device="numpy").process(np.full((8, 8, 3), 255, np.uint8), "white")
+    assert not [each for each in recwarn if "clipped" in str(each.message)]

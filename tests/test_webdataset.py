@@ -24,7 +24,7 @@ from clpipe.batch.tars import cut
 from clpipe.inputs.find import Job
 from clpipe.outputs import folder as output_folders
 from clpipe.outputs import writer
-from tests.conftest import ROOT, written
+from tests.conftest import ROOT, statuses, written
 
 # A chain that other tests compile too.
 OTHER = ("-o", "out", "--iso", 3200, "--webdataset")
@@ -68,12 +68,6 @@ def contents(folder):
 
 def stamps(folder):
     return {name: (Path(folder) / name).stat().st_mtime_ns for name in contents(folder)}
-
-
-def statuses(folder):
-    lines = read_log(Path(folder) / "run.jsonl")
-    last = max(i for i, line in enumerate(lines) if line["event"] == "start")
-    return {x["name"]: x["status"] for x in lines[last:] if x["event"] == "image"}
 
 
 def test_what_readers_see(clpipe, renders):

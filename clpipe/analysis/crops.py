@@ -39,7 +39,7 @@ class Place:
         return f"{self.left},{self.top},{self.width}x{self.height}"
 
     def of(self, image: Array) -> Array:
-        """This part of an image, (height, width[, channel])."""
+        """The part of an image that lies there, (height, width[, channel])."""
         return image[self.top : self.top + self.height, self.left : self.left + self.width]
 
     def within(self, width: int, height: int) -> bool:

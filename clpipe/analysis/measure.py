@@ -16,7 +16,7 @@ from clpipe.analysis.statistics import Channel, channel_statistics, correlation
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Doubles, Floats, Mask
 from clpipe.outputs.places import FLAT, HALVED, PICTURE, covariance, halved, select_flat
-from clpipe.reference.cfa import red_site
+from clpipe.reference.cfa import sites
 from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.stage import Kind
 
@@ -214,9 +214,10 @@ def mosaic_channels(
     whole_mask = np.zeros((height, width), bool)
     centred, standard = (np.zeros((len(noise), height, width), np.float32) for _ in range(2))
     channels, curves = [], []
-    x, y = red_site(first.pattern)
-    places = {"R": (y, x), "G1": (y, 1 - x), "G2": (1 - y, x), "B": (1 - y, 1 - x)}
-    slices = {name: np.s_[..., top:height:2, left:width:2] for name, (top, left) in places.items()}
+    slices = {
+        name: np.s_[..., rows.start : height : 2, columns.start : width : 2]
+        for name, (rows, columns) in sites(first.pattern).items()
+    }
     for name, at in slices.items():
         mask = select_unclipped(clean[at], clipped[at], edges, start[at])
         if not mask.any():

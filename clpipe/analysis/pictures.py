@@ -11,7 +11,7 @@ from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import Settings
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import holds_mosaic, photograph_facts, read_finished, read_image
-from clpipe.inputs.kept import carried_settings
+from clpipe.inputs.kept import embedded_settings
 from clpipe.reference.cfa import Pattern
 from clpipe.stage import Context, Kind
 
@@ -83,7 +83,7 @@ def load_picture(path: Path, pattern: Pattern = "RGGB") -> Picture:
     pixels = source.pixels.astype(np.float32)
     kind = source.attributes.get("kind")
     try:
-        settings = carried_settings(source.attributes)
+        settings = embedded_settings(source.attributes)
         context = context_after(settings, source.attributes.get("stage")) if settings else None
     except RequestError as error:
         raise ImageError(f"{path}: its settings cannot be used: {error}") from None

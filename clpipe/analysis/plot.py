@@ -3,6 +3,7 @@
 from io import BytesIO
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -37,18 +38,24 @@ def draw(report: NoiseReport, path: Path) -> None:
     Raises:
         ImageError: the file cannot be written.
     """
+    with mpl.rc_context({"font.size": 12, "axes.grid": True, "grid.alpha": 0.3}):
+        figure = _figure(report)
+    FigureCanvasAgg(figure)
+    png = BytesIO()
+    figure.savefig(png)
+    write_new(path, png.getvalue())
+
+
+def _figure(report: NoiseReport) -> Figure:
     figure = Figure(figsize=(16, 11), dpi=100, layout="constrained")
     grid = figure.add_gridspec(2, 1, height_ratios=(1.15, 1))
     above, below = figure.add_subfigure(grid[0]), figure.add_subfigure(grid[1])
     intensity, tails = above.subplots(1, 2)
     draw_intensity(intensity, report)
     draw_tails(tails, report)
-    by_name = {one.name: one for one in report.channels}
-    names = MAPS.get(report.kind, SITE_MAPS)
-    shown = [by_name[name] for name in names]
-    largest = max((peak(one) for one in shown), default=0.0)
-    limit = float(np.clip(largest, 0.05, 1.0))
-    axes = below.subplots(1, len(names))
+    shown = mapped(report)
+    limit = max(peak(one) for one in shown)
+    axes = below.subplots(1, len(shown))
     for axis, one in zip(axes, shown, strict=True):
         picture = draw_autocorrelation(axis, one, limit, report)
     below.colorbar(picture, ax=axes, shrink=0.85, label="correlation (lag 0 is 1)")
@@ -57,10 +64,13 @@ def draw(report: NoiseReport, path: Path) -> None:
     against = short_name(report.truth) if report.truth else "their mean"
     title = f"Noise of {subject} against {against} ({report.kind}, {report.share:.0%} used)"
     figure.suptitle(title, fontsize=15)
-    FigureCanvasAgg(figure)
-    png = BytesIO()
-    figure.savefig(png)
-    write_new(path, png.getvalue())
+    return figure
+
+
+def mapped(report: NoiseReport) -> list[Channel]:
+    """The channels whose autocorrelation is drawn."""
+    by_name = {one.name: one for one in report.channels}
+    return [by_name[name] for name in MAPS.get(report.kind, SITE_MAPS)]
 
 
 def short_name(path: str) -> str:
@@ -73,10 +83,10 @@ def short_name(path: str) -> str:
 
 
 def peak(one: Channel) -> float:
-    """The largest absolute autocorrelation of a channel, lag 0 left out."""
+    """The largest absolute autocorrelation of a channel, lag 0 left out; 0.05 at least."""
     table = np.nan_to_num(one.autocorrelation.copy())
     table[LAGS, LAGS] = 0
-    return float(np.abs(table).max())
+    return float(np.clip(np.abs(table).max(), 0.05, 1.0))
 
 
 def draw_intensity(axes: Axes, report: NoiseReport) -> None:
@@ -97,13 +107,14 @@ def draw_intensity(axes: Axes, report: NoiseReport) -> None:
             y = np.linspace(report.edges[0], report.edges[-1], 200)
             variance = np.maximum(one.law.a * y + one.law.b, 0)
             axes.plot(y, np.sqrt(variance), color=ink, linewidth=1)
-    axes.set_ylim(bottom=0)
-    axes.set_xlabel(f"intensity of the truth ({UNITS[report.kind]})", fontsize=12)
-    axes.set_ylabel("sigma of the noise", fontsize=12)
     fitted = any(one.law for one in report.channels)
-    axes.set_title("Noise by intensity" + ("; lines: sqrt(a·y + b)" if fitted else ""), fontsize=13)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=12)
+    axes.set(
+        ylim=(0, None),
+        xlabel=f"intensity ({UNITS[report.kind]})",
+        ylabel="sigma",
+        title="Noise by intensity" + ("; lines: sqrt(a·y + b)" if fitted else ""),
+    )
+    axes.legend()
 
 
 def draw_tails(axes: Axes, report: NoiseReport) -> None:
@@ -120,14 +131,15 @@ def draw_tails(axes: Axes, report: NoiseReport) -> None:
             linewidth=1.5,
             label=one.name,
         )
-    axes.set_yscale("log")
-    axes.set_ylim(0.3 / max(one.count for one in report.channels), 0.7)
-    axes.set_xlim(-6, 6)
-    axes.set_xlabel("noise / its sigma at that intensity", fontsize=12)
-    axes.set_ylabel("share of samples further out", fontsize=12)
-    axes.set_title("Tails", fontsize=13)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=12)
+    axes.set(
+        yscale="log",
+        ylim=(0.3 / max(one.count for one in report.channels), 0.7),
+        xlim=(-6, 6),
+        xlabel="noise / its sigma at that intensity",
+        ylabel="share of samples further out",
+        title="Tails",
+    )
+    axes.legend()
 
 
 def draw_autocorrelation(axes: Axes, one: Channel, limit: float, report: NoiseReport) -> AxesImage:
@@ -136,10 +148,11 @@ def draw_autocorrelation(axes: Axes, one: Channel, limit: float, report: NoiseRe
     table[LAGS, LAGS] = np.nan
     extent = (-LAGS - 0.5, LAGS + 0.5, LAGS + 0.5, -LAGS - 0.5)
     picture = axes.imshow(table, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=extent)
-    axes.set_title(f"{one.name}: left after 2x2: {one.energy_left:.3f}", fontsize=13)
+    axes.grid(visible=False)
+    axes.set_title(f"{one.name}: left after 2x2: {one.energy_left:.3f}")
     per_site = report.kind not in MAPS and one.name != "mosaic"
-    axes.set_xlabel("lag right, pixels" + (" of this site" if per_site else ""), fontsize=12)
-    axes.set_ylabel("lag down", fontsize=12)
+    axes.set_xlabel("lag right, pixels" + (" of this site" if per_site else ""))
+    axes.set_ylabel("lag down")
     axes.set_xticks(range(-LAGS, LAGS + 1, 4))
     axes.set_yticks(range(-LAGS, LAGS + 1, 4))
     return picture

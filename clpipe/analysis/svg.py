@@ -15,8 +15,15 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from clpipe.analysis.plot import INK, MAPS, SITE_MAPS, draw_tails, peak
-from clpipe.analysis.report import UNITS, NoiseReport
+from clpipe.analysis.plot import (
+    INK,
+    draw_autocorrelation,
+    draw_intensity,
+    draw_tails,
+    mapped,
+    peak,
+)
+from clpipe.analysis.report import NoiseReport
 from clpipe.analysis.spatial import LAGS
 
 NEUTRAL = INK["mosaic"]  # in :mod:`clpipe.analysis.plot`
@@ -27,6 +34,8 @@ SETTINGS = {
     "svg.hashsalt": "clpipe",
     "font.family": "sans-serif",
     "font.size": 11,
+    "axes.titlesize": 11,
+    "legend.fontsize": 9,
     "axes.edgecolor": PAGE,
     "axes.labelcolor": PAGE,
     "axes.spines.top": False,
@@ -91,9 +100,7 @@ def lines_svg(
         axes = figure.add_subplot()
         for colour, (name, values) in zip(COLOURS, lines.items(), strict=False):
             axes.plot(x, values, color=colour, label=name, linewidth=1.8)
-        axes.set_ylim(bottom=0)
-        axes.set_xlabel(labels[0])
-        axes.set_ylabel(labels[1])
+        axes.set(ylim=(0, None), xlabel=labels[0], ylabel=labels[1])
         if len(lines) > 1:
             axes.legend()
         return _text(figure, title)
@@ -108,8 +115,7 @@ def shares_svg(
         axes = figure.add_subplot()
         used = COLOURS[: len(shares)]
         axes.stackplot(x, *shares.values(), labels=list(shares), colors=used, alpha=0.8)
-        axes.set_ylim(0, 1)
-        axes.set_xlabel(label)
+        axes.set(ylim=(0, 1), xlabel=label)
         axes.yaxis.set_major_formatter("{x:.0%}")
         axes.set_ylabel("share of the time")
         axes.legend(loc="center left", bbox_to_anchor=(1, 0.5))
@@ -140,14 +146,14 @@ def noise_svg(report: NoiseReport) -> str:
     with mpl.rc_context(SETTINGS):
         figure = _figure(11, 5.6)
         above, below = figure.subplots(2, 3)
-        _draw_variance(above[0], report)
+        draw_intensity(above[0], report)
         _draw_lags(above[1], report)
         _draw_spectrum(above[2], report)
         draw_tails(below[0], report)
-        below[0].set_title("Tails", fontsize=11)
-        if legend := below[0].get_legend():  # the other drawings have one
-            legend.remove()
-        _draw_map(below[1], report)
+        below[0].get_legend().remove()  # the other drawings have one
+        first = mapped(report)[0]
+        picture = draw_autocorrelation(below[1], first, peak(first), report)
+        figure.colorbar(picture, ax=below[1], shrink=0.8)
         _draw_correlations(below[2], report)
         return _text(figure, "Noise by intensity, its autocorrelation, spectrum, tails and colours")
 
@@ -172,36 +178,19 @@ def law_svg(report: NoiseReport, a: float, b: float, title: str) -> str:
             )
         ends = np.array([0, max(one.curve.mean.max() for one in sites)])
         axes.plot(ends, a * ends + b, color=PAGE, linewidth=1.2, label="asked")
-        axes.set_ylim(bottom=0)
-        axes.set_xlabel("intensity (signal)")
-        axes.set_ylabel("variance")
+        axes.set(ylim=(0, None), xlabel="intensity (signal)", ylabel="variance")
         axes.ticklabel_format(axis="y", scilimits=(0, 0))
-        axes.legend(fontsize=8)
+        axes.legend()
         return _text(figure, title)
 
 
-def _draw_variance(axes: Axes, report: NoiseReport) -> None:
-    for one in report.channels:
-        dashes = "--" if one.name in ("Y", "Cb", "Cr") else "-"
-        axes.plot(one.curve.mean, one.curve.sigma**2, dashes, color=INK[one.name], label=one.name)
-    axes.set_ylim(bottom=0)
-    axes.set_xlabel(f"intensity ({UNITS[report.kind]})")
-    axes.set_ylabel("variance")
-    axes.ticklabel_format(axis="y", scilimits=(0, 0))
-    axes.legend(fontsize=8, ncols=2)
-
-
 def _draw_lags(axes: Axes, report: NoiseReport) -> None:
-    for one in report.channels:
-        if one.name in MAPS.get(report.kind, SITE_MAPS):
-            right = one.autocorrelation[LAGS, LAGS:]
-            axes.plot(
-                range(LAGS + 1), right, "-o", markersize=3, color=INK[one.name], label=one.name
-            )
+    for one in mapped(report):
+        right = one.autocorrelation[LAGS, LAGS:]
+        axes.plot(range(LAGS + 1), right, "-o", markersize=3, color=INK[one.name], label=one.name)
     axes.axhline(0, color=PAGE, linewidth=0.8)
-    axes.set_xlabel("lag to the right, px")
-    axes.set_ylabel("autocorrelation")
-    axes.legend(fontsize=8)
+    axes.set(xlabel="lag to the right, px", ylabel="autocorrelation")
+    axes.legend()
 
 
 def _draw_spectrum(axes: Axes, report: NoiseReport) -> None:
@@ -213,30 +202,14 @@ def _draw_spectrum(axes: Axes, report: NoiseReport) -> None:
     lags = np.arange(1, LAGS + 1)
     window = 0.5 + 0.5 * np.cos(np.pi * lags / (LAGS + 1))
     waves = np.cos(2 * np.pi * np.outer(frequency, lags))
-    for one in report.channels:
-        if one.name in MAPS.get(report.kind, SITE_MAPS):
-            right = np.nan_to_num(one.autocorrelation[LAGS, LAGS + 1 :])
-            axes.plot(
-                frequency, 1 + 2 * waves @ (window * right), color=INK[one.name], label=one.name
-            )
+    for one in mapped(report):
+        right = np.nan_to_num(one.autocorrelation[LAGS, LAGS + 1 :])
+        axes.plot(frequency, 1 + 2 * waves @ (window * right), color=INK[one.name], label=one.name)
     axes.axhline(1, color=PAGE, linewidth=0.8, linestyle=":")
-    axes.set_ylim(bottom=0)
-    axes.set_xlabel("frequency along rows, cycles/px")
-    axes.set_ylabel("power; white noise is 1")
-    axes.legend(fontsize=8)
-
-
-def _draw_map(axes: Axes, report: NoiseReport) -> None:
-    name = MAPS.get(report.kind, SITE_MAPS)[0]
-    one = next(each for each in report.channels if each.name == name)
-    table = one.autocorrelation.copy()
-    table[LAGS, LAGS] = np.nan
-    limit = float(np.clip(peak(one), 0.05, 1.0))
-    extent = (-LAGS - 0.5, LAGS + 0.5, LAGS + 0.5, -LAGS - 0.5)
-    picture = axes.imshow(table, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=extent)
-    axes.grid(visible=False)
-    axes.set_title(f"autocorrelation of {name}", fontsize=11)
-    axes.figure.colorbar(picture, ax=axes, shrink=0.8)
+    axes.set(
+        ylim=(0, None), xlabel="frequency along rows, cycles/px", ylabel="power; white noise is 1"
+    )
+    axes.legend()
 
 
 def _draw_correlations(axes: Axes, report: NoiseReport) -> None:
@@ -245,4 +218,4 @@ def _draw_correlations(axes: Axes, report: NoiseReport) -> None:
     values = [float(np.nan_to_num(report.correlations[pair])) for pair in pairs]
     axes.barh(["-".join(pair) for pair in pairs], values, color=COLOURS[2])
     axes.set_xlim(min(0, *values), 1)
-    axes.set_title("correlation between channels", fontsize=11)
+    axes.set_title("correlation between channels")

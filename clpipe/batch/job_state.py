@@ -9,7 +9,7 @@ from typing import Any
 
 from clpipe.batch.outcome import DONE, FAILED, Outcome, Span
 from clpipe.images.read import SourceImage
-from clpipe.inputs.carry import Carried
+from clpipe.inputs.carry import Aovs
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.patches import Patch
@@ -33,7 +33,7 @@ class JobState:
     error: str = ""
     reason: str = ""
     outputs: list[str] = field(default_factory=list)
-    carried: Carried | None = None  # until it is written
+    aovs: Aovs | None = None  # until it is written
     clipped: float = 0.0  # the share of clipped pixels, of the rendition that has most
     patches: list[Patch] = field(default_factory=list)  # that are made in place of pictures
     old: int = 0  # renditions that another program has made

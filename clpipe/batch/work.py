@@ -15,7 +15,7 @@ from clpipe.base.types import Array
 from clpipe.batch.job_state import JobState
 from clpipe.batch.outcome import LEFT_OUT, SKIPPED, Span
 from clpipe.batch.runners import Runners, SpareArrays
-from clpipe.chain.baseline import STEP, with_noise
+from clpipe.chain.baseline import with_noise
 from clpipe.chain.chain import Chain
 from clpipe.chain.depth import depth_steps
 from clpipe.chain.formats import DNG
@@ -166,7 +166,7 @@ class ImageWorker:
             state.patches = every_patch(patches, loaded.chain, width, height, job.key)
         if any(map(self.writer.carries, renditions)):
             orientation = self.writer.picture_orientation(loaded.source, loaded.chain)
-            state.carried = state.loader.carried(job, loaded, orientation)
+            state.aovs = state.loader.aovs(job, loaded, orientation)
         state.source = loaded.source
         recipes = self.writer.plan_of(job).recipes(loaded.chain, loaded.key)
         state.recipes = [recipe for recipe in recipes if recipe.rendition in renditions]
@@ -210,7 +210,7 @@ class ImageWorker:
                 for spread in {each.spread for each in state.recipes if each.spread}:
                     spread.take(recipe.rendition, result.final)
             if result and recipe.estimates:
-                result.estimates[STEP] = dict(recipe.estimates)
+                result.estimates[recipe.chain.steps[-1].name] = dict(recipe.estimates)
             name = threading.current_thread().name
             state.spans += [Span(t.name, name, t.start, t.seconds) for t in timings or []]
             if result and recipe is state.recipes[-1] and DNG not in self.writer.formats:
@@ -262,10 +262,11 @@ class ImageWorker:
             try:
                 carried = None
                 if writer.carries(recipe.rendition):
-                    carried, state.carried = state.carried, None
+                    carried, state.aovs = state.aovs, None
                 files = writer.write(job, recipe, state.source, result, carried, state.patches)
                 clipped = None if recipe.noise else clipped_share(result, recipe.chain)
-                state.clipped = max(state.clipped, clipped or 0.0)
+                if recipe.chain.source is not Kind.DISPLAY:  # a photograph was clipped before
+                    state.clipped = max(state.clipped, clipped or 0.0)
                 path = writer.path(job, SIDECAR, recipe.rendition)
                 record = sidecar(
                     job,

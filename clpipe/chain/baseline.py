@@ -7,11 +7,11 @@ from dataclasses import replace
 
 from clpipe.base.errors import RequestError
 from clpipe.chain.chain import Chain
+from clpipe.chain.registry import stage_in
 from clpipe.chain.rendition import CLEAN
 from clpipe.chain.truth import picture_without_noise
+from clpipe.stage import StageRole
 from clpipe.stages.picture_noise import IidGaussian, IntensityDependent, NoNoise
-
-STEP = "picture_noise"  # the step that adds it
 
 
 def baseline_of(chain: Chain) -> Chain:
@@ -24,21 +24,22 @@ def baseline_of(chain: Chain) -> Chain:
         RequestError: the chain adds no noise, has noise on the finished picture already, or has no
             step for it.
     """
-    step = next((step for step in chain.steps if step.name == STEP), None)
+    step = chain.step_in(StageRole.BASELINE)
     if step is None:
-        raise RequestError(f"--truth: a baseline has the noise of {STEP}, which this chain has not")
+        name = stage_in(StageRole.BASELINE).name
+        raise RequestError(f"--truth: a baseline has the noise of {name}, which this chain has not")
     if step.adds_noise:
-        raise RequestError(f"--truth: {STEP} adds noise already; leave one of them out")
+        raise RequestError(f"--truth: {step.name} adds noise already; leave one of them out")
     clean = picture_without_noise(CLEAN, chain)
-    steps = *(each for each in clean.steps if each.name != STEP), step
+    steps = *(each for each in clean.steps if each.name != step.name), step
     return with_noise(replace(clean, steps=steps), IidGaussian(sigma=(0.0, 0.0, 0.0)))
 
 
 def matching_of(chain: Chain) -> NoNoise:
     """How the noise of a baseline is matched to that of the picture, as the chain says."""
-    method = chain.step_named(STEP).method
-    assert isinstance(method, NoNoise)  # as baseline_of has seen
-    return method
+    step = chain.step_in(StageRole.BASELINE)
+    assert step and isinstance(step.method, NoNoise)  # as baseline_of has seen
+    return step.method
 
 
 def with_noise(chain: Chain, noise: IidGaussian | IntensityDependent) -> Chain:

@@ -16,7 +16,7 @@ PNG = "png"  # a kind: depth, which is written as a PNG, too
 
 
 @dataclass(frozen=True)
-class Carry:
+class AovSpec:
     """A layer to carry.
 
     Args:
@@ -32,20 +32,20 @@ class Carry:
     png: bool = False
 
 
-def parse_carry(texts: Sequence[str]) -> tuple[Carry, ...]:
+def parse_carry(texts: Sequence[str]) -> tuple[AovSpec, ...]:
     """Layers from texts of the form NAME[:KIND][=PATTERN].
 
     >>> parse_carry(["Depth", "nn:normal"])[1]
-    Carry(name='nn', kind='normal', pattern='', png=False)
+    AovSpec(name='nn', kind='normal', pattern='', png=False)
     >>> parse_carry(["Z:png=../z/{name}.exr"])
-    (Carry(name='Z', kind='depth', pattern='../z/{name}.exr', png=True),)
+    (AovSpec(name='Z', kind='depth', pattern='../z/{name}.exr', png=True),)
 
     Raises:
         RequestError: a name is empty, cannot be a part of a file's name, or is there twice, a kind
             does not exist, or a pattern has no place for the image's name.
     """
     kinds = (*get_args(LayerKind), PNG)
-    found: dict[str, Carry] = {}
+    found: dict[str, AovSpec] = {}
     for text in texts:
         layer, equals, pattern = text.partition("=")
         name, colon, kind = layer.rpartition(":")
@@ -64,5 +64,5 @@ def parse_carry(texts: Sequence[str]) -> tuple[Carry, ...]:
         if name.lower() in found:
             raise RequestError(f"--carry {name}: it is there twice")
         known = "depth" if kind == PNG else kind or kind_named(name)
-        found[name.lower()] = Carry(name, cast("LayerKind | None", known), pattern, kind == PNG)
+        found[name.lower()] = AovSpec(name, cast("LayerKind | None", known), pattern, kind == PNG)
     return tuple(found.values())

@@ -18,7 +18,17 @@ from clpipe.chain.settings import Settings
 from clpipe.reference.geometry import NO_MARGINS, Composition, Margins
 from clpipe.reference.intrinsics import Intrinsics
 from clpipe.reference.resample import Resampler, sizes
-from clpipe.stage import Context, FromLens, Kind, Method, Noiseless, Resample, Stage, Unchanged
+from clpipe.stage import (
+    Context,
+    FromLens,
+    Kind,
+    Method,
+    Noiseless,
+    Resample,
+    Stage,
+    StageRole,
+    Unchanged,
+)
 
 
 @dataclass(frozen=True)
@@ -184,6 +194,10 @@ class Chain:
         """The chain up to the last of these steps; all of it where none is named."""
         places = [place for place, step in enumerate(self.steps) if step.name in names]
         return replace(self, steps=self.steps[: places[-1] + 1]) if places else self
+
+    def step_in(self, role: StageRole) -> Step | None:
+        """The first step whose stage has a role; None where the chain has none."""
+        return next((step for step in self.steps if step.stage.role is role), None)
 
     def step_named(self, name: str) -> Step:
         """The step of that name.

@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.base.reading import check_regular
 from clpipe.chain.keys import NOISE
-from clpipe.stage import CompileTime, Context, Method, Stage
+from clpipe.stage import CompileTime, Context, Method, Stage, StageRole
 from clpipe.stages import own_stages
 
 ARGUMENT_TYPES = (np.float32, np.int32, np.uint32, np.ndarray, CompileTime)
@@ -56,6 +56,11 @@ def installed_stages() -> dict[str, Stage]:
         _check_stage_name(package, stage.name, own_stages() | stages)
         stages[stage.name] = replace(stage, folder=file.parent)
     return stages
+
+
+def stage_in(role: StageRole) -> Stage:
+    """The stage that has a role: clpipe's own, unless that is gone."""
+    return next(stage for stage in all_stages().values() if stage.role is role)
 
 
 def load_stage_file(path: Path) -> Stage:

@@ -56,11 +56,11 @@ class RenderCamera(BaseModel):
         """What is set of the optics, by the names of the fields."""
         return self.model_dump(exclude={"exposure_time", *POSE}, exclude_none=True)
 
-    def filled(self, shot: Mapping[str, float]) -> "RenderCamera":
+    def with_defaults(self, shot: Mapping[str, float]) -> "RenderCamera":
         """A copy in which ``shot``, what a source says of itself, fills the fields that are None.
 
         >>> camera = RenderCamera(focal_length=24.0)
-        >>> camera.filled({"focal_length": 50.0, "exposure_time": 0.5}).focal_length
+        >>> camera.with_defaults({"focal_length": 50.0, "exposure_time": 0.5}).focal_length
         24.0
         """
         own = self.model_dump(exclude_none=True)

@@ -3,17 +3,17 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
 from clpipe.base.validation import first_fault
-from clpipe.chain.carry import Carry, parse_carry
+from clpipe.chain.carry import AovSpec, parse_carry
 from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.files import load_config
 from clpipe.chain.formats import EVERY_FORMAT, NPY
@@ -63,7 +63,7 @@ class Recorded(BaseModel):
 
 RECORDED = tuple(Recorded.model_fields)
 
-R = TypeVar("R", bound="Request")
+MADE = 8  # settings that a request, and those that it is replaced by, keep
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,8 @@ class Request:
         patch: the sides of patches in px, which are written in place of pictures; None is pictures.
         patches_per_image: how many of each picture, at random places, or "grid"; 0 without patches.
         augment: whether patches are flipped and turned.
+        made: the settings that were made of ``config`` and ``options``; requests that are replaced
+            by others share them.
     """
 
     config: Mapping[str, Any] | None = None
@@ -115,6 +117,9 @@ class Request:
     patch: int | None = None
     patches_per_image: int | Literal["grid"] = 0
     augment: bool = False
+    made: BoundedCache[Settings] = field(
+        default_factory=lambda: BoundedCache(MADE), compare=False, repr=False
+    )
 
     @classmethod
     def from_options(
@@ -181,9 +186,10 @@ class Request:
             **fields_,
         )
         if configuration:
-            vars(request)["_configured"] = configuration.settings  # is validated already
+            # They are validated already.
+            request.made.get(Identity(request.config), lambda: configuration.settings)
         request.settings()
-        request.carried()  # refuses what is wrong
+        request.aov_specs()  # refuses what is wrong
         return request
 
     @classmethod
@@ -203,12 +209,12 @@ class Request:
             raise RequestError(f"found formats {', '.join(values['formats'])}")
         lists = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
         request = cls(**{**values, **lists})
-        request.carried()  # refuses what is wrong
+        request.aov_specs()  # refuses what is wrong
         return request
 
     def for_image(self, name: str, values: Mapping[str, Any]) -> Self:
         """The request for one image: its name, and values that hold for it alone."""
-        return self._shared(replace(self, image_name=name, image=values))
+        return replace(self, image_name=name, image=values)
 
     def with_outputs(self, chain: Chain) -> "ResolvedRequest":
         """The request with every output named, as a chain has them.
@@ -228,9 +234,9 @@ class Request:
         truth_keep = tuple(step for step in keep if step != own)
         known = {each.name: getattr(self, each.name) for each in fields(Request)}
         known |= {"formats": formats, "keep": keep, "truth_keep": truth_keep}
-        return self._shared(ResolvedRequest(**known))
+        return ResolvedRequest(**known)
 
-    def carried(self) -> tuple[Carry, ...]:
+    def aov_specs(self) -> tuple[AovSpec, ...]:
         """The layers that go along with each picture.
 
         Raises:
@@ -238,33 +244,33 @@ class Request:
         """
         return parse_carry(self.carry)
 
-    def settings(self, carried: Settings | None = None) -> Settings:
+    def settings(self, embedded: Settings | None = None) -> Settings:
         """The settings that are asked for, drawn for the image where there is one.
 
         Args:
-            carried: the settings that an image carries, which hold where nothing else is set.
+            embedded: the settings that an image carries, which hold where nothing else is set.
 
         Raises:
             RequestError: a name or value that is not allowed.
         """
         for file in self.stage_files:
             load_stage_file(Path(file))
-        settings = self._general
-        if carried is not None:
+        settings = self._general()
+        if embedded is not None:
             for values in (self.config, self.options):
-                carried = overlay(carried, values) if values else carried
-            settings = carried
+                embedded = overlay(embedded, values) if values else embedded
+            settings = embedded
         if self.image:
             settings = overlay(settings, self.image)
         return settings.drawn(self.image_name) if self.image_name else settings
 
-    def chain(self, carried: Settings | None = None) -> Chain:
-        """The chain that is asked for; ``carried`` as for :meth:`settings`.
+    def chain(self, embedded: Settings | None = None) -> Chain:
+        """The chain that is asked for; ``embedded`` as for :meth:`settings`.
 
         Raises:
             RequestError: it cannot be made.
         """
-        return self.chain_from(self.settings(carried), self.start_at)
+        return self.chain_from(self.settings(embedded), self.start_at)
 
     def chain_from(self, settings: Settings, start_at: str | None) -> Chain:
         """The chain of settings, from a step on.
@@ -295,25 +301,17 @@ class Request:
         record: dict[str, Any] = json.loads(json.dumps(values))  # as it is read back
         return record
 
-    @cached_property
-    def _configured(self) -> Settings:
-        """The configuration over the defaults."""
-        return overlay(DEFAULTS, self.config) if self.config else DEFAULTS
-
-    @cached_property
     def _general(self) -> Settings:
         """The options over the configuration: the settings of all images, nothing drawn."""
-        return overlay(self._configured, self.options) if self.options else self._configured
-
-    def _shared(self, other: R) -> R:
-        """Another request for the same settings, which shares what was made of them."""
-        shared = ("_configured", "_general")
-        vars(other).update({name: vars(self)[name] for name in shared if name in vars(self)})
-        return other
-
-    def __getstate__(self) -> dict[str, Any]:
-        # Settings may hold models of stage files, whose classes cannot be sent.
-        return {each.name: getattr(self, each.name) for each in fields(self)}
+        config, options = Identity(self.config), Identity(self.options)
+        configured = (
+            self.made.get(config, lambda: overlay(DEFAULTS, self.config or {}))
+            if self.config
+            else DEFAULTS
+        )
+        if not self.options:
+            return configured
+        return self.made.get((config, options), lambda: overlay(configured, self.options))
 
 
 @dataclass(frozen=True)

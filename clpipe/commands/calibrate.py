@@ -9,7 +9,7 @@ from clpipe.analysis.calibration.frames import FrameOverrides
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.result import Calibration
 from clpipe.camera.text import check_profile_name
-from clpipe.commands.options import Command, dump_option, json_option
+from clpipe.commands.options import Command, dump_option, json_option, output_option
 from clpipe.commands.printing import show, show_json
 from clpipe.images.dump import parse_dump
 from clpipe.reference.cfa import PATTERNS, Pattern
@@ -22,13 +22,8 @@ CALIBRATION = (
 
 @click.command("calibrate", cls=Command)
 @click.argument("inputs", nargs=-1, required=True, metavar="FRAMES...")
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    type=click.Path(path_type=Path),
-    metavar="CAMERA.toml",
-    help="The profile to write; CAMERA.png, a picture of the fit, is written beside it.",
+@output_option(
+    "CAMERA.toml", "The profile to write; CAMERA.png, a picture of the fit, is written beside it."
 )
 @click.option(
     "--dark",

@@ -8,7 +8,7 @@ import click
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import Camera, built_in_cameras, load_camera
 from clpipe.commands.completion import cameras_or_import
-from clpipe.commands.options import Command, json_option
+from clpipe.commands.options import Command, json_option, output_option
 from clpipe.commands.printing import Rows, short_text, show, show_json
 
 # What a camera has at every ISO, with units.
@@ -33,13 +33,7 @@ FIXED = {
 @click.option(
     "--camera", metavar="NAME", help="Which camera of a noiseprofiles.json, by make and model."
 )
-@click.option(
-    "-o",
-    "--output",
-    metavar="FILE.toml",
-    type=click.Path(path_type=Path),
-    help="Write the profile there. [default: print it]",
-)
+@output_option("FILE.toml", "Write the profile there. [default: print it]", required=False)
 def import_command(path: Path, camera: str | None, output: Path | None) -> None:
     """Make a camera profile of a noise model from elsewhere.
 

@@ -8,7 +8,7 @@ from clpipe.analysis.comparison import Comparison
 from clpipe.analysis.comparison import compare as compare_pictures
 from clpipe.analysis.crops import FOUND, HEIGHT, WIDTH
 from clpipe.base.extras import require
-from clpipe.commands.options import Command
+from clpipe.commands.options import Command, output_option
 from clpipe.commands.printing import number, show
 
 FILE = click.Path(path_type=Path)
@@ -16,15 +16,8 @@ FILE = click.Path(path_type=Path)
 
 @click.command("compare", cls=Command)
 @click.argument("pictures", nargs=-1, required=True, type=FILE, metavar="PICTURE...")
-@click.option(
-    "-o",
-    "--output",
-    "outputs",
-    required=True,
-    multiple=True,
-    type=FILE,
-    metavar="FIGURE",
-    help="The figure to write, as .png, .pdf or .svg; may be repeated.",
+@output_option(
+    "FIGURE", "The figure to write, as .png, .pdf or .svg; may be repeated.", multiple=True
 )
 @click.option(
     "--crop",

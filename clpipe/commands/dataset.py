@@ -1,6 +1,5 @@
 """``clpipe dataset``: a scene or a folder of renders becomes a dataset."""
 
-import logging
 import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -19,7 +18,13 @@ from clpipe.chain.rendition import CLEAN, TRUTHS
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import carry_option, format_option, series_options
 from clpipe.commands.input_options import poses_option
-from clpipe.commands.options import GroupedCommand, device_option, options_set
+from clpipe.commands.options import (
+    GroupedCommand,
+    device_option,
+    options_set,
+    output_option,
+    quiet_option,
+)
 from clpipe.commands.progress import Reporter, follow
 from clpipe.inputs.series import Series, parse_isos
 from clpipe.scenes.blender import Rendering
@@ -34,14 +39,7 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
 
 @click.command("dataset", cls=GroupedCommand)
 @click.argument("source", type=click.Path(path_type=Path), metavar="SCENE.blend|FOLDER")
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    type=click.Path(path_type=Path),
-    metavar="DS",
-    help="The folder of the dataset; it is made where it is missing.",
-)
+@output_option("DS", "The folder of the dataset; it is made where it is missing.")
 @click.option(
     "--views",
     type=click.IntRange(1, 100_000),
@@ -111,7 +109,7 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
 @carry_option
 @format_option
 @device_option
-@click.option("--quiet", is_flag=True, help="Print failures only.")
+@quiet_option
 def dataset(
     source: Path,
     output: Path,
@@ -129,18 +127,14 @@ def dataset(
     rendered; and writes the cameras of the pictures (cameras.json, transforms.json, COLMAP's
     sparse/0), manifest.csv, train.txt and val.txt, a contact sheet and a README.
 
-    A folder of renders is taken as it is, with the cameras.json or transforms.json in it.
-
-    The same command goes on where it was interrupted. It makes other ISOs and cameras of the same
-    views without rendering them again.
+    A folder of renders is taken as it is, with the cameras.json or transforms.json in it. The same
+    command goes on where it was interrupted, and renders no view twice for other ISOs and cameras.
 
     \b
     clpipe dataset scene.blend -o set --iso 100,800,3200 --views 24
     clpipe dataset scene.blend -o film --frames 1-48 --iso 1600
     clpipe dataset renders/ -o set --iso 100,800 --camera sony-a7r2 --camera canon-5d2
     """
-    if quiet:
-        logging.getLogger("clpipe").setLevel(logging.WARNING)
     series = Series(cameras, parse_isos(isos) if isos is not None else ())
     rendering = {name: options.pop(name) for name in RENDER_OPTIONS}
     request = Request.from_options(camera=series.camera, iso=series.iso, **options)

@@ -19,26 +19,14 @@ from clpipe.base.memory import check_addresses
 from clpipe.base.system import address_space, processors, save_addresses
 from clpipe.base.text import one_line
 
-# In the order of the help. Each is a module of this folder that defines a function of its name.
-COMMANDS = (
-    "run",
-    "replay",
-    "dataset",
-    "poses",
-    "report",
-    "explore",
-    "plan",
-    "stages",
-    "cameras",
-    "devices",
-    "meter",
-    "measure",
-    "compare",
-    "calibrate",
-    "match",
-    "check",
-    "bench",
-)
+# By the headings of the help. Each is a module of this folder that defines a function of its name.
+GROUPS = {
+    "Make pictures": ("run", "replay", "dataset", "meter"),
+    "Look at them": ("report", "explore", "compare", "measure", "poses"),
+    "Cameras": ("cameras", "calibrate", "match"),
+    "What runs, and where": ("stages", "plan", "devices", "check", "bench"),
+}
+COMMANDS = tuple(name for names in GROUPS.values() for name in names)
 
 
 # Bytes of addresses: what loading libraries takes, and a thread of theirs, one on each processor.
@@ -73,8 +61,9 @@ class LazyGroup(click.Group):
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, summary(name)) for name in COMMANDS])
+        for heading, names in GROUPS.items():
+            with formatter.section(heading):
+                formatter.write_dl([(name, summary(name)) for name in names])
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         # The base imports every command for this.

@@ -10,20 +10,13 @@ from clpipe.analysis.matching.result import Match, Row, write_configuration
 from clpipe.base.extras import require
 from clpipe.chain.toml import value_text
 from clpipe.commands.chain_options import camera_option
-from clpipe.commands.options import Command, device_option, json_option
+from clpipe.commands.options import Command, device_option, json_option, output_option
 from clpipe.commands.printing import Rows, number, show, show_json
 
 
 @click.command("match", cls=Command)
 @click.argument("frames", nargs=-1, required=True, metavar="FRAME...")
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    type=click.Path(path_type=Path),
-    metavar="CONFIG.toml",
-    help="The configuration to write.",
-)
+@output_option("CONFIG.toml", "The configuration to write.")
 @click.option(
     "--mean",
     "means",

@@ -17,7 +17,13 @@ from clpipe.commands.input_options import (
     max_pixels_option,
     transfer_option,
 )
-from clpipe.commands.options import Command, device_option, json_option, stage_file_option
+from clpipe.commands.options import (
+    Command,
+    device_option,
+    json_option,
+    output_option,
+    stage_file_option,
+)
 from clpipe.commands.printing import show_json
 from clpipe.engine.device import open_device
 from clpipe.inputs.find import find_jobs
@@ -26,14 +32,7 @@ from clpipe.inputs.loader import ImageLoader
 
 @click.command("meter", cls=Command)
 @click.argument("frames", nargs=-1, required=True, metavar="FRAMES...")
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    type=click.Path(path_type=Path),
-    metavar="EXPOSURES.csv",
-    help="The manifest to write.",
-)
+@output_option("EXPOSURES.csv", "The manifest to write.")
 @click.option(
     "--smooth",
     default=8.0,

@@ -3,15 +3,20 @@
 Options that need the stages are in chain_options.
 """
 
+import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, TypeVar
 
 import click
 from click.core import ParameterSource
 
 from clpipe.base.errors import RequestError
+from clpipe.base.memory import parse_size
 from clpipe.images.dump import TYPES
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 # The options of commands that have many, by the heading that they stand under. "+" is before those
 # that --help shows, briefly; --help-all shows all in full.
@@ -121,15 +126,48 @@ dump_option = click.option(
 )
 
 
-def folder_named(text: str) -> Path:
-    """The output folder.
+class OutputPath(click.Path):
+    """A file or folder to write to; "" is refused, which would else be the working directory."""
 
-    Raises:
-        RequestError: the name is empty.
-    """
-    if not text:
-        raise RequestError("--output: it is empty; name a folder")
-    return Path(text)
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if not value:
+            raise RequestError("--output: it is empty; name what to write to")
+        return super().convert(value, param, ctx)
+
+
+def output_option(
+    metavar: str, text: str, required: bool = True, multiple: bool = False
+) -> Callable[[F], F]:
+    """The option -o; ``text`` is its help."""
+    return click.option(
+        "-o",
+        "--output",
+        "outputs" if multiple else "output",
+        required=required,
+        multiple=multiple,
+        type=OutputPath(path_type=Path),
+        metavar=metavar,
+        help=text,
+    )
+
+
+out_option = output_option("OUT", "The output folder; it is made where it is missing.")
+
+memory_option = click.option(
+    "--memory",
+    callback=lambda _context, _option, text: None if text is None else parse_size(text),
+    metavar="SIZE",
+    help="Memory of a device, such as 2G; larger images are done in tiles. [default: what is free]",
+)
+
+
+def _hush(_context: click.Context, _option: click.Parameter, is_quiet: bool) -> bool:
+    if is_quiet:
+        logging.getLogger("clpipe").setLevel(logging.WARNING)
+    return is_quiet
+
+
+quiet_option = click.option("--quiet", is_flag=True, callback=_hush, help="Print failures only.")
 
 
 def options_set() -> dict[str, str]:

@@ -128,7 +128,7 @@ def slots_text(plan: Plan, number: int) -> str:
 
 
 def reads_text(plan: Plan, launch: AnyLaunch) -> str:
-    """What a launch reads."""
+    """The images that a launch reads, as text."""
     if isinstance(launch, Launch) and not launch.reads:
         return f"source {plan.source.label}, {'half' if plan.half else 'float'}"
     return "; ".join(
@@ -137,7 +137,7 @@ def reads_text(plan: Plan, launch: AnyLaunch) -> str:
 
 
 def writes_text(plan: Plan, launch: AnyLaunch) -> str:
-    """What a launch writes."""
+    """The images that a launch writes, as text."""
     if not isinstance(launch, Launch):
         return ""
     kept = {image.number: name for name, image in plan.kept}

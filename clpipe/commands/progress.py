@@ -20,7 +20,6 @@ from clpipe.outputs.existing import Redo
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-REPEATED = 20  # failures that are printed again at the end
 FEW = 50  # images that have a line each, where there is no terminal
 EVERY = 10.0  # s, from line to line of more images
 
@@ -157,12 +156,6 @@ class Reporter:
         if not self._quiet:
             self._print_passed_over()
         failed = summary.failures
-        if self._several and failed and (self._bar or not self._quiet):
-            self.print("failed:")
-            for error in failed[:REPEATED]:
-                self.print(f"  {error}")
-            if len(failed) > REPEATED:
-                self.print(f"  and {len(failed) - REPEATED} more, which the run log names")
         if self._quiet or not (self._several or failed or counts[SKIPPED]):
             return
         there = f" ({counts[SKIPPED]} of them were there already)" if counts[SKIPPED] else ""

@@ -6,38 +6,37 @@ from pathlib import Path
 import click
 
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.memory import parse_size
 from clpipe.batch.replay import replay_of
 from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
 from clpipe.commands.input_options import max_pixels_option
-from clpipe.commands.options import Command, device_option, folder_named, stage_file_option
+from clpipe.commands.options import (
+    Command,
+    device_option,
+    memory_option,
+    out_option,
+    quiet_option,
+    stage_file_option,
+)
 from clpipe.commands.progress import follow
 
 
 @click.command("replay", cls=Command)
 @click.argument("sidecar", type=click.Path(path_type=Path), metavar="SIDECAR")
 @click.argument("image", required=False, type=click.Path(path_type=Path), metavar="[INPUT]")
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    callback=lambda _context, _option, text: folder_named(text),
-    metavar="OUT",
-    help="The output folder; it is made where it is missing.",
-)
+@out_option
 @stage_file_option
 @device_option
-@click.option("--memory", metavar="SIZE", help="Memory of the device, such as 2G.")
+@memory_option
 @max_pixels_option
-@click.option("--quiet", is_flag=True, help="Print failures only.")
+@quiet_option
 def replay(
     sidecar: Path,
     image: Path | None,
     output: Path,
     stage_files: tuple[Path, ...],
     selector: str | None,
-    memory: str | None,
+    memory: int | None,
     max_pixels: int,
     quiet: bool,
 ) -> None:
@@ -54,7 +53,7 @@ def replay(
     """
     again = replay_of(sidecar, [image] if image else [], max_pixels, stage_files)
     selectors = () if selector is None else (selector,)
-    where = Where(output, selectors, parse_size(memory) if memory else None)
+    where = Where(output, selectors, memory)
     try:
         made = Run(again.request, Images(found=[again.job]), where, arguments=sys.argv[1:])
     except RequestError as error:

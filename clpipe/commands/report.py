@@ -8,7 +8,7 @@ import click
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
 from clpipe.base.files import write_new
-from clpipe.commands.options import Command
+from clpipe.commands.options import Command, output_option
 from clpipe.outputs.existing import is_marked
 
 
@@ -16,13 +16,7 @@ from clpipe.outputs.existing import is_marked
 @click.argument(
     "folders", metavar="OUT [OUT2]", nargs=-1, required=True, type=click.Path(path_type=Path)
 )
-@click.option(
-    "--output",
-    "-o",
-    type=click.Path(path_type=Path),
-    metavar="FILE.html",
-    help="The file. [default: OUT/report.html]",
-)
+@output_option("FILE.html", "The file. [default: OUT/report.html]", required=False)
 def report(folders: tuple[Path, ...], output: Path | None) -> None:
     """Look at a run: its figures, pictures, noise and settings, in one HTML file.
 

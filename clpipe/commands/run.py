@@ -1,6 +1,5 @@
 """``clpipe run``: images through the chain, on this machine or on a cluster."""
 
-import logging
 import sys
 from pathlib import Path
 from typing import Any, Literal
@@ -8,7 +7,6 @@ from typing import Any, Literal
 import click
 
 from clpipe.base.errors import RequestError
-from clpipe.base.memory import parse_size
 from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
 from clpipe.chain.identity import MAX_FRAMES
@@ -28,7 +26,13 @@ from clpipe.commands.input_options import (
     poses_option,
     transfer_option,
 )
-from clpipe.commands.options import GroupedCommand, dump_option, folder_named
+from clpipe.commands.options import (
+    GroupedCommand,
+    dump_option,
+    memory_option,
+    out_option,
+    quiet_option,
+)
 from clpipe.commands.progress import follow, print_line
 from clpipe.inputs.find import Shard, parse_shard
 from clpipe.inputs.series import Series, parse_isos
@@ -38,14 +42,7 @@ from clpipe.outputs.patches import PER_IMAGE
 
 @click.command("run", cls=GroupedCommand)
 @click.argument("inputs", nargs=-1, metavar="INPUT...")
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    callback=lambda _context, _option, text: folder_named(text),
-    metavar="OUT",
-    help="The output folder; it is made where it is missing.",
-)
+@out_option
 @series_options
 @format_option
 @keep_option
@@ -97,11 +94,7 @@ from clpipe.outputs.patches import PER_IMAGE
     help="An index or a part of a name from 'clpipe devices', or numpy; may be repeated. [default: "
     "the first GPU and all of its kind, else the CPU]",
 )
-@click.option(
-    "--memory",
-    metavar="SIZE",
-    help="Memory of a device, such as 2G; larger images are done in tiles. [default: what is free]",
-)
+@memory_option
 @click.option(
     "--jobs",
     "threads",
@@ -128,7 +121,7 @@ from clpipe.outputs.patches import PER_IMAGE
     metavar="ADDRESS",
     help="Run on the workers of a Dask scheduler (tcp://HOST:8786); they must see the same files.",
 )
-@click.option("--quiet", is_flag=True, help="Print failures only.")
+@quiet_option
 @click.option(
     "--json-lines",
     is_flag=True,
@@ -149,7 +142,7 @@ def run(
     poses: Path | None,
     redo: str,
     selectors: tuple[str, ...],
-    memory: str | None,
+    memory: int | None,
     threads: int | None,
     shard: Shard,
     per_tar: int | None,
@@ -170,17 +163,13 @@ def run(
     clpipe run render.exr -o out --camera sony-a7r2 --iso 3200
     clpipe run renders/ -o out --truth clean --set denoise.luma_strength=2
     """
-    if quiet:
-        logging.getLogger("clpipe").setLevel(logging.WARNING)
     series = Series(cameras, parse_isos(isos) if isos is not None else ())
     patches = options["patch"], options["patches_per_image"], options["augment"]
     options["patches_per_image"] = patch_count(*patches)
     made = Run(
         Request.from_options(camera=series.camera, iso=series.iso, **options),
         Images(inputs, exclude, poses, series, shard, per_tar),
-        Where(
-            output, selectors, parse_size(memory) if memory else None, threads, Redo(redo), trace
-        ),
+        Where(output, selectors, memory, threads, Redo(redo), trace),
         dask,
         sys.argv[1:],
         print_line if json_lines else None,

@@ -8,7 +8,7 @@ import numpy as np
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.text import one_of
 from clpipe.base.types import Array
-from clpipe.reference.cfa import Pattern, red_site
+from clpipe.reference.cfa import Pattern, sites
 from clpipe.stage import Kind
 
 DTYPES = ("float16", "float32", "uint16")
@@ -42,7 +42,7 @@ def packed(mosaic: Array, pattern: Pattern) -> Array:
     >>> packed(np.array([[1, 2], [3, 4]]), "GRBG").ravel().tolist()
     [2, 1, 4, 3]
     """
-    return np.stack([mosaic[row::2, column::2] for column, row in _sites(pattern)])
+    return np.stack([mosaic[site] for site in sites(pattern).values()])
 
 
 def unpacked(planes: Array, pattern: Pattern) -> Array:
@@ -53,15 +53,9 @@ def unpacked(planes: Array, pattern: Pattern) -> Array:
     """
     _, height, width = planes.shape
     mosaic = np.empty((2 * height, 2 * width), planes.dtype)
-    for plane, (column, row) in zip(planes, _sites(pattern), strict=True):
-        mosaic[row::2, column::2] = plane
+    for plane, site in zip(planes, sites(pattern).values(), strict=True):
+        mosaic[site] = plane
     return mosaic
-
-
-def _sites(pattern: Pattern) -> tuple[tuple[int, int], ...]:
-    """Column and row of R, Gr, Gb and B in the 2x2 cell."""
-    x, y = red_site(pattern)
-    return ((x, y), (1 - x, y), (x, 1 - y), (1 - x, 1 - y))
 
 
 @dataclass(frozen=True)

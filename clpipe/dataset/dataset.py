@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self, Unpack
 
 from clpipe.base.errors import RequestError
 from clpipe.base.processors import available_processors
@@ -24,6 +24,9 @@ from clpipe.dataset.samples import SampleBatch, SampleLoader
 from clpipe.images.openimageio import set_codec_threads
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.outputs.patches import Patches
+
+if TYPE_CHECKING:
+    from clpipe.chain.keywords import Keywords
 
 
 class Dataset(ReadOnly):
@@ -126,7 +129,7 @@ class Dataset(ReadOnly):
         epoch: int = 0,
         epochs: int | None = 1,
         threads: int | None = None,
-        **settings: Any,
+        **settings: "Unpack[Keywords]",
     ) -> None:
         for name, number in {"epochs": epochs, "threads": threads}.items():
             if number is not None and number < 1:

@@ -16,7 +16,7 @@ from clpipe.chain.identity import noise_key, of_frame
 from clpipe.dataset.developer import MAX_CHAINS, Developer, Sample, SampleSpec
 from clpipe.engine.device import open_device
 from clpipe.images.read import SourceImage
-from clpipe.inputs.carry import Carried
+from clpipe.inputs.carry import Aovs
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.inputs.raw import RawImage
@@ -100,7 +100,7 @@ class SampleLoader:
             )
             loaded = loader.enter(job, self._source(job, loader))
             if loaded and loader.request.carry:
-                along = loader.carried(job, loaded)
+                along = loader.aovs(job, loaded)
                 named = {**along.arrays(), VALID: along.valid}
                 carried = {f"carried.{name}": array for name, array in named.items()}
                 if self.patches and self.patches.augment:
@@ -190,7 +190,7 @@ class SampleLoader:
             return self._opened
 
 
-def check_turns(carried: Carried) -> None:
+def check_turns(carried: Aovs) -> None:
     """See that layers can be flipped and turned, which vectors are not by moving their pixels.
 
     Raises:

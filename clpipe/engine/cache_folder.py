@@ -1,4 +1,4 @@
-"""Where compiled programs are kept between processes, and where the libraries below keep theirs.
+"""Folders in which compiled programs are kept between processes, by us and the libraries below.
 
 What is kept is run, so it is a folder that nobody but this user may write to.
 """

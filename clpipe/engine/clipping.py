@@ -1,4 +1,4 @@
-"""How much of a picture is clipped: a render in other units than the sensor's comes out white."""
+"""The clipped share of a picture: a render in other units than the sensor's comes out white."""
 
 import math
 
@@ -48,7 +48,7 @@ def clipped_share(result: Result, chain: Chain) -> float | None:
 
 
 def clipping_text(share: float) -> str:
-    """What is said of a share of clipped pixels.
+    """The warning about a share of clipped pixels.
 
     >>> clipping_text(0.997)
     '99.7 % of its pixels are clipped; are its values 0 to 255, or is exposure.ev too high?'

@@ -107,7 +107,7 @@ def kernels_of(ops: Sequence[Op | None]) -> list[str]:
 
 
 def _prologue(builder: KernelBuilder, read: Read) -> list[tuple[Op, list[str], list[str]]]:
-    """Each pass redone at a tap, its arguments, and which of them are run-time values."""
+    """The passes redone at a tap, each with its arguments and those that are run-time values."""
     calls = []
     for op in read.prologue:
         arguments = builder.arguments(op)
@@ -142,7 +142,7 @@ def _source_image(builder: KernelBuilder, launch: Launch) -> str:
 
 
 def _load(builder: KernelBuilder, launch: Launch) -> tuple[list[str], list[str], Kind]:
-    """What makes ``v0``, from the source, a stored image or the stencil; and its kind.
+    """Lines that make ``v0``, from the source, a stored image or the stencil; and its kind.
 
     The first lines come once a work item (for a stencil that gives its whole block), the others
     once a row.

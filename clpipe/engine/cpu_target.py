@@ -1,4 +1,4 @@
-"""Which CPU the PoCL of pip compiles for: the one that the features say, not the one LLVM names.
+"""The CPU that the PoCL of pip compiles for: by its features, not by the name that LLVM gives.
 
 PoCL up to 4 asks LLVM for the name of the CPU and compiles for that. LLVM 14, of 2022, which is
 within pip's PoCL 3.0, calls an AMD Zen 5 "generic", for which nothing compiles (PoCL's issue 1049).
@@ -136,7 +136,7 @@ CPUINFO = Path("/proc/cpuinfo")
 
 @cache
 def cpu_text() -> str:
-    """What tells this CPU from others: maker, model and features, as Linux lists them, or ""."""
+    """The text of this CPU: maker, model and features, as Linux lists them, or ""."""
     try:
         lines = CPUINFO.read_text("utf-8").splitlines()
     except (OSError, UnicodeDecodeError):
@@ -206,7 +206,7 @@ def own_target(version: str) -> tuple[str, str] | None:
 
 
 def candidates(platform: Any, device: Any) -> list[Target]:
-    """What a device may compile for, the first that works is taken; see :func:`compile_for`.
+    """Targets of a device, of which the first that works is taken; see :func:`compile_for`.
 
     Args:
         platform: a ``pyopencl.Platform``.

@@ -103,7 +103,7 @@ class Device:
 
     @property
     def depth(self) -> int:
-        """How many images it can work on at a time."""
+        """The number of images that it can work on at a time."""
         return self._flow.depth
 
     def is_compiled(self, plan: Plan) -> bool:

@@ -129,7 +129,7 @@ def devices_of(platform: Any, known: Verdicts) -> tuple[list[Any], str]:
 
 
 def describe(index: int, platform: Any, device: Any, known: Verdicts) -> DeviceInfo:
-    """What is to be known of a ``pyopencl.Device``, which compiles for its target from now on."""
+    """The description of a ``pyopencl.Device``, which compiles for its target from now on."""
     type_ = type_of(platform, device)
     problem = problem_with(type_, platform, device)
     target = candidates(platform, device)[0]
@@ -177,7 +177,7 @@ def without_device(
 
 
 def remedies() -> str:
-    """What helps on this machine where no OpenCL runtime works."""
+    """Advice for this machine where no OpenCL runtime works."""
     linux = this_system.system() == "Linux"
     x86 = this_system.machine() in ("x86_64", "AMD64")
     ways = [

@@ -1,4 +1,4 @@
-"""Where an image, or a tile of it, lies, and how large its planes are on a device. Pure."""
+"""The place of an image or a tile of it, and the size of its planes on a device. Pure."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,12 +20,12 @@ class Box:
 
     @property
     def width(self) -> int:
-        """How many columns."""
+        """The number of columns."""
         return self.right - self.left
 
     @property
     def height(self) -> int:
-        """How many rows."""
+        """The number of rows."""
         return self.bottom - self.top
 
     @property

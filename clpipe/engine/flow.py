@@ -31,13 +31,13 @@ TABLES = 1 << 26  # bytes of arrays that are kept on the device, 64 of them at m
 
 
 def room_of_table(buffer: Any) -> int:
-    """What a table's buffer takes of :data:`TABLES`: its bytes, but one may take all."""
+    """The room that a table's buffer takes of :data:`TABLES`: its bytes, but one may take all."""
     return min(max(buffer.size, TABLES // 64), TABLES)
 
 
 @dataclass(frozen=True)
 class ImageTask:
-    """What is to be done to one image.
+    """The work that is to be done to one image.
 
     Args:
         plan: the plan.
@@ -132,7 +132,7 @@ class Flow:
 
     @property
     def depth(self) -> int:
-        """How many tiles may be on the way at a time."""
+        """The number of tiles that may be on the way at a time."""
         return self._transfers.depth
 
     def start(self, image: DeviceImage, memory: int) -> None:

@@ -1,4 +1,4 @@
-"""Which piece of hardware a device is: two OpenCL drivers may offer the same one."""
+"""The piece of hardware that a device is: two OpenCL drivers may offer the same one."""
 
 import ctypes
 import struct
@@ -11,7 +11,7 @@ PCI_BUS_INFO, UUID = 0x410F, 0x106A
 
 @dataclass(frozen=True)
 class Hardware:
-    """What a driver says of a device's hardware; None where it does not.
+    """The hardware of a device, as far as its driver says; None where it does not.
 
     Args:
         platform: the platform's handle.

@@ -1,4 +1,4 @@
-"""What a plan is made of: images, the launches that read and write them, and the plan itself. Pure.
+"""The parts of a plan: images, the launches that read and write them, and the plan itself. Pure.
 
 Images of one size are a level. The source is on level 0; each resampling leads to the next.
 """
@@ -56,7 +56,7 @@ class Launch:
 
     @property
     def stencil(self) -> Stencil | None:
-        """How the opener reads its neighbours, if it is a stencil."""
+        """The access of the opener, if it is a stencil."""
         access = self.opener.pass_.access if self.opener else None
         return access if isinstance(access, Stencil) else None
 
@@ -153,7 +153,7 @@ class Plan:
 
     @cached_property
     def unscaled(self) -> "Plan":
-        """What plans have in common that differ in the scales of resamplings alone: the kernels."""
+        """The plan without the scales of resamplings, on which its kernels do not depend."""
         if not self.resamplings:
             return self
         launches = tuple(unscaled(launch) for launch in self.launches)

@@ -1,4 +1,4 @@
-"""What the buffers of a device hold, so that a launch is left out that would write the same again.
+"""The contents of a device's buffers, so that a launch is left out that would write the same again.
 
 What a launch writes follows from its kernel, the values of its arguments and what the buffers that
 it reads hold. A digest of these stands for it, and the source, which kernels do not make, has a
@@ -27,7 +27,7 @@ def digest_of(*parts: bytes) -> bytes:
 
 @dataclass(frozen=True)
 class LaunchCache:
-    """What buffers hold after an image that went through whole; at first nothing is known.
+    """The contents of buffers after an image that went through whole; at first nothing is known.
 
     Args:
         source: that image's array.
@@ -49,7 +49,7 @@ class LaunchCache:
         extents: Extents,
         bind: Bind,
     ) -> tuple[tuple[int, ...], "LaunchCache"]:
-        """What is to be done for the next image, and what buffers hold when it is done.
+        """The launches to do for the next image, and the contents of buffers after them.
 
         Args:
             calls: of a plan whose launches write each buffer once.

@@ -30,7 +30,7 @@ class Op:
 
     @property
     def radius(self) -> int:
-        """How far from a place it reads."""
+        """The largest distance from a place at which it reads."""
         access = self.pass_.access
         return access.radius if isinstance(access, Stencil | Resample) else 0
 

@@ -1,4 +1,4 @@
-"""What one run of an image is asked for besides its chain."""
+"""Options of one run of an image, besides its chain."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from clpipe.engine.extents import Box
 
 @dataclass(frozen=True)
 class Timing:
-    """How long one launch or transfer took, in seconds on the device.
+    """The time that one launch or transfer took, in seconds on the device.
 
     ``start`` is on the clock of :func:`time.perf_counter`. Transfers are called "upload" and
     "download".
@@ -23,7 +23,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How an image is put through a chain, and what comes back.
+    """Options of one run: how an image is put through a chain, and what comes back.
 
     Args:
         timings: one entry a launch and transfer that is done is appended (devices only).

@@ -17,7 +17,7 @@ from clpipe.engine.tiles import Tiling, buffer_sizes, cutter_of, phases_of
 def with_patches(
     plan: Plan, boxes: Sequence[Box], whole: Tiling, lanes: int, memory: int, ends: int = 1
 ) -> Tiling:
-    """How only parts of an image's result are made.
+    """The tiling that makes only parts of an image's result.
 
     Numbers that are estimated from the whole image are still estimated from all of its tiles, in
     the phases before the last.

@@ -60,7 +60,7 @@ class Programs:
         self._builder = builder_for(info, self.context)
 
     def __len__(self) -> int:
-        """How many programs there are."""
+        """The number of programs."""
         return len(self._programs)
 
     def kernel(self, kernel: Kernel) -> Any:
@@ -107,7 +107,7 @@ class Programs:
 
 
 def builder_for(info: DeviceInfo, context: Any) -> BinaryBuilder | PoclBuilder | None:
-    """What builds a device's programs out of kept ones; None where its driver keeps them itself."""
+    """The builder of a device's programs; None where its driver keeps them itself."""
     from pyopencl.characterize import has_src_build_cache
 
     folder, of_pocl = cache_folder(), pocl_folder()
@@ -161,7 +161,7 @@ def announced(info: DeviceInfo) -> Iterator[None]:
 
 
 def build_log(text: str) -> str:
-    """What the compiler said, out of pyopencl's error message.
+    """The compiler's messages, out of pyopencl's error message.
 
     >>> build_log("failed\\n\\nBuild on <x>:\\n\\nerror: a.cl:2:7: no\\n\\n(options: -a)")
     'error: a.cl:2:7: no'

@@ -277,7 +277,7 @@ class Runner:
         return lambda: self._result(plan, results(), self._estimates_for(*image.shape[1::-1]))
 
     def _estimates_for(self, width: int, height: int) -> dict[str, dict[str, float]]:
-        """What steps say that follows from the size of their image, by step."""
+        """Numbers that follow from the size of the steps' images, by step."""
         found = {}
         for step in self.chain.steps:
             if values := step.method.estimates_for(width, height):
@@ -289,7 +289,7 @@ class Runner:
 
     @staticmethod
     def _result(plan: Plan, output: HostImages, from_size: dict[str, dict[str, float]]) -> Result:
-        """What the device made of an image, by steps."""
+        """The results that the device made of an image, by steps."""
         names = {
             x.op.step: x.op.reduction.estimates for x in plan.launches if isinstance(x, Finalize)
         }

@@ -1,4 +1,4 @@
-"""What kind of device an OpenCL runtime offers, and how kernels are compiled for it."""
+"""Kinds of devices that OpenCL runtimes offer, and how kernels are compiled for them."""
 
 import shutil
 from typing import Any
@@ -24,7 +24,7 @@ def type_of(platform: Any, device: Any) -> str:
 
 
 def lanes_for(type_: str, platform: Any, device: Any, target: Target) -> int:
-    """How many lanes the kernels are compiled for: one vector register on a CPU, 1 on a GPU.
+    """The lanes that kernels are compiled for: one vector register on a CPU, 1 on a GPU.
 
     A CPU whose natural vectors are one wide has a compiler like a GPU's: Mesa's rusticl, which gets
     the pictures of wider ones wrong.
@@ -62,6 +62,6 @@ def platform_id(platform: Any) -> str:
 
 
 def attempt(platform: Any, device: Any, target: Target) -> str:
-    """All that the result of a trial depends on, in one text."""
+    """The conditions that the result of a trial depends on, in one text."""
     parts = (platform_id(platform), device.name, device.version, device.driver_version, target.name)
     return " | ".join(part.strip() for part in parts)

@@ -1,4 +1,4 @@
-"""Which buffers the planes of a plan's images are in, by liveness. Pure."""
+"""Slots: the buffers that the planes of a plan's images are in, by liveness. Pure."""
 
 from collections.abc import Sequence
 

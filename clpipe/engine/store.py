@@ -1,4 +1,4 @@
-"""What is kept between processes, as files that are looked at before they are believed.
+"""A store of what is kept between processes, as files that are looked at before they are believed.
 
 Each file begins with its digest, is written whole or not at all, and is named after all that
 decides what is in it. So there is no lock, nothing goes stale, and what is damaged is not there.
@@ -32,7 +32,7 @@ class Store:
         return self.folder / hashlib.sha256(parts).hexdigest()[:40] if self.folder else None
 
     def load(self, *key: str) -> bytes | None:
-        """What is kept under a key; None where it is not there, or damaged."""
+        """The bytes that are kept under a key; None where it is not there, or damaged."""
         path = self.path(*key)
         if path is None:
             return None

@@ -76,7 +76,7 @@ class Phase:
 
 @dataclass(frozen=True)
 class Tiling:
-    """How an image goes through a plan: its tiles, in which phases, and the bytes it takes.
+    """The way of an image through a plan: its tiles, in which phases, and the bytes it takes.
 
     Where only ``patches`` of the result are made, these are the tiles of the last phase.
     """
@@ -129,7 +129,7 @@ def reduction_of(launch: AnyLaunch) -> Op | None:
 
 
 def leading_to(plan: Plan, ends: set[int]) -> tuple[int, ...]:
-    """These launches, and all that they depend on."""
+    """The launches with these numbers, and all that they depend on."""
     images: set[int] = set()
     chosen = []
     for number, launch in reversed(tuple(enumerate(plan.launches))):
@@ -191,7 +191,7 @@ class Cutter:
         return self.spans_of(axis, cores)
 
     def spans_of(self, axis: Axis, cores: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
-        """As :meth:`spans`, of a tile whose core on each level begins and ends anywhere."""
+        """The :meth:`spans` of a tile whose core on each level begins and ends anywhere."""
         step = self.across if axis == "columns" else 4
         sizes = [e.width if axis == "columns" else e.height for e in self.whole]
         spans: list[tuple[int, ...]] = []
@@ -264,7 +264,7 @@ class Cutter:
 
 @lru_cache(maxsize=64)
 def cutter_of(plan: Plan, width: int, height: int, lanes: int) -> Cutter:
-    """What cuts an image of that size, for a plan and a device of so many lanes."""
+    """The cutter of an image of that size, for a plan and a device of so many lanes."""
     return Cutter(plan, width, height, lanes)
 
 
@@ -272,7 +272,7 @@ def cutter_of(plan: Plan, width: int, height: int, lanes: int) -> Cutter:
 def tiling_of(
     plan: Plan, width: int, height: int, lanes: int, memory: int, largest: int, ends: int = 1
 ) -> Tiling:
-    """How an image goes through a plan in limited memory: whole if it fits, else in tiles.
+    """The tiling for limited memory: an image goes through a plan whole if it fits, else in tiles.
 
     Of the divisions that fit, the one with the smallest share of halos is chosen. Among those that
     differ by less than 2 %, it is the one into the fewest columns, since full rows are transferred

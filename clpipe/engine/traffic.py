@@ -1,4 +1,4 @@
-"""How many bytes a plan takes on a device, and how many its launches move. Pure."""
+"""Bytes that a plan takes on a device, and that its launches move. Pure."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""How pixels reach a device and come back: where they lie in memory, or through staging buffers.
+"""Transfers of pixels to a device and back: where they lie in memory, or through staging buffers.
 
 An image, or a tile of it, goes one way in three steps: ``upload``, ``target`` for the eight-bit
 pixels, and ``fetch`` for each result, whose array may be read when its event is complete and until
@@ -79,7 +79,7 @@ class InPlace:
         return self._end(self._cl.mem_flags.READ_ONLY, data), []
 
     def again(self, source: Array) -> Sent | None:
-        """What the last upload sent, if it was of that array; here it costs nothing to do so."""
+        """The last upload, if it was of that array; here it costs nothing to do one."""
         return None
 
     def target(self, size: int, whole: Array | None) -> Any:
@@ -112,7 +112,7 @@ class InPlace:
         self._queue.flush()
 
     def done(self) -> None:
-        """What was fetched is not needed any more."""
+        """Give back what was fetched, which is not needed any more."""
         maps, self._maps = self._maps, []
         ends, self._ends = self._ends, []
         for array in maps:

@@ -43,7 +43,7 @@ def samples() -> np.ndarray:
 
 
 def expected(source: np.ndarray) -> tuple[Floats, Floats]:
-    """What the kernel makes of halves: noisy values, bit for bit, and quotients."""
+    """The kernel's results for halves: noisy values, bit for bit, and quotients."""
     a, zero = source.astype(np.float32), np.zeros(1, np.uint32)
     word, *_ = philox(np.arange(COUNT, dtype=np.uint32), zero, zero, zero + 3, Stream(1, 2, 3))
     return a + square_root(np.abs(a)) * normal_of(word), a / DIVISOR

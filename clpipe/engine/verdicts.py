@@ -1,4 +1,4 @@
-"""Which OpenCL runtimes work: each is tried once, in a child process, and the result is kept.
+"""Verdicts on OpenCL runtimes: each is tried once, in a child process, and the result is kept.
 
 A runtime that crashes, compiles nothing or computes wrongly is found there, by
 :mod:`clpipe.engine.trial`, and not by a user. What is known is bound to the CPU, the installed
@@ -33,7 +33,7 @@ SENSITIVE = (*VARIABLES, VARIABLE, "POCL_DEVICES", "LD_LIBRARY_PATH", "LD_PRELOA
 
 @dataclass(frozen=True)
 class Verdicts:
-    """What became of trials.
+    """Results of trials.
 
     Args:
         listing: why the platforms cannot be listed at all; "" where they can.
@@ -56,7 +56,7 @@ class Verdicts:
         return bool(self.listing or self.hidden or self.platforms or any(self.attempts.values()))
 
     def of(self, platform: Any, device: Any) -> tuple[Target, str] | None:
-        """What a device compiles for, and why it does not work, or ""; None if it was not tried."""
+        """The target of a device, and why it does not work, or ""; None if it was not tried."""
         targets = candidates(platform, device)
         found = {t: self.attempts.get(attempt(platform, device, t)) for t in targets}
         works = next((t for t, problem in found.items() if problem == ""), None)
@@ -67,7 +67,7 @@ class Verdicts:
 
 
 def verdicts(again: bool = False, missing: Sequence[str] = ()) -> Verdicts:
-    """What is known of this machine's runtimes, after they are tried if that is not known.
+    """The verdicts on this machine's runtimes, after they are tried if that is not known.
 
     Args:
         again: try what failed once more.
@@ -180,13 +180,13 @@ def _parsed(output: bytes) -> Iterator[dict[str, Any]]:
 
 
 def _store() -> Store:
-    """Where verdicts are kept; without a lasting folder, for this process."""
+    """The store of verdicts; without a lasting folder, for this process."""
     folder = cache_folder() or process_folder()
     return Store(folder / "known" if folder else None)
 
 
 def _state() -> str:
-    """All that verdicts hold for: this machine, its drivers and the trial, in one text."""
+    """The conditions of verdicts: this machine, its drivers and the trial, in one text."""
     parts = {
         "cpu": cpu_text(),
         "sys": Path("/sys/devices/system/cpu").is_dir(),

@@ -1,4 +1,4 @@
-"""How many work items do what, and where planes begin for them. Pure."""
+"""Numbers of work items and of lanes, and where planes begin for them. Pure."""
 
 from clpipe.engine.ir import AnyLaunch, Border, Launch
 

@@ -25,6 +25,7 @@ def stage_controls() -> dict[str, Any]:
     return {
         name: {
             "summary": stage.summary,
+            "role": stage.role.name if stage.role else "",
             "methods": [
                 {
                     "name": method.method,

@@ -122,12 +122,12 @@ class Explorer:
         """
         check_named(values, self.named)
         none = replace(self._request, config=None, options={}, image={}, image_name="")
-        if self.goes_on_from_carried:
+        if self.goes_on_from_embedded:
             return replace(none, options=dict(values))
         return replace(none, config=dict(values))
 
     @property
-    def goes_on_from_carried(self) -> bool:
+    def goes_on_from_embedded(self) -> bool:
         """Whether values lie over those that a kept image carries, as none were configured."""
         return self._request.start_at is not None and self._request.config is None
 

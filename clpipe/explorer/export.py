@@ -32,7 +32,7 @@ def exported(explorer: Explorer, image: int, values: Mapping[str, Any]) -> dict[
     loading = [part for file in files for part in ("--stage-file", str(file))]
     options, saved = options_of(used), ["-c", SAVED]
     own = saved if options is None else [*loading, *options]
-    carries = explorer.goes_on_from_carried
+    carries = explorer.goes_on_from_embedded
     # A configuration stands in place of what a kept image carries, so it must have that, too.
     config = explorer.settings(image, values).record() if carries else values
     return {

@@ -151,7 +151,7 @@ class Server:
         return with_pixels(sample.facts, small, place)
 
     def _pixels(self, question: Mapping[str, Any]) -> Response:
-        """All of what was made."""
+        """Pixels of all that was made."""
         (number,) = whole_numbers(question, "number")
         return with_pixels({}, self._explorer.sample(number).shown, {})
 

@@ -31,7 +31,7 @@ class Claim:
 
 
 def plain_claim(width: int, height: int) -> Claim:
-    """That of a mosaic which is read as it is and becomes floats."""
+    """The claim of a mosaic which is read as it is and becomes floats."""
     return Claim(width, height, width * height * FLOAT, width * height * 3 * FLOAT)
 
 

@@ -40,7 +40,7 @@ def open_exr(path: Path, header_only: bool = False, separate: bool = True) -> An
 
 
 def read_channels(path: Path, names: Sequence[str], shape: tuple[int, int]) -> Array | None:
-    """Some channels of an OpenEXR file as stored: (rows, columns, channel), float16 or float32.
+    """Channels of an OpenEXR file as stored: (rows, columns, channel), float16 or float32.
 
     R, G and B without alpha are interleaved in memory; other channels are one plane behind the
     other, of which the array is a view.

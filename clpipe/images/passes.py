@@ -62,7 +62,7 @@ class LayerLocation:
 
     @property
     def without_rank(self) -> str:
-        """Its name, that of a Cryptomatte's layers without their number."""
+        """The name, that of a Cryptomatte's layers without their number."""
         is_rank = "crypto" in self.name.lower() and self.name[-2:].isdigit()
         return self.name[:-2] if is_rank else self.name
 

@@ -372,7 +372,7 @@ def _read_part(
 
 
 def read_samples(path: Path, file: Any, part: int, channels: Sequence[int], type_: Any) -> Array:
-    """Some channels of a part's data window, (rows, columns, channel), as samples of a type.
+    """Channels of a part's data window, (rows, columns, channel), as samples of a type.
 
     Raises:
         ImageError: the part is damaged, or a volume.

@@ -15,7 +15,7 @@ from clpipe.base.errors import ImageError
 from clpipe.base.reading import unchanged
 from clpipe.base.text import one_of
 from clpipe.base.types import Array
-from clpipe.chain.carry import Carry
+from clpipe.chain.carry import AovSpec
 from clpipe.chain.chain import Chain
 from clpipe.images.kinds import CHANNELS, kind_named, vectors_of
 from clpipe.images.passes import (
@@ -38,7 +38,7 @@ SEPARATORS = "_.-"  # between an image's name and what its companion holds
 
 
 @dataclass(frozen=True)
-class CarriedLayer:
+class Aov:
     """A layer as it goes along with a picture.
 
     Args:
@@ -57,7 +57,7 @@ class CarriedLayer:
 
 
 @dataclass(frozen=True)
-class Carried:
+class Aovs:
     """All layers that go along with a picture.
 
     Args:
@@ -66,7 +66,7 @@ class Carried:
         attributes: what goes with them, such as the names of a Cryptomatte's objects.
     """
 
-    layers: tuple[CarriedLayer, ...]
+    layers: tuple[Aov, ...]
     valid: Array
     attributes: Mapping[str, str]
 
@@ -94,10 +94,10 @@ def carry(
     path: Path,
     source: SourceImage,
     chain: Chain,
-    layers: Sequence[Carry],
+    layers: Sequence[AovSpec],
     max_pixels: int,
     orientation: int = 1,
-) -> Carried:
+) -> Aovs:
     """The layers of an image that go along with its picture.
 
     Args:
@@ -136,10 +136,10 @@ def carry(
         read.append(Layer(each.kind, pixels, x, y, vectors if each.kind == "flow" else ()))
     moved, valid = warp(read, geometry_of(chain, orientation), *whole)
     carried = tuple(
-        CarriedLayer(each.name, each.kind, each.channels, pixels, _record(path, each, sums))
+        Aov(each.name, each.kind, each.channels, pixels, _record(path, each, sums))
         for each, pixels in zip(found, moved, strict=True)
     )
-    return Carried(carried, valid, attributes)
+    return Aovs(carried, valid, attributes)
 
 
 def geometry_of(chain: Chain, orientation: int) -> Geometry | None:
@@ -192,7 +192,7 @@ class Finder:
     patterns: Sequence[str] = ()
     layers: dict[Path, list[LayerLocation]] = field(default_factory=dict)  # of the files so far
 
-    def find(self, asked: Carry) -> list[FoundLayer]:
+    def find(self, asked: AovSpec) -> list[FoundLayer]:
         """A layer that is asked for; of a Cryptomatte each rank.
 
         Raises:
@@ -248,7 +248,7 @@ class Finder:
             self.layers[file] = find_layers(file)
         return self.layers[file]
 
-    def _found(self, asked: Carry, file: Path, location: LayerLocation) -> FoundLayer:
+    def _found(self, asked: AovSpec, file: Path, location: LayerLocation) -> FoundLayer:
         kind = asked.kind or kind_of(asked.name, location)
         if kind is None:
             raise ImageError(

@@ -10,7 +10,7 @@ from clpipe.base.digests import digests, stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.reading import unchanged
 from clpipe.base.types import Array, Floats
-from clpipe.chain.carry import Carry
+from clpipe.chain.carry import AovSpec
 from clpipe.chain.chain import Chain
 from clpipe.chain.depth import depth_steps
 from clpipe.images.passes import read_layer
@@ -27,7 +27,7 @@ def read_depth(
     width: int,
     height: int,
     margins: Margins,
-    carried: Sequence[Carry],
+    carried: Sequence[AovSpec],
     max_pixels: int,
 ) -> Depth:
     """The depth of an image.
@@ -75,7 +75,7 @@ def _find(path: Path, step: str, name: str, patterns: Sequence[str]) -> FoundLay
     errors = []
     for asked in (name,) if name else USUAL:
         try:
-            return Finder(path, patterns).find(Carry(asked, "depth"))[0]
+            return Finder(path, patterns).find(AovSpec(asked, "depth"))[0]
         except ImageError as error:
             errors.append(str(error))
     usual = "" if name else f" (nor {', '.join(USUAL[1:])})"

@@ -47,7 +47,7 @@ def attributes_of(step: Step, chain: Chain, key: str, frame: int | None = None) 
     }
 
 
-def carried_settings(attributes: Mapping[str, str], folder: Path | None = None) -> Settings | None:
+def embedded_settings(attributes: Mapping[str, str], folder: Path | None = None) -> Settings | None:
     """The settings that a kept image was made with; None where it has no such attribute.
 
     Args:
@@ -93,7 +93,7 @@ class KeptLoader:
             RequestError: it cannot be made.
         """
         try:
-            return self._chain(self.request, carried_settings(read_attributes(path), self.folder))
+            return self._chain(self.request, embedded_settings(read_attributes(path), self.folder))
         except RequestError:
             return self._chain(self.request, None)
 
@@ -133,7 +133,7 @@ class KeptLoader:
 
     def _chain_for(self, request: Request, path: Path, attributes: Mapping[str, str]) -> Chain:
         try:
-            chain = self._chain(request, carried_settings(attributes, self.folder))
+            chain = self._chain(request, embedded_settings(attributes, self.folder))
         except RequestError as error:
             raise ImageError(f"{path}: what it was made with cannot be used: {error}") from None
         noise = attributes.get(NOISE)
@@ -142,9 +142,9 @@ class KeptLoader:
         return _without_input_noise(chain) if noise in ("none", CLEAN) else chain
 
     @staticmethod
-    def _chain(request: Request, carried: Settings | None) -> Chain:
+    def _chain(request: Request, embedded: Settings | None) -> Chain:
         """The chain of a request; a configuration that is named replaces what an image carries."""
-        return request.chain(carried if request.config is None else None)
+        return request.chain(embedded if request.config is None else None)
 
     def _is_next(self, chain: Chain, attributes: Mapping[str, str]) -> bool:
         """Whether an image was kept right before ``start_at``, as far as it says."""

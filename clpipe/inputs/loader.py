@@ -27,7 +27,7 @@ from clpipe.images.read import (
     SourceImage,
     read_source,
 )
-from clpipe.inputs.carry import Carried, carry
+from clpipe.inputs.carry import Aovs, carry
 from clpipe.inputs.depth import read_depth
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import KeptLoader, kind_message
@@ -217,7 +217,7 @@ class ImageLoader:
         if loaded is None:
             return None
         source, request = loaded.source, self.request
-        carried, most = request.carried(), request.max_pixels or USUAL_MAX_PIXELS
+        carried, most = request.aov_specs(), request.max_pixels or USUAL_MAX_PIXELS
 
         def depth(chain: Chain, width: int, height: int, margins: Margins) -> Depth:
             return read_depth(job.path, chain, width, height, margins, carried, most)
@@ -246,7 +246,7 @@ class ImageLoader:
             source = replace(source, warnings=(*source.warnings, warning))
         return LoadedImage(self.chain, source, key)
 
-    def carried(self, job: Job, loaded: LoadedImage, orientation: int = 1) -> Carried:
+    def aovs(self, job: Job, loaded: LoadedImage, orientation: int = 1) -> Aovs:
         """The layers that go along with a job's picture.
 
         Args:
@@ -259,7 +259,7 @@ class ImageLoader:
         """
         request = self.request
         most = request.max_pixels or USUAL_MAX_PIXELS
-        layers = request.carried()
+        layers = request.aov_specs()
         return carry(job.path, loaded.source, loaded.chain, layers, most, orientation)
 
     def is_left_out(self, job: Job, error: Exception) -> bool:

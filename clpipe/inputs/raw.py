@@ -14,7 +14,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import sha256_of
 from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_name, load_camera
 from clpipe.chain.chain import Chain
-from clpipe.chain.registry import all_stages
+from clpipe.chain.registry import all_stages, stage_in
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
 from clpipe.images.dump import Dump, read_dump
@@ -23,7 +23,7 @@ from clpipe.images.raw import RAW_SUFFIXES, RawFacts, read_facts, read_raw
 from clpipe.images.read import RENDER_SUFFIXES, SourceImage
 from clpipe.images.tags import Tags, to_attributes
 from clpipe.inputs.plausibility import brightness_warnings, input_warnings
-from clpipe.stage import Kind
+from clpipe.stage import Kind, StageRole
 
 UNKNOWN_COLOURS = "its colour matrix is unknown; its colours stay those of the sensor"
 
@@ -116,12 +116,13 @@ class RawLoader:
 
     def _chain(self, path: Path, facts: RawFacts | Dump) -> tuple[Chain, list[str]]:
         """The chain for a raw, and warnings about what its file does not say, or says wrongly."""
-        carried, warnings = settings_of(facts)
-        parameters = dict(carried.parameters)
+        embedded, warnings = settings_of(facts)
+        parameters = dict(embedded.parameters)
         own = self.request.settings().drawn("")  # an example, where there is no image yet
-        if "white_balance" in warnings and own.parameters.get("white_balance"):
-            del parameters["white_balance"]  # the user's own replaces what stands in for the file's
-        settings = self.request.settings(replace(carried, parameters=parameters)).drawn("")
+        balance = name_of(StageRole.BALANCE)
+        if balance in warnings and own.parameters.get(balance):
+            del parameters[balance]  # the user's own replaces what stands in for the file's
+        settings = self.request.settings(replace(embedded, parameters=parameters)).drawn("")
         camera = load_camera(settings.camera)
         low, high = camera.iso_range
         iso = min(max(settings.iso, low), high)
@@ -134,7 +135,7 @@ class RawLoader:
             settings = replace(settings, iso=iso)
         chain = self._chain_from(settings)
         self._check(path, facts, chain)
-        return chain, _remaining(warnings, chain, carried)
+        return chain, _remaining(warnings, chain, embedded)
 
     def _check(self, path: Path, facts: RawFacts | Dump, chain: Chain) -> None:
         """See that a chain can take a raw.
@@ -149,36 +150,38 @@ class RawLoader:
                 f"{path}: a raw enters at {first_raw_step(settings)}; "
                 f"{self.request.start_at} reads {chain.source.label}"
             )
-        pattern = settings.parameters.get("mosaic", {}).get("pattern", "RGGB")
+        name = name_of(StageRole.PATTERN)
+        pattern = settings.parameters.get(name, {}).get("pattern", "RGGB")
         if chain.steps[0].context.pattern != pattern:
             raise ImageError(
-                f"{path}: its pattern is {pattern}, which the mosaic stage says, but the chain has "
-                "none; list mosaic and quantize first (they are not run on a raw)"
+                f"{path}: its pattern is {pattern}, which the {name} stage says, but the chain has "
+                f"none; list {name} and what makes DN first (they are not run on a raw)"
             )
-        levels = settings.parameters.get("normalize", {})
+        name = name_of(StageRole.LEVELS)
+        levels = settings.parameters.get(name, {})
         if isinstance(facts, RawFacts) and not {"black_level", "white_level"} <= levels.keys():
             raise ImageError(
                 f"{path}: its levels cannot be right: black {facts.black_level}, white "
-                f"{facts.white_level} (--set normalize.black_level, normalize.white_level)"
+                f"{facts.white_level} (--set {name}.black_level, {name}.white_level)"
             )
 
 
-def _remaining(warnings: dict[str, str], chain: Chain, carried: Settings) -> list[str]:
+def _remaining(warnings: dict[str, str], chain: Chain, embedded: Settings) -> list[str]:
     """The warnings that still hold: not about what the user set, or what no step of the chain uses.
 
     Args:
         warnings: by what they are about.
         chain: the chain for the raw.
-        carried: the settings that the raw carries.
+        embedded: the settings that the raw carries.
     """
     settings, stages = chain.settings, {step.stage.name for step in chain.steps}
-    is_denoised = "denoise" in stages
+    is_denoised = chain.step_in(StageRole.DENOISING) is not None
     is_current = {
-        "no_iso": is_denoised and settings.iso == carried.iso,
-        "camera": is_denoised and settings.camera == carried.camera,
+        "no_iso": is_denoised and settings.iso == embedded.iso,
+        "camera": is_denoised and settings.camera == embedded.camera,
     }
-    for name in ("white_balance", "color_matrix"):
-        same = settings.parameters.get(name) == carried.parameters.get(name)
+    for name in map(name_of, (StageRole.BALANCE, StageRole.COLOURS)):
+        same = settings.parameters.get(name) == embedded.parameters.get(name)
         is_current[name] = same and name in stages
     return [text for about, text in warnings.items() if is_current.get(about, True)]
 
@@ -195,16 +198,22 @@ def first_raw_step(settings: Settings) -> str:
     for name in settings.stages:
         if all_stages()[name].reads is Kind.RAW and name not in settings.skip:
             return name
-    raise RequestError("no stage of the chain reads a raw; normalize does")
+    raise RequestError(f"no stage of the chain reads a raw; {name_of(StageRole.LEVELS)} does")
+
+
+def name_of(role: StageRole) -> str:
+    """The name of the stage that has a role, under which a raw carries its parameters."""
+    return stage_in(role).name
 
 
 def settings_of(facts: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
     """The settings that a raw carries, and warnings by what they are about."""
+    balance, colours = name_of(StageRole.BALANCE), name_of(StageRole.COLOURS)
     if isinstance(facts, Dump):
-        gray_world = {"white_balance": {"method": "gray_world"}}
+        gray_world = {balance: {"method": "gray_world"}}
         return Settings(parameters=gray_world), {
-            "white_balance": "it does not say its white balance; gray_world estimates it",
-            "color_matrix": UNKNOWN_COLOURS,
+            balance: "it does not say its white balance; gray_world estimates it",
+            colours: UNKNOWN_COLOURS,
         }
     warnings: dict[str, str] = {}
     profile = camera_named(facts.make, facts.model)
@@ -218,27 +227,28 @@ def settings_of(facts: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
     iso = facts.iso or Settings().iso
     if not facts.iso:
         warnings["no_iso"] = f"it does not say its ISO; {iso:g} is taken for denoising (--iso)"
-    parameters: dict[str, dict[str, Any]] = {"mosaic": {"pattern": facts.pattern}}
+    parameters: dict[str, dict[str, Any]] = {name_of(StageRole.PATTERN): {"pattern": facts.pattern}}
     if 0 <= facts.black_level < facts.white_level:
         levels = {"black_level": float(facts.black_level), "white_level": float(facts.white_level)}
-        parameters["normalize"] = levels
+        parameters[name_of(StageRole.LEVELS)] = levels
     if facts.gains:
         red_and_blue = dict(zip(("red_gain", "blue_gain"), facts.gains, strict=True))
-        parameters |= {"inverse_white_balance": red_and_blue, "white_balance": {**red_and_blue}}
+        light = name_of(StageRole.BALANCE_OF_LIGHT)
+        parameters |= {light: red_and_blue, balance: {**red_and_blue}}
     else:
-        parameters["white_balance"] = {"method": "gray_world"}
+        parameters[balance] = {"method": "gray_world"}
         multipliers = ", ".join(f"{x:.4g}" for x in facts.as_shot)
-        warnings["white_balance"] = (
+        warnings[balance] = (
             f"its white balance as shot cannot be right, with multipliers {multipliers}; "
             "gray_world estimates it"
         )
     if facts.camera_to_srgb:
         matrix = [list(row) for row in facts.camera_to_srgb]
-        parameters["color_matrix"] = {"method": "camera", "matrix": matrix}
+        parameters[colours] = {"method": "camera", "matrix": matrix}
     elif profile and profile.xyz_to_camera:
-        parameters["color_matrix"] = {"method": "camera"}
+        parameters[colours] = {"method": "camera"}
     else:
-        warnings["color_matrix"] = UNKNOWN_COLOURS
+        warnings[colours] = UNKNOWN_COLOURS
     return Settings(camera=camera, iso=iso, parameters=parameters), warnings
 
 

@@ -288,5 +288,5 @@ def _check_pinhole(model: str, coefficients: Mapping[str, Any]) -> None:
         what = f"has distortion ({bent})" if bent else f"is of the model {model}"
         raise ValueError(
             f"its camera {what}, but a render is straight; take it out of the file, and have "
-            "clpipe bend the picture: --set distortion.method=..."
+            "clpipe bend the picture: clpipe stages distortion"
         )

@@ -13,13 +13,13 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import unchanged
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.chain.chain import step_names
+from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import Settings
 from clpipe.images.read import SourceImage
 from clpipe.inputs.find import Job
 from clpipe.reference.geometry import Margins
+from clpipe.stage import StageRole
 from clpipe.stages.shutter import Rows
-
-SHUTTER = "shutter"
 
 
 def shutter_of(settings: Settings) -> Rows | None:
@@ -28,13 +28,14 @@ def shutter_of(settings: Settings) -> Rows | None:
     Raises:
         RequestError: how many frames it averages is drawn.
     """
-    if SHUTTER not in step_names(settings):
+    name = stage_in(StageRole.SHUTTER).name
+    if name not in step_names(settings):
         return None
-    if f"{SHUTTER}.subframes" in settings.draws:
+    if f"{name}.subframes" in settings.draws:
         raise RequestError(
-            "shutter.subframes: found a draw; it says how files are grouped, so it is one number"
+            f"{name}.subframes: found a draw; it says how files are grouped, so it is one number"
         )
-    shutter = settings.method(SHUTTER)
+    shutter = settings.method(name)
     return shutter if isinstance(shutter, Rows) and shutter.subframes > 1 else None
 
 
@@ -56,8 +57,8 @@ def exposures(jobs: Sequence[Job], settings: Settings) -> list[Job]:
         files = list(own)
         if len(files) % count:
             raise RequestError(
-                f"{folder}: shutter.subframes is {count}, but there are {len(files)} images; "
-                f"give a multiple of {count}"
+                f"{folder}: {stage_in(StageRole.SHUTTER).name}.subframes is {count}, but there are "
+                f"{len(files)} images; give a multiple of {count}"
             )
         for start in range(0, len(files), count):
             first, *others = files[start : start + count]
@@ -91,7 +92,7 @@ def average(job: Job, read: Callable[[Path], SourceImage], shutter: Rows) -> Sou
             source = read(path)
         pixels = source.pixels
         if pixels.ndim != 3:
-            raise ImageError(f"{path}: a mosaic; shutter.subframes averages renders")
+            raise ImageError(f"{path}: a mosaic; subframes are averaged of renders")
         if not found:
             weights = weights_of(shutter, len(job.paths), pixels.shape[0], source.margins)
             total = np.zeros(pixels.shape, np.float32)

@@ -20,7 +20,7 @@ from clpipe.base.files import keep_names, make_folder_of, write_whole
 from clpipe.base.reading import read_bytes
 from clpipe.chain.formats import DNG, ending_of
 from clpipe.chain.render_camera import Matrix, Vector
-from clpipe.chain.rendition import TRUTHS, Rendition
+from clpipe.chain.rendition import BASELINES, NOISY, PICTURES, Rendition, Role
 from clpipe.outputs.existing import is_marked
 from clpipe.outputs.sealed import (
     SIDECAR,
@@ -35,9 +35,17 @@ from clpipe.reference.pose import to_opengl, to_quaternion
 
 CAMERAS, TRANSFORMS, COLMAP = "cameras.json", "transforms.json", "sparse/0"
 
-FILES = (
-    *(CAMERAS, TRANSFORMS),
-    *(f"{COLMAP}/cameras.txt", f"{COLMAP}/images.txt", f"{COLMAP}/points3D.txt"),
+# What is trained on is of one kind: noisy pictures lie in the folder itself, others below.
+OTHERS = (*PICTURES, *BASELINES)
+MODELS = {NOISY: "", **{role: f"models/{Rendition(role).label[1:]}/" for role in OTHERS}}
+
+FILES = tuple(
+    model + name
+    for model in MODELS.values()
+    for name in (
+        *(CAMERAS, TRANSFORMS),
+        *(f"{COLMAP}/cameras.txt", f"{COLMAP}/images.txt", f"{COLMAP}/points3D.txt"),
+    )
 )
 
 NOTE = (
@@ -59,9 +67,17 @@ NERFSTUDIO = {OPENCV: ("k1", "k2", "k3", "p1", "p2"), OPENCV_FISHEYE: ("k1", "k2
 
 @dataclass(frozen=True)
 class Photograph:
-    """A picture of an output folder: its path there, its camera, and R and t, where known."""
+    """A picture of an output folder.
+
+    Args:
+        file: its path there.
+        role: what it is.
+        camera: its intrinsics.
+        pose: R and t, where known.
+    """
 
     file: str
+    role: Role
     camera: Intrinsics
     pose: tuple[Matrix, Vector] | None
 
@@ -72,7 +88,7 @@ class Written:
 
     Args:
         files: by their paths in the folder; none where no picture's intrinsics are known.
-        pictures: how many are in the first of them.
+        pictures: how many are in them.
         left_out: what is not in all of them and why, as texts.
     """
 
@@ -85,7 +101,8 @@ class Written:
         warnings = [f"warning: {each}" for each in self.left_out]
         if not self.files:
             return warnings
-        files = ", ".join(str(folder / name) for name in self.files)
+        shown = dict.fromkeys("/".join(name.split("/")[:2]) for name in self.files)
+        files = ", ".join(str(folder / name) for name in shown)
         return [f"wrote {files}: {self.pictures} picture{'s' * (self.pictures != 1)}", *warnings]
 
 
@@ -112,14 +129,10 @@ def write_camera_files(folder: Path) -> Written:
     check_camera_files(folder)
     left_out: dict[str, list[str]] = defaultdict(list)
     found = sorted(photographs(folder, left_out), key=lambda each: each.file)
-    posed = [each for each in found if each.pose]
-    if posed:
-        left_out[f"no pose, so not in {TRANSFORMS} and images.txt"] = [
-            each.file for each in found if not each.pose
-        ]
-    texts = {CAMERAS: cameras_json(found), **colmap(found, posed, left_out)} if found else {}
-    if nerf := nerfstudio(posed, left_out):
-        texts[TRANSFORMS] = nerf
+    texts: dict[str, str] = {}
+    for role, model in MODELS.items():
+        own = [each for each in found if each.role == role]
+        texts |= {model + name: text for name, text in texts_of(own, model, left_out).items()}
     taken = [name for name in texts if _is_taken(folder / name)]
     for name in taken:
         del texts[name]
@@ -146,6 +159,30 @@ def write_camera_files(folder: Path) -> Written:
     return Written(tuple(name for name in FILES if name in texts), len(found), reasons)
 
 
+def texts_of(
+    pictures: Sequence[Photograph], model: str, left_out: Mapping[str, list[str]]
+) -> dict[str, str]:
+    """The files of pictures of one kind, by their names.
+
+    Args:
+        pictures: sorted.
+        model: the folder that the files are for, below the pictures' own.
+        left_out: gets the names of those that are not in all of them, by the reason.
+    """
+    if not pictures:
+        return {}
+    up = "../" * model.count("/")
+    posed = [each for each in pictures if each.pose]
+    if posed:
+        left_out[f"no pose, so not in {TRANSFORMS} and images.txt"] += [
+            each.file for each in pictures if not each.pose
+        ]
+    texts = {CAMERAS: cameras_json(pictures, up), **colmap(pictures, posed, left_out)}
+    if nerf := nerfstudio(posed, up, left_out):
+        texts[TRANSFORMS] = nerf
+    return texts
+
+
 def _is_taken(path: Path) -> bool:
     """Whether a file of the views would take the place of a picture's sidecar."""
     try:
@@ -157,8 +194,7 @@ def _is_taken(path: Path) -> bool:
 def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Photograph]:
     """The pictures that sidecars of a folder list, in the first format that is no raw.
 
-    Frames of bursts and exposures of brackets are among them; truths are not, for they are what a
-    model made of the pictures is compared with.
+    Frames of bursts and exposures of brackets are among them; mosaics are not.
 
     Args:
         folder: the output folder.
@@ -174,8 +210,9 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
             shown = path.relative_to(folder).as_posix()
             try:
                 values = values_in(read_bytes(path), path)
-                file = values and _picture(path, values)
-                if not values or not file:
+                role = values and Rendition.from_record(values).role
+                file = values and _picture(path, values) if role in MODELS else None
+                if not values or not role or not file:
                     continue
                 shown = file.relative_to(folder).as_posix()
                 if values["intrinsics"] is None:
@@ -184,7 +221,7 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
                 camera = CAMERA.validate_python(values["intrinsics"])
                 pose = values["pose"]
                 r_and_t = pose and POSE.validate_python((pose["R"], pose["t"]))
-                yield Photograph(shown, simplest(camera), r_and_t)
+                yield Photograph(shown, role, simplest(camera), r_and_t)
             except SidecarError:
                 left_out[f"{CHANGED}, so not used; the same clpipe run makes it again"].append(
                     shown
@@ -196,13 +233,13 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
 
 
 def _picture(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
-    """The picture of a sidecar; None where it is a truth's, or there is none.
+    """The picture of a sidecar; None where there is none.
 
     Raises:
         KeyError, TypeError, ValueError: the values are damaged.
     """
     formats = [each for each in values["request"]["formats"] if each != DNG]
-    if Rendition.from_record(values).role in TRUTHS or not formats:
+    if not formats:
         return None
     file = sidecar.with_name(f"{sidecar.name.removesuffix(SIDECAR)}{ending_of(formats[0])}")
     return file if file.name in outputs_in(values) and file.exists() else None
@@ -225,13 +262,13 @@ def simplest(camera: Intrinsics) -> Intrinsics:
     return replace(camera, model=model, distortion=own)
 
 
-def cameras_json(pictures: Sequence[Photograph]) -> str:
-    """A cameras.json, which ``--poses`` reads, too."""
+def cameras_json(pictures: Sequence[Photograph], up: str = "") -> str:
+    """A cameras.json, which ``--poses`` reads, too; ``up`` leads to the pictures' folder."""
     views = []
     for each in pictures:
         camera = each.camera
         k = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
-        view = {"file": each.file, "width": camera.width, "height": camera.height, "K": k}
+        view = {"file": up + each.file, "width": camera.width, "height": camera.height, "K": k}
         view |= dict(zip("Rt", each.pose, strict=True)) if each.pose else {}
         views.append({**view, "model": camera.model, "distortion": dict(camera.distortion)})
     return json_text({"note": NOTE, "views": views})
@@ -284,7 +321,7 @@ def _text(values: Sequence[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def nerfstudio(pictures: Sequence[Photograph], left_out: Mapping[str, list[str]]) -> str:
+def nerfstudio(pictures: Sequence[Photograph], up: str, left_out: Mapping[str, list[str]]) -> str:
     """A transforms.json of nerfstudio's; "" where no picture can be in it.
 
     https://docs.nerf.studio/quickstart/data_conventions.html. It counts pixels as COLMAP does. Its
@@ -293,6 +330,7 @@ def nerfstudio(pictures: Sequence[Photograph], left_out: Mapping[str, list[str]]
 
     Args:
         pictures: those whose pose is known.
+        up: the way from the file's folder to the pictures'.
         left_out: gets the names that the format cannot hold, by the reason.
     """
     fisheyes = [each for each in pictures if each.camera.model == OPENCV_FISHEYE]
@@ -309,7 +347,9 @@ def nerfstudio(pictures: Sequence[Photograph], left_out: Mapping[str, list[str]]
         sizes = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
         own = {name: camera.distortion.get(name, 0.0) for name in NERFSTUDIO[model]}
         cameras.append({**sizes, "cx": camera.cx, "cy": camera.cy, **own})
-        frames.append({"file_path": each.file, "transform_matrix": to_opengl(*each.pose).tolist()})
+        frames.append(
+            {"file_path": up + each.file, "transform_matrix": to_opengl(*each.pose).tolist()}
+        )
     if not frames:
         return ""
     shared = cameras[0] if all(each == cameras[0] for each in cameras) else {}

@@ -9,12 +9,12 @@ from clpipe.base.types import Array
 from clpipe.chain.carry import VALID
 from clpipe.images.attributes import PREFIX
 from clpipe.images.write import write_grey_png, write_planes
-from clpipe.inputs.carry import CARRIED, Carried
+from clpipe.inputs.carry import CARRIED, Aovs
 
 MM = 1000  # in a metre
 
 
-def write_carried(path: Path, carried: Carried, depth: str = "") -> Stored:
+def write_carried(path: Path, carried: Aovs, depth: str = "") -> Stored:
     """Write all carried layers as an EXR, or one of them, a depth in metres, as a PNG.
 
     The EXR has the layers' own channels, in their own types, and the channel :data:`VALID`.

@@ -7,7 +7,7 @@ from clpipe.base.errors import RequestError
 from clpipe.camera.profile import IDENTITY
 from clpipe.chain.chain import Chain
 from clpipe.images.dng import Negative, xyz_to_camera
-from clpipe.stage import Context, Kind
+from clpipe.stage import Context, Kind, StageRole
 
 
 def negative_of(chain: Chain) -> Negative:
@@ -26,7 +26,7 @@ def negative_of(chain: Chain) -> Negative:
         )
     context = first.context if is_input else makers[-1].method.next_context(makers[-1].context)
     end = last.method.next_context(last.context)
-    is_balanced = any(step.stage.name == "white_balance" for step in chain.steps)
+    is_balanced = chain.step_in(StageRole.BALANCE) is not None
     gains = end.applied_gains if is_input and is_balanced else context.gains
     levels = first.method if is_input else context  # normalize has the levels of a raw that enters
     black = _level(levels, "black_level", chain.camera.black_level)
@@ -34,7 +34,7 @@ def negative_of(chain: Chain) -> Negative:
     if white != int(white):
         raise RequestError(
             f"--format dng: found a white level of {white:g}, but DNG wants whole DN; "
-            f"--set quantize.white_level={white:.0f}"
+            f"--set {(first if is_input else makers[-1]).name}.white_level={white:.0f}"
         )
     return Negative(
         step=None if is_input else makers[-1].name,

@@ -114,7 +114,7 @@ class Cutting:
         return self._columns * -(-self.height // self.size)
 
     def in_grid(self, numbers: Sequence[int], owner: str) -> list[Patch]:
-        """Some of these, by their numbers, row by row; the last of a row or column ends with it.
+        """Patches side by side, by their numbers, row by row; the last end where the picture does.
 
         Patches move by up to a pixel where the pattern wants that. ``owner`` as for :meth:`drawn`.
         """
@@ -201,7 +201,7 @@ class Patches:
     def cut(
         self, cutting: Cutting, numbers: Sequence[int], chain: Chain, key: str, epoch: int = 0
     ) -> list[Patch]:
-        """Some of them, by their numbers, as they are for a chain's seed and an image's key."""
+        """Patches, by their numbers, as they are for a chain's seed and an image's key."""
         owner = f"patch:{chain.seed}:{key}:{epoch}"
         cut = cutting.in_grid if self.per_image == "grid" else cutting.drawn
         return cut(numbers, owner)

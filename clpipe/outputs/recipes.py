@@ -8,6 +8,7 @@ from clpipe.base.errors import KeyedError, RequestError
 from clpipe.chain.baseline import baseline_of, matching_of
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.identity import noise_key, of_bracket
+from clpipe.chain.registry import stage_in
 from clpipe.chain.rendition import (
     BASELINES,
     CLEAN,
@@ -23,8 +24,7 @@ from clpipe.chain.rendition import (
 from clpipe.chain.settings import overlay
 from clpipe.chain.truth import noisy_mosaic, picture_without_noise, signal_and_noise
 from clpipe.outputs.spread import Spread
-
-EXPOSURE = "exposure"  # the step whose ev a bracket adds to
+from clpipe.stage import StageRole
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class RenditionPlan:
         return [role for role in (NOISY, *TRUTHS, *BASELINES) if role in asked]
 
     def needed(self, renditions: Iterable[Rendition]) -> set[Rendition]:
-        """These renditions, with those that a baseline among them is measured on."""
+        """Renditions, with those that a baseline among them is measured on."""
         needed = set(renditions)
         for each in tuple(needed):
             if each.role in BASELINES:
@@ -141,32 +141,32 @@ def measured_on(baseline: Rendition) -> tuple[Rendition, Rendition, Rendition]:
 
 @lru_cache(maxsize=64)  # as chain_and_noise
 def exposed(chain: Chain, ev: float) -> Chain:
-    """A chain with so many EV more in its step ``exposure``, and with noise of its own.
+    """A chain that is exposed by so many EV more, and with noise of its own.
 
     Raises:
         RequestError: it has no such step, or the sum is not allowed.
     """
-    place = next((i for i, step in enumerate(chain.steps) if step.name == EXPOSURE), None)
-    before = None if place is None else getattr(chain.steps[place].method, "ev", None)
-    if place is None or before is None:
-        names = ", ".join(step.name for step in chain.steps)
+    step = chain.step_in(StageRole.EXPOSURE)
+    before = getattr(step and step.method, "ev", None)
+    if step is None or before is None:
+        names = ", ".join(each.name for each in chain.steps)
+        name = stage_in(StageRole.EXPOSURE).name
         raise RequestError(
-            f"--bracket: it adds to {EXPOSURE}.ev, but this chain has no stage {EXPOSURE}: {names}"
+            f"--bracket: it adds to {name}.ev, but this chain has no stage {name}: {names}"
         )
     if not ev:
         return chain
     try:
-        settings = overlay(chain.settings, {EXPOSURE: {"ev": before + ev}})
+        settings = overlay(chain.settings, {step.name: {"ev": before + ev}})
     except KeyedError as error:
         raise RequestError(
-            f"--bracket: {ev:+g} EV on {EXPOSURE}.ev={before:g} is too far; {error}"
+            f"--bracket: {ev:+g} EV on {step.name}.ev={before:g} is too far; {error}"
         ) from None
     if settings.noise_key:
         settings = replace(settings, noise_key=of_bracket(settings.noise_key, ev))
-    step = chain.steps[place]
-    method = settings.method(EXPOSURE).resolve(step.context)
-    steps = (*chain.steps[:place], replace(step, method=method), *chain.steps[place + 1 :])
-    return replace(chain, steps=steps, settings=settings)
+    method = settings.method(step.name).resolve(step.context)
+    steps = (replace(s, method=method) if s is step else s for s in chain.steps)
+    return replace(chain, steps=tuple(steps), settings=settings)
 
 
 @lru_cache(maxsize=64)  # most images of a run share one chain, and plans are cached per chain

@@ -17,7 +17,7 @@ from clpipe.engine.runner import Result
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import FLIPS, orientation_of
 from clpipe.images.write import versions
-from clpipe.inputs.carry import Carried
+from clpipe.inputs.carry import Aovs
 from clpipe.inputs.find import Job
 from clpipe.inputs.raw import RawImage
 from clpipe.outputs.patches import Patch, facts_of
@@ -70,7 +70,7 @@ def sidecar(
     result: Result,
     outputs: Mapping[Path, Stored],
     clipped: float | None,
-    carried: Carried | None = None,
+    carried: Aovs | None = None,
     patches: Sequence[Patch] = (),
 ) -> dict[str, Any]:
     """Everything that is needed to make the files of a rendition again, as JSON values.
@@ -112,7 +112,7 @@ def sidecar(
         "camera": chain.camera.name,
         "iso": chain.iso,
         "output": chain.settings.output.model_dump()
-        | chain.settings.render.filled(source.shot).model_dump(exclude=POSE),
+        | chain.settings.render.with_defaults(source.shot).model_dump(exclude=POSE),
         "intrinsics": intrinsics.record() if intrinsics else None,
         "pose": chain.settings.render.pose,
         "noise": noise.record() if noise else None,

@@ -25,7 +25,7 @@ from clpipe.images.dng import write_dng
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import TAG_ATTRIBUTES, Tags, from_attributes, orientation_of, upright
 from clpipe.images.write import JPEG_MAX_SIDE, write_display, write_exr, write_npy
-from clpipe.inputs.carry import CARRIED, Carried
+from clpipe.inputs.carry import CARRIED, Aovs
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import attributes_of
 from clpipe.outputs.carried import write_carried
@@ -123,7 +123,7 @@ class OutputWriter:
         """The files of carried layers: that of all, "", and the PNG of each depth by its name."""
         if not self.carries(rendition):
             return {}
-        depths = [each.name for each in self.request.carried() if each.png]
+        depths = [each.name for each in self.request.aov_specs() if each.png]
         return {
             "": self.path(job, f"{CARRIED}.exr"),
             **{name: self.path(job, f"{name}.png") for name in depths},
@@ -269,7 +269,7 @@ class OutputWriter:
         recipe: Recipe,
         source: SourceImage,
         result: Result,
-        carried: Carried | None = None,
+        carried: Aovs | None = None,
         patches: Sequence[Patch] = (),
     ) -> dict[Path, Stored]:
         """Write the images of one rendition, or of patches of it.

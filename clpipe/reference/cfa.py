@@ -19,6 +19,17 @@ def red_site(pattern: Pattern) -> tuple[int, int]:
     return pattern.index("R") % 2, pattern.index("R") // 2
 
 
+def sites(pattern: Pattern) -> dict[str, tuple[slice, slice]]:
+    """The rows and columns of R, G1, G2 and B in a mosaic; G1 is in the rows of red.
+
+    >>> sites("GRBG")["R"]
+    (slice(0, None, 2), slice(1, None, 2))
+    """
+    x, y = red_site(pattern)
+    places = {"R": (y, x), "G1": (y, 1 - x), "G2": (1 - y, x), "B": (1 - y, 1 - x)}
+    return {name: np.s_[row::2, column::2] for name, (row, column) in places.items()}
+
+
 def by_site(
     shape: tuple[int, ...],
     pattern: Pattern,

@@ -1,12 +1,13 @@
 """Light spread by how far its surface is from focus: twin of ``kernels/defocus.cl``."""
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
+from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.reference.image import tap
@@ -21,12 +22,12 @@ class Depth:
     Args:
         pixels: (height, width), above 0, in any unit; infinite where there is nothing.
         record: what a sidecar says of where it is from.
-        derived: what follows from it, by what that depends on, so that renditions share it.
+        derived: what follows from it, by what that depends on; renditions share it.
     """
 
     pixels: Floats
     record: Mapping[str, Any] = field(default_factory=dict)
-    derived: dict[Hashable, Any] = field(default_factory=dict)
+    derived: BoundedCache[Any] = field(default_factory=lambda: BoundedCache(2))
 
 
 NOWHERE = Depth(np.full((1, 1), np.inf, np.float32))

@@ -66,7 +66,7 @@ class Geometry(Protocol):
         ...
 
     def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
-        """Those of its result, from those of an image that it gets; None where they are not known.
+        """The intrinsics of the result, from those of the image before; None where not known.
 
         Raises:
             RequestError: they contradict what it does.

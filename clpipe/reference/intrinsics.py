@@ -54,7 +54,7 @@ class Intrinsics:
         shot: Mapping[str, float],
         places: Mapping[str, str] = MappingProxyType({}),
     ) -> "Intrinsics | None":
-        """Those of a render, which has no distortion; None where its focal length is not known.
+        """The intrinsics of a render, undistorted; None where its focal length is not known.
 
         Args:
             width, height: in px.
@@ -92,13 +92,13 @@ class Intrinsics:
         return cls(width, height, fx, shot.get("fy", fx), cx, cy)
 
     def scaled(self, width: int, height: int) -> "Intrinsics":
-        """Those of the picture made another size, its edges staying where they are."""
+        """The intrinsics of the picture made another size, its edges staying where they are."""
         x, y = width / self.width, height / self.height
         places = self.fx * x, self.fy * y, self.cx * x, self.cy * y
         residual = self.residual * max(x, y)
         return Intrinsics(width, height, *places, self.model, self.distortion, residual)
 
     def record(self) -> dict[str, Any]:
-        """All of them as JSON values; coefficients that are not given are 0."""
+        """Intrinsics as JSON values; coefficients that are not given are 0."""
         names = COEFFICIENTS[self.model]
         return {**asdict(self), "distortion": {n: self.distortion.get(n, 0.0) for n in names}}

@@ -79,7 +79,7 @@ class Grid:
 
 
 def sum_of(terms: Iterator[Floats]) -> Floats:
-    """Their sum, in order."""
+    """The sum of terms, in order."""
     total = next(terms)
     for term in terms:
         total = total + term

@@ -188,7 +188,7 @@ class Large:
 
     @classmethod
     def of(cls, made: Made, pixels: Array) -> "Large":
-        """Without views yet.
+        """An image, without views yet.
 
         Args:
             made: the picture.

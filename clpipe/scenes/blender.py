@@ -26,7 +26,7 @@ class RenderError(ClpipeError):
 
 @dataclass(frozen=True)
 class Rendering:
-    """What is asked of Blender.
+    """A request to Blender.
 
     Args:
         scene: the .blend file.
@@ -50,7 +50,7 @@ class Rendering:
     seed: int
 
     def record(self) -> dict[str, Any]:
-        """It as JSON values."""
+        """The rendering as JSON values."""
         return {**asdict(self), "scene": str(self.scene), "folder": str(self.folder)}
 
 

@@ -21,7 +21,7 @@ from clpipe.stage.bases import (
 )
 from clpipe.stage.checking import run_reference, variant_label, variants
 from clpipe.stage.context import Context, ReferenceContext
-from clpipe.stage.method import Method, Stage, parameter
+from clpipe.stage.method import Method, Stage, StageRole, parameter
 from clpipe.stage.passes import (
     Argument,
     CompileTime,
@@ -58,6 +58,7 @@ __all__ = [
     "ReferenceContext",
     "Resample",
     "Stage",
+    "StageRole",
     "Stencil",
     "TableLookup",
     "Unchanged",

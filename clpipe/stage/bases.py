@@ -1,4 +1,4 @@
-"""What several methods have in common: bases to derive from, and a check of window sizes."""
+"""Parts that several methods have in common: bases to derive from, and a check of window sizes."""
 
 from collections.abc import Mapping
 from typing import ClassVar

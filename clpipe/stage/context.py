@@ -1,4 +1,4 @@
-"""What a stage knows besides its image and its parameters."""
+"""Contexts: what a stage knows besides its image and its parameters."""
 
 import weakref
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from clpipe.stage.passes import CompileTime, NoiseScope
 
 @dataclass(frozen=True)
 class Context:
-    """What the steps before a stage say of the image that it reads."""
+    """Facts about the image that a stage reads, from the steps before it."""
 
     camera: Camera
     iso: float
@@ -48,7 +48,7 @@ class Context:
 
 @dataclass
 class ReferenceContext:
-    """What a reference gets besides the image and its parameters.
+    """Inputs of a reference besides the image and its parameters.
 
     ``stream`` has the random streams by scope. A reference stores the numbers that it estimates
     from the image, such as gains, in ``estimates``.

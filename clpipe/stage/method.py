@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from enum import Enum
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -79,7 +80,7 @@ class Method(BaseModel):
 
     @property
     def margins(self) -> Margins:
-        """How far the image that it reads goes on beyond the picture."""
+        """The margins of the image that it reads, beyond the picture."""
         return self._margins
 
     def with_margins(self, margins: Margins) -> Self:
@@ -111,7 +112,7 @@ class Method(BaseModel):
         raise NotImplementedError(type(self).__name__)
 
     def geometry(self) -> Geometry | None:
-        """How this (resolved) method moves pixels; None if each stays where it is."""
+        """The way this (resolved) method moves pixels; None if each stays where it is."""
         return None
 
     def estimates_for(self, width: int, height: int) -> Mapping[str, float]:
@@ -173,12 +174,27 @@ def optics_names(method: type[Method]) -> tuple[str, ...]:
     return tuple(name for name, extra in extras.items() if extra and extra.get("optics"))
 
 
+class StageRole(Enum):
+    """What a stage is to the rest of clpipe, which finds it by this and not by its name."""
+
+    EXPOSURE = "its ev is what a bracket adds to"
+    SHUTTER = "its subframes are files of one exposure"
+    PATTERN = "its pattern is that of a raw that enters"
+    LEVELS = "its black_level and white_level are those of a raw that enters"
+    BALANCE_OF_LIGHT = "its red_gain and blue_gain are taken out, as a raw's light has them"
+    BALANCE = "its red_gain and blue_gain are those of a raw that enters"
+    COLOURS = "its matrix is that of a raw that enters"
+    DENOISING = "its strength follows camera and ISO"
+    BASELINE = "its noise is that of a baseline"
+
+
 @dataclass(frozen=True)
 class Stage:
     """A stage by name, with its methods; the first one is the default.
 
     ``explain`` describes in a few lines how automatic parameters follow from the context. ``also``
-    are further kinds that it may read; it then writes the same kind.
+    are further kinds that it may read; it then writes the same kind. ``role`` is what it is beyond
+    its chain.
     """
 
     name: str
@@ -189,6 +205,7 @@ class Stage:
     explain: Callable[[Context], str] | None = None
     folder: Path | None = None  # of a plug-in's kernel files
     also: tuple[Kind, ...] = ()
+    role: StageRole | None = None
 
     def reading(self, kind: Kind | None) -> "Stage":
         """The stage where an image of a kind enters it; the stage as it is if it reads no such."""

@@ -26,12 +26,12 @@ class Kind(Enum):
 
     @property
     def c_name(self) -> str:
-        """Its name in the kernel library's functions, such as ``tap_mosaic``."""
+        """The name in the kernel library's functions, such as ``tap_mosaic``."""
         return "mosaic" if self.c_type == "vf" else self.c_type
 
 
 class NoiseScope(Enum):
-    """What a draw of noise belongs to; the random key is made of it."""
+    """The owner of a draw of noise; the random key is made of it."""
 
     IMAGE = "image"  # each image has its own
     CAMERA = "camera"  # fixed pattern: the same in all images of a camera
@@ -149,7 +149,7 @@ class Pass:
 
     @property
     def gives(self) -> tuple[str, ...]:
-        """What later passes may take as arguments: its estimates, and its table."""
+        """Arguments that it makes for later passes: its estimates, and its table."""
         estimates = self.access.estimates if isinstance(self.access, Reduction) else ()
         return *estimates, self.writes
 

@@ -18,6 +18,7 @@ from clpipe.stage import (
     Pass,
     ReferenceContext,
     Stage,
+    StageRole,
     Unchanged,
     parameter,
 )
@@ -157,4 +158,5 @@ STAGE = Stage(
     Kind.RGB,
     Kind.RGB,
     (NoMatrix, CameraToSrgb, SrgbToCamera, FixedMatrix),
+    role=StageRole.COLOURS,
 )

@@ -204,14 +204,7 @@ class ThinLens(InFocalLengths, OfDepth):
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
         depth = _depth_in(context)
-        if self not in depth.derived:
-            radii = self.clipped(depth.pixels)
-            largest = float(np.ceil(abs(radii).max() * 4)) / 4  # few tables for many images
-            reach = reach_of(largest)
-            around = ((reach, reach), (reach, reach + VECTOR))
-            taps = aperture_taps(self.blades, largest)
-            depth.derived[self] = np.pad(radii, around, "reflect"), reach, taps
-        radii, reach, taps = depth.derived[self]
+        radii, reach, taps = depth.derived.get(self, lambda: self._tables(depth.pixels))
         return {
             "radii": radii,
             "columns": np.int32(radii.shape[1]),
@@ -220,6 +213,14 @@ class ThinLens(InFocalLengths, OfDepth):
             "taps": taps,
             "count": np.int32(len(taps)),
         }
+
+    def _tables(self, depth: Floats) -> tuple[Floats, int, Floats]:
+        """The radii with a border, how wide that is, and the taps of the largest disc."""
+        radii = self.clipped(depth)
+        largest = float(np.ceil(abs(radii).max() * 4)) / 4  # few tables for many images
+        reach = reach_of(largest)
+        border = ((reach, reach), (reach, reach + VECTOR))
+        return np.pad(radii, border, "reflect"), reach, aperture_taps(self.blades, largest)
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         taps = self.arguments(given.context)["taps"]

@@ -138,7 +138,7 @@ class Distortion(HasPicture):
         return self.lens() if self.passes() else None
 
     def estimates_for(self, width: int, height: int) -> Mapping[str, float]:
-        """What ``fit`` makes of the focal length: its factor."""
+        """The factor by which ``fit`` changes the focal length."""
         return {"focal_length_factor": self.lens().scale(width, height)} if self.fit else {}
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
@@ -173,7 +173,7 @@ class OfCamera(InFocalLengths, Distortion):
         return own.with_defaults(fy=own.fx)
 
     def estimates_for(self, width: int, height: int) -> Mapping[str, float]:
-        """What ``fit`` makes of the focal length: its factor, and the focal length in px."""
+        """The factor by which ``fit`` changes the focal length, and that in px."""
         found = super().estimates_for(width, height)
         if not found:
             return found

@@ -11,8 +11,8 @@ from clpipe.stage import Curve, Kind, Stage, parameter
 
 @lru_cache(maxsize=16)
 def power_table(exponent: float) -> Floats:
-    """The table of x^(1/exponent); cached, so that it is uploaded once."""
-    return tabulate(lambda x: x ** (1 / exponent))
+    """The table of x^exponent; cached, so that it is uploaded once."""
+    return tabulate(lambda x: x**exponent)
 
 
 class Power(Curve):
@@ -21,10 +21,10 @@ class Power(Curve):
     method: ClassVar = "power"
     summary: ClassVar = "x^(1/exponent)"
 
-    exponent: float = parameter(2.2, "Gamma; 1 leaves the light linear.", ge=0.1, le=10)
+    exponent: float = parameter(2.2, "Gamma; 1 leaves the values as they are.", ge=0.1, le=10)
 
     def table(self) -> Floats:
-        return power_table(self.exponent)
+        return power_table(1 / self.exponent)
 
 
 SRGB_TABLE = tabulate(srgb_curve)

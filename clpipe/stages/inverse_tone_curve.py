@@ -5,7 +5,6 @@ from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
-from pydantic import field_validator
 
 from clpipe.base.types import Floats
 from clpipe.reference.curve import tabulate
@@ -19,9 +18,8 @@ from clpipe.stage import (
     ReferenceContext,
     Stage,
     Unchanged,
-    parameter,
 )
-from clpipe.stages.tone_curve import CAMERA_RAW
+from clpipe.stages import tone_curve
 from clpipe.stages.tone_curve.filmic import A, B, C, D, inverse_filmic, keep_hue
 from clpipe.stages.tone_curve.table import table_of
 
@@ -74,7 +72,7 @@ class CameraRaw(Curve):
     summary: ClassVar = "undo the default curve of Adobe Camera Raw (DNG SDK)"
 
     def table(self) -> Floats:
-        return inverse_table(CAMERA_RAW)
+        return inverse_table(tone_curve.CAMERA_RAW)
 
 
 class Linear(Unchanged):
@@ -84,27 +82,11 @@ class Linear(Unchanged):
     summary: ClassVar = "no curve to undo"
 
 
-class File(Curve):
+class File(tone_curve.File):
     """The inverse of a curve from a file, on each channel."""
 
-    method: ClassVar = "file"
     summary: ClassVar = "undo a curve from a .csv or one-dimensional .cube file"
-
-    path: str = parameter(
-        CAMERA_RAW,
-        "The file of the curve; a configuration gives it relative to itself.",
-        auto="camera_raw.csv",
-        file=True,
-    )
-
-    @field_validator("path")
-    @classmethod
-    def _readable(cls, path: str) -> str:
-        inverse_table(path)
-        return path
-
-    def table(self) -> Floats:
-        return inverse_table(self.path)
+    read: ClassVar = staticmethod(inverse_table)
 
 
 STAGE = Stage(

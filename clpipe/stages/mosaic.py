@@ -8,7 +8,17 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
-from clpipe.stage import Argument, Context, Kind, Method, Pass, ReferenceContext, Stage, parameter
+from clpipe.stage import (
+    Argument,
+    Context,
+    Kind,
+    Method,
+    Pass,
+    ReferenceContext,
+    Stage,
+    StageRole,
+    parameter,
+)
 
 
 class Bayer(Method):
@@ -43,5 +53,10 @@ class Bayer(Method):
 
 
 STAGE = Stage(
-    "mosaic", "Lay a colour filter array over the image.", Kind.RGB, Kind.MOSAIC, (Bayer,)
+    "mosaic",
+    "Lay a colour filter array over the image.",
+    Kind.RGB,
+    Kind.MOSAIC,
+    (Bayer,),
+    role=StageRole.PATTERN,
 )

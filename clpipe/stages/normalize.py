@@ -7,7 +7,17 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, Kind, Method, Pass, ReferenceContext, Stage, parameter
+from clpipe.stage import (
+    Argument,
+    Context,
+    Kind,
+    Method,
+    Pass,
+    ReferenceContext,
+    Stage,
+    StageRole,
+    parameter,
+)
 
 
 class Linear(Method):
@@ -75,4 +85,11 @@ class Linear(Method):
         return (image - np.float32(self.black_level)) * scale
 
 
-STAGE = Stage("normalize", "Apply the levels: DN to signal.", Kind.RAW, Kind.MOSAIC, (Linear,))
+STAGE = Stage(
+    "normalize",
+    "Apply the levels: DN to signal.",
+    Kind.RAW,
+    Kind.MOSAIC,
+    (Linear,),
+    role=StageRole.LEVELS,
+)

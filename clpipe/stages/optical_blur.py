@@ -37,7 +37,7 @@ UNROLLED = (
 
 
 def along(sigma: float, low_pass: float, pixel_area: float) -> Doubles:
-    """How the light of a pixel falls along a row or a column: (pixel,) of odd length, of sum 1.
+    """The light of a pixel along a row or a column: (pixel,) of odd length, of sum 1.
 
     The light is even over the pixel's square, spread by a Gaussian, doubled by the low-pass filter,
     and collected by photosites of some side. All arguments are in px; see :class:`Lens`.
@@ -62,7 +62,7 @@ def along(sigma: float, low_pass: float, pixel_area: float) -> Doubles:
 def diffracted(
     sigma: float, low_pass: float, pixel_area: float, f_number: float, pitch: float
 ) -> Doubles:
-    """As :func:`along`, with diffraction: a point spread function, (height, width, 3).
+    """The light of :func:`along`, with diffraction: a point spread function, (height, width, 3).
 
     It is the Fourier transform of the product of all transfer functions. That of a round aperture
     is (2 / pi)(acos(v) - v sqrt(1 - v^2)), v = frequency * wavelength * f-number (Goodman,

@@ -27,6 +27,7 @@ from clpipe.stage import (
     Pass,
     ReferenceContext,
     Stage,
+    StageRole,
     Unchanged,
     parameter,
 )
@@ -71,7 +72,7 @@ class NoNoise(Unchanged, Matched):
 
 
 def _as_three(value: Any) -> Any:
-    """One number as three equal ones, and a list, as TOML has it, as a tuple."""
+    """Three equal numbers for one, and a tuple for a list, as TOML has it."""
     if isinstance(value, float | int) and not isinstance(value, bool):
         return (float(value),) * 3
     return tuple(value) if isinstance(value, list) else value
@@ -377,4 +378,5 @@ STAGE = Stage(
     Kind.DISPLAY,
     Kind.DISPLAY,
     (NoNoise, IidGaussian, IntensityDependent),
+    role=StageRole.BASELINE,
 )

@@ -35,7 +35,7 @@ class Filter(Method):
 
     @property
     def resamplings(self) -> tuple[Resampling, Resampling]:
-        """That of rows, and that of columns."""
+        """The resamplings of rows and of columns."""
         weight, support = self.filter
         return (
             Resampling("rows", self.scale, weight, support),

@@ -6,10 +6,11 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, Kind, Method, Pass, ReferenceContext, Stage, parameter
+from clpipe.stage import Argument, Context, Kind, Pass, ReferenceContext, Stage
+from clpipe.stages.white_balance.gains import CameraGains
 
 
-class Brooks2019(Method):
+class Brooks2019(CameraGains):
     """Red and blue of nearly white pixels, raised so that dividing by the gains leaves them white.
 
     Where a photograph is white, all three colours of the sensor are clipped; dividing red and blue
@@ -28,25 +29,12 @@ class Brooks2019(Method):
     kernel: ClassVar = "restore_highlights"
     summary: ClassVar = "raise red and blue of nearly white pixels by the gains"
 
-    red_gain: float | None = parameter(
-        None, "White balance gain of red, green = 1.", auto="from the camera", gt=0, le=64
-    )
-    blue_gain: float | None = parameter(
-        None, "White balance gain of blue, green = 1.", auto="from the camera", gt=0, le=64
-    )
-
-    def resolve(self, context: Context) -> "Brooks2019":
-        red, blue = context.camera.white_balance_gains
-        return self.with_defaults(red_gain=red, blue_gain=blue)
-
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("restore_highlights", arguments=("red_gain", "blue_gain")),)
 
     def arguments(self, context: Context) -> Mapping[str, Argument]:
-        return {
-            "red_gain": np.float32(self.red_gain),
-            "blue_gain": np.float32(self.blue_gain),
-        }
+        red, blue = map(np.float32, self.gains)
+        return {"red_gain": red, "blue_gain": blue}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         one = np.float32(1)

@@ -6,6 +6,7 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.random import normal_of_line
+from clpipe.reference.resample import Axis
 from clpipe.stage import (
     Context,
     GaussianNoise,
@@ -18,7 +19,28 @@ from clpipe.stage import (
 )
 
 
-class Gaussian(GaussianNoise):
+class LineNoise(GaussianNoise):
+    """One Gaussian offset for each row or each column. A subclass says which, and whose it is."""
+
+    kernel: ClassVar = "line_noise"
+    axis: ClassVar[Axis]
+    scope: ClassVar[NoiseScope]
+
+    def draw(self) -> tuple[Pass, ...]:
+        table = LineTable(self.axis)
+        return (
+            Pass("noise_of_lines", table, ("sigma",), writes="lines", random=self.scope),
+            Pass(f"{self.axis[:-1]}_noise", arguments=("lines",)),
+        )
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        is_row = self.axis == "rows"
+        offsets = normal_of_line(image.shape[not is_row], given.stream[self.scope])
+        offsets *= np.float32(self.sigma)
+        return image + (offsets[:, None] if is_row else offsets)
+
+
+class Gaussian(LineNoise):
     """y + sigma * n_r: one Gaussian offset for each row, new in each image.
 
     n_r is a standard normal of row r; sigma is in signal units.
@@ -29,27 +51,12 @@ class Gaussian(GaussianNoise):
     (0.01, True)
     """
 
-    kernel: ClassVar = "line_noise"
     summary: ClassVar = "add a Gaussian offset to each row, new in each image"
+    axis: ClassVar = "rows"
+    scope: ClassVar = NoiseScope.IMAGE
 
     def resolve(self, context: Context) -> "Gaussian":
         return self.with_defaults(sigma=context.camera.row_noise(context.iso))
-
-    def draw(self) -> tuple[Pass, ...]:
-        return (
-            Pass(
-                "noise_of_lines",
-                LineTable("rows"),
-                arguments=("sigma",),
-                writes="lines",
-                random=NoiseScope.IMAGE,
-            ),
-            Pass("row_noise", arguments=("lines",)),
-        )
-
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        normals = normal_of_line(image.shape[0], given.stream[NoiseScope.IMAGE])
-        return image + (normals * np.float32(self.sigma))[:, None]
 
 
 STAGE = Stage("row_noise", "Add an offset to each row.", Kind.MOSAIC, Kind.MOSAIC, (Gaussian,))

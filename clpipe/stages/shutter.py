@@ -15,6 +15,7 @@ from clpipe.stage import (
     Pass,
     ReferenceContext,
     Stage,
+    StageRole,
     parameter,
 )
 
@@ -122,4 +123,5 @@ STAGE = Stage(
     Kind.RGB,
     Kind.RGB,
     (Rows,),
+    role=StageRole.SHUTTER,
 )

@@ -34,20 +34,20 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from clpipe.analysis.charts import (
-    chart_image,
-    chart_patches,
-    patch_means,
-    patch_places,
-    saturated_image,
-)
-from clpipe.analysis.fidelity import colour_errors, delta_e, dots, psnr
 from clpipe.analysis.signature import BRIGHTEST, DARKEST, flat_places, luma, signature
 from clpipe.base.errors import ClpipeError
 from clpipe.base.types import Array, Floats, Mask
 from clpipe.images.read import read_image
 from clpipe.images.write import write_exr
 from tools import RENDER, ROOT
+from tools.compare.charts import (
+    chart_image,
+    chart_patches,
+    patch_means,
+    patch_places,
+    saturated_image,
+)
+from tools.compare.fidelity import colour_errors, delta_e, dots, psnr
 from tools.pages.side_by_side import COLUMNS, cells, markdown, sheet, telling_places
 
 LIMIT = 600  # seconds a development

@@ -23,14 +23,14 @@ from rich.console import Console
 from rich.table import Table
 
 import clpipe
-from clpipe.analysis.charts import slanted_edge
-from clpipe.analysis.fidelity import psnr, sharpness
 from clpipe.base.types import Array
 from clpipe.chain.registry import all_stages
 from clpipe.images.read import read_image
 from clpipe.reference.curve import to_8_bit
 from clpipe.stages import DEFAULT_CHAIN
 from tools import RENDER, ROOT
+from tools.compare.charts import slanted_edge
+from tools.compare.fidelity import psnr, sharpness
 
 KODAK = ROOT.parent / "shared" / "data" / "kodak"
 BORDER = 10

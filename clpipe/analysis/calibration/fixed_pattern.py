@@ -7,6 +7,7 @@ import numpy as np
 from clpipe.analysis.calibration.line_fit import Estimate, Line
 from clpipe.analysis.calibration.repeats import Sensor, Stack
 from clpipe.base.types import Array, Floats
+from clpipe.reference.cfa import sites
 
 SURE = 7.0  # standard deviations; by chance not one of 1e8 pixels is further out
 # Choices; tests/test_calibrate.py shows what they find and refuse.
@@ -52,7 +53,7 @@ def hot_in_dark(dark: Floats, sensor: Sensor) -> Pixels:
 
     excess = np.empty(dark.shape, np.float32)
     hot = np.empty(dark.shape, bool)
-    for site in sensor.sites().values():
+    for site in sites(sensor.pattern).values():
         excess[site] = dark[site] - median_filter(dark[site], 3, mode="mirror")
         low, high = np.quantile(excess[site], norm.cdf([-2, 2]))
         hot[site] = excess[site] > SURE * max((high - low) / 4, LEAST_DEVIATION)
@@ -99,7 +100,7 @@ def _extremes(stack: Stack) -> tuple[Floats, Floats]:
     around = np.ones((3, 3), bool)
     around[1, 1] = False
     low, high = np.empty_like(stack.light), np.empty_like(stack.light)
-    for site in stack.sensor.sites().values():
+    for site in sites(stack.sensor.pattern).values():
         low[site] = minimum_filter(stack.light[site], footprint=around, mode="mirror")
         high[site] = maximum_filter(stack.light[site], footprint=around, mode="mirror")
     return low, high
@@ -124,7 +125,7 @@ def dark_pattern(
     values = dark.astype(np.float64)
     good = np.ones(dark.shape, bool)
     good[bad.rows, bad.columns] = False
-    for site in sensor.sites().values():
+    for site in sites(sensor.pattern).values():
         values[site] -= values[site][good[site]].mean()
     values[~good] = 0
     height, width = dark.shape
@@ -160,7 +161,7 @@ def response_pattern(stack: Stack, line: Line, dsnu: float) -> Estimate | None:
     surface = _surface()
     freedom = BLOCK**2 - surface.shape[1]
     squares, lights = [], []
-    for site in stack.sensor.sites().values():
+    for site in sites(stack.sensor.pattern).values():
         used = _blocks(stack.used[site]).all(axis=(1, 2))
         pixels = _blocks(stack.light[site])[used].reshape(-1, BLOCK**2).astype(np.float64)
         mean = pixels.mean(axis=1)

@@ -17,7 +17,7 @@ from clpipe.images.attributes import read_attributes
 from clpipe.images.dump import Dump, read_dump
 from clpipe.images.raw import RAW_SUFFIXES, RawFacts, read_facts, read_raw
 from clpipe.images.read import RENDER_SUFFIXES, read_image
-from clpipe.inputs.kept import carried_settings
+from clpipe.inputs.kept import embedded_settings
 from clpipe.inputs.raw import may_be_dump
 from clpipe.reference.cfa import Pattern
 from clpipe.stage import Kind
@@ -192,7 +192,7 @@ def _from_kept(
             f"{path}: holds {found}; a mosaic is needed, such as clpipe run --until quantize writes"
         )
     try:
-        settings = carried_settings(attributes)
+        settings = embedded_settings(attributes)
         assert settings is not None
         chain = make_chain(settings)
         step = chain.step_named(attributes.get("stage", ""))

@@ -65,9 +65,11 @@ def _variance_over_mean(panel: object, one: Calibration) -> None:
         label = None if name in one.bins else f"fit, {name}"
         panel.plot(ends, own, color=COLOURS[name], lw=0.8, alpha=0.7, label=label)
     panel.plot(ends, gain.value * ends + floor.value, color="black", lw=1.3, label="fit, all")
-    panel.set_title(f"ISO {one.iso:g}: variance = {gain.value:.4g} · mean + {floor.value:.3g}")
-    panel.set_xlabel("mean above black, DN")
-    panel.set_ylabel("variance, DN²")
+    panel.set(
+        title=f"ISO {one.iso:g}: variance = {gain.value:.4g} · mean + {floor.value:.3g}",
+        xlabel="mean above black, DN",
+        ylabel="variance, DN²",
+    )
     panel.set_ylim(0)
     panel.set_xlim(0)
     panel.grid(alpha=0.25)
@@ -90,10 +92,12 @@ def _photon_transfer(panel: object, calibrations: Sequence[Calibration]) -> None
         every = [b for bins in one.bins.values() for b in bins if b.light > light[0]]
         noise = np.sqrt([max(b.variance - one.rounding, 1e-9) for b in every])
         panel.plot([b.light for b in every], noise, "o", ms=3.5, color=shade)
-    panel.set_xscale("log")
-    panel.set_yscale("log")
-    panel.set_title("Photon transfer: lines as fitted, points as measured")
-    panel.set_xlabel("mean above black, DN")
-    panel.set_ylabel("noise (standard deviation), DN")
+    panel.set(
+        xscale="log",
+        yscale="log",
+        title="Photon transfer: lines as fitted, points as measured",
+        xlabel="mean above black, DN",
+        ylabel="noise (standard deviation), DN",
+    )
     panel.grid(alpha=0.25, which="both")
     panel.legend(fontsize=10, loc="upper left")

@@ -9,7 +9,7 @@ import numpy as np
 from clpipe.analysis.calibration.line_fit import Estimate, Line, Table
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Floats
-from clpipe.reference.cfa import Pattern, red_site
+from clpipe.reference.cfa import Pattern, sites
 
 CHANNELS = ("R", "G1", "G2", "B")
 # The limits are choices; tests/test_calibrate.py has a case on each side of the last two.
@@ -30,19 +30,6 @@ class Sensor:
     def unit(self) -> float:
         """The white level minus the black level in DN: the DN of signal 1."""
         return self.white_level - self.black_level
-
-    def sites(self) -> dict[str, tuple[slice, slice]]:
-        """The slices of rows and columns of each channel in a mosaic; G1 is in the rows of red.
-
-        >>> Sensor("GRBG", 0, 1).sites()["R"]
-        (slice(0, None, 2), slice(1, None, 2))
-        """
-        x, y = red_site(self.pattern)
-        places = ((y, x), (y, 1 - x), (1 - y, x), (1 - y, 1 - x))
-        return {
-            name: (slice(row, None, 2), slice(column, None, 2))
-            for name, (row, column) in zip(CHANNELS, places, strict=True)
-        }
 
 
 @dataclass(frozen=True)
@@ -86,7 +73,7 @@ class Stack:
     def tables(self, variance: Array) -> dict[str, Table]:
         """The table of each channel, from the variances of pixels, (height, width), DN^2."""
         tables = {}
-        for name, site in self.sensor.sites().items():
+        for name, site in sites(self.sensor.pattern).items():
             used = self.used[site]
             rows = 2 * np.nonzero(used)[0] + site[0].start
             s, light, around = (x[site][used] for x in (variance, self.light, self.around))

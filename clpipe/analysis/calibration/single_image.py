@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from clpipe.analysis.calibration.line_fit import Estimate, Line
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.base.types import Floats
+from clpipe.reference.cfa import sites
 
 # Daubechies' wavelet and scaling function with three vanishing moments (sec. II-A). The wavelet has
 # the norm 1, the scaling function the sum 1.
@@ -254,7 +255,9 @@ def single_image(
     unit = sensor.unit
     low = -sensor.black_level / unit
     dark_sets = [dark] if dark else []
-    places = {name: smooth_places(light[site] / unit) for name, site in sensor.sites().items()}
+    places = {
+        name: smooth_places(light[site] / unit) for name, site in sites(sensor.pattern).items()
+    }
 
     def line(parts: Sequence[Places]) -> tuple[Line, LevelSets]:
         a, b, sets, errors = explained_line(parts, low, dark_sets)

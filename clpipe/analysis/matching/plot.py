@@ -64,9 +64,7 @@ def draw_lags(axes: Axes, match: Match) -> None:
         for planes, style, what in (((0,), "-o", "luma"), ((1, 2), "--s", "chroma")):
             table = mean_table(match, who, planes)
             axes.plot(lags, table[REACH, REACH:], style, color=ink, label=f"{what}, {who}")
-    axes.set_title("Autocorrelation")
-    axes.set_xlabel("lag right, px")
-    axes.set_ylabel("correlation")
+    axes.set(title="Autocorrelation", xlabel="lag right, px", ylabel="correlation")
     axes.grid(alpha=0.3)
     axes.legend()
 
@@ -79,10 +77,12 @@ def draw_spectrum(axes: Axes, match: Match) -> None:
         rings = np.digitize(radius, edges)
         power = [spectrum[rings == k].mean() for k in range(1, len(edges))]
         axes.plot((edges[1:] + edges[:-1]) / 2, power, "-o", color=ink, label=who)
-    axes.set_title("Power spectrum of luma; independent noise: 1")
-    axes.set_xlabel("cycles/px")
-    axes.set_ylabel("power over variance")
-    axes.set_ylim(bottom=0)
+    axes.set(
+        title="Power spectrum of luma; independent noise: 1",
+        xlabel="cycles/px",
+        ylabel="power over variance",
+        ylim=(0, None),
+    )
     axes.grid(alpha=0.3)
     axes.legend()
 
@@ -101,10 +101,12 @@ def draw_intensity(axes: Axes, match: Match) -> None:
         middle = (np.arange(len(count)) + 0.5) * STEP
         sigma = np.sqrt(squares[kept] / count[kept])
         axes.plot(middle[kept], sigma, "-o", color=ink, label=who)
-    axes.set_title("Noise of luma by intensity")
-    axes.set_xlabel("luma, levels")
-    axes.set_ylabel("sigma, levels")
-    axes.set_ylim(bottom=0)
+    axes.set(
+        title="Noise of luma by intensity",
+        xlabel="luma, levels",
+        ylabel="sigma, levels",
+        ylim=(0, None),
+    )
     axes.grid(alpha=0.3)
     axes.legend()
 

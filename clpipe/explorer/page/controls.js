@@ -141,11 +141,11 @@ const makeKeys = (facts) => {
     set("skip", noise.checked ? (skip.length ? skip : null) : [...skip, "noise"]);
   });
   switchRow.append(made("div", { className: "line" }, made("label", { htmlFor: "noise-on", textContent: "noise" }), noise));
-  const exposure = facts.steps.find((each) => each.name === "exposure" && "ev" in each.values);
-  const methods = exposure ? known.stages.exposure.methods : [];
-  const ev = methods.filter((method) => method.name === exposure.method).map((method) => method.parameters.ev);
+  const exposing = facts.steps.find((each) => known.stages[each.stage].role === "EXPOSURE" && "ev" in each.values);
+  const methods = exposing ? known.stages[exposing.stage].methods : [];
+  const ev = methods.filter((method) => method.name === exposing.method).map((method) => method.parameters.ev);
   byId("keys").replaceChildren(camera, isoRow, switchRow,
-    ...ev.map((schema) => keyRow("exposure.ev", "exposure", schema, 0)),
+    ...ev.map((schema) => keyRow(`${exposing.name}.ev`, exposing.name, schema, 0)),
     ...Object.entries(known.keys).map(([key, schema]) => keyRow(key, key.replaceAll("_", " "), schema, 0)));
   isoCamera = "";
 };

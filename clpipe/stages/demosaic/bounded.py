@@ -70,7 +70,7 @@ SETS = (
 def bounds(
     roots: Floats, known: Floats, green: Floats, pattern: Pattern, doubt: np.float32
 ) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
-    """How low and how high red and blue may be, (red, blue) each, (height, width), in roots.
+    """The least and the most that red and blue may be, (red, blue) each, (height, width), in roots.
 
     As far as the nearest samples of that colour go, and beyond them by as much as green goes beyond
     what it is there, less ``doubt``. A line narrower than the pattern is an extreme of green, too,
@@ -126,7 +126,7 @@ class Bounded(Method):
 
     @property
     def doubt(self) -> np.float32:
-        """What noise alone may do to green, in roots: three sigma, and what no eye would see."""
+        """The noise that green may have, in roots: three sigma, and what no eye would see."""
         assert self.noise is not None and self.offset is not None
         return np.float32(0.01 + 3 * noise_in_roots(self.noise, MID_GREY, self.offset))
 

@@ -40,7 +40,7 @@ def directional_differences(image: Floats, pattern: Pattern) -> tuple[Floats, Fl
 
 
 def change(differences: Floats) -> Floats:
-    """How much horizontal differences change around each red or blue site, (height, width).
+    """The change of horizontal differences around each red or blue site, (height, width).
 
     The sum of absolute changes between next neighbours of one colour, 2 px apart, in the five rows
     of a 5x5 window; the middle row counts three times.

@@ -1,6 +1,6 @@
 """Denoising of luma and, more strongly, of chroma; the strength follows the predicted noise."""
 
-from clpipe.stage import Context, Kind, Stage
+from clpipe.stage import Context, Kind, Stage, StageRole
 from clpipe.stages.denoise import strength
 from clpipe.stages.denoise.bilateral import Bilateral
 from clpipe.stages.denoise.biweight import Biweight
@@ -12,7 +12,7 @@ METHODS = (Biweight, Bilateral, NonLocalMeans, Median, Mean)
 
 
 def explain(context: Context) -> str:
-    """How the strength follows from the noise, and its effect in each method, in a few lines."""
+    """Lines about how the strength follows from the noise, and its effect in each method."""
     effects = [f"  {m.method}: {m().resolve(context).effect}" for m in METHODS]
     return "\n".join([strength.explain(context), *effects])
 
@@ -24,4 +24,5 @@ STAGE = Stage(
     Kind.RGB,
     METHODS,
     explain,
+    role=StageRole.DENOISING,
 )

@@ -1,4 +1,4 @@
-"""How the strength of denoising follows the noise, and the parameters that every method has.
+"""The strength of denoising, which follows the noise, and the parameters that every method has.
 
 A sensor's noise has the variance a*y + b (Foi et al., IEEE TIP 2008, eq. 2), with a and b as
 ``sensor_noise`` used them, else from the camera at the ISO. White balance gains amplify it. Luma

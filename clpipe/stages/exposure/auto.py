@@ -46,7 +46,7 @@ def luminance(image: Floats) -> Floats:
 
 
 def in_circle(height: int, width: int, share: int) -> Mask:
-    """Which pixels lie in the circle around an image's middle, (height, width).
+    """The mask of the pixels in the circle around an image's middle, (height, width).
 
     ``share`` is the shorter side over its diameter, which is 2 px at least; with 0 all are inside.
 

@@ -68,7 +68,7 @@ class Photometric(Gain):
         return replace(context, headroom=headroom)
 
     def factor(self, iso: float) -> np.float32:
-        """What a render's unit becomes, over the sensor's full scale, at an ISO."""
+        """The value of a render's unit, over the sensor's full scale, at an ISO."""
         assert self.f_number
         exposure = self.q * self.scale * self.exposure_time / self.f_number**2  # lx s
         return np.float32(exposure * iso / SATURATION * 2.0 ** (self.ev - self.headroom))

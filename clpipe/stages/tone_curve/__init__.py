@@ -76,6 +76,8 @@ class File(Curve):
     method: ClassVar = "file"
     summary: ClassVar = "a curve from a .csv (x,y; monotone cubic) or one-dimensional .cube file"
 
+    read: ClassVar = staticmethod(table_of)
+
     path: str = parameter(
         CAMERA_RAW,
         "The file of the curve; a configuration gives it relative to itself.",
@@ -86,11 +88,11 @@ class File(Curve):
     @field_validator("path")
     @classmethod
     def _readable(cls, path: str) -> str:
-        table_of(path)
+        cls.read(path)
         return path
 
     def table(self) -> Floats:
-        return table_of(self.path)
+        return self.read(self.path)
 
 
 STAGE = Stage(

@@ -1,6 +1,6 @@
 """White balance on the mosaic. Results above 1 are clipped, so burnt-out highlights are white."""
 
-from clpipe.stage import Kind, Stage
+from clpipe.stage import Kind, Stage, StageRole
 from clpipe.stages.white_balance.gains import AsShot, Gains, Unbalanced
 from clpipe.stages.white_balance.gray_world import GrayWorld
 from clpipe.stages.white_balance.white_patch import WhitePatch
@@ -11,4 +11,5 @@ STAGE = Stage(
     Kind.MOSAIC,
     Kind.MOSAIC,
     (AsShot, GrayWorld, WhitePatch, Gains, Unbalanced),
+    role=StageRole.BALANCE,
 )

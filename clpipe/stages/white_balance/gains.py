@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -56,17 +56,58 @@ class EstimatedGains(Method):
         return apply_gains(image, given.context, red, blue)
 
 
-class AsShot(Method):
-    """min(y * gain, 1), with the gains that ``inverse_white_balance`` divided by, else 1.
+class CameraGains(Method):
+    """Gains of red and blue, from the camera where they are not set. A subclass says what for."""
+
+    red_gain: float | None = parameter(
+        None, "White balance gain of red, green = 1.", auto="from the camera", gt=0, le=64
+    )
+    blue_gain: float | None = parameter(
+        None, "White balance gain of blue, green = 1.", auto="from the camera", gt=0, le=64
+    )
+
+    def resolve(self, context: Context) -> Self:
+        red, blue = context.camera.white_balance_gains
+        return self.with_defaults(red_gain=red, blue_gain=blue)
+
+    @property
+    def gains(self) -> tuple[float, float]:
+        """The (resolved) gains of red and blue."""
+        assert self.red_gain is not None and self.blue_gain is not None
+        return self.red_gain, self.blue_gain
+
+
+class Gains(CameraGains):
+    """min(y * gain, 1), with fixed gains: the user's, else the camera's.
 
     >>> from clpipe.stage import run_reference
-    >>> as_shot = AsShot(red_gain=2.0, blue_gain=4.0)
-    >>> run_reference(as_shot, np.full((2, 2), 0.375, np.float32)).tolist()
+    >>> gains = Gains(red_gain=2.0, blue_gain=4.0)
+    >>> run_reference(gains, np.full((2, 2), 0.375, np.float32)).tolist()
     [[0.75, 0.375], [0.375, 1.0]]
     """
 
-    method: ClassVar = "as_shot"
+    method: ClassVar = "gains"
     kernel: ClassVar = "site_gains"
+    summary: ClassVar = "fixed gains, by default the camera's"
+
+    def next_context(self, context: Context) -> Context:
+        return replace(context, applied_gains=self.gains)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (APPLY,)
+
+    def arguments(self, context: Context) -> Mapping[str, Argument]:
+        red, blue = map(np.float32, self.gains)
+        return {"pattern": context.cfa, "red_gain": red, "blue_gain": blue}
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        return apply_gains(image, given.context, *map(np.float32, self.gains))
+
+
+class AsShot(Gains):
+    """min(y * gain, 1), with the gains that ``inverse_white_balance`` divided by, else 1."""
+
+    method: ClassVar = "as_shot"
     summary: ClassVar = "the gains that inverse_white_balance divided by"
 
     red_gain: float | None = parameter(
@@ -76,42 +117,8 @@ class AsShot(Method):
         None, "Gain of blue, green = 1.", auto="as inverse_white_balance used it", gt=0, le=64
     )
 
-    def resolve(self, context: Context) -> "AsShot":
+    def resolve(self, context: Context) -> Self:
         red, blue = context.gains
-        return self.with_defaults(red_gain=red, blue_gain=blue)
-
-    def next_context(self, context: Context) -> Context:
-        assert self.red_gain is not None and self.blue_gain is not None
-        return replace(context, applied_gains=(self.red_gain, self.blue_gain))
-
-    def passes(self) -> tuple[Pass, ...]:
-        return (APPLY,)
-
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
-        red, blue = np.float32(self.red_gain), np.float32(self.blue_gain)
-        return {"pattern": context.cfa, "red_gain": red, "blue_gain": blue}
-
-    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return apply_gains(
-            image, given.context, np.float32(self.red_gain), np.float32(self.blue_gain)
-        )
-
-
-class Gains(AsShot):
-    """min(y * gain, 1), with fixed gains: the user's, else the camera's."""
-
-    method: ClassVar = "gains"
-    summary: ClassVar = "fixed gains, by default the camera's"
-
-    red_gain: float | None = parameter(
-        None, "Gain of red, green = 1.", auto="from the camera", gt=0, le=64
-    )
-    blue_gain: float | None = parameter(
-        None, "Gain of blue, green = 1.", auto="from the camera", gt=0, le=64
-    )
-
-    def resolve(self, context: Context) -> "Gains":
-        red, blue = context.camera.white_balance_gains
         return self.with_defaults(red_gain=red, blue_gain=blue)
 
 

@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clpipe.analysis.charts import GREY, linear
 from clpipe.analysis.signature import luma
 from clpipe.base.types import Doubles
 from clpipe.camera.profile import SRGB_TO_XYZ
+from tools.compare.charts import GREY, linear
 
 HAS_HUE = 10.0  # CIELAB chroma of a colour from which on its hue is compared
 DOT = 32  # levels of luma from the median of the 3x3
@@ -54,9 +54,9 @@ def colour_errors(pictured: NDArray[np.number], true: NDArray[np.number]) -> Col
 
     Args:
         pictured: (24, 3).
-        true: (24, 3), as of :func:`~clpipe.analysis.charts.chart_patches`.
+        true: (24, 3), as of :func:`~tools.compare.charts.chart_patches`.
 
-    >>> from clpipe.analysis.charts import chart_patches
+    >>> from tools.compare.charts import chart_patches
     >>> true = chart_patches()
     >>> colour_errors(true, true)
     ColourErrors(grey=122.0, lightness=0.0, hue=0.0, largest_hue=0.0, chroma=1.0)
@@ -129,7 +129,7 @@ class Sharpness:
 
 
 def sharpness(picture: NDArray[np.number]) -> Sharpness:
-    """The sharpness of a picture of :func:`~clpipe.analysis.charts.slanted_edge`, in linear light.
+    """The sharpness of a picture of :func:`~tools.compare.charts.slanted_edge`, in linear light.
 
     The edge is found in each row and fitted with a line. The pixels of all rows, by their distance
     from it, give its profile in steps of a quarter of a pixel; the transfer function is the
@@ -138,7 +138,7 @@ def sharpness(picture: NDArray[np.number]) -> Sharpness:
     Args:
         picture: (height, width, 3); the edge crosses every row once, near the middle.
 
-    >>> from clpipe.analysis.charts import slanted_edge
+    >>> from tools.compare.charts import slanted_edge
     >>> from clpipe.reference.transfer import srgb_curve
     >>> found = sharpness(255 * srgb_curve(slanted_edge()))  # pixels that average their own area
     >>> round(found.mtf50, 2), round(found.mtf25, 2), round(found.overshoot, 2)
