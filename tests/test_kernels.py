@@ -151,7 +151,7 @@ def test_sums_over_the_blocks_of_a_wide_stencil(device, scalar_device):
 def test_a_wrong_kernel_is_caught(device, monkeypatch):
     stage = all_stages()["exposure"]
     method = stage.methods[0]
-    monkeypatch.setattr(method, "reference", lambda self, image, frame: image * np.float32(1.001))
+    monkeypatch.setattr(method, "reference", lambda self, image, given: image * np.float32(1.001))
     assert not check_method(device, stage, method).passed
 
 

@@ -40,7 +40,7 @@ from clpipe.stages import DEFAULT_CHAIN
 
 @dataclass(frozen=True)
 class Settings:
-    """All that can be set, with nothing resolved yet: None and what is missing stay automatic.
+    """Values that can be set, with nothing resolved yet: None and what is missing stay automatic.
 
     Where ``draws`` has a law for a dotted name ("iso", "sensor_noise.a"), the value is drawn for
     each image, by :meth:`drawn`.
@@ -126,7 +126,7 @@ class Settings:
         return {**self.parameters.get(step, others), **drawn}
 
     def _set_in(self, table: str) -> dict[str, Any]:
-        """What is set in a table that belongs to no stage."""
+        """The values that are set in a table that belongs to no stage."""
         model: BaseModel = getattr(self, table)
         return model.model_dump(exclude_defaults=True)
 
@@ -157,7 +157,7 @@ class Settings:
         return files
 
     def models(self, step: str) -> list[type[BaseModel]]:
-        """What declares the parameters of a step: its method, or all that its method is drawn from.
+        """The classes that declare a step's parameters: its method, or all that are drawn from.
 
         Raises:
             KeyedError: there is no such method.
