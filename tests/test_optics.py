@@ -5,6 +5,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 
 import clpipe as clpipe_api
@@ -178,6 +179,17 @@ def test_a_lens_is_that_of_the_depth_of_field(clpipe, point):
     set_ = ("--focal-length", 50, "--focus-distance", 3, "--set", "render.sensor_width=36")
     clpipe(*RUN, *DEFOCUS, *set_, "-o", "o")
     assert spread_of(Path("o/a.exr")) == pytest.approx(disc(50, 0.5, 0.1), abs=0.3)
+
+
+def test_what_an_exr_says_of_its_camera_is_taken_where_nothing_else_is_said(clpipe, point):
+    with OpenEXR.File("in/a.exr", separate_channels=True) as file:
+        said = {"effectiveFocalLength": 35.0, "sensorOverallDimensions": np.float32([36, 24])}
+        header, channels = file.header() | said, {n: c.pixels for n, c in file.channels().items()}
+    OpenEXR.File(header, channels).write("in/a.exr")
+    clpipe(*RUN, *DEFOCUS, "-o", "o")
+    assert spread_of(Path("o/a.exr")) == pytest.approx(disc(35, 0.5, 0.1), abs=0.3)
+    clpipe(*RUN, *DEFOCUS, "-o", "p", "--focal-length", 50)
+    assert spread_of(Path("p/a.exr")) == pytest.approx(disc(50, 0.5, 0.1), abs=0.3)
 
 
 CALIBRATED = by_name.LensCalibration(

@@ -1,4 +1,4 @@
-"""What a camera is: profiles of sensors and the noise model, and lenses by their names.
+"""Cameras: profiles of sensors and the noise model, and lenses by their names.
 
 Nothing here reads images or knows the chain; a profile, one of the built-in TOML files or a user's,
 answers "what is a and b at this ISO".

@@ -22,7 +22,7 @@ ASPECT = 1.5  # of the pictures that a lens was calibrated with, where the datab
 
 @dataclass(frozen=True)
 class LensCalibration:
-    """What lensfun knows of a lens, set in some way.
+    """Calibration of a lens, set in some way, as lensfun knows it.
 
     Args:
         focal_length: in mm.

@@ -20,7 +20,7 @@ IN_PIXELS = ("fx", "fy", "cx", "cy")
 
 @dataclass(frozen=True)
 class Optics:
-    """What is known of a camera's optics; None is not known.
+    """Facts of a camera's optics; None is not known.
 
     Args:
         fx, fy: focal lengths in px of the render.

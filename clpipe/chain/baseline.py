@@ -36,7 +36,7 @@ def baseline_of(chain: Chain) -> Chain:
 
 
 def matching_of(chain: Chain) -> NoNoise:
-    """How the noise of a baseline is matched to that of the picture, as the chain says."""
+    """The matching of a baseline's noise to that of the picture, as the chain says it."""
     step = chain.step_in(StageRole.BASELINE)
     assert step and isinstance(step.method, NoNoise)  # as baseline_of has seen
     return step.method

@@ -1,4 +1,4 @@
-"""Which layers go along with a picture, as they are asked for."""
+"""Layers that go along with a picture, as they are asked for."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -85,7 +85,7 @@ class Chain:
 
     @property
     def optics(self) -> Optics:
-        """What is known of the camera's optics."""
+        """The camera's optics, as far as they are known."""
         return self.steps[0].context.optics
 
     @property
@@ -99,7 +99,7 @@ class Chain:
 
     @cached_property
     def geometry(self) -> Composition | None:
-        """Where the pixels of what comes out come from in what enters; None if each stays."""
+        """The map from pixels of what comes out to what enters; None if each stays."""
         moves = tuple(filter(None, (step.method.geometry() for step in self.steps)))
         return Composition(moves) if moves else None
 
@@ -330,7 +330,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
 
 
 def optics_of(settings: Settings, camera: Camera, names: Sequence[str]) -> Optics:
-    """What is known of the optics: stated in settings, of the render, or by the steps of a chain.
+    """The optics that settings, the render's camera and the steps of a chain state.
 
     Raises:
         RequestError: two statements contradict each other, or the lens that is named cannot be

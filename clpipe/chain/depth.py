@@ -44,7 +44,7 @@ def with_depth(chain: Chain, depth: Depth) -> Chain:
 
 
 def warnings_of(chain: Chain, depth: Depth) -> list[str]:
-    """What the steps that need depth have to say of an image's.
+    """Warnings of the steps that need depth, about that of an image.
 
     Raises:
         RequestError: one cannot use it.

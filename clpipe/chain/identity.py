@@ -1,4 +1,4 @@
-"""What the noise of an image belongs to, so that no two images share it by accident."""
+"""Keys that noise belongs to, so that no two images share it by accident."""
 
 from typing import TYPE_CHECKING
 
@@ -50,7 +50,7 @@ def of_bracket(key: str, ev: float) -> str:
 
 
 def noise_key(settings: "Settings", key: str, frame: int | None = None) -> str:
-    """What noise is made of, beside the seed and the stage: the image and the ISO.
+    """The key that noise is made of, beside the seed and the stage: the image and the ISO.
 
     The first frame of a burst, or epoch, has the noise of the image alone.
 

@@ -16,7 +16,7 @@ Matrix = Annotated[tuple[Vector, Vector, Vector], Field(strict=False), AfterVali
 
 
 class RenderCamera(BaseModel):
-    """What the pixels of a render are of: its camera, as far as it is known.
+    """The camera of a render: what its pixels are of, as far as it is known.
 
     Its optics are a part of :class:`clpipe.camera.optics.Optics`.
     """
@@ -53,7 +53,7 @@ class RenderCamera(BaseModel):
 
     @property
     def optics(self) -> dict[str, float]:
-        """What is set of the optics, by the names of the fields."""
+        """The optics that are set, by the names of the fields."""
         return self.model_dump(exclude={"exposure_time", *POSE}, exclude_none=True)
 
     def with_defaults(self, shot: Mapping[str, float]) -> "RenderCamera":

@@ -1,4 +1,4 @@
-"""All that is asked for, as plain values: from options, a configuration, a manifest, a sidecar."""
+"""Requests: plain values from options, a configuration, a manifest, a sidecar."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ MOST_PATCHES = 9999  # of an image; the names of their files have four digits
 
 
 class Recorded(BaseModel):
-    """What decides about the bytes of a picture, as a sidecar stores it; see :class:`Request`.
+    """The part of a request that decides about a picture's bytes, as a sidecar stores it.
 
     The rest decides which pictures are made, or whether.
     """
@@ -68,7 +68,7 @@ MADE = 8  # settings that a request, and those that it is replaced by, keep
 
 @dataclass(frozen=True)
 class Request:
-    """All that is asked for. Every field is a plain value, so a request can be stored and sent.
+    """A request: plain values for all that is asked for, so that it can be stored and sent.
 
     Args:
         config: the values of a configuration, nested as in its file; None where none is named.
@@ -287,7 +287,7 @@ class Request:
         return chain
 
     def record(self) -> dict[str, Any]:
-        """What a sidecar stores of the request, as JSON values.
+        """The request as a sidecar stores it, in JSON values.
 
         Equal records make the same bytes of the same image: :data:`RECORDED`, and the SHA-256 of
         all files that are named, as "files".

@@ -70,7 +70,7 @@ def embedded_settings(attributes: Mapping[str, str], folder: Path | None = None)
 
 @dataclass(frozen=True)
 class KeptLoader:
-    """How a kept image enters the chain of a request that has ``start_at``.
+    """The entry of kept images into the chain of a request that has ``start_at``.
 
     Args:
         request: the request.
@@ -169,7 +169,7 @@ def kind_message(error: KindError, chain: Chain, start_at: str | None) -> str:
 
 
 def _entries_of(kind: str, chain: Chain) -> str:
-    """Where an image of a kind can enter a chain, in words."""
+    """The steps at which an image of a kind can enter a chain, in words."""
     stages = {name: all_stages()[base_name(name)] for name in chain.names}
     names = [
         name

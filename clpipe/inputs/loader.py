@@ -1,4 +1,4 @@
-"""How an image becomes pixels with a chain: a render, a camera raw or dump, or a kept image."""
+"""Images as pixels with a chain: renders, camera raws and dumps, and kept images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -104,7 +104,7 @@ class ImageLoader:
 
     @property
     def kept(self) -> KeptLoader | None:
-        """How kept images enter; None where images enter at the first step."""
+        """The entry of kept images; None where images enter at the first step."""
         return None if self.request.start_at is None else KeptLoader(self.request, self.folder)
 
     @property
@@ -114,7 +114,7 @@ class ImageLoader:
 
     @property
     def raw(self) -> RawLoader:
-        """How raws and dumps enter."""
+        """The entry of raws and dumps."""
         return RawLoader(self.request, self.settings.dump_format)
 
     def endings(self) -> tuple[str, ...]:
@@ -151,13 +151,15 @@ class ImageLoader:
         Raises:
             RequestError: they are not; the message says in which row.
         """
+        carries = self.raw.takes if self.kept is None else lambda path: True
         # What is only of a camera's file was checked when it was found there.
         if rows := [job for job in jobs if job.place or job.values.keys() - {RENDER}]:
-            carries = self.raw.takes if self.kept is None else lambda path: True
             check_rows(rows, self.settings, carries)
+        if not all(job in rows or carries(job.path) for job in jobs):
+            self.settings.check_cameras()
 
     def claim(self, job: Job) -> Claim:
-        """What the file of a job claims, before it is read; nothing where reading refuses it.
+        """The claim of a job's file, before it is read; nothing where reading refuses it.
 
         Of one that cannot be opened each byte is taken for a pixel.
         """

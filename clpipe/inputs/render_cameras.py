@@ -2,6 +2,7 @@
 of NeRF's or nerfstudio's, or a folder with COLMAP's text model.
 """
 
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,7 +32,7 @@ COEFFICIENT = re.compile(r"[kp][1-6]")
 
 @dataclass(frozen=True)
 class View:
-    """What a file says of one render's camera.
+    """A render's camera, as a file says it.
 
     Args:
         name: of the image, as the file has it.
@@ -153,7 +154,10 @@ def _from_frame(frame: Mapping[str, Any], common: Mapping[str, Any]) -> View:
     listed = numbers("distortion_params", own.get("distortion_params", []), None).tolist()
     coefficients |= {f"distortion_params[{i}]": value for i, value in enumerate(listed)}
     _check_pinhole(str(own.get("camera_model") or "PINHOLE"), coefficients)
-    return View("", values, _size(own, "w", "h"))
+    size = _size(own, "w", "h")
+    if size and "fx" not in values and 0 < values.get("camera_angle_x", 0.0) < math.pi:
+        values["fx"] = size[0] / 2 / math.tan(values.pop("camera_angle_x") / 2)
+    return View("", values, size)
 
 
 FORMS: dict[str, Parser] = {"views": _from_view, "frames": _from_frame}

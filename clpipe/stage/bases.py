@@ -28,7 +28,7 @@ class Unchanged(Method):
 
 
 class FromLens(Method):
-    """What lensfun knows of the lens that ``--lens`` names."""
+    """An effect of the lens that ``--lens`` names, as lensfun knows it."""
 
     method: ClassVar = "lens"
     kernel: ClassVar = ""
@@ -42,7 +42,7 @@ class FromLens(Method):
 
 
 class InFocalLengths(Method):
-    """Counts in focal lengths: px, or mm over the width of the sensor."""
+    """A method that counts in focal lengths: px, or mm over the width of the sensor."""
 
     alternatives: ClassVar = frozenset({"fx", "focal_length"})
 
@@ -84,7 +84,7 @@ class InFocalLengths(Method):
 
 
 class OfDepth(Method):
-    """Needs the depth of its image, which :attr:`Context.depth` then has."""
+    """A method that needs the depth of its image, which :attr:`Context.depth` then has."""
 
     layer: str = parameter("", "The layer that has the depth; else one of a usual name.")
 

@@ -90,7 +90,7 @@ class Method(BaseModel):
         return other
 
     def optics(self) -> Mapping[str, float]:
-        """What this method, as it was set, states of the optics, by the names that they have."""
+        """Facts of the optics that this method, as it was set, states, by the names of Optics."""
         return {n: v for n in optics_names(type(self)) if (v := getattr(self, n)) is not None}
 
     def resolve(self, context: Context) -> "Method":
@@ -175,7 +175,7 @@ def optics_names(method: type[Method]) -> tuple[str, ...]:
 
 
 class StageRole(Enum):
-    """What a stage is to the rest of clpipe, which finds it by this and not by its name."""
+    """Roles, by which the rest of clpipe finds stages, and not by their names."""
 
     EXPOSURE = "its ev is what a bracket adds to"
     SHUTTER = "its subframes are files of one exposure"

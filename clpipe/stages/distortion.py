@@ -44,7 +44,7 @@ class NoDistortion(Unchanged):
 
 
 class HasPicture(Method):
-    """What is said of the picture, whatever the lens."""
+    """Parameters of the picture, whatever the lens."""
 
     cx: float | None = parameter(
         None,
@@ -71,7 +71,7 @@ class HasPicture(Method):
 
 
 class DistortionOfLens(FromLens, HasPicture):
-    """What lensfun knows of the lens that ``--lens`` names; without it, no distortion."""
+    """Distortion of the lens that ``--lens`` names, as lensfun knows it; without it, none."""
 
     summary: ClassVar = "that of the lens which --lens names; none without it"
 

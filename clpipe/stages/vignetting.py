@@ -35,7 +35,7 @@ class NoVignetting(Unchanged):
 
 
 class VignettingOfLens(FromLens):
-    """What lensfun knows of the lens that ``--lens`` names, at the f-number of ``--aperture``."""
+    """Vignetting of the lens that ``--lens`` names, at the camera's f-number."""
 
     summary: ClassVar = "that of the lens which --lens names, at --aperture; none without these"
 
