@@ -54,9 +54,9 @@ def material(tmp_path_factory):
     write(folder / "photo.jpg", np.clip(small, 0, 1) ** (1 / 2.2), oiio.UINT8)
     write(folder / "mosaic.exr", 256 + 3800 * small[..., :1].clip(0, 1), oiio.FLOAT)
     # Patches from dark to bright, as a scene for calibration.
-    steps = np.kron(np.linspace(0.01, 0.9, 24).reshape(4, 6), np.ones((80, 80)))
+    steps = np.kron(np.linspace(0.01, 0.9, 24).reshape(4, 6), np.ones((60, 60)))
     write(folder / "scene.exr", np.repeat(steps[..., None], 3, axis=2), oiio.HALF)
-    write(folder / "black.exr", np.zeros((320, 480, 3)), oiio.HALF)
+    write(folder / "black.exr", np.zeros((240, 360, 3)), oiio.HALF)
     dn = np.random.default_rng(0).integers(600, 9000, (64, 96))
     write_dng(folder / "IMG_0001.dng", dn)
     dump = np.random.default_rng(1).integers(600, 9000, (512, 768))

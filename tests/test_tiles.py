@@ -36,7 +36,9 @@ METHODS = [
 
 def accesses(stage, method):
     chain = chain_for(stage, method, {}, "GRBG")
-    return tuple(pass_.access for pass_ in chain.steps[0].method.passes())
+    own = [pass_.access for pass_ in chain.steps[0].method.passes()]
+    shapes = [getattr(each, name, 0) > 0 for each in own for name in ("bins", "vectors_per_row")]
+    return *map(type, own), *shapes
 
 
 # One lane differs in how pixels are read and written: a method for each way to do that is enough.

@@ -13,9 +13,9 @@ import time
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 
 import clpipe
+from clpipe.images.write import write_exr
 
 CAMERAS = ["sony-a7r2", "canon-5d2", "canon-6d", "nikon-d850"]
 BATCH = 32
@@ -28,10 +28,7 @@ def write_renders(folder: Path, count: int, side: int) -> None:
         texture = np.random.default_rng(i).random((side, side, 3)) * 0.1
         waves = [0.25 + 0.2 * np.sin(6 * (i + 1) * (x * c + y)) for c in (1, 0.5, 0.2)]
         pixels = (np.stack(waves, -1) + texture).astype(np.float32)
-        file = oiio.ImageOutput.create(str(folder / f"{i}.exr"))
-        file.open(str(folder / f"{i}.exr"), oiio.ImageSpec(side, side, 3, oiio.HALF))
-        file.write_image(pixels)
-        file.close()
+        write_exr(folder / f"{i}.exr", pixels, "RGB", {}, half=True)
 
 
 def dataset(folder: Path, patch: int, epochs: int) -> clpipe.Dataset:

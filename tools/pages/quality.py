@@ -26,10 +26,11 @@ import clpipe
 from clpipe.base.types import Array
 from clpipe.chain.registry import all_stages
 from clpipe.images.read import read_image
+from clpipe.reference.curve import to_8_bit
 from clpipe.stages import DEFAULT_CHAIN
 from tools import RENDER, ROOT
 from tools.compare.charts import slanted_edge
-from tools.compare.fidelity import sharpness
+from tools.compare.fidelity import psnr, sharpness
 
 KODAK = ROOT.parent / "shared" / "data" / "kodak"
 BORDER = 10
@@ -91,13 +92,7 @@ NOISE = ("sensor_noise", "row_noise", "column_noise", "quantize", "normalize")
 def cpsnr(one: Array, two: Array) -> float:
     """Colour peak signal-to-noise ratio of two (height, width, 3) eight-bit images, in dB."""
     inside = slice(BORDER, -BORDER)
-    error = one[inside, inside].astype(np.float64) - two[inside, inside]
-    return float(10 * np.log10(255**2 / (error**2).mean()))
-
-
-def to_8_bit(image: Array) -> Array:
-    """0..1 to 0..255, rounded."""
-    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    return psnr(one[inside, inside], two[inside, inside])
 
 
 def kodak(folder: Path) -> list[Array]:

@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
 import pyopencl as cl
 
 import clpipe
 from clpipe.commands.main import main as command
+from clpipe.images.write import write_exr
 
 BATCH = 1000  # images between two lines
 SIZES = ((8, 8), (17, 40), (64, 64), (90, 31), (1, 9), (33, 120))  # height, width
@@ -56,30 +56,22 @@ def count_objects() -> None:
         setattr(cl, name, type(name, (base,), {"__init__": begin, "__del__": end}))
 
 
-def write(path: Path, pixels: np.ndarray, half: bool) -> None:
-    """An EXR of (height, width, channel)."""
-    spec = oiio.ImageSpec(*pixels.shape[1::-1], pixels.shape[2], oiio.HALF if half else oiio.FLOAT)
-    if pixels.shape[2] == 1:
-        spec.channelnames = ("Y",)
-    file = oiio.ImageOutput.create(str(path))
-    assert file.open(str(path), spec) and file.write_image(pixels) and file.close()
-
-
 def write_sources(folder: Path) -> None:
     """Two folders of links to a few files: renders, and mosaics that enter in the middle."""
     random = np.random.default_rng(0)
-    for name, channels in (("renders", 3), ("mosaics", 1)):
+    for name, channels in (("renders", "RGB"), ("mosaics", "Y")):
         files = folder / f"{name} files"
         files.mkdir()
         (folder / name).mkdir()
         for i, size in enumerate(SIZES):
             for half in (True, False):
-                pixels = random.random((*size, channels)).astype(np.float32)
-                write(files / f"{i}{'hf'[half]}.exr", pixels, half)
+                pixels = random.random((*size, len(channels))).astype(np.float32)
+                write_exr(files / f"{i}{'hf'[half]}.exr", pixels, channels, {}, half)
         whole = (files / "2h.exr").read_bytes()
         (files / "damaged.exr").write_bytes(whole[: len(whole) // 2])
         (files / "none.exr").write_bytes(b"no picture")
-        write(files / "too_large.exr", np.zeros((200, 200, channels), np.float32), True)
+        large = np.zeros((200, 200, len(channels)), np.float32)
+        write_exr(files / "too_large.exr", large, channels, {}, half=True)
         targets = sorted(files.iterdir())
         for i in range(BATCH):
             (folder / name / f"{i:04}.exr").symlink_to(targets[i % len(targets)])
