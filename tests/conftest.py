@@ -20,6 +20,7 @@ from clpipe.engine import programs
 from clpipe.engine.device import Device
 from clpipe.engine.discovery import choose, find_devices
 from clpipe.engine.runner import Result, Runner
+from clpipe.images.write import write_exr as write_file
 from clpipe.outputs.sealed import SEAL, sealed
 from clpipe.stage import Kind
 
@@ -185,6 +186,18 @@ def write_exr(tmp_path: Path) -> Callable[..., Path]:
         return path
 
     return write
+
+
+@pytest.fixture(scope="session")
+def two_renders(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two small renders, one of them in a folder of the folder."""
+    folder = tmp_path_factory.mktemp("explore") / "renders"
+    (folder / "left").mkdir(parents=True)
+    y, x = np.mgrid[0:63, 0:96] / 96
+    for i, name in enumerate(("a", "left/b")):
+        picture = np.stack([0.2 + 0.5 * x, 0.6 - 0.5 * y, 0.3 + 0.2 * np.sin(9 * x + i)], -1)
+        write_file(folder / f"{name}.exr", picture.astype(np.float32), ("R", "G", "B"), {})
+    return folder
 
 
 @pytest.fixture

@@ -13,9 +13,10 @@ import pytest
 
 from clpipe.base.errors import DeviceError, ImageError
 from clpipe.chain.chain import make_chain
-from clpipe.chain.settings import settings_from
+from clpipe.chain.settings import Settings, settings_from
 from clpipe.commands.devices import device_rows
 from clpipe.engine import hardware
+from clpipe.engine.check import example
 from clpipe.engine.cpu_target import Target
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.discovery import choose, choose_all, find_devices
@@ -25,6 +26,7 @@ from clpipe.engine.hardware import Hardware, hardware_of
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Runner
 from clpipe.engine.runtimes import lanes_for
+from clpipe.stage import Kind
 
 
 @pytest.fixture
@@ -335,3 +337,18 @@ def test_another_chain_of_the_same_structure_is_not_planned_again(device, monkey
     monkeypatch.setattr("clpipe.engine.runner.make_plan", plan_again)
     assert np.array_equal(runner.for_chain(changed).run(image, "k").encoded, alone)
     assert np.array_equal(runner.for_chain(changed).run(image, "k").encoded, alone)
+
+
+def test_a_device_keeps_the_kernels_of_so_many_plans(device, monkeypatch):
+    monkeypatch.setattr("clpipe.engine.device.PLANS", 2)
+    fresh, image = Device(device.info), example(Kind.RGB, (9, 20))
+    stages = (("exposure",), ("gamma",), ("exposure", "gamma"), ("exposure",))
+    runners = [
+        Runner(make_chain(Settings(stages=each)), fresh, encode=False, final=True)
+        for each in stages
+    ]
+    for runner in runners:
+        expected = Runner(runner.chain, None, encode=False, final=True).run(image, "k").final
+        assert np.abs(runner.run(image, "k").final - expected).max() < 1e-6
+    compiled = [fresh.is_compiled(runner.plan_for(image)) for runner in runners]
+    assert compiled == [True, False, True, True]  # the first and the last have one plan

@@ -1,6 +1,7 @@
 """Values that a configuration leaves to chance: their laws, and what cannot be drawn."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -158,7 +159,9 @@ def test_a_normal_ends_where_its_parameter_does():
     wide = settings_from({"iso": {"normal": [3200, 3200]}, "camera": DRAWS["camera"]})
     make_chain(wide)
     isos = [wide.drawn(key).iso for key in KEYS[:200]]
-    assert (min(isos), max(isos)) == (100, 6400)  # what both cameras have
+    # Each camera draws from what it has, and nothing is heaped where that ends.
+    assert 100 < min(isos) < 400 and 6400 < max(isos) < 12800
+    assert len({*isos}) == len(isos)
 
 
 def test_choices_of_lists_and_texts():
@@ -326,8 +329,12 @@ def test_a_draw_that_cannot_be(tmp_path, text, message):
     [
         ({"iso": {"uniform": [50, 800]}}, "iso: found 50, but camera sony-a7r2 goes from 100"),
         (
-            {"iso": {"uniform": [100, 12800]}, "camera": DRAWS["camera"]},
-            "iso: found 12800, but camera canon-5d2 goes from 100 to 6400",
+            {"iso": {"uniform": [100, 50000]}, "camera": {"choice": ["canon-5d2", "sony-a7r2"]}},
+            "iso: found 50000, but camera sony-a7r2 goes from 100 to 25600",
+        ),
+        (
+            {"iso": {"choice": [12800]}, "camera": {"choice": ["canon-5d2", "sony-a7r2"]}},
+            r"iso: found .*12800.*, but camera canon-5d2 goes from 100 to 6400 and has none of",
         ),
         ({"iso": 50, "camera": {"choice": ["sony-a7s2", "canon-5d2"]}}, "found 50, but camera can"),
         ({"camera": {"choice": ["sony-a7r2", "sony-a7r9"]}}, "unknown camera 'sony-a7r9'"),
@@ -346,3 +353,43 @@ def test_the_limits_of_a_parameter_are_its_own():
     assert limits_of(exposure.methods[0], "ev") == Limits(-20, 20)
     assert limits_of(bits.methods[0], "bits") == Limits(8, 16, whole=True)
     assert limits_of(all_stages()["mosaic"].methods[0], "pattern") is None
+
+
+@pytest.mark.parametrize(
+    ("law", "share"),
+    [
+        ({"log_uniform": [800, 12800]}, None),
+        ({"uniform": [800, 12800]}, None),
+        ({"normal": [5000, 4000]}, None),
+        ({"choice": [800, 1600, 6400, 12800]}, 1 / 3),
+    ],
+)
+def test_each_camera_draws_in_its_own_part_of_a_law(law, share):
+    cameras = {"sony-a7r2": 12800, "canon-6d": 6400}
+    settings = settings_from({"iso": law, "camera": {"choice": list(cameras)}})
+    settings.check_cameras()
+    drawn = [settings.drawn(f"{n}.exr") for n in range(2000)]
+    for name, highest in cameras.items():
+        isos = np.array([each.iso for each in drawn if each.camera == name])
+        assert 900 < len(isos) < 1100 and (isos <= highest + 12800 * ("normal" in law)).all()
+        heap = np.mean(isos == isos.max())
+        assert heap < (0.01 if share is None else share + 0.1)
+        if "log_uniform" in law:  # its law is kept: as many in each half of what a camera has
+            middle = np.sqrt(800 * highest)
+            assert abs(np.mean(isos < middle) - 0.5) < 0.05
+    says = settings.draw_note()
+    assert says in ("", "iso: drawn from what a camera has: canon-6d from 100 to 6400")
+    assert bool(says) is ("normal" not in law)
+
+
+def test_what_no_camera_has_is_refused_before_a_run(clpipe, write_exr):
+    write_exr("a.exr", np.full((4, 6, 3), 0.25))
+    run = ("run", "a.exr", "-o", "out", "--device", "numpy")
+    Path("c.toml").write_text("camera = { choice = ['sony-a7r2', 'canon-6d'] }\niso = 12800\n")
+    refused = clpipe(*run, "-c", "c.toml", status=2).stderr
+    assert "iso: found 12800, but camera canon-6d goes from 100 to 6400" in refused
+    Path("c.toml").write_text(
+        "camera = { choice = ['sony-a7r2', 'canon-6d'] }\niso = { log_uniform = [800, 12800] }\n"
+    )
+    said = clpipe(*run, "-c", "c.toml").stderr
+    assert said.count("iso: drawn from what a camera has: canon-6d from 100 to 6400") == 1

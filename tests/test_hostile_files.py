@@ -18,18 +18,16 @@ import pytest
 from clpipe.base.digests import digests
 from clpipe.base.errors import ClpipeError, ImageError, RequestError
 from clpipe.base.files import sha256_of
-from clpipe.base.reading import parse_toml, unchanged
+from clpipe.base.reading import unchanged
 from clpipe.batch.replay import replay_of
 from clpipe.batch.tars import Members, is_own
 from clpipe.camera.profile import load_camera
 from clpipe.chain.files import load_config
 from clpipe.chain.registry import load_stage_file
 from clpipe.chain.settings import settings_from
-from clpipe.chain.toml import toml_value
 from clpipe.images.dump import parse_dump, read_dump
 from clpipe.images.raw import read_exif, read_facts
 from clpipe.images.read import ReadOptions, holds_mosaic, read_source
-from clpipe.inputs.kept import embedded_settings
 from clpipe.inputs.manifest import read_manifest
 from clpipe.stage import Kind
 from tests.conftest import ROOT
@@ -208,62 +206,6 @@ def test_exif_that_repeats_itself_is_given_up(tmp_path):
     begin = time.perf_counter()
     assert read_exif(tmp_path / "a.dng").tags == {}
     assert time.perf_counter() - begin < 10
-
-
-DEEP = {
-    "parts": "a." * 50_000 + "a = 1",
-    "quoted": '"a" . ' * 50_000 + "a = 1",
-    "table": "[" + "a." * 50_000 + "a]",
-    "inline": "x = { " + "a." * 50_000 + "a = 1 }",
-    "arrays": "x = " + "[" * 100_000,
-    "tables": "x = " + "{a=" * 100_000,
-    "number": "iso = " + "9" * 100_000,
-    "bytes": "\ufffd = 1",
-}
-
-
-@pytest.mark.parametrize("text", DEEP.values(), ids=DEEP)
-def test_toml_that_would_take_all_memory_or_time(tmp_path, text):
-    path = tmp_path / "a.toml"
-    path.write_text(text, "utf-8")
-    for load in (load_config, load_camera):
-        with pytest.raises(RequestError, match=r"a\.toml") as refused:
-            load(str(path))
-        assert len(str(refused.value)) < 1000
-    cell = text.removeprefix("x = ")
-    assert toml_value(cell) == cell  # text, which no parameter takes
-
-
-def test_names_that_no_file_can_have():
-    for name in ("a\0.toml", "a\udcff\ud800.toml"):
-        for load in (load_config, load_camera):
-            with pytest.raises(RequestError, match="no file can have this name"):
-                load(name)
-
-
-def test_usual_toml_is_no_deep_key():
-    text = "name = '" + "Measured by hand. " * 40 + "'\nx = [0.5" + ", 0.25" * 99 + "]\n"
-    assert parse_toml(text + "a.b.c.d = 1")["a"] == {"b": {"c": {"d": 1}}}
-
-
-def test_json_that_is_nested_too_deeply_is_refused(tmp_path):
-    deep = '{"channels": ' * 100_000
-    (tmp_path / "a.json").write_text(deep)
-    with pytest.raises(RequestError, match="not a report of clpipe measure"):
-        settings_from(
-            {"picture_noise": {"method": "iid_gaussian", "measured": str(tmp_path / "a.json")}}
-        )
-    with pytest.raises(RequestError, match="nested too deeply"):
-        embedded_settings({"settings": deep})
-    (tmp_path / "a.jsonl").write_text(deep)
-    with pytest.raises(RequestError, match="row 1: not valid JSON"):
-        read_manifest(tmp_path / "a.jsonl")
-
-
-def test_a_giant_field_is_refused(tmp_path):
-    (tmp_path / "a.csv").write_text("path\n" + "x" * 1_000_000)
-    with pytest.raises(RequestError, match="row 2: not valid CSV: field larger than"):
-        read_manifest(tmp_path / "a.csv")
 
 
 # How each file that a request names is read, by the ending of its name.

@@ -13,8 +13,12 @@ import numpy as np
 import pytest
 
 from clpipe.base.errors import RequestError
+from clpipe.base.reading import parse_toml
 from clpipe.camera.profile import built_in_cameras, load_camera
+from clpipe.chain.files import load_config
 from clpipe.chain.settings import settings_from
+from clpipe.chain.toml import toml_value
+from clpipe.inputs.kept import embedded_settings
 from clpipe.inputs.manifest import read_manifest
 from tests.conftest import ROOT, reseal
 
@@ -102,3 +106,59 @@ def test_a_replay_that_cannot_be_names_its_sidecar(clpipe, write_exr):
     reseal(Path("out/a.json"), values)
     result = clpipe("replay", "out/a.json", "-o", "b", "--device", "numpy", status=2)
     assert result.stderr.startswith("clpipe: out/a.json: unknown camera '/dev/zero'")
+
+
+DEEP = {
+    "parts": "a." * 50_000 + "a = 1",
+    "quoted": '"a" . ' * 50_000 + "a = 1",
+    "table": "[" + "a." * 50_000 + "a]",
+    "inline": "x = { " + "a." * 50_000 + "a = 1 }",
+    "arrays": "x = " + "[" * 100_000,
+    "tables": "x = " + "{a=" * 100_000,
+    "number": "iso = " + "9" * 100_000,
+    "bytes": "\ufffd = 1",
+}
+
+
+@pytest.mark.parametrize("text", DEEP.values(), ids=DEEP)
+def test_toml_that_would_take_all_memory_or_time(tmp_path, text):
+    path = tmp_path / "a.toml"
+    path.write_text(text, "utf-8")
+    for load in (load_config, load_camera):
+        with pytest.raises(RequestError, match=r"a\.toml") as refused:
+            load(str(path))
+        assert len(str(refused.value)) < 1000
+    cell = text.removeprefix("x = ")
+    assert toml_value(cell) == cell  # text, which no parameter takes
+
+
+def test_names_that_no_file_can_have():
+    for name in ("a\0.toml", "a\udcff\ud800.toml"):
+        for load in (load_config, load_camera):
+            with pytest.raises(RequestError, match="no file can have this name"):
+                load(name)
+
+
+def test_usual_toml_is_no_deep_key():
+    text = "name = '" + "Measured by hand. " * 40 + "'\nx = [0.5" + ", 0.25" * 99 + "]\n"
+    assert parse_toml(text + "a.b.c.d = 1")["a"] == {"b": {"c": {"d": 1}}}
+
+
+def test_json_that_is_nested_too_deeply_is_refused(tmp_path):
+    deep = '{"channels": ' * 100_000
+    (tmp_path / "a.json").write_text(deep)
+    with pytest.raises(RequestError, match="not a report of clpipe measure"):
+        settings_from(
+            {"picture_noise": {"method": "iid_gaussian", "measured": str(tmp_path / "a.json")}}
+        )
+    with pytest.raises(RequestError, match="nested too deeply"):
+        embedded_settings({"settings": deep})
+    (tmp_path / "a.jsonl").write_text(deep)
+    with pytest.raises(RequestError, match="row 1: not valid JSON"):
+        read_manifest(tmp_path / "a.jsonl")
+
+
+def test_a_giant_field_is_refused(tmp_path):
+    (tmp_path / "a.csv").write_text("path\n" + "x" * 1_000_000)
+    with pytest.raises(RequestError, match="row 2: not valid CSV: field larger than"):
+        read_manifest(tmp_path / "a.csv")

@@ -41,6 +41,9 @@ class BoundedCache(Generic[V]):
     ([4, 9, 4, 16], 2)
     >>> [squares.get(n, lambda: 0) for n in (2, 3)], 4 in squares, len(squares)
     ([4, 0], False, 2)
+    >>> texts = BoundedCache(5, size=len)
+    >>> [texts.get(n, lambda n=n: n * "x") for n in (2, 3, 6)], texts.taken, 6 in texts
+    (['xx', 'xxx', 'xxxxxx'], 5, False)
     """
 
     def __init__(self, bound: int, size: Callable[[V], int] | None = None) -> None:

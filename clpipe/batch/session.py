@@ -3,6 +3,7 @@
 The commands that make pictures and :func:`clpipe.run` all go this way.
 """
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -43,6 +44,9 @@ from clpipe.stage import Kind
 
 if TYPE_CHECKING:
     from clpipe.batch.dask_client import Cluster
+
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -139,6 +143,8 @@ class Run:
         if not self.jobs:
             return
         self._loader.check(self.jobs)
+        if note := self._loader.settings.draw_note():
+            log.info("%s", note)
         self._chain = self._loader.first_chain(self.jobs)
         check_render_options(request, self._chain.source)
         self._request = request.with_outputs(self._chain)
@@ -183,11 +189,11 @@ class Run:
                 check_camera_files(folder)
             trace = stack.enter_context(Trace(where.trace)) if where.trace else None
             remove_unfinished(where.output, self.jobs, self._request.patch is not None)
-            log = RunLog(where.output / log_name(images.shard), start, self._echo)
-            stack.enter_context(closing(log))
+            run_log = RunLog(where.output / log_name(images.shard), start, self._echo)
+            stack.enter_context(closing(run_log))
             running = stack.enter_context(closing(batch.run(jobs)))
             self.summary.began = time.perf_counter()
-            yield from self._counted(running, log, trace)
+            yield from self._counted(running, run_log, trace)
             self._look_behind(folders)
 
     def _counted(

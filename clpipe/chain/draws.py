@@ -43,6 +43,15 @@ class Limits:
         rounded = round(inside) if self.whole else float(f"{inside:.9g}")
         return min(max(rounded, self.low), self.high)
 
+    def overlap(self, low: float, high: float) -> tuple[float, float] | None:
+        """The part of a range that is allowed; None where there is none.
+
+        >>> Limits(100, 6400).overlap(800, 12800), Limits(100, 400).overlap(800, 1600)
+        ((800, 6400), None)
+        """
+        ends = max(low, self.low), min(high, self.high)
+        return ends if ends[0] <= ends[1] else None
+
     def between(self, low: float, high: float) -> list[float]:
         """Numbers of a range to validate: its ends, and whole numbers between them.
 
@@ -103,6 +112,13 @@ class Draw(BaseModel):
         """
         raise NotImplementedError(type(self).__name__)
 
+    def within(self, limits: Limits) -> "Draw | None":
+        """The same law of what limits allow, so that nothing is heaped at a limit.
+
+        None where they allow nothing, or not even the mean. A law that follows another value stays.
+        """
+        return self
+
     def value(self, uniform: float, limits: Limits | None, followed: Any) -> Any:
         """The value of a uniform number.
 
@@ -131,6 +147,10 @@ class Choice(Draw):
 
     def extremes(self, limits: Limits | None, followed: Sequence[Any]) -> Sequence[Any]:
         return self.choice
+
+    def within(self, limits: Limits) -> "Choice | None":
+        left = [each for each in self.choice if limits.low <= each <= limits.high]
+        return Choice(choice=left) if left else None
 
     def value(self, uniform: float, limits: Limits | None, followed: Any) -> Any:
         return self.choice[int(uniform * len(self.choice))]
@@ -174,6 +194,10 @@ class Uniform(NumberDraw):
     def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
         return self.uniform
 
+    def within(self, limits: Limits) -> "Uniform | None":
+        ends = limits.overlap(*self.uniform)
+        return Uniform(uniform=ends) if ends else None
+
     def number(self, uniform: float, limits: Limits, followed: Any) -> float:
         low, high = self.uniform
         if limits.whole:
@@ -199,6 +223,10 @@ class LogUniform(NumberDraw):
 
     def reach(self, limits: Limits, followed: Sequence[Any]) -> tuple[float, float]:
         return self.log_uniform
+
+    def within(self, limits: Limits) -> "LogUniform | None":
+        ends = limits.overlap(*self.log_uniform)
+        return LogUniform(log_uniform=ends) if ends else None
 
     def number(self, uniform: float, limits: Limits, followed: Any) -> float:
         low, high = self.log_uniform
@@ -227,9 +255,31 @@ class Normal(NumberDraw):
             return mean, mean  # validation will refuse it
         return limits.nearest(mean - FAR * sigma), limits.nearest(mean + FAR * sigma)
 
+    def within(self, limits: Limits) -> "Truncated | None":
+        if not limits.low <= self.normal[0] <= limits.high:
+            return None
+        return Truncated(normal=self.normal, ends=(limits.low, limits.high))
+
     def number(self, uniform: float, limits: Limits, followed: Any) -> float:
         mean, sigma = self.normal
         return mean + sigma * _normal(uniform)
+
+
+class Truncated(Normal):
+    """A Gaussian of which only what lies between two ends is drawn.
+
+    >>> Truncated(normal=(0, 1), ends=(0, 8)).value(0.5, Limits(), None)
+    0.67448975
+    """
+
+    ends: Ends
+
+    def number(self, uniform: float, limits: Limits, followed: Any) -> float:
+        mean, sigma = self.normal
+        if not sigma:
+            return mean
+        low, high = (NormalDist(mean, sigma).cdf(end) for end in self.ends)
+        return super().number(low + uniform * (high - low), limits, followed)
 
 
 class SameAs(Draw):

@@ -17,7 +17,7 @@ from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
 from clpipe.camera.profile import DEFAULT_CAMERA, built_in_name, load_camera
 from clpipe.chain.drawing import draw_of, extremes_of, values_of
-from clpipe.chain.draws import TINY, Choice, Draw, Limits, limits_of
+from clpipe.chain.draws import TINY, Choice, Draw, Limits, Truncated, limits_of
 from clpipe.chain.keys import CODE, KEYS, LENS, MAX_STAGES, NOISE, TABLES, check_type, names_in
 from clpipe.chain.methods import (
     TABLE_MODELS,
@@ -100,10 +100,17 @@ class Settings:
         """
         if not self.draws:
             return self
-        limits = partial(self.limits, isos=self.isos() if "iso" in self.draws else Limits())
         owner = f"draw:{self.seed}:{name}"
+        draws, isos = dict(self.draws), Limits()
+        if "iso" in draws:
+            first = {key: draw for key, draw in draws.items() if key == "camera"}
+            limits = partial(self.limits, isos=isos)
+            own = values_of(first, self.constants(), limits, owner).get("camera", self.camera)
+            isos = Limits(*load_camera(own).iso_range)
+            draws["iso"] = draws["iso"].within(isos) or draws["iso"]
+        limits = partial(self.limits, isos=isos)
         values: dict[str, Any] = {}
-        for key, value in values_of(self.draws, self.constants(), limits, owner).items():
+        for key, value in values_of(draws, self.constants(), limits, owner).items():
             step, _, name = key.rpartition(".")
             if step:
                 values.setdefault(step, dict(self.parameters.get(step, {})))[name] = value
@@ -197,17 +204,44 @@ class Settings:
         return Limits(max(low for low, _ in ranges), min(high for _, high in ranges))
 
     def check_cameras(self) -> None:
-        """See that every camera that can be drawn exists, and has every ISO that can be drawn.
+        """See that every camera that can be drawn exists, and that each ISO has a camera.
+
+        Where cameras differ, each draws in the part of a law that it has, and only there.
 
         Raises:
-            RequestError: a camera cannot be loaded, or an ISO is outside its range.
+            RequestError: a camera cannot be loaded, an ISO is outside the range of every camera, or
+                a camera has no ISO that can be drawn.
         """
-        isos: Sequence[float] = [self.iso]
-        if "iso" in self.draws:
-            limits = partial(self.limits, isos=self.isos())
-            isos = extremes_of(self.draws, self.constants(), limits)["iso"]
-        for camera, iso in product(map(load_camera, self.cameras()), isos):
-            camera.gain_stage(iso)
+        cameras, draw = [load_camera(name) for name in self.cameras()], self.draws.get("iso")
+        if draw is None or draw.follows:
+            isos: Sequence[float] = [self.iso]
+            if draw:
+                limits = partial(self.limits, isos=self.isos())
+                isos = extremes_of(self.draws, self.constants(), limits)["iso"]
+            for camera, iso in product(cameras, isos):
+                camera.gain_stage(iso)
+            return
+        lows, highs = zip(*(camera.iso_range for camera in cameras), strict=True)
+        for iso in draw.extremes(Limits(min(lows), max(highs)), ()):
+            if not any(low <= iso <= high for low, high in zip(lows, highs, strict=True)):
+                lowest, highest = lows.index(min(lows)), highs.index(max(highs))
+                cameras[lowest if iso < min(lows) else highest].gain_stage(iso)
+        for camera in cameras:
+            if draw.within(Limits(*camera.iso_range)) is None:
+                low, high = camera.iso_range
+                raise RequestError(
+                    f"iso: found {draw.record()}, but camera {camera.name} goes from {low:g} to "
+                    f"{high:g} and has none of that"
+                )
+
+    def draw_note(self) -> str:
+        """What is to be said of a drawn ISO, "" where every camera draws from the whole law."""
+        draw, parts = self.draws.get("iso"), []
+        for camera in map(load_camera, self.cameras()) if draw else ():
+            own = draw and draw.within(Limits(*camera.iso_range))
+            if own != draw and not isinstance(own, Truncated):  # of a normal, tails are left out
+                parts.append("{} from {:g} to {:g}".format(camera.name, *camera.iso_range))
+        return f"iso: drawn from what a camera has: {', '.join(parts)}" if parts else ""
 
 
 def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Settings:

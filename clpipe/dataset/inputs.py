@@ -1,5 +1,6 @@
 """What a dataset is made of, as its arguments name it: images, texts, bytes."""
 
+import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,6 +9,8 @@ from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
 from clpipe.inputs.find import Job, find_jobs
 from clpipe.inputs.loader import ImageLoader
+
+log = logging.getLogger(__name__)
 
 NOWHERE = Path(os.devnull)  # nothing is written
 
@@ -40,6 +43,8 @@ def jobs_of(loader: ImageLoader, inputs: Sequence[str], exclude: Sequence[str]) 
     """
     jobs = loader.exposures(find_jobs(inputs, NOWHERE, loader.endings(), exclude))
     loader.check(jobs)
+    if note := loader.settings.draw_note():
+        log.info("%s", note)
     owners: dict[str, Job] = {}
     for job in jobs:
         if job.listed and not job.path.exists():  # those of a folder were found there

@@ -151,10 +151,12 @@ class ImageLoader:
         Raises:
             RequestError: they are not; the message says in which row.
         """
+        carries = self.raw.takes if self.kept is None else lambda path: True
         # What is only of a camera's file was checked when it was found there.
         if rows := [job for job in jobs if job.place or job.values.keys() - {RENDER}]:
-            carries = self.raw.takes if self.kept is None else lambda path: True
             check_rows(rows, self.settings, carries)
+        if not all(job in rows or carries(job.path) for job in jobs):
+            self.settings.check_cameras()
 
     def claim(self, job: Job) -> Claim:
         """The claim of a job's file, before it is read; nothing where reading refuses it.
