@@ -24,6 +24,7 @@ from clpipe.stage.context import Context, ReferenceContext
 from clpipe.stage.method import Method, Stage, StageRole, parameter
 from clpipe.stage.passes import (
     Argument,
+    Arguments,
     CompileTime,
     Kind,
     LineTable,
@@ -38,6 +39,7 @@ from clpipe.stage.passes import (
 
 __all__ = [
     "Argument",
+    "Arguments",
     "Array",
     "CompileTime",
     "Context",
