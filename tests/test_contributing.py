@@ -62,6 +62,15 @@ def test_the_walks_are_true_to_the_code():
             assert pkgutil.resolve_name(f"clpipe.{name}") is not None
 
 
+def test_the_words_are_those_of_the_code():
+    words = TEXT[TEXT.index("| word |") : TEXT.index("## A stage of your own")]
+    code = "\n".join(path.read_text() for path in (ROOT / "clpipe").rglob("*.py"))
+    named = re.findall(r"^\| ([a-zA-Z, ]+) \|", words, re.MULTILINE)[1:]
+    assert len(named) > 25
+    for word in (word for row in named for word in row.split(", ")):
+        assert re.search(rf"\b{word}s?\b", code, re.IGNORECASE), word
+
+
 def test_the_tools_that_are_named_are_those_that_are_there():
     table = TEXT[TEXT.index("| `tools/run` |") : TEXT.index("## Dependencies")]
     rows = set(re.findall(r"^\| `(\w+ \w+)` \|", table, re.MULTILINE))

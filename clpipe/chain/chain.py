@@ -301,19 +301,17 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     Raises:
         RequestError: image kinds do not fit.
     """
-    names = step_names(settings)
-    optics = optics_of(settings, camera, names)
+    methods = {name: settings.method(name) for name in step_names(settings)}
+    optics = optics_of(settings, camera, methods)
     context = Context(camera=camera, iso=settings.iso, optics=optics)
     steps: list[Step] = []
     before, takes_lens = "the input", not settings.lens
-    for name in names:
+    for name, own in methods.items():
         stage = all_stages()[base_name(name)].reading(kind)
-        method = settings.method(name)
-        with validation_errors(name, type(method)), user_code_errors(f"stage {name}", stage.folder):
+        with validation_errors(name, type(own)), user_code_errors(f"stage {name}", stage.folder):
             fits = stage.reads is (kind or stage.reads)
-            if fits or isinstance(method, FromLens):
-                own, method = method, method.resolve(context)
-                takes_lens |= isinstance(own, FromLens) and not isinstance(method, Unchanged)
+            method = own.resolve(context) if fits or isinstance(own, FromLens) else own
+            takes_lens |= isinstance(own, FromLens) and not isinstance(method, Unchanged)
             if not fits:
                 if isinstance(method, Unchanged) and stage.reads is stage.writes:
                     continue  # so that gamma can be skipped without what does nothing behind it
@@ -325,11 +323,11 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
         context = after
         kind, before = stage.writes, name
     if not takes_lens:
-        raise KeyedError("lens", _unused_lens(settings, names))
+        raise KeyedError("lens", _unused_lens(settings, methods))
     return steps
 
 
-def optics_of(settings: Settings, camera: Camera, names: Sequence[str]) -> Optics:
+def optics_of(settings: Settings, camera: Camera, methods: Mapping[str, Method]) -> Optics:
     """The optics that settings, the render's camera and the steps of a chain state.
 
     Raises:
@@ -342,9 +340,8 @@ def optics_of(settings: Settings, camera: Camera, names: Sequence[str]) -> Optic
         if (value := getattr(settings, key)) is not None
     ]
     stated += [(f"{RENDER}.{name}", name, v) for name, v in settings.render.optics.items()]
-    for step in names:
-        own = settings.method(step).optics()
-        stated += [(f"{step}.{name}", name, value) for name, value in own.items()]
+    for step, method in methods.items():
+        stated += [(f"{step}.{name}", name, value) for name, value in method.optics().items()]
     optics = Optics.of(stated)
     if not settings.lens:
         return optics
@@ -358,12 +355,12 @@ def optics_of(settings: Settings, camera: Camera, names: Sequence[str]) -> Optic
 SETTINGS = dict(zip(LENS[1:], ("focal_length", "f_number", "focus_distance"), strict=True))
 
 
-def _unused_lens(settings: Settings, names: Sequence[str]) -> str:
+def _unused_lens(settings: Settings, methods: Mapping[str, Method]) -> str:
     """The message for a lens that is named, and that no step takes."""
-    taking = [name for name in names if isinstance(settings.method(name), FromLens)]
     known = "lensfun knows neither distortion nor vignetting of it as it is set"
     stages = " or ".join(s.name for s in all_stages().values() if "lens" in s.by_name)
-    why = known if taking else f"no step takes it; that is done by {stages} with method lens"
+    takes_it = any(isinstance(method, FromLens) for method in methods.values())
+    why = known if takes_it else f"no step takes it; that is done by {stages} with method lens"
     return f"lens: found {settings.lens}, but {why}; leave it out"
 
 

@@ -10,6 +10,7 @@ What a stage file may import is all in ``__all__`` here, and only from here. The
 
 from clpipe.base.types import Array, Floats
 from clpipe.stage.bases import (
+    AboutAxis,
     Curve,
     FromLens,
     GaussianNoise,
@@ -37,6 +38,7 @@ from clpipe.stage.passes import (
 )
 
 __all__ = [
+    "AboutAxis",
     "Argument",
     "Array",
     "CompileTime",

@@ -41,6 +41,25 @@ class FromLens(Method):
         return self.of_lens(context.optics.calibration).resolve(context)
 
 
+class AboutAxis(Method):
+    """A method that counts from the principal point."""
+
+    cx: float | None = parameter(
+        None,
+        "Principal point, from the left edge: OpenCV's cx + 0.5.",
+        "px",
+        "render.cx, the middle",
+        optics=True,
+    )
+    cy: float | None = parameter(
+        None,
+        "Principal point, from the upper edge: OpenCV's cy + 0.5.",
+        "px",
+        "render.cy, the middle",
+        optics=True,
+    )
+
+
 class InFocalLengths(Method):
     """A method that counts in focal lengths: px, or mm over the width of the sensor."""
 

@@ -99,9 +99,9 @@ class Method(BaseModel):
 
     def with_optics(self, context: Context) -> Self:
         """A copy in which what is known of the optics replaces the parameters that are None."""
-        return self.with_defaults(
-            **{n: getattr(context.optics, n) for n in optics_names(type(self))}
-        )
+        names = optics_names(type(self))
+        known = {name: getattr(context.optics, name) for name in names}
+        return self.with_defaults(**known) if known else self
 
     def next_context(self, context: Context) -> Context:
         """The context of the next step, from this (resolved) method's."""

@@ -12,6 +12,7 @@ from clpipe.base.types import Floats
 from clpipe.reference.convolve import convolve, reach_of, taps_of
 from clpipe.reference.turning import BILINEAR, Turning
 from clpipe.stage import (
+    AboutAxis,
     Argument,
     Context,
     InFocalLengths,
@@ -151,7 +152,7 @@ class Linear(Method):
         return convolve(image, self.taps) if self.pixels else image
 
 
-class Perspective(InFocalLengths):
+class Perspective(InFocalLengths, AboutAxis):
     """The streaks of a camera that turns, as they are in each place of a picture in perspective.
 
     It turns evenly about an axis in the plane of its picture, and shows the render as it is in the
@@ -183,12 +184,6 @@ class Perspective(InFocalLengths):
         "degrees",
         ge=-360,
         le=360,
-    )
-    cx: float | None = parameter(
-        None, "Principal point, from the left edge.", "px", "render.cx, the middle", optics=True
-    )
-    cy: float | None = parameter(
-        None, "Principal point, from the upper edge.", "px", "render.cy, the middle", optics=True
     )
 
     def resolve(self, context: Context) -> Self:

@@ -10,6 +10,7 @@ from clpipe.base.types import Floats
 from clpipe.camera.lens import LensCalibration
 from clpipe.reference.math import inverse_root
 from clpipe.stage import (
+    AboutAxis,
     Argument,
     CompileTime,
     Context,
@@ -85,7 +86,7 @@ class Pa(Method):
         return image * np.maximum(gain, np.float32(0))[..., None]
 
 
-class CosineFourth(InFocalLengths):
+class CosineFourth(InFocalLengths, AboutAxis):
     """v * cos^4 of the angle to the optical axis, which passes through the principal point.
 
     What falls on a sensor behind a lens without vignetting of its own, cos^4 = 1 / (1 + r^2)^2 with
@@ -104,13 +105,6 @@ class CosineFourth(InFocalLengths):
     other_examples: ClassVar = (
         {"fx": None, "focal_length": 20.0, "sensor_width": 36.0},
         {"cx": 12.3, "cy": 9.0},
-    )
-
-    cx: float | None = parameter(
-        None, "Principal point, from the left edge.", "px", "render.cx, the middle", optics=True
-    )
-    cy: float | None = parameter(
-        None, "Principal point, from the upper edge.", "px", "render.cy, the middle", optics=True
     )
 
     def resolve(self, context: Context) -> Self:
