@@ -148,6 +148,23 @@ def test_a_damaged_image_is_named(dataset):
     assert dataset[3]["key"] == "r3.exr"
 
 
+def test_a_damaged_image_is_skipped_where_that_is_asked_for(renders):
+    data = Path("in/r2.exr").read_bytes()
+    Path("in/r2.exr").write_bytes(data[: len(data) // 2])  # its header is whole
+    skipping = api.Dataset(renders, iso=ISO, on_error="skip")
+    with pytest.warns(UserWarning, match="skipped: in/r2.exr"):
+        assert [sample["key"] for sample in skipping] == [f"r{i}.exr" for i in (0, 1, 3, 4)]
+    with pytest.warns(UserWarning, match="skipped: in/r2.exr"):
+        assert [s["key"] for s in skipping.__getitems__([1, 2])] == ["r1.exr", "r3.exr"]
+    with pytest.raises(ImageError, match=r"in/r2.exr"):
+        list(api.Dataset(renders, iso=ISO))
+    Path("in/r2.exr").write_bytes(b"no image")
+    with pytest.raises(RequestError, match=r"in/r2.exr: damaged, .*; remove it, or say on_error="):
+        api.Dataset(renders, iso=ISO)
+    with pytest.warns(UserWarning, match="in/r2.exr: damaged, .*; left out"):
+        assert len(api.Dataset(renders, iso=ISO, on_error="skip")) == 4
+
+
 def test_what_is_refused(renders):
     for wrong, message in (
         ({"isos": 3}, "isos"),

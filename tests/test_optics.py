@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
+from PIL import Image
 
 import clpipe as clpipe_api
 from clpipe.base.errors import RequestError
@@ -159,7 +160,9 @@ def point(write_exr):
 
 
 RUN = ("run", "in/a.exr", "--stages", "defocus", "--format", "exr", "--device", "numpy")
-DEFOCUS = ("--set", "defocus.method=thin_lens", "--aperture", 0.5)
+THIN = ("--set", "defocus.method=thin_lens")
+FOCAL = ("--set", "motion_blur.method=perspective", "--set", "motion_blur.focal_length=35")
+DEFOCUS = (*THIN, "--aperture", 0.5)
 POSE = {"R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "t": [0, 0, 0]}
 VIEW = {"file": "a.exr", "K": [[350, 0, 180], [0, 350, 120], [0, 0, 1]], **POSE}
 
@@ -179,6 +182,17 @@ def test_a_lens_is_that_of_the_depth_of_field(clpipe, point):
     set_ = ("--focal-length", 50, "--focus-distance", 3, "--set", "render.sensor_width=36")
     clpipe(*RUN, *DEFOCUS, *set_, "-o", "o")
     assert spread_of(Path("o/a.exr")) == pytest.approx(disc(50, 0.5, 0.1), abs=0.3)
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [("--focal-length", 35, "--aperture", 4), (*FOCAL, "--set", "defocus.f_number=4", *THIN)],
+)
+def test_exif_has_it_wherever_it_is_stated(clpipe, point, stated):
+    clpipe("run", "in/a.exr", "-o", "o", "--device", "numpy", *stated)
+    with Image.open("o/a.jpg") as image:
+        inner = image.getexif().get_ifd(0x8769)
+    assert (inner[0x829D], inner[0x920A]) == (4, 35)
 
 
 def test_what_an_exr_says_of_its_camera_is_taken_where_nothing_else_is_said(clpipe, point):

@@ -114,6 +114,36 @@ def test_places_are_everywhere_and_fit():
     assert {(p.left % 2, p.top % 2, p.orientation) for p in plain} == {(0, 0, 1)}
 
 
+def test_each_patch_has_draws_of_its_own(renders):
+    options = {"iso": {"log_uniform": [200, 6400]}, "patch": api.Patches(16, per_image=6)}
+    isos = {}
+    for draws in (None, "patch", "image"):
+        dataset = api.Dataset(renders, device="numpy", draws=draws, epochs=2, **options)
+        isos[draws] = [(s["key"], s["epoch"], s["iso"]) for s in dataset]
+        by_number = [dataset[i] for i in (0, 7, 1)]
+        assert [(s["key"], s["epoch"], s["iso"]) for s in by_number] == [
+            isos[draws][i] for i in (0, 7, 1)
+        ]
+    assert isos[None] == isos["patch"] and len({*isos["patch"]}) == len(isos["patch"])
+    images = {sample[:2] for sample in isos["image"]}
+    assert len({*isos["image"]}) == len(images)
+    grid = {**options, "patch": api.Patches(16, per_image="grid")}
+    assert len({s["iso"] for s in api.Dataset(renders, device="numpy", **grid)}) == len(images) / 2
+
+
+def test_a_patch_with_draws_of_its_own_is_of_the_picture_with_these(renders):
+    options = {"iso": {"choice": [400, 3200]}, "patch": api.Patches(16, per_image=4)}
+    wholes = {
+        (s["key"], s["iso"]): s["quantize"]
+        for iso in (400, 3200)
+        for s in api.Dataset(renders, device="numpy", keep="quantize", iso=iso)
+    }
+    for sample in api.Dataset(renders, device="numpy", keep="quantize", **options):
+        left, top = sample["place"]
+        whole = wholes[sample["key"], sample["iso"]]
+        assert np.array_equal(sample["quantize"], whole[top : top + 16, left : left + 16])
+
+
 @pytest.mark.parametrize("augment", [False, True])
 def test_a_grid_covers_the_picture(augment):
     cutting = Cutting(8, 37, 24, "RGGB", augment)

@@ -8,6 +8,7 @@ import io
 import re
 import zlib
 from collections.abc import Mapping, Sequence
+from importlib import resources
 
 import matplotlib as mpl
 import numpy as np
@@ -27,6 +28,7 @@ from clpipe.analysis.report import NoiseReport
 from clpipe.analysis.spatial import LAGS
 
 NEUTRAL = INK["mosaic"]  # in :mod:`clpipe.analysis.plot`
+PAGE_COLOURS = resources.files("clpipe.analysis") / "colours.css"  # of the pages
 PAGE = "#010203"  # stands for the page's colour until the drawing is text
 COLOURS = ("#1f8a8a", "#d9822b", "#7a5bb5", "#c8102e")
 SETTINGS = {

@@ -47,10 +47,10 @@ class MotionBlur(TypedDict, total=False):
     angle: Number
     rotation: Number
     fx: Number
-    focal_length: Number
-    sensor_width: Number
     cx: Number
     cy: Number
+    focal_length: Number
+    sensor_width: Number
 
 
 class Distortion(TypedDict, total=False):
@@ -90,11 +90,11 @@ class Vignetting(TypedDict, total=False):
     k1: Number
     k2: Number
     k3: Number
+    cx: Number
+    cy: Number
     fx: Number
     focal_length: Number
     sensor_width: Number
-    cx: Number
-    cy: Number
 
 
 class OpticalBlur(TypedDict, total=False):

@@ -2,13 +2,14 @@
 
 import copy
 import hashlib
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, Unpack
 
-from clpipe.base.errors import RequestError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.processors import available_processors
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import several
@@ -92,6 +93,12 @@ class Dataset(ReadOnly):
             0 to 1, not rounded to eight bits, and raws in signal, 0 at black and 1 at white.
             "uint16": display values from 0 to 65535, and raws in DN.
         channels_first: whether arrays of three dimensions are (channel, height, width).
+        draws: whether an "image" has one draw of each value and epoch, or each "patch" its own; the
+            picture that its bits are those of is then developed with that. None is "patch", but
+            for a grid.
+        on_error: what becomes of an image that cannot be read or developed: "raise" its error, or
+            "skip" it with a warning. Asked for by their numbers, its samples are then those of the
+            next image. Headers are read at once; files without one are refused, or left out.
         cache: bytes of decoded renders that are kept in memory for further patches and epochs, in
             each process; also as a text, such as "4G".
         epoch: the number of the first epoch.
@@ -125,6 +132,8 @@ class Dataset(ReadOnly):
         variance: bool = False,
         dtype: Any = None,
         channels_first: bool = False,
+        draws: Literal["image", "patch"] | None = None,
+        on_error: Literal["raise", "skip"] = "raise",
         cache: int | str = "1G",
         epoch: int = 0,
         epochs: int | None = 1,
@@ -145,10 +154,14 @@ class Dataset(ReadOnly):
             carry=several(carry),
         )
         loader = ImageLoader(request)
-        self._jobs = jobs_of(loader, several(inputs), several(exclude))
+        self._skips = on_error == "skip"
+        self._jobs = jobs_of(loader, several(inputs), several(exclude), self._skips)
         chain = loader.first_chain(self._jobs)
         if truth is None and patch and any(step.adds_noise for step in chain.steps):
             truth = "clean"
+        at_random = self._patches is not None and self._patches.per_image != "grid"
+        is_drawn = bool(loader.settings.draws) or any(job.values for job in self._jobs)
+        self._draws_by_patch = is_drawn and (draws == "patch" if draws else at_random)
         spec = SampleSpec(
             arrays=ArrayFormat(dtype_named(dtype), channels_first, raw),
             keep=chain.select(several(keep)),
@@ -240,18 +253,38 @@ class Dataset(ReadOnly):
         """
         places = [self._place(index) for index in indices]
         groups: dict[tuple[int, ...], list[int]] = {}
+        together = self._patches and not self._draws_by_patch
         for i, place in enumerate(places):
             # A whole picture is all that an image has; asked for twice, it is made twice.
-            groups.setdefault(place[:2] if self._patches else (i,), []).append(i)
+            groups.setdefault(place[:2] if together else (i,), []).append(i)
         samples: list[Sample] = [{}] * len(places)
         for group in groups.values():
             epoch, image, _ = places[group[0]]
-            numbers = [places[i][2] for i in group]
-            batch = SampleBatch(self._jobs[image], self._epoch + epoch, numbers)
-            made = self._loader.begin(batch, *self._loader.read(batch))()
+            made = self._made(epoch, image, [places[i][2] for i in group])
             for i, sample in zip(group, made, strict=True):
                 samples[i] = sample
         return samples
+
+    def _made(self, epoch: int, image: int, numbers: Sequence[int]) -> list[Sample]:
+        """Samples of an image; of the next one that has any, where it is to be skipped.
+
+        Raises:
+            ImageError: it cannot be read or processed, or no image can.
+        """
+        for following in range(len(self._jobs)):
+            batch = self._batch(epoch, (image + following) % len(self._jobs), numbers)
+            try:
+                return self._loader.begin(batch, *self._loader.read(batch))()
+            except ImageError as error:
+                if not self._skips:
+                    raise
+                warnings.warn(f"skipped: {error}", stacklevel=3)
+        raise ImageError("no image of the dataset can be read and developed")
+
+    def _batch(self, epoch: int, image: int, numbers: Sequence[int]) -> SampleBatch:
+        """Samples of an image, in an epoch counted from the first one."""
+        drawn = numbers[0] if self._draws_by_patch else None
+        return SampleBatch(self._jobs[image], self._epoch + epoch, numbers, drawn)
 
     def __iter__(self) -> Iterator[Sample]:
         """Every sample in order; images are decoded and developed ahead, a few at a time.
@@ -261,18 +294,18 @@ class Dataset(ReadOnly):
             DeviceError: there is no usable device.
         """
         set_codec_threads(max(available_processors() // self._threads, 1))
-        ahead: deque[Future[Callable[[], list[Sample]]]] = deque()
+        ahead: deque[tuple[SampleBatch, Future[Callable[[], list[Sample]]]]] = deque()
         decoders = ThreadPoolExecutor(self._threads, "decode")
         developer = ThreadPoolExecutor(1, "device")
         self._next, self._first = self._first, 0
         try:
             for batch in self._batches(self._next):
                 read = decoders.submit(self._loader.read, batch)
-                ahead.append(developer.submit(self._begin_read, batch, read))
+                ahead.append((batch, developer.submit(self._begin_read, batch, read)))
                 if len(ahead) > self._threads + 1:
-                    yield from self._counted(ahead.popleft().result()())
+                    yield from self._counted(*ahead.popleft())
             while ahead:
-                yield from self._counted(ahead.popleft().result()())
+                yield from self._counted(*ahead.popleft())
         finally:
             decoders.shutdown(cancel_futures=True)
             developer.shutdown(cancel_futures=True)
@@ -283,7 +316,17 @@ class Dataset(ReadOnly):
     ) -> Callable[[], list[Sample]]:
         return self._loader.begin(batch, *read.result())
 
-    def _counted(self, samples: Sequence[Sample]) -> Iterator[Sample]:
+    def _counted(
+        self, batch: SampleBatch, begun: Future[Callable[[], list[Sample]]]
+    ) -> Iterator[Sample]:
+        try:
+            samples = begun.result()()
+        except ImageError as error:
+            if not self._skips:
+                raise
+            warnings.warn(f"skipped: {error}", stacklevel=3)
+            self._next += len(batch.numbers)
+            return
         for sample in samples:
             self._next += 1
             yield sample
@@ -315,7 +358,8 @@ class Dataset(ReadOnly):
             for epoch, image, numbers in self._numbering().groups(first):
                 if epoch == self._epochs:
                     return
-                yield SampleBatch(self._jobs[image], self._epoch + epoch, numbers)
+                parts = [[n] for n in numbers] if self._draws_by_patch else [numbers]
+                yield from (self._batch(epoch, image, part) for part in parts)
 
     def _digest(self) -> str:
         """What tells the images and patches of one dataset from those of another."""

@@ -2,7 +2,9 @@
 
 import logging
 import os
+import warnings
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from clpipe.base.errors import RequestError
@@ -30,16 +32,19 @@ def cache_size(cache: int | str) -> int:
     return size
 
 
-def jobs_of(loader: ImageLoader, inputs: Sequence[str], exclude: Sequence[str]) -> list[Job]:
+def jobs_of(
+    loader: ImageLoader, inputs: Sequence[str], exclude: Sequence[str], skips: bool
+) -> list[Job]:
     """The images of a dataset.
 
     Args:
         loader: how they enter.
         inputs, exclude: as for :func:`clpipe.inputs.find.find_jobs`.
+        skips: leave files out, with a warning, whose headers cannot be read.
 
     Raises:
-        RequestError: none is found, one that is named does not exist, or two have the same name,
-            and so the same draws.
+        RequestError: none is found, one that is named does not exist, one has a header that cannot
+            be read, or two have the same name, and so the same draws.
     """
     jobs = loader.exposures(find_jobs(inputs, NOWHERE, loader.endings(), exclude))
     loader.check(jobs)
@@ -55,4 +60,14 @@ def jobs_of(loader: ImageLoader, inputs: Sequence[str], exclude: Sequence[str]) 
                 f"{other.label} and {job.label} are both called {job.key}, and what is drawn for "
                 "them would be the same; give the folder that both are in"
             )
-    return jobs
+    with ThreadPoolExecutor() as threads:
+        opens = list(threads.map(loader.opens, jobs))
+    damaged = [job for job, is_whole in zip(jobs, opens, strict=True) if not is_whole]
+    if not damaged:
+        return jobs
+    others = f" and {len(damaged) - 1} others" if len(damaged) > 1 else ""
+    text = f"{damaged[0].path}{others}: damaged, or no image that can be read"
+    if not skips or len(damaged) == len(jobs):
+        raise RequestError(f"{text}; remove it, or say on_error='skip'")
+    warnings.warn(f"{text}; left out", stacklevel=4)
+    return [job for job, is_whole in zip(jobs, opens, strict=True) if is_whole]

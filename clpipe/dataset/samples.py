@@ -27,11 +27,25 @@ _opening = threading.Lock()
 
 @dataclass(frozen=True)
 class SampleBatch:
-    """Samples of one image that are developed together: the image, the epoch, their numbers."""
+    """Samples of one image that are developed together.
+
+    Args:
+        job: the image.
+        epoch: of the samples.
+        numbers: theirs among those of the image.
+        drawn: the number of the patch that draws are made for; None is all of the image.
+    """
 
     job: Job
     epoch: int
     numbers: Sequence[int]
+    drawn: int | None = None
+
+    @property
+    def draw_key(self) -> str:
+        """What draws belong to."""
+        key = of_frame(self.job.key, self.epoch or None)
+        return key if self.drawn is None else f"{key}, patch {self.drawn}"
 
 
 def pixel_bytes(source: SourceImage) -> int:
@@ -90,13 +104,12 @@ class SampleLoader:
 
     def read(self, batch: SampleBatch) -> tuple[LoadedImage, Sample]:
         """An image, and the layers that go along with its picture."""
-        job, epoch = batch.job, batch.epoch
+        job = batch.job
         loader = self._loader
         carried: Sample = {}
         try:
             loader = self._loaders.get(
-                (job.key, epoch),
-                lambda: self._loader.for_job(replace(job, key=of_frame(job.key, epoch or None))),
+                batch.draw_key, lambda: self._loader.for_job(replace(job, key=batch.draw_key))
             )
             loaded = loader.enter(job, self._source(job, loader))
             if loaded and loader.request.carry:
@@ -159,7 +172,7 @@ class SampleLoader:
         if loaded.source.depth:  # of which runners would keep a copy
             return None
         own = loaded.chain is not self._loader.chain
-        return (loaded.key, batch.epoch) if own else ()
+        return (loaded.key, batch.draw_key) if own else ()
 
     @contextmanager
     def _errors_of(self, job: Job) -> Iterator[None]:

@@ -173,6 +173,11 @@ class ImageLoader:
             claim = found or plain_claim(min(stamp_of(job.path)[0], most), 1)
         return claim if claim.width * claim.height <= most else plain_claim(0, 0)
 
+    def opens(self, job: Job) -> bool:
+        """Whether the header of a job's file can be read."""
+        is_dump = self.settings.dump_format is not None and may_be_dump(job.path)
+        return is_dump or claim_of(job.path) is not None
+
     def read(self, job: Job) -> SourceImage:
         """The image of a job.
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from clpipe.analysis.svg import histogram_svg, lines_svg, shares_svg
+from clpipe.analysis.svg import PAGE_COLOURS, histogram_svg, lines_svg, shares_svg
 from clpipe.base.about import __version__
 from clpipe.base.text import duration
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, STEPS
@@ -122,7 +122,7 @@ def html(runs: Sequence[Run]) -> str:
         laws=judged,
         law_drawings=law_drawings,
         limit=f"{LIMIT:g}",
-        style=(TEMPLATES / "report.css").read_text(),
+        style=PAGE_COLOURS.read_text() + (TEMPLATES / "report.css").read_text(),
         script=(TEMPLATES / "report.js").read_text(),
     )
 

@@ -10,6 +10,7 @@ What a stage file may import is all in ``__all__`` here, and only from here. The
 
 from clpipe.base.types import Array, Floats
 from clpipe.stage.bases import (
+    AboutAxis,
     Curve,
     FromLens,
     GaussianNoise,
@@ -24,6 +25,7 @@ from clpipe.stage.context import Context, ReferenceContext
 from clpipe.stage.method import Method, Stage, StageRole, parameter
 from clpipe.stage.passes import (
     Argument,
+    Arguments,
     CompileTime,
     Kind,
     LineTable,
@@ -37,7 +39,9 @@ from clpipe.stage.passes import (
 )
 
 __all__ = [
+    "AboutAxis",
     "Argument",
+    "Arguments",
     "Array",
     "CompileTime",
     "Context",

@@ -20,7 +20,8 @@ from clpipe.reference import warp
 from clpipe.reference.lens import DistortionMap
 from clpipe.reference.radial import Radial
 from clpipe.stage import (
-    Argument,
+    AboutAxis,
+    Arguments,
     CompileTime,
     Context,
     FromLens,
@@ -43,23 +44,9 @@ class NoDistortion(Unchanged):
     summary: ClassVar = "straight lines stay straight"
 
 
-class HasPicture(Method):
+class HasPicture(AboutAxis):
     """Parameters of the picture, whatever the lens."""
 
-    cx: float | None = parameter(
-        None,
-        "Principal point, from the left edge: OpenCV's cx + 0.5.",
-        "px",
-        "render.cx, the middle",
-        optics=True,
-    )
-    cy: float | None = parameter(
-        None,
-        "Principal point, from the upper edge: OpenCV's cy + 0.5.",
-        "px",
-        "render.cy, the middle",
-        optics=True,
-    )
     fit: bool = parameter(
         False, "Scale the picture so that it shows as much of the render as leaves no void."
     )
@@ -141,7 +128,7 @@ class Distortion(HasPicture):
         """The factor by which ``fit`` changes the focal length."""
         return {"focal_length_factor": self.lens().scale(width, height)} if self.fit else {}
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         filter_ = warp.FILTERS[self.filter]
         taps, powers = filter_.shape
         return {

@@ -1,6 +1,5 @@
 """Blur by a camera that moves while the shutter is open."""
 
-from collections.abc import Mapping
 from functools import lru_cache
 from typing import ClassVar, Self
 
@@ -12,7 +11,8 @@ from clpipe.base.types import Floats
 from clpipe.reference.convolve import convolve, reach_of, taps_of
 from clpipe.reference.turning import BILINEAR, Turning
 from clpipe.stage import (
-    Argument,
+    AboutAxis,
+    Arguments,
     Context,
     InFocalLengths,
     Kind,
@@ -142,7 +142,7 @@ class Linear(Method):
         radius = reach_of(self.taps)
         return (Pass("convolve", Stencil(radius), ("taps", "count")),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         if not self.pixels:
             return {}
         return {"taps": self.taps, "count": np.int32(len(self.taps))}
@@ -151,7 +151,7 @@ class Linear(Method):
         return convolve(image, self.taps) if self.pixels else image
 
 
-class Perspective(InFocalLengths):
+class Perspective(InFocalLengths, AboutAxis):
     """The streaks of a camera that turns, as they are in each place of a picture in perspective.
 
     It turns evenly about an axis in the plane of its picture, and shows the render as it is in the
@@ -184,12 +184,6 @@ class Perspective(InFocalLengths):
         ge=-360,
         le=360,
     )
-    cx: float | None = parameter(
-        None, "Principal point, from the left edge.", "px", "render.cx, the middle", optics=True
-    )
-    cy: float | None = parameter(
-        None, "Principal point, from the upper edge.", "px", "render.cy, the middle", optics=True
-    )
 
     def resolve(self, context: Context) -> Self:
         """The method with the camera's focal length and principal point.
@@ -214,7 +208,7 @@ class Perspective(InFocalLengths):
         turning = self.turning
         return (Pass("turned", Resample(turning, 1), ("filter",)),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"filter": BILINEAR} if self.rotation else {}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

@@ -1,6 +1,5 @@
 """Vignetting: light falls off towards the corners of the picture."""
 
-from collections.abc import Mapping
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
@@ -10,7 +9,9 @@ from clpipe.base.types import Floats
 from clpipe.camera.lens import LensCalibration
 from clpipe.reference.math import inverse_root
 from clpipe.stage import (
+    AboutAxis,
     Argument,
+    Arguments,
     CompileTime,
     Context,
     FromLens,
@@ -72,7 +73,7 @@ class Pa(Method):
             return ()
         return (Pass("vignetting_pa", arguments=("extent", "k1", "k2", "k3")),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         ks = {name: np.float32(getattr(self, name)) for name in ("k1", "k2", "k3")}
         return {"extent": CompileTime("e"), **ks}
 
@@ -85,7 +86,7 @@ class Pa(Method):
         return image * np.maximum(gain, np.float32(0))[..., None]
 
 
-class CosineFourth(InFocalLengths):
+class CosineFourth(InFocalLengths, AboutAxis):
     """v * cos^4 of the angle to the optical axis, which passes through the principal point.
 
     What falls on a sensor behind a lens without vignetting of its own, cos^4 = 1 / (1 + r^2)^2 with
@@ -106,13 +107,6 @@ class CosineFourth(InFocalLengths):
         {"cx": 12.3, "cy": 9.0},
     )
 
-    cx: float | None = parameter(
-        None, "Principal point, from the left edge.", "px", "render.cx, the middle", optics=True
-    )
-    cy: float | None = parameter(
-        None, "Principal point, from the upper edge.", "px", "render.cy, the middle", optics=True
-    )
-
     def resolve(self, context: Context) -> Self:
         """The method with the camera's focal length and principal point.
 
@@ -127,7 +121,7 @@ class CosineFourth(InFocalLengths):
         given = ("extent", "x", "y", "per_px", "per_side")
         return (Pass("vignetting_cosine", arguments=given),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         per_px, per_side = self._units()
         places = {"x": _place(self.cx, "width"), "y": _place(self.cy, "height")}
         return {"extent": CompileTime("e"), **places, "per_px": per_px, "per_side": per_side}
