@@ -13,8 +13,8 @@ from clpipe.images.tags import upright
 from tests.test_overscan import AROUND, BARREL, HEIGHT, WIDTH, light, places, write_render
 
 ISO = 3200
-THIN = {"method": "thin_lens", "focal_length": 100.0, "f_number": 4.0, "focus_distance": 2.0}
-DEFOCUS = {"defocus": {**THIN, "pixel_pitch": 10.0, "max_radius": 6}}
+THIN = {"method": "thin_lens", "f_number": 0.5, "focus_distance": 0.5, "pixel_pitch": 1000.0}
+DEFOCUS = {"defocus": {**THIN, "focal_length": BARREL["fx"], "max_radius": 6}}
 BEND = {"distortion": BARREL}
 MOVE = {"motion_blur": {"method": "linear", "length": 9.0, "angle": 30.0}}
 DARK = {"exposure": {"ev": -2.0}}
@@ -48,7 +48,7 @@ def depth_of(write_exr, tmp_path, monkeypatch):
 
     def write(away=0.0):
         x, y = places(WIDTH, HEIGHT, AROUND)
-        depth = np.float32(1.9 + 0.3 * np.sin((x + y) / 15) + away)
+        depth = np.float32(0.48 + 0.08 * np.sin((x + y) / 15) + away)
         write_render(write_exr, "in/a.exr", pixels=np.dstack([light(x, y), depth]))
         return depth
 

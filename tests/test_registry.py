@@ -62,7 +62,7 @@ def test_without_its_file_the_stage_is_unknown(clpipe):
     [
         (("class CosineFourth(Method):", "class CosineFourth(Method:"), r"vignette.py, line \d+: "),
         (("STAGE = ", "STAG = "), "vignette.py: STAGE is not there"),
-        (("import numpy as np", "import numpi as np"), r"vignette.py, line 6: ModuleNotFound"),
+        (("import numpy as np", "import numpi as np"), r"vignette.py, line 5: ModuleNotFound"),
         (
             ('"vignette", "Darken', '"denoise", "Darken'),
             "'denoise', but that name is taken",

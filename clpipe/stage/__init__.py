@@ -25,6 +25,7 @@ from clpipe.stage.context import Context, ReferenceContext
 from clpipe.stage.method import Method, Stage, StageRole, parameter
 from clpipe.stage.passes import (
     Argument,
+    Arguments,
     CompileTime,
     Kind,
     LineTable,
@@ -40,6 +41,7 @@ from clpipe.stage.passes import (
 __all__ = [
     "AboutAxis",
     "Argument",
+    "Arguments",
     "Array",
     "CompileTime",
     "Context",

@@ -1,6 +1,5 @@
 """Parts that several methods have in common: bases to derive from, and a check of window sizes."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -12,7 +11,7 @@ from clpipe.reference.curve import curve_index
 from clpipe.reference.defocus import Depth
 from clpipe.stage.context import Context, ReferenceContext
 from clpipe.stage.method import Method, parameter
-from clpipe.stage.passes import Argument, Pass, TableLookup
+from clpipe.stage.passes import Arguments, Pass, TableLookup
 
 
 class Unchanged(Method):
@@ -135,7 +134,7 @@ class Curve(Method):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("curve", TableLookup(), ("table",)),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"table": self.table()}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
@@ -171,7 +170,7 @@ class GaussianNoise(Method):
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
         return before + np.float32(self.sigma) ** 2
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"sigma": np.float32(self.sigma)}
 
 

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, PrivateAttr
 from clpipe.base.types import Floats
 from clpipe.reference.geometry import NO_MARGINS, Geometry, Margins
 from clpipe.stage.context import Context, ReferenceContext
-from clpipe.stage.passes import Argument, Kind, Pass
+from clpipe.stage.passes import Arguments, Kind, Pass
 
 
 def parameter(
@@ -153,7 +153,7 @@ class Method(BaseModel):
         """
         return None if self.passes() else before
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         """Kernel arguments by name, from the resolved parameters."""
         return {}
 

@@ -1,5 +1,6 @@
 """Image kinds, and passes: functions of a kernel file, as the planner places them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
@@ -162,3 +163,4 @@ class CompileTime:
 
 
 Argument = np.float32 | np.uint32 | np.int32 | Array | CompileTime
+Arguments = Mapping[str, Argument]  # by name

@@ -1,6 +1,5 @@
 """Colour matrices: between a camera's white-balanced RGB and linear sRGB."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
@@ -11,7 +10,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Doubles, Floats
 from clpipe.camera.profile import IDENTITY, Camera, Matrix
 from clpipe.stage import (
-    Argument,
+    Arguments,
     Context,
     Kind,
     Method,
@@ -103,7 +102,7 @@ class FixedMatrix(Method):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("color_matrix", arguments=NAMES),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return dict(zip(NAMES, self._array.ravel(), strict=True))
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

@@ -1,6 +1,5 @@
 """Defect pixels: hot ones, with too much charge, and dead ones, without signal."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -9,7 +8,7 @@ from clpipe.base.types import Floats
 from clpipe.reference.math import negative_log
 from clpipe.reference.random import word_at
 from clpipe.stage import (
-    Argument,
+    Arguments,
     Context,
     Kind,
     Method,
@@ -75,7 +74,7 @@ class Random(Method):
         assert self.hot_share is not None and self.dead_share is not None
         return round(self.hot_share * WORDS), WORDS - 1 - round(self.dead_share * WORDS)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         hot_limit, dead_limit = self._limits()
         return {
             "hot_limit": np.int32(hot_limit),

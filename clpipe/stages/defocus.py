@@ -10,7 +10,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.reference.defocus import NOWHERE, Depth, aperture_taps, defocus, reach_of
 from clpipe.stage import (
-    Argument,
+    Arguments,
     Context,
     InFocalLengths,
     Kind,
@@ -202,7 +202,7 @@ class ThinLens(InFocalLengths, OfDepth):
         """The radii that are used, see :meth:`radii`: none above ``max_radius``."""
         return np.clip(self.radii(depth), -self.max_radius, self.max_radius)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         depth = _depth_in(context)
         radii, reach, taps = depth.derived.get(self, lambda: self._tables(depth.pixels))
         return {

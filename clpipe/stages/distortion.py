@@ -21,7 +21,7 @@ from clpipe.reference.lens import DistortionMap
 from clpipe.reference.radial import Radial
 from clpipe.stage import (
     AboutAxis,
-    Argument,
+    Arguments,
     CompileTime,
     Context,
     FromLens,
@@ -128,7 +128,7 @@ class Distortion(HasPicture):
         """The factor by which ``fit`` changes the focal length."""
         return {"focal_length_factor": self.lens().scale(width, height)} if self.fit else {}
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         filter_ = warp.FILTERS[self.filter]
         taps, powers = filter_.shape
         return {

@@ -1,6 +1,5 @@
 """Inverse tone curve: from a photograph's contrast back to that of the scene."""
 
-from collections.abc import Mapping
 from functools import lru_cache
 from typing import ClassVar
 
@@ -9,7 +8,7 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.curve import tabulate
 from clpipe.stage import (
-    Argument,
+    Arguments,
     Context,
     Curve,
     Kind,
@@ -50,7 +49,7 @@ class Filmic(Method):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("inverse_filmic", arguments=("a", "b", "c", "d")),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"a": A, "b": B, "c": C, "d": D}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

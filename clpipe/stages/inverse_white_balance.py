@@ -1,6 +1,5 @@
 """Inverse white balance: it comes before the noise, which depends on the sensor's own signal."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -8,7 +7,7 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import by_site
-from clpipe.stage import Argument, Context, Kind, Pass, ReferenceContext, Stage, StageRole
+from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stage, StageRole
 from clpipe.stages.white_balance.gains import CameraGains
 
 
@@ -36,7 +35,7 @@ class Gains(CameraGains):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("inverse_white_balance", arguments=("pattern", "red", "blue")),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         red, blue = self.factors
         return {"pattern": context.cfa, "red": red, "blue": blue}
 

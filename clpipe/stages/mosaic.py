@@ -1,6 +1,5 @@
 """The colour filter array."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -9,7 +8,7 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.stage import (
-    Argument,
+    Arguments,
     Context,
     Kind,
     Method,
@@ -44,7 +43,7 @@ class Bayer(Method):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("mosaic", arguments=("pattern",)),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"pattern": replace(context, pattern=self.pattern).cfa}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

@@ -1,6 +1,5 @@
 """Denoising before demosaicing, where the noise of different samples is still independent."""
 
-from collections.abc import Mapping
 from math import sqrt
 from typing import ClassVar
 
@@ -13,7 +12,7 @@ from clpipe.reference.image import tap
 from clpipe.reference.math import square_root
 from clpipe.reference.patch import bias_of, decay_of, patch_distances
 from clpipe.stage import (
-    Argument,
+    Arguments,
     CompileTime,
     Context,
     Kind,
@@ -135,7 +134,7 @@ class NonLocalMeans(Method):
             "scale": decay_of(FACTOR * self.strength),
         }
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {
             "pattern": context.cfa,
             "reach": CompileTime(str(self.reach)),

@@ -1,6 +1,5 @@
 """Blur by a camera that moves while the shutter is open."""
 
-from collections.abc import Mapping
 from functools import lru_cache
 from typing import ClassVar, Self
 
@@ -13,7 +12,7 @@ from clpipe.reference.convolve import convolve, reach_of, taps_of
 from clpipe.reference.turning import BILINEAR, Turning
 from clpipe.stage import (
     AboutAxis,
-    Argument,
+    Arguments,
     Context,
     InFocalLengths,
     Kind,
@@ -143,7 +142,7 @@ class Linear(Method):
         radius = reach_of(self.taps)
         return (Pass("convolve", Stencil(radius), ("taps", "count")),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         if not self.pixels:
             return {}
         return {"taps": self.taps, "count": np.int32(len(self.taps))}
@@ -209,7 +208,7 @@ class Perspective(InFocalLengths, AboutAxis):
         turning = self.turning
         return (Pass("turned", Resample(turning, 1), ("filter",)),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"filter": BILINEAR} if self.rotation else {}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

@@ -1,6 +1,5 @@
 """Levels: from DN to signal, the first step of a raw converter."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -8,7 +7,7 @@ from pydantic import model_validator
 
 from clpipe.base.types import Floats
 from clpipe.stage import (
-    Argument,
+    Arguments,
     Context,
     Kind,
     Method,
@@ -70,7 +69,7 @@ class Linear(Method):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("normalize_levels", arguments=("black_level", "scale")),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         assert self.black_level is not None and self.white_level is not None
         scale = np.float32(1 / (self.white_level - self.black_level))
         return {"black_level": np.float32(self.black_level), "scale": scale}

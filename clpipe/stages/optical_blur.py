@@ -1,6 +1,5 @@
 """Blur by what lies before the photosites: lens, low-pass filter, and their own area."""
 
-from collections.abc import Mapping
 from functools import lru_cache
 from math import erf, sqrt
 from pathlib import Path
@@ -13,7 +12,7 @@ from clpipe.base.errors import ImageError
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.convolve import NEGLIGIBLE, blur, convolve, reach_of, taps_of
 from clpipe.stage import (
-    Argument,
+    Arguments,
     CompileTime,
     Context,
     Kind,
@@ -272,7 +271,7 @@ class Lens(Method):
             Pass("convolve", Stencil(reach), down, reads=("rows",)),
         )
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         lines = self._by_lines
         if lines is None:
             return {"taps": self._taps, "count": np.int32(len(self._taps))}

@@ -20,6 +20,7 @@ from clpipe.reference.correlated import correlated_normals, mixing
 from clpipe.reference.curve import to_8_bit
 from clpipe.stage import (
     Argument,
+    Arguments,
     Context,
     Kind,
     Method,
@@ -206,7 +207,7 @@ class IidGaussian(IndependentNoise):
         names = ("red", "green", "blue", *MIXING)
         return (Pass("picture_noise", arguments=names, random=NoiseScope.IMAGE),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         assert self.sigma is not None
         sigmas = zip(("red", "green", "blue"), map(np.float32, self.sigma), strict=True)
         return {**dict(sigmas), **self.mixing_arguments()}
@@ -263,7 +264,7 @@ class IntensityDependent(IndependentNoise):
         names = ("sigmas", *MIXING)
         return (Pass("picture_noise", arguments=names, random=NoiseScope.IMAGE),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"sigmas": self.table(), **self.mixing_arguments()}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

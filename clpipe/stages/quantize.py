@@ -1,6 +1,5 @@
 """The analogue-to-digital converter."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -8,7 +7,7 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, Kind, Method, Pass, ReferenceContext, Stage, parameter
+from clpipe.stage import Arguments, Context, Kind, Method, Pass, ReferenceContext, Stage, parameter
 
 
 class Linear(Method):
@@ -75,7 +74,7 @@ class Linear(Method):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("quantize", arguments=("range", "black_level", "white_level")),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {
             "range": np.float32(self._range),
             "black_level": np.float32(self.black_level),

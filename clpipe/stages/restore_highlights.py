@@ -1,12 +1,11 @@
 """Restored highlights: for a photograph, before its white balance is undone."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, Kind, Pass, ReferenceContext, Stage
+from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stage
 from clpipe.stages.white_balance.gains import CameraGains
 
 
@@ -32,7 +31,7 @@ class Brooks2019(CameraGains):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("restore_highlights", arguments=("red_gain", "blue_gain")),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         red, blue = map(np.float32, self.gains)
         return {"red_gain": red, "blue_gain": blue}
 

@@ -1,6 +1,5 @@
 """Sharpening, as cameras do it: an unsharp mask on luma."""
 
-from collections.abc import Mapping
 from functools import lru_cache
 from typing import ClassVar, Self
 
@@ -11,7 +10,7 @@ from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.reference.image import tap
 from clpipe.reference.roots import noise_in_roots
 from clpipe.stage import (
-    Argument,
+    Arguments,
     CompileTime,
     Context,
     Kind,
@@ -121,7 +120,7 @@ class Unsharp(Method):
             Pass("from_root_and_ratios", arguments=("offset",), reads=("sharp",)),
         )
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {
             "reach": CompileTime(str(self.reach)),
             "step": CompileTime(str(blur_step(self.radius))),

@@ -1,13 +1,12 @@
 """When each row of the sensor sees the scene: a rolling shutter, and lamps that flicker."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
 
 from clpipe.base.types import Doubles, Floats
 from clpipe.stage import (
-    Argument,
+    Arguments,
     Context,
     Kind,
     LineTable,
@@ -106,7 +105,7 @@ class Rows(Method):
         before = self.margins.top * float(self.cycles)  # the picture's first row
         return np.float32((middle + self.flicker_phase / 360 - before) % 1)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"cycles": self.cycles, "start": self.start, "swing": self.swing}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

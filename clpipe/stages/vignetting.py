@@ -1,6 +1,5 @@
 """Vignetting: light falls off towards the corners of the picture."""
 
-from collections.abc import Mapping
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
@@ -12,6 +11,7 @@ from clpipe.reference.math import inverse_root
 from clpipe.stage import (
     AboutAxis,
     Argument,
+    Arguments,
     CompileTime,
     Context,
     FromLens,
@@ -73,7 +73,7 @@ class Pa(Method):
             return ()
         return (Pass("vignetting_pa", arguments=("extent", "k1", "k2", "k3")),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         ks = {name: np.float32(getattr(self, name)) for name in ("k1", "k2", "k3")}
         return {"extent": CompileTime("e"), **ks}
 
@@ -121,7 +121,7 @@ class CosineFourth(InFocalLengths, AboutAxis):
         given = ("extent", "x", "y", "per_px", "per_side")
         return (Pass("vignetting_cosine", arguments=given),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         per_px, per_side = self._units()
         places = {"x": _place(self.cx, "width"), "y": _place(self.cy, "height")}
         return {"extent": CompileTime("e"), **places, "per_px": per_px, "per_side": per_side}

@@ -1,13 +1,12 @@
 """Bilinear demosaicing."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
-from clpipe.stage import Argument, Context, Method, Pass, ReferenceContext, Stencil
+from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, Stencil
 from clpipe.stages.demosaic.common import (
     HALF,
     QUARTER,
@@ -44,7 +43,7 @@ class Bilinear(Method):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("bilinear", Stencil(1), ("pattern",)),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"pattern": context.cfa}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

@@ -1,6 +1,5 @@
 """Demosaicing within bounds that the samples around set."""
 
-from collections.abc import Mapping
 from math import sqrt
 from typing import ClassVar, Self
 
@@ -10,7 +9,16 @@ from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
 from clpipe.reference.roots import from_root, in_steps, noise_in_roots, root_of
-from clpipe.stage import Argument, Context, Kind, Method, Pass, ReferenceContext, Stencil, parameter
+from clpipe.stage import (
+    Arguments,
+    Context,
+    Kind,
+    Method,
+    Pass,
+    ReferenceContext,
+    Stencil,
+    parameter,
+)
 from clpipe.stages.demosaic.common import (
     QUARTER,
     from_differences,
@@ -151,7 +159,7 @@ class Bounded(Method):
             Pass("roots_to_light", arguments=("offset",), reads=("colours",)),
         )
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {
             "pattern": context.cfa,
             "even": EVEN,

@@ -1,7 +1,6 @@
 """Edge-directed demosaicing: green is interpolated along edges, not across them."""
 
 import typing
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -10,7 +9,7 @@ from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
 from clpipe.stage import (
-    Argument,
+    Arguments,
     CompileTime,
     Context,
     Kind,
@@ -97,7 +96,7 @@ class EdgeDirected(Method):
             Pass("add_differences", Stencil(1), ("pattern",), reads=("src", "known")),
         )
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"pattern": context.cfa, "classifier": CompileTime(self.classifier.upper())}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

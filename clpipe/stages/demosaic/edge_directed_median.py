@@ -1,11 +1,10 @@
 """Edge-directed demosaicing with Freeman's median step."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 from clpipe.base.types import Floats
 from clpipe.reference.median import median_filter
-from clpipe.stage import Argument, Context, Kind, Pass, ReferenceContext, Stencil
+from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stencil
 from clpipe.stages.demosaic.common import from_differences, spread_differences
 from clpipe.stages.demosaic.edge_directed import EdgeDirected, green_or_difference
 from clpipe.stages.demosaic.median import Median
@@ -33,7 +32,7 @@ class EdgeDirectedMedian(Median, EdgeDirected):
         )
         return green, spread, self.median_pass()
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {**EdgeDirected.arguments(self, context), **Median.arguments(self, context)}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

@@ -1,7 +1,6 @@
 """Freeman's demosaicing: bilinear, with median filtered colour differences."""
 
 import typing
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -9,7 +8,7 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.median import median_filter
 from clpipe.stage import (
-    Argument,
+    Arguments,
     CompileTime,
     Context,
     Kind,
@@ -55,7 +54,7 @@ class Median(Method):
         arguments, reads = ("pattern", "size"), ("src", "spread")
         return Pass("freeman", Stencil(self.size // 2), arguments, reads)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"pattern": context.cfa, "size": CompileTime(str(self.size))}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

@@ -5,7 +5,6 @@ decision", IEEE Transactions on Image Processing 16(1), 2007. Below, "own" is th
 blue site, and "other" is blue at a red site and red at a blue site.
 """
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -13,7 +12,7 @@ import numpy as np
 from clpipe.base.types import Floats, Mask
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
-from clpipe.stage import Argument, Context, Kind, Method, Pass, ReferenceContext, Stencil
+from clpipe.stage import Arguments, Context, Kind, Method, Pass, ReferenceContext, Stencil
 from clpipe.stages.demosaic.common import HALF, QUARTER, mean_above_below, mean_beside, red_and_blue
 
 THIRD = np.float32(1 / 3)
@@ -120,7 +119,7 @@ class Menon2007(Method):
             stencil("interpolate", 2, "src", "chosen", "refined"),
         )
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"pattern": context.cfa}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

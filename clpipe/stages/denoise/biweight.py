@@ -11,7 +11,7 @@ from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.reference.image import tap
 from clpipe.reference.roots import from_root, in_steps, noise_in_roots, root_of
 from clpipe.stage import (
-    Argument,
+    Arguments,
     Context,
     Kind,
     Pass,
@@ -154,7 +154,7 @@ class Biweight(Denoiser):
             Pass("luma_chroma_to_light", arguments=("offset", *units), reads=("filtered",)),
         )
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         luma, chroma = self.ranges
         return {
             "luma_range": np.float32(luma),

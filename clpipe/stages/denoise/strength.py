@@ -17,7 +17,7 @@ from pydantic import field_validator
 
 from clpipe.reference.colour import LUMA
 from clpipe.stage import (
-    Argument,
+    Arguments,
     CompileTime,
     Context,
     Kind,
@@ -223,7 +223,7 @@ class WindowDenoiser(Denoiser):
             self.leave,
         )
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         luma, chroma = self.reaches
         reaches = {"luma_reach": CompileTime(str(luma)), "chroma_reach": CompileTime(str(chroma))}
         return {**reaches, **self.numbers(context)}

@@ -1,6 +1,5 @@
 """Exposure by metering: the gain follows from the luminance of the image itself."""
 
-from collections.abc import Mapping
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -10,7 +9,7 @@ from pydantic import model_validator
 from clpipe.base.types import Floats, Mask
 from clpipe.reference.math import negative_log, power_of_two
 from clpipe.stage import (
-    Argument,
+    Arguments,
     CompileTime,
     Context,
     Pass,
@@ -155,7 +154,7 @@ class Auto(Gain):
             )
         return search, Pass("exposure", arguments=("gain",))
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         assert self.target is not None
         inside, outside = WEIGHTS[self.metering]
         return {

@@ -1,13 +1,12 @@
 """Exposure by a number of stops."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, Method, Pass, ReferenceContext, parameter
+from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, parameter
 
 
 class Gain(Method):
@@ -48,7 +47,7 @@ class Gain(Method):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("exposure", arguments=("gain",)),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"gain": self.gain}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

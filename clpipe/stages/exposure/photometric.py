@@ -1,14 +1,13 @@
 """Exposure by physics: what a camera's settings make of a scene in cd/m2."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar, Self
 
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, ReferenceContext, parameter
+from clpipe.stage import Arguments, Context, ReferenceContext, parameter
 from clpipe.stages.exposure.gain import Gain
 
 SATURATION = 78.0  # lx s, over the ISO: the exposure that fills the sensor
@@ -73,7 +72,7 @@ class Photometric(Gain):
         exposure = self.q * self.scale * self.exposure_time / self.f_number**2  # lx s
         return np.float32(exposure * iso / SATURATION * 2.0 ** (self.ev - self.headroom))
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"gain": self.factor(context.iso)}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

@@ -1,6 +1,5 @@
 """The strength of sensor noise: its parameters, and the noise model that they define."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from math import isclose
 from typing import Self
@@ -13,7 +12,7 @@ from clpipe.base.types import Floats
 from clpipe.camera.noise import Emva, NoiseModel, Paper
 from clpipe.reference.random import normal_at, word_at
 from clpipe.reference.tukey_lambda import shape_and_scale, tukey_lambda_of
-from clpipe.stage import Argument, Context, Method, NoiseScope, ReferenceContext, parameter
+from clpipe.stage import Arguments, Context, Method, NoiseScope, ReferenceContext, parameter
 from clpipe.stages.sensor_noise.common import NEVER_FULL, or_default
 from clpipe.stages.sensor_noise.no_noise import NoNoise
 
@@ -191,7 +190,7 @@ class SensorNoise(Method):
         """The kernel's arguments, by name."""
         raise NotImplementedError(type(self).__name__)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return self.numbers()
 
     def read_noise_numbers(self) -> dict[str, np.float32]:

@@ -1,12 +1,11 @@
 """An ideal sensor: no noise, but a full well."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, Method, Pass, ReferenceContext, parameter
+from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, parameter
 from clpipe.stages.sensor_noise.common import NEVER_FULL, or_default
 
 
@@ -39,7 +38,7 @@ class NoNoise(Method):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("full_well", arguments=("full_signal",)),) if self.full_signal else ()
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"full_signal": np.float32(or_default(self.full_signal, NEVER_FULL))}
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:

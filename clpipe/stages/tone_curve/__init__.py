@@ -1,6 +1,5 @@
 """Tone curve: the contrast of a photograph, on linear RGB, before gamma."""
 
-from collections.abc import Mapping
 from importlib import resources
 from typing import ClassVar, Self
 
@@ -9,7 +8,7 @@ from pydantic import field_validator
 
 from clpipe.base.types import Floats
 from clpipe.stage import (
-    Argument,
+    Arguments,
     Context,
     Curve,
     Kind,
@@ -63,7 +62,7 @@ class Linear(Method):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("exposure", arguments=("gain",)),) if self.headroom else ()
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"gain": self.gain}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

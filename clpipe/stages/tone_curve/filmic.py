@@ -1,12 +1,12 @@
 """A rational tone curve that keeps hues, and its inverse."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import ClassVar
 
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.stage import Argument, Context, Method, Pass, ReferenceContext
+from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext
 
 # y = x (a x + b) / (x (c x + d) + 1); a + b = c + d + 1, so that 1 stays 1. Fitted (in roots of y)
 # to three fifths of Camera Raw's default curve and two fifths of the render's own light, which is
@@ -71,7 +71,7 @@ class Filmic(Method):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("filmic", arguments=("a", "b", "c", "d", "twist")),)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"a": A, "b": B, "c": C, "d": D, "twist": A * D - B * C}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:

@@ -1,6 +1,5 @@
 """White balance with gains that do not depend on the image, and the base of those that do."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar, Self
 
@@ -9,7 +8,7 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.stage import (
-    Argument,
+    Arguments,
     Context,
     Method,
     Pass,
@@ -96,7 +95,7 @@ class Gains(CameraGains):
     def passes(self) -> tuple[Pass, ...]:
         return (APPLY,)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         red, blue = map(np.float32, self.gains)
         return {"pattern": context.cfa, "red_gain": red, "blue_gain": blue}
 

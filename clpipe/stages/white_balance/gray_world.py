@@ -1,13 +1,12 @@
 """White balance by gray world: the mean colour of a scene is grey."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
-from clpipe.stage import Argument, Context, Pass, Reduction
+from clpipe.stage import Arguments, Context, Pass, Reduction
 from clpipe.stages.white_balance.gains import EstimatedGains
 
 
@@ -26,7 +25,7 @@ class GrayWorld(EstimatedGains):
         find = Reduction("gray_world", ("red_gain", "blue_gain"), ("pattern",))
         return Pass("gray_world_sample", find)
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {"pattern": context.cfa}
 
     def gains(self, image: Floats, pattern: Pattern) -> tuple[np.float32, np.float32]:

@@ -1,13 +1,12 @@
 """White balance by white patch: the brightest place of a scene is white."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
-from clpipe.stage import Argument, Context, Pass, Reduction, parameter
+from clpipe.stage import Arguments, Context, Pass, Reduction, parameter
 from clpipe.stages.white_balance.gains import EstimatedGains
 
 STEPS = 6144  # bins of each colour: 12 octaves below 1, with 512 bins each
@@ -76,7 +75,7 @@ class WhitePatch(EstimatedGains):
             ("pattern", "clip"),
         )
 
-    def arguments(self, context: Context) -> Mapping[str, Argument]:
+    def arguments(self, context: Context) -> Arguments:
         return {
             "pattern": context.cfa,
             "clip": np.float32(self.clip),
