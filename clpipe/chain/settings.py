@@ -75,15 +75,10 @@ class Settings:
     def record(self) -> dict[str, Any]:
         """The settings as nested JSON values, which :func:`settings_from` reads back."""
         plain: dict[str, Any] = {"camera": self.camera, "iso": self.iso, "seed": self.seed}
-        plain |= {key: value for key in LENS if (value := getattr(self, key))}
-        if self.noise_key:
-            plain["noise_key"] = self.noise_key
-        if self.dump:
-            plain["dump"] = self.dump
+        named = *LENS, "noise_key", "dump"
+        plain |= {key: value for key in named if (value := getattr(self, key))}
         lists = {"stages": list(self.stages), "skip": list(self.skip)}
-        others = {name: own for name in TABLES if (own := self._set_in(name))}
-        tables = {**self.parameters, **others}
-        record = {**plain, **lists, **{name: dict(t) for name, t in tables.items()}}
+        record = {**plain, **lists, **{name: dict(table) for name, table in self.tables.items()}}
         for key, draw in self.draws.items():
             table, _, name = key.rpartition(".")
             (record.setdefault(table, {}) if table else record)[name] = draw.record()
@@ -120,22 +115,22 @@ class Settings:
 
     def constants(self) -> dict[str, Any]:
         """The values that are set and not drawn, by their dotted names."""
-        tables = {**self.parameters, **{name: self._set_in(name) for name in TABLES}}
-        named = {f"{name}.{key}": v for name, table in tables.items() for key, v in table.items()}
+        tables = self.tables.items()
+        named = {f"{name}.{key}": v for name, table in tables for key, v in table.items()}
         lens = {key: value for key in LENS if (value := getattr(self, key))}
         return {"iso": self.iso, "camera": self.camera, **lens, **named}
 
     def table(self, step: str) -> dict[str, Any]:
         """The values and draws of a step, or of another table."""
-        others = self._set_in(step) if step in TABLES else {}
         names = {key: key.removeprefix(f"{step}.") for key in self.draws}
         drawn = {names[key]: draw for key, draw in self.draws.items() if names[key] != key}
-        return {**self.parameters.get(step, others), **drawn}
+        return {**self.tables.get(step, {}), **drawn}
 
-    def _set_in(self, table: str) -> dict[str, Any]:
-        """The values that are set in a table that belongs to no stage."""
-        model: BaseModel = getattr(self, table)
-        return model.model_dump(exclude_defaults=True)
+    @property
+    def tables(self) -> dict[str, Mapping[str, Any]]:
+        """The values that are set, by steps and by the tables that belong to no stage."""
+        others = {name: getattr(self, name).model_dump(exclude_defaults=True) for name in TABLES}
+        return {**self.parameters, **{name: own for name, own in others.items() if own}}
 
     def method(self, step: str) -> Method:
         """The method of a step with its parameters, validated.

@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image
 
 from clpipe.base.types import Array, Doubles, Mask
+from clpipe.chain.rendition import NOISY
 from clpipe.outputs.camera_files import COLMAP, Photograph, colmap
 from clpipe.reference.intrinsics import PINHOLE, Intrinsics
 from tools.reconstruction.views import SAME, View
@@ -94,7 +95,7 @@ def write_colmap(folder: Path, views: Sequence[View], pictures: Sequence[Array])
         fx, fy, cx, cy = view.k[0, 0], view.k[1, 1], view.k[0, 2], view.k[1, 2]
         camera = Intrinsics(width, height, fx, fy, cx, cy, PINHOLE, {})
         pose = tuple(map(tuple, view.r.tolist())), tuple(view.t.tolist())
-        photographs.append(Photograph(name, camera, pose))
+        photographs.append(Photograph(name, NOISY, camera, pose))
     for name, text in colmap(photographs, photographs, {}).items():
         (folder / name).write_text(text, encoding="utf-8")
 
