@@ -25,6 +25,7 @@ from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.clipping import MUCH, clipped_share, clipping_text
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Result, Runner
+from clpipe.images.arrays import as_array, as_image
 from clpipe.images.kinds import CHANNELS, vectors_of
 from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
 from clpipe.reference.defocus import Depth
@@ -101,7 +102,8 @@ class Pipeline(ReadOnly):
         Args:
             image: (height, width, 3) linear RGB, 1 = full scale of the sensor, of float16, float32
                 or float64; or (height, width) where the chain starts on a mosaic, also of uint16;
-                or a finished picture, also of uint8, where it starts on one.
+                or a finished picture, also of uint8, where it starts on one. A NumPy array, or a
+                tensor of any library with DLPack that is on the CPU.
             key: the image's name. Draws depend on it and on the seed alone; noise on both, on what
                 the image holds, and on the ISO. Who wants the same noise in several images, or in
                 one at several ISOs, gives them one ``noise_key``, which replaces these; that of a
@@ -122,14 +124,21 @@ class Pipeline(ReadOnly):
             RequestError: a name or value that is not allowed.
         """
         runner = self._runner_for(key, settings)
-        checked = _checked(image, runner.chain.source)
+        try:
+            checked = as_image(image, runner.chain.source)
+        except ImageError as error:
+            raise ImageError(f"{key}: {error}") from None
         margins = margins_of_array(overscan, checked)
 
         def depth_of(chain: Chain, width: int, height: int, kept: Margins) -> Depth:
-            cropped = depth if depth is None or kept else margins.cropped(np.asarray(depth))
+            given = None if depth is None else as_array(depth, "depth")
+            cropped = given if given is None or kept else margins.cropped(given)
             return depth_of_array(cropped, width, height)
 
         own = enter(runner.chain, checked, margins, depth_of)
+        if depth is not None and own.depth is None:
+            unread = "depth is given, but no step reads it; defocus.method=thin_lens does"
+            warnings.warn(f"{key}: {unread}", stacklevel=2)
         for warning in own.warnings:
             warnings.warn(f"{key}: {warning}", stacklevel=2)
         chain, pixels = own.chain, own.pixels
@@ -171,8 +180,9 @@ class Pipeline(ReadOnly):
         """
         if kind not in RESAMPLING:
             raise RequestError(one_of("kind", str(kind), RESAMPLING))
-        if not isinstance(layer, np.ndarray) or layer.ndim not in (2, 3) or not layer.size:
-            raise ImageError("expected a layer as a NumPy array, (height, width[, channel])")
+        layer = as_array(layer, "layer")
+        if layer.ndim not in (2, 3) or not layer.size:
+            raise ImageError(f"found a layer of {layer.shape}; expected (height, width[, channel])")
         pixels = layer.reshape(*layer.shape[:2], -1)
         if pixels.shape[2] < (least := CHANNELS.get(kind, 1)):
             raise ImageError(f"found {pixels.shape[2]} channels; {kind} has {least} or more")
@@ -211,26 +221,3 @@ class Pipeline(ReadOnly):
 def digest_of(image: Array) -> str:
     """A digest of an image's samples that takes little time."""
     return xxh3_64_hexdigest(np.ascontiguousarray(image).data)
-
-
-def _checked(image: Array, kind: Kind) -> Array:
-    """The image in a type that a chain can start on: float16, float32 or whole DN.
-
-    Raises:
-        ImageError: it is of another type, or not finite.
-    """
-    if not isinstance(image, np.ndarray):
-        raise ImageError(f"found {type(image).__name__}; expected a NumPy array")
-    if kind is Kind.DISPLAY and image.dtype in (np.uint8, np.uint16):
-        return image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
-    is_dn = image.dtype in (np.uint16, np.uint32) and len(kind.channels) == 1
-    if image.dtype.kind != "f" and not is_dn:
-        also = (
-            " (or DN as uint16)" if len(kind.channels) == 1 else "; uint8 pictures are not linear"
-        )
-        raise ImageError(f"found an image of {image.dtype}; expected {kind.label} in floats{also}")
-    if image.dtype not in (np.float16, np.float32):
-        image = image.astype(np.float32)
-    if not np.isfinite(image).all():
-        raise ImageError("found NaN or infinity in an image; np.nan_to_num replaces them")
-    return image

@@ -161,6 +161,7 @@ def point(write_exr):
 
 RUN = ("run", "in/a.exr", "--stages", "defocus", "--format", "exr", "--device", "numpy")
 THIN = ("--set", "defocus.method=thin_lens")
+ZOOM = ("--lens", "Canon EF 24-70mm f/2.8L", "--focal-length", 70, "--aperture", 2.8)
 FOCAL = ("--set", "motion_blur.method=perspective", "--set", "motion_blur.focal_length=35")
 DEFOCUS = (*THIN, "--aperture", 0.5)
 POSE = {"R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "t": [0, 0, 0]}
@@ -182,6 +183,15 @@ def test_a_lens_is_that_of_the_depth_of_field(clpipe, point):
     set_ = ("--focal-length", 50, "--focus-distance", 3, "--set", "render.sensor_width=36")
     clpipe(*RUN, *DEFOCUS, *set_, "-o", "o")
     assert spread_of(Path("o/a.exr")) == pytest.approx(disc(50, 0.5, 0.1), abs=0.3)
+
+
+def test_a_lens_by_name_is_that_of_the_depth_of_field(clpipe, point):
+    pytest.importorskip("lensfunpy")
+    run = [each if each != "defocus" else "defocus,vignetting" for each in (*RUN, *THIN)]
+    clpipe(*run, *ZOOM, "--set", "render.sensor_width=36", "-o", "o")
+    assert spread_of(Path("o/a.exr")) == pytest.approx(disc(70, 2.8, 0.1), abs=0.3)
+    said = clpipe(*run, *ZOOM, "--set", "render.focal_length=35", "-o", "p", status=2).stderr
+    assert "render.focal_length: 35, but focal_length: 70; set one" in said
 
 
 @pytest.mark.parametrize(

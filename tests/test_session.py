@@ -49,7 +49,7 @@ def test_what_cannot_be_is_refused_at_once(renders):
         ({"truth": "cleen"}, r"unknown truth 'cleen' \(did you mean 'clean'"),
         ({"patch": 0}, "patch"),
         ({"redo": "some"}, "found redo 'some'"),
-        ({"frames": "2"}, "found frames '2'; expected int"),
+        ({"frames": "2"}, "found frames '2'; expected a whole number or None"),
         (
             {"layer": "a", "stages": ["normalize", "demosaic"], "start_at": "normalize"},
             "--layer: it is for renders",

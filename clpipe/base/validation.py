@@ -1,11 +1,12 @@
 """Errors of pydantic as one line for a user: the place of the value, the value, the reason."""
 
 import inspect
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import wraps
-from typing import Literal, ParamSpec, TypeVar
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
@@ -75,7 +76,7 @@ def typed(function: Callable[P, R]) -> Callable[P, R]:
     ... def keep(names: str, truth: bool = False) -> None: ...
     >>> keep("normalize", truth="mosaic")
     Traceback (most recent call last):
-    clpipe.base.errors.RequestError: found truth 'mosaic'; expected bool
+    clpipe.base.errors.RequestError: found truth 'mosaic'; expected true or false
 
     Raises:
         RequestError: an argument is of another type.
@@ -96,9 +97,45 @@ def typed(function: Callable[P, R]) -> Callable[P, R]:
             try:
                 TypeAdapter(annotations[name], config=strict).validate_python(value)
             except ValidationError:
-                text = inspect.formatannotation(annotations[name])
-                expected = re.sub(r"\b[a-z_.]+\.(?=[A-Z])", "", text)  # without their modules
+                expected = in_words(annotations[name])
                 raise RequestError(f"found {name} {value!r}; expected {expected}") from None
         return function(*args, **kwargs)
 
     return checked
+
+
+def in_words(annotation: Any) -> str:
+    """The values that a type allows, for people.
+
+    >>> in_words(bool | Literal["clean", "noisy"] | None), in_words(str | Sequence[str | Path])
+    ("true or false, 'clean', 'noisy' or None", 'a text or a list of texts or paths')
+    """
+    *others, last = dict.fromkeys(_allowed(annotation))
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+def _allowed(annotation: Any) -> Iterator[str]:
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin is Literal:
+        yield from map(repr, parts)
+    elif origin in (Union, UnionType):
+        for part in parts:
+            yield from _allowed(part)
+    elif origin is Sequence:
+        plural = (each.split(" ", 1)[-1] + "s" for each in _allowed(parts[0]))
+        yield f"a list of {' or '.join(plural)}"
+    elif origin is Mapping:
+        yield "a table"
+    else:
+        yield WORDS.get(annotation, getattr(annotation, "__name__", str(annotation)))
+
+
+WORDS: dict[Any, str] = {
+    str: "a text",
+    Path: "a path",
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    type(None): "None",
+    Any: "anything",
+}

@@ -76,13 +76,15 @@ def names_in(values: Mapping[str, Any], key: str, what: str) -> tuple[str, ...]:
 
     Args:
         values: nested values, as a TOML file holds them.
-        key: one whose value is a list of texts.
+        key: one whose value is a list of texts; to skip one stage, a text will do.
         what: what the texts are, for the message.
 
     Raises:
         KeyedError: the value is no list, or an item is no text.
     """
     names = values.get(key, [])
+    if key == "skip" and isinstance(names, str):
+        return (names,)
     if isinstance(names, str | Mapping) or not isinstance(names, Sequence):
         raise KeyedError(key, f"{key}: found {names!r}, but it is a list of {what}")
     for name in names:

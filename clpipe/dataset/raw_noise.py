@@ -12,6 +12,7 @@ from clpipe.base.readonly import ReadOnly
 from clpipe.base.types import Array
 from clpipe.base.validation import typed
 from clpipe.dataset.arrays import packed, unpacked
+from clpipe.images.arrays import as_array
 from clpipe.outputs.patches import pattern_of
 from clpipe.pipeline import Pipeline
 
@@ -88,17 +89,18 @@ class RawNoise(ReadOnly):
             DeviceError: there is no usable device.
         """
         pipeline, random = self._open()
-        shape = np.shape(raw)
+        raw = as_array(raw, "raw")
+        shape = raw.shape
         channels = MOSAIC if len(shape) == 2 else shape[-3] if len(shape) in (3, 4) else 0
         if channels not in (MOSAIC, PACKED) or 0 in shape:
             raise ImageError(
                 f"found an array of shape {shape}; expected a mosaic, (height, width), its planes, "
                 "(4, height / 2, width / 2), or a batch, (raw, 1 or 4, height, width)"
             )
-        if not isinstance(raw, np.ndarray) or raw.dtype.kind != "f":
+        if raw.dtype.kind != "f":
             raise ImageError(
-                f"found {getattr(raw, 'dtype', type(raw).__name__)}; expected a NumPy array of "
-                "floats in signal: raws in DN less the black level, over white less black"
+                f"found {raw.dtype}; expected floats in signal: raws in DN less the black level, "
+                "over white less black"
             )
         if key is None or isinstance(key, np.random.Generator):
             key = f"{(key or random).integers(2**63):016x}"

@@ -1,0 +1,93 @@
+"""Arrays that are given as images: taken where their meaning is plain, else refused with a way."""
+
+from typing import Any
+
+import numpy as np
+
+from clpipe.base.errors import ImageError
+from clpipe.base.types import Array
+from clpipe.stage import Kind
+
+
+def as_array(value: Any, what: str) -> Array:
+    """A NumPy array of an array or of a tensor of any library with DLPack, whose memory it shares.
+
+    Args:
+        value: the array.
+        what: what it is called, for the message.
+
+    Raises:
+        ImageError: it is neither, or its memory cannot be shared as it is.
+    """
+    if isinstance(value, np.ndarray):
+        return value
+    kind = type(value).__name__
+    if not hasattr(value, "__dlpack__"):
+        raise ImageError(f"{what}: found {kind}; expected an array: numpy.asarray({what})")
+    if getattr(value, "requires_grad", False):
+        raise ImageError(f"{what}: found a {kind} with a gradient; give {what}.detach()")
+    try:
+        return np.from_dlpack(value)
+    except (BufferError, RuntimeError, TypeError, ValueError) as error:
+        raise ImageError(
+            f"{what}: found a {kind} that cannot be shared ({error}); if it is on a GPU, give "
+            f"{what}.cpu()"
+        ) from None
+
+
+def as_image(value: Any, kind: Kind) -> Array:
+    """An image in a type that a chain can start on: float16, float32 or whole DN.
+
+    Args:
+        value: an array or tensor, (height, width, 3), or (height, width) of a mosaic.
+        kind: of image that the chain starts on.
+
+    Raises:
+        ImageError: it is of another type or shape, or not finite; the message says what helps.
+    """
+    image = as_array(value, "image")
+    check_shape(image.shape, kind)
+    is_mosaic = len(kind.channels) == 1
+    if kind is Kind.DISPLAY and image.dtype in (np.uint8, np.uint16):
+        return image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
+    if image.dtype.kind != "f" and not (is_mosaic and image.dtype in (np.uint16, np.uint32)):
+        ways = "is it linear? image / np.float32(WHITE); a finished picture: Pipeline('unprocess')"
+        ways = "DN go in as uint16: image.astype(np.uint16)" if is_mosaic else ways
+        raise ImageError(f"image: found {image.dtype}; expected {kind.label} in floats; {ways}")
+    if image.dtype not in (np.float16, np.float32):
+        image = image.astype(np.float32)
+    if not np.isfinite(image).all():
+        wrong = np.argwhere(~np.isfinite(image))
+        names = ("row", "column", "channel")[: image.ndim]
+        place = ", ".join(f"{name} {i}" for name, i in zip(names, wrong[0], strict=True))
+        raise ImageError(
+            f"image: found {len(wrong)} samples that are NaN or infinite, the first at {place}; "
+            "np.nan_to_num(image) replaces them"
+        )
+    return image
+
+
+def check_shape(shape: tuple[int, ...], kind: Kind) -> None:
+    """See that an array has the shape of one image of a kind.
+
+    Raises:
+        ImageError: it has not; the message has the line of code that gives it.
+    """
+    channels = len(kind.channels)
+    expected = "(height, width, 3)" if channels > 1 else "(height, width)"
+    if 0 not in shape and len(shape) == (3 if channels > 1 else 2) and shape[2:] in ((), (3,)):
+        return
+    way = ""
+    if channels == 1 and len(shape) == 3 and 1 in (shape[0], shape[2]):
+        way = "image[0]" if shape[0] == 1 else "image[..., 0]"
+    elif channels == 1 and len(shape) == 3 and shape[2] == 3:
+        way = "colours enter a chain at mosaic or before it"
+    elif channels > 1 and len(shape) == 3 and shape[2] == 4:
+        way = "without alpha: image[..., :3]"
+    elif channels > 1 and len(shape) == 3 and shape[0] in (3, 4):
+        way = "channels last: np.moveaxis(image[:3], 0, -1)"
+    elif channels > 1 and (len(shape) == 2 or shape[2:] == (1,)):
+        way = "a grey image: np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)"
+    elif len(shape) == (4 if channels > 1 else 3):
+        way = "a batch, image by image: process_many(zip(images, keys))"
+    raise ImageError(f"image: found shape {shape}; expected {expected}{'; ' * bool(way)}{way}")
