@@ -80,7 +80,8 @@ def test_denoisers_learn(start, tmp_path):
         *("--format", "png", "--truth", "development"),
     )
     pair = ("still_life.png", "still_life.truth.png")
-    for held_out in (["--test", STILL_LIFE], ["--real", *pair]):
+    (tmp_path / "held_out.exr").write_bytes(STILL_LIFE.read_bytes())
+    for held_out in (["--test", "held_out.exr"], ["--real", *pair]):
         told = start(
             *(sys.executable, EXAMPLES / "train_denoiser.py", STILL_LIFE, *held_out),
             *(*iso, "--steps", "300", "--size", "32", "-o", "crops.png"),
@@ -90,3 +91,14 @@ def test_denoisers_learn(start, tmp_path):
             assert all(np.greater(table[name], table["noisy"])), table
         with Image.open(tmp_path / "crops.png") as crops:
             assert np.ptp(np.asarray(crops)) > 100
+
+
+def test_what_is_trained_on_is_no_test(tmp_path):
+    pytest.importorskip("torch")
+    (tmp_path / "renders").mkdir()
+    (tmp_path / "renders/a.exr").write_bytes(STILL_LIFE.read_bytes())
+    (tmp_path / "link.exr").symlink_to(tmp_path / "renders/a.exr")
+    for test in ("renders/a.exr", "link.exr"):
+        command = [sys.executable, EXAMPLES / "train_denoiser.py", "renders", "--test", test]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 2 and f"{test} is in renders, which is trained on" in done.stderr

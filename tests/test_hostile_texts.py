@@ -92,7 +92,7 @@ def test_a_working_directory_that_has_gone(tmp_path):
     gone = tmp_path / "gone"
     gone.mkdir()
     code = "import os, sys; os.rmdir(os.getcwd()); from clpipe.commands.main import main; main()"
-    command = [sys.executable, "-c", code, "run", "/a.exr", "-o", "/out", "--device", "numpy"]
+    command = [sys.executable, "-c", code, "run", "a.exr", "-o", "out", "--device", "numpy"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     result = subprocess.run(command, cwd=gone, env=environment, capture_output=True, text=True)
     assert result.stderr == ("clpipe: the working directory has gone; change to one that exists\n")

@@ -1,20 +1,27 @@
 """Compiled programs: shared by a process, kept between processes, and announced when slow."""
 
+import io
 import logging
 import os
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import platformdirs
 import pyopencl as cl
 import pytest
+from rich.console import Console
 
 from clpipe.base.errors import DeviceError
+from clpipe.batch.run_log import Summary
+from clpipe.batch.where import Where
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
+from clpipe.commands import progress
+from clpipe.commands.notices import NOTICES
 from clpipe.engine import cache_folder, programs
 from clpipe.engine.device import Device
 from clpipe.engine.discovery import choose, find_devices
@@ -137,3 +144,31 @@ def test_the_command_line_prints_it(clpipe, monkeypatch, options, count):
     monkeypatch.setattr(programs, "_announced", programs.threading.Event())
     done = clpipe("run", STILL_LIFE, "-o", "out", "--stages", "exposure,gamma", *options)
     assert done.stderr.count("clpipe: compiling kernels for") == count
+
+
+def test_who_watches_is_told_how_far_compiling_is(device):
+    told = []
+    chain = make_chain(settings_from({"stages": ["exposure", "mosaic", "demosaic", "gamma"]}))
+    with programs.watched(lambda *counts: told.append(counts)):
+        Runner(chain, Device(device.info)).compile()
+    count = told[-1][1]
+    assert count > 1 and told == [(i, count) for i in range(count + 1)]
+    Runner(chain, Device(device.info)).compile()
+    assert len(told) == count + 1
+
+
+def test_compiling_is_a_step_of_the_live_display(monkeypatch):
+    monkeypatch.setattr(progress, "SOON", -1.0)
+    console = Console(file=io.StringIO(), force_terminal=True, width=80, color_system=None)
+    run = SimpleNamespace(summary=Summary(6), writer=None, where=Where(Path("out")))
+    with progress.Reporter(run, console) as reporter:
+        programs.tell_watchers(2, 7)
+        (task,) = reporter._bar.tasks
+        assert task.description == "compiling 3 of 7"
+        record = logging.LogRecord("clpipe", logging.INFO, "", 0, "compiling kernels", (), None)
+        NOTICES.handle(record)
+        programs.tell_watchers(7, 7)
+        assert task.description == "first launches"
+    shown = console.file.getvalue()
+    assert "clpipe: compiling kernels\n" in shown.replace("\r", "")
+    assert shown.rstrip().endswith("6 not begun") and "0/6" not in shown.splitlines()[-1]

@@ -30,7 +30,7 @@ def version_at(root):
 def copy(tmp_path):
     """A checkout's files without its history."""
     root = tmp_path / "copy"
-    for name in (ABOUT, "kernels/one.cl", "README.md", ".gitattributes"):
+    for name in (ABOUT, "kernels/one.cl", "README.md", ".gitattributes", ".gitignore"):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_bytes((ROOT / name).read_bytes() if (ROOT / name).exists() else b"\n")
     return root

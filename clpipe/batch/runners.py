@@ -57,6 +57,7 @@ class Runners:
 class SpareArrays:
     """Arrays that are not used any more, to be used again: new memory costs time.
 
+    >>> import numpy as np
     >>> spare = SpareArrays(2)
     >>> spare.give(np.zeros((2, 3)))
     >>> spare.take((3, 2)) is None, spare.take((2, 3)).shape, spare.take((2, 3)) is None

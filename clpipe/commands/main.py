@@ -18,6 +18,7 @@ from clpipe.base.errors import ClpipeError, DeviceError, OutputError, RequestErr
 from clpipe.base.memory import check_addresses
 from clpipe.base.system import address_space, processors, save_addresses
 from clpipe.base.text import one_line
+from clpipe.commands.notices import NOTICES
 
 # By the headings of the help. Each is a module of this folder that defines a function of its name.
 GROUPS = {
@@ -32,16 +33,6 @@ COMMANDS = tuple(name for names in GROUPS.values() for name in names)
 # Bytes of addresses: what loading libraries takes, and a thread of theirs, one on each processor.
 LIBRARIES = 240 << 20
 OF_THREAD = 10 << 20
-
-
-class Notices(logging.Handler):
-    """Prints what the package logs, such as that kernels are being compiled."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        click.echo(f"clpipe: {one_line(record.getMessage())}", err=True)
-
-
-NOTICES = Notices()
 
 
 class LazyGroup(click.Group):

@@ -14,13 +14,16 @@ from clpipe.base.text import duration, one_line
 from clpipe.batch.interrupt import interruptible
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
 from clpipe.batch.session import Run
+from clpipe.commands.notices import NOTICES
 from clpipe.engine.clipping import clipping_text
+from clpipe.engine.programs import watched
 from clpipe.outputs.existing import Redo
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
 FEW = 50  # images that have a line each, where there is no terminal
+SOON = 0.5  # s, after which compiling is worth a word
 EVERY = 10.0  # s, from line to line of more images
 
 
@@ -54,19 +57,35 @@ class Reporter:
         self._quiet = quiet
         self._keeps_old = run.where.redo is Redo.MISSING
         self._several = summary.total > 1
-        self._said = time.perf_counter()
+        self._said = self._began = time.perf_counter()
         self._bar: Progress | None = None
-        if self._several and console.is_terminal and not quiet:
-            self._bar = bar_on(console)
-            self._task = self._bar.add_task("", total=summary.total)
+        self._shows = console.is_terminal and not quiet
+        self._live = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
-        if self._bar:
-            self._bar.start()
+        self._live.enter_context(NOTICES.printed_by(self.print))
+        self._live.enter_context(watched(self._compiling))
+        if self._shows and self._several:
+            self._show("")
         return self
 
     def __exit__(self, *error: object) -> None:
+        self._live.close()
         self.end()
+
+    def _show(self, description: str) -> None:
+        """Show the bar, with what is described beside it."""
+        if self._bar is None:
+            self._bar = bar_on(self._console)
+            self._task = self._bar.add_task("", total=self._summary.total)
+            self._bar.start()
+        self._bar.update(self._task, completed=self._summary.finished, description=description)
+
+    def _compiling(self, compiled: int, of: int) -> None:
+        """Show how many kernels are compiled, where that takes time."""
+        if self._shows and time.perf_counter() - self._began > SOON:
+            left = f"compiling {compiled + 1} of {of}" if compiled < of else "first launches"
+            self._show(left)
 
     def print(self, text: str) -> None:
         """Print a line. One that cannot be printed, on a full disk, ends no run."""
@@ -82,10 +101,8 @@ class Reporter:
         for warning in outcome.warnings:
             if outcome.status == DONE:
                 self.print(f"clpipe: {outcome.job.path}: warning: {warning}")
-        if self._bar:
-            self._bar.update(
-                self._task, completed=self._summary.finished, description=self._state()
-            )
+        if self._bar and self._several:
+            self._show(self._state())
         elif self._summary.total > FEW:
             if time.perf_counter() - self._said >= EVERY:
                 self._said = time.perf_counter()
@@ -169,7 +186,7 @@ class Reporter:
             speed = summary.megapixels / summary.elapsed
             text += f"; {summary.elapsed:.1f} s, {speed:.3g} MP/s; {summary.shares()}"
         self.print(text)
-        if self._bar and counts[DONE]:
+        if self._bar and self._several and counts[DONE]:
             self.print(f"look at it: clpipe report {shlex.quote(str(self._writer.folder))}")
 
 

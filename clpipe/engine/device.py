@@ -26,7 +26,7 @@ from clpipe.engine.flow import DeviceImage, Flow, ImageTask
 from clpipe.engine.ir import AnyLaunch, Border, Launch, Plan
 from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.patches import with_patches
-from clpipe.engine.programs import forget_programs, programs_of
+from clpipe.engine.programs import forget_programs, programs_of, tell_watchers
 from clpipe.engine.tiles import Tiling, tiling_of
 
 log = logging.getLogger(__name__)
@@ -116,9 +116,14 @@ class Device:
         Raises:
             DeviceError: a kernel does not compile; the message is the compiler's.
         """
-        return self._calls.get(
-            plan.unscaled, lambda: [self._call(plan, launch) for launch in plan.launches]
-        )
+
+        def compiled() -> Iterator[Call]:
+            for number, launch in enumerate(plan.launches):
+                tell_watchers(number, len(plan.launches))
+                yield self._call(plan, launch)
+            tell_watchers(len(plan.launches), len(plan.launches))
+
+        return self._calls.get(plan.unscaled, lambda: list(compiled()))
 
     def _call(self, plan: Plan, launch: AnyLaunch | Border) -> Call:
         kernel = write_kernel(plan, launch, self.info.lanes)

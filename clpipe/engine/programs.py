@@ -8,7 +8,7 @@ import logging
 import re
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ log = logging.getLogger(__name__)
 _by_device: dict[int, "Programs"] = {}
 _lock = threading.Lock()
 _announced = threading.Event()
+_watchers: list[Callable[[int, int], None]] = []
 
 
 class Programs:
@@ -158,6 +159,22 @@ def announced(info: DeviceInfo) -> Iterator[None]:
         yield
     finally:
         timer.cancel()
+
+
+@contextmanager
+def watched(watcher: Callable[[int, int], None]) -> Iterator[None]:
+    """Have a function told, by any thread, how many kernels of how many are compiled."""
+    _watchers.append(watcher)
+    try:
+        yield
+    finally:
+        _watchers.remove(watcher)
+
+
+def tell_watchers(compiled: int, of: int) -> None:
+    """Tell how many kernels of a plan are compiled."""
+    for watcher in tuple(_watchers):
+        watcher(compiled, of)
 
 
 def build_log(text: str) -> str:

@@ -16,6 +16,7 @@ import copy
 import sys
 import time
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -143,6 +144,12 @@ def read(path):
         return torch.from_numpy(np.array(picture.convert("RGB"))).permute(2, 0, 1) / 255
 
 
+def held_in(picture, renders):
+    """The file or folder of some that is a picture or has it, by what links lead to; or None."""
+    real = picture.resolve()
+    return next((each for each in renders if each.resolve() in (real, *real.parents)), None)
+
+
 def main():
     """Train, compare, print, and draw."""
     parser = argparse.ArgumentParser(
@@ -161,6 +168,8 @@ def main():
     given = parser.parse_args()
     if given.steps < 1:
         parser.error(f"--steps: found {given.steps}; expected 1 or more")
+    if given.test and (place := held_in(Path(given.test), map(Path, given.renders))):
+        parser.error(f"--test: {given.test} is in {place}, which is trained on; hold it out")
 
     torch.manual_seed(1)
     settings = {name: v for name in ("camera", "iso") if (v := getattr(given, name)) is not None}

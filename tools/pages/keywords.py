@@ -1,4 +1,4 @@
-"""Write clpipe/chain/keywords.py: what Python callers may set, as editors and mypy read it.
+"""Write clpipe/chain/keywords.pyi: what Python callers may set, as editors and mypy read it.
 
     tools/run pages keywords
 
@@ -18,7 +18,7 @@ from clpipe.chain.methods import TABLE_MODELS
 from clpipe.chain.registry import all_stages
 from tools import ROOT
 
-PATH = ROOT / "clpipe" / "chain" / "keywords.py"
+PATH = ROOT / "clpipe" / "chain" / "keywords.pyi"
 
 START = '''"""Keywords of the Python API: the tables and keys of a configuration, with their types.
 
@@ -84,7 +84,7 @@ def text_of() -> str:
     fields = plain | {name: {title} for name, title in tables.items()}
     parts.append(class_of("Keywords", fields))
     command = [sys.executable, "-m", "ruff", "format", "--stdin-filename", str(PATH), "-"]
-    written = "\n\n\n".join(parts) + "\n"
+    written = "\n\n".join(parts) + "\n"
     return subprocess.run(command, input=written, stdout=PIPE, text=True, check=True).stdout
 
 

@@ -16,7 +16,6 @@ Whole = int | np.integer[Any] | Draw
 Text = str | Draw
 Several = Sequence[Any] | np.ndarray[Any, Any] | Draw
 
-
 class Shutter(TypedDict, total=False):
     method: Draw | Literal["rows"]
     subframes: Whole
@@ -25,7 +24,6 @@ class Shutter(TypedDict, total=False):
     flicker_depth: Number
     flicker_frequency: Number
     flicker_phase: Number
-
 
 class Defocus(TypedDict, total=False):
     method: Draw | Literal["none", "thin_lens"]
@@ -40,7 +38,6 @@ class Defocus(TypedDict, total=False):
     blades: Whole
     max_radius: Whole
 
-
 class MotionBlur(TypedDict, total=False):
     method: Draw | Literal["linear", "perspective"]
     length: Number
@@ -51,7 +48,6 @@ class MotionBlur(TypedDict, total=False):
     cy: Number
     focal_length: Number
     sensor_width: Number
-
 
 class Distortion(TypedDict, total=False):
     method: Draw | Literal["lens", "none", "brown_conrady", "fisheye", "poly3", "poly5", "ptlens"]
@@ -84,7 +80,6 @@ class Distortion(TypedDict, total=False):
     b: Number
     c: Number
 
-
 class Vignetting(TypedDict, total=False):
     method: Draw | Literal["lens", "none", "pa", "cosine_fourth"]
     k1: Number
@@ -96,7 +91,6 @@ class Vignetting(TypedDict, total=False):
     focal_length: Number
     sensor_width: Number
 
-
 class OpticalBlur(TypedDict, total=False):
     method: Draw | Literal["lens", "none"]
     sigma: Number
@@ -105,7 +99,6 @@ class OpticalBlur(TypedDict, total=False):
     low_pass: Number
     pixel_area: Number
     psf: Text
-
 
 class Exposure(TypedDict, total=False):
     method: Draw | Literal["gain", "auto", "photometric"]
@@ -123,29 +116,24 @@ class Exposure(TypedDict, total=False):
     q: Number
     scale: Number
 
-
 class Mosaic(TypedDict, total=False):
     method: Draw | Literal["bayer"]
     pattern: Draw | Literal["RGGB", "BGGR", "GRBG", "GBRG"]
-
 
 class InverseWhiteBalance(TypedDict, total=False):
     method: Draw | Literal["gains"]
     red_gain: Number
     blue_gain: Number
 
-
 class Prnu(TypedDict, total=False):
     method: Draw | Literal["gaussian"]
     sigma: Number
-
 
 class DefectPixels(TypedDict, total=False):
     method: Draw | Literal["random"]
     hot_share: Number
     hot_level: Number
     dead_share: Number
-
 
 class SensorNoise(TypedDict, total=False):
     method: Draw | Literal["gaussian", "poisson", "none"]
@@ -163,21 +151,17 @@ class SensorNoise(TypedDict, total=False):
     tukey_lambda: Number
     full_signal: Number
 
-
 class Dsnu(TypedDict, total=False):
     method: Draw | Literal["gaussian"]
     sigma: Number
-
 
 class RowNoise(TypedDict, total=False):
     method: Draw | Literal["gaussian"]
     sigma: Number
 
-
 class ColumnNoise(TypedDict, total=False):
     method: Draw | Literal["gaussian"]
     sigma: Number
-
 
 class Quantize(TypedDict, total=False):
     method: Draw | Literal["linear"]
@@ -185,12 +169,10 @@ class Quantize(TypedDict, total=False):
     black_level: Number
     white_level: Number
 
-
 class Normalize(TypedDict, total=False):
     method: Draw | Literal["linear"]
     black_level: Number
     white_level: Number
-
 
 class WhiteBalance(TypedDict, total=False):
     method: Draw | Literal["as_shot", "gray_world", "white_patch", "gains", "none"]
@@ -198,7 +180,6 @@ class WhiteBalance(TypedDict, total=False):
     blue_gain: Number
     percentile: Number
     clip: Number
-
 
 class Demosaic(TypedDict, total=False):
     method: (
@@ -218,7 +199,6 @@ class Demosaic(TypedDict, total=False):
     classifier: Draw | Literal["hamilton_adams", "laroche_prescott", "hibbard"]
     size: Draw | Literal[3, 5]
 
-
 class Denoise(TypedDict, total=False):
     method: Draw | Literal["biweight", "bilateral", "non_local_means", "median", "mean"]
     luma_strength: Number
@@ -231,11 +211,9 @@ class Denoise(TypedDict, total=False):
     chroma_size: Whole
     spatial_sigma: Number
 
-
 class ColorMatrix(TypedDict, total=False):
     method: Draw | Literal["none", "camera", "inverse_camera", "given"]
     matrix: Several
-
 
 class Sharpen(TypedDict, total=False):
     method: Draw | Literal["unsharp", "none"]
@@ -245,17 +223,14 @@ class Sharpen(TypedDict, total=False):
     limit: Number
     offset: Number
 
-
 class ToneCurve(TypedDict, total=False):
     method: Draw | Literal["filmic", "camera_raw", "linear", "file"]
     headroom: Number
     path: Text
 
-
 class Gamma(TypedDict, total=False):
     method: Draw | Literal["srgb", "power"]
     exponent: Number
-
 
 class PictureNoise(TypedDict, total=False):
     method: Draw | Literal["none", "iid_gaussian", "intensity_dependent"]
@@ -266,16 +241,13 @@ class PictureNoise(TypedDict, total=False):
     correlation: Several
     sigma: Several
 
-
 class InverseGamma(TypedDict, total=False):
     method: Draw | Literal["srgb", "power"]
     exponent: Number
 
-
 class InverseToneCurve(TypedDict, total=False):
     method: Draw | Literal["filmic", "camera_raw", "linear", "file"]
     path: Text
-
 
 class MosaicDenoise(TypedDict, total=False):
     method: Draw | Literal["non_local_means"]
@@ -284,24 +256,20 @@ class MosaicDenoise(TypedDict, total=False):
     a: Number
     b: Number
 
-
 class Resize(TypedDict, total=False):
     method: Draw | Literal["area", "lanczos3"]
     scale: Number
-
 
 class RestoreHighlights(TypedDict, total=False):
     method: Draw | Literal["brooks2019"]
     red_gain: Number
     blue_gain: Number
 
-
 class Encoding(TypedDict, total=False):
     jpeg_quality: Whole
     jpeg_subsampling: Draw | Literal["4:4:4", "4:2:2", "4:2:0"]
     jpeg_progressive: Flag
     png_compression: Whole
-
 
 class RenderCamera(TypedDict, total=False):
     exposure_time: Number
@@ -314,7 +282,6 @@ class RenderCamera(TypedDict, total=False):
     camera_angle_x: Number
     rotation: Several
     translation: Several
-
 
 class Keywords(TypedDict, total=False):
     camera: Text

@@ -1,0 +1,108 @@
+"""Make the pictures of the documentation's first page: cameras and ISOs, and truths of a scene.
+
+    tools/run pages gallery
+
+They go to docs/gallery_cameras.webp and docs/gallery_truths.webp; each cell is what the command
+above it in docs/index.md makes.
+"""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import matplotlib
+import numpy as np
+import OpenImageIO as oiio
+from PIL import Image, ImageDraw, ImageFont
+
+import clpipe
+from clpipe.base.types import Array
+from tools import RENDER, ROOT
+
+CAMERAS = ("sony-a7s2", "canon-6d", "nikon-d800", "oppo-reno-10x")
+ISOS = (100, 1600, 6400)
+CROP = (560, 292, 120, 96)  # x, y, width, height, with smooth places, edges and a dark corner
+SCENE = ROOT / "tools" / "reconstruction" / "data" / "view0.exr"
+SCALE = 2
+GAP, HEAD = 6, 26
+LENS = {"method": "brown_conrady", "fx": 900, "k1": 0.12}
+
+
+def grid(rows: list[list[Image.Image]], columns: list[str], names: list[str]) -> Image.Image:
+    """Pictures of one size in rows, with captions above the columns and beside the rows."""
+    font = ImageFont.load_default(15)
+    width, height = rows[0][0].size
+    left = max(font.getlength(name) for name in names) + 10 * any(names)
+    size = int(left) + len(columns) * (width + GAP), HEAD + len(rows) * (height + GAP)
+    page = Image.new("RGB", size, "white")
+    draw = ImageDraw.Draw(page)
+    for x, caption in enumerate(columns):
+        draw.text((left + x * (width + GAP) + 2, 4), caption, fill="black", font=font)
+    for y, (row, name) in enumerate(zip(rows, names, strict=True)):
+        top = HEAD + y * (height + GAP)
+        draw.text((2, top + height // 2 - 10), name, fill="black", font=font)
+        for x, picture in enumerate(row):
+            page.paste(picture, (int(left) + x * (width + GAP), top))
+    return page
+
+
+def cameras(folder: Path) -> Image.Image:
+    """One place of a render, as cameras see it at some ISOs."""
+    made = clpipe.run(RENDER, folder, camera=CAMERAS, iso=ISOS, format="png")
+    list(made)
+    left, top, width, height = CROP
+    rows = []
+    for iso in ISOS:
+        row = []
+        for camera in CAMERAS:
+            picture = Image.open(folder / camera / f"iso{iso}" / f"{RENDER.stem}.png")
+            crop = picture.crop((left, top, left + width, top + height))
+            row.append(crop.resize((width * SCALE, height * SCALE), Image.Resampling.NEAREST))
+        rows.append(row)
+    return grid(rows, list(CAMERAS), [f"ISO {iso}" for iso in ISOS])
+
+
+def truths(folder: Path) -> Image.Image:
+    """A view of a scene, and what else comes out beside it."""
+    options = {"truth": ["clean", "variance"], "carry": ["Z:depth", "texture:label"]}
+    list(clpipe.run(SCENE, folder, format="png", iso=3200, distortion=LENS, **options))
+    name = SCENE.stem
+    pictures = {
+        f"{name}.png": Image.open(folder / f"{name}.png"),
+        "truth_clean.png": Image.open(folder / f"{name}.truth_clean.png"),
+        "truth_variance.exr": coloured(np.sqrt(layer(folder / f"{name}.truth_variance.exr", 0))),
+    }
+    along = folder / f"{name}.carried.exr"
+    names = oiio.ImageBuf(str(along)).spec().channelnames
+    depth, label = (next(i for i, n in enumerate(names) if key in n) for key in ("Z", "texture"))
+    pictures["carried.exr: depth"] = coloured(-layer(along, depth))
+    pictures["carried.exr: labels"] = coloured(layer(along, label), "tab20")
+    size = (240, 160)
+    small = [i.convert("RGB").resize(size, Image.Resampling.BOX) for i in pictures.values()]
+    return grid([small], list(pictures), [""])
+
+
+def layer(path: Path, channel: int) -> Array:
+    """A channel of a file, (height, width)."""
+    pixels = oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT)
+    return np.asarray(pixels).reshape(*pixels.shape[:2], -1)[..., channel]
+
+
+def coloured(values: Array, colours: str = "viridis") -> Image.Image:
+    """Values as colours, from the lowest to the highest that is finite but for a hundredth."""
+    low, high = np.percentile(values[np.isfinite(values)], (1, 99))
+    scaled = np.clip((values - low) / max(high - low, 1e-9), 0, 1)
+    pixels = matplotlib.colormaps[colours](np.nan_to_num(scaled))[..., :3]
+    return Image.fromarray((pixels * 255).astype(np.uint8))
+
+
+def main() -> None:
+    """Write the pictures."""
+    with TemporaryDirectory() as name:
+        for stem, make in (("cameras", cameras), ("truths", truths)):
+            path = ROOT / "docs" / f"gallery_{stem}.webp"
+            make(Path(name, stem)).save(path, quality=88, method=6)
+            print(path.relative_to(ROOT))
+
+
+if __name__ == "__main__":
+    main()
