@@ -76,7 +76,7 @@ class CamerasCommand(Command):
 @click.option("--iso", type=float, help="The ISO. [default: all that were measured]")
 @json_option
 def cameras(name: str | None, iso: float | None, as_json: bool) -> None:
-    """List the cameras, or show the noise of one.
+    """List the cameras, show the noise of one, or make one of a noise model (cameras import).
 
     NAME is that of the list, or a make and model. Noise is shown in three forms, with the source of
     each figure.

@@ -1,0 +1,79 @@
+"""Make the pictures of the pages that clpipe shows: docs/screen_report.webp and screen_explore.webp.
+
+    tools/run pages screens
+
+It needs a Chromium, and Playwright: .venv/bin/python -m pip install playwright
+"""
+
+import shutil
+import sys
+import threading
+from io import BytesIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from PIL import Image
+
+import clpipe
+from clpipe.chain.request import Request
+from clpipe.engine.device import open_device
+from clpipe.explorer.explorer import Explorer
+from clpipe.explorer.server import Server
+from clpipe.inputs.find import Job
+from clpipe.reports.page import html
+from clpipe.reports.run import read_run
+from tools import RENDER, ROOT
+
+SIZE = {"width": 1366, "height": 768}
+
+
+def taken(page: Any, name: str) -> None:
+    """Write what a page shows."""
+    path = ROOT / "docs" / f"screen_{name}.webp"
+    Image.open(BytesIO(page.screenshot())).convert("RGB").save(path, quality=86, method=6)
+    print(path.relative_to(ROOT))
+
+
+def report(page: Any, folder: Path) -> None:
+    """The report of a small run."""
+    out = folder / "out"
+    list(clpipe.run(RENDER, out, iso=[400, 6400], truth="clean", camera="sony-a7r2"))
+    path = out / "report.html"
+    path.write_text(html([read_run(out)]), "utf-8")
+    page.goto(f"file://{path}")
+    page.get_by_label("image", exact=True).select_option(index=1)
+    page.get_by_role("heading", name="Look closer").evaluate("e => e.scrollIntoView()")
+    page.wait_for_timeout(500)
+    taken(page, "report")
+
+
+def explorer(page: Any) -> None:
+    """The explorer on a render, at a high ISO."""
+    jobs = [Job(RENDER, RENDER.name)]
+    server = Server(Explorer(jobs, Request.from_options(iso=6400), open_device(None)), 0)
+    threading.Thread(target=server.run, daemon=True).start()
+    page.goto(server.address)
+    page.wait_for_timeout(6000)
+    taken(page, "explore")
+
+
+def main() -> None:
+    """Write the pictures."""
+    try:
+        from playwright.sync_api import sync_playwright
+    except ModuleNotFoundError:
+        sys.exit("needs Playwright: .venv/bin/python -m pip install playwright")
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if not chromium:
+        sys.exit("needs a Chromium (Debian: apt-get install chromium)")
+    with sync_playwright() as play, TemporaryDirectory() as name:
+        browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        page = browser.new_page(viewport=SIZE)
+        report(page, Path(name))
+        explorer(page)
+        browser.close()
+
+
+if __name__ == "__main__":
+    main()
