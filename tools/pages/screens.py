@@ -1,4 +1,4 @@
-"""Make the pictures of the pages that clpipe shows, docs/screen_report.webp and screen_explore.webp.
+"""Make the pictures of pages that clpipe shows: docs/screen_report.webp, docs/screen_explore.webp.
 
     tools/run pages screens
 
