@@ -150,6 +150,16 @@ def test_verify_reads_everything(again):
     assert again("--redo", "damaged") == []
 
 
+@pytest.mark.parametrize("how", ["empty", "cut"])
+def test_what_lost_its_end_before_its_sidecar_was_written_is_made_again(again, how):
+    path = Path("out/a.jpg")
+    before = path.read_bytes()
+    damaged(path, how)
+    os.utime("out/a.json")  # its time says nothing; its size does
+    assert "a.jpg" in again()
+    assert path.read_bytes() == before
+
+
 def test_an_input_that_only_looks_the_same(again, write_exr):
     status = Path("in/a.exr").stat()
     write_exr("in/a.exr", np.full((8, 8, 3), 0.5, np.float32))

@@ -11,6 +11,7 @@ from clpipe.chain.settings import Settings
 from clpipe.engine.check import (
     SIZES,
     Difference,
+    chain_for,
     check_ends,
     check_method,
     check_raw,
@@ -36,8 +37,10 @@ SMALL_SIZES = SIZES[:6]
 
 @pytest.mark.parametrize(("stage", "method", "values"), VARIANTS)
 def test_kernel_agrees_with_its_reference(device, stage, method, values):
-    # Patterns in which red stands in either row and in either column; the raw is made of all four.
-    result = check_method(device, stage, method, patterns=("GRBG", "GBRG"), values=values)
+    # In several launches, patterns in which red stands in either row and in either column.
+    in_one = len(chain_for(stage, method, {}, "GRBG").steps[0].method.passes()) == 1
+    patterns = PATTERNS if in_one else ("GRBG", "GBRG")
+    result = check_method(device, stage, method, patterns=patterns, values=values)
     assert result.difference.samples > 1000
     assert result.passed, result
 

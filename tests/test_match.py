@@ -1,13 +1,22 @@
 """clpipe match: its columns, known developments that come back, the pictures that it refuses."""
 
+import io
 import json
+import math
+import os
+import signal
+import subprocess
+import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from clpipe.analysis.matching import match, search
+from clpipe.analysis.matching.ambiguity import ambiguities
 from clpipe.analysis.matching.columns import (
     COLUMNS,
     TAILS,
@@ -30,6 +39,7 @@ from clpipe.analysis.signature import flat_places, signature
 from clpipe.chain.chain import make_chain
 from clpipe.chain.files import load_settings
 from clpipe.chain.settings import Settings, overlay
+from clpipe.commands.match import Follower
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding, through_jpeg
 from clpipe.pipeline import Pipeline
 from tests.conftest import ROOT, SHARED
@@ -170,11 +180,10 @@ def test_the_configuration_develops_what_was_measured(found):
     assert (folder / "look.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.usefixtures("quick")
 def test_the_table(found, clpipe, monkeypatch, tmp_path):
     _, folder = found
-    monkeypatch.setattr(match, "space_for", lambda *_: replace(SMALL, strength=None))
-    monkeypatch.setattr(search, "QUICK", 1)
-    monkeypatch.setattr(search, "FULL", 1)
+    monkeypatch.setattr("clpipe.commands.match.EVERY", 0.0)
     frames = [folder / f"frame{k}.png" for k in range(3)]
     result = clpipe("match", *frames, "-o", tmp_path / "a.toml", "--iso", 3200, "--device", "numpy")
     assert "note: 3 frames without a mean: kurtosis and tails are left out" in result.stdout
@@ -182,6 +191,137 @@ def test_the_table(found, clpipe, monkeypatch, tmp_path):
     assert rows["kurtosis"][-1] == "-"
     assert rows["luma, 1 right"][-2] == "±"
     assert "largest residual of a correlation in places not searched" in result.stdout
+    assert "5%; residuals of" in result.stderr
+    assert " left\n" in result.stderr
+
+
+def test_what_cannot_be_told_is_said_and_written(found):
+    report, folder = found
+    written = (folder / "look.toml").read_text()
+    assert set(report["searched"]) == {
+        "iso",
+        "denoise.luma_strength",
+        "denoise.chroma_strength",
+    } | {name for name in report["searched"] if name.startswith("sharpen")}
+    for each in report["ambiguities"]:
+        assert f"# {each['names'][0]} " in written
+
+
+def test_numbers_that_make_up_for_each_other_are_told_of():
+    chroma = Dimension("denoise.chroma_strength", 0.1, 10, 1, logarithmic=True)
+    luma, grain = replace(chroma, name="denoise.luma_strength"), replace(chroma, name="iso")
+
+    def residuals(settings, targets):
+        table = settings.parameters["denoise"]
+        logs = [math.log(table[name]) for name in ("luma_strength", "chroma_strength")]
+        return np.array([5 * sum(logs), 0.3 * logs[0], 0.1 * math.log(settings.iso / 100)])
+
+    stub = SimpleNamespace(
+        dimensions=lambda settings: [luma, chroma, grain], residuals=residuals, targets=[None]
+    )
+    numbers = {luma.name: 1.0, chroma.name: 2.0, "iso": 2.0}
+    settings = overlay(Settings(), {"denoise": {"luma_strength": 1.0, "chroma_strength": 2.0}})
+    best = search.Candidate({}, replace(settings, iso=2.0), numbers, 1.0, 1.0)
+    weak, pair = ambiguities(stub, best)
+    assert weak.names == ("iso",)
+    assert "a factor of 2 alters no residual" in str(weak)
+    assert pair.names == (luma.name, chroma.name)
+    assert pair.correlation == pytest.approx(-1, abs=0.01)
+    assert "cannot be told apart" in str(pair)
+
+
+class Told(search.Watch):
+    """Keeps what it is told."""
+
+    def __init__(self):
+        self.shares, self.costs = [], []
+
+    def advanced(self, share, best, scenes):
+        self.shares.append(share)
+        self.costs.append(best.cost)
+
+
+def test_a_search_tells_how_far_it_is(burst, tmp_path, monkeypatch):
+    def fit(self, choices, start, targets, steps):
+        cost = 100.0 / 2 ** sum(choice.text == "b" for choice in choices.values())
+        return search.Candidate(choices, self.settings, {}, cost, cost)
+
+    monkeypatch.setattr(search.Search, "fit", fit)
+    scenes = load_scenes(saved(tmp_path, **{f"{k}": frame for k, frame in enumerate(burst)}), [])
+    space = Space({part: tuple(map(Choice, "abc")) for part in ("x", "y", "z")}, None)
+    told = Told()
+    best = search.Search(scenes, Settings(), space, None, told).run()
+    assert best.cost == 12.5
+    assert told.costs == sorted(told.costs, reverse=True)
+    assert set(told.costs) == {100, 50, 25, 12.5}
+    assert told.shares == sorted(told.shares)
+    assert told.shares[0] == 0
+    # Three parts and, since the last of them got better, the two others again.
+    assert len(told.shares) == 1 + 5 * 3
+    assert told.shares[-1] == pytest.approx(15 / (15 + search.LAST))
+
+
+def candidate(cost):
+    return search.Candidate({}, overlay(Settings(), KNOWN), {"iso": 3200.0}, cost, cost)
+
+
+def test_a_terminal_has_a_bar_with_the_share_and_the_time_left(burst, tmp_path):
+    scenes = load_scenes(saved(tmp_path, a=burst[0], b=burst[1]), [])
+    terminal = io.StringIO()
+    with Follower(tmp_path / "a.toml", Console(file=terminal, force_terminal=True)) as follower:
+        follower.advanced(0.0, candidate(2.0), scenes)
+        follower.advanced(0.25, best := candidate(1.5), scenes)
+        first = (tmp_path / "a.toml").stat().st_ino
+        follower.advanced(0.5, best, scenes)
+    assert (tmp_path / "a.toml").stat().st_ino == first  # the best is the same
+    assert "50%; residuals of 1.5; about" in terminal.getvalue()
+    assert "the best after 25% of the search" in (tmp_path / "a.toml").read_text()
+    assert load_settings(str(tmp_path / "a.toml")).parameters["denoise"]["method"] == "mean"
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """A search of one step in the small space."""
+    monkeypatch.setattr(match, "space_for", lambda *_: replace(SMALL, strength=None))
+    monkeypatch.setattr(search, "QUICK", 1)
+    monkeypatch.setattr(search, "FULL", 1)
+
+
+@pytest.mark.usefixtures("quick")
+def test_stopped_it_ends_with_the_best_so_far(clpipe, burst, tmp_path, monkeypatch):
+    frames = saved(tmp_path, **{f"{k}": frame for k, frame in enumerate(burst[:3])})
+    words = ["match", *frames, "-o", tmp_path / "a.toml", "--iso", 3200, "--device", "numpy"]
+    advanced = Follower.advanced
+
+    def stopped(self, *state):
+        advanced(self, *state)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Follower, "advanced", stopped)
+    result = clpipe(*words, status=130)
+    assert f"stopped: wrote {tmp_path / 'a.toml'}, the best after 0% of the search" in result.stderr
+    assert load_settings(str(tmp_path / "a.toml")).parameters["denoise"]["method"] == "mean"
+    (tmp_path / "a.toml").unlink()
+    monkeypatch.setattr(Follower, "is_stopping", True)
+    assert "nothing was found yet, and nothing is written" in clpipe(*words, status=130).stderr
+    assert not (tmp_path / "a.toml").exists()
+
+
+def test_without_matplotlib_it_only_cannot_draw(burst, tmp_path):
+    frames = saved(tmp_path, **{f"{k}": frame for k, frame in enumerate(burst[:3])})
+    script = """if True:
+        import sys
+        sys.modules["matplotlib"] = None
+        from clpipe.analysis.matching import match, search
+        from tests.test_match import SMALL, replace
+        match.space_for = lambda *_: replace(SMALL, strength=None)
+        search.QUICK = search.FULL = 1
+        from clpipe.commands.main import main
+        main(sys.argv[1:])
+    """
+    words = ["match", *frames, "-o", str(tmp_path / "a.toml"), "--iso", "3200", "--device", "numpy"]
+    subprocess.run([sys.executable, "-c", script, *words], cwd=ROOT, check=True)
+    assert (tmp_path / "a.toml").exists()
 
 
 def test_jpegs_say_their_quality_and_subsampling(burst, tmp_path):

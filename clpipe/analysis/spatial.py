@@ -95,8 +95,11 @@ def energy_left(standard: NDArray[np.floating[Any]], mask: Mask) -> float:
     et al., CVPR Workshops 2019). Blocks with a pixel that does not count are left out.
     """
     height, width = (size // 2 * 2 for size in mask.shape)
-    blocks = standard[:, :height, :width].reshape(len(standard), height // 2, 2, width // 2, 2)
     whole = mask[:height, :width].reshape(height // 2, 2, width // 2, 2).all((1, 3))
-    means = blocks.mean((2, 4), dtype=np.float64)[:, whole]
-    energy = (blocks.astype(np.float64) ** 2).mean((2, 4))[:, whole].sum()
-    return float((means**2).sum() / energy) if energy > 0 else math.nan
+    corners = [
+        standard[:, i:height:2, j:width:2][:, whole].astype(np.float64)
+        for i, j in ((0, 0), (0, 1), (1, 0), (1, 1))
+    ]
+    energy = sum(float((corner**2).sum()) for corner in corners)
+    together = float((np.add.reduce(corners) ** 2).sum()) / 4
+    return together / energy if energy > 0 else math.nan

@@ -1,17 +1,82 @@
 """``clpipe match``: from pictures of a camera to a development with the same noise."""
 
+import time
 from pathlib import Path
+from typing import TYPE_CHECKING, Self
 
 import click
+from rich.console import Console
 
 from clpipe.analysis.matching.columns import COLUMNS
 from clpipe.analysis.matching.match import check_names, match_files
 from clpipe.analysis.matching.result import Match, Row, write_configuration
+from clpipe.analysis.matching.scenes import Scenes
+from clpipe.analysis.matching.search import Candidate, StoppedError, Watch
 from clpipe.base.extras import require
+from clpipe.base.text import duration
+from clpipe.batch.interrupt import INTERRUPTED, interruptible
+from clpipe.chain.settings import Settings
 from clpipe.chain.toml import value_text
 from clpipe.commands.chain_options import camera_option
 from clpipe.commands.options import Command, device_option, json_option, output_option
 from clpipe.commands.printing import Rows, number, show, show_json
+from clpipe.commands.progress import EVERY
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+
+class Follower(Watch):
+    """Says how far a search is, and writes the best configuration so far, each time it is better.
+
+    Args:
+        output: the configuration.
+        console: where to print; a terminal gets a bar while this is a context.
+    """
+
+    def __init__(self, output: Path, console: Console) -> None:
+        self._output = output
+        self._console = console
+        self._began = self._said = time.perf_counter()
+        self._written: Settings | None = None
+        self._bar: Progress | None = None
+        self.state = "nothing was found yet, and nothing is written"
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal:
+            from rich import progress
+
+            columns = progress.BarColumn(), progress.TextColumn("{task.description}")
+            self._bar = progress.Progress(*columns, console=self._console, transient=True)
+            self._task = self._bar.add_task("the first fit", total=1.0)
+            self._bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._bar:
+            self._bar.stop()
+
+    def stop(self) -> None:
+        """Have the search end."""
+        self.is_stopping = True
+
+    def advanced(self, share: float, best: Candidate, scenes: Scenes) -> None:
+        """Write the best if it is new, and say how it goes, without a terminal now and then."""
+        residuals = f"residuals of {best.residual:.2g}"
+        if best.settings is not self._written:
+            self._written = best.settings
+            remark = f"the best after {share:.0%} of the search, with {residuals}"
+            write_configuration(self._output, best.settings, scenes, [remark])
+            self.state = f"wrote {self._output}, {remark}"
+        now = time.perf_counter()
+        text = f"{share:.0%}; {residuals}"
+        if share:
+            text += f"; about {duration((now - self._began) * (1 / share - 1))} left"
+        if self._bar:
+            self._bar.update(self._task, completed=share, description=text)
+        elif now - self._said >= EVERY:
+            self._said = now
+            self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 @click.command("match", cls=Command)
@@ -63,8 +128,14 @@ def match(
     """
     require("clpipe match", "calibrate", "scipy", *(["matplotlib"] if plot else []))
     check_names(output, plot)
-    found = match_files(frames, means, camera, iso, selector)
-    write_configuration(output, found)
+    follower = Follower(output, Console(stderr=True))
+    try:
+        with interruptible(follower.stop), follower:
+            found = match_files(frames, means, camera, iso, selector, follower)
+    except StoppedError:
+        click.echo(f"stopped: {follower.state}", err=True)
+        raise click.exceptions.Exit(INTERRUPTED) from None
+    write_configuration(output, found.settings, found.scenes, found.remarks)
     if plot is not None:
         from clpipe.analysis.matching.plot import draw
 
@@ -77,6 +148,8 @@ def match(
     headings, *rows = columns_table(found)
     show(headings, rows, left=1)
     click.echo(f"\n{summary(found)}")
+    for each in found.ambiguities:
+        click.echo(f"warning: {each}")
     click.echo(f"wrote {' and '.join(map(str, [output, *([plot] if plot else [])]))}")
 
 

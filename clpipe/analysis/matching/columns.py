@@ -100,7 +100,7 @@ class Noise:
     @cached_property
     def planes(self) -> tuple[Doubles, Doubles, Doubles]:
         """Luma, Cb and Cr, (frame, height, width) each."""
-        y = luma(self.rgb)
+        y = self.rgb @ LUMA.astype(self.rgb.dtype)
         return y, *chroma(self.rgb, y)
 
 
@@ -129,7 +129,7 @@ def figures_of(noise: Noise, places: Places) -> Figures:
     luma_map, *chroma_maps = (autocorrelation(plane, places) for plane in (y, cb, cr))
     chroma_map = (chroma_maps[0] + chroma_maps[1]) / 2
     samples = noise.rgb[:, mask].reshape(-1, 3)
-    power = samples.T @ samples / len(samples)
+    power = np.einsum("ni,nj->ij", samples, samples, dtype=np.float64) / len(samples)
     with np.errstate(invalid="ignore", divide="ignore"):
         red_green, red_blue, green_blue = (
             power[a, b] / np.sqrt(power[a, a] * power[b, b]) for a, b in ((0, 1), (0, 2), (1, 2))
@@ -162,8 +162,8 @@ def lags(table: Doubles, prefix: str, names: Sequence[str]) -> Figures:
 def products(planes: Doubles) -> Doubles:
     """The sums of products at all lags up to 6 px, (13, 13) with lag 0 in the middle.
 
-    They come by way of the power spectrum (Wiener and Khinchin), of which so few lags need but two
-    products of matrices.
+    They come by way of the power spectrum (Wiener and Khinchin). Products of matrices would need no
+    second transform, but BLAS takes longer to wake its threads for them.
 
     Args:
         planes: (frame, height, width), 0 beyond their borders.
@@ -171,12 +171,11 @@ def products(planes: Doubles) -> Doubles:
     from scipy import fft
 
     height, width = (fft.next_fast_len(size + REACH, real=True) for size in planes.shape[1:])
-    power = (np.abs(fft.rfft2(planes.astype(np.float32), (height, width))) ** 2).sum(0)
+    waves = fft.rfft2(planes.astype(np.float32), (height, width))
+    power = (waves.real**2 + waves.imag**2).sum(0)
     steps = np.arange(-REACH, REACH + 1)
-    down = np.exp(2j * np.pi * np.outer(steps, np.arange(height)) / height)
-    right = np.exp(2j * np.pi * np.outer(np.arange(width // 2 + 1), steps) / width)
-    right[1 : (width + 1) // 2] *= 2  # the other half of the spectrum of real numbers
-    return np.asarray((down @ power @ right).real / (height * width))
+    rows = fft.ifft(power, axis=0)[steps]
+    return np.asarray(fft.irfft(rows, width)[:, steps], np.float64)
 
 
 def autocorrelation(plane: Doubles, places: Places) -> Doubles:

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from clpipe.analysis.matching.result import Match, measured
-from clpipe.analysis.matching.scenes import Scenes, load_scenes
-from clpipe.analysis.matching.search import Search
-from clpipe.analysis.matching.space import Space, space_for
+from clpipe.analysis.matching.scenes import load_scenes
+from clpipe.analysis.matching.search import Search, Watch
+from clpipe.analysis.matching.space import space_for
 from clpipe.base.errors import RequestError
 from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.device import open_device
@@ -30,6 +30,7 @@ def match_files(
     camera: str | None = None,
     iso: float | None = None,
     device: str | None = None,
+    watch: Watch | None = None,
 ) -> Match:
     """Find the development whose noise is that of pictures.
 
@@ -39,8 +40,10 @@ def match_files(
         camera: whose raw noise is developed; None is the default camera.
         iso: at which; None finds the ISO, too.
         device: where, as ``clpipe devices`` lists them, or "numpy"; None chooses.
+        watch: is told how it goes, and may stop it.
 
     Raises:
+        StoppedError: the watch asked for it.
         RequestError: the pictures do not belong together, or there is no such camera or ISO.
         ImageError: a file cannot be read, or does not tell of noise.
         DeviceError: there is no such device.
@@ -49,22 +52,6 @@ def match_files(
     settings = overlay(Settings(), {k: v for k, v in values.items() if v is not None})
     settings.check_cameras()
     scenes = load_scenes(frames, means)
-    return match_scenes(scenes, settings, space_for(settings, iso is not None), device)
-
-
-def match_scenes(
-    scenes: Scenes, settings: Settings, space: Space, device: str | None = None
-) -> Match:
-    """Find the development in a space whose noise is that of scenes.
-
-    Args:
-        scenes: what to match.
-        settings: to start from.
-        space: what may change.
-        device: as for :func:`match_files`.
-
-    Raises:
-        DeviceError: there is no such device.
-    """
-    search = Search(scenes, settings, space, open_device(device))
-    return measured(search, search.run(), scenes)
+    space = space_for(settings, iso is not None)
+    search = Search(scenes, settings, space, open_device(device), watch)
+    return measured(search, search.run())

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from clpipe.analysis.matching.columns import COLUMNS, Noise
+from clpipe.analysis.matching.ambiguity import Ambiguity, ambiguities
+from clpipe.analysis.matching.columns import COLUMNS, TAILS, Noise
 from clpipe.analysis.matching.scenes import Scenes
 from clpipe.analysis.matching.search import Candidate, Search, Target, target_at, target_of
 from clpipe.analysis.matching.space import DEVELOPMENT
@@ -61,11 +62,21 @@ class Match:
     unseen: tuple[Row, ...]
     evaluations: int
     noises: tuple[Compared, ...]
+    ambiguities: tuple[Ambiguity, ...]
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a reader of the configuration must know: the verdict, and what is ambiguous."""
+        return (self.verdict, *map(str, self.ambiguities))
 
     @property
     def verdict(self) -> str:
         """The correlation with the largest residual in places that the search did not see."""
-        rows = [row for row in self.unseen if not row.relative and abs(row.theirs) <= 1]
+        rows = [
+            row
+            for row in self.unseen
+            if abs(row.theirs) <= 1 and not (row.relative or row.name in TAILS)
+        ]
         if not rows:
             return "the places that were not searched are too few to tell"
         worst = max(rows, key=lambda row: abs(row.residual))
@@ -82,6 +93,7 @@ class Match:
             "evaluations": self.evaluations,
             "scenes": [scene.name for scene in self.scenes.each],
             "notes": list(self.scenes.notes),
+            "ambiguities": [each.record() for each in self.ambiguities],
             "columns": {
                 seen.name: {
                     "relative": seen.relative,
@@ -98,8 +110,13 @@ def row_record(row: Row) -> dict[str, float | None]:
     return {key: json_number(getattr(row, key)) for key in ("theirs", "ours", "residual", "error")}
 
 
-def measured(search: Search, found: Candidate, scenes: Scenes) -> Match:
-    """What was found, developed with new noise, and measured on all crops."""
+def measured(search: Search, found: Candidate) -> Match:
+    """What was found, developed with new noise, and measured on all crops.
+
+    Raises:
+        StoppedError: the search's watch asked for it.
+    """
+    scenes = search.scenes
     settings = with_output(found.settings, scenes)
     pairs: dict[bool, list[tuple[Target, Target]]] = {True: [], False: []}
     noises = []
@@ -119,6 +136,7 @@ def measured(search: Search, found: Candidate, scenes: Scenes) -> Match:
         rows_of(pairs[False]),
         search.evaluations,
         tuple(noises),
+        ambiguities(search, found),
     )
 
 
@@ -164,24 +182,23 @@ def with_output(settings: Settings, scenes: Scenes) -> Settings:
     return overlay(settings, {"output": encoding})
 
 
-def configuration(match: Match) -> str:
-    """The match as a configuration file.
+def configuration(settings: Settings, scenes: Scenes, remarks: Sequence[str]) -> str:
+    """A development as a configuration file, with remarks at its beginning.
 
     Every parameter of the stages that were searched is written, so that it stays the same where a
     default changes.
     """
-    settings = match.settings
-    names = [scene.name for scene in match.scenes.each]
+    names = [scene.name for scene in scenes.each]
     more = f" and {len(names) - 1} more" if len(names) > 1 else ""
     lines = [
         f"# Noise like that of {names[0]}{more}; found by clpipe match:",
-        f"# {match.verdict}.",
+        *(f"# {remark}." for remark in remarks),
         f"camera = {value_text(settings.camera)}",
         f"iso = {value_text(settings.iso)}",
     ]
     if settings.stages != Settings().stages:
         lines += ["stages = [", *(f"    {value_text(name)}," for name in settings.stages), "]"]
-    record = settings.record()
+    record = with_output(settings, scenes).record()
     for name, table in record.items():
         if not isinstance(table, dict):
             continue
@@ -192,10 +209,12 @@ def configuration(match: Match) -> str:
     return "\n".join(lines) + "\n"
 
 
-def write_configuration(path: Path, match: Match) -> None:
-    """Write the configuration.
+def write_configuration(
+    path: Path, settings: Settings, scenes: Scenes, remarks: Sequence[str]
+) -> None:
+    """Write a development as a :func:`configuration`.
 
     Raises:
         ImageError: it cannot be written.
     """
-    write_new(path, configuration(match).encode())
+    write_new(path, configuration(settings, scenes, remarks).encode())

@@ -19,6 +19,7 @@ from clpipe.analysis.matching.space import (
     DEVELOPMENT,
     RESIZE,
     Choice,
+    Dimension,
     Space,
     dimensions_of,
     variants_of,
@@ -39,16 +40,34 @@ KNEE = 3.0  # residuals beyond count less than their squares (soft L1)
 BETTER = 0.8  # share of the cost below which another method is taken; by chance, some reach 0.9
 FEW, SMALL = 4, 384  # scenes by which methods are compared, and the size of their crops, px
 ROUNDS = 2  # of all parts
+LAST = 20  # ways in whose time the last fit is done, which is of all scenes in their full size
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A development: its settings, the numbers that were fitted, and the cost that is left."""
+    """A development: its settings, the numbers that were fitted, and the cost that is left.
+
+    ``residual`` is that of a typical column, in its error and floor together.
+    """
 
     choices: Mapping[str, Choice]
     settings: Settings
     numbers: Mapping[str, float]
     cost: float
+    residual: float
+
+
+class StoppedError(Exception):
+    """A search was stopped before its end."""
+
+
+class Watch:
+    """What a search tells as it goes. This one says nothing, and never stops a search."""
+
+    is_stopping = False  # whether the search is to raise StoppedError
+
+    def advanced(self, share: float, best: Candidate, scenes: Scenes) -> None:
+        """Take in how much of the search is done, 0 to 1, and the best development so far."""
 
 
 @dataclass(frozen=True)
@@ -81,38 +100,69 @@ class Search:
         settings: to start from.
         space: what may change.
         device: where to develop; None is NumPy.
+        watch: is told how it goes, and may stop it.
     """
 
     def __init__(
-        self, scenes: Scenes, settings: Settings, space: Space, device: Device | None
+        self,
+        scenes: Scenes,
+        settings: Settings,
+        space: Space,
+        device: Device | None,
+        watch: Watch | None = None,
     ) -> None:
+        self.scenes = scenes
+        self.watch = watch or Watch()
         self.settings = settings
         self.space = space
         self.simulator = Simulator(device)
         self.targets = [target_of(s, s.mask) for s in scenes.each if s.mask.any()]
         self.evaluations = 0
+        self._done, self._expected, self._share = 0, LAST, 0.0  # ways that are tried
 
     def run(self) -> Candidate:
-        """The best development that is found."""
+        """The best development that is found.
+
+        Raises:
+            StoppedError: the watch asked for it.
+        """
         flattest = sorted(self.targets, key=lambda t: -int(t.scene.mask.sum()))[:FEW]
         crops = [crops_of(target.scene, SMALL, 1)[0] for target in flattest]
         few = [target_of(crop, crop.mask) for crop in crops]
-        best = self.converged(self.fit(self.space.first, {}, few, QUICK), few)
-        LOG.info("start: residuals of %.2g", typical(best, few))
+        first = self.fit(self.space.first, {}, few, QUICK)
+        self.watch.advanced(0.0, first, self.scenes)
+        best = self.converged(first, few)
+        LOG.info("start: residuals of %.2g", best.residual)
         tried = {labels(best)}
+        parts, count = list(self.space.choices) * ROUNDS, len(self.space.choices)
         unchanged = 0  # parts that were tried since the best changed
-        for part, choices in list(self.space.choices.items()) * ROUNDS:
-            if unchanged == len(self.space.choices):
+        for number, part in enumerate(parts):
+            if unchanged == count:
                 break
+            ahead = parts[number:][: count - unchanged]  # more of them, when the best changes
+            self._expected = self._done + sum(self.ways(best, each) for each in ahead) + LAST
             before = best
-            for choice in choices:
-                best = self.attempt(best, part, choice, few, tried)
+            for choice in self.space.choices[part]:
+                best = self.told(self.attempt(best, part, choice, few, tried))
             for step in steps_of(best, part):
                 for choice in variants_of(best.settings, step):
                     variant = merged(best.choices[part], choice)
-                    best = self.attempt(best, part, variant, few, tried, own=True)
+                    best = self.told(self.attempt(best, part, variant, few, tried, own=True))
             unchanged = unchanged + 1 if best is before else 1
         return self.fit(best.choices, best.numbers, self.targets, FULL)
+
+    def ways(self, best: Candidate, part: str) -> int:
+        """How many ways of a part there are to try."""
+        steps = steps_of(best, part)
+        variants = sum(1 for step in steps for _ in variants_of(best.settings, step))
+        return len(self.space.choices[part]) + variants
+
+    def told(self, best: Candidate) -> Candidate:
+        """The best, after the watch was told of it, and of one more way that was tried."""
+        self._done += 1
+        self._share = max(self._share, min(self._done / self._expected, 1.0))
+        self.watch.advanced(self._share, best, self.scenes)
+        return best
 
     def attempt(
         self,
@@ -130,7 +180,7 @@ class Search:
         """
         choices = {**best.choices, part: choice}
         other = tuple(each.text for each in choices.values())
-        if other in tried or typical(best, targets) < ENOUGH:
+        if other in tried or best.residual < ENOUGH:
             return best
         tried.add(other)
         start = {k: v for k, v in best.numbers.items() if own or k.partition(".")[0] != part}
@@ -143,7 +193,7 @@ class Search:
         LOG.debug("%s: cost %.1f, best %.1f", ", ".join(other), found.cost, best.cost)
         if found.cost >= BETTER * best.cost:
             return best
-        LOG.info("%s: residuals of %.2g", ", ".join(other), typical(found, targets))
+        LOG.info("%s: residuals of %.2g", ", ".join(other), found.residual)
         return found
 
     def converged(
@@ -172,9 +222,7 @@ class Search:
         settings = self.settings
         for choice in choices.values():
             settings = choice.over(settings)
-        dimensions = dimensions_of(make_chain(settings))
-        if self.space.strength:
-            dimensions = [self.space.strength, *dimensions]
+        dimensions = self.dimensions(settings)
         numbers = {d.name: start.get(d.name, d.start) for d in dimensions}
         numbers = self.scaled(settings, numbers, targets[0])
 
@@ -184,12 +232,16 @@ class Search:
             }
             return self.residuals(with_numbers(settings, values), targets)
 
+        def made(values: Mapping[str, float], cost: float) -> Candidate:
+            own = with_numbers(settings, values)
+            return Candidate(choices, own, values, cost, typical(cost, targets))
+
         # From 1 to 2, not from 0: SciPy's steps for differences are relative.
         places = np.clip([1 + d.share(numbers[d.name]) for d in dimensions], 1.01, 1.99)
         if not (dimensions and steps):
             knee = (residuals(places) / KNEE) ** 2
             cost = float(KNEE**2 * (np.sqrt(1 + knee) - 1).sum())  # as SciPy's soft_l1
-            return Candidate(choices, with_numbers(settings, numbers), numbers, cost)
+            return made(numbers, cost)
         found = least_squares(
             residuals,
             places,
@@ -202,7 +254,12 @@ class Search:
             ftol=1e-3,
         )
         values = {d.name: d.value(x - 1) for d, x in zip(dimensions, found.x, strict=True)}
-        return Candidate(choices, with_numbers(settings, values), values, float(found.cost))
+        return made(values, float(found.cost))
+
+    def dimensions(self, settings: Settings) -> list[Dimension]:
+        """The numbers that are searched with some settings."""
+        strength = [self.space.strength] if self.space.strength else []
+        return [*strength, *dimensions_of(make_chain(settings))]
 
     def scaled(
         self, settings: Settings, numbers: Mapping[str, float], target: Target
@@ -220,7 +277,13 @@ class Search:
         return scaled
 
     def residuals(self, settings: Settings, targets: Sequence[Target]) -> Doubles:
-        """The residuals of all columns of some scenes."""
+        """The residuals of all columns of some scenes.
+
+        Raises:
+            StoppedError: the watch asked for it.
+        """
+        if self.watch.is_stopping:
+            raise StoppedError
         with ThreadPoolExecutor() as pool:
             figures = pool.map(lambda target: self.figures(settings, target), targets)
             found = [t.residuals(f) for t, f in zip(targets, figures, strict=True)]
@@ -245,10 +308,10 @@ def target_at(scene: Scene, noise: Noise, places: Places) -> Target:
     return Target(scene, places, kept, errors)
 
 
-def typical(candidate: Candidate, targets: Sequence[Target]) -> float:
-    """The residual of a typical column, in its error and floor together."""
+def typical(cost: float, targets: Sequence[Target]) -> float:
+    """The residual of a typical column at a cost, in its error and floor together."""
     columns = sum(len(target.residuals(target.figures)) for target in targets) / len(targets)
-    return float((2 * candidate.cost / columns) ** 0.5)
+    return float((2 * cost / columns) ** 0.5)
 
 
 def labels(candidate: Candidate) -> tuple[str, ...]:
