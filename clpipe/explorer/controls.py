@@ -62,7 +62,7 @@ def key_controls() -> dict[str, Any]:
     That of "lens" has all names as "suggested", or says what to install for them.
     """
     names = {int: "integer", str: "string", int | float: "number"}
-    controls = {}
+    controls: dict[str, dict[str, Any]] = {}
     for key, (text, unit) in ABOUT.items():
         controls[key] = {"type": names[TYPES[key][1]], "text": text, "unit": unit, "plain": True}
         if key in LENS and key != "lens":
