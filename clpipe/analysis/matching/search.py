@@ -118,6 +118,7 @@ class Search:
         self.simulator = Simulator(device)
         self.targets = [target_of(s, s.mask) for s in scenes.each if s.mask.any()]
         self.evaluations = 0
+        self._known: dict[tuple[str, Scene], Figures] = {}  # by settings and scene
         self._done, self._expected, self._share = 0, LAST, 0.0  # ways that are tried
 
     def run(self) -> Candidate:
@@ -290,10 +291,13 @@ class Search:
         return np.concatenate(found) / len(targets) ** 0.5
 
     def figures(self, settings: Settings, target: Target) -> Figures:
-        """The columns of a scene's development."""
-        self.evaluations += 1
-        noise = self.simulator.noise(settings, target.scene, "search")
-        return figures_of(noise, target.places)
+        """The columns of a scene's development, which is done once."""
+        key = repr(settings), target.scene
+        if key not in self._known:
+            self.evaluations += 1
+            noise = self.simulator.noise(settings, target.scene, "search")
+            self._known[key] = figures_of(noise, target.places)
+        return self._known[key]
 
 
 def target_of(scene: Scene, mask: Mask) -> Target:
