@@ -146,13 +146,15 @@ def histogram_svg(values: Sequence[float], label: str) -> str:
 def noise_svg(report: NoiseReport) -> str:
     """Sigma over intensity, autocorrelation, power spectrum and tails of finished pictures."""
     with mpl.rc_context(SETTINGS):
-        figure = _figure(11, 5.6)
+        figure = _figure(11, 5.6, right=0.9)
         above, below = figure.subplots(2, 3)
         draw_intensity(above[0], report)
         _draw_lags(above[1], report)
         _draw_spectrum(above[2], report)
         draw_tails(below[0], report)
-        below[0].get_legend().remove()  # the other drawings have one
+        figure.legend(*above[0].get_legend_handles_labels(), loc="center right")
+        for axes in (above[0], below[0]):
+            axes.get_legend().remove()  # which would cover a curve
         first = mapped(report)[0]
         picture = draw_autocorrelation(below[1], first, peak(first), report)
         figure.colorbar(picture, ax=below[1], shrink=0.8)
@@ -192,7 +194,6 @@ def _draw_lags(axes: Axes, report: NoiseReport) -> None:
         axes.plot(range(LAGS + 1), right, "-o", markersize=3, color=INK[one.name], label=one.name)
     axes.axhline(0, color=PAGE, linewidth=0.8)
     axes.set(xlabel="lag to the right, px", ylabel="autocorrelation")
-    axes.legend()
 
 
 def _draw_spectrum(axes: Axes, report: NoiseReport) -> None:
@@ -211,7 +212,6 @@ def _draw_spectrum(axes: Axes, report: NoiseReport) -> None:
     axes.set(
         ylim=(0, None), xlabel="frequency along rows, cycles/px", ylabel="power; white noise is 1"
     )
-    axes.legend()
 
 
 def _draw_correlations(axes: Axes, report: NoiseReport) -> None:
