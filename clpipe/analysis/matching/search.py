@@ -151,7 +151,9 @@ class Search:
                     variant = merged(best.choices[part], choice)
                     best = self.told(self.attempt(best, part, variant, few, tried, own=True))
             unchanged = unchanged + 1 if best is before else 1
-        return self.fit(best.choices, best.numbers, self.targets, FULL)
+        last = self.fit(best.choices, best.numbers, self.targets, FULL)
+        again = self.fit(last.choices, last.numbers, self.targets, FULL)  # with a new trust region
+        return min(last, again, key=lambda candidate: candidate.cost)
 
     def ways(self, best: Candidate, part: str) -> int:
         """How many ways of a part there are to try."""
