@@ -31,7 +31,8 @@ from clpipe.engine.device import Device
 
 LOG = logging.getLogger(__name__)
 
-GLANCE, QUICK, FULL = 2, 3, 12  # steps of least squares: at first, while promising, at the end
+GLANCE, QUICK, FULL = 2, 3, 20  # steps of least squares: at first, while promising, at the end
+COARSE, FINE = 1e-3, 1e-4  # shares of cost and numbers at which least squares ends; the last fit's
 HOPELESS, PROMISING = 5.0, 1.5  # times the best cost, before and after a glance
 ENOUGH = 0.5  # residuals of a typical column below which no other method is tried
 CONVERGED = 0.95  # share of the cost above which another few steps gain too little to go on
@@ -243,6 +244,7 @@ class Search:
             knee = (residuals(places) / KNEE) ** 2
             cost = float(KNEE**2 * (np.sqrt(1 + knee) - 1).sum())  # as SciPy's soft_l1
             return made(numbers, cost)
+        tolerance = FINE if targets is self.targets else COARSE
         found = least_squares(
             residuals,
             places,
@@ -251,8 +253,8 @@ class Search:
             loss="soft_l1",
             f_scale=KNEE,
             max_nfev=steps,
-            xtol=1e-3,
-            ftol=1e-3,
+            xtol=tolerance,
+            ftol=tolerance,
         )
         values = {d.name: d.value(x - 1) for d, x in zip(dimensions, found.x, strict=True)}
         return made(values, float(found.cost))
