@@ -23,6 +23,9 @@ from tests.conftest import cli_output as clpipe
 
 pytest.importorskip("starlette")
 
+from clpipe.camera.lens import calibration_of
+from clpipe.camera.profile import load_camera
+from clpipe.explorer.controls import key_controls
 from clpipe.explorer.explorer import Explorer
 from clpipe.explorer.export import exported, inputs_of, options_of, run_command
 from clpipe.explorer.view import View
@@ -226,6 +229,39 @@ def test_steps_say_what_is_on_and_which_values_follow(explorer):
     assert steps["denoise"]["values"]["luma_strength"] == 0.5
     assert steps["sensor_noise"]["values"]["a"] > 0
     assert steps["white_balance"]["method"] == "gray_world"
+
+
+def test_stages_that_do_nothing_say_so(explorer):
+    def idle(values):
+        steps = explorer.develop(0, values, View()).facts["steps"]
+        return {step["name"] for step in steps if step["on"] and step["idle"]}
+
+    usual = idle({})
+    assert {"defocus", "motion_blur", "picture_noise"} <= usual
+    assert not usual & {"sensor_noise", "sharpen", "denoise", "gamma"}
+    none = {"sharpen": {"amount": 0}, "denoise": {"luma_strength": 0, "chroma_strength": 0}}
+    assert idle(none | {"color_matrix": {"method": "none"}}) - usual == {"sharpen", "denoise"}
+    assert "motion_blur" not in idle({"motion_blur": {"length": 3}})
+
+
+def test_lenses_are_listed_or_the_extra_is_named(monkeypatch):
+    def missing():
+        raise ImportError
+
+    monkeypatch.setattr("clpipe.camera.lens._loaded", missing)
+    lens = key_controls()["lens"]
+    assert "suggested" not in lens and "pip install 'clpipe[lens]'" in lens["text"]
+
+
+def test_every_lens_in_the_list_is_one():
+    pytest.importorskip("lensfunpy")
+    names = key_controls()["lens"]["suggested"]
+    assert len(names) > 500 and names == sorted(set(names))
+    for name in names[::100]:
+        try:
+            assert calibration_of(name, load_camera("sony-a7r2")).focal_length > 0
+        except RequestError as error:
+            assert "is a zoom; set" in str(error)
 
 
 def test_a_page_may_switch_on_what_the_command_line_skipped(two_renders):

@@ -3,6 +3,7 @@
 import http.client
 import json
 import logging
+import re
 import signal
 import socket
 import subprocess
@@ -250,6 +251,7 @@ def test_controls_change_the_picture_and_what_is_saved_makes_it_again(page, two_
     }
     seen = on_screen(page)
     assert (seen != first).any()
+    page.click('[popovertarget="menu"]')
     with page.expect_download() as download:
         page.click("#save")
     download.value.save_as("camera.toml")
@@ -311,6 +313,7 @@ def test_stages_pixels_comparison_and_noise(page):
     page.click("#redo")
     settle(page)
     assert page.evaluate("[state.values, settingB]") == [b_values, swapped]
+    page.click("#tab-noise")
     for field, value in (("left", "8"), ("top", "8"), ("width", "48"), ("height", "48")):
         page.fill(f"#{field}", value)
     page.click("#measure")
@@ -357,6 +360,129 @@ def test_a_reload_after_a_mistake_brings_back_what_worked(page):
     page.reload()
     settle(page)
     assert page.evaluate("[state.image, state.values]") == [0, {}]
+
+
+def test_a_screen_of_a_laptop_shows_what_is_worked_with_at_once(page):
+    page.set_viewport_size({"width": 1366, "height": 768})
+    page.wait_for_timeout(200)
+    seen = ["#picture", "#histogram-text", "#below", "#keys .row", "#output"]
+    seen += ['.row[data-key="iso"]', '.row[data-key="exposure.ev"]', ".step"]
+    bottoms = page.evaluate(
+        "seen => seen.slice(0, -1).concat('.step:last-child').map(each => "
+        "(document.querySelector(each).closest('#panel > details') || "
+        "document.querySelector(each)).getBoundingClientRect().bottom)",
+        seen,
+    )
+    assert max(bottoms) <= 768
+    assert page.evaluate("document.querySelector('header').offsetHeight") < 50  # one line
+    page.evaluate(
+        "document.querySelectorAll('#panel details').forEach(each => { each.open = true })"
+    )
+    cut = "field => field.offsetParent && field.scrollWidth > field.clientWidth && field.value"
+    fields = "[...document.querySelectorAll('#panel input[type=\"number\"]')]"
+    assert page.evaluate(f"{fields}.length") > 60
+    assert page.evaluate(f"{fields}.filter({cut}).map(each => each.value)") == []
+    assert page.evaluate("document.documentElement.scrollWidth") == 1366
+
+
+def test_stages_that_do_nothing_are_neither_on_nor_off(page):
+    step = page.locator('.step[data-step="sharpen"]')
+    mixed = "element => element.querySelector('input').indeterminate"
+    assert not step.evaluate(mixed)
+    put(page, "sharpen.amount", "0")
+    assert step.evaluate(mixed)
+    assert "does nothing (unsharp)" in step.locator("summary").inner_text()
+    assert "does nothing" in step.locator("input").first.get_attribute("aria-label")
+    step.locator("input").first.click()
+    settle(page)
+    assert step.locator("summary").inner_text() == "sharpen off"
+
+
+def test_sliders_have_the_limits_of_their_texts(page):
+    sliders = page.evaluate(
+        "rows.filter(row => row.dataset.key !== 'iso' && row.querySelector('[type=range]')).map("
+        "row => [row.querySelector('[type=range]'), row.querySelector('.help').textContent]).map("
+        "([slider, text]) => [Number(slider.min), Number(slider.max), text])"
+    )
+    assert len(sliders) > 20
+    for low, high, text in sliders:
+        said = re.search(r"The slider: (\S+) to (\S+)\.(?= |$)", text)
+        said = said or re.search(r"(?:From|Above) (\S+) (?:to|below) (\S+)\.(?= |$)", text)
+        assert said, text
+        near = pytest.approx((low, high), abs=(high - low) / 300)
+        assert (float(said[1]), float(said[2])) == near, text
+
+
+def test_keys_move_zoom_swap_and_undo(page):
+    put(page, "iso", "6400")
+    page.click("#keep-b")
+    put(page, "seed", "5")
+    page.keyboard.press("b")  # in a field it is a letter
+    assert page.evaluate("state.values.seed") == 5
+    page.focus("#picture")
+    before = page.evaluate("[seen.x, seen.y, seen.scale]")
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("ArrowDown")
+    x, y, scale = page.evaluate("[seen.x, seen.y, seen.scale]")
+    assert x > before[0] and y < before[1] and scale == before[2]
+    page.keyboard.press("1")
+    page.keyboard.press("+")
+    assert page.evaluate("seen.scale") == 1.5
+    page.keyboard.press("-")
+    assert page.evaluate("seen.scale") == 1
+    page.keyboard.press("b")
+    settle(page)
+    assert page.evaluate("[state.values, settingB]") == [{"iso": 6400}, {"iso": 6400, "seed": 5}]
+    page.keyboard.press("z")
+    settle(page)
+    assert page.evaluate("state.values") == {"iso": 6400, "seed": 5}
+    page.keyboard.press("Shift+Z")
+    settle(page)
+    assert page.evaluate("state.values") == {"iso": 6400}
+    page.keyboard.press("?")
+    page.wait_for_selector("#keyboard[open]")
+    page.keyboard.press("z")
+    assert page.evaluate("state.values") == {"iso": 6400}
+    page.keyboard.press("Escape")
+
+
+def test_a_link_shows_the_same_view_again(page, served):
+    put(page, "iso", "6400")
+    page.click("#keep-b")
+    put(page, "seed", "5")
+    page.select_option("#step", "demosaic")
+    page.fill("#split", "30")
+    page.click("#zoom-max")
+    settle(page)
+    page.click('[popovertarget="menu"]')
+    page.click("#link")
+    page.wait_for_selector("#say[open]")
+    link = page.inner_text("#say-command")
+    address, _, fragment = link.partition("#")
+    assert address == served
+    assert urlsplit(served).path.strip("/") not in fragment
+    view = "[state, settingB, viewed()]"
+    before = page.evaluate(view)
+    page.goto("about:blank")
+    page.goto(link)
+    settle(page)
+    page.wait_for_timeout(500)
+    settle(page)
+    after = page.evaluate(view)
+    assert after[2].pop("at") == pytest.approx(before[2]["at"], abs=0.3)
+    assert after == [*before[:2], {k: v for k, v in before[2].items() if k != "at"}]
+    assert before[2]["compare"] == "B" and before[2]["split"] == 30 and before[2]["at"][0] == 8
+
+
+@pytest.mark.parametrize(
+    "view", [{"compare": "x", "at": [None, 1, 2], "box": "y", "b": 3, "split": []}, 5, []]
+)
+def test_a_damaged_view_in_a_link_is_passed_over(page, served, view):
+    page.goto("about:blank")
+    page.goto(f"{served}#{json.dumps({'image': 0, 'values': {'iso': 800}, 'view': view})}")
+    settle(page)
+    assert page.evaluate("state.values") == {"iso": 800}
+    assert page.evaluate("[settingB, box, seen.fits]") == [None, None, True]
 
 
 def test_a_narrow_page_is_not_wider_than_the_screen(page):

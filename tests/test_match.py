@@ -16,7 +16,7 @@ from PIL import Image
 from rich.console import Console
 
 from clpipe.analysis.matching import match, search
-from clpipe.analysis.matching.ambiguity import ambiguities
+from clpipe.analysis.matching.ambiguity import Ambiguity, ambiguities
 from clpipe.analysis.matching.columns import (
     COLUMNS,
     TAILS,
@@ -184,8 +184,15 @@ def test_the_configuration_develops_what_was_measured(found):
 def test_the_table(found, clpipe, monkeypatch, tmp_path):
     _, folder = found
     monkeypatch.setattr("clpipe.commands.match.EVERY", 0.0)
+    one = "clpipe.analysis.matching.result.ambiguities"
+    monkeypatch.setattr(one, lambda *_: (Ambiguity(("iso",)),))
     frames = [folder / f"frame{k}.png" for k in range(3)]
-    result = clpipe("match", *frames, "-o", tmp_path / "a.toml", "--iso", 3200, "--device", "numpy")
+    words = [*frames, "-o", tmp_path / "a.toml", "--iso", 3200, "--device", "numpy"]
+    told = json.loads(clpipe("match", *words, "--json").stdout)["ambiguities"]
+    assert told == [{"names": ["iso"], "correlation": None}]
+    result = clpipe("match", *words)
+    assert "warning: iso is not told: a factor of 2" in result.stdout
+    assert "\n# iso is not told: a factor of 2" in (tmp_path / "a.toml").read_text()
     assert "note: 3 frames without a mean: kurtosis and tails are left out" in result.stdout
     rows = {line[:22].strip(): line[22:].split() for line in result.stdout.splitlines()}
     assert rows["kurtosis"][-1] == "-"
@@ -193,18 +200,6 @@ def test_the_table(found, clpipe, monkeypatch, tmp_path):
     assert "largest residual of a correlation in places not searched" in result.stdout
     assert "5%; residuals of" in result.stderr
     assert " left\n" in result.stderr
-
-
-def test_what_cannot_be_told_is_said_and_written(found):
-    report, folder = found
-    written = (folder / "look.toml").read_text()
-    assert set(report["searched"]) == {
-        "iso",
-        "denoise.luma_strength",
-        "denoise.chroma_strength",
-    } | {name for name in report["searched"] if name.startswith("sharpen")}
-    for each in report["ambiguities"]:
-        assert f"# {each['names'][0]} " in written
 
 
 def test_numbers_that_make_up_for_each_other_are_told_of():
@@ -259,6 +254,27 @@ def test_a_search_tells_how_far_it_is(burst, tmp_path, monkeypatch):
     # Three parts and, since the last of them got better, the two others again.
     assert len(told.shares) == 1 + 5 * 3
     assert told.shares[-1] == pytest.approx(15 / (15 + search.LAST))
+
+
+def test_a_development_is_done_once(burst, tmp_path):
+    names = saved(tmp_path, **{f"{k}": frame for k, frame in enumerate(burst[:3])})
+    looking = search.Search(load_scenes(names, []), Settings(), SMALL, None)
+    settings = overlay(Settings(), KNOWN)
+    first = looking.residuals(settings, looking.targets)
+    assert looking.evaluations == 1
+    assert np.array_equal(looking.residuals(settings, looking.targets), first)
+    assert looking.evaluations == 1
+    looking.residuals(overlay(settings, {"iso": 1600.0}), looking.targets)
+    assert looking.evaluations == 2
+
+
+def test_scenes_of_one_name_in_two_folders_stay_apart(burst, tmp_path):
+    scenes = load_scenes(saved(tmp_path, a=burst[0], b=burst[1]), [])
+    one = scenes.each[0]
+    darker = replace(one, mean=one.mean / 2)
+    simulator, settings = Simulator(None), overlay(Settings(), KNOWN)
+    noises = [simulator.noise(settings, each, "a").rgb for each in (one, darker)]
+    assert not np.array_equal(*noises)
 
 
 def candidate(cost):

@@ -200,6 +200,52 @@ def test_hostile_sidecars(out):
     assert page.text.count("</style>") == page.text.count("<style")
 
 
+def views_of(page):
+    return {each["name"]: [v["label"] for v in each["views"]] for each in page.data["look-data"]}
+
+
+def test_without_truths_a_picture_is_beside_another_of_its_image_or_sequence(renders, tmp_path):
+    run = ("run", renders / "a.exr", *NUMPY)
+    clpipe(*run, "-o", tmp_path / "isos", "--iso", "100,1600")
+    views = views_of(report(tmp_path / "isos"))
+    assert views["iso100/a"] == ["picture", "iso1600/a (sony-a7r2, ISO 1600)"]
+    clpipe(*run, "-o", tmp_path / "bracket", "--bracket=-1,1", "--iso", 800)
+    views = views_of(report(tmp_path / "bracket"))
+    assert views["a.ev+1"] == ["picture", "a.ev-1 (sony-a7r2, ISO 800)"]
+    clpipe(*run, "-o", tmp_path / "one", "--iso", 800)
+    page = report(tmp_path / "one")
+    assert views_of(page) == {"a": ["picture"]}
+    assert "a run with --truth clean has the picture without noise" in page.said
+    for i in range(3):
+        picture = np.asarray(np.random.default_rng(i).random((64, 96, 3)), np.float32)
+        write(tmp_path / f"view{i}.exr", picture, ("R", "G", "B"), {})
+    clpipe("run", *tmp_path.glob("view*.exr"), "-o", tmp_path / "way", *NUMPY, "--iso", 200)
+    views = views_of(report(tmp_path / "way"))
+    assert [each[1].split()[0] for each in views.values()] == ["view1", "view0", "view1"]
+
+
+def test_what_was_drawn_is_drawn_and_what_follows_is_folded(renders, tmp_path):
+    out = tmp_path / "out"
+    config = tmp_path / "own.toml"
+    config.write_text(
+        'iso = { uniform = [1000, 6000] }\ncamera = { choice = ["sony-a7r2", "canon-6d"] }\n'
+    )
+    clpipe("run", renders, "-o", out, "-c", config, "--seed", 4, *NUMPY, status=1)
+    page = report(out)
+    assert 'aria-label="Histogram of ISO"' in page.text
+    asked, _, follows = page.said.partition("What follows from these")
+    assert re.search(r"ISO ?: \d+, \d+, \d+", asked)
+    assert "noise a" in follows and "noise a" not in asked
+    assert all(isinstance(entry["iso"], int) for entry in page.data["sheet-data"])
+
+
+def test_a_report_that_takes_long_says_where_it_is(out, monkeypatch):
+    monkeypatch.setattr("clpipe.commands.progress.EVERY", 0)
+    said = clpipe("report", out)
+    for text in ("sidecars", "noise of raws", "small picture 2 of 3", "large picture 1 of 3"):
+        assert f"{text}\n" in said
+
+
 def test_tars_and_series_are_read(renders, tmp_path):
     out = tmp_path / "out"
     arguments = ("--iso", "100,1600", "--truth", "development")
@@ -209,7 +255,7 @@ def test_tars_and_series_are_read(renders, tmp_path):
     page = report(out / "s")
     names = {entry["name"]: entry["iso"] for entry in page.data["sheet-data"]}
     assert names == {"iso100/a": 100, "iso100/b": 100, "iso1600/a": 1600, "iso1600/b": 1600}
-    assert "ISO 100, 1600" in page.said
+    assert "ISO : 100, 1600" in page.said
     page = report(out / "t")
     assert [entry["name"] for entry in page.data["sheet-data"]] == ["a", "b"]
     assert all(entry["image"] for entry in page.data["sheet-data"])

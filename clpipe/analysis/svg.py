@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from clpipe.analysis.plot import (
     INK,
@@ -31,6 +32,7 @@ NEUTRAL = INK["mosaic"]  # in :mod:`clpipe.analysis.plot`
 PAGE_COLOURS = resources.files("clpipe.analysis") / "colours.css"  # of the pages
 PAGE = "#010203"  # stands for the page's colour until the drawing is text
 COLOURS = ("#1f8a8a", "#d9822b", "#7a5bb5", "#c8102e")
+LONG = 18  # characters of a name beside a bar
 SETTINGS = {
     "svg.fonttype": "none",
     "svg.hashsalt": "clpipe",
@@ -132,27 +134,46 @@ def histogram_svg(values: Sequence[float], label: str) -> str:
     count = min(max(int(len(data) ** 0.5), 5), 30)
     edges = np.geomspace(low, high, count + 1) if logarithmic else np.linspace(low, high, count + 1)
     with mpl.rc_context(SETTINGS):
-        figure = _figure(3.4, 1.9)
+        figure = _figure(3.4, 1.9, right=0.4)
         axes = figure.add_subplot()
         axes.hist(data, list(edges), color=COLOURS[0])
+        ticks = list(MaxNLocator(4).tick_values(low, high))
         if logarithmic:
             axes.set_xscale("log")
-            axes.xaxis.set_minor_formatter("")
+            axes.minorticks_off()
+            ticks = [float(f"{tick:.2g}") for tick in np.geomspace(low, high, 4)]
+        axes.set_xticks(ticks, [f"{tick:,.0f}" if tick >= 100 else f"{tick:.3g}" for tick in ticks])
+        axes.set_xlim(edges[0], edges[-1])
         axes.set_xlabel(label)
         axes.locator_params(axis="y", nbins=4, integer=True)
         return _text(figure, f"Histogram of {label}")
 
 
+def bars_svg(counts: Mapping[str, int], label: str) -> str:
+    """How often each of a few values occurs."""
+    with mpl.rc_context(SETTINGS):
+        figure = _figure(3.4, 1.9)
+        figure.subplots_adjust(left=0.4)
+        axes = figure.add_subplot()
+        names = [name if len(name) <= LONG else f"{name[: LONG - 1]}…" for name in counts]
+        axes.barh(range(len(names)), list(counts.values()), color=COLOURS[0], tick_label=names)
+        axes.set_xlabel(label)
+        axes.locator_params(axis="x", nbins=4, integer=True)
+        return _text(figure, f"How often each value of {label} occurs")
+
+
 def noise_svg(report: NoiseReport) -> str:
     """Sigma over intensity, autocorrelation, power spectrum and tails of finished pictures."""
     with mpl.rc_context(SETTINGS):
-        figure = _figure(11, 5.6)
+        figure = _figure(11, 5.6, right=0.9)
         above, below = figure.subplots(2, 3)
         draw_intensity(above[0], report)
         _draw_lags(above[1], report)
         _draw_spectrum(above[2], report)
         draw_tails(below[0], report)
-        below[0].get_legend().remove()  # the other drawings have one
+        figure.legend(*above[0].get_legend_handles_labels(), loc="center right")
+        for axes in (above[0], below[0]):
+            axes.get_legend().remove()  # which would cover a curve
         first = mapped(report)[0]
         picture = draw_autocorrelation(below[1], first, peak(first), report)
         figure.colorbar(picture, ax=below[1], shrink=0.8)
@@ -192,7 +213,6 @@ def _draw_lags(axes: Axes, report: NoiseReport) -> None:
         axes.plot(range(LAGS + 1), right, "-o", markersize=3, color=INK[one.name], label=one.name)
     axes.axhline(0, color=PAGE, linewidth=0.8)
     axes.set(xlabel="lag to the right, px", ylabel="autocorrelation")
-    axes.legend()
 
 
 def _draw_spectrum(axes: Axes, report: NoiseReport) -> None:
@@ -211,7 +231,6 @@ def _draw_spectrum(axes: Axes, report: NoiseReport) -> None:
     axes.set(
         ylim=(0, None), xlabel="frequency along rows, cycles/px", ylabel="power; white noise is 1"
     )
-    axes.legend()
 
 
 def _draw_correlations(axes: Axes, report: NoiseReport) -> None:

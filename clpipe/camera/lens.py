@@ -17,6 +17,7 @@ from clpipe.camera.profile import Camera
 INSTALL = "pip install 'clpipe[lens]'"
 FAR = 1000.0  # m, at which lensfun's calibrations for infinity stand
 OTHERS = 2  # words of a lens's name, beside the maker, that may be left out
+RECTILINEAR = "RECTILINEAR"  # lensfun's type of the lenses that are known here
 ASPECT = 1.5  # of the pictures that a lens was calibrated with, where the database says nothing
 
 
@@ -84,6 +85,16 @@ def _calibration(
             terms = (term * ratio ** (2 * i) for i, term in enumerate(found.terms, 1))
             falloff = {"method": "pa"} | dict(zip(("k1", "k2", "k3"), terms, strict=True))
     return LensCalibration(focal, bend, falloff)
+
+
+def lens_names() -> list[str]:
+    """All lenses of lensfun's database that :func:`calibration_of` takes, in their order.
+
+    Raises:
+        KeyedError: lensfunpy is not installed.
+    """
+    lenses = _database().lenses
+    return sorted({_full(lens) for lens in lenses if lens.type.name == RECTILINEAR})
 
 
 def _bend(lens: Any, focal: float) -> dict[str, Any]:
@@ -190,7 +201,7 @@ def _focal_length(lens: Any, focal: float | None) -> float:
         RequestError: it has no such one, or several and none is set; or it is a fisheye.
     """
     name, low, high = _full(lens), lens.min_focal, lens.max_focal or lens.min_focal
-    if lens.type.name != "RECTILINEAR":
+    if lens.type.name != RECTILINEAR:
         raise KeyedError(
             "lens",
             f"lens: {name} is no rectilinear lens, and lensfun describes it as departing from "

@@ -1,5 +1,6 @@
 """``clpipe match``: from pictures of a camera to a development with the same noise."""
 
+import contextlib
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -18,6 +19,7 @@ from clpipe.batch.interrupt import INTERRUPTED, interruptible
 from clpipe.chain.settings import Settings
 from clpipe.chain.toml import value_text
 from clpipe.commands.chain_options import camera_option
+from clpipe.commands.notices import NOTICES
 from clpipe.commands.options import Command, device_option, json_option, output_option
 from clpipe.commands.printing import Rows, number, show, show_json
 from clpipe.commands.progress import EVERY
@@ -40,6 +42,7 @@ class Follower(Watch):
         self._began = self._said = time.perf_counter()
         self._written: Settings | None = None
         self._bar: Progress | None = None
+        self._live = contextlib.ExitStack()
         self.state = "nothing was found yet, and nothing is written"
 
     def __enter__(self) -> Self:
@@ -49,12 +52,15 @@ class Follower(Watch):
             columns = progress.BarColumn(), progress.TextColumn("{task.description}")
             self._bar = progress.Progress(*columns, console=self._console, transient=True)
             self._task = self._bar.add_task("the first fit", total=1.0)
-            self._bar.start()
+            self._live.enter_context(self._bar)
+        self._live.enter_context(NOTICES.printed_by(self._print))
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self._bar:
-            self._bar.stop()
+        self._live.close()
+
+    def _print(self, text: str) -> None:
+        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def stop(self) -> None:
         """Have the search end."""
@@ -76,7 +82,7 @@ class Follower(Watch):
             self._bar.update(self._task, completed=share, description=text)
         elif now - self._said >= EVERY:
             self._said = now
-            self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+            self._print(text)
 
 
 @click.command("match", cls=Command)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Self
 
 import click
 from rich.console import Console
+from rich.text import Text
 
 from clpipe.base.text import duration, one_line
 from clpipe.batch.interrupt import interruptible
@@ -39,6 +40,25 @@ def bar_on(console: Console) -> "Progress":
         console=console,
         transient=True,
     )
+
+
+@contextlib.contextmanager
+def told() -> Generator[Callable[[str], None]]:
+    """What shows on stderr what is done: one line on a terminal, else a line now and then."""
+    console = Console(stderr=True)
+    last = time.perf_counter()
+
+    def line(text: str) -> None:
+        nonlocal last
+        if time.perf_counter() - last >= EVERY:
+            last = time.perf_counter()
+            console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    if not console.is_terminal:
+        yield line
+        return
+    with console.status("") as status:
+        yield lambda text: status.update(Text(text))
 
 
 class Reporter:

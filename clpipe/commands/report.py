@@ -9,6 +9,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
 from clpipe.base.files import write_new
 from clpipe.commands.options import Command, output_option
+from clpipe.commands.progress import told
 from clpipe.outputs.existing import is_marked
 
 
@@ -42,6 +43,8 @@ def report(folders: tuple[Path, ...], output: Path | None) -> None:
     from clpipe.reports.page import html
     from clpipe.reports.run import read_run
 
-    page = html([read_run(folder) for folder in folders]).encode()
+    with told() as tell:
+        tell("sidecars")
+        page = html([read_run(folder) for folder in folders], tell).encode()
     size = write_new(path, page).size
     click.echo(f"wrote {path} ({size / 2**20:.1f} MiB)")

@@ -6,6 +6,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from clpipe.base.errors import KeyedError
+from clpipe.camera.lens import INSTALL, lens_names
 from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.chain import step_names
 from clpipe.chain.keys import ABOUT, LENS, TYPES
@@ -55,13 +57,20 @@ def parameters_of(model: type[BaseModel]) -> dict[str, Any]:
 
 
 def key_controls() -> dict[str, Any]:
-    """The values that stand in no table, each as a JSON schema with a text."""
+    """The values that stand in no table, each as a JSON schema with a text.
+
+    That of "lens" has all names as "suggested", or says what to install for them.
+    """
     names = {int: "integer", str: "string", int | float: "number"}
-    controls = {}
+    controls: dict[str, dict[str, Any]] = {}
     for key, (text, unit) in ABOUT.items():
         controls[key] = {"type": names[TYPES[key][1]], "text": text, "unit": unit, "plain": True}
         if key in LENS and key != "lens":
             controls[key]["exclusiveMinimum"] = 0
+    try:
+        controls["lens"]["suggested"] = lens_names()
+    except KeyedError:
+        controls["lens"]["text"] += f" It needs {INSTALL}."
     return controls
 
 

@@ -167,6 +167,7 @@ class Parameter:
 
     name: str
     values: Counter[Any]  # JSON values, lists as their text
+    is_asked: bool = True  # whether it was drawn, or set for images alone; else it follows
 
     @property
     def varies(self) -> bool:
@@ -257,12 +258,13 @@ def _step(name: str, counted: Sequence[tuple[Mapping[str, Any], int]]) -> Step:
 
 def drawn(pictures: Sequence[Made], steps: Sequence[Step]) -> list[Parameter]:
     """What differs from picture to picture: camera, ISO, noise and parameters."""
+    asked: set[str] = set().union(*(made.value("asked") or () for made in pictures))
     cameras = Counter(text_of(made.value("camera")) for made in pictures)
-    facts = [Parameter("camera", cameras)]
+    isos = Counter(round(number(made.value("iso"))) for made in pictures)
+    facts = [Parameter("camera", cameras), Parameter("ISO", isos)]
     facts += [
-        Parameter(name, Counter(plain(made.value(*keys)) for made in pictures))
+        Parameter(name, Counter(plain(made.value(*keys)) for made in pictures), False)
         for name, keys in (
-            ("ISO", ("iso",)),
             ("noise a", ("noise", "signal", "a")),
             ("noise b", ("noise", "signal", "b")),
             ("clipped share", ("clipped",)),
@@ -270,7 +272,7 @@ def drawn(pictures: Sequence[Made], steps: Sequence[Step]) -> list[Parameter]:
     ]
     repeated = {("sensor_noise", "a"), ("sensor_noise", "b")}
     facts += [
-        Parameter(f"{step.name}.{each.name}", each.values)
+        Parameter(f"{step.name}.{each.name}", each.values, f"{step.name}.{each.name}" in asked)
         for step in steps
         for each in step.parameters
         if (step.name, each.name) not in repeated

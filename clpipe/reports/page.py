@@ -3,19 +3,19 @@
 import json
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from clpipe.analysis.svg import PAGE_COLOURS, histogram_svg, lines_svg, shares_svg
+from clpipe.analysis.svg import PAGE_COLOURS, bars_svg, histogram_svg, lines_svg, shares_svg
 from clpipe.base.about import __version__
 from clpipe.base.text import duration
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, STEPS
 from clpipe.reports import figures
-from clpipe.reports.figures import Parameter, Session, Step
+from clpipe.reports.figures import Parameter, Session, Step, text_of
 from clpipe.reports.noise import LIMIT, laws, noises
 from clpipe.reports.run import Made, Run
 from clpipe.reports.shown import BUDGET, Budget, Large, add_stages, chosen, contact_sheet, large
@@ -23,6 +23,7 @@ from clpipe.reports.shown import BUDGET, Budget, Large, add_stages, chosen, cont
 TEMPLATES = Path(__file__).parent / "page"
 LISTED = 40  # failures, warnings, problems
 HISTOGRAMS = 12
+BARS = 8  # values that are drawn as bars
 SHEET_SHARE = 0.45  # of the budget, for contact sheets
 STAGED = 2  # images whose kept stages are shown large
 DRAWN = 3  # pictures whose noise is drawn
@@ -51,11 +52,12 @@ def listed(texts: Sequence[str]) -> Listed:
     return Listed(lines[:LISTED], max(len(lines) - LISTED, 0), len(texts))
 
 
-def html(runs: Sequence[Run]) -> str:
+def html(runs: Sequence[Run], tell: Callable[[str], None] = lambda _: None) -> str:
     """The report of a run, or of two runs beside each other.
 
     Args:
         runs: one or two.
+        tell: is called with what is done next, in words.
     """
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
@@ -70,10 +72,12 @@ def html(runs: Sequence[Run]) -> str:
     steps = [figures.steps_of(run.pictures) for run in runs]
     drawn = figures.drawn(first.pictures, steps[0]) if not others else []
     problems = [text for run in runs for text in run.problems]
+    tell("noise of raws")
     judged = [law for run in runs for law in laws(run, problems)]
     picked = chosen(first, {law.name for law in judged if law.leaves})
     typical = sorted(picked, key=lambda made: bool(figures.oddities(made)))
     budget = Budget(BUDGET)
+    tell("noise of pictures")
     noise = [
         (label, each)
         for label, run in zip(labels, runs, strict=True)
@@ -85,11 +89,15 @@ def html(runs: Sequence[Run]) -> str:
         budget.take(svg)
     share = int(budget.left * SHEET_SHARE) // len(runs)
     shares = [Budget(share) for _ in runs]
-    sheets = [contact_sheet(*each) for each in zip(runs, shares, labels, strict=True)]
+    sheets = [contact_sheet(*each, tell) for each in zip(runs, shares, labels, strict=True)]
     budget.left -= sum(share - each.left for each in shares)
     problems += [text for sheet in sheets for text in sheet.problems]
     entries = [entry for sheet in sheets for entry in sheet.entries]
-    found_large = [(made, large(runs, labels, made, budget, problems)) for made in picked]
+    found_large = []
+    for i, made in enumerate(picked, 1):
+        tell(f"large picture {i} of {len(picked)}")
+        found_large.append((made, large(runs, labels, made, budget, problems)))
+    tell("figures")
     shown = [each for _, each in found_large if each]
     for made, each in found_large[:STAGED]:
         if each:
@@ -229,11 +237,15 @@ def machine_facts(pictures: Sequence[Made]) -> list[tuple[str, str]]:
 
 
 def drawings_of(drawn: Sequence[Parameter]) -> list[tuple[Parameter, str]]:
-    """What was drawn, with a histogram where it is numbers."""
+    """What differs; what was asked has a histogram, or bars where there are few values."""
     found: list[tuple[Parameter, str]] = []
     for fact in drawn:
         numbers = fact.numbers
-        is_drawn = len(numbers) == fact.values.total() and len(fact.values) > 2
-        is_drawn = is_drawn and len(found) < HISTOGRAMS
-        found.append((fact, histogram_svg(numbers, fact.name) if is_drawn else ""))
+        svg = ""
+        if fact.is_asked and sum(bool(each) for _, each in found) < HISTOGRAMS:
+            if len(numbers) == fact.values.total() and len(fact.values) > 2:
+                svg = histogram_svg(numbers, fact.name)
+            elif len(fact.values) <= BARS:
+                svg = bars_svg({text_of(value): n for value, n in fact.values.items()}, fact.name)
+        found.append((fact, svg))
     return found

@@ -13,12 +13,13 @@ from clpipe.base.errors import RequestError
 from clpipe.base.reading import TEXT_BYTES, parse_json, read_bytes
 from clpipe.batch.run_log import read_log
 from clpipe.batch.tars import DAMAGED
+from clpipe.chain.keys import KEYS as SINGLE
 from clpipe.chain.rendition import Rendition
 from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, values_in
 
 TAR = ".tar"
 # What is kept of sidecars, of which there may be hundreds of thousands.
-KEYS = ("clpipe", "iso", "camera", "width", "height", "noise", "clipped", "warnings")
+KEYS = ("clpipe", "sha256", "iso", "camera", "width", "height", "noise", "clipped", "warnings")
 ALIKE = ("device", "versions")  # which most of them share
 STAGES, STAGES_END = b'\n  "stages": [\n', b"\n  ],\n"  # as json_text writes them
 LOGS = "run*.jsonl"
@@ -147,6 +148,8 @@ class Run:
         kept = {key: record.get(key) for key in KEYS}
         for key in ALIKE:
             kept[key] = self._alike.setdefault(repr(record.get(key)), record.get(key))
+        asked = asked_in(record.get("request"))
+        kept["asked"] = self._alike.setdefault(repr(sorted(asked)), asked)
         kept["stages"] = [step for step in steps if isinstance(step, dict)]
         return kept
 
@@ -154,6 +157,27 @@ class Run:
         """Add a picture."""
         self.made.append(made)
         self._by_image.setdefault(made.image, {})[made.rendition] = made
+
+
+def asked_in(request: Any) -> frozenset[str]:
+    """The values that a sidecar's request draws, or has for its image alone; others follow.
+
+    >>> config = {"iso": {"choice": [100, 200]}, "denoise": {"luma_strength": 1}}
+    >>> sorted(asked_in({"config": config, "image": {"x": {"y": 2}}}))
+    ['iso', 'x.y']
+    """
+    tables = request if isinstance(request, Mapping) else {}
+    found = set()
+    for part in ("config", "options", "image"):
+        table = tables.get(part)
+        for key, value in table.items() if isinstance(table, Mapping) else ():
+            own = {key: value}
+            if key not in SINGLE and isinstance(value, Mapping):
+                own = {f"{key}.{name}": each for name, each in value.items()}
+            found |= {
+                name for name, each in own.items() if part == "image" or isinstance(each, Mapping)
+            }
+    return frozenset(found)
 
 
 def read_run(folder: Path) -> Run:

@@ -5,7 +5,8 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Collection, Iterator, Sequence
+import re
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
@@ -16,7 +17,7 @@ import numpy as np
 from clpipe.analysis.crops import HEIGHT, WIDTH, Place, choose_places
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
-from clpipe.chain.rendition import BASELINES, PICTURES
+from clpipe.chain.rendition import BASELINES, NOISY, PICTURES
 from clpipe.images.preview import decoded, jpeg_bytes, reduced, thumbnail_bytes
 from clpipe.reports.figures import number, oddities
 from clpipe.reports.run import Blob, Made, Run
@@ -88,13 +89,16 @@ class Sheet:
     problems: list[str] = field(default_factory=list)
 
 
-def contact_sheet(run: Run, budget: Budget, label: str) -> Sheet:
+def contact_sheet(
+    run: Run, budget: Budget, label: str, tell: Callable[[str], None] = lambda _: None
+) -> Sheet:
     """Small pictures of a run, in its order: as many as there is room and time for.
 
     Args:
         run: the run.
         budget: that they take from.
         label: stands before the names of its pictures; "" does not.
+        tell: is called with how far it is, in words.
     """
     pictures = run.pictures
     sheet = Sheet(pictures=len(pictures))
@@ -105,6 +109,7 @@ def contact_sheet(run: Run, budget: Budget, label: str) -> Sheet:
         if not budget.take(json.dumps(entry)):
             break
         entries[i] = entry
+        tell(f"small picture {len(entries)} of {len(order)}")
         sheet.problems += [problem] if problem else []
     sheet.entries = [entries[i] for i in sorted(entries)]
     return sheet
@@ -139,7 +144,7 @@ def _entry(made: Made, image: str, label: str) -> dict[str, Any]:
     return {
         "name": f"{label}: {made.name}" if label else made.name,
         "image": image,
-        "iso": number(made.value("iso")),
+        "iso": round(number(made.value("iso"))),
         "camera": str(made.value("camera")),
         "clipped": number(made.value("clipped")),
         "odd": oddities(made),
@@ -269,13 +274,15 @@ def large(
         problems: gets what cannot be shown, and why.
     """
     shown: Large | None = None
+    comparison = [(label, file) for label, file in _beside(runs[0], made) if len(runs) == 1]
     views = [
         (" ".join(filter(None, (label, view))), file)
         for label, run in zip(labels, runs, strict=True)
         if (own := run.picture_beside(made))
         for view, file in _views(run, own)
     ]
-    for label, file in sorted(views, key=lambda view: not view[0].endswith(PICTURE)):
+    views.sort(key=lambda view: not view[0].endswith(PICTURE))
+    for label, file in views if len(views) > 1 else views + comparison:
         try:
             pixels = decoded(checked(file), file.name)
         except ImageError as error:
@@ -299,6 +306,34 @@ def _views(run: Run, made: Made) -> Iterator[tuple[str, Blob]]:
         is_shown = rendition.role in (*PICTURES, *BASELINES) and rendition.ev == made.rendition.ev
         if is_shown and (file := picture_file(other)):
             yield rendition.label.strip("."), file
+
+
+def _beside(run: Run, made: Made) -> Iterator[tuple[str, Blob]]:
+    """What a picture without truths can be compared with, with a label.
+
+    It is a picture of the same file, such as another ISO, exposure or frame; else its neighbour in
+    a sequence, whose name has other digits.
+    """
+    alike = [
+        other
+        for other in run.made
+        if other is not made
+        and other.rendition.role == NOISY
+        and other.value("sha256") == made.value("sha256")
+        and all(other.value(key) == made.value(key) for key in ("width", "height"))
+    ]
+    pictures = run.pictures
+    number_of = pictures.index(made)
+    near = pictures[number_of - 1 if number_of else 1 : number_of or 2]
+    alike += [each for each in near if _without_digits(each.name) == _without_digits(made.name)]
+    for other in alike[:1]:
+        if file := picture_file(other):
+            iso = f"{number(other.value('iso')):.0f}"
+            yield f"{other.name} ({other.value('camera')}, ISO {iso})", file
+
+
+def _without_digits(name: str) -> str:
+    return re.sub(r"\d+", "", name)
 
 
 def _kept(made: Made) -> Iterator[tuple[str, Blob]]:
@@ -344,5 +379,5 @@ def _facts(made: Made) -> str:
     law = f"; variance {a:.3g} y + {b:.3g}"
     size = f"{number(made.value('width')):.0f} x {number(made.value('height')):.0f} px"
     iso, clipped = number(made.value("iso")), number(made.value("clipped"))
-    text = f"{size}, {made.value('camera')}, ISO {iso:g}, {clipped * 100:.2f} % clipped"
+    text = f"{size}, {made.value('camera')}, ISO {iso:.0f}, {clipped * 100:.2f} % clipped"
     return text + (law if made.value("noise", "signal") else "")

@@ -39,7 +39,7 @@ MOVED, MOVED_BLOCK = 1.0, 16  # sigma, px: the mean of a block that noise does n
 MOST_MOVED = 0.1  # share of the blocks
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """Frames of one scene, (height, width, 3), 0 to 255, and what they are compared with.
 

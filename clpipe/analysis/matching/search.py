@@ -31,7 +31,8 @@ from clpipe.engine.device import Device
 
 LOG = logging.getLogger(__name__)
 
-GLANCE, QUICK, FULL = 2, 3, 12  # steps of least squares: at first, while promising, at the end
+GLANCE, QUICK, FULL = 2, 3, 20  # steps of least squares: at first, while promising, at the end
+COARSE, FINE = 1e-3, 1e-4  # shares of cost and numbers at which least squares ends; the last fit's
 HOPELESS, PROMISING = 5.0, 1.5  # times the best cost, before and after a glance
 ENOUGH = 0.5  # residuals of a typical column below which no other method is tried
 CONVERGED = 0.95  # share of the cost above which another few steps gain too little to go on
@@ -118,6 +119,7 @@ class Search:
         self.simulator = Simulator(device)
         self.targets = [target_of(s, s.mask) for s in scenes.each if s.mask.any()]
         self.evaluations = 0
+        self._known: dict[tuple[str, Scene], Figures] = {}  # by settings and scene
         self._done, self._expected, self._share = 0, LAST, 0.0  # ways that are tried
 
     def run(self) -> Candidate:
@@ -149,7 +151,9 @@ class Search:
                     variant = merged(best.choices[part], choice)
                     best = self.told(self.attempt(best, part, variant, few, tried, own=True))
             unchanged = unchanged + 1 if best is before else 1
-        return self.fit(best.choices, best.numbers, self.targets, FULL)
+        last = self.fit(best.choices, best.numbers, self.targets, FULL)
+        again = self.fit(last.choices, last.numbers, self.targets, FULL)  # with a new trust region
+        return min(last, again, key=lambda candidate: candidate.cost)
 
     def ways(self, best: Candidate, part: str) -> int:
         """How many ways of a part there are to try."""
@@ -242,6 +246,7 @@ class Search:
             knee = (residuals(places) / KNEE) ** 2
             cost = float(KNEE**2 * (np.sqrt(1 + knee) - 1).sum())  # as SciPy's soft_l1
             return made(numbers, cost)
+        tolerance = FINE if targets is self.targets else COARSE
         found = least_squares(
             residuals,
             places,
@@ -250,8 +255,8 @@ class Search:
             loss="soft_l1",
             f_scale=KNEE,
             max_nfev=steps,
-            xtol=1e-3,
-            ftol=1e-3,
+            xtol=tolerance,
+            ftol=tolerance,
         )
         values = {d.name: d.value(x - 1) for d, x in zip(dimensions, found.x, strict=True)}
         return made(values, float(found.cost))
@@ -290,10 +295,13 @@ class Search:
         return np.concatenate(found) / len(targets) ** 0.5
 
     def figures(self, settings: Settings, target: Target) -> Figures:
-        """The columns of a scene's development."""
-        self.evaluations += 1
-        noise = self.simulator.noise(settings, target.scene, "search")
-        return figures_of(noise, target.places)
+        """The columns of a scene's development, which is done once."""
+        key = repr(settings), target.scene
+        if key not in self._known:
+            self.evaluations += 1
+            noise = self.simulator.noise(settings, target.scene, "search")
+            self._known[key] = figures_of(noise, target.places)
+        return self._known[key]
 
 
 def target_of(scene: Scene, mask: Mask) -> Target:

@@ -64,12 +64,12 @@ class Simulator:
                 pictures.append(self._quiet.run(linear, "").encoded)
         frames = [finished(picture, scene) for picture in pictures]
         mean = None if scene.own_mean else frames.pop()
-        return replace(noise_of_frames(frames, mean), level=scene.noise.level)
+        return noise_of_frames(frames, mean, scene.noise.level)
 
     def _linear_light(self, chain: Chain, scene: Scene) -> Floats:
         """The scene in the light, and of the size, that the chain starts on."""
         methods, scale, gain = undoing(chain), scale_of(chain), gain_of(chain)
-        key = scene.name, scale, gain, *((type(m), m.model_dump_json()) for m in methods)
+        key = scene, scale, gain, *((type(m), m.model_dump_json()) for m in methods)
         if key not in self._linear:
             image = (scene.clean / 255).astype(np.float32)
             for method in methods:

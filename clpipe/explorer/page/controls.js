@@ -28,13 +28,21 @@ const limitsOf = (schema, value) => {
   };
 };
 
-// The limits of a number in words.
+// The limits of a number in words, and those of its slider where they are others.
 const between = (type) => {
   const { minimum, exclusiveMinimum, maximum, exclusiveMaximum } = type;
   const low = minimum !== undefined ? `from ${minimum}` : exclusiveMinimum !== undefined ? `above ${exclusiveMinimum}` : "";
   const high = maximum !== undefined ? `to ${maximum}` : exclusiveMaximum !== undefined ? `below ${exclusiveMaximum}` : "";
   const text = [low, high].filter(Boolean).join(" ");
   return text && `${text[0].toUpperCase()}${text.slice(1)}.`;
+};
+
+const figures = (value) => Number(Number(value).toPrecision(6));
+
+const sliderText = (type, { from, to }) => {
+  const [low, high] = [type.minimum ?? type.exclusiveMinimum, type.maximum ?? type.exclusiveMaximum];
+  const near = (limit, end) => limit !== undefined && Math.abs(limit - end) <= (to - from) / 400;
+  return near(low, from) && near(high, to) ? "" : `The slider: ${figures(from)} to ${figures(to)}.`;
 };
 
 let count = 0;
@@ -48,8 +56,13 @@ const row = (key, name, schema, resolved) => {
   auto.setAttribute("aria-label", `auto: ${name}`);
   const element = made("div", { className: "row" },
     made("div", { className: "line" }, made("label", { htmlFor: id, textContent: name + (schema.unit ? ` (${schema.unit})` : "") }), inputs, auto));
-  const help = [schema.text, between(type), schema.auto ? `Automatic: ${schema.auto}.` : ""].filter(Boolean).join(" ");
-  if (help) element.append(made("p", { className: "help", id: `${id}-help`, textContent: help }));
+  const help = made("p", { className: "help", id: `${id}-help` });
+  const explain = (sliding) => {
+    help.textContent = [schema.text, between(type), sliding, schema.auto ? `Automatic: ${schema.auto}.` : ""].filter(Boolean).join(" ");
+    element.title = help.textContent;
+  };
+  explain("");
+  element.append(help);
   element.dataset.key = key;
   let field;
   let slider = null;
@@ -76,6 +89,7 @@ const row = (key, name, schema, resolved) => {
       let range = limits;
       slider.reach = (value, isSet) => {
         if (!log && !(isSet && value >= range.from && value <= range.to)) range = limitsOf(schema, value);
+        explain(sliderText(type, range));
         slider.min = place(range.from);
         slider.max = place(range.to);
         slider.value = place(Number(value ?? 0));
@@ -86,25 +100,33 @@ const row = (key, name, schema, resolved) => {
         const short = whole || (log && value > 20) ? Math.round(value) : Number(value.toPrecision(4));
         return Math.min(Math.max(short, range.from), range.to);
       };
-      slider.addEventListener("input", () => { set(key, at(), true); field.value = at(); });
+      slider.addEventListener("input", () => { set(key, at(), true); field.value = at(); widen(); });
       slider.addEventListener("change", () => { lastKey = ""; });
       inputs.append(slider);
     }
   } else {
     field = made("input", { type: "text", placeholder: schema.placeholder || "" });
     field.addEventListener("change", () => set(key, parsed(field.value, type)));
+    if (schema.suggested) {
+      const list = made("datalist", { id: `${id}-list` }, ...schema.suggested.map((each) => new Option(each)));
+      inputs.append(list);
+      field.setAttribute("list", list.id);
+    }
   }
   field.id = id;
-  if (help) field.setAttribute("aria-describedby", `${id}-help`);
+  field.setAttribute("aria-describedby", help.id);
   inputs.append(field);
   auto.addEventListener("click", () => set(key, null));
+  const widen = () => { field.style.width = `${Math.max(field.value.length, 4) + 4}ch`; };
+  if (field.type === "number") field.addEventListener("input", widen);
   element.show = (value, isSet) => {
     element.classList.toggle("set", isSet);
     auto.hidden = !isSet;
     if (document.activeElement === field && field.type !== "checkbox" && field.tagName !== "SELECT") return;
     if (field.type === "checkbox") field.checked = Boolean(value);
-    else if (field.type === "number") field.value = value === null || value === undefined ? "" : Number(Number(value).toPrecision(6));
+    else if (field.type === "number") field.value = value === null || value === undefined ? "" : figures(value);
     else field.value = value === null || value === undefined ? "" : typeof value === "object" ? JSON.stringify(value) : value;
+    if (field.type === "number") widen();
     if (slider && document.activeElement !== slider) slider.reach(value ?? 0, isSet);
   };
   return element;
@@ -145,8 +167,8 @@ const makeKeys = (facts) => {
   const methods = exposing ? known.stages[exposing.stage].methods : [];
   const ev = methods.filter((method) => method.name === exposing.method).map((method) => method.parameters.ev);
   byId("keys").replaceChildren(camera, isoRow, switchRow,
-    ...ev.map((schema) => keyRow(`${exposing.name}.ev`, exposing.name, schema, 0)),
-    ...Object.entries(known.keys).map(([key, schema]) => keyRow(key, key.replaceAll("_", " "), schema, 0)));
+    ...ev.map((schema) => keyRow(`${exposing.name}.ev`, exposing.name, schema, 0)));
+  byId("more-keys").replaceChildren(...Object.entries(known.keys).map(([key, schema]) => keyRow(key, key.replaceAll("_", " "), schema, 0)));
   isoCamera = "";
 };
 
@@ -157,14 +179,13 @@ const makeStages = (facts) => {
     const declared = known.stages[each.stage];
     const chosen = declared.methods.find((method) => method.name === each.method) || declared.methods[0];
     const toggle = made("input", { type: "checkbox", checked: each.on });
-    toggle.setAttribute("aria-label", `${each.name}: on`);
     // What an image carries cannot be taken back by values over it.
     toggle.disabled = !each.on && !(state.values.skip || []).includes(each.name);
     toggle.addEventListener("change", () => {
       const skip = (state.values.skip || []).filter((name) => name !== each.name);
       set("skip", toggle.checked ? (skip.length ? skip : null) : [...skip, each.name]);
     });
-    const details = made("details", {}, made("summary", {}, made("b", { textContent: each.name }), " ", made("span", { textContent: each.on ? each.method : "off" })));
+    const details = made("details", {}, made("summary", {}, made("b", { textContent: each.name }), " ", made("span")));
     details.dataset.step = each.name;
     details.open = opened.has(each.name);
     details.append(made("p", { className: "help", textContent: declared.summary }));
@@ -175,11 +196,21 @@ const makeStages = (facts) => {
       const key = `${each.name}.${name}`;
       details.append(keyRow(key, name, schema, each.values[name]));
     }
-    const item = made("div", { className: `step${each.on ? "" : " off"}${each.idle ? " idle" : ""}` }, toggle, details);
+    const item = made("div", { className: `step${each.on ? "" : " off"}` }, toggle, details);
     item.dataset.step = each.name;
     return item;
   }));
   byId("step").replaceChildren(new Option("the picture", ""), ...facts.steps.filter((each) => each.here).map((each) => new Option(`after ${each.name}`, each.name)));
+};
+
+// What becomes of a stage: a switch of one that is on and does nothing is neither on nor off.
+const showStep = (item, { name, on, idle, method }) => {
+  const toggle = item.querySelector("input");
+  const nothing = on && idle;
+  item.classList.toggle("idle", idle);
+  toggle.indeterminate = nothing;
+  toggle.setAttribute("aria-label", `${name}: on${nothing ? ", but does nothing" : ""}`);
+  item.querySelector("summary span").textContent = !on ? "off" : !nothing ? method : method === "none" ? "does nothing" : `does nothing (${method})`;
 };
 
 // Facts with the methods and switches that were asked, so that what is refused can be set right.
@@ -219,7 +250,7 @@ const showControls = (facts) => {
     resolved[`${each.name}.method`] = each.method;
     for (const [name, value] of Object.entries(each.values)) resolved[`${each.name}.${name}`] = value;
     const item = document.querySelector(`.step[data-step="${each.name}"]`);
-    if (item) item.classList.toggle("idle", each.idle);
+    if (item) showStep(item, each);
   }
   for (const [key, , schema] of tableKeys()) resolved[key] = schema.default;
   for (const element of rows) {

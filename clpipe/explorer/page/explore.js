@@ -179,10 +179,42 @@ document.addEventListener("keydown", (event) => {
   else step(past, future);
 });
 
+// The fragment of the address has all that makes a view: what was developed last, and how it is
+// looked at.
+
+let remembered = "";
 let remembering = 0;
-const remember = (of) => {
+const fragment = () => `#${encodeURIComponent(JSON.stringify({ ...JSON.parse(remembered), view: viewed() }))}`;
+const remember = (of = remembered) => {
+  remembered = of;
   clearTimeout(remembering);
-  remembering = setTimeout(() => history.replaceState(null, "", `#${encodeURIComponent(of)}`), 300);
+  if (of) remembering = setTimeout(() => history.replaceState(null, "", fragment()), 300);
+};
+
+const viewed = () => ({
+  compare: byId("compare").value,
+  split: Number(byId("split").value),
+  b: settingB,
+  box,
+  at: seen.fits ? null : [seen.scale, (canvas.width / 2 - seen.x) / seen.scale, (canvas.height / 2 - seen.y) / seen.scale],
+});
+
+const areNumbers = (values, length) => Array.isArray(values) && values.length === length && values.every(Number.isFinite);
+
+// Look as a fragment says; of what is damaged, not.
+const lookAs = ({ compare, split, b, box: rectangle, at }) => {
+  if (b && typeof b === "object") keepB(b);
+  if ([...byId("compare").options].some(({ value }) => value === compare && (value !== "B" || settingB))) compareWith(compare);
+  if (Number.isFinite(split)) byId("split").value = split;
+  if (areNumbers(rectangle, 4)) {
+    const [left, top, width, height] = rectangle;
+    setBox([left, top], [left + width, top + height]);
+  }
+  if (areNumbers(at, 3) && at[0] > 0) {
+    const [scale, x, y] = at;
+    [seen.x, seen.y] = [canvas.width / 2 - x * seen.scale, canvas.height / 2 - y * seen.scale];
+    zoomTo(scale);
+  }
 };
 
 // What a page's settings are elsewhere.
@@ -224,6 +256,12 @@ byId("apply").addEventListener("click", tried(async () => {
   await save(config);
   say("Apply to a folder", `The settings are saved as ${known.saved}; beside it, this develops the folder:`, folder);
 }));
+byId("link").addEventListener("click", tried(async () => {
+  if (!remembered) return;
+  const address = location.href.split("#")[0] + fragment();
+  const done = await toClipboard(address);
+  say("Link", `${done ? "It is copied, and" : "It"} shows this view as long as this program runs; behind “#” it has the settings.`, address);
+}));
 byId("say-copy").addEventListener("click", () => toClipboard(byId("say-command").textContent));
 
 byId("theme").addEventListener("click", () => {
@@ -241,41 +279,72 @@ byId("step").addEventListener("change", () => {
   changed();
 });
 byId("compare").addEventListener("change", () => {
-  if (byId("compare").value === "B" && !settingB) keepB();
-  byId("split-label").hidden = !byId("compare").value;
+  if (byId("compare").value === "B" && !settingB) keepB(state.values);
+  compareWith(byId("compare").value);
   changed();
 });
 byId("split").addEventListener("input", draw);
-const keepB = () => {
-  settingB = copy(state.values);
+const keepB = (values) => {
+  settingB = copy(values);
   byId("swap-b").disabled = false;
 };
+const compareWith = (kind) => {
+  byId("compare").value = kind;
+  byId("split").hidden = !kind;
+};
 byId("keep-b").addEventListener("click", () => {
-  keepB();
-  byId("compare").value = "B";
-  byId("split-label").hidden = false;
+  keepB(state.values);
+  compareWith("B");
   changed();
 });
-byId("swap-b").addEventListener("click", () => {
-  if (same(settingB, state.values)) return;
+byId("help").addEventListener("click", () => byId("keyboard").showModal());
+const swapB = () => {
+  if (!settingB || same(settingB, state.values)) return;
   const [mine, theirs] = [copy(state.values), settingB];
   settingB = mine;
   setValues(theirs, "", theirs);
-});
+};
+byId("swap-b").addEventListener("click", swapB);
 byId("zoom-in").addEventListener("click", () => zoomBy(1));
 byId("zoom-out").addEventListener("click", () => zoomBy(-1));
 byId("zoom-fit").addEventListener("click", fit);
 byId("zoom-one").addEventListener("click", () => zoomTo(1));
 byId("zoom-max").addEventListener("click", () => zoomTo(8));
 
+// Tabs.
+
+const tabs = [...document.querySelectorAll('[role="tab"]')];
+const openTab = (tab) => {
+  for (const each of tabs) {
+    const isOpen = each === tab;
+    each.setAttribute("aria-selected", isOpen);
+    each.tabIndex = isOpen ? 0 : -1;
+    byId(each.getAttribute("aria-controls")).hidden = !isOpen;
+  }
+};
+tabs.forEach((tab, i) => {
+  tab.addEventListener("click", () => openTab(tab));
+  tab.addEventListener("keydown", (event) => {
+    const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+    if (!by) return;
+    const next = tabs.at((i + by) % tabs.length);
+    openTab(next);
+    next.focus();
+  });
+});
+
 const begin = async () => {
   known = await (await ask("start", {})).json();
   byId("device").textContent = known.device;
   byId("image").replaceChildren(...known.images.map((name, i) => new Option(name, i)));
   state.values = known.values;
+  let view = null;
   try {
-    const held = JSON.parse(decodeURIComponent(location.hash.slice(1)));
-    if (held.values && held.image < known.images.length) Object.assign(state, held);
+    const { image, values, step: seenStep, view: held } = JSON.parse(decodeURIComponent(location.hash.slice(1)));
+    if (values && image < known.images.length) {
+      Object.assign(state, { image, values, step: seenStep || "" });
+      view = held;
+    }
   } catch {
     // no settings in the address, so those of the start
   }
@@ -283,6 +352,10 @@ const begin = async () => {
   sizeCanvas();
   document.body.dataset.settled = "false";
   await refresh();
+  if (developedOf && view) {
+    lookAs(view);
+    await refresh();
+  }
   if (!developedOf && location.hash) { // what was kept there does not fit these images
     Object.assign(state, { image: 0, values: known.values, step: "" });
     byId("image").value = 0;

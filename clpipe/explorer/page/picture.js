@@ -81,6 +81,7 @@ const draw = () => {
     context.strokeRect(...rect);
   }
   byId("zoom").textContent = `${Number((seen.scale * 100).toPrecision(3))} %`;
+  remember();
 };
 
 const label = (context, text, x, align) => {
@@ -147,7 +148,10 @@ const pinch = (id, at) => {
 
 const release = (event) => {
   POINTERS.delete(event.pointerId);
-  if (drag && drag.kind === "box" && box) measure();
+  if (drag && drag.kind === "box" && box) {
+    openTab(byId("tab-noise"));
+    measure();
+  }
   drag = null;
 };
 canvas.addEventListener("pointerup", release);
@@ -157,16 +161,20 @@ canvas.addEventListener("wheel", (event) => {
   zoomBy(-event.deltaY, ...onCanvas(event));
 }, { passive: false });
 
-canvas.addEventListener("keydown", (event) => {
-  const step = 40 * density();
-  const moves = { ArrowLeft: [step, 0], ArrowRight: [-step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] };
-  const zooms = { "+": () => zoomBy(1), "=": () => zoomBy(1), "-": () => zoomBy(-1), 0: fit, 1: () => zoomTo(1), 8: () => zoomTo(8) };
+// Keys of the whole page; fields, lists, sliders, tabs and dialogs have their own.
+document.addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.metaKey || event.altKey || !picture) return;
+  if (event.target.closest('input:not([type="checkbox"]), select, [role="tab"], dialog')) return;
+  const by = 40 * density();
+  const moves = { ArrowLeft: [by, 0], ArrowRight: [-by, 0], ArrowUp: [0, by], ArrowDown: [0, -by] };
+  const others = { "+": () => zoomBy(1), "=": () => zoomBy(1), "-": () => zoomBy(-1), 0: fit, 1: () => zoomTo(1), 8: () => zoomTo(8), b: swapB, B: swapB, z: () => step(past, future), Z: () => step(future, past), "?": () => byId("keyboard").showModal() };
   if (moves[event.key]) {
     seen.x += moves[event.key][0];
     seen.y += moves[event.key][1];
+    seen.fits = false;
     draw();
-  } else if (zooms[event.key] && !event.ctrlKey && !event.metaKey) {
-    zooms[event.key]();
+  } else if (others[event.key]) {
+    others[event.key]();
   } else return;
   event.preventDefault();
 });
@@ -174,7 +182,10 @@ canvas.addEventListener("keydown", (event) => {
 new ResizeObserver(() => {
   if (seen.fits) fit();
   else {
+    const { width, height } = canvas;
     sizeCanvas();
+    seen.x += Math.round((canvas.width - width) / 2);
+    seen.y += Math.round((canvas.height - height) / 2);
     draw();
   }
 }).observe(canvas);
