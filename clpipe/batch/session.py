@@ -34,7 +34,6 @@ from clpipe.inputs.find import Job, Shard, find_jobs, parse_shard
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.poses import with_views
 from clpipe.inputs.series import Series, check_isos
-from clpipe.outputs.camera_files import check_camera_files, write_camera_files
 from clpipe.outputs.existing import Redo
 from clpipe.outputs.folder import output_folder, remove_unfinished
 from clpipe.outputs.gone import pictures_without_input
@@ -185,8 +184,11 @@ class Run:
                 batch.stop()
             stack.enter_context(output_folder(where.output, images.shard))
             folders = images.series.under(where.output) if images.poses and images.is_whole else []
-            for folder in folders:
-                check_camera_files(folder)
+            if folders:
+                from clpipe.outputs.camera_files import check_camera_files
+
+                for folder in folders:
+                    check_camera_files(folder)
             trace = stack.enter_context(Trace(where.trace)) if where.trace else None
             remove_unfinished(where.output, self.jobs, self._request.patch is not None)
             run_log = RunLog(where.output / log_name(images.shard), start, self._echo)
@@ -228,8 +230,11 @@ class Run:
         """Write the views of a run's folders, and note what else there is to say of it."""
         if self.summary.interrupted:
             return
-        for folder in folders:
-            self.notes += write_camera_files(folder).lines(folder)
+        if folders:
+            from clpipe.outputs.camera_files import write_camera_files
+
+            for folder in folders:
+                self.notes += write_camera_files(folder).lines(folder)
         if self._images.is_whole and (
             count := pictures_without_input(self.writer, self.jobs, self._images.inputs)
         ):

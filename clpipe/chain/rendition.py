@@ -7,6 +7,7 @@ all of these at each of its exposures.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import Any, Literal, get_args
 
 from pydantic import FiniteFloat, TypeAdapter, ValidationError
@@ -78,7 +79,7 @@ class Rendition:
         """
         own = {each.name: values[each.name] for each in fields(cls)}
         try:
-            found = RENDITION.validate_python(own)
+            found = _adapter().validate_python(own)
         except ValidationError:
             raise ValueError(f"found {own}") from None
         numbers = range(found.frames or 0) if found.role == NOISY and found.frames else (None,)
@@ -88,7 +89,10 @@ class Rendition:
         return found
 
 
-RENDITION = TypeAdapter(Rendition)
+@cache
+def _adapter() -> TypeAdapter[Rendition]:
+    return TypeAdapter(Rendition)  # which takes 10 ms to make
+
 
 FIRST = Rendition()
 
