@@ -11,8 +11,9 @@ from clpipe.base.about import __version__
 
 if TYPE_CHECKING:
     from clpipe.base.errors import ClpipeError, DeviceError, ImageError, RequestError
+    from clpipe.batch.api import run
     from clpipe.batch.outcome import Outcome
-    from clpipe.batch.session import Run, run
+    from clpipe.batch.session import Run
     from clpipe.camera.noise import NoiseModel
     from clpipe.camera.profile import Camera, built_in_cameras, load_camera
     from clpipe.dataset import Dataset, Patches, RawNoise
@@ -35,7 +36,7 @@ _MODULES = {
     "Run": "clpipe.batch.session",
     "built_in_cameras": "clpipe.camera.profile",
     "load_camera": "clpipe.camera.profile",
-    "run": "clpipe.batch.session",
+    "run": "clpipe.batch.api",
 }
 
 __all__ = [

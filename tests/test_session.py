@@ -48,6 +48,16 @@ def test_what_cannot_be_is_refused_at_once(renders):
         ({"iso": [100, 100]}, "--iso: found 100, 100, with 100 twice"),
         ({"truth": "cleen"}, r"unknown truth 'cleen' \(did you mean 'clean'"),
         ({"patch": 0}, "patch"),
+        ({"frames": 0}, "found frames 0; expected 1 to 100000"),
+        ({"frames": 10**9}, "found frames 1000000000; expected 1 to 100000"),
+        ({"jobs": -1}, "found jobs -1; expected 1 to 1024"),
+        ({"webdataset": 0}, "found webdataset 0; expected 1 to"),
+        ({"max_pixels": 0}, "found max_pixels 0; expected 1 to"),
+        ({"memory": 0}, "found memory 0; expected bytes"),
+        ({"format": "gif"}, "unknown format 'gif'"),
+        ({"transfer": "x"}, "found transfer 'x'; expected 'srgb', 'linear' or None"),
+        ({"bracket": [1, 1]}, r"--bracket: found '1,1', with \+1 EV twice"),
+        ({"bracket": [float("nan")]}, "--bracket: found 'nan'; expected EVs"),
         ({"redo": "some"}, "found redo 'some'"),
         ({"frames": "2"}, "found frames '2'; expected a whole number or None"),
         (
@@ -58,6 +68,8 @@ def test_what_cannot_be_is_refused_at_once(renders):
     ):
         with pytest.raises(RequestError, match=message):
             package.run("in", "out", **{**DEVICE, **options})
+    with pytest.raises(RequestError, match="output: it is empty; name a folder"):
+        package.run("in", "", **DEVICE)
     with pytest.raises(RequestError, match="the name of a picture"):
         package.run("in", "out.jpg", **DEVICE)
 

@@ -7,9 +7,9 @@ from typing import Any, Literal
 import click
 
 from clpipe.base.errors import RequestError
+from clpipe.batch.api import MOST
 from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
-from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.rendition import BASELINES, TRUTHS, parse_bracket
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import (
@@ -59,7 +59,7 @@ from clpipe.outputs.patches import PER_IMAGE
 @carry_option
 @click.option(
     "--frames",
-    type=click.IntRange(1, MAX_FRAMES),
+    type=click.IntRange(1, MOST["frames"]),
     metavar="N",
     help="Make a burst of N frames of each image: each with its own noise, and their truth.",
 )
@@ -98,7 +98,7 @@ from clpipe.outputs.patches import PER_IMAGE
 @click.option(
     "--jobs",
     "threads",
-    type=click.IntRange(1, 1024),
+    type=click.IntRange(1, MOST["jobs"]),
     metavar="N",
     help="Threads that decode, and as many that encode. [default: one for each processor]",
 )
@@ -112,7 +112,7 @@ from clpipe.outputs.patches import PER_IMAGE
 @click.option(
     "--webdataset",
     "per_tar",
-    type=click.IntRange(1),
+    type=click.IntRange(1, MOST["webdataset"]),
     metavar="N",
     help="Pack N images at a time into OUT/000000.tar and so on, for WebDataset.",
 )
