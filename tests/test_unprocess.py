@@ -22,8 +22,8 @@ from clpipe.stages.inverse_gamma import Power as InversePower
 from clpipe.stages.inverse_gamma import Srgb as InverseSrgb
 from clpipe.stages.inverse_tone_curve import CameraRaw as InverseCameraRaw
 from clpipe.stages.inverse_tone_curve import File as InverseFile
-from clpipe.stages.inverse_tone_curve import Filmic as InverseFilmic
-from clpipe.stages.tone_curve import CameraRaw, Filmic
+from clpipe.stages.inverse_tone_curve import Neutral as InverseNeutral
+from clpipe.stages.tone_curve import CameraRaw, Neutral
 from tests.conftest import written
 
 QUIET = ["sensor_noise", "row_noise", "denoise"]
@@ -54,12 +54,12 @@ def test_what_is_undone_was_there(there, back):
     assert np.abs(again - light)[light > 0.01].mean() < 2e-4
 
 
-def test_the_filmic_curve_is_undone_for_all_colours():
+def test_the_neutral_curve_is_undone_for_all_colours():
     light = np.random.default_rng(0).random((40, 50, 3), np.float32) ** 2
     light[:, 25:] *= 1 / 64  # the toe
-    curved = run_reference(Filmic(), light)
+    curved = run_reference(Neutral(), light)
     assert np.abs(curved - light).max() > 0.2
-    assert np.abs(run_reference(InverseFilmic(), curved) - light).max() < 2e-6
+    assert np.abs(run_reference(InverseNeutral(), curved) - light).max() < 2e-6
 
 
 def test_a_curve_that_falls_cannot_be_undone(tmp_path):

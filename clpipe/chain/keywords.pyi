@@ -116,6 +116,10 @@ class Exposure(TypedDict, total=False):
     q: Number
     scale: Number
 
+class InverseColorMatrix(TypedDict, total=False):
+    method: Draw | Literal["camera", "given", "none"]
+    matrix: Several
+
 class Mosaic(TypedDict, total=False):
     method: Draw | Literal["bayer"]
     pattern: Draw | Literal["RGGB", "BGGR", "GRBG", "GBRG"]
@@ -136,7 +140,7 @@ class DefectPixels(TypedDict, total=False):
     dead_share: Number
 
 class SensorNoise(TypedDict, total=False):
-    method: Draw | Literal["gaussian", "poisson", "none"]
+    method: Draw | Literal["skewed_gaussian", "gaussian", "poisson", "none"]
     a: Number
     b: Number
     system_gain: Number
@@ -206,13 +210,14 @@ class Denoise(TypedDict, total=False):
     luma_noise: Number
     chroma_noise: Number
     grain: Number
+    chroma_scale: Whole
     offset: Number
     luma_size: Whole
     chroma_size: Whole
     spatial_sigma: Number
 
 class ColorMatrix(TypedDict, total=False):
-    method: Draw | Literal["none", "camera", "inverse_camera", "given"]
+    method: Draw | Literal["as_shot", "camera", "given", "none"]
     matrix: Several
 
 class Sharpen(TypedDict, total=False):
@@ -224,7 +229,10 @@ class Sharpen(TypedDict, total=False):
     offset: Number
 
 class ToneCurve(TypedDict, total=False):
-    method: Draw | Literal["filmic", "camera_raw", "linear", "file"]
+    method: Draw | Literal["standard", "neutral", "camera_raw", "linear", "file"]
+    contrast: Number
+    toe: Number
+    shoulder: Number
     headroom: Number
     path: Text
 
@@ -246,7 +254,10 @@ class InverseGamma(TypedDict, total=False):
     exponent: Number
 
 class InverseToneCurve(TypedDict, total=False):
-    method: Draw | Literal["filmic", "camera_raw", "linear", "file"]
+    method: Draw | Literal["standard", "neutral", "camera_raw", "linear", "file"]
+    contrast: Number
+    toe: Number
+    shoulder: Number
     path: Text
 
 class MosaicDenoise(TypedDict, total=False):
@@ -302,6 +313,7 @@ class Keywords(TypedDict, total=False):
     vignetting: Vignetting
     optical_blur: OpticalBlur
     exposure: Exposure
+    inverse_color_matrix: InverseColorMatrix
     mosaic: Mosaic
     inverse_white_balance: InverseWhiteBalance
     prnu: Prnu

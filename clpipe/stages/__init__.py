@@ -20,6 +20,7 @@ DEFAULT_CHAIN = (
     "vignetting",
     "optical_blur",
     "exposure",
+    "inverse_color_matrix",
     "mosaic",
     "inverse_white_balance",
     "prnu",

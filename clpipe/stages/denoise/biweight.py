@@ -12,6 +12,7 @@ from clpipe.reference.image import tap
 from clpipe.reference.roots import from_root, in_steps, noise_in_roots, root_of
 from clpipe.stage import (
     Arguments,
+    CompileTime,
     Context,
     Kind,
     Pass,
@@ -36,18 +37,23 @@ LUMA_WINDOW = {1: 0.5, 2: 0.25}
 CHROMA_WINDOW = {2: 0.4, 4: 0.25}
 
 
-def window_offsets(window: Mapping[int, float]) -> list[tuple[int, int, np.float32]]:
+def window_offsets(
+    window: Mapping[int, float], scale: int = 1
+) -> list[tuple[int, int, np.float32]]:
     """The offsets in px, right and down, and weights of a window's pixels but for its centre.
 
-    >>> len(window_offsets(LUMA_WINDOW)), len(window_offsets(CHROMA_WINDOW))
-    (8, 8)
+    >>> len(window_offsets(LUMA_WINDOW)), max(window_offsets(CHROMA_WINDOW, scale=3))[0]
+    (8, 6)
     """
     steps = range(-2, 3)
     squares = [(dx, dy, dx * dx + dy * dy) for dy in steps for dx in steps]
-    return [(dx, dy, np.float32(window[r2])) for dx, dy, r2 in squares if r2 in window]
+    near = [(dx, dy, window[r2]) for dx, dy, r2 in squares if r2 in window]
+    return [(scale * dx, scale * dy, np.float32(weight)) for dx, dy, weight in near]
 
 
-def biweight(planes: Floats, window: Mapping[int, float], reach: np.float32) -> Floats:
+def biweight(
+    planes: Floats, window: Mapping[int, float], reach: np.float32, scale: int = 1
+) -> Floats:
     """The weighted mean about each pixel, (height, width, plane) in and out.
 
     A pixel weighs (1 - d^2 / reach^2)^2, d its difference from the centre in all planes, or 0 where
@@ -59,7 +65,7 @@ def biweight(planes: Floats, window: Mapping[int, float], reach: np.float32) -> 
     """
     scaled = planes * (np.float32(1) / reach)
     total, weights = scaled.copy(), np.ones_like(planes[..., :1])
-    for dx, dy, near in window_offsets(window):
+    for dx, dy, near in window_offsets(window, scale):
         other = tap(scaled, dx, dy)
         squared = np.square(other - scaled).sum(-1, keepdims=True)
         weight = np.square(np.maximum(np.float32(1) - squared, np.float32(0))) * near
@@ -89,6 +95,14 @@ class Biweight(Denoiser):
         "0.35 where there is little noise, less where there is more",
         ge=0,
         le=1,
+    )
+    chroma_scale: int = parameter(
+        2,
+        "Scale at which chroma is filtered: the distance of the pixels that its mean looks at.",
+        "px",
+        structural=True,
+        ge=1,
+        le=4,
     )
     offset: float | None = offset_parameter()
 
@@ -145,8 +159,8 @@ class Biweight(Denoiser):
             ),
             Pass(
                 "biweight",
-                Stencil(2),
-                ("grain",),
+                Stencil(2 * self.chroma_scale),
+                ("grain", "chroma_scale"),
                 reads=("planes",),
                 writes="filtered",
                 kind=Kind.YCBCR,
@@ -160,6 +174,7 @@ class Biweight(Denoiser):
             "luma_range": np.float32(luma),
             "chroma_range": np.float32(chroma),
             "grain": np.float32(self.grain),
+            "chroma_scale": CompileTime(str(self.chroma_scale)),
             "offset": np.float32(self.offset),
         }
 
@@ -172,5 +187,5 @@ class Biweight(Denoiser):
         y, c = planes[..., :1], planes[..., 1:]
         filtered = biweight(y, LUMA_WINDOW, luma_range)
         y = filtered + grain * (y - filtered)
-        c = biweight(c, CHROMA_WINDOW, chroma_range)
+        c = biweight(c, CHROMA_WINDOW, chroma_range, self.chroma_scale)
         return from_root(ycbcr_to_rgb(np.concatenate([y, c], axis=-1)), offset)
