@@ -2,12 +2,12 @@
 // added as gives it the third moment of shot noise (Cornish and Fisher 1938).
 #include "lib/tukey_lambda.h"
 
+// What that adds to the variance is taken from z's own part, but for its square.
 INLINE vf skewed(vf z, vf y, float a, float b) {
-    const vf shot = vmax(a * y, (vf)(0.0f)), variance = vmax(a * y + b, (vf)(0.0f));
-    const vf inverse = inverse_root(vmax(variance, (vf)(1e-30f)));
-    const vf skew = shot * inverse * inverse * (a * 0.16666667f);
-    const vf linear = square_root(vmax(variance - 2.0f * skew * skew, (vf)(0.0f)));
-    return linear * z + skew * (z * z - 1.0f);
+    const vf shot = vmax(a * y, (vf)(0.0f)), variance = vmax(a * y + b, (vf)(1e-30f));
+    const vf inverse = inverse_root(variance), sigma = variance * inverse;
+    const vf skew = shot * inverse * inverse * (a * 0.16666667f), share = skew * inverse;
+    return (sigma - sigma * share * share) * z + skew * (z * z - 1.0f);
 }
 
 INLINE vf skewed_noise(vf y, site at, stream s, float a, float b, float full_well) {

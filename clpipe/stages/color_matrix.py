@@ -58,8 +58,8 @@ def srgb_to_camera(camera: Camera) -> Doubles:
         return camera.srgb_to_camera()
     except RequestError as error:
         raise RequestError(
-            f"{error}; leave colours to color_matrix.method=as_shot, add the matrix to a profile of "
-            "your own, or choose another camera"
+            f"{error}; set color_matrix.method=as_shot, add the matrix to a profile of your own, "
+            "or choose another camera"
         ) from None
 
 

@@ -20,9 +20,8 @@ from clpipe.stage import (
 )
 from clpipe.stages import tone_curve
 from clpipe.stages.tone_curve import standard
-from clpipe.stages.tone_curve.hue import keep_hue
+from clpipe.stages.tone_curve.hue import between_extremes, extremes_of, keep_hue
 from clpipe.stages.tone_curve.neutral import A, B, C, D, inverse_neutral
-from clpipe.stages.tone_curve.standard import GREY_OUT, NAMES
 from clpipe.stages.tone_curve.table import table_of
 
 
@@ -50,13 +49,21 @@ class Standard(standard.Standard):
     example: ClassVar = {"contrast": 1.3, "toe": 0.5, "shoulder": 0.4}
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("inverse_standard", arguments=NAMES),)
+        return (Pass("inverse_standard", arguments=("grey_out", *standard.NAMES)),)
 
     def arguments(self, context: Context) -> Arguments:
-        return self.numbers(GREY_OUT)
+        return {"grey_out": np.float32(standard.GREY_OUT), **super().arguments(context)}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return keep_hue(image, self.inverse)
+        inside, to_low, to_high = extremes_of(image)
+        high = self.inverse(to_high)
+        ratio = np.asarray(to_high / np.maximum(high, np.float32(1e-9)), np.float32)
+        low, step = high * np.float32(0.5), high * np.float32(0.25)
+        for _ in range(24):  # halving: the smallest colour's curve has no inverse in closed form
+            below = self.curve_of_smallest(low, ratio) < to_low
+            low = np.where(below, low + step, low - step)
+            step = step * np.float32(0.5)
+        return between_extremes(inside, (to_low, to_high), (low, high))
 
 
 class Neutral(Method):

@@ -31,6 +31,8 @@ RANGE_LUMA, RANGE_CHROMA = 16.0, 2.5
 # 0.006 a picture of ISO 100 is further from the truth than without denoising.
 LEAST_NOISE = 0.0025
 
+GRAIN = 0.35  # share of luma's noise that stays at a strength of 1, where there is little of it
+
 # Weights by squared distance, px: for luma a binomial window, for chroma a wider one of pixels
 # that demosaicing made of other samples than the centre's.
 LUMA_WINDOW = {1: 0.5, 2: 0.25}
@@ -88,11 +90,14 @@ class Biweight(Denoiser):
     summary: ClassVar = "weighted mean of near pixels, as light as a camera's; keeps grain"
     tolerance: ClassVar = 5e-5  # the kernel's root is a short iteration
 
+    luma_strength: float = parameter(
+        0.5, "Strength on luma, relative to luma_noise; 0 is off.", ge=0, le=100
+    )
     grain: float | None = parameter(
         None,
         "Share of luma's noise that stays as it is.",
         "",
-        "0.35 where there is little noise, less where there is more",
+        "0.35 of the strength, at most 0.35; less where there is much noise",
         ge=0,
         le=1,
     )
@@ -117,7 +122,8 @@ class Biweight(Denoiser):
 
     def resolve(self, context: Context) -> Self:
         resolved = super().resolve(context).with_defaults(offset=offset_of_roots(context))
-        return resolved.with_defaults(grain=0.35 / (1 + (resolved.roots[0] / 0.03) ** 2))
+        share = GRAIN * min(resolved.luma_strength, 1.0)
+        return resolved.with_defaults(grain=share / (1 + (resolved.roots[0] / 0.03) ** 2))
 
     @property
     def effect(self) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, parameter
-from clpipe.stages.tone_curve.hue import keep_hue
+from clpipe.stages.tone_curve.hue import between_extremes, extremes_of
 
 # 18 % grey with one stop of headroom, and what it becomes: as bright as sRGB shows it, nearly.
 GREY, GREY_OUT = 0.09, 0.173
@@ -55,14 +55,17 @@ class Standard(Method):
     It is meant for a raw with one stop of headroom, as ``exposure`` leaves it: 0.09, which is then
     18 % grey, becomes 0.173. From black to grey and from grey to white goes a rational quadratic
     each (Gregory and Delbourgo, IMA J. Numer. Anal. 1982), and the parameters are their slopes. The
-    toe takes the noise of shadows down, the shoulder that of highlights, as in a camera. Hues stay:
-    the curve is applied to the largest and the smallest colour, and the third keeps its place
-    between them.
+    toe takes the noise of shadows down, the shoulder that of highlights, as in a camera.
+
+    The curve is applied to the largest colour. The smallest comes to lie half-way between where the
+    curve moves it, which keeps hue in HSV and makes colours more saturated, and where it has the
+    same ratio to the largest, which keeps hue in CIELAB and saturation; the third keeps its place
+    between both. So hues of a chart stay within two degrees, and colours gain a little.
 
     >>> from clpipe.stage import run_reference
     >>> greys = np.float32([0, 0.01, 0.09, 0.5, 1])[:, None, None].repeat(3, 2)
     >>> run_reference(Standard(), greys)[:, 0, 0].astype(float).round(3).tolist()
-    [0.0, 0.007, 0.173, 0.84, 1.0]
+    [0.0, 0.005, 0.173, 0.839, 1.0]
     """
 
     method: ClassVar = "standard"
@@ -72,13 +75,13 @@ class Standard(Method):
     example: ClassVar = {"contrast": 1.3, "toe": 1.0, "shoulder": 0.4}
 
     contrast: float = parameter(
-        2.1,
+        2.2,
         "Slope at grey: by how many stops the picture changes for one of light.",
         ge=0.1,
         le=10,
     )
     toe: float = parameter(
-        0.8,
+        0.85,
         "How much darker shadows are: what the slope at black lacks to that of the line from black "
         "to grey; 1 begins level.",
         ge=0,
@@ -105,19 +108,15 @@ class Standard(Method):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("standard", arguments=NAMES),)
 
-    def numbers(self, grey: float) -> Arguments:
-        """The kernel's arguments; ``grey`` is where the pieces meet, before or after the curve."""
-        numbers = (grey, *(x for p in self.pieces for x in (p.a, p.b, p.c, p.d)))
-        return dict(zip(NAMES, map(np.float32, numbers), strict=True))
-
     def arguments(self, context: Context) -> Arguments:
-        return self.numbers(GREY)
+        numbers = (GREY, *(x for p in self.pieces for x in (p.a, p.b, p.c, p.d)))
+        return dict(zip(NAMES, map(np.float32, numbers), strict=True))
 
     def curve(self, x: Floats) -> Floats:
         """The curve on values 0..1 of any shape."""
         dark, bright = self.pieces
         one = np.float32(1)
-        return np.where(x < np.float32(GREY), dark.at(x), one - bright.at(one - x))
+        return np.asarray(np.where(x < np.float32(GREY), dark.at(x), one - bright.at(one - x)))
 
     def inverse(self, y: Floats) -> Floats:
         """The inverse of :meth:`curve`.
@@ -128,7 +127,15 @@ class Standard(Method):
         """
         dark, bright = self.pieces
         one = np.float32(1)
-        return np.where(y < np.float32(GREY_OUT), dark.inverse(y), one - bright.inverse(one - y))
+        is_dark = y < np.float32(GREY_OUT)
+        return np.asarray(np.where(is_dark, dark.inverse(y), one - bright.inverse(one - y)))
+
+    def curve_of_smallest(self, low: Floats, ratio: Floats) -> Floats:
+        """What the smallest colour becomes where the largest is multiplied by ``ratio``."""
+        return np.asarray(np.float32(0.5) * (self.curve(low) + low * ratio))
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return keep_hue(image, self.curve)
+        inside, low, high = extremes_of(image)
+        to_high = self.curve(high)
+        ratio = np.asarray(to_high / np.maximum(high, np.float32(1e-9)), np.float32)
+        return between_extremes(inside, (low, high), (self.curve_of_smallest(low, ratio), to_high))
