@@ -20,7 +20,7 @@ from clpipe.stage import (
 )
 from clpipe.stages import tone_curve
 from clpipe.stages.tone_curve import standard
-from clpipe.stages.tone_curve.hue import between_extremes, extremes_of, keep_hue
+from clpipe.stages.tone_curve.hue import inside_of, keep_hue
 from clpipe.stages.tone_curve.neutral import A, B, C, D, inverse_neutral
 from clpipe.stages.tone_curve.table import table_of
 
@@ -49,21 +49,17 @@ class Standard(standard.Standard):
     example: ClassVar = {"contrast": 1.3, "toe": 0.5, "shoulder": 0.4}
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("inverse_standard", arguments=("grey_out", *standard.NAMES)),)
+        return (Pass("inverse_standard", arguments=(*standard.NAMES, "saturation")),)
 
     def arguments(self, context: Context) -> Arguments:
-        return {"grey_out": np.float32(standard.GREY_OUT), **super().arguments(context)}
+        return self.numbers(standard.GREY_OUT)
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        inside, to_low, to_high = extremes_of(image)
+        inside = inside_of(image)
+        to_high = inside.max(-1, keepdims=True)
         high = self.inverse(to_high)
-        ratio = np.asarray(to_high / np.maximum(high, np.float32(1e-9)), np.float32)
-        low, step = high * np.float32(0.5), high * np.float32(0.25)
-        for _ in range(24):  # halving: the smallest colour's curve has no inverse in closed form
-            below = self.curve_of_smallest(low, ratio) < to_low
-            low = np.where(below, low + step, low - step)
-            step = step * np.float32(0.5)
-        return between_extremes(inside, (to_low, to_high), (low, high))
+        part = high / (self.colourfulness(high) * np.maximum(to_high, np.float32(1e-9)))
+        return np.maximum(high - (to_high - inside) * part, np.float32(0))
 
 
 class Neutral(Method):

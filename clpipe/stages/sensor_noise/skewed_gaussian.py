@@ -14,8 +14,9 @@ class SkewedGaussian(Gaussian):
 
     A Poisson number of mean m is m + sqrt(m) z + (z^2 - 1)/6 + ..., z a standard normal (Cornish
     and Fisher, Rev. Int. Stat. Inst. 1938). So the noise is s z + c (z^2 - 1), with
-    c = a^2 y / (6 (a*y + b)) and s^2 = a*y + b - 2 c^2 (to 1 % above 0.3 electrons). In shadows it has few bright outliers and
-    no dark ones, as a camera's; it costs what a Gaussian costs.
+    c = a^2 y / (6 (a*y + b)) and s^2 = a*y + b - 2 c^2, to 1 % of it above 0.3 electrons. In
+    shadows it has few bright outliers and no dark ones, as a camera's; it costs what a Gaussian
+    does.
 
     The noisy signal is limited to the full well. With ``tukey_lambda`` the read noise, of variance
     b, is drawn from a Tukey lambda distribution instead and added after the full well.

@@ -7,11 +7,12 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, parameter
-from clpipe.stages.tone_curve.hue import between_extremes, extremes_of
+from clpipe.stages.tone_curve.hue import inside_of
 
 # 18 % grey with one stop of headroom, and what it becomes: as bright as sRGB shows it, nearly.
 GREY, GREY_OUT = 0.09, 0.173
 NAMES = ("grey", "a", "b", "c", "d", "bright_a", "bright_b", "bright_c", "bright_d")
+WHITER = 0.5  # by which colourfulness falls up to the brightest highlights, which turn white
 
 
 @dataclass(frozen=True)
@@ -57,15 +58,14 @@ class Standard(Method):
     each (Gregory and Delbourgo, IMA J. Numer. Anal. 1982), and the parameters are their slopes. The
     toe takes the noise of shadows down, the shoulder that of highlights, as in a camera.
 
-    The curve is applied to the largest colour. The smallest comes to lie half-way between where the
-    curve moves it, which keeps hue in HSV and makes colours more saturated, and where it has the
-    same ratio to the largest, which keeps hue in CIELAB and saturation; the third keeps its place
-    between both. So hues of a chart stay within two degrees, and colours gain a little.
+    The largest of the three colours takes the curve's value, and the others keep their ratio to it,
+    so hue and saturation stay, in CIELAB as well. Then all move from the grey of the largest, or
+    towards it: ``saturation`` says how far, and the brightest highlights turn whiter.
 
     >>> from clpipe.stage import run_reference
     >>> greys = np.float32([0, 0.01, 0.09, 0.5, 1])[:, None, None].repeat(3, 2)
     >>> run_reference(Standard(), greys)[:, 0, 0].astype(float).round(3).tolist()
-    [0.0, 0.005, 0.173, 0.839, 1.0]
+    [0.0, 0.005, 0.173, 0.844, 1.0]
     """
 
     method: ClassVar = "standard"
@@ -95,6 +95,10 @@ class Standard(Method):
         le=1,
     )
 
+    saturation: float = parameter(
+        1.0, "Distance of colours from grey, relative to the scene's.", gt=0.5, le=3
+    )
+
     @property
     def pieces(self) -> tuple[Piece, Piece]:
         """From black to grey, and from white back to grey."""
@@ -106,11 +110,16 @@ class Standard(Method):
         )
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("standard", arguments=NAMES),)
+        return (Pass("standard", arguments=(*NAMES, "saturation")),)
+
+    def numbers(self, grey: float) -> Arguments:
+        """The kernel's arguments; ``grey`` is where the pieces meet, before or after the curve."""
+        numbers = (grey, *(x for p in self.pieces for x in (p.a, p.b, p.c, p.d)))
+        named = dict(zip(NAMES, map(np.float32, numbers), strict=True))
+        return {**named, "saturation": np.float32(self.saturation)}
 
     def arguments(self, context: Context) -> Arguments:
-        numbers = (GREY, *(x for p in self.pieces for x in (p.a, p.b, p.c, p.d)))
-        return dict(zip(NAMES, map(np.float32, numbers), strict=True))
+        return self.numbers(GREY)
 
     def curve(self, x: Floats) -> Floats:
         """The curve on values 0..1 of any shape."""
@@ -126,16 +135,16 @@ class Standard(Method):
         [0.0, 0.019999999552965164, 0.09000000357627869, 0.5, 1.0]
         """
         dark, bright = self.pieces
-        one = np.float32(1)
-        is_dark = y < np.float32(GREY_OUT)
+        one, is_dark = np.float32(1), y < np.float32(GREY_OUT)
         return np.asarray(np.where(is_dark, dark.inverse(y), one - bright.inverse(one - y)))
 
-    def curve_of_smallest(self, low: Floats, ratio: Floats) -> Floats:
-        """What the smallest colour becomes where the largest is multiplied by ``ratio``."""
-        return np.asarray(np.float32(0.5) * (self.curve(low) + low * ratio))
+    def colourfulness(self, high: Floats) -> Floats:
+        """How much of the distance from the grey of the largest colour stays, by its light."""
+        return np.asarray(np.float32(self.saturation) - np.float32(WHITER) * np.square(high * high))
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        inside, low, high = extremes_of(image)
+        inside = inside_of(image)
+        high = inside.max(-1, keepdims=True)
         to_high = self.curve(high)
-        ratio = np.asarray(to_high / np.maximum(high, np.float32(1e-9)), np.float32)
-        return between_extremes(inside, (low, high), (self.curve_of_smallest(low, ratio), to_high))
+        part = self.colourfulness(high) * (to_high / np.maximum(high, np.float32(1e-9)))
+        return np.asarray(to_high - (high - inside) * part)
