@@ -91,6 +91,10 @@ class Vignetting(TypedDict, total=False):
     focal_length: Number
     sensor_width: Number
 
+class InverseColorMatrix(TypedDict, total=False):
+    method: Draw | Literal["camera", "given", "none"]
+    matrix: Several
+
 class OpticalBlur(TypedDict, total=False):
     method: Draw | Literal["lens", "none"]
     sigma: Number
@@ -115,10 +119,6 @@ class Exposure(TypedDict, total=False):
     f_number: Number
     q: Number
     scale: Number
-
-class InverseColorMatrix(TypedDict, total=False):
-    method: Draw | Literal["camera", "given", "none"]
-    matrix: Several
 
 class Mosaic(TypedDict, total=False):
     method: Draw | Literal["bayer"]
@@ -233,6 +233,7 @@ class ToneCurve(TypedDict, total=False):
     contrast: Number
     toe: Number
     shoulder: Number
+    saturation: Number
     headroom: Number
     path: Text
 
@@ -258,6 +259,7 @@ class InverseToneCurve(TypedDict, total=False):
     contrast: Number
     toe: Number
     shoulder: Number
+    saturation: Number
     path: Text
 
 class MosaicDenoise(TypedDict, total=False):
@@ -311,9 +313,9 @@ class Keywords(TypedDict, total=False):
     motion_blur: MotionBlur
     distortion: Distortion
     vignetting: Vignetting
+    inverse_color_matrix: InverseColorMatrix
     optical_blur: OpticalBlur
     exposure: Exposure
-    inverse_color_matrix: InverseColorMatrix
     mosaic: Mosaic
     inverse_white_balance: InverseWhiteBalance
     prnu: Prnu
