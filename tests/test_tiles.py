@@ -188,7 +188,7 @@ def test_numbers_found_twice_and_kept_images(device, monkeypatch):
     assert fused.final.tobytes() == kept.final.tobytes()
 
 
-@pytest.mark.parametrize("noise", ["gaussian", "poisson"])
+@pytest.mark.parametrize("noise", ["skewed_gaussian", "poisson"])
 def test_every_source_of_noise(device, monkeypatch, noise):
     names = list(all_stages())
     chain = tuple(names[: names.index("quantize") + 1])

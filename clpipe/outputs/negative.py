@@ -56,8 +56,8 @@ def _level(owner: object, name: str, default: float) -> float:
 def _colours(context: Context, end: Context, is_input: bool) -> NDArray[np.float64]:
     """The matrix from linear sRGB to the mosaic's own colours, white-balanced.
 
-    For a render it is what color_matrix did before the mosaic. For a camera's raw it is the inverse
-    of what color_matrix does behind it.
+    For a render it is what inverse_color_matrix did. For a camera's raw it is the inverse
+    of what color_matrix does.
 
     Args:
         context: at the raw.
