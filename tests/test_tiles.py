@@ -269,7 +269,7 @@ def test_phases_end_with_what_is_found():
     names = [launch.name for launch in plan.launches]
     assert [names[i] for i in first.first] == ["lines"]
     assert [names[i] for i in first.each] == [
-        "load",
+        "inverse_color_matrix",
         "optical_blur.blur..normalize",
         "white_balance.add_up",
     ]
