@@ -44,13 +44,21 @@ def window_offsets(
 ) -> list[tuple[int, int, np.float32]]:
     """The offsets in px, right and down, and weights of a window's pixels but for its centre.
 
-    >>> len(window_offsets(LUMA_WINDOW)), max(window_offsets(CHROMA_WINDOW, scale=3))[0]
-    (8, 6)
+    At a larger scale a pixel at a distance of (1, 1) is one at (scale, scale), and one at (2, 0)
+    is at (scale + 1, 0): so the eight pixels of chroma stay on a ring.
+
+    >>> len(window_offsets(LUMA_WINDOW)), len(window_offsets(CHROMA_WINDOW))
+    (8, 8)
+    >>> [(dx, dy) for dx, dy, _ in window_offsets(CHROMA_WINDOW, scale=3)][:3]
+    [(0, -4), (-3, -3), (3, -3)]
     """
-    steps = range(-2, 3)
+    steps, at = range(-2, 3), (0, scale, scale + 1)
     squares = [(dx, dy, dx * dx + dy * dy) for dy in steps for dx in steps]
     near = [(dx, dy, window[r2]) for dx, dy, r2 in squares if r2 in window]
-    return [(scale * dx, scale * dy, np.float32(weight)) for dx, dy, weight in near]
+    return [
+        (at[abs(dx)] * (1 if dx > 0 else -1), at[abs(dy)] * (1 if dy > 0 else -1), np.float32(w))
+        for dx, dy, w in near
+    ]
 
 
 def biweight(
@@ -103,7 +111,7 @@ class Biweight(Denoiser):
     )
     chroma_scale: int = parameter(
         2,
-        "Scale at which chroma is filtered: the distance of the pixels that its mean looks at.",
+        "Scale at which chroma is filtered: how far the pixels of its mean are, along both axes.",
         "px",
         structural=True,
         ge=1,
@@ -165,7 +173,7 @@ class Biweight(Denoiser):
             ),
             Pass(
                 "biweight",
-                Stencil(2 * self.chroma_scale),
+                Stencil(self.chroma_scale + 1),
                 ("grain", "chroma_scale"),
                 reads=("planes",),
                 writes="filtered",
