@@ -1,15 +1,17 @@
-"""tools/compare/converters.py and side_by_side.py; no converter is needed here."""
+"""tools/compare/converters.py and side_by_side.py; converters that are missing are left out."""
 
 import doctest
+import shutil
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from clpipe.analysis.crops import HEIGHT, WIDTH
+from tests.conftest import cli_output
 from tools.compare import charts, fidelity
 from tools.compare import converters as tool
-from tools.compare.charts import chart_image, chart_patches, saturated_image
+from tools.compare.charts import chart_image, chart_patches, patch_means, saturated_image
 from tools.compare.fidelity import colour_errors
 from tools.pages import side_by_side
 
@@ -17,6 +19,7 @@ pytestmark = pytest.mark.tools
 
 COPY = tool.Converter("copy", "none", "cp DNG PICTURE")
 PRINT = tool.Converter("print", "none", "cat DNG")
+AUTOMATIC = tool.Converter("dcraw, automatic", "dcraw", "dcraw -w -T -c DNG")
 FAIL = tool.Converter("fail", "none", "cat HOME/missing")
 
 
@@ -113,3 +116,32 @@ def test_what_is_missing_is_named_and_left_out(monkeypatch, capsys, tmp_path):
     said = capsys.readouterr().err
     assert "darktable is left out: apt-get install darktable" in said
     assert "RawTherapee is left out: apt-get install rawtherapee" in said
+
+
+@pytest.mark.parametrize(
+    "converter",
+    [AUTOMATIC, *(c for c in tool.CONVERTERS if c.name in ("darktable", "RawTherapee"))],
+    ids=lambda c: c.name,
+)
+def test_our_dng_is_as_bright_as_our_picture_in_other_converters(tmp_path, write_exr, converter):
+    """18 % grey is within 100 to 140 of 255, and what is brighter than white is not clipped."""
+    program = converter.command.split()[0]
+    if shutil.which(program) is None:
+        pytest.skip(f"needs {program}")
+    chart = chart_image()
+    if converter is not AUTOMATIC:  # which makes a picture darker that has brighter light
+        ramp = np.linspace(0, 1.9, chart.shape[1], dtype=np.float32)
+        chart = np.concatenate([chart, np.broadcast_to(ramp[None, :, None], chart.shape)])
+    formats = ("--format", "dng", "--format", "png", "--truth", "development")
+    render = write_exr("chart.exr", chart.repeat(4, 0).repeat(4, 1))
+    cli_output("run", render, "-o", tmp_path / "clpipe-default/iso100", "--iso", 100, *formats)
+    made = comparison(tmp_path, converter)
+    negative = tmp_path / "clpipe-default/iso100/chart.truth.dng"
+    made.convert(converter, negative, made.folder(converter.name, 100) / "chart.truth.png")
+    picture = made.picture(converter.name, 100, "chart", noisy=False)[::4, ::4]
+    found = colour_errors(patch_means(picture[:256]), chart_patches())
+    assert 100 <= found.grey <= 140
+    assert found.hue < 3
+    if converter is not AUTOMATIC:
+        bright = picture[320:448, 200::40].mean((0, 2))
+        assert (np.diff(bright) > 0.5).all(), bright

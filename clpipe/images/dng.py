@@ -5,6 +5,7 @@ and what applies to the whole file, a second one below it holds the mosaic.
 """
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +26,8 @@ from clpipe.reference.transfer import srgb_curve
 
 PREVIEW_SIDE = 512  # px, at most
 D65 = 21  # EXIF's LightSource of that illuminant
+NO_BLACK_RENDER = 1  # DefaultBlackRender: the converter takes nothing off near black
+CURVE_POINTS = 33
 D50_XYZ = np.array([0.9642, 1.0, 0.8251])  # CIE XYZ of the white D50, Y = 1; sources differ by 1e-4
 
 # Tags of fields that point to other parts of the file; their values are known last.
@@ -38,8 +41,8 @@ class Negative:
     ``step`` is the step of the chain whose image is the raw; None is the image that enters the
     chain. Levels are in DN; ``gains`` are those of white balance for red and blue (green = 1).
     ``xyz_to_camera`` is the 3x3 matrix from CIE XYZ under D65 to the sensor's RGB before white
-    balance. ``noise`` is None where it is unknown. ``headroom`` is by how many stops the scene was
-    darkened, which a converter gives back.
+    balance. ``noise`` is None where it is unknown. ``tone`` is the tone curve that the raw is meant
+    for: on linear sRGB, (height, width, 3), in units of the white level.
     """
 
     step: str | None
@@ -49,7 +52,7 @@ class Negative:
     gains: tuple[float, float]
     xyz_to_camera: Doubles
     noise: NoiseModel | None
-    headroom: float = 0.0
+    tone: Callable[[Floats], Floats]
 
 
 def xyz_to_camera(colours: Doubles, gains: tuple[float, float]) -> Doubles:
@@ -75,7 +78,8 @@ def xyz_to_camera(colours: Doubles, gains: tuple[float, float]) -> Doubles:
 def preview(dn: Array, negative: Negative) -> Array:
     """A small sRGB picture of a mosaic, (height, width, 3) uint8, at most 512 pixels a side.
 
-    Each pixel is the mean of a block of the mosaic: of its red, its green and its blue sites.
+    Each pixel is the mean of a block of the mosaic: of its red, its green and its blue sites. It
+    has the tone curve: RawTherapee makes its own curve so that its picture has the preview's tones.
     """
     rows, columns = (max(side // 2, 1) for side in dn.shape)
     block = -(-max(rows, columns) // PREVIEW_SIDE)
@@ -95,8 +99,23 @@ def preview(dn: Array, negative: Negative) -> Array:
     neutral = np.array([1 / negative.gains[0], 1, 1 / negative.gains[1]])
     clipped = np.clip(signal / neutral, 0, 1) * neutral
     to_camera = negative.xyz_to_camera @ SRGB_TO_XYZ
-    linear = clipped @ np.linalg.inv(to_camera).T * to_camera.sum(1)[1] * 2**negative.headroom
-    return to_8_bit(srgb_curve(np.clip(linear, 0, 1)).astype(np.float32))
+    linear = clipped @ np.linalg.inv(to_camera).T * to_camera.sum(1)[1]
+    picture = negative.tone(np.clip(linear, 0, 1).astype(np.float32))
+    return to_8_bit(srgb_curve(picture.astype(np.float64)).astype(np.float32))
+
+
+def tone_fields(negative: Negative) -> tiff.Directory:
+    """The tone curve for converters that take one from a DNG, as Adobe's do.
+
+    There is no BaselineExposure: it is for cameras that expose otherwise than such a curve expects.
+    Adobe's software would clip the headroom for it, and the others that were tried ignore it.
+    """
+    light = np.linspace(0, 1, CURVE_POINTS, dtype=np.float32) ** 2  # curves bend most near black
+    curve = negative.tone(np.repeat(light[None, :, None], 3, axis=-1))[0, :, 0]
+    return {
+        50940: tiff.float32(*np.stack([light, curve], axis=-1).ravel()),  # ProfileToneCurve
+        51110: tiff.long(NO_BLACK_RENDER),  # DefaultBlackRender
+    }
 
 
 def main_directory(
@@ -111,6 +130,7 @@ def main_directory(
     return {
         **tiff.image_fields(small, subfile_type=1, photometric=2),  # RGB
         **noise_fields(negative),
+        **tone_fields(negative),
         **({306: tiff.text(tags.taken)} if tags.taken else {}),  # DateTime
         271: tiff.text(tags.make),  # Make
         # Model. It is not the real camera's name: for that one RawTherapee cuts off optically black
@@ -126,7 +146,6 @@ def main_directory(
         50708: tiff.text(SIMULATED + whole_name),  # UniqueCameraModel
         50721: tiff.signed_rational(*negative.xyz_to_camera.ravel().round(7)),  # ColorMatrix1
         50728: tiff.rational(1 / red, 1, 1 / blue),  # AsShotNeutral
-        50730: tiff.signed_rational(negative.headroom),  # BaselineExposure
         50778: tiff.short(D65),  # CalibrationIlluminant1
     }
 

@@ -61,6 +61,11 @@ def signed_rational(*values: float) -> Field:
     return Field(10, len(values), struct.pack(f"<{len(parts)}i", *parts))
 
 
+def float32(*values: float) -> Field:
+    """FLOAT: float32."""
+    return Field(11, len(values), struct.pack(f"<{len(values)}f", *values))
+
+
 def double(*values: float) -> Field:
     """DOUBLE: float64."""
     return Field(12, len(values), struct.pack(f"<{len(values)}d", *values))

@@ -1,16 +1,21 @@
 """The raw of a chain as a negative: what a DNG stores beside the samples."""
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
 from clpipe.base.errors import RequestError
 from clpipe.chain.chain import Chain
 from clpipe.images.dng import Negative, xyz_to_camera
-from clpipe.stage import Context, Kind, StageRole
+from clpipe.stage import Context, Kind, StageRole, run_reference
+from clpipe.stages.tone_curve import STAGE as TONE_CURVE
 
 
 def negative_of(chain: Chain) -> Negative:
     """The raw of a chain: what its last stage that gives DN makes, else the raw that enters it.
+
+    Its tone curve is the default one, whatever the chain does behind the raw.
 
     Raises:
         RequestError: the chain has no raw, or one that DNG cannot hold.
@@ -43,7 +48,7 @@ def negative_of(chain: Chain) -> Negative:
         gains=gains,
         xyz_to_camera=xyz_to_camera(_colours(context, end, is_input), gains),
         noise=context.noise,
-        headroom=context.headroom,
+        tone=partial(run_reference, TONE_CURVE.methods[0]()),
     )
 
 

@@ -16,10 +16,12 @@ their own development makes of the same enlarged eight times, where no pixel is 
 across an edge. So each is compared with its own tone and colours, whatever they are; what
 smoothing and sharpening change counts.
 
-Converters run as they come, but for what would make two exposures of one: dcraw without its
-brightening by histogram (-W) and with the white balance as shot (-w), RawTherapee with its command
-line's default, which is its neutral profile. They know nothing of the headroom that clpipe's
-exposure leaves in the raw: what they make is darker by it, and what is darker errs by fewer levels.
+Converters run as they come, but dcraw with the white balance as shot (-w) and without brightening
+by histogram (-W), which would make two exposures of one. RawTherapee runs twice: with the profile
+that its window gives to a raw (-d), which takes its tone curve from the preview in the DNG and
+sharpens, and with its neutral one. This one and dcraw have no tone curve, so their pictures are
+darker by the headroom that clpipe's exposure leaves in the raw, and what is darker errs by fewer
+levels.
 """
 
 import argparse
@@ -82,7 +84,8 @@ CONVERTERS = (
         "darktable",
         "darktable-cli DNG PICTURE --core --disable-opencl --configdir HOME --library :memory:",
     ),
-    Converter("RawTherapee", "rawtherapee", "rawtherapee-cli -o PICTURE -n -b8 -Y -c DNG"),
+    Converter("RawTherapee", "rawtherapee", "rawtherapee-cli -d -o PICTURE -n -b8 -Y -c DNG"),
+    Converter("RawTherapee, neutral", "rawtherapee", "rawtherapee-cli -o PICTURE -n -b8 -Y -c DNG"),
 )
 
 
