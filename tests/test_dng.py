@@ -197,7 +197,7 @@ def test_the_preview_is_our_own_picture(tmp_path):
     off = np.abs(blocks(preview) - blocks(ours)).max(-1)
     assert np.median(off) < 1.5
     assert (
-        np.percentile(off, 95) < 5
+        np.percentile(off, 95) < 7
     )  # blocks with edges, whose light and whose levels are averaged
 
 
