@@ -12,7 +12,7 @@ from xxhash import xxh3_64_hexdigest
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
-from clpipe.base.text import one_of
+from clpipe.base.text import one_of, several
 from clpipe.base.types import Array, plain
 from clpipe.base.validation import typed
 from clpipe.chain.chain import Chain, make_chain
@@ -40,7 +40,8 @@ class Pipeline(ReadOnly):
     """A chain of stages on a device, ready for images.
 
     Args:
-        config: a built-in configuration ("default", "paper") or a TOML file.
+        config: a built-in configuration ("default", "paper") or a TOML file, or several, each over
+            those before it: of a second one with ``stages``, the development.
         device: an index or a part of a name as ``clpipe devices`` lists them, or "numpy"; None
             takes the first GPU, else the CPU.
         keep: steps whose image is returned beside the last one, or "all".
@@ -57,7 +58,7 @@ class Pipeline(ReadOnly):
     @typed
     def __init__(
         self,
-        config: str | Path = "default",
+        config: str | Path | Sequence[str | Path] = "default",
         *,
         device: str | int | None = None,
         keep: str | Sequence[str] = (),
@@ -65,7 +66,7 @@ class Pipeline(ReadOnly):
         until: str | None = None,
         **settings: "Unpack[Keywords]",
     ) -> None:
-        self._settings = overlay(load_settings(str(config)), plain(settings))
+        self._settings = overlay(load_settings(*several(config)), plain(settings))
         self._ends = start_at, until
         self._numbers = itertools.count()
         self._lock = threading.Lock()  # a device is for one thread

@@ -37,7 +37,7 @@ from clpipe.analysis.matching.space import (
 )
 from clpipe.analysis.signature import flat_places, signature
 from clpipe.chain.chain import make_chain
-from clpipe.chain.files import load_settings
+from clpipe.chain.files import load_config, load_settings
 from clpipe.chain.settings import Settings, overlay
 from clpipe.commands.match import Follower
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding, through_jpeg
@@ -292,7 +292,9 @@ def test_a_terminal_has_a_bar_with_the_share_and_the_time_left(burst, tmp_path):
     assert (tmp_path / "a.toml").stat().st_ino == first  # the best is the same
     assert "50%; residuals of 1.5; about" in terminal.getvalue()
     assert "the best after 25% of the search" in (tmp_path / "a.toml").read_text()
-    assert load_settings(str(tmp_path / "a.toml")).parameters["denoise"]["method"] == "mean"
+    found = load_config(str(tmp_path / "a.toml"))
+    assert found.settings.parameters["denoise"]["method"] == "mean"
+    assert "stages" in found.values  # it is a whole chain, and so a look over another
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ Texts = str | Path | Sequence[str | Path]  # one, or several
 def run(
     inputs: Texts,
     output: str | Path,
-    config: str | Path | None = None,
+    config: Texts | None = None,
     *,
     camera: Texts = (),
     iso: float | Sequence[float] | Mapping[str, Any] = (),
@@ -72,7 +72,7 @@ def run(
     Args:
         inputs: files, folders, globs and manifests.
         output: the folder that the pictures go to; it is made where it is missing.
-        config: a built-in configuration or a TOML file.
+        config: a built-in configuration or a TOML file, or several, each over those before it.
         camera, iso: one, or several, whose pictures go to folders of their own.
         stage_files, format, keep, carry, truth, exclude, device: one, or several.
         memory: of a device, in bytes or as "2G".
@@ -106,7 +106,7 @@ def run(
     if isinstance(iso, Mapping):
         values["iso"] = plain(iso)
     request = Request.from_options(
-        config=None if config is None else str(config),
+        config=config,
         camera=series.camera,
         iso=series.iso,
         stage_files=[Path(file) for file in several(stage_files)],

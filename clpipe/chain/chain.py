@@ -12,7 +12,7 @@ from clpipe.camera.optics import Optics
 from clpipe.camera.profile import Camera, load_camera
 from clpipe.chain.draws import Draw
 from clpipe.chain.keys import LENS, NOISE, RENDER
-from clpipe.chain.methods import base_name, validation_errors
+from clpipe.chain.methods import base_name, numbered, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
 from clpipe.reference.geometry import NO_MARGINS, Composition, Margins
@@ -282,10 +282,7 @@ def step_names(settings: Settings) -> list[str]:
     >>> step_names(Settings(stages=("exposure", "mosaic", "exposure"), skip=("mosaic",)))
     ['exposure', 'exposure_2']
     """
-    before = [settings.stages[:place].count(stage) for place, stage in enumerate(settings.stages)]
-    pairs = zip(settings.stages, before, strict=True)
-    names = [f"{stage}_{count + 1}" if count else stage for stage, count in pairs]
-    return [name for name in names if name not in settings.skip]
+    return [name for name in numbered(settings.stages) if name not in settings.skip]
 
 
 def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from clpipe.base.reading import parse_toml, read_text
 from clpipe.base.text import one_of
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.keys import CODE, KEYS, LENS, TABLES, names_in
+from clpipe.chain.looks import laid_over
 from clpipe.chain.paths import from_folder
 from clpipe.chain.registry import load_stage_file
 from clpipe.chain.settings import Settings, settings_from
@@ -36,9 +38,33 @@ class Config:
     stage_files: tuple[Path, ...]
 
 
-def load_settings(name: str) -> Settings:
-    """The settings of a configuration; argument and errors as :func:`load_config`."""
-    return load_config(name).settings
+def load_settings(*names: str) -> Settings:
+    """The settings of configurations, or the default ones; errors as :func:`load_configs`."""
+    return load_configs(names).settings if names else Settings()
+
+
+def load_configs(names: Sequence[str]) -> Config:
+    """Configurations, each laid over those before it, see :func:`clpipe.chain.looks.laid_over`.
+
+    Args:
+        names: at least one, as for :func:`load_config`.
+
+    Raises:
+        RequestError: as :func:`load_config`, or one cannot be laid over those before it.
+    """
+    found = load_config(names[0])
+    for before, name in pairwise(names):
+        over = load_config(name)
+        try:
+            settings = laid_over(found.settings, over.values)
+        except KeyedError as error:
+            raise RequestError(f"{name} over {before}: {error}") from None
+        named = found.values.keys() | over.values.keys()
+        record = settings.record()
+        own = {key: v for key, v in record.items() if key in named or isinstance(v, Mapping)}
+        code = dict.fromkeys((*found.stage_files, *over.stage_files))
+        found = Config(own, settings, tuple(code))
+    return found
 
 
 def load_config(name: str) -> Config:

@@ -1,7 +1,7 @@
 """The methods of stages: found by their names, made from a table of parameters and validated."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
@@ -26,6 +26,17 @@ def base_name(step: str) -> str:
     'denoise'
     """
     return re.sub(r"_\d+$", "", step)
+
+
+def numbered(stages: Sequence[str]) -> list[str]:
+    """The names of the steps of stages; a repeated stage gets a number.
+
+    >>> numbered(["denoise", "gamma", "denoise"])
+    ['denoise', 'gamma', 'denoise_2']
+    """
+    before = [stages[:place].count(stage) for place, stage in enumerate(stages)]
+    pairs = zip(stages, before, strict=True)
+    return [f"{stage}_{count + 1}" if count else stage for stage, count in pairs]
 
 
 def stage_named(key: str, name: str) -> Stage:

@@ -11,11 +11,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.digests import digests
 from clpipe.base.errors import RequestError
-from clpipe.base.text import one_of
+from clpipe.base.text import one_of, several
 from clpipe.base.validation import first_fault
 from clpipe.chain.carry import AovSpec, parse_carry
 from clpipe.chain.chain import Chain, make_chain
-from clpipe.chain.files import load_config
+from clpipe.chain.files import load_configs
 from clpipe.chain.formats import EVERY_FORMAT, NPY
 from clpipe.chain.keys import KEYS, TABLES
 from clpipe.chain.registry import code_files, load_stage_file
@@ -125,7 +125,7 @@ class Request:
     def from_options(
         cls,
         *,
-        config: str | None = None,
+        config: str | Path | Sequence[str | Path] | None = None,
         camera: str | None = None,
         iso: float | None = None,
         lens: str | None = None,
@@ -146,7 +146,8 @@ class Request:
         """The request of command-line options; None and () are options that are not set.
 
         Args:
-            config: the name of a built-in configuration, or of a TOML file.
+            config: the name of a built-in configuration, or of a TOML file; of several, each lies
+                over those before it.
             camera, iso, seed, noise_key, skip, dump: settings.
             lens, focal_length, aperture, focus_distance: settings.
             assignments: texts of the form ``stage.parameter=value``.
@@ -175,7 +176,7 @@ class Request:
         for text in assignments:
             stage, parameter, value = parse_assignment(text)
             options.setdefault(stage, {})[parameter] = value
-        configuration = load_config(config) if config is not None else None
+        configuration = load_configs(several(config)) if config else None
         code = (*(configuration.stage_files if configuration else ()), *stage_files)
         request = cls(
             configuration.values if configuration else None,

@@ -45,9 +45,11 @@ iso_option = click.option(
 config_option = click.option(
     "-c",
     "--config",
+    multiple=True,
     metavar="NAME|FILE",
     shell_complete=configs,
-    help=f"A configuration: {', '.join(built_in_configs())}, or a TOML file.",
+    help=f"A configuration: {', '.join(built_in_configs())}, or a TOML file. Of a second one with "
+    "stages, the development goes behind the raw of the first.",
 )
 
 set_option = click.option(

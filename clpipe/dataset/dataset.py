@@ -116,7 +116,7 @@ class Dataset(ReadOnly):
     def __init__(
         self,
         inputs: str | Path | Sequence[str | Path],
-        config: str | Path | None = None,
+        config: str | Path | Sequence[str | Path] | None = None,
         *,
         device: str | int | None = None,
         keep: str | Sequence[str] = (),
@@ -145,7 +145,7 @@ class Dataset(ReadOnly):
                 raise RequestError(f"found {name} {number}; expected 1 or more, or None")
         self._patches = Patches(patch) if isinstance(patch, int) else patch
         request = Request.from_options(
-            config=None if config is None else str(config),
+            config=config,
             values=plain(settings),
             start_at=start_at,
             until=until,

@@ -185,8 +185,8 @@ def with_output(settings: Settings, scenes: Scenes) -> Settings:
 def configuration(settings: Settings, scenes: Scenes, remarks: Sequence[str]) -> str:
     """A development as a configuration file, with remarks at its beginning.
 
-    Every parameter of the stages that were searched is written, so that it stays the same where a
-    default changes.
+    The stages and every parameter of those that were searched are written, so that it stays the
+    same where a default changes, and lies over another way to a raw with all of its steps.
     """
     names = [scene.name for scene in scenes.each]
     more = f" and {len(names) - 1} more" if len(names) > 1 else ""
@@ -195,9 +195,10 @@ def configuration(settings: Settings, scenes: Scenes, remarks: Sequence[str]) ->
         *(f"# {remark}." for remark in remarks),
         f"camera = {value_text(settings.camera)}",
         f"iso = {value_text(settings.iso)}",
+        "stages = [",
+        *(f"    {value_text(name)}," for name in settings.stages),
+        "]",
     ]
-    if settings.stages != Settings().stages:
-        lines += ["stages = [", *(f"    {value_text(name)}," for name in settings.stages), "]"]
     record = with_output(settings, scenes).record()
     for name, table in record.items():
         if not isinstance(table, dict):
