@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import BeforeValidator
 
-from clpipe.base.types import Floats, plain
+from clpipe.base.types import Floats
 from clpipe.reference.random import normal_of_line
 from clpipe.stage import (
     Arguments,
@@ -65,9 +65,7 @@ class Offsets(Method):
 
     def resolve(self, context: Context) -> "Offsets":
         camera, iso = context.camera, context.iso
-        return self.with_defaults(
-            sigma=camera.black_level_error(iso), bias=plain(camera.color_bias(iso))
-        )
+        return self.with_defaults(sigma=camera.black_level_error(iso), bias=camera.color_bias(iso))
 
     def passes(self) -> tuple[Pass, ...]:
         if not self.sigma and not any(self.bias or ()):
