@@ -19,10 +19,10 @@ INLINE rgb luma_chroma_to_light(ycbcr c, site at, float offset, float luma_range
     return roots_to_light(v, at, offset);
 }
 
-// Luma from the pixels around, chroma from those at the corners and two pixels away, whose own noise
-// demosaicing has made differ from the centre's. `grain` is the share of luma that stays as it is. What
+// Luma from the pixels around, chroma from eight on a ring: `chroma_scale` away along both axes, or one more
+// along one; their own noise demosaicing has made differ from the centre's. `grain` is the share of luma that stays as it is. What
 // is equally far has one weight, which comes last.
-INLINE ycbcr biweight(site at, image planes, float grain) {
+INLINE ycbcr biweight(site at, image planes, float grain, int chroma_scale) {
 #pragma OPENCL FP_CONTRACT ON
     const ycbcr centre = tap_ycbcr(planes, 0, 0), none = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
     ycbcr sums[5] = {none, none, none, none, none};  // of weighted differences, by squared distance
@@ -40,7 +40,9 @@ INLINE ycbcr biweight(site at, image planes, float grain) {
                 luma_weights[distance] += weight;
             }
             if (distance == 2 || distance == 4) {
-                const ycbcr c = tap_ycbcr(planes, dx, dy);
+                const ycbcr c = distance == 2
+                                    ? tap_ycbcr(planes, dx * chroma_scale, dy * chroma_scale)
+                                    : tap_ycbcr(planes, dx / 2 * (chroma_scale + 1), dy / 2 * (chroma_scale + 1));
                 const vf db = centre.cb - c.cb, dr = centre.cr - c.cr;
                 const vf near = vmax((vf)(1.0f) - db * db - dr * dr, (vf)(0.0f));
                 const vf weight = near * near;

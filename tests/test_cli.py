@@ -448,7 +448,9 @@ def test_a_plan_prints_the_source_of_a_launch(clpipe):
     assert re.search(r"__kernel .*\nvoid launch_[0-9a-f]{16}\(", by_number)
     for unknown in ("0", "8", "denoise"):
         said = clpipe("plan", "--source", unknown, status=2).stderr
-        assert f"unknown launch '{unknown}'" in said and "1 lines, 2 load, 3 optical_blur" in said
+        assert (
+            f"unknown launch '{unknown}'" in said and "1 lines, 2 inverse_color_matrix, 3" in said
+        )
     assert "give one" in clpipe("plan", "--source", 4, "--json", status=2).stderr
 
 

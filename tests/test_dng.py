@@ -30,10 +30,7 @@ from tests.dng import write_dng as write_raw
 
 LINEAR = ("--skip", "denoise", "--skip", "tone_curve", "--skip", "sharpen")
 LINEAR += ("--set", "gamma.method=power", "--set", "gamma.exponent=1")
-THROUGH_FILTERS = (
-    *("--stages", "color_matrix,mosaic,inverse_white_balance,quantize,normalize,white_balance"),
-    *("--set", "color_matrix.method=inverse_camera"),
-)
+NO_FILTERS = ("--set", "inverse_color_matrix.method=none")
 
 
 @pytest.fixture
@@ -74,7 +71,7 @@ def strip(path):
 @pytest.mark.parametrize("size", [(24, 30), (37, 51)])
 def test_libraw_reads_the_very_dn(scene, tmp_path, pattern, size):
     options = ("--iso", 3200, "--set", f"mosaic.pattern={pattern}", "--keep", "quantize")
-    options += ("--set", "exposure.headroom=0")  # so that some samples are white
+    options += ("--set", "exposure.ev=1.5")  # so that some samples are white
     clpipe("run", scene(*size), "-o", tmp_path / "o", *options, "--format", "dng")
     kept = read_image(tmp_path / "o" / "scene.quantize.exr", mosaic=True).pixels
     path = tmp_path / "o" / "scene.dng"
@@ -86,9 +83,8 @@ def test_libraw_reads_the_very_dn(scene, tmp_path, pattern, size):
     assert facts.white_level == 16383
     assert facts.gains == pytest.approx((2.77, 1.36), rel=1e-6)
     assert (facts.make, facts.model, facts.iso) == ("Sony", "ILCE-7RM2", 3200)
-    # The real camera's matrix is not the render's, which has the primaries of sRGB.
-    to_camera = np.array(facts.xyz_to_camera) @ SRGB_TO_XYZ
-    assert to_camera / to_camera[1, 1] == pytest.approx(np.diag([1 / 2.77, 1, 1 / 1.36]), abs=1e-4)
+    real = load_camera("sony-a7r2").xyz_to_camera
+    assert np.array(facts.xyz_to_camera) == pytest.approx(np.array(real), abs=3e-3)
     assert np.array_equal(read_raw(path, facts), kept)
     with rawpy.imread(str(path)) as raw:
         assert raw.color_desc == b"RGBG"
@@ -146,16 +142,15 @@ def test_it_has_every_tag_of_a_jpeg(tmp_path):
     assert (facts.aperture, facts.taken) == (2.8, tags.taken)
 
 
-@pytest.mark.parametrize("stages", [{}, {"color_matrix": {"method": "inverse_camera"}}])
-def test_its_matrix_is_read_as_that_of_a_camera(tmp_path, stages):
-    order = ["color_matrix", "mosaic", "inverse_white_balance", "quantize"] if stages else []
-    values = {**stages, **({"stages": order} if order else {})}
+@pytest.mark.parametrize("method", ["none", "camera"])
+def test_its_matrix_is_read_as_that_of_a_camera(tmp_path, method):
+    values = {"inverse_color_matrix": {"method": method}}
     negative = negative_of(make_chain(settings_from(values)))
     mosaic = np.arange(4096, dtype=np.float32).reshape(64, 64)
     write_dng(tmp_path / "a.dng", mosaic, negative, Tags("Sony", "A", 100))
     matrix = read_facts(tmp_path / "a.dng").xyz_to_camera
     assert np.array(matrix) == pytest.approx(negative.xyz_to_camera, abs=1e-6)
-    if stages:
+    if method == "camera":
         camera = load_camera("sony-a7r2")
         assert np.array(matrix) == pytest.approx(np.array(camera.xyz_to_camera), abs=1e-3)
 
@@ -202,7 +197,7 @@ def test_the_preview_is_our_own_picture(tmp_path):
     off = np.abs(blocks(preview) - blocks(ours)).max(-1)
     assert np.median(off) < 1.5
     assert (
-        np.percentile(off, 95) < 5
+        np.percentile(off, 95) < 7
     )  # blocks with edges, whose light and whose levels are averaged
 
 
@@ -225,14 +220,13 @@ def test_adobes_software_is_told_of_our_tone_curve(tmp_path, scene):
 
 def test_the_colour_matrix_is_of_what_the_mosaic_holds():
     camera = load_camera("sony-a7r2")
-    rendered = negative_of(make_chain(settings_from({})))
+    plain = {"inverse_color_matrix": {"method": "none"}}
+    rendered = negative_of(make_chain(settings_from(plain)))
     white = rendered.xyz_to_camera @ SRGB_TO_XYZ @ np.ones(3)
     assert white / white[1] == pytest.approx([1 / 2.77, 1, 1 / 1.36])  # AsShotNeutral is D65's
     red = rendered.xyz_to_camera @ SRGB_TO_XYZ @ [1, 0, 0]
     assert red / red[0] == pytest.approx([1, 0, 0], abs=1e-6)
-    stages = THROUGH_FILTERS[1].split(",")
-    through = {"stages": stages, "color_matrix": {"method": "inverse_camera"}}
-    filtered = negative_of(make_chain(settings_from(through)))
+    filtered = negative_of(make_chain(settings_from({})))
     assert filtered.xyz_to_camera == pytest.approx(np.array(camera.xyz_to_camera), abs=3e-3)
 
 

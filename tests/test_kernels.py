@@ -76,9 +76,9 @@ def test_median_of_zeros_and_ones(device, size):
     assert np.array_equal(one, two)
 
 
-@pytest.mark.parametrize("noise", ["gaussian", "poisson"])
+@pytest.mark.parametrize("noise", ["skewed_gaussian", "gaussian", "poisson"])
 def test_raw_is_bit_for_bit_the_references(device, scalar_device, noise):
-    several = PATTERNS if noise == "gaussian" else ("GRBG",)
+    several = PATTERNS if noise == "skewed_gaussian" else ("GRBG",)
     for any_device, patterns in ((device, several), (scalar_device, ("GRBG",))):
         result = check_raw(any_device, noise, patterns=patterns)
         assert result.difference.differing == 0, result

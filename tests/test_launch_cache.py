@@ -50,7 +50,7 @@ class Developer:
         return [t.name.split(".")[-1] for t in timings if not t.transfer]
 
 
-LINES, LOAD, NOISE = "lines", "load", "demosaic"
+LINES, LOAD, NOISE = "lines", "inverse_color_matrix", "demosaic"
 AFTER = ["bounded_green", "denoise", "sharpen", "gamma"]
 
 

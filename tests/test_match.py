@@ -153,7 +153,7 @@ def test_a_known_development_comes_back(found):
         row = column["searched"]
         if name != "beyond_4_sigma" and row["residual"] is not None:
             assert abs(row["residual"]) < 0.03 + 2 * row["error"], (name, row)
-            assert row["error"] < 0.2, name
+            assert row["error"] < 0.3, name
     assert report["searched"]["iso"] == pytest.approx(KNOWN["iso"], rel=0.1)
     strength = report["searched"]["denoise.luma_strength"]
     assert strength == pytest.approx(KNOWN["denoise"]["luma_strength"], rel=0.2)
@@ -378,12 +378,8 @@ def test_every_number_of_the_development_is_searched():
     methods = {choice.text for choice in space.choices["demosaic"]}
     assert {"demosaic bilinear", "demosaic menon2007"} <= methods
     assert not any("file" in choice.text for choice in space.choices["tone_curve"])
-    camera = space.choices["chroma"][-1].over(Settings())
-    chain = make_chain(camera)
-    assert [s.method.method for s in chain.steps if "matrix" in s.name] == [
-        "inverse_camera",
-        "camera",
-    ]
+    chain = make_chain(space.choices["chroma"][-1].over(Settings()))
+    assert [s.method.method for s in chain.steps if "matrix" in s.name] == ["none", "as_shot"]
     smoother = {d.name for d in dimensions_of(chain) if d.name.startswith("denoise_2.")}
     assert smoother == {"denoise_2.chroma_strength", "denoise_2.spatial_sigma"}
 

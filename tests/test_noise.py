@@ -103,7 +103,7 @@ def noisy_flats(develop, key="flat", seed=0, method="gaussian"):
     return result.final.astype(np.float64) - flat[..., 0]
 
 
-@pytest.mark.parametrize("method", ["gaussian", "poisson"])
+@pytest.mark.parametrize("method", ["skewed_gaussian", "gaussian", "poisson"])
 def test_flat_fields_have_variance_a_y_plus_b(develop, method):
     noise = noisy_flats(develop, method=method).reshape(512, len(LEVELS), 128)
     n = 512 * 128

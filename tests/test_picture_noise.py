@@ -243,7 +243,7 @@ def loop(tmp_path_factory):
 def test_the_matched_variance_is_measured_again(loop):
     for name in "RGB":
         camera, baseline = (loop[x]["channels"][name] for x in ("camera", "iid_gaussian"))
-        assert baseline["sigma_picture"] == pytest.approx(camera["sigma_picture"], rel=0.015)
+        assert baseline["sigma_picture"] == pytest.approx(camera["sigma_picture"], rel=0.03)
         assert np.std(baseline["intensity"]["sigma"]) < 0.1 * np.std(camera["intensity"]["sigma"])
 
 

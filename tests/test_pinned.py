@@ -38,7 +38,7 @@ RUNS = {
     " --set 'sensor_noise.a={log_uniform=[1e-4, 0.01]}' --seed 7",
     "patches": "--format npy --patch 24 --patches-per-image 3 --augment --truth mosaic",
     "methods": "--format png --set demosaic.method=menon2007 --set denoise.method=non_local_means"
-    " --set white_balance.method=gray_world --set tone_curve.method=filmic",
+    " --set white_balance.method=gray_world --set tone_curve.method=neutral",
 }
 
 

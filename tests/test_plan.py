@@ -29,7 +29,7 @@ def names(plan):
 def test_default_chain():
     assert names(plan_of()) == [
         "lines",
-        "load",
+        "inverse_color_matrix",
         "optical_blur.blur..demosaic",
         "demosaic.bounded_green",
         "demosaic.bounded_red_and_blue..denoise",
@@ -140,8 +140,9 @@ def test_a_plan_depends_on_structure_alone():
 
 
 def test_the_border_is_as_wide_as_the_widest_stencil():
-    assert plan_of().border == 4  # of sharpening, twice its sigma of 2.2
-    assert plan_of(skip=["sharpen"]).border == 2
+    assert plan_of().border == 3  # of chroma, its scale and one more
+    assert plan_of(denoise={"chroma_scale": 4}).border == 5
+    assert plan_of(skip=["denoise"]).border == 2
     assert plan_of(denoise={"method": "mean", "chroma_size": 13}).border == 6
     assert plan_of(stages=["exposure", "gamma"]).border == 0
 

@@ -111,7 +111,7 @@ def test_figures_pictures_and_failures(out):
     assert [view["label"] for view in large[0]["views"]] == ["picture", "truth", "after normalize"]
     assert [view["label"] for view in large[2]["views"]] == ["picture", "truth"]
     assert re.search(r"exposure\.ev ?: -?[\d.]+, -?[\d.]+, -?[\d.]+", page.said)
-    assert "sensor_noise gaussian" in page.said
+    assert "sensor_noise skewed_gaussian" in page.said
     assert "finished" in page.said
 
 
@@ -310,7 +310,7 @@ def test_two_runs_are_compared(out, renders, tmp_path):
     more = ("--iso", 400, "--set", "denoise.luma_strength=2", "--truth", "development")
     clpipe("run", renders / "a.exr", "-o", other, *NUMPY, *more)
     page = report(out, other)
-    assert "denoise.luma_strength 1 2" in page.said
+    assert "denoise.luma_strength 0.5 2" in page.said
     large = {each["name"]: each for each in page.data["look-data"]}
     labels = [view["label"] for view in large["a"]["views"]]
     assert labels[:2] == ["out picture", "other picture"]

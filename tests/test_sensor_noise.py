@@ -90,7 +90,7 @@ def test_tukey_lambda_is_that_of_scipy(shape):
     assert np.abs(z / exact - 1)[np.abs(exact) > 0.01].max() < 1e-3
 
 
-@pytest.mark.parametrize("method", ["gaussian", "poisson"])
+@pytest.mark.parametrize("method", ["skewed_gaussian", "gaussian", "poisson"])
 @pytest.mark.parametrize("more", [{}, {"tukey_lambda": -0.15}])
 def test_mean_and_variance_are_those_asked_for(develop, method, more):
     a, b, n = 2e-3, 5e-6, 1_000_000
@@ -108,7 +108,7 @@ def test_mean_and_variance_are_those_asked_for(develop, method, more):
 
 def test_tails_of_the_gaussian_to_five_sigma(develop):
     n = 24_000_000
-    z = draw(develop, 0.5, n, a=1e-4, b=0.0) - 0.5
+    z = draw(develop, 0.5, n, method="gaussian", a=1e-4, b=0.0) - 0.5
     z /= sqrt(0.5e-4)
     for sigma in (3, 4, 5):
         expected = n * norm.sf(sigma)
@@ -116,9 +116,25 @@ def test_tails_of_the_gaussian_to_five_sigma(develop):
             assert abs(count - expected) < 4 * sqrt(expected)
 
 
+@pytest.mark.parametrize("read_noise", [0.0, 2.0])
+@pytest.mark.parametrize("electrons", [1, 4, 40, 1000])
+def test_the_skew_is_that_of_shot_noise(develop, electrons, read_noise):
+    n, a = 1_000_000, 1e-3
+    b, level = (a * read_noise) ** 2, a * electrons
+    noise = (draw(develop, level, n, method="skewed_gaussian", a=a, b=b) - level) / a
+    variance = electrons + read_noise**2
+    skewness = electrons / variance**1.5
+    found = float((noise.astype(np.float64) ** 3).mean() / noise.var(dtype=np.float64) ** 1.5)
+    # The error of a skewness of n normals is sqrt(6 / n); what is not modelled is c's cube.
+    assert abs(found - skewness) < 4 * sqrt(6 / n) + 0.04 * skewness
+    assert abs(noise.var(dtype=np.float64) / variance - 1) < 4 * sqrt(2 / n) + 0.01 / electrons
+    gaussian = draw(develop, level, n, method="gaussian", a=a, b=b) - level
+    assert abs((gaussian.astype(np.float64) ** 3).mean()) < 0.1 * a**3 * variance**1.5
+
+
 def test_a_full_well_holds_no_more(develop):
     given = {"a": 1e-3, "full_well": 500.0, "b": 0.0}
-    for method in ("gaussian", "poisson"):
+    for method in ("skewed_gaussian", "gaussian", "poisson"):
         bright = draw(develop, 0.9, 10_000, method=method, **given)
         assert bright.max() == np.float32(0.5) == bright.min()
         assert draw(develop, 0.3, 10_000, method=method, **given).max() < 0.5

@@ -1,12 +1,17 @@
-"""Tone curves from files."""
+"""Tone curves: picture styles, and curves from files."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from clpipe.base.errors import RequestError
 from clpipe.chain.chain import make_chain
 from clpipe.chain.settings import settings_from
-from clpipe.stages.tone_curve import CAMERA_RAW
+from clpipe.stage import run_reference
+from clpipe.stages.inverse_tone_curve import Standard as InverseStandard
+from clpipe.stages.tone_curve import CAMERA_RAW, Standard
+from clpipe.stages.tone_curve.standard import GREY, GREY_OUT
 from clpipe.stages.tone_curve.table import table_of
 
 RAMP = np.linspace(0, 1, 300, dtype=np.float32).reshape(10, 10, 3)
@@ -118,3 +123,61 @@ def test_a_linear_tone_curve_gives_the_headroom_back_and_changes_nothing_else(de
             result = develop(RAMP, numpy=numpy, keep=("exposure",), tone_curve=linear, **stages)
             assert np.array_equal(result.kept["exposure"] * 2**headroom, RAMP)
             assert np.array_equal(result.final, RAMP)
+
+
+STYLES = st.fixed_dictionaries(
+    {
+        "contrast": st.floats(0.2, 5),
+        "toe": st.floats(0, 1),
+        "shoulder": st.floats(0, 1),
+        "saturation": st.floats(0.6, 2),
+    }
+)
+
+
+@given(STYLES)
+def test_every_style_rises_and_keeps_black_grey_and_white(values):
+    style = Standard(**values)
+    curve = style.curve(np.linspace(0, 1, 2001, dtype=np.float32))
+    assert np.diff(curve).min() > -1e-6  # rounding
+    ends = style.curve(np.float32([0, GREY, 1]))
+    assert ends == pytest.approx([0, GREY_OUT, 1], abs=1e-6)
+
+
+@given(STYLES, st.integers(0, 1000))
+def test_a_style_is_undone(values, seed):
+    light = np.random.default_rng(seed).random((9, 11, 3), np.float32) ** 2
+    style = Standard(**values)
+    curved = run_reference(style, light)
+    again = run_reference(InverseStandard(**values), curved)
+    # Where the curve is level, light cannot be told; where colours left 0 to 1, neither.
+    high = light.max(-1, keepdims=True)
+    step = style.curve(high + np.float32(1e-3)) - style.curve(high - np.float32(1e-3))
+    told = (step > 1e-4) & (curved.min(-1, keepdims=True) > 0)
+    assert np.abs(np.where(told, again - light, 0)).max() < 1e-4
+
+
+def test_what_the_parameters_of_a_style_say():
+    x = np.geomspace(0.002, 0.9, 400).astype(np.float32)
+
+    def slope(level, **values):
+        stops = np.log2(Standard(**values).curve(np.float32([level / 1.01, level * 1.01])))
+        return float(np.diff(stops)[0] / (2 * np.log2(1.01)))
+
+    for contrast in (1.0, 1.6, 2.2):
+        assert slope(GREY, contrast=contrast) == pytest.approx(contrast, rel=0.02)
+    dark, bright = x < GREY, x > GREY
+    assert (Standard(toe=0.9).curve(x) < Standard(toe=0.2).curve(x))[dark].all()
+    assert (Standard(shoulder=0.9).curve(x) > Standard(shoulder=0.2).curve(x))[bright].all()
+    colour = np.float32([[[0.3, 0.2, 0.1]]])
+    ranges = [np.ptp(run_reference(Standard(saturation=s), colour)) for s in (0.8, 1.0, 1.2)]
+    assert ranges[0] < ranges[1] < ranges[2]
+
+
+def test_a_style_keeps_ratios_below_the_highlights():
+    colours = np.random.default_rng(0).random((20, 20, 3), np.float32) * np.float32(0.2)
+    styled = run_reference(Standard(), colours)
+    ratios = [c / c.max(-1, keepdims=True) for c in (colours, styled)]
+    assert np.abs(ratios[0] - ratios[1]).max() < 2e-3
+    lamp = run_reference(Standard(), np.float32([[[1, 0.8, 0.2]]]))[0, 0]
+    assert lamp[0] == 1 and lamp[2] > 0.5  # the brightest turn whiter

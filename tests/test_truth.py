@@ -68,7 +68,7 @@ def agree(noisy, clean, variance, axis=1):
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
-@pytest.mark.parametrize("method", ["gaussian", "poisson"])
+@pytest.mark.parametrize("method", ["skewed_gaussian", "gaussian", "poisson"])
 def test_the_noise_of_400_frames_is_as_large_as_is_said(method, pattern):
     noise = {"method": method}
     agree(*known(tall(), **FIXED, mosaic={"pattern": pattern}, sensor_noise=noise))

@@ -91,6 +91,10 @@ class Vignetting(TypedDict, total=False):
     focal_length: Number
     sensor_width: Number
 
+class InverseColorMatrix(TypedDict, total=False):
+    method: Draw | Literal["camera", "given", "none"]
+    matrix: Several
+
 class OpticalBlur(TypedDict, total=False):
     method: Draw | Literal["lens", "none"]
     sigma: Number
@@ -136,7 +140,7 @@ class DefectPixels(TypedDict, total=False):
     dead_share: Number
 
 class SensorNoise(TypedDict, total=False):
-    method: Draw | Literal["gaussian", "poisson", "none"]
+    method: Draw | Literal["skewed_gaussian", "gaussian", "poisson", "none"]
     a: Number
     b: Number
     system_gain: Number
@@ -206,13 +210,14 @@ class Denoise(TypedDict, total=False):
     luma_noise: Number
     chroma_noise: Number
     grain: Number
+    chroma_scale: Whole
     offset: Number
     luma_size: Whole
     chroma_size: Whole
     spatial_sigma: Number
 
 class ColorMatrix(TypedDict, total=False):
-    method: Draw | Literal["none", "camera", "inverse_camera", "given"]
+    method: Draw | Literal["as_shot", "camera", "given", "none"]
     matrix: Several
 
 class Sharpen(TypedDict, total=False):
@@ -224,7 +229,11 @@ class Sharpen(TypedDict, total=False):
     offset: Number
 
 class ToneCurve(TypedDict, total=False):
-    method: Draw | Literal["filmic", "camera_raw", "linear", "file"]
+    method: Draw | Literal["standard", "neutral", "camera_raw", "linear", "file"]
+    contrast: Number
+    toe: Number
+    shoulder: Number
+    saturation: Number
     headroom: Number
     path: Text
 
@@ -246,7 +255,11 @@ class InverseGamma(TypedDict, total=False):
     exponent: Number
 
 class InverseToneCurve(TypedDict, total=False):
-    method: Draw | Literal["filmic", "camera_raw", "linear", "file"]
+    method: Draw | Literal["standard", "neutral", "camera_raw", "linear", "file"]
+    contrast: Number
+    toe: Number
+    shoulder: Number
+    saturation: Number
     path: Text
 
 class MosaicDenoise(TypedDict, total=False):
@@ -300,6 +313,7 @@ class Keywords(TypedDict, total=False):
     motion_blur: MotionBlur
     distortion: Distortion
     vignetting: Vignetting
+    inverse_color_matrix: InverseColorMatrix
     optical_blur: OpticalBlur
     exposure: Exposure
     mosaic: Mosaic

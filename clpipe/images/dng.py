@@ -101,8 +101,8 @@ def preview(dn: Array, negative: Negative) -> Array:
     to_camera = negative.xyz_to_camera @ SRGB_TO_XYZ
     linear = clipped @ np.linalg.inv(to_camera).T * to_camera.sum(1)[1]
     picture = negative.tone(np.clip(linear, 0, 1).astype(np.float32))
-    light = np.clip(picture, 0, 1).astype(np.float64)  # a curve may leave it by a rounding error
-    return to_8_bit(srgb_curve(light).astype(np.float32))
+    shown = np.clip(picture.astype(np.float64), 0, 1)  # which rounding may leave
+    return to_8_bit(srgb_curve(shown).astype(np.float32))
 
 
 def tone_fields(negative: Negative) -> tiff.Directory:

@@ -209,9 +209,10 @@ def name_of(role: StageRole) -> str:
 def settings_of(facts: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
     """The settings that a raw carries, and warnings by what they are about."""
     balance, colours = name_of(StageRole.BALANCE), name_of(StageRole.COLOURS)
+    unseen: dict[str, dict[str, Any]] = {name_of(StageRole.COLOURS_OF_LIGHT): {"method": "none"}}
     if isinstance(facts, Dump):
         gray_world = {balance: {"method": "gray_world"}}
-        return Settings(parameters=gray_world), {
+        return Settings(parameters=gray_world | unseen), {
             balance: "it does not say its white balance; gray_world estimates it",
             colours: UNKNOWN_COLOURS,
         }
@@ -227,7 +228,7 @@ def settings_of(facts: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
     iso = facts.iso or Settings().iso
     if not facts.iso:
         warnings["no_iso"] = f"it does not say its ISO; {iso:g} is taken for denoising (--iso)"
-    parameters: dict[str, dict[str, Any]] = {name_of(StageRole.PATTERN): {"pattern": facts.pattern}}
+    parameters = unseen | {name_of(StageRole.PATTERN): {"pattern": facts.pattern}}
     if 0 <= facts.black_level < facts.white_level:
         levels = {"black_level": float(facts.black_level), "white_level": float(facts.white_level)}
         parameters[name_of(StageRole.LEVELS)] = levels

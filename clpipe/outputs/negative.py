@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clpipe.base.errors import RequestError
-from clpipe.camera.profile import IDENTITY
 from clpipe.chain.chain import Chain
 from clpipe.images.dng import Negative, xyz_to_camera
 from clpipe.stage import Context, Kind, StageRole, run_reference
@@ -61,14 +60,14 @@ def _level(owner: object, name: str, default: float) -> float:
 def _colours(context: Context, end: Context, is_input: bool) -> NDArray[np.float64]:
     """The matrix from linear sRGB to the mosaic's own colours, white-balanced.
 
-    For a render it is what color_matrix did before the mosaic. For a camera's raw it is the inverse
-    of what color_matrix does behind it.
+    It is what was done to a render before the mosaic. For a raw that enters it is the inverse of
+    what is done to it behind, if anything is.
 
     Args:
         context: at the raw.
         end: at the end of the chain.
         is_input: whether the raw is the image that enters.
     """
-    if is_input and context.colours == IDENTITY:
-        return np.asarray(np.linalg.inv(end.colours), np.float64)
+    if is_input and end.colours != context.colours:
+        return np.asarray(np.array(context.colours) @ np.linalg.inv(end.colours), np.float64)
     return np.array(context.colours)

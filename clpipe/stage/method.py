@@ -183,6 +183,7 @@ class StageRole(Enum):
     LEVELS = "its black_level and white_level are those of a raw that enters"
     BALANCE_OF_LIGHT = "its red_gain and blue_gain are taken out, as a raw's light has them"
     BALANCE = "its red_gain and blue_gain are those of a raw that enters"
+    COLOURS_OF_LIGHT = "it is not done to a raw that enters, whose light the sensor saw"
     COLOURS = "its matrix is that of a raw that enters"
     DENOISING = "its strength follows camera and ISO"
     BASELINE = "its noise is that of a baseline"

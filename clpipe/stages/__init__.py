@@ -18,6 +18,7 @@ DEFAULT_CHAIN = (
     "motion_blur",
     "distortion",
     "vignetting",
+    "inverse_color_matrix",
     "optical_blur",
     "exposure",
     "mosaic",

@@ -1,4 +1,4 @@
-"""Colour matrices: between a camera's white-balanced RGB and linear sRGB."""
+"""Colour matrix: from a camera's white-balanced RGB to linear sRGB."""
 
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar
@@ -25,7 +25,7 @@ from clpipe.stage import (
 NAMES = tuple(f"{row}_{column}" for row in "rgb" for column in "rgb")
 
 
-def _as_tuples(value: Any) -> Any:
+def as_tuples(value: Any) -> Any:
     """A 3x3 list of numbers, as TOML has it, as the tuples that strict validation needs."""
     if value is None:
         return None
@@ -58,17 +58,16 @@ def srgb_to_camera(camera: Camera) -> Doubles:
         return camera.srgb_to_camera()
     except RequestError as error:
         raise RequestError(
-            f"{error}, from which color_matrix has its own; leave colours as they are with --set "
-            "color_matrix.method=none (and color_matrix_2.method=none where the chain has two), "
-            "add the matrix to a profile of your own, or choose another camera"
+            f"{error}; set color_matrix.method=as_shot, add the matrix to a profile of your own, "
+            "or choose another camera"
         ) from None
 
 
 class NoMatrix(Unchanged):
-    """No matrix: a render is in linear sRGB already."""
+    """No matrix: colours stay as they are."""
 
     method: ClassVar = "none"
-    summary: ClassVar = "no matrix: a render is in linear sRGB already"
+    summary: ClassVar = "no matrix: colours stay as they are"
 
 
 class FixedMatrix(Method):
@@ -79,7 +78,7 @@ class FixedMatrix(Method):
     summary: ClassVar = "a 3x3 matrix of your own"
     example: ClassVar = {"matrix": [[1.6, -0.5, -0.1], [-0.2, 1.5, -0.3], [0.05, -0.6, 1.55]]}
 
-    matrix: Annotated[Matrix, BeforeValidator(_as_tuples)] | None = parameter(
+    matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = parameter(
         IDENTITY,
         "Three rows of three numbers: the new red, green and blue, each as a sum of the old ones.",
     )
@@ -93,20 +92,43 @@ class FixedMatrix(Method):
 
     def next_context(self, context: Context) -> Context:
         colours = np.array(self.matrix) @ context.colours
-        return replace(context, colours=_as_tuples(colours.tolist()))
+        return replace(context, colours=as_tuples(colours.tolist()))
 
     @property
     def _array(self) -> Floats:
         return np.array(self.matrix, np.float32)
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("color_matrix", arguments=NAMES),)
+        return () if self.matrix == IDENTITY else (Pass("color_matrix", arguments=NAMES),)
 
     def arguments(self, context: Context) -> Arguments:
         return dict(zip(NAMES, self._array.ravel(), strict=True))
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         return apply_matrix(image, self._array)
+
+
+class AsShot(FixedMatrix):
+    """Back to linear sRGB: the inverse of the matrix with which a render became camera RGB.
+
+    Where there was none, colours stay as they are.
+    """
+
+    method: ClassVar = "as_shot"
+    summary: ClassVar = "undo inverse_color_matrix: a render's colours become linear sRGB again"
+    example: ClassVar = {}
+    other_examples: ClassVar = ({"matrix": [[1.2, -0.2, 0.0], [0.0, 1.0, 0.0], [0.0, -0.5, 1.5]]},)
+
+    matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = parameter(
+        None,
+        "Three rows of three numbers, from camera RGB to linear sRGB.",
+        auto="the inverse of what inverse_color_matrix did",
+    )
+
+    def resolve(self, context: Context) -> "AsShot":
+        if context.colours == IDENTITY:
+            return self.with_defaults(matrix=IDENTITY)
+        return self.with_defaults(matrix=as_tuples(np.linalg.inv(context.colours).tolist()))
 
 
 class CameraToSrgb(FixedMatrix):
@@ -119,7 +141,7 @@ class CameraToSrgb(FixedMatrix):
     summary: ClassVar = "camera RGB to linear sRGB, for a camera's raws"
     example: ClassVar = {}
 
-    matrix: Annotated[Matrix, BeforeValidator(_as_tuples)] | None = parameter(
+    matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = parameter(
         None,
         "Three rows of three numbers, from camera RGB to linear sRGB.",
         auto="from the camera",
@@ -129,33 +151,14 @@ class CameraToSrgb(FixedMatrix):
         if self.matrix is not None:
             return self
         inverse = np.linalg.inv(srgb_to_camera(context.camera))
-        return self.with_defaults(matrix=_as_tuples(inverse.tolist()))
-
-
-class SrgbToCamera(FixedMatrix):
-    """Linear sRGB to white-balanced camera RGB: the camera's matrix, for a render before mosaic."""
-
-    method: ClassVar = "inverse_camera"
-    summary: ClassVar = "linear sRGB to camera RGB, for a render, before mosaic"
-    example: ClassVar = {}
-
-    matrix: Annotated[Matrix, BeforeValidator(_as_tuples)] | None = parameter(
-        None,
-        "Three rows of three numbers, from linear sRGB to camera RGB.",
-        auto="from the camera",
-    )
-
-    def resolve(self, context: Context) -> "SrgbToCamera":
-        if self.matrix is not None:
-            return self
-        return self.with_defaults(matrix=_as_tuples(srgb_to_camera(context.camera).tolist()))
+        return self.with_defaults(matrix=as_tuples(inverse.tolist()))
 
 
 STAGE = Stage(
     "color_matrix",
-    "Convert between the camera's colours and linear sRGB.",
+    "Convert the camera's colours to linear sRGB.",
     Kind.RGB,
     Kind.RGB,
-    (NoMatrix, CameraToSrgb, SrgbToCamera, FixedMatrix),
+    (AsShot, CameraToSrgb, FixedMatrix, NoMatrix),
     role=StageRole.COLOURS,
 )

@@ -19,7 +19,9 @@ from clpipe.stage import (
     Unchanged,
 )
 from clpipe.stages import tone_curve
-from clpipe.stages.tone_curve.filmic import A, B, C, D, inverse_filmic, keep_hue
+from clpipe.stages.tone_curve import standard
+from clpipe.stages.tone_curve.hue import inside_of, keep_hue
+from clpipe.stages.tone_curve.neutral import A, B, C, D, inverse_neutral
 from clpipe.stages.tone_curve.table import table_of
 
 
@@ -38,22 +40,44 @@ def inverse_table(path: str) -> Floats:
     return tabulate(lambda y: np.interp(y, value, linear[first]))
 
 
-class Filmic(Method):
-    """The inverse of the curve filmic: the raw's light, with its one stop of headroom."""
+class Standard(standard.Standard):
+    """The inverse of the curve standard: the raw's light, with its one stop of headroom."""
 
-    method: ClassVar = "filmic"
-    kernel: ClassVar = "inverse_tone_curve_filmic"
-    summary: ClassVar = "undo the curve filmic"
+    kernel: ClassVar = "inverse_tone_curve_standard"
+    summary: ClassVar = "undo the curve standard"
+    tolerance: ClassVar = 2e-3  # near black the kernel's root is a short iteration
+    example: ClassVar = {"contrast": 1.3, "toe": 0.5, "shoulder": 0.4}
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("inverse_standard", arguments=(*standard.NAMES, "saturation")),)
+
+    def arguments(self, context: Context) -> Arguments:
+        return self.numbers(standard.GREY_OUT)
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        inside = inside_of(image)
+        to_high = inside.max(-1, keepdims=True)
+        high = self.inverse(to_high)
+        part = high / (self.colourfulness(high) * np.maximum(to_high, np.float32(1e-9)))
+        return np.maximum(high - (to_high - inside) * part, np.float32(0))
+
+
+class Neutral(Method):
+    """The inverse of the curve neutral: the raw's light, with its one stop of headroom."""
+
+    method: ClassVar = "neutral"
+    kernel: ClassVar = "inverse_tone_curve_neutral"
+    summary: ClassVar = "undo the curve neutral"
     tolerance: ClassVar = 5e-5  # the kernel's root is a short iteration
 
     def passes(self) -> tuple[Pass, ...]:
-        return (Pass("inverse_filmic", arguments=("a", "b", "c", "d")),)
+        return (Pass("inverse_neutral", arguments=("a", "b", "c", "d")),)
 
     def arguments(self, context: Context) -> Arguments:
         return {"a": A, "b": B, "c": C, "d": D}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return keep_hue(image, inverse_filmic)
+        return keep_hue(image, inverse_neutral)
 
 
 class CameraRaw(Curve):
@@ -93,5 +117,5 @@ STAGE = Stage(
     "Undo the contrast of a photograph.",
     Kind.RGB,
     Kind.RGB,
-    (Filmic, CameraRaw, Linear, File),
+    (Standard, Neutral, CameraRaw, Linear, File),
 )

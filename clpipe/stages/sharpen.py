@@ -33,6 +33,7 @@ from clpipe.stages.denoise.strength import (
 # pictures: the amount without noise; what is added where denoising softens most; and the luma
 # noise, in roots of the signal, at which that is.
 LEAST_AMOUNT, MORE_AMOUNT, SOFTEST = 0.2, 0.55, 0.009
+THRESHOLD = 0.2  # of the luma noise; without one, small noise is sharpened and large is not
 LEAST_LIMIT = 0.008  # without noise; two levels of 255
 
 
@@ -70,7 +71,7 @@ class Unsharp(Method):
     tolerance: ClassVar = 1e-4  # the kernel's root is a short iteration
     example: ClassVar = {"amount": 0.8, "threshold": 0.002, "limit": 0.03}
 
-    radius: float = parameter(2.4, "Sigma of the blur.", "px", structural=True, ge=0.3, le=8)
+    radius: float = parameter(1.2, "Sigma of the blur.", "px", structural=True, ge=0.3, le=8)
     amount: float | None = parameter(
         None,
         "How much of the difference from the blurred picture is added; 0 is off.",
@@ -79,8 +80,13 @@ class Unsharp(Method):
         ge=0,
         le=10,
     )
-    threshold: float = parameter(
-        0.0, "Differences up to this are not sharpened.", "root of signal", ge=0, le=1
+    threshold: float | None = parameter(
+        None,
+        "Differences up to this are not sharpened.",
+        "root of signal",
+        "a fifth of the noise",
+        ge=0,
+        le=1,
     )
     limit: float | None = parameter(
         None,
@@ -97,7 +103,8 @@ class Unsharp(Method):
         noise = noise_in_roots(predicted_noise(context)[0], MID_GREY, offset)
         x = (noise / SOFTEST) ** 2
         amount = LEAST_AMOUNT + MORE_AMOUNT * 4 * x / (1 + x) ** 2
-        return self.with_defaults(amount=amount, limit=LEAST_LIMIT + noise, offset=offset)
+        limits = {"threshold": THRESHOLD * noise, "limit": LEAST_LIMIT + noise}
+        return self.with_defaults(amount=amount, offset=offset, **limits)
 
     @property
     def reach(self) -> int:

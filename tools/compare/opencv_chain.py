@@ -18,7 +18,7 @@ Stage by stage, with the parameters of clpipe's own chain:
 - sharpen: an unsharp mask of the same sigma, amount and limit. Less: it is added to luma, and does
   not scale the colours.
 - tone_curve, gamma, eight bits: one table, cv2.LUT. Less: the curve is on each channel, and hues
-  turn where ``filmic`` keeps them.
+  turn where ``neutral`` keeps them.
 
 There is no clipping to a display, no tile, and no size but an even one.
 """
@@ -36,7 +36,7 @@ from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain
 from clpipe.reference.curve import to_8_bit
 from clpipe.reference.transfer import srgb_curve
-from clpipe.stages.tone_curve.filmic import filmic
+from clpipe.stages.tone_curve.neutral import neutral
 
 CODES = 65536  # of 16 bits
 TOP = CODES - 1
@@ -91,7 +91,7 @@ class OpenCVChain:
         self.radius, self.amount = sharpen.radius, np.float32(sharpen.amount)
         self.limit = np.float32(sharpen.limit / root_of_top)
         light = np.clip((np.arange(CODES) / TOP * root_of_top) ** 2 - offset, 0, 1)
-        self.display = to_8_bit(np.float32(srgb_curve(filmic(np.float32(light)))))
+        self.display = to_8_bit(np.float32(srgb_curve(neutral(np.float32(light)))))
         self.to_colours = cv2.COLOR_YCrCb2BGR if bgr else cv2.COLOR_YCrCb2RGB
 
     def blur(self, render: Array) -> Floats:

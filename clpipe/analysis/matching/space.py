@@ -182,23 +182,15 @@ def smaller(settings: Settings) -> Iterator[Choice]:
 
 
 def chroma_ways(settings: Settings) -> Iterator[Choice]:
-    """What makes the noise of chroma: the colours of the scene or the sensor's; smoother or not.
-
-    Each alone may gain nothing where both together do: a matrix makes chroma noise stronger.
-    """
-    camera = {
-        "color_matrix": {"method": "inverse_camera"},
-        "color_matrix_2": {"method": "camera"},
-    }
+    """What makes the noise of chroma: the colours of the sensor or the scene's; smoother or not."""
+    scene = {"inverse_color_matrix": {"method": "none"}}
     before = SHARPEN if SHARPEN in settings.stages else BEFORE
     smooth = {"denoise_2": SMOOTHER}, {"denoise": before}
-    yield Choice("colours of the scene")
-    yield Choice("colours of the scene, smoother", *smooth)
-    if "color_matrix" in settings.stages:
-        added = {"color_matrix": "mosaic"}
-        yield Choice("colours of the camera", camera, added)
-        both = {**camera, **smooth[0]}, {**added, **smooth[1]}
-        yield Choice("colours of the camera, smoother", *both)
+    yield Choice("colours of the camera")
+    yield Choice("colours of the camera, smoother", *smooth)
+    if "inverse_color_matrix" in settings.stages:
+        yield Choice("colours of the scene", scene)
+        yield Choice("colours of the scene, smoother", {**scene, **smooth[0]}, smooth[1])
 
 
 def usable(method: type[Method]) -> bool:

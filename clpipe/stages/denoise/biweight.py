@@ -12,6 +12,7 @@ from clpipe.reference.image import tap
 from clpipe.reference.roots import from_root, in_steps, noise_in_roots, root_of
 from clpipe.stage import (
     Arguments,
+    CompileTime,
     Context,
     Kind,
     Pass,
@@ -30,24 +31,39 @@ RANGE_LUMA, RANGE_CHROMA = 16.0, 2.5
 # 0.006 a picture of ISO 100 is further from the truth than without denoising.
 LEAST_NOISE = 0.0025
 
+GRAIN = 0.35  # share of luma's noise that stays at a strength of 1, where there is little of it
+
 # Weights by squared distance, px: for luma a binomial window, for chroma a wider one of pixels
 # that demosaicing made of other samples than the centre's.
 LUMA_WINDOW = {1: 0.5, 2: 0.25}
 CHROMA_WINDOW = {2: 0.4, 4: 0.25}
 
 
-def window_offsets(window: Mapping[int, float]) -> list[tuple[int, int, np.float32]]:
+def window_offsets(
+    window: Mapping[int, float], scale: int = 1
+) -> list[tuple[int, int, np.float32]]:
     """The offsets in px, right and down, and weights of a window's pixels but for its centre.
+
+    At a larger scale a pixel at a distance of (1, 1) is one at (scale, scale), and one at (2, 0)
+    is at (scale + 1, 0): so the eight pixels of chroma stay on a ring.
 
     >>> len(window_offsets(LUMA_WINDOW)), len(window_offsets(CHROMA_WINDOW))
     (8, 8)
+    >>> [(dx, dy) for dx, dy, _ in window_offsets(CHROMA_WINDOW, scale=3)][:3]
+    [(0, -4), (-3, -3), (3, -3)]
     """
-    steps = range(-2, 3)
+    steps, at = range(-2, 3), (0, scale, scale + 1)
     squares = [(dx, dy, dx * dx + dy * dy) for dy in steps for dx in steps]
-    return [(dx, dy, np.float32(window[r2])) for dx, dy, r2 in squares if r2 in window]
+    near = [(dx, dy, window[r2]) for dx, dy, r2 in squares if r2 in window]
+    return [
+        (at[abs(dx)] * (1 if dx > 0 else -1), at[abs(dy)] * (1 if dy > 0 else -1), np.float32(w))
+        for dx, dy, w in near
+    ]
 
 
-def biweight(planes: Floats, window: Mapping[int, float], reach: np.float32) -> Floats:
+def biweight(
+    planes: Floats, window: Mapping[int, float], reach: np.float32, scale: int = 1
+) -> Floats:
     """The weighted mean about each pixel, (height, width, plane) in and out.
 
     A pixel weighs (1 - d^2 / reach^2)^2, d its difference from the centre in all planes, or 0 where
@@ -59,7 +75,7 @@ def biweight(planes: Floats, window: Mapping[int, float], reach: np.float32) -> 
     """
     scaled = planes * (np.float32(1) / reach)
     total, weights = scaled.copy(), np.ones_like(planes[..., :1])
-    for dx, dy, near in window_offsets(window):
+    for dx, dy, near in window_offsets(window, scale):
         other = tap(scaled, dx, dy)
         squared = np.square(other - scaled).sum(-1, keepdims=True)
         weight = np.square(np.maximum(np.float32(1) - squared, np.float32(0))) * near
@@ -82,13 +98,24 @@ class Biweight(Denoiser):
     summary: ClassVar = "weighted mean of near pixels, as light as a camera's; keeps grain"
     tolerance: ClassVar = 5e-5  # the kernel's root is a short iteration
 
+    luma_strength: float = parameter(
+        0.5, "Strength on luma, relative to luma_noise; 0 is off.", ge=0, le=100
+    )
     grain: float | None = parameter(
         None,
         "Share of luma's noise that stays as it is.",
         "",
-        "0.35 where there is little noise, less where there is more",
+        "0.35 of the strength, at most 0.35; less where there is much noise",
         ge=0,
         le=1,
+    )
+    chroma_scale: int = parameter(
+        2,
+        "Scale at which chroma is filtered: how far the pixels of its mean are, along both axes.",
+        "px",
+        structural=True,
+        ge=1,
+        le=4,
     )
     offset: float | None = offset_parameter()
 
@@ -103,7 +130,8 @@ class Biweight(Denoiser):
 
     def resolve(self, context: Context) -> Self:
         resolved = super().resolve(context).with_defaults(offset=offset_of_roots(context))
-        return resolved.with_defaults(grain=0.35 / (1 + (resolved.roots[0] / 0.03) ** 2))
+        share = GRAIN * min(resolved.luma_strength, 1.0)
+        return resolved.with_defaults(grain=share / (1 + (resolved.roots[0] / 0.03) ** 2))
 
     @property
     def effect(self) -> str:
@@ -145,8 +173,8 @@ class Biweight(Denoiser):
             ),
             Pass(
                 "biweight",
-                Stencil(2),
-                ("grain",),
+                Stencil(self.chroma_scale + 1),
+                ("grain", "chroma_scale"),
                 reads=("planes",),
                 writes="filtered",
                 kind=Kind.YCBCR,
@@ -160,6 +188,7 @@ class Biweight(Denoiser):
             "luma_range": np.float32(luma),
             "chroma_range": np.float32(chroma),
             "grain": np.float32(self.grain),
+            "chroma_scale": CompileTime(str(self.chroma_scale)),
             "offset": np.float32(self.offset),
         }
 
@@ -172,5 +201,5 @@ class Biweight(Denoiser):
         y, c = planes[..., :1], planes[..., 1:]
         filtered = biweight(y, LUMA_WINDOW, luma_range)
         y = filtered + grain * (y - filtered)
-        c = biweight(c, CHROMA_WINDOW, chroma_range)
+        c = biweight(c, CHROMA_WINDOW, chroma_range, self.chroma_scale)
         return from_root(ycbcr_to_rgb(np.concatenate([y, c], axis=-1)), offset)

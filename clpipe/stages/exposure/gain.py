@@ -30,7 +30,7 @@ class Gain(Method):
     headroom: float = parameter(
         1.0,
         "How far the sensor's white lies above a render's 1.0, for highlights; "
-        "the tone curve filmic gives one stop of it back, linear all.",
+        "the tone curve neutral gives one stop of it back, linear all.",
         "EV",
         ge=0,
         le=10,

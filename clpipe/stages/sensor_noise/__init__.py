@@ -4,11 +4,12 @@ from clpipe.stage import Kind, Stage
 from clpipe.stages.sensor_noise.gaussian import Gaussian
 from clpipe.stages.sensor_noise.no_noise import NoNoise
 from clpipe.stages.sensor_noise.poisson import Poisson
+from clpipe.stages.sensor_noise.skewed_gaussian import SkewedGaussian
 
 STAGE = Stage(
     "sensor_noise",
     "Add shot and read noise.",
     Kind.MOSAIC,
     Kind.MOSAIC,
-    (Gaussian, Poisson, NoNoise),
+    (SkewedGaussian, Gaussian, Poisson, NoNoise),
 )

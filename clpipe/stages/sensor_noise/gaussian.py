@@ -28,14 +28,15 @@ class Gaussian(SensorNoise):
     kernel: ClassVar = "sensor_noise_gaussian"
     summary: ClassVar = "add Gaussian noise of variance a*y + b"
     other_examples: ClassVar = ({"tukey_lambda": -0.2, "full_well": 1000.0},)
+    functions: ClassVar = ("sensor_noise", "sensor_noise_tukey")  # in the kernel file
 
     def passes(self) -> tuple[Pass, ...]:
+        of_gaussian, of_tukey = self.functions
         if self.tukey_lambda is None:
-            return (
-                Pass("sensor_noise", arguments=("a", "b", "full_well"), random=NoiseScope.IMAGE),
-            )
+            names: tuple[str, ...] = ("a", "b", "full_well")
+            return (Pass(of_gaussian, arguments=names, random=NoiseScope.IMAGE),)
         names = ("a", "full_well", "read_noise", "shape", "scale")
-        return (Pass("sensor_noise_tukey", arguments=names, random=NoiseScope.IMAGE),)
+        return (Pass(of_tukey, arguments=names, random=NoiseScope.IMAGE),)
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
         if self.tukey_lambda is None:  # here a negative signal lowers the variance below b
@@ -52,9 +53,13 @@ class Gaussian(SensorNoise):
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         n = self.numbers()
         normals = normal_at(image.shape, 0, given.stream[NoiseScope.IMAGE])
-        variance = n["a"] * image + n.get("b", np.float32(0))
-        noise = normals * square_root(np.maximum(variance, np.float32(0)))
+        noise = self.noise(normals, image, n["a"], n.get("b", np.float32(0)))
         noisy = np.minimum(image + noise, n["full_well"])
         if self.tukey_lambda is None:
             return noisy
         return noisy + self.unit_read_noise(image, given) * n["read_noise"]
+
+    @staticmethod
+    def noise(normals: Floats, y: Floats, a: np.float32, b: np.float32) -> Floats:
+        """The noise in a signal y that standard normals make."""
+        return normals * square_root(np.maximum(a * y + b, np.float32(0)))

@@ -18,7 +18,8 @@ from clpipe.stage import (
     Stage,
     parameter,
 )
-from clpipe.stages.tone_curve.filmic import Filmic
+from clpipe.stages.tone_curve.neutral import Neutral
+from clpipe.stages.tone_curve.standard import Standard
 from clpipe.stages.tone_curve.table import table_of
 
 CAMERA_RAW = str(resources.files("clpipe.stages.tone_curve") / "camera_raw.csv")
@@ -39,11 +40,11 @@ class CameraRaw(Curve):
 
 
 class Linear(Method):
-    """No curve: the scene's contrast, as bright as it was before ``exposure`` left headroom."""
+    """No curve: the picture as sRGB shows the render; the headroom is given back."""
 
     method: ClassVar = "linear"
     kernel: ClassVar = "exposure"
-    summary: ClassVar = "no curve; gives back the headroom that exposure left"
+    summary: ClassVar = "no curve: the picture as sRGB shows the render"
     example: ClassVar = {"headroom": 1.0}
 
     headroom: float | None = parameter(
@@ -99,5 +100,5 @@ STAGE = Stage(
     "Give the image the contrast of a photograph.",
     Kind.RGB,
     Kind.RGB,
-    (Filmic, CameraRaw, Linear, File),
+    (Standard, Neutral, CameraRaw, Linear, File),
 )

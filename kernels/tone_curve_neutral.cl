@@ -4,7 +4,7 @@
 
 // The chord's slope between both ends has their denominators below it, and the difference of the ends
 // cancels: one division does for all. `twist` is a d - b c.
-INLINE rgb filmic(rgb v, site at, float a, float b, float c, float d, float twist) {
+INLINE rgb neutral(rgb v, site at, float a, float b, float c, float d, float twist) {
 #pragma OPENCL FP_CONTRACT ON
     const extremes x = extremes_of(v);
     const vf below_low = x.low * (c * x.low + d) + 1.0f;

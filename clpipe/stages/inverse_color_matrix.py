@@ -1,0 +1,44 @@
+"""Inverse colour matrix: from linear sRGB to a camera's white-balanced RGB, for a render."""
+
+from typing import Annotated, ClassVar
+
+from pydantic import BeforeValidator
+
+from clpipe.camera.profile import IDENTITY, Matrix
+from clpipe.stage import Context, Kind, Stage, StageRole, parameter
+from clpipe.stages.color_matrix import FixedMatrix, NoMatrix, as_tuples
+
+
+class SrgbToCamera(FixedMatrix):
+    """Linear sRGB to white-balanced camera RGB, as the sensor sees a render.
+
+    The matrix is :meth:`clpipe.camera.profile.Camera.srgb_to_camera`. The way back mixes the noise
+    of the three colours, as in a camera. Where a camera's matrix is not known, colours stay.
+    """
+
+    method: ClassVar = "camera"
+    summary: ClassVar = "linear sRGB to camera RGB, where the camera's matrix is known"
+    example: ClassVar = {}
+
+    matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = parameter(
+        None,
+        "Three rows of three numbers, from linear sRGB to camera RGB.",
+        auto="from the camera; else none",
+    )
+
+    def resolve(self, context: Context) -> "SrgbToCamera":
+        if self.matrix is not None:
+            return self
+        if context.camera.xyz_to_camera is None:
+            return self.with_defaults(matrix=IDENTITY)
+        return self.with_defaults(matrix=as_tuples(context.camera.srgb_to_camera().tolist()))
+
+
+STAGE = Stage(
+    "inverse_color_matrix",
+    "Convert linear sRGB to the camera's colours.",
+    Kind.RGB,
+    Kind.RGB,
+    (SrgbToCamera, FixedMatrix, NoMatrix),
+    role=StageRole.COLOURS_OF_LIGHT,
+)

@@ -1,0 +1,150 @@
+"""A camera's standard picture style: an S-curve that keeps hues and grey, and its inverse."""
+
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+
+from clpipe.base.types import Floats
+from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, parameter
+from clpipe.stages.tone_curve.hue import inside_of
+
+# 18 % grey with one stop of headroom, and what it becomes: as bright as sRGB shows it, nearly.
+GREY, GREY_OUT = 0.09, 0.173
+NAMES = ("grey", "a", "b", "c", "d", "bright_a", "bright_b", "bright_c", "bright_d")
+WHITER = 0.5  # by which colourfulness falls up to the brightest highlights, which turn white
+
+
+@dataclass(frozen=True)
+class Piece:
+    """The curve v (a v + b) / (v (c v + d) + 1), which rises from (0, 0)."""
+
+    a: float
+    b: float
+    c: float
+    d: float
+
+    @classmethod
+    def between(cls, width: float, height: float, first: float, last: float) -> Self:
+        """The monotone curve from (0, 0) to (width, height) of two slopes at its ends.
+
+        It is the rational quadratic of Gregory and Delbourgo (IMA J. Numer. Anal. 1982, eq. 2.3).
+        """
+        chord = height / width
+        bend = (first + last - 2 * chord) / height
+        return cls((chord - first) / width, first, -bend / width, bend)
+
+    def at(self, v: Floats) -> Floats:
+        """The curve."""
+        a, b, c, d = (np.float32(each) for each in (self.a, self.b, self.c, self.d))
+        return np.asarray(v * (a * v + b) / (v * (c * v + d) + np.float32(1)))
+
+    def inverse(self, y: Floats) -> Floats:
+        """The root of (a - c y) v^2 + (b - d y) v - y = 0 that is not negative."""
+        a, b, c, d = (np.float32(each) for each in (self.a, self.b, self.c, self.d))
+        quadratic, linear = a - c * y, b - d * y
+        root = np.sqrt(np.maximum(linear * linear + np.float32(4) * quadratic * y, np.float32(0)))
+        two = np.float32(2)
+        above = np.where(linear > 0, two * y, root - linear)
+        below = np.where(linear > 0, linear + root, two * quadratic)
+        return np.asarray(above / np.maximum(below, np.float32(1e-12)))
+
+
+class Standard(Method):
+    """An S-curve as cameras' standard picture styles have it, which keeps grey and hues.
+
+    It is meant for a raw with one stop of headroom, as ``exposure`` leaves it: 0.09, which is then
+    18 % grey, becomes 0.173. From black to grey and from grey to white goes a rational quadratic
+    each (Gregory and Delbourgo, IMA J. Numer. Anal. 1982), and the parameters are their slopes. The
+    toe takes the noise of shadows down, the shoulder that of highlights, as in a camera.
+
+    The largest of the three colours takes the curve's value, and the others keep their ratio to it,
+    so hue and saturation stay, in CIELAB as well. Then all move from the grey of the largest, or
+    towards it: ``saturation`` says how far, and the brightest highlights turn whiter.
+
+    >>> from clpipe.stage import run_reference
+    >>> greys = np.float32([0, 0.01, 0.09, 0.5, 1])[:, None, None].repeat(3, 2)
+    >>> run_reference(Standard(), greys)[:, 0, 0].astype(float).round(3).tolist()
+    [0.0, 0.005, 0.173, 0.844, 1.0]
+    """
+
+    method: ClassVar = "standard"
+    kernel: ClassVar = "tone_curve_standard"
+    summary: ClassVar = "a camera's S-curve with toe and shoulder; keeps grey and hues"
+    tolerance: ClassVar = 1e-5  # sums may be contracted
+    example: ClassVar = {"contrast": 1.3, "toe": 1.0, "shoulder": 0.4}
+
+    contrast: float = parameter(
+        2.2,
+        "Slope at grey: by how many stops the picture changes for one of light.",
+        ge=0.1,
+        le=10,
+    )
+    toe: float = parameter(
+        0.85,
+        "How much darker shadows are: what the slope at black lacks to that of the line from black "
+        "to grey; 1 begins level.",
+        ge=0,
+        le=1,
+    )
+    shoulder: float = parameter(
+        0.95,
+        "How softly highlights end: what the slope at white lacks to that of the line from grey to "
+        "white; 1 ends level.",
+        ge=0,
+        le=1,
+    )
+
+    saturation: float = parameter(
+        1.0, "Distance of colours from grey, relative to the scene's.", gt=0.5, le=3
+    )
+
+    @property
+    def pieces(self) -> tuple[Piece, Piece]:
+        """From black to grey, and from white back to grey."""
+        dark, bright = GREY_OUT / GREY, (1 - GREY_OUT) / (1 - GREY)
+        slope = self.contrast * dark
+        return (
+            Piece.between(GREY, GREY_OUT, (1 - self.toe) * dark, slope),
+            Piece.between(1 - GREY, 1 - GREY_OUT, (1 - self.shoulder) * bright, slope),
+        )
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("standard", arguments=(*NAMES, "saturation")),)
+
+    def numbers(self, grey: float) -> Arguments:
+        """The kernel's arguments; ``grey`` is where the pieces meet, before or after the curve."""
+        numbers = (grey, *(x for p in self.pieces for x in (p.a, p.b, p.c, p.d)))
+        named = dict(zip(NAMES, map(np.float32, numbers), strict=True))
+        return {**named, "saturation": np.float32(self.saturation)}
+
+    def arguments(self, context: Context) -> Arguments:
+        return self.numbers(GREY)
+
+    def curve(self, x: Floats) -> Floats:
+        """The curve on values 0..1 of any shape."""
+        dark, bright = self.pieces
+        one = np.float32(1)
+        return np.asarray(np.where(x < np.float32(GREY), dark.at(x), one - bright.at(one - x)))
+
+    def inverse(self, y: Floats) -> Floats:
+        """The inverse of :meth:`curve`.
+
+        >>> style = Standard(toe=1.0)
+        >>> style.inverse(style.curve(np.float32([0, 0.02, 0.09, 0.5, 1]))).round(3).tolist()
+        [0.0, 0.019999999552965164, 0.09000000357627869, 0.5, 1.0]
+        """
+        dark, bright = self.pieces
+        one, is_dark = np.float32(1), y < np.float32(GREY_OUT)
+        return np.asarray(np.where(is_dark, dark.inverse(y), one - bright.inverse(one - y)))
+
+    def colourfulness(self, high: Floats) -> Floats:
+        """How much of the distance from the grey of the largest colour stays, by its light."""
+        return np.asarray(np.float32(self.saturation) - np.float32(WHITER) * np.square(high * high))
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        inside = inside_of(image)
+        high = inside.max(-1, keepdims=True)
+        to_high = self.curve(high)
+        part = self.colourfulness(high) * (to_high / np.maximum(high, np.float32(1e-9)))
+        return np.asarray(to_high - (high - inside) * part)
