@@ -186,9 +186,9 @@ def test_a_converter_gives_the_colours_of_our_own_picture(tmp_path, options):
     assert np.abs(np.percentile(ratio, [5, 95], axis=0) - 1).max() < 0.03
 
 
-def test_the_preview_is_our_own_picture(tmp_path):
+def test_the_preview_is_our_neutral_picture(tmp_path):
     formats = ("--format", "dng", "--format", "png", "--truth", "clean")
-    plain = ("--skip", "denoise", "--skip", "sharpen")
+    plain = ("--skip", "denoise", "--skip", "sharpen", "--set", "tone_curve.method=neutral")
     clpipe("run", STILL_LIFE, "-o", tmp_path, *formats, *plain)
     with rawpy.imread(str(tmp_path / "still_life.truth_clean.dng")) as raw:
         preview = raw.extract_thumb().data
@@ -196,9 +196,7 @@ def test_the_preview_is_our_own_picture(tmp_path):
         ours = np.asarray(picture)
     off = np.abs(blocks(preview) - blocks(ours)).max(-1)
     assert np.median(off) < 1.5
-    assert (
-        np.percentile(off, 95) < 7
-    )  # blocks with edges, whose light and whose levels are averaged
+    assert np.percentile(off, 95) < 8  # of edges: one averages light there, the other levels
 
 
 def test_adobes_software_is_told_of_our_tone_curve(tmp_path, scene):
@@ -211,7 +209,11 @@ def test_adobes_software_is_told_of_our_tone_curve(tmp_path, scene):
     assert (np.diff(light) > 0).all()
     x = np.linspace(0, 1, 256, dtype=np.float32)
     greys = x[None, :, None].repeat(3, 2)
-    ours = Pipeline(device="numpy", stages=["tone_curve"]).process(greys, "greys").image
+    ours = (
+        Pipeline(device="numpy", stages=["tone_curve"], tone_curve={"method": "neutral"})
+        .process(greys, "greys")
+        .image
+    )
     spline = CubicSpline(light, tone, bc_type="natural")  # as Adobe's software has it
     assert np.abs(spline(x) - ours[0, :, 0]).max() < 2e-3
     assert first[51110] == 1  # DefaultBlackRender: none

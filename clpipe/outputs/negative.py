@@ -9,13 +9,14 @@ from clpipe.base.errors import RequestError
 from clpipe.chain.chain import Chain
 from clpipe.images.dng import Negative, xyz_to_camera
 from clpipe.stage import Context, Kind, StageRole, run_reference
-from clpipe.stages.tone_curve import STAGE as TONE_CURVE
+from clpipe.stages.tone_curve.neutral import Neutral
 
 
 def negative_of(chain: Chain) -> Negative:
     """The raw of a chain: what its last stage that gives DN makes, else the raw that enters it.
 
-    Its tone curve is the default one, whatever the chain does behind the raw.
+    Its tone curve is ``neutral``, whatever the chain does behind the raw: others lay a curve over
+    colours in their own way, and what is steeper would saturate them.
 
     Raises:
         RequestError: the chain has no raw, or one that DNG cannot hold.
@@ -48,7 +49,7 @@ def negative_of(chain: Chain) -> Negative:
         gains=gains,
         xyz_to_camera=xyz_to_camera(_colours(context, end, is_input), gains),
         noise=context.noise,
-        tone=partial(run_reference, TONE_CURVE.methods[0]()),
+        tone=partial(run_reference, Neutral()),
     )
 
 

@@ -16,12 +16,11 @@ their own development makes of the same enlarged eight times, where no pixel is 
 across an edge. So each is compared with its own tone and colours, whatever they are; what
 smoothing and sharpening change counts.
 
-Converters run as they come, but dcraw with the white balance as shot (-w) and without brightening
-by histogram (-W), which would make two exposures of one. RawTherapee runs twice: with the profile
-that its window gives to a raw (-d), which takes its tone curve from the preview in the DNG and
-sharpens, and with its neutral one. This one and dcraw have no tone curve, so their pictures are
-darker by the headroom that clpipe's exposure leaves in the raw, and what is darker errs by fewer
-levels.
+Converters run as they come, and so their colours are compared: dcraw brightens by histogram, and
+RawTherapee, with the profile that its window gives to a raw (-d), takes its tones from the preview
+in the DNG. Both would make two exposures of one, so noise and edges are compared without: dcraw
+with -W, RawTherapee with its neutral profile. These two have no tone curve, and are darker by the
+headroom that clpipe's exposure leaves in the raw; what is darker errs by fewer levels.
 """
 
 import argparse
@@ -69,22 +68,30 @@ class ComparisonError(Exception):
 class Converter:
     """A raw converter: its command, with words for the DNG, the picture and a folder of its own.
 
-    It prints the picture where PICTURE is no word of the command.
+    It prints the picture where PICTURE is no word of the command. One that ``adapts`` chooses its
+    tones by the picture: of that one colours are compared, and nothing else.
     """
 
     name: str
     package: str
     command: str
+    adapts: bool = False
 
 
 CONVERTERS = (
-    Converter("dcraw", "dcraw", "dcraw -w -W -T -c DNG"),
+    Converter("dcraw", "dcraw", "dcraw -w -T -c DNG", adapts=True),
+    Converter("dcraw -W", "dcraw", "dcraw -w -W -T -c DNG"),
     Converter(
         "darktable",
         "darktable",
         "darktable-cli DNG PICTURE --core --disable-opencl --configdir HOME --library :memory:",
     ),
-    Converter("RawTherapee", "rawtherapee", "rawtherapee-cli -d -o PICTURE -n -b8 -Y -c DNG"),
+    Converter(
+        "RawTherapee",
+        "rawtherapee",
+        "rawtherapee-cli -d -o PICTURE -n -b8 -Y -c DNG",
+        adapts=True,
+    ),
     Converter("RawTherapee, neutral", "rawtherapee", "rawtherapee-cli -o PICTURE -n -b8 -Y -c DNG"),
 )
 
@@ -106,12 +113,18 @@ class Comparison:
         ours = {f"clpipe, {Path(c).stem}": f"clpipe-{Path(c).stem}" for c in self.configs}
         return ours | {c.name: c.name for c in self.converters}
 
+    @property
+    def steady(self) -> list[str]:
+        """The makers that develop each picture alike."""
+        adapting = {c.name for c in self.converters if c.adapts}
+        return [maker for maker in self.makers if maker not in adapting]
+
     def folder(self, maker: str, iso: float) -> Path:
         """Where a maker's pictures of an ISO are."""
         return self.out / self.makers[maker] / f"iso{iso:g}"
 
     def develop(self, images: Sequence[Path], iso: float, noisy: bool = True) -> None:
-        """Develop renders by all makers, with and without noise; without alone if not ``noisy``.
+        """Develop renders, with and without noise by the steady makers; else, without, by all.
 
         Raises:
             ComparisonError: a program fails.
@@ -134,7 +147,7 @@ class Comparison:
             ]
             run([*map(str, command), *dng, "--quiet", "--redo", "all"], os.environ.copy())
         for converter in self.converters:
-            for image in images:
+            for image in images if not (noisy and converter.adapts) else ():
                 for name in (image.stem, f"{image.stem}.truth")[not noisy :]:
                     negative = self.folder(ours[0], iso) / f"{name}.dng"
                     picture = self.folder(converter.name, iso) / f"{name}.png"
@@ -212,7 +225,7 @@ def noise_rows(
 ) -> Iterator[list[str]]:
     """The rows of the table of noise."""
     for iso in isos:
-        for maker in comparison.makers:
+        for maker in comparison.steady:
             chart = [comparison.picture(maker, iso, SATURATED, noisy) for noisy in (True, False)]
             y = luma(chart[1])
             patches = patch_places(len(y)) & (y >= DARKEST) & (y <= BRIGHTEST)
@@ -236,7 +249,7 @@ def colour_rows(comparison: Comparison) -> Iterator[list[str]]:
 def edge_rows(comparison: Comparison, names: Sequence[str]) -> Iterator[list[str]]:
     """The rows of the table of edges."""
     for name in names:
-        for maker in comparison.makers:
+        for maker in comparison.steady:
             small = comparison.picture(maker, BASE_ISO, name, noisy=False)
             large = comparison.picture(maker, BASE_ISO, f"{name}-enlarged", noisy=False)
             reference, picture = (
@@ -269,15 +282,15 @@ def middle_of(image: Floats) -> Floats:
 
 def crops(comparison: Comparison, names: Sequence[str], isos: Sequence[float]) -> Image.Image:
     """The sheet: two places of each image, a column a maker."""
-    first, *_ = comparison.makers
+    makers = comparison.steady
     rows = {}
     for name in names:
-        places = telling_places(comparison.picture(first, isos[0], name, noisy=False))
+        places = telling_places(comparison.picture(makers[0], isos[0], name, noisy=False))
         for place in places:
             for iso in isos:
-                pictures = [comparison.picture(maker, iso, name) for maker in comparison.makers]
+                pictures = [comparison.picture(maker, iso, name) for maker in makers]
                 rows[f"{name}, {place.name}, ISO {iso:g}"] = [place.of(each) for each in pictures]
-    return sheet(list(comparison.makers), rows)
+    return sheet(makers, rows)
 
 
 def compare(comparison: Comparison, renders: Sequence[Path], isos: Sequence[float]) -> None:
