@@ -64,10 +64,10 @@ class Thermal(Method):
     )
     doubling: float | None = parameter(
         None,
-        "Difference of temperature that doubles the current.",
+        "Difference of temperature that doubles the current; 0: it does not depend on it.",
         "K",
-        "from the camera; else the current is the same at every temperature",
-        gt=0,
+        "from the camera; else 0",
+        ge=0,
         le=1000,
     )
     spread: float | None = parameter(
@@ -88,7 +88,7 @@ class Thermal(Method):
             exposure_time=context.exposure_time or 0.0,
             reference_temperature=camera.dark_current_temperature,
             current=camera.dark_current,
-            doubling=camera.dark_current_doubling,
+            doubling=camera.dark_current_doubling or 0.0,
             spread=camera.dark_current_spread,
             gain=camera.signal_of(1.0, context.iso),
         )
