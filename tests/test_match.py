@@ -4,6 +4,7 @@ import io
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -25,6 +26,7 @@ from clpipe.analysis.matching.columns import (
     figures_of,
     noise_of_frames,
 )
+from clpipe.analysis.matching.result import ended_by
 from clpipe.analysis.matching.scenes import Scenes, expand, load_scenes, with_holdout
 from clpipe.analysis.matching.simulation import Simulator
 from clpipe.analysis.matching.space import (
@@ -186,13 +188,18 @@ def test_the_table(found, clpipe, monkeypatch, tmp_path):
     monkeypatch.setattr("clpipe.commands.match.EVERY", 0.0)
     one = "clpipe.analysis.matching.result.ambiguities"
     monkeypatch.setattr(one, lambda *_: (Ambiguity(("iso",)),))
+    monkeypatch.setattr("clpipe.analysis.matching.result.ended_by", lambda *_: "iso stopped")
     frames = [folder / f"frame{k}.png" for k in range(3)]
     words = [*frames, "-o", tmp_path / "a.toml", "--iso", 3200, "--device", "numpy"]
-    told = json.loads(clpipe("match", *words, "--json").stdout)["ambiguities"]
-    assert told == [{"names": ["iso"], "correlation": None}]
+    told = json.loads(clpipe("match", *words, "--json").stdout)
+    assert told["ambiguities"] == [{"names": ["iso"], "correlation": None}]
+    assert told["ended_by_range"] == "iso stopped"
     result = clpipe("match", *words)
     assert "warning: iso is not told: a factor of 2" in result.stdout
-    assert "\n# iso is not told: a factor of 2" in (tmp_path / "a.toml").read_text()
+    assert "warning: iso stopped\n" in result.stdout
+    text = (tmp_path / "a.toml").read_text()
+    assert "\n# iso is not told: a factor of 2" in text
+    assert "\n# iso stopped.\n" in text
     assert "note: 3 frames without a mean: kurtosis and tails are left out" in result.stdout
     rows = {line[:22].strip(): line[22:].split() for line in result.stdout.splitlines()}
     assert rows["kurtosis"][-1] == "-"
@@ -200,6 +207,19 @@ def test_the_table(found, clpipe, monkeypatch, tmp_path):
     assert "largest residual of a correlation in places not searched" in result.stdout
     assert "5%; residuals of" in result.stderr
     assert " left\n" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("numbers", "told"),
+    [
+        ({"iso": 6390.0}, "iso stopped at 6400, .* may have more noise"),
+        ({"iso": 100.0}, "iso stopped at 100, .* may have less noise"),
+        ({"iso": 5000.0}, "$"),
+        ({"denoise.luma_strength": 1.0}, "$"),
+    ],
+)
+def test_an_iso_that_stops_where_the_profile_ends_is_told_of(numbers, told):
+    assert re.match(told, ended_by(Settings(camera="nikon-d800", iso=6400), numbers))
 
 
 def test_numbers_that_make_up_for_each_other_are_told_of():

@@ -154,7 +154,7 @@ def match(
     headings, *rows = columns_table(found)
     show(headings, rows, left=1)
     click.echo(f"\n{summary(found)}")
-    for each in found.ambiguities:
+    for each in found.warnings:
         click.echo(f"warning: {each}")
     click.echo(f"wrote {' and '.join(map(str, [output, *([plot] if plot else [])]))}")
 

@@ -18,6 +18,7 @@ from clpipe.base.types import Mask
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import value_text
 
+AT_END = 0.01  # of an ISO: what is as near to an end of the range is at it
 CHECKED = 4  # frames of each pair that are developed when the result is measured
 
 
@@ -66,8 +67,14 @@ class Match:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a reader of the configuration must know: the verdict, and what is ambiguous."""
-        return (self.verdict, *map(str, self.ambiguities))
+        """What a reader of the configuration must know: the verdict and the warnings."""
+        return (self.verdict, *self.warnings)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is ambiguous, and where the camera's ISOs ended the search."""
+        ended = ended_by(self.settings, self.numbers)
+        return (*map(str, self.ambiguities), *([ended] if ended else []))
 
     @property
     def verdict(self) -> str:
@@ -94,6 +101,7 @@ class Match:
             "scenes": [scene.name for scene in self.scenes.each],
             "notes": list(self.scenes.notes),
             "ambiguities": [each.record() for each in self.ambiguities],
+            "ended_by_range": ended_by(self.settings, self.numbers) or None,
             "columns": {
                 seen.name: {
                     "relative": seen.relative,
@@ -103,6 +111,22 @@ class Match:
                 for seen, unseen in zip(self.seen, self.unseen, strict=True)
             },
         }
+
+
+def ended_by(settings: Settings, numbers: Mapping[str, float]) -> str:
+    """What is to be said of an ISO that was searched up to an end of the camera's range, else "".
+
+    >>> ended_by(Settings(camera="nikon-d800"), {"iso": 6400})  # doctest: +ELLIPSIS
+    'iso stopped at 6400, where those of nikon-d800 end: the pictures may have more noise than...'
+    """
+    limits = settings.isos()
+    for end, which in ((limits.low, "less"), (limits.high, "more")):
+        if abs(numbers.get("iso", 0.0) / end - 1) < AT_END:
+            return (
+                f"iso stopped at {end:g}, where those of {settings.camera} end: the pictures may "
+                f"have {which} noise than its profile has at any ISO"
+            )
+    return ""
 
 
 def row_record(row: Row) -> dict[str, float | None]:
