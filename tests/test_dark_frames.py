@@ -16,7 +16,7 @@ SHAPE = (301, 403)
 
 def dark(develop, stage, key="k", shape=SHAPE, **values):
     """A dark frame through one stage, (height, width)."""
-    chain = {"stages": ["mosaic", stage], stage: {"gain": 1e-3, **values}}
+    chain = {"stages": ["mosaic", stage], stage: {"per_electron": 1e-3, **values}}
     if stage != "dark_current":
         chain[stage] = values
     return develop(np.zeros((*shape, 3), np.float32), key, numpy=True, **chain).final
@@ -77,7 +77,7 @@ CAMERAS = ("canon-5d2", "canon-6d", "canon-80d", "nikon-d600", "nikon-d800", "so
 
 
 def test_dark_current_doubles_and_its_pattern_stays(develop):
-    given = {"current": 4.0, "doubling": 6.0, "reference_temperature": 20.0, "gain": 1e-3}
+    given = {"current": 4.0, "doubling": 6.0, "reference_temperature": 20.0, "per_electron": 1e-3}
 
     def sigma(**values):
         return dark(develop, "dark_current", **{**given, "spread": 0.0, **values}).std()
@@ -201,7 +201,7 @@ def test_a_profile_reaches_every_stage():
     assert resolved("crosstalk").share == 0.01
     current = resolved("dark_current")
     assert (current.current, current.doubling) == (3.0, 8.0)
-    assert current.gain == pytest.approx(0.2 / unit)
+    assert current.per_electron == pytest.approx(0.2 / unit)
     shading = resolved("dark_shading")
     assert (shading.slope * unit, shading.offset * unit) == pytest.approx((0.001, 0.2))
     assert resolved("banding").amplitude == pytest.approx(2 * 0.2 / unit)

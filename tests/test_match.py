@@ -37,7 +37,7 @@ from clpipe.analysis.matching.space import (
     smaller,
     space_for,
 )
-from clpipe.analysis.signature import flat_places, signature
+from clpipe.analysis.signature import flat_places, luma, signature
 from clpipe.chain.chain import make_chain
 from clpipe.chain.files import load_config, load_settings
 from clpipe.chain.settings import Settings, overlay
@@ -95,14 +95,15 @@ def test_the_columns_of_the_signature_are_the_signature(burst):
     noise = noise_of_frames([burst[0].astype(np.float64)], mean)
     mask = flat_places(mean)
     own = signature(burst[0], mean, mask).record()
-    found = figures_of(noise, Places(mask))
+    found = figures_of(noise, Places(mask, noise.level))
     assert {name: found[name] for name in own} == pytest.approx(own, rel=1e-5, abs=1e-5)
 
 
 def test_independent_noise(grey):
     clean, noisy = (picture.astype(np.float64) for picture in grey)
-    places = Places(np.ones(clean.shape[:2], bool))
-    found = figures_of(noise := noise_of_frames([noisy], clean), places)
+    noise = noise_of_frames([noisy], clean)
+    places = Places(np.ones(clean.shape[:2], bool), noise.level)
+    found = figures_of(noise, places)
     for name in ("right", "two_below", "chroma_right", "red_green", "green_blue"):
         assert abs(found[name]) < 0.03, name
     # The shares of the plane of frequencies in rings of 1/8 cycle per pixel, up to its corners.
@@ -118,7 +119,8 @@ def test_independent_noise(grey):
 
 def test_noise_against_the_mean_of_a_burst_is_that_of_a_frame(burst):
     frames = [frame.astype(np.float32) for frame in burst]
-    places = Places(flat_places(np.mean(burst, axis=0)))
+    mean = np.mean(burst, axis=0)
+    places = Places(flat_places(mean), luma(mean))
     clean = Pipeline(device="numpy", **KNOWN, skip=["sensor_noise", "row_noise", "column_noise"])
     truth = clean.process(scene(), "").image.astype(np.float64)
     against_truth = figures_of(noise_of_frames(frames, truth), places)
@@ -381,7 +383,7 @@ def test_what_is_developed_goes_through_the_same_jpeg(burst, tmp_path):
     assert scenes.jpeg == JpegEncoding(50, "4:2:0")
     settings = overlay(Settings(), KNOWN)
     one, simulator = scenes.each[0], Simulator(None)
-    places = Places(one.mask)
+    places = Places(one.mask, one.noise.level)
     ours = figures_of(simulator.noise(settings, one, "a"), places)
     without = figures_of(simulator.noise(settings, replace(one, jpeg=None), "a"), places)
     theirs = figures_of(one.noise, places)
@@ -504,7 +506,7 @@ def test_looks_are_like_the_cameras(look, device):
     frames, means = (f"{SHARED}/real_noise/{PAIRS[look]}_?_{kind}.png" for kind in ("real", "mean"))
     simulator, residuals, sizes = Simulator(device), [], []
     for one in load_scenes([frames], [means]).each:
-        places = Places(one.mask | one.holdout)
+        places = Places(one.mask | one.holdout, one.noise.level)
         ours = figures_of(simulator.noise(load_settings(look), one, "test"), places)
         theirs = figures_of(one.noise, places)
         residuals.append([ours[name] - theirs[name] for name in WITHIN])

@@ -53,7 +53,7 @@ def chroma(noise: Doubles, of_luma: Doubles) -> tuple[Doubles, Doubles]:
     return 0.564 * (noise[..., 2] - of_luma), 0.713 * (noise[..., 0] - of_luma)
 
 
-def flat_places(mean: NDArray[np.number]) -> Mask:
+def flat_places(mean: NDArray[np.number], darkest: float = DARKEST) -> Mask:
     """Where a picture without noise is flat and neither dark nor bright, (height, width).
 
     Flat is below the 60th percentile of the gradient of the smoothed luma, and two pixels away from
@@ -61,6 +61,7 @@ def flat_places(mean: NDArray[np.number]) -> Mask:
 
     Args:
         mean: (height, width, 3), 0 to 255.
+        darkest: the least luma that counts.
     """
     from scipy import ndimage
 
@@ -68,7 +69,7 @@ def flat_places(mean: NDArray[np.number]) -> Mask:
     smooth = ndimage.gaussian_filter(y, SMOOTH)
     gradient = np.hypot(ndimage.sobel(smooth, 0), ndimage.sobel(smooth, 1))
     flat = ndimage.binary_erosion(gradient <= np.percentile(gradient, FLAT), np.ones((5, 5)))
-    return np.asarray(flat & (y >= DARKEST) & (y <= BRIGHTEST))
+    return np.asarray(flat & (y >= darkest) & (y <= BRIGHTEST))
 
 
 def noise_of(picture: NDArray[np.number], mean: NDArray[np.number]) -> Doubles:

@@ -151,7 +151,7 @@ class DarkCurrent(TypedDict, total=False):
     reference_temperature: Number
     doubling: Number
     spread: Number
-    gain: Number
+    per_electron: Number
 
 class Blooming(TypedDict, total=False):
     method: Draw | Literal["none", "column"]

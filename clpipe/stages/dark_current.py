@@ -30,7 +30,7 @@ class Thermal(Method):
     spread * D, as hot pixels make its tail long, and stays put for a camera.
 
     >>> from clpipe.stage import run_reference
-    >>> hot = Thermal(exposure_time=10.0, current=2.0, spread=0.0, gain=1e-3)
+    >>> hot = Thermal(exposure_time=10.0, current=2.0, spread=0.0, per_electron=1e-3)
     >>> round(float(run_reference(hot, np.zeros((300, 300), np.float32)).std()), 4)
     0.0045
     """
@@ -38,7 +38,7 @@ class Thermal(Method):
     method: ClassVar = "thermal"
     kernel: ClassVar = "dark_current"
     summary: ClassVar = "add the shot noise and the fixed pattern of dark current"
-    example: ClassVar = {"exposure_time": 30.0, "current": 3.0, "spread": 0.4, "gain": 4e-4}
+    example: ClassVar = {"exposure_time": 30.0, "current": 3.0, "spread": 0.4, "per_electron": 4e-4}
 
     exposure_time: float | None = parameter(
         None,
@@ -78,7 +78,7 @@ class Thermal(Method):
         ge=0,
         le=100,
     )
-    gain: float | None = parameter(
+    per_electron: float | None = parameter(
         None, "Signal of an electron.", "signal/e-", "from the camera and ISO", gt=0, le=1
     )
 
@@ -90,7 +90,7 @@ class Thermal(Method):
             current=camera.dark_current,
             doubling=camera.dark_current_doubling or 0.0,
             spread=camera.dark_current_spread,
-            gain=camera.signal_of(1.0, context.iso),
+            per_electron=camera.signal_of(1.0, context.iso),
         )
         return own.with_defaults(temperature=own.reference_temperature)
 
@@ -125,9 +125,9 @@ class Thermal(Method):
     @property
     def sigmas(self) -> tuple[np.float32, np.float32]:
         """Standard deviations of the shot noise and of the pattern, in signal."""
-        assert self.spread is not None and self.gain is not None
+        assert self.spread is not None and self.per_electron is not None
         shot, pattern = sqrt(self.electrons), self.spread * self.electrons
-        return np.float32(shot * self.gain), np.float32(pattern * self.gain)
+        return np.float32(shot * self.per_electron), np.float32(pattern * self.per_electron)
 
     def arguments(self, context: Context) -> Arguments:
         shot, pattern = self.sigmas

@@ -1,7 +1,8 @@
 """The columns in which two developments are compared: the signature, and more of the same noise.
 
 The columns of :mod:`clpipe.analysis.signature` are joined by more lags, correlations of channels,
-the power spectrum of luma in four bands, and luma noise at four intensities.
+the power spectrum of luma in four bands, and the size and the skew of luma noise by intensity,
+which go further into the shadows than the others.
 """
 
 import itertools
@@ -11,13 +12,14 @@ from functools import cached_property
 
 import numpy as np
 
-from clpipe.analysis.signature import BIN, FEWEST, LUMA, chroma, luma, noise_of
+from clpipe.analysis.signature import BIN, DARKEST, FEWEST, LUMA, chroma, luma, noise_of
 from clpipe.analysis.spatial import energy_left
 from clpipe.base.types import Array, Doubles, Floats, Mask
 
 REACH = 6  # px, the longest lag
 BANDS = (0.0, 0.125, 0.25, 0.375, 0.75)  # edges in cycles per pixel; a corner is at 0.71
-LEVELS = (30, 70, 110, 160, 226)  # of luma; noise by intensity is compared between two of them
+LEVELS = (12, 24, 40, 64, 96, 128, 160, 192, 226)  # of luma; noise is compared between two of them
+SHADOWS, MIDTONES = (24, 48), (64, 160)  # of luma, where the skew of its noise is compared
 BLOCK = 32  # px
 GROUPS = 8  # of blocks, of which a jackknife leaves out one at a time
 FEWEST_FRAMES = 4  # for tails: what is left of a frame beside the mean of few is their mixture
@@ -42,6 +44,7 @@ class Column:
         return ours / theirs - 1 if theirs else np.nan
 
 
+FURTHER = range(3, REACH + 1)  # lags, px
 TAILS = ("kurtosis", "beyond_4_sigma")
 COLUMNS: Mapping[str, Column] = {
     "rms": Column("luma rms, levels", 0.03, relative=True),
@@ -52,11 +55,13 @@ COLUMNS: Mapping[str, Column] = {
     "diagonal": Column("luma, diagonal", 0.02),
     "two_right": Column("luma, 2 right", 0.02),
     "two_below": Column("luma, 2 below", 0.04),
+    **{f"right_{lag}": Column(f"luma, {lag} right", 0.03) for lag in FURTHER},
     "half": Column("luma left after 2x2", 0.02),
     "chroma_rms": Column("chroma rms, levels", 0.1, relative=True),
     "chroma_right": Column("chroma, 1 right", 0.02),
     "chroma_below": Column("chroma, 1 below", 0.03),
     "chroma_two_right": Column("chroma, 2 right", 0.04),
+    **{f"chroma_right_{lag}": Column(f"chroma, {lag} right", 0.04) for lag in FURTHER},
     "red_green": Column("R-G", 0.03),
     "green_blue": Column("G-B", 0.1),
     "red_blue": Column("R-B", 0.1),
@@ -65,22 +70,34 @@ COLUMNS: Mapping[str, Column] = {
         for k, (low, high) in enumerate(itertools.pairwise(BANDS), 1)
     },
     **{
-        f"sigma_{low}": Column(f"luma rms at {low}-{high - 1}, levels", 0.3, relative=True)
+        f"sigma_{low}": Column(f"luma rms at {low}-{high - 1}, levels", 0.04, relative=True)
         for low, high in itertools.pairwise(LEVELS)
     },
+    "skew_shadows": Column("luma skew at {}-{}".format(*SHADOWS), 0.08),
+    "skew_midtones": Column("luma skew at {}-{}".format(*MIDTONES), 0.08),
 }
 
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """The pixels of a scene that count, (height, width)."""
+    """The pixels of a scene that count, and its luma, (height, width) each.
+
+    ``mask`` goes down to the shadows, where noise is told by its intensity; ``bright``, without
+    them, is where everything else is compared.
+    """
 
     mask: Mask
+    level: Doubles
+
+    @cached_property
+    def bright(self) -> Mask:
+        """The pixels that count and are not dark."""
+        return np.asarray(self.mask & (self.level >= DARKEST))
 
     @cached_property
     def pairs(self) -> Doubles:
-        """How many pairs of them there are at each lag, (13, 13); NaN where there is none."""
-        count = products(self.mask[None].astype(np.float64)).round()
+        """How many bright pairs there are at each lag, (13, 13); NaN where there is none."""
+        count = products(self.bright[None].astype(np.float64)).round()
         return np.where(count > 0, count, np.nan)
 
 
@@ -125,9 +142,10 @@ def noise_of_frames(
 
 def figures_of(noise: Noise, places: Places) -> Figures:
     """The columns of noise, over all frames, at the pixels that count."""
-    found, mask = dict.fromkeys(COLUMNS, np.nan), places.mask
+    found, mask = dict.fromkeys(COLUMNS, np.nan), places.bright
     if not mask.any():
         return found
+    names = ("right", "below", "diagonal", "two_right", "two_below", *FURTHER_RIGHT)
     y, cb, cr = noise.planes
     luma_map, *chroma_maps = (autocorrelation(plane, places) for plane in (y, cb, cr))
     chroma_map = (chroma_maps[0] + chroma_maps[1]) / 2
@@ -141,19 +159,21 @@ def figures_of(noise: Noise, places: Places) -> Figures:
         "rms": float(np.sqrt(LUMA @ power @ LUMA)),
         "chroma_rms": float(np.sqrt(sum((p[:, mask] ** 2).mean() for p in (cb, cr)) / 2)),
         "half": energy_left(y, mask),
-        **lags(luma_map, "", ("right", "below", "diagonal", "two_right", "two_below")),
-        **lags(chroma_map, "chroma_", ("right", "below", "two_right")),
+        **lags(luma_map, "", names),
+        **lags(chroma_map, "chroma_", ("right", "below", "two_right", *FURTHER_RIGHT)),
         "red_green": float(red_green),
         "green_blue": float(green_blue),
         "red_blue": float(red_blue),
         **bands(luma_map),
-        **by_intensity(y[:, mask], noise.level[mask]),
+        **by_intensity(y[:, places.mask], noise.level[places.mask]),
     }
     return found
 
 
 PLACES = {"right": (0, 1), "below": (1, 0), "diagonal": (1, 1), "two_right": (0, 2)}
 PLACES["two_below"] = (2, 0)
+FURTHER_RIGHT = {f"right_{lag}": (0, lag) for lag in FURTHER}
+PLACES |= FURTHER_RIGHT
 
 
 def lags(table: Doubles, prefix: str, names: Sequence[str]) -> Figures:
@@ -191,7 +211,7 @@ def autocorrelation(plane: Doubles, places: Places) -> Doubles:
         places: the pixels that count.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
-        covariance = products(plane * places.mask) / (places.pairs * len(plane))
+        covariance = products(plane * places.bright) / (places.pairs * len(plane))
         return np.asarray(covariance / covariance[REACH, REACH])
 
 
@@ -217,7 +237,7 @@ def bands(table: Doubles) -> Figures:
 
 
 def by_intensity(noise: Doubles, level: Doubles) -> Figures:
-    """Tails, over the sigma of the intensity's bin, and luma rms at four intensities.
+    """Luma rms and skew at several intensities; tails, over the sigma of the intensity's bin.
 
     Args:
         noise: of luma, (frame, sample).
@@ -227,6 +247,10 @@ def by_intensity(noise: Doubles, level: Doubles) -> Figures:
     for low, high in itertools.pairwise(LEVELS):
         own = noise[:, (level >= low) & (level < high)]
         found[f"sigma_{low}"] = float(np.sqrt((own**2).mean())) if own.size >= FEWEST else np.nan
+    for name, (low, high) in (("skew_shadows", SHADOWS), ("skew_midtones", MIDTONES)):
+        found[name] = skewness(noise[:, (level >= low) & (level < high)])
+    bright = level >= DARKEST
+    noise, level = noise[:, bright], level[bright]
     bins = (level // BIN).astype(int)
     count = np.bincount(bins) * len(noise)
     first = np.bincount(bins, noise.sum(0))
@@ -240,6 +264,18 @@ def by_intensity(noise: Doubles, level: Doubles) -> Figures:
         found["kurtosis"] = float((squares * squares).mean() / squares.mean() ** 2)
         found["beyond_4_sigma"] = float(1e4 * (np.abs(z) > 4).mean())
     return found
+
+
+def skewness(noise: Doubles) -> float:
+    """The third moment over the cubed sigma; NaN for too few samples.
+
+    >>> skewness(np.array([[0.0, 0.0, 0.0, 4.0]] * 100)), skewness(np.zeros((1, 4)))
+    (1.1547005383792515, nan)
+    """
+    if noise.size < FEWEST or not (sigma := float(noise.std())):
+        return float("nan")
+    own = noise - noise.mean()
+    return float((own * own * own).mean() / sigma**3)
 
 
 def block_numbers(shape: tuple[int, ...]) -> Array:
@@ -257,7 +293,8 @@ def errors_of(noise: Noise, places: Places) -> Figures:
     numbers = block_numbers(mask.shape)
     rank = {number: k for k, number in enumerate(np.unique(numbers[mask]))}
     dealt = np.array([rank.get(k, 0) % GROUPS for k in range(numbers.max() + 1)])[numbers]
-    without = [figures_of(noise, Places(mask & (dealt != group))) for group in range(GROUPS)]
+    parts = (Places(mask & (dealt != group), places.level) for group in range(GROUPS))
+    without = [figures_of(noise, part) for part in parts]
     errors = {}
     for name in COLUMNS:
         values = np.array([figures[name] for figures in without])

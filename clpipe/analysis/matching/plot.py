@@ -50,7 +50,7 @@ def draw(match: Match, path: Path) -> None:
 def mean_table(match: Match, who: str, planes: Sequence[int]) -> Doubles:
     """The autocorrelation of planes (0 luma, 1 Cb, 2 Cr) of "theirs" or "ours", over scenes."""
     tables = [
-        autocorrelation(getattr(scene, who).planes[plane], Places(scene.mask))
+        autocorrelation(getattr(scene, who).planes[plane], Places(scene.mask, scene.theirs.level))
         for scene in match.noises
         for plane in planes
     ]

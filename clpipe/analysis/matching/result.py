@@ -11,7 +11,7 @@ from clpipe.analysis.matching.ambiguity import Ambiguity, ambiguities
 from clpipe.analysis.matching.columns import COLUMNS, TAILS, Noise
 from clpipe.analysis.matching.scenes import Scenes
 from clpipe.analysis.matching.search import Candidate, Search, Target, target_at, target_of
-from clpipe.analysis.matching.space import DEVELOPMENT
+from clpipe.analysis.matching.space import DEVELOPMENT, TONE
 from clpipe.analysis.report import json_number
 from clpipe.base.files import write_new
 from clpipe.base.types import Mask
@@ -227,7 +227,7 @@ def configuration(settings: Settings, scenes: Scenes, remarks: Sequence[str]) ->
     for name, table in record.items():
         if not isinstance(table, dict):
             continue
-        if name in DEVELOPMENT:
+        if name in (*DEVELOPMENT, TONE):
             method = settings.method(name)
             table = {"method": method.method, **method.model_dump(exclude_none=True)}  # noqa: PLW2901
         lines += ["", f"[{name}]", *(f"{key} = {value_text(v)}" for key, v in table.items())]

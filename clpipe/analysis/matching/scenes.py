@@ -27,6 +27,7 @@ CROP = 512  # px; crops begin at multiples of 16, where the blocks of a JPEG do
 CROPS = 4
 FEWEST_FLAT = 4000  # pixels of all scenes that are neither clipped nor near an edge
 FEWEST_OF_EACH = 1000  # and of each
+DARK = 12  # luma, from which on noise is compared by its intensity
 ALIKE = 1e-9  # squares of DN of 255, from rounding in a mean; noise has more
 HOLDOUT = 3  # one crop or block in so many is kept out of the search
 MANY = 6  # crops, of which whole ones are kept out; of fewer, a whole one would be one odd scene
@@ -210,7 +211,7 @@ def checked_scene(
         raise ImageError(f"{paths[0]}: too small; expected {2 * SCENE_BLOCK} px or more each way")
     clean = np.asarray(np.mean(frames, axis=0) if mean is None else mean, np.float64)
     against = str(mean_path) if mean_path else "the mean of the frames"
-    mask = flat_places(clean)
+    mask = flat_places(clean, DARK)
     if mask.sum() < FEWEST_OF_EACH:
         raise ImageError(too_few([str(paths[0])], [clean], int(mask.sum()), FEWEST_OF_EACH))
     still = np.ones_like(mask)

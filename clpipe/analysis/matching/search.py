@@ -306,7 +306,7 @@ class Search:
 
 def target_of(scene: Scene, mask: Mask) -> Target:
     """A scene as what is searched for, at the pixels that count."""
-    return target_at(scene, scene.noise, Places(mask))
+    return target_at(scene, scene.noise, Places(mask, scene.noise.level))
 
 
 def target_at(scene: Scene, noise: Noise, places: Places) -> Target:

@@ -2,7 +2,6 @@
 
 import math
 import threading
-from collections.abc import Hashable
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from clpipe.analysis.matching.columns import Noise, noise_of_frames
 from clpipe.analysis.matching.scenes import Scene
 from clpipe.analysis.matching.space import RESIZE
+from clpipe.base.cache import BoundedCache
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, make_chain, step_names
 from clpipe.chain.methods import base_name
@@ -18,8 +18,9 @@ from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
 from clpipe.images.jpeg import through_jpeg
-from clpipe.stage import Method, ReferenceContext
+from clpipe.stage import Kind, Method, ReferenceContext
 
+LINEAR = 16  # scenes in linear light that are kept: as many as there are, of one tone curve
 UNDONE = ("gamma", "tone_curve")  # by the stage of that name with "inverse_" before it
 # Stages that the light of a picture has gone through.
 SEEN = ("shutter", "defocus", "motion_blur", "distortion", "vignetting", "optical_blur")
@@ -37,7 +38,7 @@ class Simulator:
         self._lock = threading.Lock()
         self._noisy: Runner | None = None  # shares plans with all runners of noisy chains
         self._quiet: Runner | None = None
-        self._linear: dict[Hashable, Floats] = {}
+        self._linear = BoundedCache[Floats](LINEAR)
 
     def noise(self, settings: Settings, scene: Scene, key: str, count: int | None = None) -> Noise:
         """The noise of a scene's development, at the intensities of the camera's pictures.
@@ -70,12 +71,14 @@ class Simulator:
         """The scene in the light, and of the size, that the chain starts on."""
         methods, scale, gain = undoing(chain), scale_of(chain), gain_of(chain)
         key = scene, scale, gain, *((type(m), m.model_dump_json()) for m in methods)
-        if key not in self._linear:
+
+        def undone() -> Floats:
             image = (scene.clean / 255).astype(np.float32)
             for method in methods:
                 image = method.reference(image, ReferenceContext(chain.steps[0].context, {}, {}))
-            self._linear[key] = np.ascontiguousarray(enlarged(image / np.float32(gain), scale))
-        return self._linear[key]
+            return np.ascontiguousarray(enlarged(image / np.float32(gain), scale))
+
+        return self._linear.get(key, undone)
 
 
 def finished(pixels: Array | None, scene: Scene) -> Floats:
@@ -86,7 +89,8 @@ def finished(pixels: Array | None, scene: Scene) -> Floats:
 
 def gain_of(chain: Chain) -> float:
     """By how much a chain brightens linear light, curves aside: in exposure and in linear tone."""
-    return math.prod(float(s.method.gain) for s in chain.steps if hasattr(s.method, "gain"))
+    in_light = (s.method for s in chain.steps if s.stage.reads is Kind.RGB)
+    return math.prod(float(method.gain) for method in in_light if hasattr(method, "gain"))
 
 
 def scale_of(chain: Chain) -> float:

@@ -20,8 +20,9 @@ from clpipe.stage import Method
 
 # The stages whose methods and numbers are searched, in the order in which they are tried.
 DEVELOPMENT = ("denoise", "demosaic", "sharpen")
+TONE = "tone_curve"
 RESIZE, SCALES = "resize", (0.5, 2 / 3, 0.75)  # of cameras' smaller pictures
-BEFORE = "tone_curve"  # where a stage of these goes that the chain lacks
+BEFORE = TONE  # where a stage of these goes that the chain lacks
 SHARPEN = "sharpen"
 # Chroma alone, once more and wider: cameras smooth it at a half or a quarter of the resolution.
 SMOOTHER = {"method": "bilateral", "luma_size": 1, "luma_strength": 0.0, "chroma_size": 7}
@@ -110,13 +111,14 @@ def is_number(annotation: Any) -> bool:
 def dimensions_of(chain: Chain) -> list[Dimension]:
     """The numbers of a chain's development that kernels get as arguments, with their ranges.
 
-    Each is searched within a factor of 8 of its value in the chain, as far as its limits allow.
+    A share is searched from 0 to 1, anything else within a factor of 8 of its value in the chain,
+    as far as its limits allow.
     What is 0 there is switched off, and stays so. Numbers in units of the signal are not searched,
     because they follow from the noise; nor those without an upper limit.
     """
     found = []
     for step in chain.steps:
-        if step.stage.name not in DEVELOPMENT:
+        if step.stage.name not in (*DEVELOPMENT, TONE):
             continue
         for name, declared in type(step.method).model_fields.items():
             extra: Any = declared.json_schema_extra
@@ -129,7 +131,9 @@ def dimensions_of(chain: Chain) -> list[Dimension]:
             low, high = limits_of(declared.metadata)
             start = float(getattr(step.method, name))
             dotted = f"{step.name}.{name}"
-            if start > 0 and math.isfinite(low + high):
+            if start > 0 and 0 <= low < high <= 1:
+                found.append(Dimension(dotted, low, high, start))
+            elif start > 0 and math.isfinite(low + high):
                 ends = max(start / SPAN, low), min(start * SPAN, high)
                 found.append(Dimension(dotted, *ends, start, logarithmic=True))
     return found
@@ -155,7 +159,7 @@ def space_for(settings: Settings, iso_is_given: bool) -> Space:
     if RESIZE not in settings.stages:
         choices[RESIZE] = (Choice("full size"), *smaller(settings))
     choices["chroma"] = tuple(chroma_ways(settings))
-    for name in (*DEVELOPMENT, "tone_curve"):
+    for name in (*DEVELOPMENT, TONE):
         stage = all_stages()[name]
         added = {} if name in settings.stages else {name: BEFORE}
         own = [
@@ -215,7 +219,7 @@ def variants_of(settings: Settings, step: str) -> Iterator[Choice]:
         if get_origin(declared.annotation) is typing.Literal:
             values = [value for value in get_args(declared.annotation) if value != own]
         elif declared.annotation is int and own > 1:
-            values = [own - 2, own + 2, own + 4]
+            values = [own - 2, own - 1, own + 1, own + 2, own + 4]
         elif declared.annotation is float:
             values = [float(f"{own * factor:.3g}") for factor in (0.5, 0.7, 1.4, 2.0)]
         for value in values:

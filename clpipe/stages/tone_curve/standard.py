@@ -96,7 +96,7 @@ class Standard(Method):
     )
 
     saturation: float = parameter(
-        1.0, "Distance of colours from grey, relative to the scene's.", gt=0.5, le=3
+        1.0, "Distance of colours from grey, relative to the scene's.", ge=0.5, le=3
     )
 
     @property

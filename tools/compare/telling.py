@@ -1,0 +1,121 @@
+"""What tells patches of noise apart: scale-free statistics, a linear judge, and distances."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from clpipe.analysis.signature import LUMA
+from clpipe.base.types import Doubles, Mask
+
+PATCH = 48  # px
+RIDGE, SHRINKAGE = 1.0, 0.1
+TINY = 1e-6  # levels, of noise that is none
+
+Judged = Mapping[str, Doubles]  # statistics of patches, (patch, statistic), by camera
+
+
+def statistics(noise: Doubles, level: Doubles) -> dict[str, float]:
+    """The statistics of a patch; those of colour begin with "colour"."""
+    y = noise @ LUMA
+    planes = {"Y": y, "Cb": noise[..., 2] - y, "Cr": noise[..., 0] - y}
+    found: dict[str, float] = {}
+    for name, plane in planes.items():
+        own = of_plane(plane - plane.mean(), level)
+        found |= {f"{name} {key}": value for key, value in own.items()}
+    power = np.corrcoef(noise.reshape(-1, 3).T)
+    red, green, blue = noise.std((0, 1))
+    both = planes["Cb"].std() + planes["Cr"].std()
+    colours = {"R-G": power[0, 1], "R-B": power[0, 2], "G-B": power[1, 2]}
+    colours |= {
+        "R/G": ratio(red, green),
+        "B/G": ratio(blue, green),
+        "chroma/luma": ratio(both, y.std()),
+    }
+    return found | {f"colour {key}": float(value) for key, value in colours.items()}
+
+
+def of_plane(noise: Doubles, level: Doubles) -> dict[str, float]:
+    """The statistics of one plane of a patch, (48, 48), whose mean is 0."""
+    sigma = max(float(noise.std()), TINY)
+    z = noise / sigma
+    found = {f"{k} right": (z[:, k:] * z[:, :-k]).mean() for k in range(1, 7)}
+    found |= {f"{k} below": (z[k:] * z[:-k]).mean() for k in (1, 2, 3)}
+    found |= {f"{k} diagonal": (z[k:, k:] * z[:-k, :-k]).mean() for k in (1, 2)}
+    for size in (2, 4, 8, 16):
+        blocks = noise.reshape(PATCH // size, size, PATCH // size, size).mean((1, 3))
+        found[f"left after {size}"] = 2 * ratio(size * blocks.std(), sigma)
+    found |= {"skew": (z**3).mean(), "kurtosis": np.log((z**4).mean())}
+    found["beyond 2.5"] = (abs(z) > 2.5).mean()
+    window = np.outer(*[np.hanning(PATCH)] * 2)
+    power = abs(np.fft.fft2(noise * window)) ** 2
+    frequency = np.hypot(*np.meshgrid(*[np.fft.fftfreq(PATCH)] * 2))
+    for k in range(4):
+        inside = (frequency >= k / 8) & (frequency < (k + 1) / 8)
+        found[f"band {k}"] = ratio(power[inside].sum(), power.sum())
+    steep = np.hypot(*np.gradient(level))
+    found["dark over bright"] = contrast(noise, level < np.median(level))
+    found["steep over flat"] = contrast(noise, steep > np.percentile(steep, 75))
+    return {key: float(value) for key, value in found.items()}
+
+
+def contrast(noise: Doubles, mask: Mask) -> float:
+    """How much stronger noise is in some places than in the others; 0 where all are alike."""
+    some = mask.any() and not mask.all()
+    return ratio(noise[mask].std(), noise[~mask].std()) if some else 0.0
+
+
+def ratio(one: float, two: float) -> float:
+    """The logarithm of a ratio of sizes."""
+    return float(np.log((one + TINY) / (two + TINY)))
+
+
+def regression(x: Doubles, y: Doubles) -> Doubles:
+    """Weights of a logistic regression with a ridge, by Newton's method; last, the constant's."""
+    x = np.c_[x, np.ones(len(x))]
+    ridge = RIDGE * np.eye(x.shape[1])
+    ridge[-1, -1] = 1e-6
+    weights = np.zeros(x.shape[1])
+    for _ in range(30):
+        p = 1 / (1 + np.exp(-np.clip(x @ weights, -30, 30)))
+        hessian = (x * (p * (1 - p))[:, None]).T @ x + ridge
+        step = np.linalg.solve(hessian, x.T @ (y - p) - ridge @ weights)
+        weights += step
+        if abs(step).max() < 1e-6:
+            break
+    return weights
+
+
+def auc(real: Doubles, made: Doubles) -> float:
+    """The chance that a real patch has the larger score."""
+    order = np.argsort(np.argsort(np.r_[real, made]))
+    return float(
+        (order[: len(real)].sum() - len(real) * (len(real) - 1) / 2) / (len(real) * len(made))
+    )
+
+
+def told(real: Judged, made: Judged, camera: str) -> float:
+    """The AUC on one camera of a judge that was trained on the others."""
+    others = [name for name in real if name != camera]
+    if not others:
+        return float("nan")
+    positive, negative = (np.concatenate([of[name] for name in others]) for of in (real, made))
+    x, y = np.r_[positive, negative], np.r_[np.ones(len(positive)), np.zeros(len(negative))]
+    mean, sigma = x.mean(0), x.std(0) + 1e-9
+    weights = regression((x - mean) / sigma, y)
+    scores = [
+        np.c_[(of[camera] - mean) / sigma, np.ones(len(of[camera]))] @ weights
+        for of in (real, made)
+    ]
+    return auc(*scores)
+
+
+def distance(one: Doubles, two: Doubles, kept: Sequence[int]) -> float:
+    """The Mahalanobis distance of mean statistics, with the covariance of patches, pooled."""
+    one, two = one[:, kept], two[:, kept]
+    covariance = (np.cov(one.T) * len(one) + np.cov(two.T) * len(two)) / (len(one) + len(two))
+    scale = np.sqrt(np.diag(covariance)) + 1e-9
+    correlation = (1 - SHRINKAGE) * covariance / np.outer(scale, scale) + SHRINKAGE * np.eye(
+        len(scale)
+    )
+    gap = (one.mean(0) - two.mean(0)) / scale
+    return float(np.sqrt(gap @ np.linalg.solve(correlation, gap)))
