@@ -108,7 +108,9 @@ def test_arrays_that_are_no_raws(found, text):
 def test_values_that_are_not_allowed(raw):
     with pytest.raises(api.RequestError, match="found key 3; expected a text"):
         noise()(raw, key=3)
-    with pytest.raises(api.RequestError, match="found until, but it runs from prnu to normalize"):
+    with pytest.raises(
+        api.RequestError, match="found until, but it runs from crosstalk to normalize"
+    ):
         noise(until="quantize")
     with pytest.raises(api.RequestError, match="did you mean 'sony-a7r2'"):
         api.RawNoise("sony-a7r22", ISO)

@@ -257,7 +257,7 @@ def test_full_rows_come_before_narrow_tiles():
 
 
 def test_the_halo_is_what_all_stencils_reach_together():
-    assert halos_of(plan_of()) == (1 + 2 + 1 + 2 + 4,)  # optical_blur, demosaic, denoise, sharpen
+    assert halos_of(plan_of()) == (1 + 2 + 1 + 3 + 2,)  # optical_blur, demosaic, denoise, sharpen
     assert halos_of(plan_of(stages=["exposure", "gamma"])) == (0,)
     bilinear = {"stages": ["mosaic", "demosaic"], "demosaic": {"method": "bilinear"}}
     assert halos_of(plan_of(**bilinear)) == (1,)

@@ -2,7 +2,7 @@
 
 import re
 from difflib import get_close_matches
-from functools import cache, cached_property, lru_cache
+from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Annotated
@@ -15,6 +15,7 @@ from clpipe.base.reading import parse_toml, read_text
 from clpipe.base.text import one_of
 from clpipe.base.types import Doubles
 from clpipe.base.validation import first_fault
+from clpipe.camera.gain_stage import GainStage, NotNegative, Offsets, Positive, TukeyLambda
 from clpipe.camera.noise import NoiseModel
 
 DEFAULT_CAMERA = "sony-a7r2"
@@ -32,63 +33,7 @@ SRGB_TO_XYZ = np.array(
     ]
 )
 
-LARGEST = 1e9  # figure of a sensor; its square is a number, too
-Positive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=0.1)]
-
-
-class GainStage(BaseModel):
-    """The measurements at ISOs that share one conversion gain, in ascending order of ISO."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    iso: Annotated[tuple[Positive, ...], Field(min_length=1)]
-    system_gain: tuple[Positive, ...]  # DN/e-
-    read_noise: tuple[Positive, ...]  # DN, of a pixel, before it is rounded to whole DN
-    row_noise: tuple[NotNegative, ...] | None = None  # DN, new in each frame
-    column_noise: tuple[NotNegative, ...] | None = None  # DN, fixed
-
-    @model_validator(mode="after")
-    def _aligned(self) -> "GainStage":
-        for name in ("system_gain", "read_noise", "row_noise", "column_noise"):
-            values = getattr(self, name)
-            if values is not None and len(values) != len(self.iso):
-                raise ValueError(
-                    f"{name} must be as long as iso; found {len(values)} and {len(self.iso)}"
-                )
-        if list(self.iso) != sorted(set(self.iso)):
-            raise ValueError("iso must ascend")
-        return self
-
-    def at(self, iso: float, values: tuple[float, ...]) -> float:
-        """The value in DN of one of this stage's tables at an ISO.
-
-        The table is converted to electrons and interpolated linearly in log ISO; outside the
-        table, the value in electrons stays that of the nearest end.
-        """
-        electrons = np.interp(np.log(iso), np.log(self.iso), np.divide(values, self.system_gain))
-        return float(electrons) * self.gain_at(iso)
-
-    def gain_at(self, iso: float) -> float:
-        """The system gain in DN/e-, interpolated in proportion to the ISO."""
-        per_iso = np.divide(self.system_gain, self.iso)
-        return float(np.interp(np.log(iso), np.log(self.iso), per_iso)) * iso
-
-    @cached_property
-    def adc_noise(self) -> float:
-        """The part of the read noise that arises after the gain, in DN.
-
-        A least-squares fit of read_noise^2 = gain^2 * before^2 + after^2 (EMVA 1288), with each
-        ISO's residual relative to its read_noise^2. It is limited to the smallest read noise, and
-        0 where the stage has fewer than three ISOs, too few to fit.
-        """
-        if len(self.iso) < 3:
-            return 0.0
-        read2 = np.square(self.read_noise)
-        terms = np.stack([np.square(self.system_gain) / read2, 1 / read2], axis=1)
-        _, after2 = np.linalg.lstsq(terms, np.ones(len(read2)))[0]
-        return float(np.sqrt(np.clip(after2, 0, read2.min())))
 
 
 class Camera(BaseModel):
@@ -111,14 +56,28 @@ class Camera(BaseModel):
     row_noise_ratio: NotNegative = 0.0  # row sigma over read noise, for stages without a table
     column_noise_ratio: NotNegative = 0.0
     full_well: Positive | None = None  # e-; None: the ADC clips first
-    tukey_lambda: Annotated[float, Field(gt=-0.5, le=1)] | None = (
-        None  # of read noise; None: Gaussian
-    )
+    tukey_lambda: TukeyLambda | None = None  # of read noise at every ISO; None: Gaussian
     prnu: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # standard deviation over mean
+    crosstalk: Annotated[float, Field(ge=0, le=0.1)] = (
+        0.0  # share of a pixel's charge, to each side
+    )
     dsnu: NotNegative = 0.0  # e-
     hot_pixel_share: Share = 0.0
     hot_pixel_level: NotNegative = 0.0  # e-, the smallest extra charge of a hot pixel
     dead_pixel_share: Share = 0.0
+    rts_share: Share = 0.0  # of pixels with random telegraph noise
+    rts_amplitude: NotNegative = 0.0  # e-, the mean distance of their two levels
+    dark_current: NotNegative = 0.0  # e-/s
+    dark_current_temperature: Annotated[float, Field(ge=-100, le=150)] = (
+        20.0  # deg C, it holds there
+    )
+    dark_current_doubling: Positive | None = None  # K; None: the same at every temperature
+    dark_current_spread: NotNegative = 0.0  # how pixels differ, standard deviation over mean
+    dark_shading_slope: NotNegative = 0.0  # DN for each ISO, standard deviation over the sensor
+    dark_shading_offset: NotNegative = 0.0  # DN, the same of what does not depend on the ISO
+    dark_shading_length: Positive = 500.0  # px, over which both change
+    banding_amplitude: NotNegative = 0.0  # e-, of a wave along the columns
+    banding_period: Positive | None = None  # rows
     pixel_pitch: Positive | None = None  # um, from the centre of a photosite to the next one's
     iso_range: tuple[Positive, Positive]
     gain_stages: Annotated[tuple[GainStage, ...], Field(min_length=1)]
@@ -139,6 +98,12 @@ class Camera(BaseModel):
                 "hot_pixel_share needs hot_pixel_level, the smallest extra charge of a hot pixel "
                 "in e-"
             )
+        if self.tukey_lambda is not None and any(s.tukey_lambda for s in self.gain_stages):
+            raise ValueError("tukey_lambda is for every ISO, or in gain_stages; found both")
+        if self.banding_amplitude and not self.banding_period:
+            raise ValueError("banding_amplitude needs banding_period, in rows")
+        if self.rts_share and not self.rts_amplitude:
+            raise ValueError("rts_share needs rts_amplitude, the mean distance of two levels in e-")
         low, high = self.iso_range
         if low > high:
             raise ValueError(f"iso_range must ascend; found {low:g} and {high:g}")
@@ -213,6 +178,29 @@ class Camera(BaseModel):
     ) -> float:
         dn = stage.at(iso, table) if table else ratio * stage.at(iso, stage.read_noise)
         return dn / self.signal_range
+
+    def tukey_lambda_at(self, iso: float) -> float | None:
+        """The shape of the read noise at an ISO; None is Gaussian. Raises as :meth:`noise`."""
+        stage = self.gain_stage(iso)
+        table = stage.tukey_lambda
+        return stage.between(iso, table) if table else self.tukey_lambda
+
+    def color_bias(self, iso: float) -> Offsets:
+        """The fixed errors of the black level of R, G in R's rows, G in B's rows and B, in signal.
+
+        Raises as :meth:`noise`.
+        """
+        stage = self.gain_stage(iso)
+        table = stage.color_bias or [(0.0,) * 4] * len(stage.iso)
+        one, two, three, four = (
+            stage.between(iso, of) / self.signal_range for of in zip(*table, strict=True)
+        )
+        return one, two, three, four
+
+    def black_level_error(self, iso: float) -> float:
+        """Standard deviation of the black level's error in a frame, in signal; as :meth:`noise`."""
+        stage = self.gain_stage(iso)
+        return self._line_noise(iso, stage, stage.black_level_error, 0.0)
 
     def signal_of(self, electrons: float, iso: float) -> float:
         """The signal that a charge in e- makes at an ISO; raises as :meth:`noise`."""

@@ -129,6 +129,10 @@ class InverseWhiteBalance(TypedDict, total=False):
     red_gain: Number
     blue_gain: Number
 
+class Crosstalk(TypedDict, total=False):
+    method: Draw | Literal["neighbours"]
+    share: Number
+
 class Prnu(TypedDict, total=False):
     method: Draw | Literal["gaussian"]
     sigma: Number
@@ -138,6 +142,21 @@ class DefectPixels(TypedDict, total=False):
     hot_share: Number
     hot_level: Number
     dead_share: Number
+
+class DarkCurrent(TypedDict, total=False):
+    method: Draw | Literal["thermal"]
+    exposure_time: Number
+    temperature: Number
+    current: Number
+    reference_temperature: Number
+    doubling: Number
+    spread: Number
+    gain: Number
+
+class Blooming(TypedDict, total=False):
+    method: Draw | Literal["none", "column"]
+    full_signal: Number
+    spill: Number
 
 class SensorNoise(TypedDict, total=False):
     method: Draw | Literal["skewed_gaussian", "gaussian", "poisson", "none"]
@@ -155,9 +174,20 @@ class SensorNoise(TypedDict, total=False):
     tukey_lambda: Number
     full_signal: Number
 
+class RandomTelegraph(TypedDict, total=False):
+    method: Draw | Literal["two_levels"]
+    share: Number
+    amplitude: Number
+
 class Dsnu(TypedDict, total=False):
     method: Draw | Literal["gaussian"]
     sigma: Number
+
+class DarkShading(TypedDict, total=False):
+    method: Draw | Literal["smooth"]
+    slope: Number
+    offset: Number
+    length: Number
 
 class RowNoise(TypedDict, total=False):
     method: Draw | Literal["gaussian"]
@@ -166,6 +196,16 @@ class RowNoise(TypedDict, total=False):
 class ColumnNoise(TypedDict, total=False):
     method: Draw | Literal["gaussian"]
     sigma: Number
+
+class Banding(TypedDict, total=False):
+    method: Draw | Literal["sine"]
+    amplitude: Number
+    period: Number
+
+class BlackLevelError(TypedDict, total=False):
+    method: Draw | Literal["offsets"]
+    sigma: Number
+    bias: Several
 
 class Quantize(TypedDict, total=False):
     method: Draw | Literal["linear"]
@@ -318,12 +358,19 @@ class Keywords(TypedDict, total=False):
     exposure: Exposure
     mosaic: Mosaic
     inverse_white_balance: InverseWhiteBalance
+    crosstalk: Crosstalk
     prnu: Prnu
     defect_pixels: DefectPixels
+    dark_current: DarkCurrent
+    blooming: Blooming
     sensor_noise: SensorNoise
+    random_telegraph: RandomTelegraph
     dsnu: Dsnu
+    dark_shading: DarkShading
     row_noise: RowNoise
     column_noise: ColumnNoise
+    banding: Banding
+    black_level_error: BlackLevelError
     quantize: Quantize
     normalize: Normalize
     white_balance: WhiteBalance

@@ -21,11 +21,25 @@ FIXED = {
     "pixel_pitch": "um",
     "tukey_lambda": "",
     "prnu": "",
+    "crosstalk": "",
     "dsnu": "e-",
     "hot_pixel_share": "",
     "hot_pixel_level": "e-",
     "dead_pixel_share": "",
+    "rts_share": "",
+    "rts_amplitude": "e-",
+    "dark_current": "e-/s",
+    "dark_current_temperature": "deg C",
+    "dark_current_doubling": "K",
+    "dark_current_spread": "",
+    "dark_shading_slope": "DN/ISO",
+    "dark_shading_offset": "DN",
+    "dark_shading_length": "px",
+    "banding_amplitude": "e-",
+    "banding_period": "rows",
 }
+DERIVED = ("bits",)  # of FIXED, what follows from others
+UNKNOWN = "unknown"
 
 
 @click.command("import", cls=Command)
@@ -151,6 +165,11 @@ def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[st
             [("", "", "", "DN/e-", "e-", "DN", "DN", "DN", "DN"), *signal],
         ),
         (
+            "Dark frames: shape of the read noise, errors of the black level",
+            ("ISO", "tukey_lambda", "color_bias: R, G, G, B", "black_level_error"),
+            [("", "", "DN", "DN"), *(dark_frames_row(camera, i) for i in isos)],
+        ),
+        (
             "The paper's: a = theta/chi, b = theta^2 b' + b'' - theta^2 p0/chi",
             ("ISO", "chi", "theta", "b'", "b''", "p0"),
             paper,
@@ -158,13 +177,33 @@ def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[st
         (
             "At every ISO",
             ("", "value", "unit"),
-            [
-                (key, short_text(value) if value is not None else "unknown", unit)
-                for key, unit in FIXED.items()
-                for value in (getattr(camera, key),)
-            ],
+            [(key, known_text(camera, key), unit) for key, unit in FIXED.items()],
         ),
     ]
+
+
+def known_text(camera: Camera, key: str) -> str:
+    """A figure of a profile that is the same at every ISO, or that it does not say it.
+
+    >>> known_text(load_camera("sony-a7s2"), "prnu")
+    'unknown'
+    """
+    said = key in camera.model_fields_set or key in DERIVED
+    value = getattr(camera, key)
+    return short_text(value) if said and value is not None else UNKNOWN
+
+
+def dark_frames_row(camera: Camera, iso: float) -> tuple[str, ...]:
+    """What is known of dark frames beside their noise at an ISO, as a row."""
+    stage, unit = camera.gain_stage(iso), camera.signal_range
+    shape = camera.tukey_lambda_at(iso)
+    bias = ", ".join(f"{offset * unit:.3g}" for offset in camera.color_bias(iso))
+    return (
+        f"{iso:g}",
+        UNKNOWN if shape is None else f"{shape:.3g}",
+        bias if stage.color_bias else UNKNOWN,
+        f"{camera.black_level_error(iso) * unit:.3g}" if stage.black_level_error else UNKNOWN,
+    )
 
 
 def figures(iso: float, *values: float) -> tuple[str, ...]:
@@ -185,6 +224,9 @@ def noise_at(camera: Camera, iso: float) -> dict[str, Any]:
         "dark_noise": model.b**0.5 * unit,
         "row_noise": camera.row_noise(iso) * unit,
         "column_noise": camera.column_noise(iso) * unit,
+        "tukey_lambda": camera.tukey_lambda_at(iso),
+        "color_bias": [offset * unit for offset in camera.color_bias(iso)],
+        "black_level_error": camera.black_level_error(iso) * unit,
     }
 
 
@@ -202,6 +244,7 @@ def camera_record(camera: Camera, iso: float | None = None) -> dict[str, Any]:
         "aliases": camera.aliases,
         "iso_range": camera.iso_range,
         **{key: getattr(camera, key) for key in FIXED},
+        "unknown": [key for key in FIXED if known_text(camera, key) == UNKNOWN],
         "noise": [noise_at(camera, i) for i in isos],
         "sources": camera.sources,
     }

@@ -16,16 +16,20 @@ from clpipe.images.arrays import as_array
 from clpipe.outputs.patches import pattern_of
 from clpipe.pipeline import Pipeline
 
-FIRST, LAST = "prnu", "normalize"  # what a chain does between the clean mosaic and the noisy one
+FIRST, LAST = (
+    "crosstalk",
+    "normalize",
+)  # what a chain does between the clean mosaic and the noisy one
 MOSAIC, PACKED = 1, 4  # channels
 
 
 class RawNoise(ReadOnly):
     """Puts a camera's noise into clean raws: a transform, to be called with each.
 
-    It runs the default chain from ``prnu`` to ``normalize``: sensor noise, what a sensor does to
-    rows, columns and single pixels, clipping and rounding to DN. Noise depends on the raw, the ISO,
-    the seed and the key; with one ``noise_key``, the bits are those that the raw gets in the chain.
+    It runs the default chain from ``crosstalk`` to ``normalize``: sensor noise, what a sensor does
+    to rows, columns and single pixels, clipping and rounding to DN. Noise depends on the raw, the
+    ISO, the seed and the key; with one ``noise_key``, the bits are those that the raw gets in the
+    chain.
 
     The process that first calls it opens the device. OpenCL does not survive a fork: workers of a
     process that has used it must be spawned.

@@ -83,5 +83,5 @@ def slot_buffer(number: int) -> str:
 
 
 def step_buffer(content: str, step: str) -> str:
-    """The name of a step's buffer: its lines, sums, partials, counts, histogram or estimates."""
+    """The name of a step's buffer: sums, partials, counts, histogram, estimates, a line table."""
     return f"{content}.{step}"

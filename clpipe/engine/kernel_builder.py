@@ -97,8 +97,8 @@ class KernelBuilder:
         return (slots + [slots[-1]] * 2)[:3]
 
     def lines(self, step: str, item: str, written: bool) -> str:
-        """The parameter of a step's line table."""
-        buffer = step_buffer("lines", step)
+        """The parameter of one of a step's line tables."""
+        buffer = step_buffer(item, step)
         return self.buffer(self.name(step, item), "float", buffer, written, restrict=False)
 
     def estimates(self, step: str, written: bool) -> str:

@@ -52,7 +52,7 @@ def buffer_sizes(plan: Plan, extents: Extents, ends: int = 1) -> dict[str, int]:
     for launch in plan.launches:
         match launch:
             case Lines(ops=ops):
-                sizes |= {step_buffer("lines", op.step): longest * 4 for op in ops}
+                sizes |= {step_buffer(op.pass_.writes, op.step): longest * 4 for op in ops}
             case Launch(sums=sums, level=level) if sums:
                 sizes[step_buffer("sums", sums.step)] = extents[level].blocks * 16
                 sizes[step_buffer("partials", sums.step)] = PARTIALS * 32

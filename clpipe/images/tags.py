@@ -11,7 +11,7 @@ from pydantic import TypeAdapter
 
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
-from clpipe.camera.profile import Positive
+from clpipe.camera.gain_stage import Positive
 from clpipe.images.encoding import Encoding
 
 FILM_DIAGONAL = math.hypot(36, 24)  # mm, of a frame of 35 mm film

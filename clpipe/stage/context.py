@@ -22,6 +22,7 @@ class Context:
     pattern: Pattern = "RGGB"
     gains: tuple[float, float] = (1.0, 1.0)  # red, blue: taken out by inverse_white_balance
     applied_gains: tuple[float, float] = (1.0, 1.0)  # red, blue: put back by white_balance
+    exposure_time: float | None = None  # s, where exposure knows it
     headroom: float = 0.0  # stops by which exposure darkened the scene
     colours: Matrix = IDENTITY  # linear sRGB to what red, green and blue are, white-balanced
     noise: NoiseModel | None = None  # of the sensor noise that was added

@@ -64,7 +64,7 @@ class Photometric(Gain):
 
     def next_context(self, context: Context) -> Context:
         headroom = context.headroom + self.headroom - math.log2(WHITE)
-        return replace(context, headroom=headroom)
+        return replace(context, headroom=headroom, exposure_time=self.exposure_time)
 
     def factor(self, iso: float) -> np.float32:
         """The value of a render's unit, over the sensor's full scale, at an ISO."""

@@ -162,7 +162,9 @@ class SensorNoise(Method):
 
     def resolve(self, context: Context) -> Self:
         model, camera = self.model(context), context.camera
-        filled = self.with_defaults(a=model.a, b=model.b, tukey_lambda=camera.tukey_lambda)
+        filled = self.with_defaults(
+            a=model.a, b=model.b, tukey_lambda=camera.tukey_lambda_at(context.iso)
+        )
         return filled.with_defaults(full_well=camera.full_well)
 
     def next_context(self, context: Context) -> Context:

@@ -1,0 +1,81 @@
+"""A gain stage: what was measured of a sensor at the ISOs that share one conversion gain."""
+
+from functools import cached_property
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+LARGEST = 1e9  # figure of a sensor; its square is a number, too
+Positive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
+Offset = Annotated[float, Field(ge=-65535, le=65535, allow_inf_nan=False)]
+TukeyLambda = Annotated[float, Field(gt=-0.5, le=1)]
+Offsets = tuple[Offset, Offset, Offset, Offset]
+
+
+class GainStage(BaseModel):
+    """The measurements at ISOs that share one conversion gain, in ascending order of ISO.
+
+    Each table is as long as ``iso``; None is unknown.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    iso: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    system_gain: tuple[Positive, ...]  # DN/e-
+    read_noise: tuple[Positive, ...]  # DN, of a pixel, before it is rounded to whole DN
+    tukey_lambda: tuple[TukeyLambda, ...] | None = None  # shape of the read noise
+    row_noise: tuple[NotNegative, ...] | None = None  # DN, new in each frame
+    column_noise: tuple[NotNegative, ...] | None = None  # DN, fixed
+    color_bias: tuple[Offsets, ...] | None = None  # DN, of R, G in its row, G in B's row, B; fixed
+    black_level_error: tuple[NotNegative, ...] | None = None  # DN, of each of them, in each frame
+
+    @model_validator(mode="after")
+    def _aligned(self) -> "GainStage":
+        for name in type(self).model_fields:
+            values = getattr(self, name)
+            if values is not None and len(values) != len(self.iso):
+                raise ValueError(
+                    f"{name} must be as long as iso; found {len(values)} and {len(self.iso)}"
+                )
+        if list(self.iso) != sorted(set(self.iso)):
+            raise ValueError("iso must ascend")
+        return self
+
+    def at(self, iso: float, values: tuple[float, ...]) -> float:
+        """The value in DN of one of this stage's tables at an ISO.
+
+        The table is converted to electrons and interpolated linearly in log ISO; outside the
+        table, the value in electrons stays that of the nearest end.
+        """
+        electrons = self.between(iso, tuple(np.divide(values, self.system_gain)))
+        return electrons * self.gain_at(iso)
+
+    def between(self, iso: float, values: tuple[float, ...]) -> float:
+        """The value of a table without a unit at an ISO: linear in log ISO, level beyond its ends.
+
+        >>> stage = GainStage(iso=(100, 400), system_gain=(1, 4), read_noise=(2, 3))
+        >>> round(stage.between(200, (0.1, 0.2)), 6), stage.between(800, (0.1, 0.2))
+        (0.15, 0.2)
+        """
+        return float(np.interp(np.log(iso), np.log(self.iso), values))
+
+    def gain_at(self, iso: float) -> float:
+        """The system gain in DN/e-, interpolated in proportion to the ISO."""
+        return self.between(iso, tuple(np.divide(self.system_gain, self.iso))) * iso
+
+    @cached_property
+    def adc_noise(self) -> float:
+        """The part of the read noise that arises after the gain, in DN.
+
+        A least-squares fit of read_noise^2 = gain^2 * before^2 + after^2 (EMVA 1288), with each
+        ISO's residual relative to its read_noise^2. It is limited to the smallest read noise, and
+        0 where the stage has fewer than three ISOs, too few to fit.
+        """
+        if len(self.iso) < 3:
+            return 0.0
+        read2 = np.square(self.read_noise)
+        terms = np.stack([np.square(self.system_gain) / read2, 1 / read2], axis=1)
+        _, after2 = np.linalg.lstsq(terms, np.ones(len(read2)))[0]
+        return float(np.sqrt(np.clip(after2, 0, read2.min())))

@@ -1,0 +1,105 @@
+"""Banding: a periodic disturbance of the readout, as a power supply makes it."""
+
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.base.types import Floats
+from clpipe.reference.random import philox
+from clpipe.stage import (
+    Arguments,
+    Context,
+    Kind,
+    LineTable,
+    Method,
+    NoiseScope,
+    Pass,
+    ReferenceContext,
+    Stage,
+    parameter,
+)
+
+SINE = tuple(map(np.float32, (42.058693, -76.705859, 81.605249, -41.341702, 6.2831853)))
+
+
+def sine_of_turns(turns: Floats) -> Floats:
+    """The sine of an angle in whole turns, to 4e-6, by * and + alone.
+
+    >>> sine_of_turns(np.float32([0, 0.125, 0.25, 0.5, 7.75])).round(3).tolist()
+    [0.0, 0.7070000171661377, 1.0, 0.0, -1.0]
+    """
+    whole = np.float32(12582912)
+    part = turns - ((turns + whole) - whole)
+    z = np.float32(0.25) - abs(abs(part) - np.float32(0.25))
+    z2 = z * z
+    sum_, *others = SINE
+    total = z2 * sum_
+    for coefficient in others[:-1]:
+        total = (total + coefficient) * z2
+    sine = (total + others[-1]) * z
+    return np.where(part < 0, -sine, sine)
+
+
+class Sine(Method):
+    """y + amplitude * sin(2 pi (row / period + phase)): a wave, of another phase in each frame.
+
+    Rows are read one after the other, so what disturbs the readout in time is a wave over the rows
+    (EMVA 1288, release 4.0, 2021, finds it as a peak of the spectrogram of rows).
+
+    >>> from clpipe.stage import run_reference
+    >>> wave = run_reference(Sine(amplitude=0.1, period=4.0), np.zeros((400, 2), np.float32))
+    >>> round(float(wave.std() * 2**0.5), 3), bool((wave[:, 0] == wave[:, 1]).all())
+    (0.1, True)
+    """
+
+    method: ClassVar = "sine"
+    kernel: ClassVar = "banding"
+    summary: ClassVar = "add a wave over the rows, of another phase in each image"
+    example: ClassVar = {"amplitude": 0.01, "period": 9.7}
+
+    amplitude: float | None = parameter(
+        None, "Of the wave.", "signal", "from the camera and ISO", ge=0, le=1
+    )
+    period: float | None = parameter(
+        None, "Of the wave.", "rows", "from the camera; else 16", ge=2, le=1e5
+    )
+
+    def resolve(self, context: Context) -> "Sine":
+        camera = context.camera
+        amplitude = camera.signal_of(camera.banding_amplitude, context.iso)
+        return self.with_defaults(amplitude=amplitude, period=camera.banding_period or 16.0)
+
+    def passes(self) -> tuple[Pass, ...]:
+        if not self.amplitude:
+            return ()
+        given = ("frequency", "amplitude")
+        return (
+            Pass("wave_of_lines", LineTable("rows"), given, writes="wave", random=NoiseScope.IMAGE),
+            Pass("banding", arguments=("wave",)),
+        )
+
+    @property
+    def frequency(self) -> np.float32:
+        """Of the wave, in turns a row."""
+        assert self.period is not None
+        return np.float32(1 / self.period)
+
+    def arguments(self, context: Context) -> Arguments:
+        return {"frequency": self.frequency, "amplitude": np.float32(self.amplitude)}
+
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        return before + np.float32(self.amplitude) ** 2 / np.float32(2)
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        if not self.amplitude:
+            return image
+        stream, zero = given.stream[NoiseScope.IMAGE], np.zeros(1, np.uint32)
+        word = philox(zero, zero, zero, np.full(1, stream.stage, np.uint32), stream)[0]
+        bits = (word >> np.uint32(1)).view(np.int32)
+        phase = bits.astype(np.float32) * np.float32(4.6566129e-10)
+        rows = np.arange(image.shape[0], dtype=np.float32)
+        wave = sine_of_turns(rows * self.frequency + phase) * np.float32(self.amplitude)
+        return image + wave[:, None]
+
+
+STAGE = Stage("banding", "Add a wave over the rows.", Kind.MOSAIC, Kind.MOSAIC, (Sine,))

@@ -1,0 +1,116 @@
+"""Errors of the black level: what is taken for black is not, in each colour and each frame."""
+
+from typing import Annotated, ClassVar
+
+import numpy as np
+from pydantic import BeforeValidator
+
+from clpipe.base.types import Floats
+from clpipe.reference.random import normal_of_line
+from clpipe.stage import (
+    Arguments,
+    CompileTime,
+    Context,
+    Kind,
+    LineTable,
+    Method,
+    NoiseScope,
+    Pass,
+    ReferenceContext,
+    Stage,
+    parameter,
+)
+
+Bias = tuple[float, float, float, float]
+
+
+def _as_tuple(value: object) -> object:
+    return tuple(value) if isinstance(value, list) else value
+
+
+class Offsets(Method):
+    """y + bias + sigma * n: one offset for each place of the filter array in each frame.
+
+    bias is fixed for a camera and ISO, one number for R, G in the rows of R, G in the rows of B
+    and B (the colour bias of Wei et al., "Physics-based noise modeling for extreme low-light
+    photography", TPAMI 2021, sec. 3.3); n is a standard normal of that colour, new in each frame.
+    Both are in signal units.
+
+    >>> from clpipe.stage import run_reference
+    >>> black = np.zeros((4, 4), np.float32)
+    >>> biased = run_reference(Offsets(sigma=0.0, bias=(0.1, 0.2, 0.3, 0.4)), black)
+    >>> biased[:2, :2].round(1).tolist()
+    [[0.10000000149011612, 0.20000000298023224], [0.30000001192092896, 0.4000000059604645]]
+    """
+
+    method: ClassVar = "offsets"
+    kernel: ClassVar = "black_level_error"
+    summary: ClassVar = "add an offset to each colour, with a part that is new in each frame"
+    example: ClassVar = {"sigma": 0.01, "bias": [0.004, -0.002, 0.001, 0.003]}
+
+    sigma: float | None = parameter(
+        None,
+        "Standard deviation of the offsets of a frame.",
+        "signal",
+        "from the camera and ISO",
+        ge=0,
+        le=1,
+    )
+    bias: Annotated[Bias, BeforeValidator(_as_tuple)] | None = parameter(
+        None,
+        "Fixed offsets of R, G in the rows of R, G in the rows of B and B.",
+        "signal",
+        "from the camera and ISO",
+    )
+
+    def resolve(self, context: Context) -> "Offsets":
+        camera, iso = context.camera, context.iso
+        return self.with_defaults(sigma=camera.black_level_error(iso), bias=camera.color_bias(iso))
+
+    def passes(self) -> tuple[Pass, ...]:
+        if not self.sigma and not any(self.bias or ()):
+            return ()
+        rows, image = LineTable("rows"), NoiseScope.IMAGE
+        even = ("column_0", "bias_00", "bias_01", "sigma")
+        odd = ("column_1", "bias_10", "bias_11", "sigma")
+        return (
+            Pass("errors_of_lines", rows, even, writes="in_even", random=image),
+            Pass("errors_of_lines", rows, odd, writes="in_odd", random=image),
+            Pass("black_level_error", arguments=("in_even", "in_odd")),
+        )
+
+    def _places(self, pattern: str) -> dict[tuple[int, int], np.float32]:
+        """The fixed offset of each place, by its column and row in the filter array."""
+        red, with_red, with_blue, blue = map(np.float32, self.bias or (0.0,) * 4)
+        green = with_red if "R" in pattern[:2] else with_blue
+        others = with_blue if "R" in pattern[:2] else with_red
+        own = {"R": (red, red), "B": (blue, blue), "G": (green, others)}
+        return {(k % 2, k // 2): own[colour][k // 2] for k, colour in enumerate(pattern)}
+
+    def arguments(self, context: Context) -> Arguments:
+        places = self._places(context.pattern)
+        return {
+            "column_0": CompileTime("0u"),
+            "column_1": CompileTime("1u"),
+            **{f"bias_{column}{row}": bias for (column, row), bias in places.items()},
+            "sigma": np.float32(self.sigma),
+        }
+
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        return before + np.float32(self.sigma) ** 2
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        normals = normal_of_line(4, given.stream[NoiseScope.IMAGE]) * np.float32(self.sigma)
+        result = image.copy()
+        for (column, row), bias in self._places(given.context.pattern).items():
+            result[row::2, column::2] += bias + normals[row + 2 * column]
+        return result
+
+
+STAGE = Stage(
+    "black_level_error",
+    "Miss the black level, in each colour.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (Offsets,),
+)

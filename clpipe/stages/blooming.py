@@ -1,0 +1,87 @@
+"""Blooming: what a full pixel cannot hold goes to its neighbours in the column."""
+
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.base.types import Floats
+from clpipe.reference.image import tap
+from clpipe.stage import (
+    Arguments,
+    Context,
+    Kind,
+    Method,
+    Pass,
+    ReferenceContext,
+    Stage,
+    Stencil,
+    Unchanged,
+    parameter,
+)
+
+REACH = 16  # px
+
+
+class NoBlooming(Unchanged):
+    """No blooming, as of sensors that drain what is too much."""
+
+    method: ClassVar = "none"
+    summary: ClassVar = "no blooming, as of sensors with a drain"
+
+
+class Column(Method):
+    """Charge above the full well goes on along the column, half up and half down.
+
+    The pixel k places on gets the share (1 - spill) * spill^(k - 1) of each half, up to 16 px, and
+    holds no more than its own full well. Bright lamps so get streaks.
+
+    >>> from clpipe.stage import run_reference
+    >>> lamp = np.zeros((65, 1), np.float32)
+    >>> lamp[32] = 3
+    >>> run_reference(Column(full_signal=1.0, spill=0.5), lamp)[30:35, 0].tolist()
+    [0.25, 0.5, 1.0, 0.5, 0.25]
+    """
+
+    method: ClassVar = "column"
+    kernel: ClassVar = "blooming"
+    summary: ClassVar = "let charge above the full well go on along the column"
+    example: ClassVar = {"full_signal": 0.4, "spill": 0.7}
+
+    full_signal: float | None = parameter(
+        None, "Signal of a full pixel.", "signal", "from the camera and ISO; else 1", gt=0, le=1e6
+    )
+    spill: float = parameter(
+        0.7, "Share of what a pixel gets too much of that goes one pixel on.", ge=0, lt=1
+    )
+
+    def resolve(self, context: Context) -> "Column":
+        full = context.camera.full_well
+        return self.with_defaults(
+            full_signal=context.camera.signal_of(full, context.iso) if full else 1.0
+        )
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("blooming", Stencil(REACH), ("full", "first", "spill")),)
+
+    def arguments(self, context: Context) -> Arguments:
+        first, spill = np.float32((1 - self.spill) / 2), np.float32(self.spill)
+        return {"full": np.float32(self.full_signal), "first": first, "spill": spill}
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        full, spill = np.float32(self.full_signal), np.float32(self.spill)
+        weight = np.float32((1 - self.spill) / 2)
+        excess = np.maximum(image - full, np.float32(0))
+        got = np.zeros_like(image)
+        for k in range(1, REACH + 1):
+            got = got + (tap(excess, 0, -k) + tap(excess, 0, k)) * weight
+            weight = weight * spill
+        return np.minimum(np.minimum(image, full) + got, full)
+
+
+STAGE = Stage(
+    "blooming",
+    "Let full pixels overflow.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (NoBlooming, Column),
+)

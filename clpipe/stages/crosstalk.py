@@ -1,0 +1,67 @@
+"""Crosstalk: light and charge that a pixel's neighbours get."""
+
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.base.types import Floats
+from clpipe.reference.image import tap
+from clpipe.stage import (
+    Arguments,
+    Context,
+    Kind,
+    Method,
+    Pass,
+    ReferenceContext,
+    Stage,
+    Stencil,
+    parameter,
+)
+
+
+class Neighbours(Method):
+    """y + share * (the four neighbours - 4 y): each pixel gives a share of its charge to each side.
+
+    Neighbours have other colours, so colours come nearer to grey, and edges become softer. It is
+    before shot noise, which stays independent (Holst and Lomheim, CMOS/CCD Sensors and Camera
+    Systems, 2nd ed. 2011).
+
+    >>> from clpipe.stage import run_reference
+    >>> dot = np.zeros((5, 5), np.float32)
+    >>> dot[2, 2] = 1
+    >>> run_reference(Neighbours(share=0.05), dot)[2, 1:4].astype(float).round(2).tolist()
+    [0.05, 0.8, 0.05]
+    """
+
+    method: ClassVar = "neighbours"
+    kernel: ClassVar = "crosstalk"
+    summary: ClassVar = "give a share of each pixel's charge to its four neighbours"
+    example: ClassVar = {"share": 0.02}
+
+    share: float | None = parameter(
+        None,
+        "Share of a pixel's charge that each neighbour gets.",
+        "",
+        "from the camera",
+        ge=0,
+        le=0.2,
+    )
+
+    def resolve(self, context: Context) -> "Neighbours":
+        return self.with_defaults(share=context.camera.crosstalk)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("crosstalk", Stencil(1), ("share",)),) if self.share else ()
+
+    def arguments(self, context: Context) -> Arguments:
+        return {"share": np.float32(self.share)}
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        across = tap(image, -1, 0) + tap(image, 1, 0)
+        down = tap(image, 0, -1) + tap(image, 0, 1)
+        return image + ((across + down) - image * np.float32(4)) * np.float32(self.share)
+
+
+STAGE = Stage(
+    "crosstalk", "Let charge leak to neighbours.", Kind.MOSAIC, Kind.MOSAIC, (Neighbours,)
+)

@@ -1,0 +1,153 @@
+"""Dark current: charge that heat sets free while the shutter is open."""
+
+from math import sqrt
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.base.types import Floats
+from clpipe.reference.math import negative_log
+from clpipe.reference.random import normal_at, word_at
+from clpipe.stage import (
+    Arguments,
+    Context,
+    Kind,
+    Method,
+    NoiseScope,
+    Pass,
+    ReferenceContext,
+    Stage,
+    parameter,
+)
+
+
+class Thermal(Method):
+    """The dark current's shot noise and fixed pattern; its mean is taken off with the black level.
+
+    A pixel gathers D = current * 2^((temperature - reference) / doubling) * time electrons in the
+    mean (EMVA 1288, release 4.0, 2021: dark current). Their shot noise has the variance D, new in
+    each frame. Pixels differ: the pattern has an exponential distribution of the standard deviation
+    spread * D, as hot pixels make its tail long, and stays put for a camera.
+
+    >>> from clpipe.stage import run_reference
+    >>> hot = Thermal(exposure_time=10.0, current=2.0, spread=0.0, gain=1e-3)
+    >>> round(float(run_reference(hot, np.zeros((300, 300), np.float32)).std()), 4)
+    0.0045
+    """
+
+    method: ClassVar = "thermal"
+    kernel: ClassVar = "dark_current"
+    summary: ClassVar = "add the shot noise and the fixed pattern of dark current"
+    example: ClassVar = {"exposure_time": 30.0, "current": 3.0, "spread": 0.4, "gain": 4e-4}
+
+    exposure_time: float | None = parameter(
+        None,
+        "How long charge is gathered.",
+        "s",
+        "from exposure; else 0, which is off",
+        ge=0,
+        le=86400,
+    )
+    temperature: float | None = parameter(
+        None,
+        "Of the sensor.",
+        "deg C",
+        "the reference temperature",
+        ge=-150,
+        le=150,
+    )
+    current: float | None = parameter(
+        None, "At the reference temperature.", "e-/s", "from the camera", ge=0, le=1e6
+    )
+    reference_temperature: float | None = parameter(
+        None, "At which the current holds.", "deg C", "from the camera", ge=-150, le=150
+    )
+    doubling: float | None = parameter(
+        None,
+        "Difference of temperature that doubles the current; 0: it does not depend on it.",
+        "K",
+        "from the camera; else 0",
+        ge=0,
+        le=1000,
+    )
+    spread: float | None = parameter(
+        None,
+        "How pixels differ: standard deviation over mean.",
+        "",
+        "from the camera",
+        ge=0,
+        le=100,
+    )
+    gain: float | None = parameter(
+        None, "Signal of an electron.", "signal/e-", "from the camera and ISO", gt=0, le=1
+    )
+
+    def resolve(self, context: Context) -> "Thermal":
+        camera = context.camera
+        own = self.with_defaults(
+            exposure_time=context.exposure_time or 0.0,
+            reference_temperature=camera.dark_current_temperature,
+            current=camera.dark_current,
+            doubling=camera.dark_current_doubling or 0.0,
+            spread=camera.dark_current_spread,
+            gain=camera.signal_of(1.0, context.iso),
+        )
+        return own.with_defaults(temperature=own.reference_temperature)
+
+    @property
+    def electrons(self) -> float:
+        """What a pixel gathers in the mean, e-."""
+        if not self.current or not self.exposure_time:
+            return 0.0
+        warmer = (self.temperature or 0.0) - (self.reference_temperature or 0.0)
+        factor = 2.0 ** (warmer / self.doubling) if self.doubling else 1.0
+        return float(self.current * factor * self.exposure_time)
+
+    def passes(self) -> tuple[Pass, ...]:
+        if not self.electrons:
+            return ()
+        shot = Pass("dark_shot_noise", arguments=("sigma",), random=NoiseScope.IMAGE)
+        pattern = Pass(
+            "dark_pattern", arguments=("spread",), writes="pattern", random=NoiseScope.CAMERA
+        )
+        if not self.spread:
+            return (shot,)
+        return (
+            pattern,
+            Pass(
+                "dark_shot_noise",
+                arguments=("sigma",),
+                reads=("pattern",),
+                random=NoiseScope.IMAGE,
+            ),
+        )
+
+    @property
+    def sigmas(self) -> tuple[np.float32, np.float32]:
+        """Standard deviations of the shot noise and of the pattern, in signal."""
+        assert self.spread is not None and self.gain is not None
+        shot, pattern = sqrt(self.electrons), self.spread * self.electrons
+        return np.float32(shot * self.gain), np.float32(pattern * self.gain)
+
+    def arguments(self, context: Context) -> Arguments:
+        shot, pattern = self.sigmas
+        return {"spread": pattern, "sigma": shot}
+
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        shot, pattern = self.sigmas
+        return before + (shot**2 + pattern**2)
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        if not self.electrons:
+            return image
+        (shot, pattern), streams = self.sigmas, given.stream
+        if self.spread:
+            words = word_at(image.shape, 0, streams[NoiseScope.CAMERA])
+            bits = (words >> np.uint32(1)).view(np.int32)
+            u = (bits.astype(np.float32) + np.float32(0.5)) * np.float32(4.6566129e-10)
+            own = np.maximum(negative_log(u), np.float32(0)) - np.float32(1)
+            image = image + own * pattern
+        return image + normal_at(image.shape, 1, streams[NoiseScope.IMAGE]) * shot
+
+
+STAGE = Stage("dark_current", "Add what heat sets free.", Kind.MOSAIC, Kind.MOSAIC, (Thermal,))

@@ -1,0 +1,152 @@
+"""Dark shading: smooth maps that a sensor adds to every frame, in the dark as well."""
+
+from math import sqrt
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.base.types import Floats
+from clpipe.reference.random import Stream, normal_of, philox
+from clpipe.stage import (
+    Arguments,
+    CompileTime,
+    Context,
+    Kind,
+    LineTable,
+    Method,
+    NoiseScope,
+    Pass,
+    ReferenceContext,
+    Stage,
+    parameter,
+)
+
+MAPS = 4  # products of a curve over the rows and one over the columns; two for each of both maps
+
+
+def curve(count: int, number: int, per_px: np.float32, stream: Stream) -> Floats:
+    """A smooth random curve of variance 1, (count,): a cubic B-spline of standard normals.
+
+    Args:
+        count: of rows or columns.
+        number: of the curve, in the stream.
+        per_px: knots for each row or column.
+        stream: the source of the normals.
+    """
+    t = np.arange(count, dtype=np.float32) * per_px
+    whole = t.astype(np.int32)
+    f = t - whole.astype(np.float32)
+    f2 = f * f
+    f3, g = f2 * f, np.float32(1) - f
+    one, three, four, six = map(np.float32, (1, 3, 4, 6))
+    weights = (
+        g * g * g,
+        three * f3 - six * f2 + four,
+        three * f2 + three * f - three * f3 + one,
+        f3,
+    )
+    zero = np.zeros(1, np.uint32)
+    stage, draw = np.full(1, stream.stage, np.uint32), np.full(1, number, np.uint32)
+    total = np.zeros(count, np.float32)
+    for k, weight in enumerate(weights):
+        place = (whole + k).astype(np.uint32)
+        total = total + normal_of(philox(place, zero, draw, stage, stream)[0]) * weight
+    return np.asarray(total * np.float32(0.24078))
+
+
+class Smooth(Method):
+    """y + ISO * k(x, y) + b(x, y): two smooth maps, fixed for a camera.
+
+    Feng et al., "Learnability enhancement for low-light raw image denoising: A data perspective"
+    (PMN; TPAMI 2023), find dark shading to be linear in the ISO. The maps here are random, the same
+    for the same camera and seed of the sensor: of each two products of a curve over the rows and
+    one over the columns, which are cubic B-splines with a knot every ``length`` pixels.
+
+    >>> from clpipe.stage import run_reference
+    >>> shaded = run_reference(Smooth(offset=0.01, length=100.0), np.zeros((900, 900), np.float32))
+    >>> steps = np.diff(shaded, axis=0)
+    >>> 0.004 < float(shaded.std()) < 0.02, float(abs(steps).max()) < 0.002
+    (True, True)
+    """
+
+    method: ClassVar = "smooth"
+    kernel: ClassVar = "dark_shading"
+    summary: ClassVar = "add two smooth random maps of the camera, one in proportion to the ISO"
+    example: ClassVar = {"slope": 1e-5, "offset": 0.01, "length": 7.3}
+
+    slope: float | None = parameter(
+        None,
+        "Standard deviation of the map k.",
+        "signal for each ISO",
+        "from the camera",
+        ge=0,
+        le=1,
+    )
+    offset: float | None = parameter(
+        None, "Standard deviation of the map b.", "signal", "from the camera", ge=0, le=1
+    )
+    length: float | None = parameter(
+        None, "Distance of the maps' knots.", "px", "from the camera", ge=4, le=1e5
+    )
+
+    def resolve(self, context: Context) -> "Smooth":
+        camera = context.camera
+        unit = camera.signal_range
+        return self.with_defaults(
+            slope=camera.dark_shading_slope / unit,
+            offset=camera.dark_shading_offset / unit,
+            length=camera.dark_shading_length,
+        )
+
+    def passes(self) -> tuple[Pass, ...]:
+        if not self.slope and not self.offset:
+            return ()
+        tables = [f"{axis}_{k}" for k in range(MAPS) for axis in ("rows", "columns")]
+        return (
+            *(
+                Pass(
+                    "curve_of_lines",
+                    LineTable("rows" if table.startswith("rows") else "columns"),
+                    (f"curve_{number}", "per_px"),
+                    writes=table,
+                    random=NoiseScope.CAMERA,
+                )
+                for number, table in enumerate(tables)
+            ),
+            Pass("dark_shading", arguments=("slope", "offset", *tables)),
+        )
+
+    def _amplitudes(self, iso: float) -> tuple[np.float32, np.float32]:
+        """Of each product of the two maps, so that the standard deviation is what was said."""
+        assert self.slope is not None and self.offset is not None
+        return np.float32(self.slope * iso / sqrt(2)), np.float32(self.offset / sqrt(2))
+
+    @property
+    def _per_px(self) -> np.float32:
+        assert self.length is not None
+        return np.float32(1 / self.length)
+
+    def arguments(self, context: Context) -> Arguments:
+        slope, offset = self._amplitudes(context.iso)
+        numbers = {f"curve_{k}": CompileTime(f"{k}u") for k in range(2 * MAPS)}
+        return {**numbers, "per_px": self._per_px, "slope": slope, "offset": offset}
+
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        """That of noise: what is the same in every frame of a camera, and smooth, is none."""
+        return before
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        if not self.slope and not self.offset:
+            return image
+        stream, (height, width) = given.stream[NoiseScope.CAMERA], image.shape[:2]
+        products = []
+        for k in range(MAPS):
+            down = curve(height, 2 * k, self._per_px, stream)
+            across = curve(width, 2 * k + 1, self._per_px, stream)
+            products.append(down[:, None] * across)
+        slope, offset = self._amplitudes(given.context.iso)
+        of_iso, fixed = products[0] + products[1], products[2] + products[3]
+        return np.asarray(image + (of_iso * slope + fixed * offset))
+
+
+STAGE = Stage("dark_shading", "Add smooth maps of the sensor.", Kind.MOSAIC, Kind.MOSAIC, (Smooth,))

@@ -1,0 +1,110 @@
+"""Random telegraph noise: pixels whose read noise has two levels."""
+
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.base.types import Floats
+from clpipe.reference.math import negative_log
+from clpipe.reference.random import word_at
+from clpipe.stage import (
+    Arguments,
+    Context,
+    Kind,
+    Method,
+    NoiseScope,
+    Pass,
+    ReferenceContext,
+    Stage,
+    parameter,
+)
+
+WORDS = 1 << 31  # the number of different random words that choose the pixels
+
+
+class TwoLevels(Method):
+    """y + A / 2 or y - A / 2 in a share of the pixels, at random in each frame.
+
+    A trap in a pixel's transistor catches an electron and sets it free again, which moves the
+    pixel's level (Wang et al., "Random telegraph signal in CMOS image sensor pixels", IEDM 2006).
+    Which pixels have one, and the distance A of their levels, stays put for a camera; A has an
+    exponential distribution. So some pixels have more read noise than others, and the read noise of
+    all has longer tails.
+
+    >>> from clpipe.stage import run_reference
+    >>> black = np.zeros((400, 400), np.float32)
+    >>> noisy = run_reference(TwoLevels(share=0.05, amplitude=0.1), black)
+    >>> round(float((noisy != 0).mean()), 2), round(float(abs(noisy[noisy != 0]).mean()), 3)
+    (0.05, 0.05)
+    """
+
+    method: ClassVar = "two_levels"
+    kernel: ClassVar = "random_telegraph"
+    summary: ClassVar = "let a share of the pixels jump between two levels of their own"
+    example: ClassVar = {"share": 0.05, "amplitude": 0.05}
+
+    share: float | None = parameter(
+        None, "Share of the pixels that jump.", "", "from the camera", ge=0, le=0.1
+    )
+    amplitude: float | None = parameter(
+        None,
+        "Mean distance of the two levels.",
+        "signal",
+        "from the camera and ISO",
+        ge=0,
+        le=1,
+    )
+
+    def resolve(self, context: Context) -> "TwoLevels":
+        camera = context.camera
+        amplitude = camera.signal_of(camera.rts_amplitude, context.iso)
+        return self.with_defaults(share=camera.rts_share, amplitude=amplitude)
+
+    def passes(self) -> tuple[Pass, ...]:
+        if not self.share or not self.amplitude:
+            return ()
+        given = ("limit", "scale", "amplitude")
+        return (
+            Pass(
+                "telegraph_levels",
+                arguments=given,
+                writes="levels",
+                kind=Kind.PAIR,
+                random=NoiseScope.CAMERA,
+            ),
+            Pass("telegraph", reads=("levels",), random=NoiseScope.IMAGE),
+        )
+
+    @property
+    def _chosen(self) -> tuple[np.int32, np.float32]:
+        """The words below which a pixel is chosen, and 1 over their number."""
+        assert self.share is not None
+        limit = round(self.share * WORDS)
+        return np.int32(limit), np.float32(1 / max(limit, 1))
+
+    def arguments(self, context: Context) -> Arguments:
+        limit, scale = self._chosen
+        return {"limit": limit, "scale": scale, "amplitude": np.float32(self.amplitude)}
+
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        """The mean variance over the sensor: share * E[A^2] / 4, E[A^2] = 2 amplitude^2."""
+        return before + np.float32(self.share) * np.float32(self.amplitude) ** 2 / np.float32(2)
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        (limit, scale), half = self._chosen, np.float32(0.5)
+        words = word_at(image.shape, 0, given.stream[NoiseScope.CAMERA])
+        bits = (words >> np.uint32(1)).view(np.int32)
+        u = (bits.astype(np.float32) + half) * scale
+        step = np.maximum(negative_log(u), np.float32(0)) * np.float32(self.amplitude) * half
+        step = np.where(bits < limit, step, np.float32(0))
+        up = word_at(image.shape, 1, given.stream[NoiseScope.IMAGE]).view(np.int32) >= 0
+        return np.where(up, image + step, image - step)
+
+
+STAGE = Stage(
+    "random_telegraph",
+    "Let some pixels jump between two levels.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (TwoLevels,),
+)

@@ -1,0 +1,15 @@
+// Charge above the full well goes on along the column. Only * and +, so that NumPy gives the same bits.
+INLINE vf excess_at(image src, int row, float full) {
+    return vmax(tap_mosaic(src, 0, row) - full, (vf)(0.0f));
+}
+
+INLINE vf blooming(site at, image src, float full, float first, float spill) {
+    vf got = (vf)(0.0f);
+    float weight = first;
+#pragma unroll
+    for (int k = 1; k <= 16; ++k) {
+        got = got + (excess_at(src, -k, full) + excess_at(src, k, full)) * weight;
+        weight = weight * spill;
+    }
+    return vmin(vmin(tap_mosaic(src, 0, 0), (vf)(full)) + got, (vf)(full));
+}
