@@ -61,7 +61,10 @@ def build(**settings):
         ),
         ({"stages": ["demosaic"]}, "demosaic reads mosaic, but the input gives rgb"),
         ({"skip": ["normalize"]}, "white_balance reads mosaic, but quantize gives raw.*normalize"),
-        ({"skip": ["quantize"]}, "normalize reads raw, but black_level_error gives mosaic.*quantize"),
+        (
+            {"skip": ["quantize"]},
+            "normalize reads raw, but black_level_error gives mosaic.*quantize",
+        ),
         ({"stages": []}, "nothing is left to do"),
         (
             {"color_matrix": {"method": "given", "matrix": [[1, 0, 0], [0, 1, 0], [1, 1, 0]]}},
