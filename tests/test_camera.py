@@ -171,6 +171,37 @@ def test_a_name_that_is_nearly_right(called):
         load_camera(called)
 
 
+# Shapes of read noise as they are published, by camera and ISO.
+SHAPES = {
+    ("canon-5d4", 800): 0.093,
+    ("canon-70d", 800): -0.031,
+    ("canon-700d", 800): -0.018,
+    ("nikon-d850", 800): -0.177,
+    ("sony-imx385", 1600): 0.015,
+    ("sony-imx686", 100): 0.102,
+    ("sony-a7s2", 100): 0.149,
+    ("sony-a7s2", 25600): -0.091,
+}
+
+
+@pytest.mark.parametrize(("name", "iso"), SHAPES)
+def test_the_shape_of_read_noise_is_what_was_published(name, iso):
+    camera = load_camera(name)
+    assert camera.tukey_lambda_at(iso) == pytest.approx(SHAPES[name, iso])
+    assert "github.com" in camera.sources["tukey_lambda"]
+    if camera.full_well:  # it bounds what the lowest ISO shows, and nothing else
+        first = camera.gain_stages[0].iso
+        shown = [camera.signal_of(camera.full_well, i) for i in first if i >= 100]
+        assert min(shown) == pytest.approx(1, rel=0.01)
+
+
+def test_the_black_level_of_the_a7s2_is_what_was_published():
+    camera = load_camera("sony-a7s2")
+    for iso, bias, error in ((6400, -2.254, 0.0591), (1600, 2.428, 0.0388)):
+        assert np.multiply(camera.color_bias(iso), 15871) == pytest.approx([bias] * 4)
+        assert camera.black_level_error(iso) * 15871 == pytest.approx(error)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_every_number_of_a_profile_has_a_source(name):
     camera = load_camera(name)

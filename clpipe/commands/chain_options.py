@@ -48,8 +48,9 @@ config_option = click.option(
     multiple=True,
     metavar="NAME|FILE",
     shell_complete=configs,
-    help=f"A configuration: {', '.join(built_in_configs())}, or a TOML file. Of a second one with "
-    "stages, the development goes behind the raw of the first.",
+    help="A configuration, or several: "
+    f"{', '.join(built_in_configs())}, or a TOML file. Each lies over those before "
+    "it: of one with stages, the development goes behind their raw.",
 )
 
 set_option = click.option(

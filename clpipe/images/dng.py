@@ -78,23 +78,21 @@ def xyz_to_camera(colours: Doubles, gains: tuple[float, float]) -> Doubles:
 def preview(dn: Array, negative: Negative) -> Array:
     """A small sRGB picture of a mosaic, (height, width, 3) uint8, at most 512 pixels a side.
 
-    Each pixel is the mean of a block of the mosaic: of its red, its green and its blue sites. It
-    has the tone curve: RawTherapee makes its own curve so that its picture has the preview's tones.
+    Each pixel is one red, green and blue site of the mosaic, as noisy as they are, and has the tone
+    curve: RawTherapee makes its own curve so that its picture has as many dark and bright pixels.
     """
     rows, columns = (max(side // 2, 1) for side in dn.shape)
     block = -(-max(rows, columns) // PREVIEW_SIDE)
-    high, wide = max(rows // block, 1), max(columns // block, 1)
+    high, wide, middle = max(rows // block, 1), max(columns // block, 1), block // 2 * 2
     red_x, red_y = red_site(negative.pattern)
 
-    def mean(x: int, y: int) -> Floats:
-        site = dn[min(y, dn.shape[0] - 1) :: 2, min(x, dn.shape[1] - 1) :: 2]
-        site = site[: high * block, : wide * block]
-        tall, broad = site.shape[0] // high, site.shape[1] // wide
-        blocks = site[: high * tall, : wide * broad].reshape(high, tall, wide, broad)
-        return blocks.mean((1, 3), np.float32)
+    def site(x: int, y: int) -> Floats:
+        top, left = min(middle + y, dn.shape[0] - 1), min(middle + x, dn.shape[1] - 1)
+        found = dn[top :: 2 * block, left :: 2 * block]
+        return found[:high, :wide].astype(np.float32)
 
-    green = (mean(1 - red_x, red_y) + mean(red_x, 1 - red_y)) / 2
-    planes = np.stack([mean(red_x, red_y), green, mean(1 - red_x, 1 - red_y)], axis=-1)
+    green = (site(1 - red_x, red_y) + site(red_x, 1 - red_y)) / 2
+    planes = np.stack([site(red_x, red_y), green, site(1 - red_x, 1 - red_y)], axis=-1)
     signal = (planes - negative.black_level) / (negative.white_level - negative.black_level)
     neutral = np.array([1 / negative.gains[0], 1, 1 / negative.gains[1]])
     clipped = np.clip(signal / neutral, 0, 1) * neutral

@@ -146,7 +146,7 @@ class SensorModel:
             source = "as the file has it, as shot"
             if not self.gains:
                 source = "not in the file; stands in: the middle of the range of Brooks et al. 2019"
-            matrix_source = "not in the file, so color_matrix has no camera for it"
+            matrix_source = "not in the file, so colours stay as they are"
         colours: dict[str, Any] = {"white_balance_gains": gains}
         if matrix:
             colours["xyz_to_camera"] = matrix
