@@ -26,6 +26,7 @@ BEFORE = TONE  # where a stage of these goes that the chain lacks
 SHARPEN = "sharpen"
 # Chroma alone, once more and wider: cameras smooth it at a half or a quarter of the resolution.
 SMOOTHER = {"method": "bilateral", "luma_size": 1, "luma_strength": 0.0, "chroma_size": 7}
+COARSER = {"method": "biweight", "luma_strength": 0.0, "chroma_scale": 4}
 SEARCHED_UNITS = ("", "px")  # what is in units of the signal follows from the noise
 SPAN = 8.0  # a number is searched within this factor of where it starts
 
@@ -186,15 +187,15 @@ def smaller(settings: Settings) -> Iterator[Choice]:
 
 
 def chroma_ways(settings: Settings) -> Iterator[Choice]:
-    """What makes the noise of chroma: the colours of the sensor or the scene's; smoother or not."""
-    scene = {"inverse_color_matrix": {"method": "none"}}
+    """What makes the noise of chroma: the colours of the sensor or the scene's; smoothed again."""
     before = SHARPEN if SHARPEN in settings.stages else BEFORE
-    smooth = {"denoise_2": SMOOTHER}, {"denoise": before}
-    yield Choice("colours of the camera")
-    yield Choice("colours of the camera, smoother", *smooth)
+    colours: dict[str, dict[str, Any]] = {"colours of the camera": {}}
     if "inverse_color_matrix" in settings.stages:
-        yield Choice("colours of the scene", scene)
-        yield Choice("colours of the scene, smoother", {**scene, **smooth[0]}, smooth[1])
+        colours["colours of the scene"] = {"inverse_color_matrix": {"method": "none"}}
+    for text, values in colours.items():
+        yield Choice(text, values)
+        for more, again in ((", smoother", SMOOTHER), (", coarser", COARSER)):
+            yield Choice(text + more, {**values, "denoise_2": again}, {"denoise": before})
 
 
 def usable(method: type[Method]) -> bool:
