@@ -21,6 +21,7 @@ from clpipe.analysis.calibration.checks import (
     linearity_notes,
 )
 from clpipe.analysis.calibration.dark import DarkFrames
+from clpipe.analysis.calibration.dark_figures import DarkFigures, dark_figures
 from clpipe.analysis.calibration.line_fit import Bin, binned, fit_line
 from clpipe.analysis.calibration.repeats import CHANNELS, Sensor
 from clpipe.analysis.calibration.result import Calibration
@@ -55,6 +56,15 @@ def calibrate(
         raise ImageError(f"ISO {iso:g}: {error}") from None
 
 
+def figures_of(
+    dark: Floats | None, sensor: Sensor, darkness: DarkFrames | None
+) -> DarkFigures | None:
+    """What dark frames show beside read noise; None without any that say something of it."""
+    if dark is None or darkness is None or (len(dark) > 1 and darkness.stack is None):
+        return None
+    return dark_figures(dark, sensor, darkness.hot)
+
+
 def _from_single_frame(
     iso: float, frame: Floats, dark: Floats | None, sensor: Sensor, whole: bool
 ) -> Calibration:
@@ -65,6 +75,7 @@ def _from_single_frame(
     rounding = ROUNDING if whole else 0.0
     unit = sensor.unit
     darkness = DarkFrames.analyse(dark, sensor, notes)
+    figures = figures_of(dark, sensor, darkness)
     dark_set = None
     if darkness and darkness.stack:
         deviation = darkness.temporal.value**0.5 / unit
@@ -93,6 +104,7 @@ def _from_single_frame(
         column_noise=pattern.column_noise if pattern else None,
         dsnu=pattern.dsnu if pattern else None,
         hot=pattern.hot if pattern else None,
+        dark=figures,
         notes=(*notes, *line_notes(pooled, rounding)),
     )
 
@@ -108,6 +120,7 @@ def _from_repeats(
     if top < sensor.white_level:
         notes.append(f"samples clip at {top:g} DN, below the white level of {sensor.white_level:g}")
     darkness = DarkFrames.analyse(dark, sensor, notes)
+    figures = figures_of(dark, sensor, darkness)
     from_black = replace(sensor, black_level=darkness.level) if darkness else sensor
     stack = repeats.unclipped(repeats.stacked(scene, from_black), None, top)
     check_enough(float(stack.used.mean()))
@@ -166,6 +179,7 @@ def _from_repeats(
         prnu=prnu2.root() if prnu2 and prnu2.significant else None,
         hot=hot,
         dead=dead,
+        dark=figures,
         notes=(
             *notes,
             *line_notes(pooled, rounding, lines),

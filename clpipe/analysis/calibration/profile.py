@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from clpipe.analysis.calibration.dark_profile import dark_values, plus_minus, weighted
 from clpipe.analysis.calibration.gain_stages import gain_stages
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.result import Calibration
@@ -53,7 +54,10 @@ def calibrated_profile(
         "full_well": f"not known; {_white_in_electrons(calibrations[0])}",
     }
     values["iso_range"] = (calibrations[0].iso, calibrations[-1].iso)
-    for key, (value, source) in _fixed_pattern(calibrations).items():
+    for key, (value, source) in {
+        **_fixed_pattern(calibrations),
+        **dark_values(calibrations),
+    }.items():
         if value is not None:
             values[key] = value
         sources[key] = source
@@ -63,14 +67,20 @@ def calibrated_profile(
     return profile_text(values, list(stages), sources)
 
 
-def _stage_tables(stage: Sequence[Calibration]) -> dict[str, list[float]]:
+def _stage_tables(stage: Sequence[Calibration]) -> dict[str, list[Any]]:
     """The tables of a gain stage in the profile; those that lack an ISO are left out."""
-    tables: Mapping[str, list[float | None]] = {
+    darks = [c.dark for c in stage]
+    shapes = [d.tukey_lambda if d else None for d in darks]
+    errors = [d.black_level_error if d else None for d in darks]
+    tables: Mapping[str, list[Any]] = {
         "iso": [c.iso for c in stage],
         "system_gain": [c.pooled.gain.value for c in stage],
         "read_noise": [read_noise(c) for c in stage],
         "row_noise": [_significant(c.row_noise) for c in stage],
         "column_noise": [_significant(c.column_noise) for c in stage],
+        "tukey_lambda": [shape and shape.value for shape in shapes],
+        "black_level_error": [_significant(error) for error in errors],
+        "color_bias": [d and [each.value for each in d.color_bias] for d in darks],
     }
     known = {key: [v for v in row if v is not None] for key, row in tables.items()}
     return {key: row for key, row in known.items() if len(row) == len(stage)}
@@ -87,18 +97,6 @@ def _significant(estimate: Estimate | None) -> float | None:
     return None if estimate is None else estimate.value if estimate.significant else 0.0
 
 
-def _plus_minus(estimate: Estimate, unit: str = "") -> str:
-    """A value with its error, or an upper limit where it is not significant.
-
-    >>> _plus_minus(Estimate(1.41, 0.012), "DN"), _plus_minus(Estimate(0.0, 0.1), "DN")
-    ('1.41 +- 0.012 DN', 'not seen, below 0.2 DN')
-    """
-    unit = unit and f" {unit}"
-    if not estimate.significant:
-        return f"not seen, below {estimate.value + 2 * estimate.error:.2g}{unit}"
-    return f"{estimate.value:.4g} +- {estimate.error:.2g}{unit}"
-
-
 def _gain_source(calibrations: Sequence[Calibration]) -> str:
     """The source of system gain and read noise: method, frames and values at each ISO."""
     parts = []
@@ -106,7 +104,7 @@ def _gain_source(calibrations: Sequence[Calibration]) -> str:
         frames = f"{c.scene_frames} frame{'s' if c.scene_frames > 1 else ''}"
         if c.dark_frames:
             frames += f" and {c.dark_frames} dark"
-        gain, read = _plus_minus(c.pooled.gain, "DN/e-"), _plus_minus(c.read_noise, "DN")
+        gain, read = plus_minus(c.pooled.gain, "DN/e-"), plus_minus(c.read_noise, "DN")
         parts.append(f"ISO {c.iso:g}: {c.method}, {frames}, gain {gain}, read noise {read}")
     text = "clpipe calibrate; read noise of a pixel without row noise and rounding; "
     return text + "; ".join(parts)
@@ -118,7 +116,7 @@ def _line_source(calibrations: Sequence[Calibration], key: str) -> str:
     if not estimates:
         needs = "two frames" if key == "row_noise" else "dark frames"
         return f"not known, for want of {needs}; zero stands in"
-    values = "; ".join(f"ISO {iso:g} {_plus_minus(e, 'DN')}" for iso, e in estimates)
+    values = "; ".join(f"ISO {iso:g} {plus_minus(e, 'DN')}" for iso, e in estimates)
     what = "means of rows" if key == "row_noise" else "means of columns of the mean dark frame"
     return f"{what}, corrected for pixel noise: {values}"
 
@@ -129,27 +127,20 @@ def _white_in_electrons(lowest: Calibration) -> str:
     return f"at ISO {lowest.iso:g} the white level is {electrons:.0f} e-, and the ADC clips there"
 
 
-def _weighted(estimates: Sequence[Estimate]) -> Estimate:
-    """The mean of estimates, weighted by their inverse squared errors."""
-    weight = np.array([1 / max(e.error, 1e-12) ** 2 for e in estimates])
-    value = float(weight @ [e.value for e in estimates] / weight.sum())
-    return Estimate(value, float(weight.sum() ** -0.5))
-
-
 def _fixed_pattern(calibrations: Sequence[Calibration]) -> dict[str, tuple[float | None, str]]:
     """PRNU, DSNU, hot and dead pixels by key: the value, None where unknown, and its source."""
     result: dict[str, tuple[float | None, str]] = {}
     prnu = [c.prnu for c in calibrations if c.prnu]
     result["prnu"] = (None, "not known: no scene was flat enough, or it was not significant")
     if prnu:
-        mean = _weighted(prnu)
-        result["prnu"] = mean.value, f"flat places of the mean frame: {_plus_minus(mean)}"
+        mean = weighted(prnu)
+        result["prnu"] = mean.value, f"flat places of the mean frame: {plus_minus(mean)}"
     dsnu = {c.iso: c.dsnu.scaled(1 / c.pooled.gain.value) for c in calibrations if c.dsnu}
     result["dsnu"] = (None, "not known, for want of dark frames")
     if dsnu:
-        each = "; ".join(f"ISO {iso:g} {_plus_minus(e, 'e-')}" for iso, e in dsnu.items())
+        each = "; ".join(f"ISO {iso:g} {plus_minus(e, 'e-')}" for iso, e in dsnu.items())
         source = f"pixels of the mean dark frame, temporal noise subtracted: {each}"
-        result["dsnu"] = _significant(_weighted(list(dsnu.values()))), source
+        result["dsnu"] = _significant(weighted(list(dsnu.values()))), source
     result |= _hot(calibrations)
     judged = [c for c in calibrations if c.dead and c.dead.seen_on > 0.05]
     result["dead_pixel_share"] = (None, "not known: too little light in the frames")

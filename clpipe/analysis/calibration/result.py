@@ -3,6 +3,7 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from clpipe.analysis.calibration.dark_figures import DarkFigures
 from clpipe.analysis.calibration.fixed_pattern import Pixels
 from clpipe.analysis.calibration.line_fit import Bin, Estimate, Line
 from clpipe.analysis.calibration.repeats import Sensor
@@ -32,6 +33,7 @@ class Calibration:
     prnu: Estimate | None = None  # relative
     hot: Pixels | None = None
     dead: Pixels | None = None
+    dark: DarkFigures | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -64,5 +66,6 @@ class Calibration:
             "prnu": self.prnu and asdict(self.prnu),
             "hot_pixels": self.hot and self.hot.record(),
             "dead_pixels": self.dead and self.dead.record(),
+            "dark": self.dark and self.dark.record(),
             "notes": list(self.notes),
         }

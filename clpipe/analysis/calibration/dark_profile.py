@@ -1,0 +1,119 @@
+"""What a profile says of dark frames, from calibrations: values, None where unknown, and why."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from clpipe.analysis.calibration.dark_figures import slope_and_offset
+from clpipe.analysis.calibration.line_fit import Estimate
+from clpipe.analysis.calibration.result import Calibration
+
+Sourced = dict[str, tuple[float | None, str]]
+UNKNOWN = "not known: "
+
+
+def plus_minus(estimate: Estimate, unit: str = "") -> str:
+    """A value with its error, or an upper limit where it is not significant.
+
+    >>> plus_minus(Estimate(1.41, 0.012), "DN"), plus_minus(Estimate(0.0, 0.1), "DN")
+    ('1.41 +- 0.012 DN', 'not seen, below 0.2 DN')
+    """
+    unit = unit and f" {unit}"
+    if not estimate.significant:
+        return f"not seen, below {estimate.value + 2 * estimate.error:.2g}{unit}"
+    return f"{estimate.value:.4g} +- {estimate.error:.2g}{unit}"
+
+
+def weighted(estimates: Sequence[Estimate]) -> Estimate:
+    """The mean of estimates, weighted by their inverse squared errors."""
+    weight = np.array([1 / max(e.error, 1e-12) ** 2 for e in estimates])
+    value = float(weight @ [e.value for e in estimates] / weight.sum())
+    return Estimate(value, float(weight.sum() ** -0.5))
+
+
+def dark_values(calibrations: Sequence[Calibration]) -> Sourced:
+    """The keys of a profile that hold at every ISO, and the sources of those by ISO."""
+    found = {**_telegraph(calibrations), **_wave(calibrations), **_shading(calibrations)}
+    for key, unit in (("tukey_lambda", ""), ("black_level_error", "DN")):
+        own = {c.iso: e for c in calibrations if c.dark and (e := getattr(c.dark, key))}
+        each = "; ".join(f"ISO {iso:g} {_signed(e, unit)}" for iso, e in own.items())
+        found[key] = None, f"dark frames: {each}" if own else f"{UNKNOWN}too few dark frames"
+    biased = [c for c in calibrations if c.dark]
+    found["color_bias"] = (
+        None,
+        "means of dark frames by colour, less the black level: "
+        + "; ".join(
+            f"ISO {c.iso:g} {', '.join(_signed(e, '') for e in c.dark.color_bias)} DN"
+            for c in biased
+            if c.dark
+        )
+        if biased
+        else f"{UNKNOWN}no dark frames",
+    )
+    found["dark_current"] = (
+        None,
+        f"{UNKNOWN}it takes dark frames of several exposure times, which are not compared",
+    )
+    found["crosstalk"] = None, f"{UNKNOWN}frames of edges or of one colour would tell it"
+    return found
+
+
+def _signed(estimate: Estimate, unit: str) -> str:
+    return f"{estimate.value:.3g} +- {estimate.error:.2g}{unit and ' '}{unit}"
+
+
+def _telegraph(calibrations: Sequence[Calibration]) -> Sourced:
+    own = [
+        (c.dark.rts_share, c.dark.rts_amplitude.scaled(1 / c.pooled.gain.value), c.iso)
+        for c in calibrations
+        if c.dark and c.dark.rts_share and c.dark.rts_amplitude
+    ]
+    if not own:
+        why = f"{UNKNOWN}no pixels that jump were seen in 8 or more dark frames of an ISO"
+        return {"rts_share": (None, why), "rts_amplitude": (None, why)}
+    share, amplitude = weighted([each[0] for each in own]), weighted([each[1] for each in own])
+    isos = ", ".join(f"{iso:g}" for _, _, iso in own)
+    source = f"pixels whose dark frames differ most, ISO {isos}: "
+    return {
+        "rts_share": (share.value, source + plus_minus(share)),
+        "rts_amplitude": (amplitude.value, source + plus_minus(amplitude, "e-")),
+    }
+
+
+def _wave(calibrations: Sequence[Calibration]) -> Sourced:
+    own = [
+        (c.dark.banding.amplitude.scaled(1 / c.pooled.gain.value), c.dark.banding.period)
+        for c in calibrations
+        if c.dark and c.dark.banding
+    ]
+    if not own:
+        why = f"{UNKNOWN}no wave stands out of the means of rows of dark frames"
+        return {"banding_amplitude": (None, why), "banding_period": (None, why)}
+    amplitude = weighted([each[0] for each in own])
+    period = max(own, key=lambda each: each[0].value / each[0].error)[1]
+    source = f"the peak of the spectrum of rows of dark frames: {plus_minus(amplitude, 'e-')}"
+    return {"banding_amplitude": (amplitude.value, source), "banding_period": (period, source)}
+
+
+def _shading(calibrations: Sequence[Calibration]) -> Sourced:
+    keys = ("dark_shading_slope", "dark_shading_offset", "dark_shading_length")
+    own = {c.iso: c.dark.shading for c in calibrations if c.dark and c.dark.shading}
+    if not own:
+        return dict.fromkeys(keys, (None, f"{UNKNOWN}no dark frames of 192 px or more each way"))
+    slope, offset = (
+        slope_and_offset(own)
+        if len(own) > 1
+        else (Estimate(0.0, 0.0), next(iter(own.values())).variance.root())
+    )
+    isos = ", ".join(f"{iso:g}" for iso in own)
+    source = f"the smooth part of mean dark frames, ISO {isos}: "
+    length = float(np.median([each.length for each in own.values()]))
+    seen = slope.significant or offset.significant
+    return {
+        keys[0]: (
+            slope.value if slope.significant else None,
+            source + (plus_minus(slope, "DN for each ISO") if len(own) > 1 else "one ISO alone"),
+        ),
+        keys[1]: (offset.value if offset.significant else None, source + plus_minus(offset, "DN")),
+        keys[2]: (length if seen else None, source + "where its correlation is a half"),
+    }
