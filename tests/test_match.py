@@ -36,6 +36,7 @@ from clpipe.analysis.matching.space import (
     dimensions_of,
     smaller,
     space_for,
+    variants_of,
 )
 from clpipe.analysis.signature import flat_places, luma, signature
 from clpipe.chain.chain import make_chain
@@ -110,8 +111,8 @@ def test_independent_noise(grey):
     rings = [np.pi * (k / 8) ** 2 for k in (1, 2, 3)]
     shares = [rings[0], rings[1] - rings[0], rings[2] - rings[1], 1 - rings[2]]
     assert [found[f"band_{k}"] for k in (1, 2, 3, 4)] == pytest.approx(shares, abs=0.03)
-    assert found["sigma_110"] == pytest.approx(found["rms"])
-    assert np.isnan(found["sigma_30"])
+    assert found["sigma_96"] == pytest.approx(found["rms"])
+    assert np.isnan(found["sigma_12"])
     # The relative standard error of the rms of n independent samples is 1 / sqrt(2 n).
     error = errors_of(noise, places)["rms"] / found["rms"]
     assert 0.3 < error * np.sqrt(2 * 160 * 160) < 3
@@ -126,7 +127,8 @@ def test_noise_against_the_mean_of_a_burst_is_that_of_a_frame(burst):
     against_truth = figures_of(noise_of_frames(frames, truth), places)
     against_mean = figures_of(noise_of_frames(frames[:4], None), places)
     for name, column in COLUMNS.items():
-        if name not in TAILS and not np.isnan(against_truth[name]):
+        # What is left of a frame beside the mean of few is skewed less, in both that are compared.
+        if name not in TAILS and "skew" not in name and not np.isnan(against_truth[name]):
             assert abs(column.residual(against_mean[name], against_truth[name])) < 0.06, name
 
 
@@ -158,7 +160,8 @@ def test_a_known_development_comes_back(found):
         if name != "beyond_4_sigma" and row["residual"] is not None:
             assert abs(row["residual"]) < 0.03 + 2 * row["error"], (name, row)
             assert row["error"] < 0.3, name
-    assert report["searched"]["iso"] == pytest.approx(KNOWN["iso"], rel=0.1)
+    # A steeper tone curve makes as much noise of a lower ISO.
+    assert report["searched"]["iso"] == pytest.approx(KNOWN["iso"], rel=0.2)
     strength = report["searched"]["denoise.luma_strength"]
     assert strength == pytest.approx(KNOWN["denoise"]["luma_strength"], rel=0.2)
 
@@ -394,6 +397,7 @@ def test_what_is_developed_goes_through_the_same_jpeg(burst, tmp_path):
 def test_every_number_of_the_development_is_searched():
     names = {d.name for d in dimensions_of(make_chain(Settings()))}
     assert {"denoise.luma_strength", "denoise.grain", "sharpen.amount"} <= names
+    assert {"tone_curve.contrast", "tone_curve.toe", "tone_curve.shoulder"} <= names
     assert not {"denoise.luma_noise", "sharpen.threshold"} & names  # in units of the signal
     space = space_for(Settings(), iso_is_given=False)
     assert space.strength is not None
@@ -402,8 +406,14 @@ def test_every_number_of_the_development_is_searched():
     assert not any("file" in choice.text for choice in space.choices["tone_curve"])
     chain = make_chain(space.choices["chroma"][-1].over(Settings()))
     assert [s.method.method for s in chain.steps if "matrix" in s.name] == ["none", "as_shot"]
-    smoother = {d.name for d in dimensions_of(chain) if d.name.startswith("denoise_2.")}
-    assert smoother == {"denoise_2.chroma_strength", "denoise_2.spatial_sigma"}
+    chroma = {choice.text: choice for choice in space.choices["chroma"]}
+    ways = {"smoother": {"chroma_strength", "spatial_sigma"}, "coarser": {"chroma_strength"}}
+    for way, numbers in ways.items():
+        chain = make_chain(chroma[f"colours of the camera, {way}"].over(Settings()))
+        again = {d.name for d in dimensions_of(chain) if d.name.startswith("denoise_2.")}
+        assert again == {f"denoise_2.{name}" for name in numbers}
+    scales = {choice.text for choice in variants_of(Settings(), "denoise")}
+    assert {"denoise.chroma_scale 1", "denoise.chroma_scale 3"} <= scales
 
 
 def test_a_smaller_picture_is_sharpened_before_or_after():
