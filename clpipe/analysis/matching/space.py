@@ -26,7 +26,7 @@ BEFORE = TONE  # where a stage of these goes that the chain lacks
 SHARPEN = "sharpen"
 # Chroma alone, once more and wider: cameras smooth it at a half or a quarter of the resolution.
 SMOOTHER = {"method": "bilateral", "luma_size": 1, "luma_strength": 0.0, "chroma_size": 7}
-COARSER = {"method": "biweight", "luma_strength": 0.0, "chroma_scale": 4}
+COARSER = {"method": "biweight", "luma_strength": 0.0, "chroma_scale": 3}
 SEARCHED_UNITS = ("", "px")  # what is in units of the signal follows from the noise
 SPAN = 8.0  # a number is searched within this factor of where it starts
 
