@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 from scipy.stats import kurtosis
 
 from clpipe.base.errors import RequestError
@@ -71,6 +72,40 @@ def test_dark_shading_is_smooth_fixed_and_grows_with_the_iso(develop):
     assert np.std(every) == pytest.approx(0.01, rel=0.08)
     longer, shorter = (maps(slope=0.0, offset=0.01, length=n) for n in (300.0, 30.0))
     assert np.abs(np.diff(shorter)).mean() > 5 * np.abs(np.diff(longer)).mean()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 70), (67, 83), (200, 133)])
+def test_dark_shading_from_files(develop, write_exr, size):
+    random = np.random.default_rng(0)
+    k, b = (random.normal(size=(5, 4, 1)).astype(np.float32) for _ in range(2))
+    files = {
+        "slope_file": str(write_exr("k.exr", k / 100, "Y", half=False)),
+        "offset_file": str(write_exr("b.exr", b, "Y", half=False)),
+    }
+    black = np.zeros((*size, 3), np.float32)
+    settings = {"iso": 400, "stages": ["mosaic", "dark_shading"]}
+    shading = {"method": "file", "block": 20.0, **files}
+    one, two = (
+        develop(black, numpy=numpy, dark_shading=shading, **settings).final
+        for numpy in (False, True)
+    )
+    assert np.array_equal(one, two)
+    whole = 4 * k[..., 0] + b[..., 0]
+    y, x = ((np.arange(n) + 0.5) / 20 - 0.5 for n in size)
+    expected = map_coordinates(whole, np.meshgrid(y, x, indexing="ij"), order=1, mode="nearest")
+    assert two * 15871 == pytest.approx(expected, abs=1e-4)
+
+
+def test_files_of_dark_shading_that_do_not_fit(write_exr):
+    files = [str(write_exr(f"{n}.exr", np.ones((4, n, 1), np.float32), "Y")) for n in (4, 5)]
+    shading = {"method": "file", "slope_file": files[0], "offset_file": files[1]}
+    with pytest.raises(RequestError, match="of different sizes: 4x4 and 5x4"):
+        make_chain(settings_from({"dark_shading": shading}))
+    shading["slope_file"] = "nowhere.exr"
+    with pytest.raises(RequestError, match=r"slope_file: .*nowhere\.exr"):
+        make_chain(settings_from({"dark_shading": shading}))
+    nothing = make_chain(settings_from({"dark_shading": {"method": "file"}}))
+    assert nothing.step_named("dark_shading").method.passes() == ()
 
 
 CAMERAS = ("canon-5d2", "canon-6d", "canon-80d", "nikon-d600", "nikon-d800", "sony-a7m2")

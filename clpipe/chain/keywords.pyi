@@ -184,10 +184,14 @@ class Dsnu(TypedDict, total=False):
     sigma: Number
 
 class DarkShading(TypedDict, total=False):
-    method: Draw | Literal["smooth"]
+    method: Draw | Literal["smooth", "file"]
     slope: Number
     offset: Number
     length: Number
+    slope_file: Text
+    offset_file: Text
+    block: Number
+    unit: Number
 
 class RowNoise(TypedDict, total=False):
     method: Draw | Literal["gaussian"]

@@ -1,11 +1,16 @@
 """Dark shading: smooth maps that a sensor adds to every frame, in the dark as well."""
 
+from functools import lru_cache
 from math import sqrt
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+from pydantic import field_validator
 
-from clpipe.base.types import Floats
+from clpipe.base.errors import ImageError
+from clpipe.base.reading import check_regular
+from clpipe.base.types import Array, Floats
 from clpipe.reference.random import Stream, normal_of, philox
 from clpipe.stage import (
     Arguments,
@@ -149,4 +154,118 @@ class Smooth(Method):
         return np.asarray(image + (of_iso * slope + fixed * offset))
 
 
-STAGE = Stage("dark_shading", "Add smooth maps of the sensor.", Kind.MOSAIC, Kind.MOSAIC, (Smooth,))
+def measured(path: str) -> Floats:
+    """The map in a file of one channel, (height, width), DN; read again when the file changes.
+
+    Raises:
+        ValueError: the file cannot be read, or holds no such map.
+    """
+    try:
+        status = check_regular(Path(path))
+        return _measured(path, status.st_mtime_ns, status.st_size)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
+    except ImageError as error:
+        raise ValueError(str(error)) from None
+
+
+@lru_cache(maxsize=8)
+def _measured(path: str, time: int, size: int) -> Floats:
+    from clpipe.images.read import read_image  # few need what it imports
+
+    return np.asarray(read_image(Path(path), mosaic=True).pixels, np.float32)
+
+
+def combined(slope: str | None, offset: str | None, iso: float, unit: float) -> Floats:
+    """The map ISO * k + b in signal of two files, of which one may be missing.
+
+    Raises:
+        ValueError: they are of different sizes.
+    """
+    maps = [measured(path) for path in (slope, offset) if path]
+    if len({each.shape for each in maps}) > 1:
+        sizes = " and ".join(f"{w}x{h}" for h, w in (each.shape for each in maps))
+        raise ValueError(f"slope_file and offset_file are of different sizes: {sizes}")
+    factors = [factor for path, factor in ((slope, iso), (offset, 1.0)) if path]
+    total = sum(each * factor for each, factor in zip(maps, factors, strict=True))
+    return np.asarray(total / unit, np.float32)
+
+
+class File(Method):
+    """y + ISO * k(x, y) + b(x, y): the maps of a sensor, from files.
+
+    Each is an image of one channel (EXR or TIFF of floats) in DN, such as means over blocks; from
+    its samples, ``block`` pixels apart, it is taken linearly, and beyond them the nearest holds.
+    """
+
+    method: ClassVar = "file"
+    kernel: ClassVar = "dark_shading_file"
+    summary: ClassVar = "add measured maps of a sensor, one in proportion to the ISO"
+
+    slope_file: str | None = parameter(
+        None, "The image of k, in DN for each ISO.", "", "none", file=True
+    )
+    offset_file: str | None = parameter(None, "The image of b, in DN.", "", "none", file=True)
+    block: float = parameter(32.0, "Distance of their samples.", "px", ge=1, le=4096)
+    unit: float | None = parameter(
+        None, "Signal of 1 in DN.", "DN", "from the camera", gt=0, le=1e6
+    )
+
+    @field_validator("slope_file", "offset_file")
+    @classmethod
+    def _readable(cls, path: str | None) -> str | None:
+        if path is not None:
+            measured(path)
+        return path
+
+    def resolve(self, context: Context) -> "File":
+        own = self.with_defaults(unit=context.camera.signal_range)
+        combined(own.slope_file, own.offset_file, context.iso, own.unit or 1.0)
+        return own
+
+    def passes(self) -> tuple[Pass, ...]:
+        if not self.slope_file and not self.offset_file:
+            return ()
+        return (Pass("dark_shading_file", arguments=("map", "width", "height", "per_px")),)
+
+    def _map(self, iso: float) -> Floats:
+        return combined(self.slope_file, self.offset_file, iso, self.unit or 1.0)
+
+    def arguments(self, context: Context) -> Arguments:
+        if not self.passes():
+            return {}
+        own = self._map(context.iso)
+        height, width = own.shape
+        sizes = {"width": np.int32(width), "height": np.int32(height)}
+        return {"map": own, **sizes, "per_px": np.float32(1 / self.block)}
+
+    def without_noise(self) -> Method | None:
+        return None if self.passes() else self
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        if not self.passes():
+            return image
+        own = self._map(given.context.iso)
+        (up, down, v), (left, right, x) = (
+            between(n, np.float32(1 / self.block), count)
+            for n, count in zip(image.shape[:2], own.shape, strict=True)
+        )
+        rows = [
+            own[row][:, left] + (own[row][:, right] - own[row][:, left]) * x for row in (up, down)
+        ]
+        upper, lower = rows
+        return np.asarray(image + (upper + (lower - upper) * v[:, None]))
+
+
+def between(pixels: int, per_px: np.float32, count: int) -> tuple[Array, Array, Floats]:
+    """For each pixel of a row: the sample before it, the next one, and the share of that."""
+    half, zero = np.float32(0.5), np.float32(0)
+    t = (np.arange(pixels, dtype=np.float32) + half) * per_px - half
+    t = np.minimum(np.maximum(t, zero), np.float32(count - 1))
+    first = t.astype(np.int32)
+    return first, np.minimum(first + 1, count - 1), t - first.astype(np.float32)
+
+
+STAGE = Stage(
+    "dark_shading", "Add smooth maps of the sensor.", Kind.MOSAIC, Kind.MOSAIC, (Smooth, File)
+)
