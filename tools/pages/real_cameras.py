@@ -27,6 +27,7 @@ from clpipe.analysis.spatial import LAGS, autocorrelation, count_pairs
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Runner
+from clpipe.images.jpeg import JpegEncoding, through_jpeg
 from tools.pages.side_by_side import COLUMNS, cells, sheet, telling_places
 
 ISOS = (800, 1600, 3200, 6400)
@@ -96,7 +97,7 @@ def _read(path: Path) -> Array:
 
 
 def develop(render: Floats, iso: float, device: str | None = None) -> Pair:
-    """A render's picture by the default chain, and its truth.
+    """A render's picture by the default chain, as the JPEG that is written, and its truth.
 
     Args:
         render: (height, width, 3), linear.
@@ -106,7 +107,10 @@ def develop(render: Floats, iso: float, device: str | None = None) -> Pair:
     pipeline = clpipe.Pipeline(iso=iso, device=device)
     ideal = Runner(pipeline.chain.without_noise(), open_device(device))
     truth = ideal.run(render, "render").encoded
-    return Pair(pipeline.process(render, "render").image, np.asarray(truth))
+    output = pipeline.chain.settings.output
+    written = JpegEncoding(output.jpeg_quality, output.jpeg_subsampling)
+    picture = np.asarray(pipeline.process(render, "render").image)
+    return Pair(through_jpeg(picture, written), np.asarray(truth))
 
 
 def medians(pairs: Iterable[Pair]) -> dict[str, float]:
