@@ -194,7 +194,7 @@ def chroma_ways(settings: Settings) -> Iterator[Choice]:
         colours["colours of the scene"] = {"inverse_color_matrix": {"method": "none"}}
     for text, values in colours.items():
         yield Choice(text, values)
-        for more, again in ((", smoother", SMOOTHER), (", coarser", COARSER)):
+        for more, again in ((", coarser", COARSER), (", smoother", SMOOTHER)):
             yield Choice(text + more, {**values, "denoise_2": again}, {"denoise": before})
 
 
