@@ -137,7 +137,7 @@ def picture(path):
 def test_an_image_gets_the_raw_of_the_way_and_the_look(way, kind, tmp_path, request):
     """The raw is that of the way alone, the picture that of the look alone from this raw on."""
     image = request.getfixturevalue(kind)
-    camera = ("--camera", "nikon-d800", "--iso", 1504)
+    camera = ("--camera", "nikon-d800", "--iso", load_settings(LOOK).iso)
     kept = ("--keep", "quantize", "--format", "png", *NUMPY)
     both = ("-c", way, "-c", LOOK)
     clpipe("run", image, "-o", tmp_path / "both", *both, *kept)

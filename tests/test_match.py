@@ -508,18 +508,22 @@ def test_wrong_names_and_files_are_refused(clpipe, burst, tmp_path):
 
 PAIRS = {"canon-5d3-jpeg": "5dmark3_iso3200", "nikon-d800-jpeg": "d800_iso1600"}
 WITHIN = ("right", "below", "diagonal", "two_right", "half", "chroma_right", "red_green")
+WITHIN += ("right_3", "right_6", "chroma_two_right", "chroma_right_4", "chroma_right_6")
+BY_INTENSITY = ("sigma_12", "sigma_24", "sigma_40", "sigma_64", "sigma_96", "sigma_128")
 
 
 @pytest.mark.skipif(not (SHARED / "real_noise").exists(), reason="needs ../shared/data/real_noise")
 @pytest.mark.parametrize("look", PAIRS)
 def test_looks_are_like_the_cameras(look, device):
     frames, means = (f"{SHARED}/real_noise/{PAIRS[look]}_?_{kind}.png" for kind in ("real", "mean"))
-    simulator, residuals, sizes = Simulator(device), [], []
+    simulator, residuals, sizes, skews = Simulator(device), [], [], []
     for one in load_scenes([frames], [means]).each:
         places = Places(one.mask | one.holdout, one.noise.level)
         ours = figures_of(simulator.noise(load_settings(look), one, "test"), places)
         theirs = figures_of(one.noise, places)
         residuals.append([ours[name] - theirs[name] for name in WITHIN])
-        sizes.append(ours["rms"] / theirs["rms"])
-    assert np.mean(sizes) == pytest.approx(1, abs=0.2)
+        sizes.append([ours[name] / theirs[name] for name in ("rms", *BY_INTENSITY)])
+        skews.append(ours["skew_shadows"] - theirs["skew_shadows"])
+    assert np.nanmean(sizes, axis=0) == pytest.approx(1, abs=0.2)
+    assert abs(np.nanmean(skews)) < 0.15
     assert np.abs(np.mean(residuals, axis=0)).max() < 0.1

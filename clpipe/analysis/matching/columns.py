@@ -46,6 +46,7 @@ class Column:
 
 FURTHER = range(3, REACH + 1)  # lags, px
 TAILS = ("kurtosis", "beyond_4_sigma")
+SKEWS = ("skew_shadows", "skew_midtones")
 COLUMNS: Mapping[str, Column] = {
     "rms": Column("luma rms, levels", 0.03, relative=True),
     "kurtosis": Column("kurtosis", 0.3),
@@ -73,8 +74,10 @@ COLUMNS: Mapping[str, Column] = {
         f"sigma_{low}": Column(f"luma rms at {low}-{high - 1}, levels", 0.04, relative=True)
         for low, high in itertools.pairwise(LEVELS)
     },
-    "skew_shadows": Column("luma skew at {}-{}".format(*SHADOWS), 0.08),
-    "skew_midtones": Column("luma skew at {}-{}".format(*MIDTONES), 0.08),
+    **{
+        name: Column(f"luma skew at {low}-{high}", 0.08)
+        for name, (low, high) in zip(SKEWS, (SHADOWS, MIDTONES), strict=True)
+    },
 }
 
 
@@ -247,7 +250,7 @@ def by_intensity(noise: Doubles, level: Doubles) -> Figures:
     for low, high in itertools.pairwise(LEVELS):
         own = noise[:, (level >= low) & (level < high)]
         found[f"sigma_{low}"] = float(np.sqrt((own**2).mean())) if own.size >= FEWEST else np.nan
-    for name, (low, high) in (("skew_shadows", SHADOWS), ("skew_midtones", MIDTONES)):
+    for name, (low, high) in zip(SKEWS, (SHADOWS, MIDTONES), strict=True):
         found[name] = skewness(noise[:, (level >= low) & (level < high)])
     bright = level >= DARKEST
     noise, level = noise[:, bright], level[bright]

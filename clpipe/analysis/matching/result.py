@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from clpipe.analysis.matching.ambiguity import Ambiguity, ambiguities
-from clpipe.analysis.matching.columns import COLUMNS, TAILS, Noise
+from clpipe.analysis.matching.columns import COLUMNS, SKEWS, TAILS, Noise
 from clpipe.analysis.matching.scenes import Scenes
 from clpipe.analysis.matching.search import Candidate, Search, Target, target_at, target_of
 from clpipe.analysis.matching.space import DEVELOPMENT, TONE
@@ -82,7 +82,7 @@ class Match:
         rows = [
             row
             for row in self.unseen
-            if abs(row.theirs) <= 1 and not (row.relative or row.name in TAILS)
+            if abs(row.theirs) <= 1 and not (row.relative or row.name in (*TAILS, *SKEWS))
         ]
         if not rows:
             return "the places that were not searched are too few to tell"
