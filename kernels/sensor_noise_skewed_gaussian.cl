@@ -5,9 +5,10 @@
 // What that adds to the variance is taken from z's own part, but for its square.
 INLINE vf skewed(vf z, vf y, float a, float b) {
     const vf shot = vmax(a * y, (vf)(0.0f)), variance = vmax(a * y + b, (vf)(1e-30f));
-    const vf inverse = inverse_root(variance), sigma = variance * inverse;
-    const vf skew = shot * inverse * inverse * (a * 0.16666667f), share = skew * inverse;
-    return (sigma - sigma * share * share) * z + skew * (z * z - 1.0f);
+    const vf inverse = inverse_root(variance);
+    const vf skew = shot * inverse * inverse * (a * 0.16666667f);
+    const vf linear = (variance - skew * skew) * inverse;
+    return (linear + skew * z) * z - skew;
 }
 
 INLINE vf skewed_noise(vf y, site at, stream s, float a, float b, float full_well) {

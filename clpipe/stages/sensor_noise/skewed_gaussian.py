@@ -36,11 +36,9 @@ class SkewedGaussian(Gaussian):
 
     @staticmethod
     def noise(normals: Floats, y: Floats, a: np.float32, b: np.float32) -> Floats:
-        one = np.float32(1)
         shot = np.maximum(a * y, np.float32(0))
         variance = np.maximum(a * y + b, np.float32(1e-30))
         inverse = inverse_root(variance)
-        sigma = variance * inverse
         skew = shot * inverse * inverse * (a * np.float32(1 / 6))
-        share = skew * inverse
-        return (sigma - sigma * share * share) * normals + skew * (normals * normals - one)
+        linear = (variance - skew * skew) * inverse
+        return (linear + skew * normals) * normals - skew
