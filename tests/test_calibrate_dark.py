@@ -1,9 +1,12 @@
 """What dark frames show comes back from frames that clpipe made, within its standard errors."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from clpipe.analysis.calibration.calibrate import calibrate
+from clpipe.analysis.calibration.dark_current import dark_current
 from clpipe.analysis.calibration.dark_figures import (
     Shading,
     dark_figures,
@@ -12,6 +15,7 @@ from clpipe.analysis.calibration.dark_figures import (
     slope_and_offset,
 )
 from clpipe.analysis.calibration.fixed_pattern import Pixels
+from clpipe.analysis.calibration.groups import by_time
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.profile import calibrated_profile
 from clpipe.analysis.calibration.repeats import Sensor
@@ -147,7 +151,44 @@ def test_a_profile_of_dark_frames_makes_such_frames_again():
     assert camera.banding_period == pytest.approx(9, rel=0.01)
     assert camera.rts_share == pytest.approx(0.01, rel=0.4)
     assert camera.tukey_lambda_at(800) is not None
-    assert "not compared" in camera.sources["dark_current"]
+    assert "two or more exposure times" in camera.sources["dark_current"]
+
+
+@pytest.mark.parametrize("counts", [(2, 2), (6, 3, 6)])
+def test_dark_current_from_frames_of_several_times(counts):
+    times = (0.01, 5.0, 30.0)[-len(counts) :]
+    sensor, gain = Sensor("RGGB", 512.0, 16383.0), Estimate(1.0, 0.002)
+    stacks = {
+        t: dark_frames(
+            n,
+            (120, 150),
+            dark_current={
+                "current": 6.0,
+                "spread": 0.5,
+                "per_electron": 1 / UNIT,
+                "exposure_time": t,
+            },
+        )
+        for t, n in zip(times, counts, strict=True)
+    }
+    found = dark_current(stacks, gain, sensor)
+    assert found is not None and found.spread is not None
+    assert within(found.current, 6.0) and found.current.error < 0.6
+    assert within(found.spread, 0.5) and found.spread.error < 0.1
+    none = dark_current({t: dark_frames(3, (63, 70)) for t in (1.0, 30.0)}, gain, sensor)
+    assert none is not None and not none.current.value > 4 * none.current.error
+    assert dark_current({1.0: stacks[times[-1]]}, gain, sensor) is None
+
+
+def test_dark_frames_are_grouped_by_their_times():
+    dark = [SimpleNamespace(seconds=t, name=n) for n, t in enumerate((8.0, 0.5, 8.0, 2.0, None))]
+
+    def names(seconds):
+        return [[f.name for f in group] for group in by_time(dark, seconds)]
+
+    assert names(2.0) == [[3], [4], [1], [0, 2]]
+    assert names(None) == [[4], [1], [3], [0, 2]]
+    assert by_time([], 1.0) == [()]
 
 
 def test_sites_of_every_pattern():

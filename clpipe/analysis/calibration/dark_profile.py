@@ -50,16 +50,37 @@ def dark_values(calibrations: Sequence[Calibration]) -> Sourced:
         if biased
         else f"{UNKNOWN}no dark frames",
     )
-    found["dark_current"] = (
-        None,
-        f"{UNKNOWN}it takes dark frames of several exposure times, which are not compared",
-    )
+    found |= _current(calibrations)
     found["crosstalk"] = None, f"{UNKNOWN}frames of edges or of one colour would tell it"
     return found
 
 
 def _signed(estimate: Estimate, unit: str) -> str:
     return f"{estimate.value:.3g} +- {estimate.error:.2g}{unit and ' '}{unit}"
+
+
+def _current(calibrations: Sequence[Calibration]) -> Sourced:
+    keys = ("dark_current", "dark_current_spread")
+    own = [c.dark_current for c in calibrations if c.dark_current]
+    if not own:
+        why = f"{UNKNOWN}it takes two or more dark frames at each of two or more exposure times"
+        return dict.fromkeys(keys, (None, why))
+    current = weighted([each.current for each in own])
+    times = ", ".join(f"{t:g}" for t in sorted({t for each in own for t in each.times}))
+    source = f"noise and pattern of dark frames of {times} s: "
+    spreads = [each.spread for each in own if each.spread]
+    spread = weighted(spreads) if spreads and current.significant else None
+    where = "; at the temperature of the frames, for which 20 deg C stands in"
+    return {
+        keys[0]: (
+            current.value if current.significant else None,
+            source + plus_minus(current, "e-/s") + where,
+        ),
+        keys[1]: (
+            spread.value if spread and spread.significant else None,
+            source + plus_minus(spread) if spread else f"{UNKNOWN}no dark current was seen",
+        ),
+    }
 
 
 def _telegraph(calibrations: Sequence[Calibration]) -> Sourced:

@@ -69,6 +69,11 @@ class CalibrationFrame:
     gains: tuple[float, float] | None = None  # white balance, red and blue (green = 1)
     xyz_to_camera: Matrix | None = None
 
+    @property
+    def seconds(self) -> float | None:
+        """The exposure time in s, where the file says it as a camera does."""
+        return self.facts.exposure if isinstance(self.facts, RawFacts) else None
+
     def read(self) -> Floats:
         """The mosaic in DN, (height, width).
 

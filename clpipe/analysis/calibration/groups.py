@@ -1,11 +1,12 @@
 """Frames of one ISO together, and their calibration."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from clpipe.analysis.calibration.calibrate import calibrate
+from clpipe.analysis.calibration.dark_current import DarkCurrent, dark_current
 from clpipe.analysis.calibration.frames import CalibrationFrame
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.analysis.calibration.result import Calibration
@@ -15,11 +16,12 @@ from clpipe.base.types import Floats
 
 @dataclass(frozen=True)
 class Group:
-    """The frames of a scene and the dark frames of one ISO."""
+    """The frames of a scene and the dark frames of one ISO; ``longer`` are of other times."""
 
     iso: float
     scene: tuple[CalibrationFrame, ...]
     dark: tuple[CalibrationFrame, ...]
+    longer: tuple[tuple[CalibrationFrame, ...], ...] = ()
 
 
 def group_frames(
@@ -61,8 +63,25 @@ def group_frames(
                     f"that of {first.path} {first.exposure or 'unknown'}; frames of one ISO must "
                     "have one exposure"
                 )
-        groups.append(Group(iso, scene_at_iso, tuple(f for f in dark if f.iso == iso)))
+        own, *longer = by_time([f for f in dark if f.iso == iso], first.seconds)
+        groups.append(Group(iso, scene_at_iso, own, tuple(longer)))
     return groups
+
+
+def by_time(
+    dark: Sequence[CalibrationFrame], seconds: float | None
+) -> list[tuple[CalibrationFrame, ...]]:
+    """Dark frames of one ISO by exposure time: first those of the scene's, else of the shortest.
+
+    Args:
+        dark: the frames; none is one empty list of them.
+        seconds: of the scene, s.
+    """
+    times = sorted({frame.seconds or 0.0 for frame in dark})
+    if seconds in times:
+        times.remove(seconds)
+        times.insert(0, seconds)
+    return [tuple(f for f in dark if (f.seconds or 0.0) == time) for time in times] or [()]
 
 
 def _levels(sensor: Sensor) -> str:
@@ -88,7 +107,15 @@ def calibrate_group(group: Group) -> Calibration:
             f"level of {black:g} DN; dark frames are given with --dark"
         )
     whole = bool((scene[0] == np.rint(scene[0])).all())
-    return calibrate(group.iso, scene, dark, group.scene[0].sensor, whole)
+    found = calibrate(group.iso, scene, dark, group.scene[0].sensor, whole)
+    return replace(found, dark_current=current_of(group, found)) if group.longer else found
+
+
+def current_of(group: Group, found: Calibration) -> DarkCurrent | None:
+    """The dark current of a group with dark frames of several exposure times."""
+    every = (group.dark, *group.longer)
+    stacks = {frames[0].seconds or 0.0: read_frames(frames) for frames in every if len(frames) > 1}
+    return dark_current(stacks, found.pooled.gain, found.sensor)
 
 
 def read_frames(frames: Sequence[CalibrationFrame]) -> Floats:

@@ -3,6 +3,7 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from clpipe.analysis.calibration.dark_current import DarkCurrent
 from clpipe.analysis.calibration.dark_figures import DarkFigures
 from clpipe.analysis.calibration.fixed_pattern import Pixels
 from clpipe.analysis.calibration.line_fit import Bin, Estimate, Line
@@ -34,6 +35,7 @@ class Calibration:
     hot: Pixels | None = None
     dead: Pixels | None = None
     dark: DarkFigures | None = None
+    dark_current: DarkCurrent | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -67,5 +69,6 @@ class Calibration:
             "hot_pixels": self.hot and self.hot.record(),
             "dead_pixels": self.dead and self.dead.record(),
             "dark": self.dark and self.dark.record(),
+            "dark_current": self.dark_current and self.dark_current.record(),
             "notes": list(self.notes),
         }

@@ -1,0 +1,103 @@
+"""Dark current from dark frames of several exposure times.
+
+Cameras take the mean dark charge off with their black level, so its shot noise and its pattern
+tell it, and not the mean (EMVA 1288, release 4.0, 2021, has both ways).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from clpipe.analysis.calibration.dark_figures import sites_of, without_rows
+from clpipe.analysis.calibration.line_fit import Estimate
+from clpipe.analysis.calibration.repeats import Sensor
+from clpipe.base.types import Doubles, Floats
+
+FEWEST_TIMES = 2
+
+
+@dataclass(frozen=True)
+class DarkCurrent:
+    """The dark current of the frames' temperature, and how pixels differ in it."""
+
+    current: Estimate  # e-/s
+    spread: Estimate | None  # standard deviation over mean; None where no current is seen
+    times: tuple[float, ...]  # s
+
+    def record(self) -> dict[str, object]:
+        """The figures as JSON values."""
+        spread = self.spread and {"value": self.spread.value, "error": self.spread.error}
+        current = {"value": self.current.value, "error": self.current.error}
+        return {"current_e_per_s": current, "spread": spread, "times_s": list(self.times)}
+
+
+def dark_current(
+    stacks: Mapping[float, Floats], gain: Estimate, sensor: Sensor
+) -> DarkCurrent | None:
+    """The dark current of frames of one ISO and temperature; None for fewer than two times.
+
+    Variance in time rises by gain^2 * current for each second, that of the pattern by the square of
+    gain * current * spread for each second squared.
+
+    Args:
+        stacks: dark frames by exposure time, s; (two or more frames, height, width) in DN.
+        gain: the system gain, DN/e-.
+        sensor: for the pattern of its colours.
+    """
+    stacks = {time: frames for time, frames in sorted(stacks.items()) if len(frames) > 1}
+    if len(stacks) < FEWEST_TIMES:
+        return None
+    times = np.array(list(stacks))
+    temporal, patterns = zip(
+        *(variances(frames, sensor) for frames in stacks.values()), strict=True
+    )
+    slope = slope_of(times, temporal)
+    factor = 1 / gain.value**2
+    relative = np.hypot(slope.error / max(abs(slope.value), 1e-12), 2 * gain.error / gain.value)
+    value = slope.value * factor
+    current = Estimate(value, max(abs(value) * float(relative), slope.error * factor))
+    spread = None
+    if current.significant:
+        rise = slope_of(times**2, patterns).root()
+        own = rise.value / (gain.value * current.value)
+        share = np.hypot(rise.error / max(rise.value, 1e-12), current.error / current.value)
+        spread = (
+            Estimate(own, own * float(share)) if rise.significant else Estimate(0.0, float(share))
+        )
+    return DarkCurrent(current, spread, tuple(float(t) for t in times))
+
+
+def variances(frames: Floats, sensor: Sensor) -> tuple[Estimate, Estimate]:
+    """The variances of a pixel in time, and of the pattern of pixels, DN^2.
+
+    What rows and columns share is neither.
+    """
+    count = len(frames)
+    mean = frames.mean(axis=0, dtype=np.float64)
+    rest = without_rows(
+        (frames - mean.astype(np.float32)) * np.float32((count / (count - 1)) ** 0.5)
+    )
+    of_pixels = rest.var(axis=0, dtype=np.float64)
+    in_time = float(of_pixels.mean())
+    freedom = of_pixels.size * (count - 1)
+    scatter = float(of_pixels.std()) / of_pixels.size**0.5
+    flat = mean.copy()
+    for site in sites_of(sensor.pattern):
+        part = flat[site]
+        part -= part.mean(axis=0, keepdims=True)
+        part -= part.mean(axis=1, keepdims=True)
+    squares = flat**2
+    pattern = float(squares.mean()) - in_time / count
+    error = float(squares.std()) / squares.size**0.5
+    least = in_time * (2 / freedom) ** 0.5
+    return Estimate(in_time, max(scatter, least)), Estimate(pattern, error)
+
+
+def slope_of(x: Doubles, estimates: tuple[Estimate, ...]) -> Estimate:
+    """The slope of a line through estimates, each weighted by its error."""
+    y = np.array([e.value for e in estimates])
+    weight = 1 / np.array([max(e.error, 1e-12) for e in estimates]) ** 2
+    middle = float((weight * x).sum() / weight.sum())
+    spread = float((weight * (x - middle) ** 2).sum())
+    return Estimate(float((weight * (x - middle) * y).sum() / spread), spread**-0.5)
