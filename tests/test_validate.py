@@ -8,8 +8,12 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
+from clpipe.analysis.matching.columns import Places, figures_of, noise_of_frames
+from clpipe.analysis.signature import flat_places, luma
 from clpipe.camera.profile import load_camera
 from clpipe.images.read import read_image
+from clpipe.pipeline import Pipeline
+from clpipe.reference.transfer import srgb_curve
 from tools.pages import real_cameras, side_by_side, validate
 
 pytestmark = pytest.mark.tools
@@ -59,6 +63,34 @@ def test_the_default_chain_is_like_a_camera():
     pair = real_cameras.develop(read_image(validate.RENDER).pixels, 1600)
     record = pair.signature().record()
     assert not real_cameras.outside(record), record
+
+
+@pytest.mark.parametrize("iso", [1600, 6400])
+def test_noise_by_intensity_and_chroma_are_a_cameras(iso):
+    """As of five cameras: quieter in shadows and highlights, no dark pits, coarse chroma."""
+    pair = real_cameras.develop(read_image(validate.RENDER).pixels, iso)
+    clean = pair.clean.astype(np.float64)
+    noise = noise_of_frames([pair.noisy.astype(np.float32)], clean)
+    found = figures_of(noise, Places(flat_places(clean, 12), luma(clean)))
+    middle = found["sigma_64"]
+    assert 0.45 < found["sigma_12"] / middle < 0.84
+    assert 0.60 < found["sigma_24"] / middle < 0.92
+    assert 0.77 < found["sigma_40"] / middle < 0.98
+    assert 0.33 < found["sigma_160"] / middle < 0.78
+    assert -0.07 < found["skew_shadows"] < 0.26
+    assert 3.2 < found["kurtosis"] < 5.3
+    assert 0.57 < found["chroma_two_right"] < 0.77
+    assert found["chroma_right_4"] > 0.14
+    assert abs(found["right_3"]) < 0.08
+
+
+def test_a_render_as_in_srgb_has_one_word():
+    grey = np.repeat(np.linspace(0.002, 0.98, 64, dtype=np.float32)[None, :, None], 3, 2)
+    image = grey.repeat(32, 0)
+    settings = {"tone_curve": {"method": "linear"}, "skip": ["noise", "denoise", "sharpen"]}
+    plain = np.rint(255 * srgb_curve(image.astype(np.float64)))
+    made = Pipeline(**settings, device="numpy").process(image, "k").image
+    assert np.abs(made.astype(float) - plain)[:, 2:-2].max() <= 2
 
 
 def test_the_cameras_that_were_measured_are_in_the_range():

@@ -72,7 +72,9 @@ class Camera(BaseModel):
         20.0  # deg C, it holds there
     )
     dark_current_doubling: Positive | None = None  # K; None: the same at every temperature
-    dark_current_spread: NotNegative = 0.0  # how pixels differ, standard deviation over mean
+    dark_current_spread: Annotated[float, Field(ge=0, le=1)] = (
+        0.0  # how pixels differ, standard deviation over mean
+    )
     dark_shading_slope: NotNegative = 0.0  # DN for each ISO, standard deviation over the sensor
     dark_shading_offset: NotNegative = 0.0  # DN, the same of what does not depend on the ISO
     dark_shading_length: Positive = 500.0  # px, over which both change

@@ -300,7 +300,8 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     """
     methods = {name: settings.method(name) for name in step_names(settings)}
     optics = optics_of(settings, camera, methods)
-    context = Context(camera=camera, iso=settings.iso, optics=optics)
+    time = settings.render.exposure_time
+    context = Context(camera=camera, iso=settings.iso, optics=optics, exposure_time=time)
     steps: list[Step] = []
     before, takes_lens = "the input", not settings.lens
     for name, own in methods.items():

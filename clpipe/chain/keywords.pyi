@@ -143,16 +143,6 @@ class DefectPixels(TypedDict, total=False):
     hot_level: Number
     dead_share: Number
 
-class DarkCurrent(TypedDict, total=False):
-    method: Draw | Literal["thermal"]
-    exposure_time: Number
-    temperature: Number
-    current: Number
-    reference_temperature: Number
-    doubling: Number
-    spread: Number
-    per_electron: Number
-
 class Blooming(TypedDict, total=False):
     method: Draw | Literal["none", "column"]
     full_signal: Number
@@ -173,6 +163,16 @@ class SensorNoise(TypedDict, total=False):
     full_well: Number
     tukey_lambda: Number
     full_signal: Number
+
+class DarkCurrent(TypedDict, total=False):
+    method: Draw | Literal["thermal"]
+    exposure_time: Number
+    temperature: Number
+    current: Number
+    reference_temperature: Number
+    doubling: Number
+    spread: Number
+    per_electron: Number
 
 class RandomTelegraph(TypedDict, total=False):
     method: Draw | Literal["two_levels"]
@@ -365,9 +365,9 @@ class Keywords(TypedDict, total=False):
     crosstalk: Crosstalk
     prnu: Prnu
     defect_pixels: DefectPixels
-    dark_current: DarkCurrent
     blooming: Blooming
     sensor_noise: SensorNoise
+    dark_current: DarkCurrent
     random_telegraph: RandomTelegraph
     dsnu: Dsnu
     dark_shading: DarkShading

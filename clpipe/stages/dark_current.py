@@ -1,12 +1,11 @@
 """Dark current: charge that heat sets free while the shutter is open."""
 
-from math import sqrt
 from typing import ClassVar
 
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.reference.math import negative_log
+from clpipe.reference.math import negative_log, square_root
 from clpipe.reference.random import normal_at, word_at
 from clpipe.stage import (
     Arguments,
@@ -25,9 +24,9 @@ class Thermal(Method):
     """The dark current's shot noise and fixed pattern; its mean is taken off with the black level.
 
     A pixel gathers D = current * 2^((temperature - reference) / doubling) * time electrons in the
-    mean (EMVA 1288, release 4.0, 2021: dark current). Their shot noise has the variance D, new in
-    each frame. Pixels differ: the pattern has an exponential distribution of the standard deviation
-    spread * D, as hot pixels make its tail long, and stays put for a camera.
+    mean (EMVA 1288, release 4.0, 2021: dark current). Pixels differ: their own charge has a shifted
+    exponential distribution of the standard deviation spread * D, as hot pixels make its tail long,
+    and stays put for a camera. Its shot noise, new in each frame, has that charge as variance.
 
     >>> from clpipe.stage import run_reference
     >>> hot = Thermal(exposure_time=10.0, current=2.0, spread=0.0, per_electron=1e-3)
@@ -44,7 +43,7 @@ class Thermal(Method):
         None,
         "How long charge is gathered.",
         "s",
-        "from exposure; else 0, which is off",
+        "from exposure or the render's camera; else 0, which is off",
         ge=0,
         le=86400,
     )
@@ -76,7 +75,7 @@ class Thermal(Method):
         "",
         "from the camera",
         ge=0,
-        le=100,
+        le=1,
     )
     per_electron: float | None = parameter(
         None, "Signal of an electron.", "signal/e-", "from the camera and ISO", gt=0, le=1
@@ -106,48 +105,49 @@ class Thermal(Method):
     def passes(self) -> tuple[Pass, ...]:
         if not self.electrons:
             return ()
-        shot = Pass("dark_shot_noise", arguments=("sigma",), random=NoiseScope.IMAGE)
-        pattern = Pass(
-            "dark_pattern", arguments=("spread",), writes="pattern", random=NoiseScope.CAMERA
-        )
-        if not self.spread:
-            return (shot,)
         return (
-            pattern,
+            Pass(
+                "dark_charge",
+                arguments=("mean", "spread"),
+                writes="charge",
+                kind=Kind.PAIR,
+                random=NoiseScope.CAMERA,
+            ),
             Pass(
                 "dark_shot_noise",
-                arguments=("sigma",),
-                reads=("pattern",),
+                arguments=("per_electron",),
+                reads=("charge",),
                 random=NoiseScope.IMAGE,
             ),
         )
 
     @property
-    def sigmas(self) -> tuple[np.float32, np.float32]:
-        """Standard deviations of the shot noise and of the pattern, in signal."""
+    def _charge(self) -> tuple[np.float32, np.float32, np.float32]:
+        """The mean charge, its standard deviation over pixels, and an electron, in signal."""
         assert self.spread is not None and self.per_electron is not None
-        shot, pattern = sqrt(self.electrons), self.spread * self.electrons
-        return np.float32(shot * self.per_electron), np.float32(pattern * self.per_electron)
+        mean = self.electrons * self.per_electron
+        return np.float32(mean), np.float32(mean * self.spread), np.float32(self.per_electron)
 
     def arguments(self, context: Context) -> Arguments:
-        shot, pattern = self.sigmas
-        return {"spread": pattern, "sigma": shot}
+        mean, spread, electron = self._charge
+        return {"mean": mean, "spread": spread, "per_electron": electron}
 
     def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
-        shot, pattern = self.sigmas
-        return before + (shot**2 + pattern**2)
+        if not self.electrons:
+            return before
+        mean, spread, electron = self._charge
+        return before + (mean * electron + spread * spread)
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         if not self.electrons:
             return image
-        (shot, pattern), streams = self.sigmas, given.stream
-        if self.spread:
-            words = word_at(image.shape, 0, streams[NoiseScope.CAMERA])
-            bits = (words >> np.uint32(1)).view(np.int32)
-            u = (bits.astype(np.float32) + np.float32(0.5)) * np.float32(4.6566129e-10)
-            own = np.maximum(negative_log(u), np.float32(0)) - np.float32(1)
-            image = image + own * pattern
-        return image + normal_at(image.shape, 1, streams[NoiseScope.IMAGE]) * shot
+        (mean, spread, electron), zero = self._charge, np.float32(0)
+        words = word_at(image.shape, 0, given.stream[NoiseScope.CAMERA])
+        bits = (words >> np.uint32(1)).view(np.int32)
+        u = (bits.astype(np.float32) + np.float32(0.5)) * np.float32(4.6566129e-10)
+        more = (np.maximum(negative_log(u), zero) - np.float32(1)) * spread
+        shot = square_root(np.maximum(more + mean, zero) * electron)
+        return image + more + normal_at(image.shape, 1, given.stream[NoiseScope.IMAGE]) * shot
 
 
 STAGE = Stage("dark_current", "Add what heat sets free.", Kind.MOSAIC, Kind.MOSAIC, (Thermal,))

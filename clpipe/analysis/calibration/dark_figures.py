@@ -208,7 +208,8 @@ def wave_in(rows: Doubles) -> Wave | None:
         return None
     amplitude = 2 / height * float(np.sqrt(power[peak] - background))
     error = 2 / height * float(np.sqrt(background / (2 * frames)))
-    return Wave(Estimate(amplitude, error), FINER * height / peak)
+    phases = amplitude / (2 * (frames - 1))  # of so few frames, whose mean keeps some of the wave
+    return Wave(Estimate(amplitude, float(np.hypot(error, phases))), FINER * height / peak)
 
 
 def shading_of(mean: Doubles, good: Mask, sites: Sequence[tuple[slice, slice]]) -> Shading | None:

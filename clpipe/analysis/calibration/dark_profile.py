@@ -77,7 +77,7 @@ def _current(calibrations: Sequence[Calibration]) -> Sourced:
             source + plus_minus(current, "e-/s") + where,
         ),
         keys[1]: (
-            spread.value if spread and spread.significant else None,
+            min(spread.value, 1.0) if spread and spread.significant else None,
             source + plus_minus(spread) if spread else f"{UNKNOWN}no dark current was seen",
         ),
     }

@@ -272,8 +272,8 @@ def by_intensity(noise: Doubles, level: Doubles) -> Figures:
 def skewness(noise: Doubles) -> float:
     """The third moment over the cubed sigma; NaN for too few samples.
 
-    >>> skewness(np.array([[0.0, 0.0, 0.0, 4.0]] * 100)), skewness(np.zeros((1, 4)))
-    (1.1547005383792515, nan)
+    >>> round(skewness(np.array([[0.0, 0.0, 0.0, 4.0]] * 100)), 3), skewness(np.zeros((1, 4)))
+    (1.155, nan)
     """
     if noise.size < FEWEST or not (sigma := float(noise.std())):
         return float("nan")
