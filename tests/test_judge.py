@@ -80,6 +80,8 @@ def test_pairs_of_two_cameras_are_judged(tmp_path, monkeypatch, capsys):
         # Independent noise is further from correlated noise than a camera's is.
         far, near = (found["judged"][way][camera]["distance"] for way in ("iid", "default"))
         assert far > near
+    white = found["figures"]["iid, as one_iso800"]
+    assert abs(white[judge.CB_RIGHT]) < 0.1 and 0.3 < white[judge.CR_COARSE] < 3
     assert found["figures"]["iid, as one_iso800"]["half"] == pytest.approx(0.25, abs=0.03)
     print(judge.table(found))
     said = capsys.readouterr().out

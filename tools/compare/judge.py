@@ -25,10 +25,17 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.analysis.matching.columns import COLUMNS, Noise, figures_of
+from clpipe.analysis.matching.columns import (
+    COLUMNS,
+    REACH,
+    Noise,
+    autocorrelation,
+    figures_of,
+)
 from clpipe.analysis.matching.scenes import Scene, load_scenes
 from clpipe.analysis.matching.search import target_of
 from clpipe.analysis.matching.simulation import Simulator
+from clpipe.analysis.spatial import over_white
 from clpipe.base.types import Doubles
 from clpipe.chain.files import load_settings
 from clpipe.chain.settings import overlay
@@ -42,6 +49,8 @@ CONFIGS = ("default", "nikon-d800-jpeg", "canon-5d3-jpeg")
 SHOWN = ("sigma_12", "sigma_24", "sigma_40", "sigma_96", "sigma_128", "skew_shadows", "kurtosis")
 SHOWN += ("right", "diagonal", "two_right", "right_3", "half", "chroma_right", "chroma_two_right")
 SHOWN += ("red_green",)
+COARSE = 16  # px, of the means of chroma
+CB_RIGHT, CR_COARSE = "Cb, 2 right", f"Cr after {COARSE}x{COARSE} means, over white noise's"
 RELATIVE_TO = "sigma_64"
 STEPS = 4  # of the search for an ISO
 
@@ -161,15 +170,18 @@ def shown(noises: Sequence[Noise], pairs: Sequence[Pair]) -> dict[str, float]:
     """The plain figures of noise: medians over pictures; sigma by luma is over that at 64 to 95."""
     rows = []
     for noise, pair in zip(noises, pairs, strict=True):
-        places = replace(target_of(pair.scene, pair.scene.mask | pair.scene.holdout).places)
+        places = target_of(pair.scene, pair.scene.mask | pair.scene.holdout).places
         figures = figures_of(noise, places)
         middle = figures[RELATIVE_TO]
         rows.append([figures[n] / middle if n.startswith("sigma") else figures[n] for n in SHOWN])
+        _, cb, cr = noise.planes
+        rows[-1].append(float(autocorrelation(cb, places)[REACH, REACH + 2]))
+        rows[-1].append(over_white(cr, places.bright, COARSE))
     with np.errstate(all="ignore"):
         medians = [
             np.nan if np.isnan(c).all() else float(np.nanmedian(c)) for c in np.array(rows).T
         ]
-    return dict(zip(SHOWN, medians, strict=True))
+    return dict(zip((*SHOWN, CB_RIGHT, CR_COARSE), medians, strict=True))
 
 
 def report(folder: Path, configs: Sequence[str]) -> dict[str, Any]:
@@ -222,9 +234,10 @@ def table(found: Mapping[str, Any]) -> str:
             numbers = f"{one['auc']:6.2f}{one['distance']:10.1f}{one['kld']:7.3f}"
             lines.append(f"{name:24}{camera:18}{numbers}  {telling}")
     lines.append("")
-    for key in SHOWN:
+    for key in (*SHOWN, CB_RIGHT, CR_COARSE):
         over = f", over that at {RELATIVE_TO[6:]}" if key.startswith("sigma") else ""
-        lines.append(f"{COLUMNS[key].text.removesuffix(', levels')}{over}")
+        text = COLUMNS[key].text.removesuffix(", levels") if key in COLUMNS else key
+        lines.append(f"{text}{over}")
         lines += [f"    {name:40}{own[key]:8.2f}" for name, own in found["figures"].items()]
     return "\n".join(lines)
 
