@@ -17,6 +17,7 @@ from clpipe.chain.registry import all_stages, check_passes, user_code_errors
 from clpipe.chain.settings import Settings
 from clpipe.reference.geometry import NO_MARGINS, Composition, Margins
 from clpipe.reference.intrinsics import Intrinsics
+from clpipe.reference.random import Stream, stream_of
 from clpipe.reference.resample import Resampler, sizes
 from clpipe.stage import (
     Context,
@@ -24,6 +25,7 @@ from clpipe.stage import (
     Kind,
     Method,
     Noiseless,
+    NoiseScope,
     Resample,
     Stage,
     StageRole,
@@ -82,6 +84,16 @@ class Chain:
     def seed(self) -> int:
         """The seed of the noise."""
         return self.settings.seed
+
+    def streams(self, step: Step, noise_key: str) -> dict[NoiseScope, Stream]:
+        """The random streams of a step for one image.
+
+        Image noise is keyed on the seed and the noise key, fixed pattern noise on the camera.
+        """
+        return {
+            NoiseScope.IMAGE: stream_of(f"image:{self.seed}:{noise_key}", step.name),
+            NoiseScope.CAMERA: stream_of(f"camera:{self.camera.name}", step.name),
+        }
 
     @property
     def optics(self) -> Optics:

@@ -10,7 +10,7 @@ import numpy as np
 from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array, Floats
-from clpipe.chain.chain import Chain, Step
+from clpipe.chain.chain import Chain
 from clpipe.chain.registry import user_code_errors
 from clpipe.engine.bindings import ArgumentValue, EncodedCurves, ResamplingValue, StreamWord, Value
 from clpipe.engine.buffers import HostImages
@@ -22,7 +22,7 @@ from clpipe.engine.options import RunOptions
 from clpipe.engine.plan import make_plan
 from clpipe.engine.programs import announced
 from clpipe.reference.curve import compose, to_8_bit
-from clpipe.reference.random import Stream, stream_of
+from clpipe.reference.random import Stream
 from clpipe.stage import NoiseScope, ReferenceContext, Resample
 
 DEFAULTS = RunOptions()
@@ -86,17 +86,6 @@ def check_resamplings(plan: Plan, width: int, height: int) -> None:
     """
     for resampling, size in zip(plan.resamplings, plan.sizes(width, height), strict=False):
         resampling.values(*size)
-
-
-def streams(chain: Chain, step: Step, noise_key: str) -> dict[NoiseScope, Stream]:
-    """The random streams of a step for one image.
-
-    Image noise is keyed on the seed and the noise key, fixed pattern noise on the camera.
-    """
-    return {
-        NoiseScope.IMAGE: stream_of(f"image:{chain.seed}:{noise_key}", step.name),
-        NoiseScope.CAMERA: stream_of(f"camera:{chain.camera.name}", step.name),
-    }
 
 
 class Runner:
@@ -269,7 +258,7 @@ class Runner:
                     return self._composed(steps)
                 case StreamWord(step, scope, word):
                     if step not in keys:
-                        keys[step] = streams(self.chain, self.chain.step_named(step), noise_key)
+                        keys[step] = self.chain.streams(self.chain.step_named(step), noise_key)
                     return np.uint32(getattr(keys[step][scope], word))
 
         check_resamplings(plan, *image.shape[1::-1])
@@ -329,7 +318,7 @@ class Runner:
         steps = (self.chain if whole else self.chain.through(self.keep)).steps
         for step in steps:
             from_size = dict(step.method.estimates_for(*image.shape[1::-1]))
-            given = ReferenceContext(step.context, streams(self.chain, step, noise_key), from_size)
+            given = ReferenceContext(step.context, self.chain.streams(step, noise_key), from_size)
             with user_code_errors(f"stage {step.name}", step.stage.folder):
                 image = step.method.reference(image, given)
             if step.name in self.keep:

@@ -245,16 +245,22 @@ class File(Method):
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         if not self.passes():
             return image
-        own = self._map(given.context.iso)
+        height, width = image.shape[:2]
+        return np.asarray(image + self.at_iso(height, width, given.context.iso))
+
+    def at_iso(self, height: int, width: int, iso: float) -> Floats:
+        """What is added, (height, width), signal."""
+        own = self._map(iso)
         (up, down, v), (left, right, x) = (
             between(n, np.float32(1 / self.block), count)
-            for n, count in zip(image.shape[:2], own.shape, strict=True)
+            for n, count in zip((height, width), own.shape, strict=True)
         )
         rows = [
             own[row][:, left] + (own[row][:, right] - own[row][:, left]) * x for row in (up, down)
         ]
         upper, lower = rows
-        return np.asarray(image + (upper + (lower - upper) * v[:, None]))
+        total: Floats = upper + (lower - upper) * v[:, None]
+        return total
 
 
 def between(pixels: int, per_px: np.float32, count: int) -> tuple[Array, Array, Floats]:

@@ -70,12 +70,13 @@ class Random(Method):
         names = ("hot_limit", "dead_limit", "hot_scale", "hot_level")
         return (Pass("defect_pixels", arguments=names, random=NoiseScope.CAMERA),)
 
-    def _limits(self) -> tuple[int, int]:
+    def limits(self) -> tuple[int, int]:
+        """The words below which a pixel is hot, and above which it is dead."""
         assert self.hot_share is not None and self.dead_share is not None
         return round(self.hot_share * WORDS), WORDS - 1 - round(self.dead_share * WORDS)
 
     def arguments(self, context: Context) -> Arguments:
-        hot_limit, dead_limit = self._limits()
+        hot_limit, dead_limit = self.limits()
         return {
             "hot_limit": np.int32(hot_limit),
             "dead_limit": np.int32(dead_limit),
@@ -88,7 +89,7 @@ class Random(Method):
         return before
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        hot_limit, dead_limit = self._limits()
+        hot_limit, dead_limit = self.limits()
         words = word_at(image.shape, 0, given.stream[NoiseScope.CAMERA])
         bits = (words >> np.uint32(1)).view(np.int32)
         u = (bits.astype(np.float32) + np.float32(0.5)) * np.float32(1 / max(hot_limit, 1))

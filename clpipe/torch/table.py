@@ -1,0 +1,166 @@
+"""Many chains side by side: what each stage needs of each of them, as tensors."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from clpipe.base.errors import RequestError
+from clpipe.chain.chain import Chain, Step
+from clpipe.reference.cfa import sites
+from clpipe.reference.random import Stream
+from clpipe.stage import Argument, CompileTime, NoiseScope
+from clpipe.torch.numbers import Streams
+from clpipe.torch.stages import TWINS, Group
+
+AT_ONCE = 1 << 17  # pixels on a CPU, whose cache holds them
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What is drawn for the samples of a batch.
+
+    Args:
+        table: of chains.
+        chains: of each sample, the number of its chain; (sample,).
+        keys: of its noise, (2, sample).
+        places: of its upper left corner on the sensor: row, column.
+        area: height and width of the part of a sensor that the places are in.
+    """
+
+    table: "Table"
+    chains: NDArray[np.intp]
+    keys: Tensor
+    places: Sequence[tuple[int, int]]
+    area: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One method of a stage, and the chains that have it.
+
+    Args:
+        twin: the method on tensors.
+        steps: of each chain, its step; None where it has another method.
+        sensors: of each chain, the stream of what is fixed to its camera.
+        numbers: the kernel's arguments by name, (chain,); 0 where it has another method.
+        stage: the stage's number in random streams.
+    """
+
+    twin: Callable[[Tensor, Group], Tensor]
+    steps: Sequence[Step | None]
+    sensors: Sequence[Stream]
+    numbers: dict[str, NDArray[np.float32]]
+    stage: int
+
+    def noisy(self, mosaics: Tensor, drawn: Drawn, samples: NDArray[np.intp]) -> Tensor:
+        """The mosaics of some samples of a batch behind this method; the others as they are."""
+        chains = drawn.chains[samples]
+        has = np.array([self.steps[chain] is not None for chain in chains])
+        if not has.any():
+            return mosaics
+        own, on = mosaics, mosaics.device
+        if not has.all():
+            rows = torch.from_numpy(np.flatnonzero(has)).to(on)
+            own, samples, chains = mosaics[rows], samples[has], chains[has]
+        values = np.array([each[chains] for each in self.numbers.values()], np.float32)
+        tensors = torch.from_numpy(values).to(on)[..., None, None]
+        group = Group(
+            steps=[step for chain in chains if (step := self.steps[chain])],
+            numbers=dict(zip(self.numbers, tensors, strict=False)),
+            streams=Streams(drawn.keys[:, torch.from_numpy(samples)].to(on), self.stage),
+            sensors=[self.sensors[chain] for chain in chains],
+            places=[drawn.places[sample] for sample in samples],
+            area=drawn.area,
+            size=(mosaics.shape[1], mosaics.shape[2]),
+        )
+        noisy = self.twin(own, group)
+        return noisy if has.all() else mosaics.index_copy(0, rows, noisy)
+
+
+class Table:
+    """Chains from a clean mosaic to the noisy one.
+
+    Args:
+        chains: of which all have the same steps.
+
+    Raises:
+        RequestError: a method has no twin on tensors.
+    """
+
+    def __init__(self, chains: Sequence[Chain]) -> None:
+        self.chains = chains
+        self._variants = [
+            variant
+            for position in range(len(chains[0].steps))
+            for variant in _variants(chains, position)
+        ]
+        # Of each chain, the plane (R, Gr, Gb, B) of each place of the filter array, by rows.
+        orders = []
+        for chain in chains:
+            last = chain.steps[-1]
+            named = sites(last.method.next_context(last.context).pattern).values()
+            places = [2 * row.start + column.start for row, column in named]
+            orders.append(np.argsort(places))
+        self.planes = torch.from_numpy(np.stack(orders))
+
+    def noisy(self, mosaics: Tensor, drawn: Drawn) -> Tensor:
+        """Mosaics with noise, (sample, height, width)."""
+        at_once = len(mosaics)
+        if mosaics.device.type == "cpu":
+            at_once = max(1, AT_ONCE // (mosaics.shape[1] * mosaics.shape[2]))
+        parts = []
+        for begin in range(0, len(mosaics), at_once):
+            part = mosaics[begin : begin + at_once]
+            samples = np.arange(begin, begin + len(part))
+            for variant in self._variants:
+                part = variant.noisy(part, drawn, samples)
+            parts.append(part)
+        return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+def _variants(chains: Sequence[Chain], position: int) -> list[Variant]:
+    """The methods of a step that do something, each with the chains that have it.
+
+    Raises:
+        RequestError: one has no twin on tensors.
+    """
+    found: dict[tuple[object, ...], dict[int, Step]] = {}
+    for number, chain in enumerate(chains):
+        step = chain.steps[position]
+        if passes := step.method.passes():
+            alike = type(step.method), *(each.function for each in passes)
+            found.setdefault(alike, {})[number] = step
+    variants = []
+    for steps in found.values():
+        number, example = next(iter(steps.items()))
+        twin = TWINS.get(type(example.method))
+        if twin is None:
+            raise RequestError(
+                f"{example.name}.method={example.method.method}: clpipe.torch has no such method; "
+                "clpipe.RawNoise runs it"
+            )
+        arguments = {number: _numbers(step) for number, step in steps.items()}
+        numbers = {
+            name: np.array(
+                [arguments[k][name] if k in steps else 0 for k in range(len(chains))], np.float32
+            )
+            for name in arguments[number]
+        }
+        sensors = [chain.streams(example, "")[NoiseScope.CAMERA] for chain in chains]
+        stage = sensors[0].stage
+        own = [steps.get(k) for k in range(len(chains))]
+        variants.append(Variant(twin, own, sensors, numbers, stage))
+    return variants
+
+
+def _numbers(step: Step) -> dict[str, Argument]:
+    """The numbers among the arguments of a step's kernels."""
+    return {
+        name: value
+        for name, value in step.method.arguments(step.context).items()
+        if not isinstance(value, CompileTime | np.ndarray)
+    }
