@@ -397,6 +397,7 @@ def test_what_is_developed_goes_through_the_same_jpeg(burst, tmp_path):
 def test_every_number_of_the_development_is_searched():
     names = {d.name for d in dimensions_of(make_chain(Settings()))}
     assert {"denoise.luma_strength", "denoise.grain", "sharpen.amount"} <= names
+    assert "sharpen.limit" in names  # what edges get
     assert {"tone_curve.contrast", "tone_curve.toe", "tone_curve.shoulder"} <= names
     assert not {"denoise.luma_noise", "sharpen.threshold"} & names  # in units of the signal
     space = space_for(Settings(), iso_is_given=False)
@@ -414,6 +415,8 @@ def test_every_number_of_the_development_is_searched():
         assert again == {f"denoise_2.{name}" for name in numbers}
     scales = {choice.text for choice in variants_of(Settings(), "denoise")}
     assert {"denoise.chroma_scale 1", "denoise.chroma_scale 3"} <= scales
+    radii = {choice.text for choice in variants_of(Settings(), "sharpen")}
+    assert {"sharpen.radius 0.84", "sharpen.radius 1.68"} <= radii
 
 
 def test_a_smaller_picture_is_sharpened_before_or_after():
@@ -436,8 +439,8 @@ def test_a_third_is_kept_out_of_the_search(burst, tmp_path):
     names = saved(tmp_path, **{f"{k}": frame for k, frame in enumerate(burst)})
     (one,) = load_scenes(names, []).each
     assert not (one.mask & one.holdout).any()
-    assert one.holdout.sum() / (one.mask | one.holdout).sum() == pytest.approx(1 / 3, abs=0.12)
-    whole = replace(one, mask=one.mask | one.holdout, holdout=np.zeros_like(one.holdout))
+    assert one.holdout.sum() / one.flat.sum() == pytest.approx(1 / 3, abs=0.12)
+    whole = replace(one, kept_out=np.zeros_like(one.flat))
     kept = with_holdout([whole] * 6)
     assert [s.mask.any() for s in kept] == [True, True, False] * 2
     assert [s.mask.any() and s.holdout.any() for s in with_holdout([whole] * 5)] == [True] * 5
@@ -518,7 +521,7 @@ def test_looks_are_like_the_cameras(look, device):
     frames, means = (f"{SHARED}/real_noise/{PAIRS[look]}_?_{kind}.png" for kind in ("real", "mean"))
     simulator, residuals, sizes, skews = Simulator(device), [], [], []
     for one in load_scenes([frames], [means]).each:
-        places = Places(one.mask | one.holdout, one.noise.level)
+        places = one.places()
         ours = figures_of(simulator.noise(load_settings(look), one, "test"), places)
         theirs = figures_of(one.noise, places)
         residuals.append([ours[name] - theirs[name] for name in WITHIN])

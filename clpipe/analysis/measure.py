@@ -1,11 +1,13 @@
 """Measuring the noise of images against their clean truth, or against each other."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
+from clpipe.analysis.edges import slopes_of
 from clpipe.analysis.intensity import bin_edges, noise_by_intensity, pool_curves
 from clpipe.analysis.pictures import SITES, WHOLE, Picture
 from clpipe.analysis.repeats import check_repeats
@@ -78,8 +80,15 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
         covariances=covariances,
         notes=tuple(notes_on(images, truth, noise)),
         iso=next((image.iso for image in images if image.iso), None),
+        at_edges=at_edges(clean, noise, start) if clean.ndim == 3 else math.nan,
         rounding=sum(picture.step**2 / 12 for picture in (first, truth) if picture),
     )
+
+
+def at_edges(clean: Floats, noise: Floats, unclipped: Mask) -> float:
+    """The rms of luma's noise where a picture is steepest over that where it is flattest."""
+    slopes = slopes_of(rgb_to_ycbcr(clean)[..., 0], np.all(unclipped, axis=-1))
+    return slopes.ratio(np.stack([rgb_to_ycbcr(frame)[..., 0] for frame in noise]))
 
 
 def check_partners(images: Sequence[Picture], truth: Picture | None) -> None:

@@ -62,6 +62,7 @@ def pool(reports: Sequence[NoiseReport]) -> NoiseReport:
         },
         notes=tuple(dict.fromkeys(note for report in reports for note in report.notes)),
         bursts=len(reports),
+        at_edges=float(mean([r.at_edges for r in reports], sizes)),
     )
 
 

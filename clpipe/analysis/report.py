@@ -38,6 +38,7 @@ class NoiseReport:
     notes: tuple[str, ...]
     iso: float | None = None  # where the images say it
     bursts: int = 1  # whose noise is pooled
+    at_edges: float = math.nan  # rms of luma's noise at edges over that in flat places; of pictures
     rounding: float = 0.0  # the part of every channel's variance that rounding in files has
 
     def record(self) -> dict[str, Any]:
@@ -55,6 +56,7 @@ class NoiseReport:
             "share_used": self.share,
             "notes": list(self.notes),
             "channels": {channel.name: channel_record(channel) for channel in self.channels},
+            "edges_over_flat": json_number(self.at_edges),
             "covariance": {where: table.tolist() for where, table in self.covariances.items()},
             "correlation": {f"{a}-{b}": json_number(r) for (a, b), r in self.correlations.items()},
         }

@@ -108,9 +108,18 @@ def measure_heading(report: NoiseReport) -> str:
         f"against {against}; "
         f"unit: {UNITS[report.kind]}",
         f"{report.share:.1%} of the {what} count; sigma (all) is that of every one",
+        *edges_text(report),
         *(f"note: {note}" for note in report.notes),
     ]
     return "\n".join(lines)
+
+
+def edges_text(report: NoiseReport) -> list[str]:
+    """How much stronger noise is at edges, of pictures."""
+    if math.isnan(report.at_edges):
+        return []
+    ratio = f"{report.at_edges:.2f} times"
+    return [f"luma noise is {ratio} as strong at edges (steepest tenth) as in the flattest quarter"]
 
 
 def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:

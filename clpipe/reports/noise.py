@@ -64,6 +64,7 @@ class Noise:
     sigma: str
     left: float  # share of luma's variance that averaging 2x2 leaves
     correlation: float  # of luma, one pixel to the right
+    at_edges: float  # of luma, over flat places
 
 
 def measured(files: Sequence[Blob]) -> NoiseReport:
@@ -117,6 +118,7 @@ def noises(run: Run, pictures: Sequence[Made], problems: list[str], most: int) -
                 ", ".join(f"{name} {by_name[name].sigma * 255:.2f}" for name in "RGB"),
                 luma.energy_left,
                 float(luma.autocorrelation[middle, middle + 1]),
+                report.at_edges,
             )
         )
     return found

@@ -34,6 +34,7 @@ SESSIONS = 12  # starts of the program, the latest
 # of luma's variance that averaging 2x2 leaves, and luma's correlation one pixel to the right.
 REAL_LEFT = (0.57, 0.63)
 REAL_RIGHT = (0.51, 0.59)
+REAL_EDGES = (1.1, 2.4)  # luma noise where they are steepest over where they are flattest
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,7 @@ def html(runs: Sequence[Run], tell: Callable[[str], None] = lambda _: None) -> s
         noise=noise,
         real_left=REAL_LEFT,
         real_right=REAL_RIGHT,
+        real_edges=REAL_EDGES,
         laws=judged,
         law_drawings=law_drawings,
         limit=f"{LIMIT:g}",

@@ -48,7 +48,7 @@ COVERED = 0.6  # share of a patch that is flat, neither dark nor bright
 CONFIGS = ("default", "nikon-d800-jpeg", "canon-5d3-jpeg")
 SHOWN = ("sigma_12", "sigma_24", "sigma_40", "sigma_96", "sigma_128", "skew_shadows", "kurtosis")
 SHOWN += ("right", "diagonal", "two_right", "right_3", "half", "chroma_right", "chroma_two_right")
-SHOWN += ("red_green",)
+SHOWN += ("red_green", "edges")
 COARSE = 16  # px, of the means of chroma
 CB_RIGHT, CR_COARSE = "Cb, 2 right", f"Cr after {COARSE}x{COARSE} means, over white noise's"
 RELATIVE_TO = "sigma_64"
@@ -91,7 +91,7 @@ def made_by(config: str, simulator: Simulator) -> Callable[[Scene], Noise]:
 
     def noise(scene: Scene) -> Noise:
         scene = replace(scene, jpeg=scene.jpeg or written)
-        target = target_of(scene, scene.mask | scene.holdout)
+        target = target_of(scene)
         iso = float(np.sqrt(low * high))
         for _ in range(STEPS):
             own = simulator.noise(overlay(settings, {"iso": iso}), scene, "iso", 1)
@@ -105,7 +105,7 @@ def made_by(config: str, simulator: Simulator) -> Callable[[Scene], Noise]:
 def iid(scene: Scene) -> Noise:
     """Independent Gaussian noise of the real noise's variance in each channel."""
     own = scene.noise
-    mask = scene.mask | scene.holdout
+    mask = scene.flat
     sigma = own.rgb[:, mask].std((0, 1))
     normals = np.random.default_rng(0).normal(size=own.rgb[:1].shape)
     return Noise(normals * sigma, own.level)
@@ -113,7 +113,7 @@ def iid(scene: Scene) -> Noise:
 
 def intensity_dependent(scene: Scene) -> Noise:
     """The same, of its variance at each luma."""
-    own, mask = scene.noise, scene.mask | scene.holdout
+    own, mask = scene.noise, scene.flat
     bins = (own.level // 16).astype(int)
     sigma = np.zeros((17, 3))
     for number in range(17):
@@ -128,7 +128,7 @@ def intensity_dependent(scene: Scene) -> Noise:
 
 def patches_of(noise: Noise, scene: Scene) -> Iterator[tuple[Doubles, Doubles]]:
     """The patches that are flat: noise (48, 48, 3) and luma (48, 48)."""
-    bright = (scene.mask | scene.holdout) & (noise.level >= 30)
+    bright = scene.flat & (noise.level >= 30)
     height, width = bright.shape
     for y in range(0, height - PATCH + 1, PATCH):
         for x in range(0, width - PATCH + 1, PATCH):
@@ -159,7 +159,7 @@ def divergence(real: Sequence[Noise], made: Sequence[Noise], pairs: Sequence[Pai
     edges = np.arange(-60.5, 61.5)
     counts = []
     for noises in (real, made):
-        masks = [p.scene.mask | p.scene.holdout for p in pairs]
+        masks = [p.scene.flat for p in pairs]
         values = np.concatenate([n.rgb[0][m].ravel() for n, m in zip(noises, masks, strict=True)])
         counts.append(np.histogram(np.clip(values, -60, 60), edges)[0] + 0.5)
     p, q = (count / count.sum() for count in counts)
@@ -170,7 +170,7 @@ def shown(noises: Sequence[Noise], pairs: Sequence[Pair]) -> dict[str, float]:
     """The plain figures of noise: medians over pictures; sigma by luma is over that at 64 to 95."""
     rows = []
     for noise, pair in zip(noises, pairs, strict=True):
-        places = target_of(pair.scene, pair.scene.mask | pair.scene.holdout).places
+        places = pair.scene.places()
         figures = figures_of(noise, places)
         middle = figures[RELATIVE_TO]
         rows.append([figures[n] / middle if n.startswith("sigma") else figures[n] for n in SHOWN])

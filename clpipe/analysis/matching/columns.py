@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from clpipe.analysis.edges import Slopes
 from clpipe.analysis.signature import BIN, DARKEST, FEWEST, LUMA, chroma, luma, noise_of
 from clpipe.analysis.spatial import energy_left
 from clpipe.base.types import Array, Doubles, Floats, Mask
@@ -47,6 +48,7 @@ class Column:
 FURTHER = range(3, REACH + 1)  # lags, px
 TAILS = ("kurtosis", "beyond_4_sigma")
 SKEWS = ("skew_shadows", "skew_midtones")
+EDGES = "edges"
 COLUMNS: Mapping[str, Column] = {
     "rms": Column("luma rms, levels", 0.03, relative=True),
     "kurtosis": Column("kurtosis", 0.3),
@@ -78,6 +80,7 @@ COLUMNS: Mapping[str, Column] = {
         name: Column(f"luma skew at {low}-{high}", 0.08)
         for name, (low, high) in zip(SKEWS, (SHADOWS, MIDTONES), strict=True)
     },
+    EDGES: Column("luma rms at edges over flat", 0.08, relative=True),
 }
 
 
@@ -86,16 +89,22 @@ class Places:
     """The pixels of a scene that count, and its luma, (height, width) each.
 
     ``mask`` goes down to the shadows, where noise is told by its intensity; ``bright``, without
-    them, is where everything else is compared.
+    them, is where everything else is compared; ``slopes`` is where flat places and edges are.
     """
 
     mask: Mask
     level: Doubles
+    slopes: Slopes | None = None
 
     @cached_property
     def bright(self) -> Mask:
         """The pixels that count and are not dark."""
         return np.asarray(self.mask & (self.level >= DARKEST))
+
+    def without(self, left_out: Mask) -> "Places":
+        """The places but for some pixels, (height, width)."""
+        slopes = self.slopes and self.slopes.within(~left_out)
+        return Places(self.mask & ~left_out, self.level, slopes)
 
     @cached_property
     def pairs(self) -> Doubles:
@@ -170,6 +179,8 @@ def figures_of(noise: Noise, places: Places) -> Figures:
         **bands(luma_map),
         **by_intensity(y[:, places.mask], noise.level[places.mask]),
     }
+    if places.slopes:
+        found[EDGES] = places.slopes.ratio(y)
     return found
 
 
@@ -295,8 +306,8 @@ def errors_of(noise: Noise, places: Places) -> Figures:
     mask = places.mask
     numbers = block_numbers(mask.shape)
     rank = {number: k for k, number in enumerate(np.unique(numbers[mask]))}
-    dealt = np.array([rank.get(k, 0) % GROUPS for k in range(numbers.max() + 1)])[numbers]
-    parts = (Places(mask & (dealt != group), places.level) for group in range(GROUPS))
+    dealt = np.array([rank.get(k, k) % GROUPS for k in range(numbers.max() + 1)])[numbers]
+    parts = (places.without(dealt == group) for group in range(GROUPS))
     without = [figures_of(noise, part) for part in parts]
     errors = {}
     for name in COLUMNS:

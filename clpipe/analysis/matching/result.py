@@ -147,11 +147,11 @@ def measured(search: Search, found: Candidate) -> Match:
     for scene in scenes.each:
         count = len(scene.frames) if scene.own_mean else CHECKED
         noise = search.simulator.noise(settings, scene, "result", count)
-        for mask, is_seen in ((scene.mask, True), (scene.holdout, False)):
-            if mask.any():
-                theirs = target_of(scene, mask)
+        for part, is_seen in ((~scene.kept_out, True), (scene.kept_out, False)):
+            if (scene.flat & part).any():
+                theirs = target_of(scene, part)
                 pairs[is_seen].append((theirs, target_at(scene, noise, theirs.places)))
-        noises.append(Compared(scene.noise, noise, scene.mask | scene.holdout))
+        noises.append(Compared(scene.noise, noise, scene.flat))
     return Match(
         settings,
         found.numbers,

@@ -9,14 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
+from clpipe.analysis.edges import slopes_of
 from clpipe.analysis.matching.columns import (
     FEWEST_FRAMES,
     TAILS,
     Noise,
+    Places,
     block_numbers,
     noise_of_frames,
 )
-from clpipe.analysis.signature import DRIFT, flat_places, luma
+from clpipe.analysis.signature import BRIGHTEST, DRIFT, flat_places, luma
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Doubles, Floats, Mask
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding
@@ -44,18 +46,36 @@ MOST_MOVED = 0.1  # share of the blocks
 class Scene:
     """Frames of one scene, (height, width, 3), 0 to 255, and what they are compared with.
 
-    ``mean`` is what was given, or their own mean where ``own_mean``. ``mask`` are the flat places
-    that the search sees, ``holdout`` those that it does not; one of them may be empty. Columns in
-    ``left_out`` cannot be compared.
+    ``mean`` is what was given, or their own mean where ``own_mean``. Masks are (height, width):
+    ``counted`` is what is neither clipped nor dark and does not move, ``flat`` the flat places of
+    it, ``kept_out`` the part of the picture that the search does not see. Columns in ``left_out``
+    cannot be compared.
     """
 
     name: str
     frames: tuple[Floats, ...]
     mean: Doubles
     own_mean: bool
-    mask: Mask
-    holdout: Mask
+    counted: Mask
+    flat: Mask
+    kept_out: Mask
     jpeg: JpegEncoding | None = None
+
+    @property
+    def mask(self) -> Mask:
+        """The flat places that the search sees."""
+        return np.asarray(self.flat & ~self.kept_out)
+
+    @property
+    def holdout(self) -> Mask:
+        """The flat places that it does not see."""
+        return np.asarray(self.flat & self.kept_out)
+
+    def places(self, part: Mask | None = None) -> Places:
+        """Where noise is compared: everywhere, or in a part of the picture, (height, width)."""
+        slopes = slopes_of(luma(self.mean), self.counted)
+        places = Places(self.flat, self.noise.level, slopes)
+        return places if part is None else places.without(~part)
 
     @cached_property
     def noise(self) -> Noise:
@@ -221,8 +241,9 @@ def checked_scene(
         notes.append(f"{paths[0]}: {(~still).mean():.1%} of the picture moves, and is left out")
     if mean is not None:
         refuse_noisy_mean(paths[0], frames[0], mean, against)
-    scene = Scene(paths[0].stem, tuple(frames), clean, own, mask & still, np.zeros_like(mask), jpeg)
-    return scene
+    level, kept_out = luma(clean), np.zeros_like(mask)
+    counted = still & (level >= DARK) & (level <= BRIGHTEST)
+    return Scene(paths[0].stem, tuple(frames), clean, own, counted, mask & still, kept_out, jpeg)
 
 
 def still_places(path: Path, frame: Floats, clean: Doubles, against: str, flat: Mask) -> Mask:
@@ -338,8 +359,9 @@ def cut(scene: Scene, at: tuple[slice, slice], place: tuple[int, int]) -> Scene:
         name=f"{scene.name} at {place[1]},{place[0]}",
         frames=tuple(frame[at] for frame in scene.frames),
         mean=scene.mean[at],
-        mask=scene.mask[at],
-        holdout=scene.holdout[at],
+        counted=scene.counted[at],
+        flat=scene.flat[at],
+        kept_out=scene.kept_out[at],
     )
 
 
@@ -347,11 +369,10 @@ def with_holdout(pieces: Sequence[Scene]) -> tuple[Scene, ...]:
     """The crops, with one third kept out of the search: whole crops of six, or blocks of fewer."""
     if len(pieces) >= MANY:
         return tuple(
-            replace(p, mask=p.holdout, holdout=p.mask) if k % HOLDOUT == HOLDOUT - 1 else p
-            for k, p in enumerate(pieces)
+            replace(piece, kept_out=np.full_like(piece.flat, number % HOLDOUT == HOLDOUT - 1))
+            for number, piece in enumerate(pieces)
         )
-    parted = []
-    for piece in pieces:
-        kept = block_numbers(piece.mask.shape) % HOLDOUT == HOLDOUT - 1
-        parted.append(replace(piece, mask=piece.mask & ~kept, holdout=piece.mask & kept))
-    return tuple(parted)
+    return tuple(
+        replace(piece, kept_out=block_numbers(piece.flat.shape) % HOLDOUT == HOLDOUT - 1)
+        for piece in pieces
+    )

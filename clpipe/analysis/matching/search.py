@@ -117,7 +117,7 @@ class Search:
         self.settings = settings
         self.space = space
         self.simulator = Simulator(device)
-        self.targets = [target_of(s, s.mask) for s in scenes.each if s.mask.any()]
+        self.targets = [target_of(s, ~s.kept_out) for s in scenes.each if s.mask.any()]
         self.evaluations = 0
         self._known: dict[tuple[str, Scene], Figures] = {}  # by settings and scene
         self._done, self._expected, self._share = 0, LAST, 0.0  # ways that are tried
@@ -130,7 +130,7 @@ class Search:
         """
         flattest = sorted(self.targets, key=lambda t: -int(t.scene.mask.sum()))[:FEW]
         crops = [crops_of(target.scene, SMALL, 1)[0] for target in flattest]
-        few = [target_of(crop, crop.mask) for crop in crops]
+        few = [target_of(crop, ~crop.kept_out) for crop in crops]
         first = self.fit(self.space.first, {}, few, QUICK)
         self.watch.advanced(0.0, first, self.scenes)
         best = self.converged(first, few)
@@ -304,9 +304,9 @@ class Search:
         return self._known[key]
 
 
-def target_of(scene: Scene, mask: Mask) -> Target:
-    """A scene as what is searched for, at the pixels that count."""
-    return target_at(scene, scene.noise, Places(mask, scene.noise.level))
+def target_of(scene: Scene, part: Mask | None = None) -> Target:
+    """A scene, or a part of it, as what is searched for."""
+    return target_at(scene, scene.noise, scene.places(part))
 
 
 def target_at(scene: Scene, noise: Noise, places: Places) -> Target:

@@ -28,6 +28,7 @@ SHARPEN = "sharpen"
 SMOOTHER = {"method": "bilateral", "luma_size": 1, "luma_strength": 0.0, "chroma_size": 7}
 COARSER = {"method": "biweight", "luma_strength": 0.0, "chroma_scale": 3}
 SEARCHED_UNITS = ("", "px")  # what is in units of the signal follows from the noise
+ALSO = ("sharpen.limit",)  # searched, though it follows from the noise: it says what edges get
 SPAN = 8.0  # a number is searched within this factor of where it starts
 
 
@@ -115,7 +116,8 @@ def dimensions_of(chain: Chain) -> list[Dimension]:
     A share is searched from 0 to 1, anything else within a factor of 8 of its value in the chain,
     as far as its limits allow.
     What is 0 there is switched off, and stays so. Numbers in units of the signal are not searched,
-    because they follow from the noise; nor those without an upper limit.
+    because they follow from the noise, but for the limit of sharpening; nor those without an upper
+    limit.
     """
     found = []
     for step in chain.steps:
@@ -123,16 +125,16 @@ def dimensions_of(chain: Chain) -> list[Dimension]:
             continue
         for name, declared in type(step.method).model_fields.items():
             extra: Any = declared.json_schema_extra
+            dotted = f"{step.name}.{name}"
             if (
                 extra["structural"]
-                or extra["unit"] not in SEARCHED_UNITS
+                or (extra["unit"] not in SEARCHED_UNITS and dotted not in ALSO)
                 or not is_number(declared.annotation)
             ):
                 continue
             low, high = limits_of(declared.metadata)
             start = float(getattr(step.method, name))
-            dotted = f"{step.name}.{name}"
-            if start > 0 and 0 <= low < high <= 1:
+            if start > 0 and 0 <= low < high <= 1 and dotted not in ALSO:
                 found.append(Dimension(dotted, low, high, start))
             elif start > 0 and math.isfinite(low + high):
                 ends = max(start / SPAN, low), min(start * SPAN, high)
