@@ -305,4 +305,7 @@ def test_a_profile_that_cannot_be_is_refused(own, old, new, message):
 
 def test_an_iso_that_the_camera_has_not(own):
     with pytest.raises(RequestError, match="found 12800, but camera mine goes from 100 to 6400"):
-        own().noise(12800)
+        own().check_iso(12800)
+    assert own().noise(12800).a == pytest.approx(2 * own().noise(6400).a)  # pushed
+    with pytest.raises(RequestError, match="found 25601, but camera mine goes from 100 to 6400"):
+        own().noise(25601)

@@ -9,7 +9,7 @@ from scipy import stats
 
 import clpipe
 from clpipe.base.errors import RequestError
-from clpipe.camera.profile import built_in_cameras
+from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.chain import make_chain
 from clpipe.chain.draws import Limits, limits_of
 from clpipe.chain.files import load_settings, toml_text
@@ -380,6 +380,33 @@ def test_each_camera_draws_in_its_own_part_of_a_law(law, share):
     says = settings.draw_note()
     assert says in ("", "iso: drawn from what a camera has: canon-6d from 100 to 6400")
     assert bool(says) is ("normal" not in law)
+
+
+def test_one_camera_is_pushed_where_a_law_goes_on(clpipe, write_exr):
+    """From its highest ISO on gain and variance go on in proportion, and this is said."""
+    settings = settings_from({"iso": {"log_uniform": [1600, 25600]}, "camera": "nikon-d800"})
+    isos = np.array([settings.drawn(f"{n}.exr").iso for n in range(400)])
+    assert abs(np.mean(isos > 6400) - 0.5) < 0.08 and isos.max() > 20000
+    drawn = next(s for n in range(400) if (s := settings.drawn(f"{n}.exr")).iso > 12800)
+    camera, step = load_camera("nikon-d800"), make_chain(drawn).step_named("sensor_noise")
+    highest = camera.noise(6400)
+    assert step.method.a == pytest.approx(highest.a * drawn.iso / 6400)
+    assert step.method.b == pytest.approx(highest.b * (drawn.iso / 6400) ** 2)
+    note = "iso: drawn beyond 6400, where those of nikon-d800 end"
+    assert settings.draw_note().startswith(note)
+    write_exr("a.exr", np.full((4, 6, 3), 0.25))
+    Path("c.toml").write_text("camera = 'nikon-d800'\niso = { log_uniform = [12800, 25600] }\n")
+    said = clpipe("run", "a.exr", "-o", "out", "--device", "numpy", "-c", "c.toml").stderr
+    assert said.count(note) == 1
+    sidecar = json.loads(Path("out/a.json").read_text())
+    assert 12800 <= sidecar["iso"] <= 25600
+    clpipe("replay", "out/a.json", "-o", "again", "--device", "numpy")
+    assert Path("again/a.jpg").read_bytes() == Path("out/a.jpg").read_bytes()
+    for law in ({"log_uniform": [1600, 51200]}, {"choice": [25601]}):
+        with pytest.raises(RequestError, match="camera nikon-d800 goes from 100 to 6400"):
+            make_chain(settings_from({"iso": law, "camera": "nikon-d800"}))
+    with pytest.raises(RequestError, match="found 12800, but camera nikon-d800"):
+        make_chain(settings_from({"iso": 12800, "camera": "nikon-d800"}))
 
 
 def test_what_no_camera_has_is_refused_before_a_run(clpipe, write_exr):

@@ -19,6 +19,7 @@ from clpipe.camera.gain_stage import GainStage, NotNegative, Offsets, Positive, 
 from clpipe.camera.noise import NoiseModel
 
 DEFAULT_CAMERA = "sony-a7r2"
+PUSHED = 4.0  # times the highest ISO of a camera: two stops
 Coefficient = Annotated[float, Field(ge=-100, le=100)]
 Row = tuple[Coefficient, Coefficient, Coefficient]
 Matrix = tuple[Row, Row, Row]
@@ -151,7 +152,7 @@ class Camera(BaseModel):
         stays the same in electrons.
 
         Raises:
-            RequestError: the ISO is outside the camera's range.
+            RequestError: the ISO is outside the camera's range, pushed by two stops.
         """
         stage = self.gain_stage(iso)
         unit = self.signal_range
@@ -208,17 +209,34 @@ class Camera(BaseModel):
         """The signal that a charge in e- makes at an ISO; raises as :meth:`noise`."""
         return electrons * self.noise(iso).a
 
+    @property
+    def pushed_range(self) -> tuple[float, float]:
+        """The ISOs with two stops more, as cameras push their highest one: there is no more gain in
+        the sensor, so the law of :meth:`noise` goes on.
+        """
+        low, high = self.iso_range
+        return low, high * PUSHED
+
+    def check_iso(self, iso: float, pushed: bool = False) -> None:
+        """See that the camera has an ISO, or may be pushed to it.
+
+        Raises:
+            RequestError: it has not.
+        """
+        low, high = self.pushed_range if pushed else self.iso_range
+        if not low <= iso <= high:
+            low, high = self.iso_range
+            raise RequestError(
+                f"iso: found {iso:g}, but camera {self.name} goes from {low:g} to {high:g}"
+            )
+
     def gain_stage(self, iso: float) -> GainStage:
         """The gain stage of an ISO: the last one that begins at or below it, else the first.
 
         Raises:
-            RequestError: the ISO is outside the camera's range.
+            RequestError: the ISO is outside the camera's range, pushed by two stops.
         """
-        low, high = self.iso_range
-        if not low <= iso <= high:
-            raise RequestError(
-                f"iso: found {iso:g}, but camera {self.name} goes from {low:g} to {high:g}"
-            )
+        self.check_iso(iso, pushed=True)
         lower = [stage for stage in self.gain_stages if stage.iso[0] <= iso]
         return lower[-1] if lower else self.gain_stages[0]
 

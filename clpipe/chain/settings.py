@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
-from clpipe.camera.profile import DEFAULT_CAMERA, built_in_name, load_camera
+from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_name, load_camera
 from clpipe.chain.drawing import draw_of, extremes_of, values_of
 from clpipe.chain.draws import TINY, Choice, Draw, Limits, Truncated, limits_of
 from clpipe.chain.keys import CODE, KEYS, LENS, MAX_STAGES, NOISE, TABLES, check_type, names_in
@@ -60,6 +60,7 @@ class Settings:
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     output: Encoding = field(default_factory=Encoding)
     render: RenderCamera = field(default_factory=RenderCamera)
+    pushed: bool = False  # the ISO was drawn, and may be beyond the camera's own
     draws: Mapping[str, Draw] = field(default_factory=dict)
     # By step: the table that overlay() validated, and the model that it made of it.
     validated: Mapping[str, tuple[Mapping[str, Any], Method]] = field(
@@ -101,7 +102,7 @@ class Settings:
             first = {key: draw for key, draw in draws.items() if key == "camera"}
             limits = partial(self.limits, isos=isos)
             own = values_of(first, self.constants(), limits, owner).get("camera", self.camera)
-            isos = Limits(*load_camera(own).iso_range)
+            isos = self.drawn_isos(load_camera(own))
             draws["iso"] = draws["iso"].within(isos) or draws["iso"]
         limits = partial(self.limits, isos=isos)
         values: dict[str, Any] = {}
@@ -111,7 +112,8 @@ class Settings:
                 values.setdefault(step, dict(self.parameters.get(step, {})))[name] = value
             else:
                 values[name] = value
-        return overlay(replace(self, draws={}), values)
+        pushed = "iso" in self.draws and "camera" not in self.draws
+        return overlay(replace(self, draws={}, pushed=pushed), values)
 
     def constants(self) -> dict[str, Any]:
         """The values that are set and not drawn, by their dotted names."""
@@ -198,6 +200,10 @@ class Settings:
         ranges = [load_camera(name).iso_range for name in self.cameras()]
         return Limits(max(low for low, _ in ranges), min(high for _, high in ranges))
 
+    def drawn_isos(self, camera: Camera) -> Limits:
+        """The ISOs that are drawn for a camera: it may be pushed where no other has them."""
+        return Limits(*(camera.iso_range if "camera" in self.draws else camera.pushed_range))
+
     def check_cameras(self) -> None:
         """See that every camera that can be drawn exists, and that each ISO has a camera.
 
@@ -214,15 +220,16 @@ class Settings:
                 limits = partial(self.limits, isos=self.isos())
                 isos = extremes_of(self.draws, self.constants(), limits)["iso"]
             for camera, iso in product(cameras, isos):
-                camera.gain_stage(iso)
+                camera.check_iso(iso, self.pushed)
             return
-        lows, highs = zip(*(camera.iso_range for camera in cameras), strict=True)
+        ranges = [self.drawn_isos(camera) for camera in cameras]
+        lows, highs = [own.low for own in ranges], [own.high for own in ranges]
         for iso in draw.extremes(Limits(min(lows), max(highs)), ()):
             if not any(low <= iso <= high for low, high in zip(lows, highs, strict=True)):
                 lowest, highest = lows.index(min(lows)), highs.index(max(highs))
-                cameras[lowest if iso < min(lows) else highest].gain_stage(iso)
-        for camera in cameras:
-            if draw.within(Limits(*camera.iso_range)) is None:
+                cameras[lowest if iso < min(lows) else highest].check_iso(iso)
+        for camera, own in zip(cameras, ranges, strict=True):
+            if draw.within(own) is None:
                 low, high = camera.iso_range
                 raise RequestError(
                     f"iso: found {draw.record()}, but camera {camera.name} goes from {low:g} to "
@@ -232,6 +239,15 @@ class Settings:
     def draw_note(self) -> str:
         """What is to be said of a drawn ISO, "" where every camera draws from the whole law."""
         draw, parts = self.draws.get("iso"), []
+        if draw and not draw.follows and "camera" not in self.draws:
+            camera = load_camera(self.camera)
+            high = camera.iso_range[1]
+            if max(draw.extremes(self.drawn_isos(camera), ())) <= high:
+                return ""
+            return (
+                f"iso: drawn beyond {high:g}, where those of {camera.name} end: from there on "
+                "noise grows with the ISO as if the picture were pushed"
+            )
         for camera in map(load_camera, self.cameras()) if draw else ():
             own = draw and draw.within(Limits(*camera.iso_range))
             if own != draw and not isinstance(own, Truncated):  # of a normal, tails are left out

@@ -217,6 +217,7 @@ def noise_at(camera: Camera, iso: float) -> dict[str, Any]:
     Raises:
         RequestError: the ISO is outside the camera's range.
     """
+    camera.check_iso(iso)
     unit, model = camera.signal_range, camera.noise(iso)
     return {
         "iso": iso,
