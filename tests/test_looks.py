@@ -87,6 +87,21 @@ def test_each_configuration_alone_is_what_it_was(two):
     assert load_settings() == settings_from({})
 
 
+@pytest.mark.parametrize("before", [(), ("unprocess",), ("nikon-d800-jpeg",)])
+def test_training_develops_each_picture_in_another_way(before):
+    settings = load_configs([*before, "training"]).settings
+    drawn = [settings.drawn(f"{n}.exr") for n in range(200)]
+    methods = [{s.name: s.method for s in make_chain(one).steps} for one in drawn[:40]]
+    for step, name, low, high in (
+        ("denoise", "luma_strength", 0.2, 4),
+        ("denoise", "chroma_strength", 0.3, 1.5),
+        ("denoise", "grain", 0.05, 0.4),
+    ):
+        values = [getattr(method[step], name) for method in methods]
+        assert low <= min(values) < low * 2 and high / 1.5 < max(values) <= high
+    assert min(one.iso for one in drawn) < 1100 and max(one.iso for one in drawn) > 5800
+
+
 @pytest.mark.parametrize("names", [("unprocess", LOOK), ("paper", "brooks2019", "canon-5d2-jpeg")])
 def test_its_values_make_the_same_settings_again(two, names):
     for each in (names, two, (*two, "paper")):

@@ -1,0 +1,124 @@
+"""tools/training: denoisers that are trained on what clpipe makes, and how they are judged."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.conftest import ROOT, STILL_LIFE
+
+pytestmark = [pytest.mark.tools, pytest.mark.slow]
+torch = pytest.importorskip("torch", reason="needs torch")
+
+
+@pytest.fixture
+def tool(tmp_path):
+    """Run one of the tools in a folder with a render; what it told."""
+    (tmp_path / "renders").mkdir()
+    (tmp_path / "renders/a.exr").write_bytes(STILL_LIFE.read_bytes())
+
+    def run(name, *words, status=0):
+        command = [sys.executable, "-m", f"tools.training.{name}", *map(str, words)]
+        done = subprocess.run(
+            command,
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == status, done.stderr
+        return done.stdout + done.stderr
+
+    return run
+
+
+@pytest.fixture
+def real(clpipe, tmp_path):
+    """A folder with pairs that stand for a camera's: a development, and that without noise."""
+    made = tmp_path / "made"
+    clpipe(
+        "run", STILL_LIFE, "-o", made, "--iso", 3200, "--truth", "development", "--format", "png"
+    )
+    folder = tmp_path / "real"
+    folder.mkdir()
+    for number, top in ((1, 100), (2, 300)):
+        for kind, name in (("real", "still_life.png"), ("mean", "still_life.truth.png")):
+            with Image.open(made / name) as picture:
+                picture.crop((200, top, 360, top + 161)).save(folder / f"cam_{number}_{kind}.png")
+    return folder
+
+
+def test_denoisers_are_compared_on_real_pictures(tool, real, tmp_path):
+    words = ("renders/a.exr", "--real", real, "--steps", 150, "--seeds", 1, "-o", "out")
+    told = tool(
+        "train_on_real", *words, "--regimes", "clpipe", "awgn", "real", "--pairs", _other(real)
+    )
+    assert "6 pictures to train on, 2 real ones to test on" in told
+    found = json.loads((tmp_path / "out/scores.json").read_text())
+    assert list(found["regimes"]) == ["noisy", "clpipe", "awgn", "real"]
+    table = (tmp_path / "out/table.md").read_text()
+    assert table.splitlines()[0].startswith("| trained on | PSNR, dB |") and "cam (2)" in table
+    for regime, row in zip(found["regimes"], table.splitlines()[2:], strict=True):
+        mean = np.mean(found["regimes"][regime]["psnr"])
+        assert row.startswith(f"| {regime} | {mean:.2f} |")
+    with Image.open(tmp_path / "out/crops.png") as crops:
+        assert crops.size[0] == 5 * 320 and np.ptp(np.asarray(crops)) > 100
+    assert list((tmp_path / "out").iterdir()) and not list((tmp_path / "out").glob("tmp*"))
+    scores = found["regimes"]
+    assert np.mean(scores["clpipe"]["psnr"]) > np.mean(scores["noisy"]["psnr"])
+
+
+def _other(real):
+    """A folder with the first pair under another name, so that it is not the one that is tested."""
+    other = real.parent / "other"
+    other.mkdir()
+    for kind in ("real", "mean"):
+        (other / f"b_1_{kind}.png").write_bytes((real / f"cam_1_{kind}.png").read_bytes())
+    return other
+
+
+def test_what_is_tested_is_not_trained_on(tool, real):
+    told = tool("train_on_real", real / "cam_1_mean.png", "--real", real, status=2)
+    assert "is tested on (cam_1), so it cannot be trained on" in told
+    told = tool("train_on_real", "renders/a.exr", "--real", real, "--pairs", real, status=2)
+    assert "--pairs FOLDER is what the regime real is trained on" in told
+    words = ("--regimes", "real", "--pairs", real)
+    told = tool("train_on_real", "renders/a.exr", "--real", real, *words, status=2)
+    assert "is tested on" in told
+
+
+def test_a_range_that_misses_the_pictures_is_said(tool, real):
+    words = ("--iso", 100, 110, "--steps", 1, "--seeds", 1, "--regimes", "clpipe")
+    told = tool("train_on_real", "renders/a.exr", "--real", real, *words)
+    assert "warning: 2 of 2 real pictures have less or more noise than what is trained on" in told
+
+
+def test_noise_models_are_compared_on_raws(tool, tmp_path, write_exr):
+    write_exr("b.exr", np.random.default_rng(0).random((96, 130, 3)).astype(np.float32) ** 2)
+    words = ("renders/a.exr", "--test", "b.exr", "--steps", 2, "--seeds", 1, "-o", "raw.json")
+    told = tool("train_on_raw", *words)
+    found = json.loads((tmp_path / "raw.json").read_text())
+    assert list(found) == ["noisy", "full", "poisson-gaussian", "iid"]
+    rows = [line for line in told.splitlines() if line.startswith("| ")]
+    kld = {row.split(" | ")[0][2:]: row.split(" | ")[-1][:-2] for row in rows[2:]}
+    assert float(kld["full"]) < float(kld["poisson-gaussian"]) < float(kld["iid"])
+
+
+def test_scores_are_what_they_are_called():
+    from tools.training.figures import Score, psnr, ssim, table
+
+    clean = torch.rand(3, 40, 50, generator=torch.Generator().manual_seed(1))
+    assert psnr(clean + 0.01, clean) == pytest.approx(40, abs=1e-3)
+    assert ssim(clean, clean) == pytest.approx(1)
+    skimage = pytest.importorskip("skimage.metrics", reason="needs scikit-image")
+    noisy = clean + 0.1 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(2))
+    own = skimage.structural_similarity(
+        clean.numpy(), noisy.numpy(), channel_axis=0, data_range=1, gaussian_weights=True
+    )
+    assert ssim(noisy, clean) == pytest.approx(own, abs=0.01)
+    one, other = (Score(np.array([[30.0, x]]), np.array([[0.9, 0.8]])) for x in (32.0, 31.0))
+    assert "| b | 30.50 | 30.50 | 0.8500 | 1 of 2 |" in table({"a": one, "b": other}, {})

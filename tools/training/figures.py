@@ -1,0 +1,109 @@
+"""How near denoised pictures come to their truth, as numbers and as crops to look at."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+from torch import Tensor
+from torch.nn import functional
+
+CROP = 160  # px, of a picture
+LABEL = 14  # px, over crops
+NOISY = "noisy"  # what was not denoised
+
+
+@dataclass(frozen=True)
+class Score:
+    """How near pictures come to their truths: PSNR in dB and SSIM, (seed, picture) each."""
+
+    psnr: np.ndarray
+    ssim: np.ndarray
+
+    def record(self) -> dict[str, list[list[float]]]:
+        """The scores as JSON values."""
+        return {"psnr": self.psnr.tolist(), "ssim": self.ssim.tolist()}
+
+
+def scores(images: Sequence[Sequence[Tensor]], truths: Sequence[Tensor]) -> Score:
+    """The scores of pictures, of each seed."""
+    each = [[(psnr(i, t), ssim(i, t)) for i, t in zip(own, truths, strict=True)] for own in images]
+    return Score(*np.moveaxis(np.array(each), 2, 0))
+
+
+def table(found: Mapping[str, Score], more: Mapping[str, Mapping[str, str]]) -> str:
+    """Scores as Markdown: means over pictures, of each seed, and how often the first regime wins.
+
+    Args:
+        found: by regime.
+        more: further columns by their headings, each by regime.
+    """
+    first = next(name for name in found if name != NOISY)
+    headings = ["trained on", "PSNR, dB", "of each seed", "SSIM", f"{first} wins", *more]
+    lines = [f"| {' | '.join(headings)} |", "|" + "---|" * len(headings)]
+    for regime, score in found.items():
+        means = score.psnr.mean(0)
+        wins = f"{(found[first].psnr.mean(0) > means).sum()} of {means.size}"
+        cells = [
+            regime,
+            f"{means.mean():.2f}",
+            "" if regime == NOISY else " ".join(f"{seed:.2f}" for seed in score.psnr.mean(1)),
+            f"{score.ssim.mean():.4f}",
+            "" if regime == first else wins,
+            *(column.get(regime, "") for column in more.values()),
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def psnr(image: Tensor, truth: Tensor) -> float:
+    """Peak signal-to-noise ratio in dB; 1 is the peak."""
+    return -10 * torch.log10((image - truth).square().mean()).item()
+
+
+def ssim(image: Tensor, truth: Tensor) -> float:
+    """Structural similarity (Wang et al., 2004), Gaussian window of 11 px, mean over channels."""
+    offsets = torch.arange(-5, 6)
+    row = torch.exp(-(offsets**2) / (2 * 1.5**2))
+    window = (row[:, None] * row / row.sum() ** 2)[None, None]
+    x, y = image[:, None], truth[:, None]
+    mean_x, mean_y, xx, yy, xy = (functional.conv2d(v, window) for v in (x, y, x * x, y * y, x * y))
+    xx, yy, xy = xx - mean_x**2, yy - mean_y**2, xy - mean_x * mean_y
+    c1, c2 = 0.01**2, 0.03**2
+    ratio = (2 * mean_x * mean_y + c1) * (2 * xy + c2)
+    return (ratio / ((mean_x**2 + mean_y**2 + c1) * (xx + yy + c2))).mean().item()
+
+
+def corner(truth: Tensor) -> tuple[int, int]:
+    """Row and column of the crop with the most detail: neither flat nor dark."""
+    luma = truth.mean(0)
+    step = CROP // 2
+    rows, columns = (range(0, max(side - CROP, 0) + 1, step) for side in luma.shape)
+    places = [(y, x) for y in rows for x in columns]
+    return max(places, key=lambda at: float(luma[at[0] : at[0] + CROP, at[1] : at[1] + CROP].std()))
+
+
+def draw_crops(rows: Sequence[Sequence[tuple[str, Tensor]]], path: Path, scale: int = 2) -> None:
+    """Write crops of pictures beside each other, one scene in each row, each with a label.
+
+    Args:
+        rows: of each scene, labels and pictures (3, height, width), 0 to 1; the last is the truth.
+        path: of the PNG.
+        scale: how many pixels one becomes, each way.
+    """
+    side = CROP * scale
+    across = max(map(len, rows))
+    sheet = Image.new("RGB", (side * across, (side + LABEL) * len(rows)), "white")
+    pen = ImageDraw.Draw(sheet)
+    for number, scene in enumerate(rows):
+        top, left = corner(scene[-1][1])
+        for column, (label, image) in enumerate(scene):
+            crop = image[:, top : top + CROP, left : left + CROP].clamp(0, 1)
+            pixels = (crop * 255).round().byte().permute(1, 2, 0).numpy()
+            large = np.repeat(np.repeat(pixels, scale, 0), scale, 1)
+            at = side * column, (side + LABEL) * number
+            pen.text((at[0] + 3, at[1] + 1), label, fill="black")
+            sheet.paste(Image.fromarray(large), (at[0], at[1] + LABEL))
+    sheet.save(path)
