@@ -5,6 +5,7 @@ import pytest
 
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import built_in_cameras, built_in_name, comparable, load_camera
+from clpipe.chain.isos import check_cameras
 
 NAMES = tuple(built_in_cameras())
 PROFILE = """name = "mine"
@@ -151,7 +152,7 @@ def test_settings_hold_a_camera_by_one_name_however_it_is_called(tmp_path):
     assert load_settings(str(tmp_path / "a.toml")).camera == "nikon-d850"
     (tmp_path / "a.csv").write_text("path,camera\na.exr,Sony A7 II\n")
     check_rows(read_manifest(tmp_path / "a.csv"), settings_from({}))
-    settings_from({"camera": {"choice": ["Nikon D850", "canon 80d"]}}).check_cameras()
+    check_cameras(settings_from({"camera": {"choice": ["Nikon D850", "canon 80d"]}}))
     assert Pipeline(camera="EOS 5D Mark III", device="numpy").chain.camera.name == "canon-5d3"
 
 

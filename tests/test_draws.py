@@ -13,6 +13,7 @@ from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.chain import make_chain
 from clpipe.chain.draws import Limits, limits_of
 from clpipe.chain.files import load_settings, toml_text
+from clpipe.chain.isos import check_cameras, draw_note
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import overlay, settings_from
 
@@ -367,7 +368,7 @@ def test_the_limits_of_a_parameter_are_its_own():
 def test_each_camera_draws_in_its_own_part_of_a_law(law, share):
     cameras = {"sony-a7r2": 12800, "canon-6d": 6400}
     settings = settings_from({"iso": law, "camera": {"choice": list(cameras)}})
-    settings.check_cameras()
+    check_cameras(settings)
     drawn = [settings.drawn(f"{n}.exr") for n in range(2000)]
     for name, highest in cameras.items():
         isos = np.array([each.iso for each in drawn if each.camera == name])
@@ -377,7 +378,7 @@ def test_each_camera_draws_in_its_own_part_of_a_law(law, share):
         if "log_uniform" in law:  # its law is kept: as many in each half of what a camera has
             middle = np.sqrt(800 * highest)
             assert abs(np.mean(isos < middle) - 0.5) < 0.05
-    says = settings.draw_note()
+    says = draw_note(settings)
     assert says in ("", "iso: drawn from what a camera has: canon-6d from 100 to 6400")
     assert bool(says) is ("normal" not in law)
 
@@ -393,7 +394,7 @@ def test_one_camera_is_pushed_where_a_law_goes_on(clpipe, write_exr):
     assert step.method.a == pytest.approx(highest.a * drawn.iso / 6400)
     assert step.method.b == pytest.approx(highest.b * (drawn.iso / 6400) ** 2)
     note = "iso: drawn beyond 6400, where those of nikon-d800 end"
-    assert settings.draw_note().startswith(note)
+    assert draw_note(settings).startswith(note)
     write_exr("a.exr", np.full((4, 6, 3), 0.25))
     Path("c.toml").write_text("camera = 'nikon-d800'\niso = { log_uniform = [12800, 25600] }\n")
     said = clpipe("run", "a.exr", "-o", "out", "--device", "numpy", "-c", "c.toml").stderr

@@ -22,6 +22,7 @@ from clpipe.batch.threads import Batch
 from clpipe.batch.trace import Trace, check_trace
 from clpipe.batch.where import Where
 from clpipe.batch.work import ImageWorker
+from clpipe.chain.isos import draw_note
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_devices
 from clpipe.images.read import PICTURE_SUFFIXES
@@ -135,7 +136,7 @@ class Run:
         if not self.jobs:
             return
         self._loader.check(self.jobs)
-        if note := self._loader.settings.draw_note():
+        if note := draw_note(self._loader.settings):
             log.info("%s", note)
         self._chain = self._loader.first_chain(self.jobs)
         check_render_options(request, self._chain.source)

@@ -11,6 +11,7 @@ from clpipe.camera.noise import NoiseModel
 from clpipe.camera.optics import Optics
 from clpipe.camera.profile import Camera, load_camera
 from clpipe.chain.draws import Draw
+from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import LENS, NOISE, RENDER
 from clpipe.chain.methods import base_name, numbered, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, user_code_errors
@@ -247,7 +248,7 @@ def make_chain(
         RequestError: image kinds that do not fit, an unknown camera, an ISO outside its range, or a
             step that is not in the chain.
     """
-    settings.check_cameras()
+    check_cameras(settings)
     draws, settings = settings.draws, settings.drawn("")
     camera = load_camera(settings.camera)
     steps = resolved_steps(settings, camera, source or (None if start_at else entry(settings)))

@@ -17,7 +17,7 @@ from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
 from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_name, load_camera
 from clpipe.chain.drawing import draw_of, extremes_of, values_of
-from clpipe.chain.draws import TINY, Choice, Draw, Limits, Truncated, limits_of
+from clpipe.chain.draws import TINY, Choice, Draw, Limits, limits_of
 from clpipe.chain.keys import CODE, KEYS, LENS, MAX_STAGES, NOISE, TABLES, check_type, names_in
 from clpipe.chain.methods import (
     TABLE_MODELS,
@@ -203,56 +203,6 @@ class Settings:
     def drawn_isos(self, camera: Camera) -> Limits:
         """The ISOs that are drawn for a camera: it may be pushed where no other has them."""
         return Limits(*(camera.iso_range if "camera" in self.draws else camera.pushed_range))
-
-    def check_cameras(self) -> None:
-        """See that every camera that can be drawn exists, and that each ISO has a camera.
-
-        Where cameras differ, each draws in the part of a law that it has, and only there.
-
-        Raises:
-            RequestError: a camera cannot be loaded, an ISO is outside the range of every camera, or
-                a camera has no ISO that can be drawn.
-        """
-        cameras, draw = [load_camera(name) for name in self.cameras()], self.draws.get("iso")
-        if draw is None or draw.follows:
-            isos: Sequence[float] = [self.iso]
-            if draw:
-                limits = partial(self.limits, isos=self.isos())
-                isos = extremes_of(self.draws, self.constants(), limits)["iso"]
-            for camera, iso in product(cameras, isos):
-                camera.check_iso(iso, self.pushed)
-            return
-        ranges = [self.drawn_isos(camera) for camera in cameras]
-        lows, highs = [own.low for own in ranges], [own.high for own in ranges]
-        for iso in draw.extremes(Limits(min(lows), max(highs)), ()):
-            if not any(low <= iso <= high for low, high in zip(lows, highs, strict=True)):
-                lowest, highest = lows.index(min(lows)), highs.index(max(highs))
-                cameras[lowest if iso < min(lows) else highest].check_iso(iso)
-        for camera, own in zip(cameras, ranges, strict=True):
-            if draw.within(own) is None:
-                low, high = camera.iso_range
-                raise RequestError(
-                    f"iso: found {draw.record()}, but camera {camera.name} goes from {low:g} to "
-                    f"{high:g} and has none of that"
-                )
-
-    def draw_note(self) -> str:
-        """What is to be said of a drawn ISO, "" where every camera draws from the whole law."""
-        draw, parts = self.draws.get("iso"), []
-        if draw and not draw.follows and "camera" not in self.draws:
-            camera = load_camera(self.camera)
-            high = camera.iso_range[1]
-            if max(draw.extremes(self.drawn_isos(camera), ())) <= high:
-                return ""
-            return (
-                f"iso: drawn beyond {high:g}, where those of {camera.name} end: from there on "
-                "noise grows with the ISO as if the picture were pushed"
-            )
-        for camera in map(load_camera, self.cameras()) if draw else ():
-            own = draw and draw.within(Limits(*camera.iso_range))
-            if own != draw and not isinstance(own, Truncated):  # of a normal, tails are left out
-                parts.append("{} from {:g} to {:g}".format(camera.name, *camera.iso_range))
-        return f"iso: drawn from what a camera has: {', '.join(parts)}" if parts else ""
 
 
 def settings_from(values: Mapping[str, Any], folder: Path | None = None) -> Settings:

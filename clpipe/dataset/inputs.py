@@ -9,6 +9,7 @@ from pathlib import Path
 
 from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
+from clpipe.chain.isos import draw_note
 from clpipe.inputs.find import Job, find_jobs
 from clpipe.inputs.loader import ImageLoader
 
@@ -48,7 +49,7 @@ def jobs_of(
     """
     jobs = loader.exposures(find_jobs(inputs, NOWHERE, loader.endings(), exclude))
     loader.check(jobs)
-    if note := loader.settings.draw_note():
+    if note := draw_note(loader.settings):
         log.info("%s", note)
     owners: dict[str, Job] = {}
     for job in jobs:

@@ -12,6 +12,7 @@ from clpipe.base.reading import unchanged
 from clpipe.chain.chain import Chain, entry
 from clpipe.chain.entering import enter
 from clpipe.chain.identity import image_key
+from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import RENDER
 from clpipe.chain.methods import base_name, stage_named
 from clpipe.chain.overscan import steps_of_overscan
@@ -156,7 +157,7 @@ class ImageLoader:
         if rows := [job for job in jobs if job.place or job.values.keys() - {RENDER}]:
             check_rows(rows, self.settings, carries)
         if not all(job in rows or carries(job.path) for job in jobs):
-            self.settings.check_cameras()
+            check_cameras(self.settings)
 
     def claim(self, job: Job) -> Claim:
         """The claim of a job's file, before it is read; nothing where reading refuses it.

@@ -13,6 +13,7 @@ from clpipe.base.reading import read_bytes
 from clpipe.base.text import one_of
 from clpipe.chain.chain import step_names
 from clpipe.chain.identity import MAX_FRAMES
+from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import TABLES
 from clpipe.chain.methods import TABLE_MODELS, base_name
 from clpipe.chain.paths import from_folder
@@ -174,7 +175,7 @@ def check_rows(
         try:
             own = overlay(settings, row.values)
             if not carried:
-                own.check_cameras()
+                check_cameras(own)
                 for step in row.values:
                     if step not in (*PLAIN, *TABLES, *steps):
                         raise RequestError(one_of("stage in this chain", step, steps))

@@ -8,6 +8,7 @@ from typing import Any
 
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import load_camera
+from clpipe.chain.isos import check_cameras
 from clpipe.chain.settings import Settings, overlay
 from clpipe.inputs.find import Job
 
@@ -61,7 +62,7 @@ class Series:
         if members == [("", {})]:
             return list(jobs)
         for _, values in members:
-            overlay(settings, values).check_cameras()
+            check_cameras(overlay(settings, values))
         for job in jobs:
             for key in members[0][1]:
                 if key in job.values:

@@ -8,6 +8,7 @@ from clpipe.analysis.matching.scenes import load_scenes
 from clpipe.analysis.matching.search import Search, Watch
 from clpipe.analysis.matching.space import space_for
 from clpipe.base.errors import RequestError
+from clpipe.chain.isos import check_cameras
 from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.device import open_device
 
@@ -50,7 +51,7 @@ def match_files(
     """
     values = {"camera": camera, "iso": iso}
     settings = overlay(Settings(), {k: v for k, v in values.items() if v is not None})
-    settings.check_cameras()
+    check_cameras(settings)
     scenes = load_scenes(frames, means)
     space = space_for(settings, iso is not None)
     search = Search(scenes, settings, space, open_device(device), watch)

@@ -1,0 +1,63 @@
+"""The ISOs that settings ask for, beside those that their cameras have."""
+
+from collections.abc import Sequence
+from functools import partial
+from itertools import product
+
+from clpipe.base.errors import RequestError
+from clpipe.camera.profile import load_camera
+from clpipe.chain.drawing import extremes_of
+from clpipe.chain.draws import Limits, Truncated
+from clpipe.chain.settings import Settings
+
+
+def check_cameras(settings: Settings) -> None:
+    """See that every camera that can be drawn exists, and that each ISO has a camera.
+
+    Where cameras differ, each draws in the part of a law that it has, and only there.
+
+    Raises:
+        RequestError: a camera cannot be loaded, an ISO is outside the range of every camera, or
+            a camera has no ISO that can be drawn.
+    """
+    cameras, draw = [load_camera(name) for name in settings.cameras()], settings.draws.get("iso")
+    if draw is None or draw.follows:
+        isos: Sequence[float] = [settings.iso]
+        if draw:
+            limits = partial(settings.limits, isos=settings.isos())
+            isos = extremes_of(settings.draws, settings.constants(), limits)["iso"]
+        for camera, iso in product(cameras, isos):
+            camera.check_iso(iso, settings.pushed)
+        return
+    ranges = [settings.drawn_isos(camera) for camera in cameras]
+    lows, highs = [own.low for own in ranges], [own.high for own in ranges]
+    for iso in draw.extremes(Limits(min(lows), max(highs)), ()):
+        if not any(low <= iso <= high for low, high in zip(lows, highs, strict=True)):
+            lowest, highest = lows.index(min(lows)), highs.index(max(highs))
+            cameras[lowest if iso < min(lows) else highest].check_iso(iso)
+    for camera, own in zip(cameras, ranges, strict=True):
+        if draw.within(own) is None:
+            low, high = camera.iso_range
+            raise RequestError(
+                f"iso: found {draw.record()}, but camera {camera.name} goes from {low:g} to "
+                f"{high:g} and has none of that"
+            )
+
+
+def draw_note(settings: Settings) -> str:
+    """What is to be said of a drawn ISO, "" where every camera draws from the whole law."""
+    draw, parts = settings.draws.get("iso"), []
+    if draw and not draw.follows and "camera" not in settings.draws:
+        camera = load_camera(settings.camera)
+        high = camera.iso_range[1]
+        if max(draw.extremes(settings.drawn_isos(camera), ())) <= high:
+            return ""
+        return (
+            f"iso: drawn beyond {high:g}, where those of {camera.name} end: from there on "
+            "noise grows with the ISO as if the picture were pushed"
+        )
+    for camera in map(load_camera, settings.cameras()) if draw else ():
+        own = draw and draw.within(Limits(*camera.iso_range))
+        if own != draw and not isinstance(own, Truncated):  # of a normal, tails are left out
+            parts.append("{} from {:g} to {:g}".format(camera.name, *camera.iso_range))
+    return f"iso: drawn from what a camera has: {', '.join(parts)}" if parts else ""
