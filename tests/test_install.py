@@ -135,7 +135,7 @@ def test_what_a_tool_installs_is_locked():
         for line in path.read_text().splitlines()
         if line.startswith("extra=") and path.name != "setup"
     ]
-    assert len(found) == 5
+    assert len(found) == 6
     for path, extra in found:
         assert (ROOT / "locks" / f"{extra or 'clpipe'}.txt").is_file(), path
 
