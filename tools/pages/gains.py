@@ -23,8 +23,8 @@ LABELS = {
     "real": "another camera's real pairs",
     "clpipe": "clpipe",
 }
-LEFT, PANEL, GAP, TOP, ROW = 250, 250, 30, 56, 30  # px
-LOW, HIGH = -2.0, 5.0  # dB
+LEFT, PANEL, GAP, TOP, ROW = 270, 250, 30, 56, 30  # px
+LOW, HIGH = -1.0, 5.0  # dB
 STYLE = """<style>
 text { font: 13px sans-serif; fill: #24292e; dominant-baseline: middle; }
 text.pale { fill: #5d676f; } text.middle { text-anchor: middle; } text.right { text-anchor: end; }
