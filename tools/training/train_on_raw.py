@@ -7,7 +7,7 @@ Renders become clean raws of a camera in dim light, noise is added while the net
 parameters), steps and patches see
 
     full             all that the camera's profile knows: shot noise, tails of the read noise, rows,
-                     errors of the black level, rounding, clipping
+                     rounding, clipping; but errors of the black level, which dark frames take off
     poisson-gaussian shot noise and Gaussian read noise, of the same variance
     iid              Gaussian noise, as strong in each patch
 
@@ -39,7 +39,8 @@ from tools.training.unet import denoised, train
 
 REGIMES = ("full", "poisson-gaussian", "iid")
 PLAIN = ("prnu", "defect_pixels", "dark_current", "random_telegraph", "dsnu")
-PLAIN += ("dark_shading", "row_noise", "column_noise", "banding", "black_level_error")
+PLAIN += ("dark_shading", "row_noise", "column_noise", "banding")
+OFFSETS = ["black_level_error"]  # what dark frames take off, and no picture tells
 DIMMED = (1 / 100, 1 / 10)  # share of the light of a good exposure
 LIGHTS = (1 / 80, 1 / 30, 1 / 12)  # of test raws
 TEST_SEED = 77  # of noise that no network has seen
@@ -65,8 +66,8 @@ def clean_raws(paths: Sequence[Path], camera: str) -> list[Tensor]:
 def models(camera: str, iso: Sequence[float], seed: int) -> dict[str, Callable[[Tensor], Tensor]]:
     """The noise of each regime, to be put on a batch of planes."""
     drawn = {"log_uniform": list(iso)}
-    full = RawNoise(camera, drawn, seed=seed)
-    plain = RawNoise(camera, drawn, seed=seed, skip=list(PLAIN), sensor_noise=NORMAL)
+    full = RawNoise(camera, drawn, seed=seed, skip=OFFSETS)
+    plain = RawNoise(camera, drawn, seed=seed, skip=[*OFFSETS, *PLAIN], sensor_noise=NORMAL)
     random = torch.Generator().manual_seed(seed)
 
     def iid(clean: Tensor) -> Tensor:
@@ -107,7 +108,8 @@ def main() -> None:
             parser.error(f"--test: {path} is trained on; hold it out")
     clean, held_out = (clean_raws(each, given.camera) for each in (given.renders, given.test))
     tests, truths = [], [raw for raw in held_out for _ in LIGHTS]
-    test_noise = RawNoise(given.camera, {"log_uniform": list(given.iso)}, seed=TEST_SEED)
+    drawn = {"log_uniform": list(given.iso)}
+    test_noise = RawNoise(given.camera, drawn, seed=TEST_SEED, skip=OFFSETS)
     for number, raw in enumerate(held_out):
         for light in LIGHTS:
             tests.append(test_noise(raw * light, f"{number} {light:.4f}") / light)
