@@ -8,6 +8,7 @@ try:
 except ModuleNotFoundError as error:
     if error.name != "torch":
         raise
-    raise ImportError("clpipe.torch needs torch; pip install 'clpipe[train]'") from None
+    needed = "clpipe.torch needs torch; pip install 'clpipe[train]'"
+    raise ModuleNotFoundError(needed, name="torch") from None
 
 __all__ = ["RawNoise"]
