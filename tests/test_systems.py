@@ -63,7 +63,8 @@ for module in pkgutil.walk_packages(clpipe.__path__, "clpipe."):
     try:
         importlib.import_module(module.name)
     except ModuleNotFoundError as error:
-        extras = "bpy distributed jinja2 lensfunpy markupsafe matplotlib scipy starlette torch uvicorn"
+        extras = "bpy distributed jinja2 lensfunpy markupsafe matplotlib scipy starlette torch"
+        extras += " uvicorn"
         if error.name.partition(".")[0] not in extras.split():
             raise
     loaded += 1

@@ -3,12 +3,26 @@
 It is PyTorch alone: no OpenCL, no files, no processes of its own. It needs the extra ``train``.
 """
 
-try:
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
     from clpipe.torch.raw_noise import RawNoise
-except ModuleNotFoundError as error:
-    if error.name != "torch":
-        raise
-    needed = "clpipe.torch needs torch; pip install 'clpipe[train]'"
-    raise ModuleNotFoundError(needed, name="torch") from None
 
 __all__ = ["RawNoise"]
+
+
+def __getattr__(name: str) -> Any:
+    """What is exported, imported on first use.
+
+    Raises:
+        ImportError: PyTorch is not installed.
+    """
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        from clpipe.torch import raw_noise
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise ImportError("clpipe.torch needs torch; pip install 'clpipe[train]'") from None
+    return getattr(raw_noise, name)
