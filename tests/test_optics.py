@@ -21,7 +21,12 @@ from clpipe.stage import Resample
 SIZE = 60, 40
 # Stages that need optics, each with what makes it need them.
 ALL = {
-    "stages": ["exposure", "defocus", "motion_blur", "distortion", "vignetting"],
+    "stages": [
+        *("shutter", "defocus", "motion_blur", "distortion", "vignetting", "exposure"),
+        *("mosaic", "dark_current"),
+    ],
+    "shutter": {"flicker_depth": 0.5},
+    "dark_current": {"current": 9.0, "reference_temperature": 20.0, "spread": 0.1},
     "exposure": {"method": "photometric"},
     "defocus": {"method": "thin_lens"},
     "motion_blur": {"method": "perspective", "rotation": 1.0},
@@ -54,6 +59,10 @@ PLACES = {
         [(table, "sensor_width") for table in ("render", "distortion", "vignetting")]
         + [("motion_blur", "sensor_width"), ("defocus", "sensor_width")],
         (36.0, 24.0),
+    ),
+    "exposure_time": (
+        [(table, "exposure_time") for table in ("render", "exposure", "shutter", "dark_current")],
+        (0.02, 0.5),
     ),
     "cx": (
         [(table, "cx") for table in ("render", "distortion", "vignetting", "motion_blur")],
@@ -217,6 +226,7 @@ def test_what_an_exr_says_of_its_camera_is_taken_where_nothing_else_is_said(clpi
 
 
 CALIBRATED = by_name.LensCalibration(
+    "Maker 24mm",
     24.0,
     {"method": "ptlens", "b": -0.03, "unit": 0.5},
     {"method": "pa", "k1": -0.5},
@@ -258,6 +268,6 @@ def test_a_lens_that_does_not_fit_is_refused(lensfun):
 
 
 def test_a_lens_of_which_nothing_is_known_is_refused(lensfun):
-    lensfun(by_name.LensCalibration(24.0, {}, {}))
+    lensfun(by_name.LensCalibration("a", 24.0, {}, {}))
     with pytest.raises(RequestError, match="knows neither distortion nor vignetting of it"):
         make_chain(settings_from({"lens": "a"}))

@@ -26,11 +26,13 @@ class LensCalibration:
     """Calibration of a lens, set in some way, as lensfun knows it.
 
     Args:
+        name: of the lens, with its maker.
         focal_length: in mm.
         distortion, vignetting: the method of the stage and its parameters; empty where lensfun
             knows none.
     """
 
+    name: str
     focal_length: float
     distortion: Mapping[str, Any]
     vignetting: Mapping[str, Any]
@@ -84,7 +86,7 @@ def _calibration(
         if found and found.model.name == "PA":
             terms = (term * ratio ** (2 * i) for i, term in enumerate(found.terms, 1))
             falloff = {"method": "pa"} | dict(zip(("k1", "k2", "k3"), terms, strict=True))
-    return LensCalibration(focal, bend, falloff)
+    return LensCalibration(_full(lens), focal, bend, falloff)
 
 
 def lens_names() -> list[str]:

@@ -1,4 +1,4 @@
-"""One camera's optics: focal length, aperture, focus and principal point, each stated once.
+"""One camera's optics: focal length, aperture, focus, shutter, principal point, each stated once.
 
 Settings, the render's camera and the parameters of stages may state them; what one of them states
 holds for all, and what two of them state must be the same.
@@ -6,7 +6,7 @@ holds for all, and what two of them state must be the same.
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from clpipe.base.errors import KeyedError
@@ -14,6 +14,8 @@ from clpipe.camera.lens import LensCalibration
 
 ROUNDING = 0.01  # of a length or an f-number; those of lenses are nominal
 PLACES = 1e-4  # of what counts in px
+
+USUAL_TIME = 0.01  # s, of an exposure of which nothing says how long it is
 
 IN_PIXELS = ("fx", "fy", "cx", "cy")
 
@@ -31,6 +33,7 @@ class Optics:
         cx, cy: the principal point in px from the upper left corner of the render.
         f_number: of the aperture.
         focus_distance: in m.
+        exposure_time: in s.
         calibration: of the lens that is named.
         places: where each of them is stated.
     """
@@ -45,6 +48,7 @@ class Optics:
     cy: float | None = None
     f_number: float | None = None
     focus_distance: float | None = None
+    exposure_time: float | None = None
     calibration: LensCalibration | None = None
     places: Mapping[str, str] = field(default_factory=dict)
 
@@ -73,6 +77,17 @@ class Optics:
     def known(self) -> dict[str, float]:
         """The numbers that are known, by their names."""
         return {name: value for name in NUMBERS if (value := getattr(self, name)) is not None}
+
+    def set_to(self, used: Mapping[str, float]) -> "Optics":
+        """A copy in which what a step used of aperture and focus holds where nothing else is known.
+
+        So a default of one step is that of those behind it, and of EXIF.
+        """
+        own = {name: used.get(name) for name in ("f_number", "focus_distance")}
+        new: dict[str, Any] = {
+            name: v for name, v in own.items() if v and getattr(self, name) is None
+        }
+        return replace(self, **new) if new else self
 
 
 NUMBERS = tuple(f.name for f in fields(Optics) if f.name not in ("calibration", "places"))

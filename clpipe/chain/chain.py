@@ -99,7 +99,8 @@ class Chain:
     @property
     def optics(self) -> Optics:
         """The camera's optics, as far as they are known."""
-        return self.steps[0].context.optics
+        last = self.steps[-1]
+        return last.context.optics.set_to(last.method.optics())
 
     @property
     def result(self) -> Kind:
@@ -313,7 +314,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     """
     methods = {name: settings.method(name) for name in step_names(settings)}
     optics = optics_of(settings, camera, methods)
-    time = settings.render.exposure_time
+    time = optics.exposure_time
     context = Context(camera=camera, iso=settings.iso, optics=optics, exposure_time=time)
     steps: list[Step] = []
     before, takes_lens = "the input", not settings.lens
@@ -328,6 +329,8 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
                     continue  # so that gamma can be skipped without what does nothing behind it
                 raise RequestError(misfit(name, stage, before, kind or stage.reads))
             after = method.next_context(context)
+            if method.passes():
+                after = replace(after, optics=after.optics.set_to(method.optics()))
         if stage.folder:
             check_passes(name, stage, method, context)
         steps.append(Step(name, stage, method, context))

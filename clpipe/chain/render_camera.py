@@ -54,7 +54,7 @@ class RenderCamera(BaseModel):
     @property
     def optics(self) -> dict[str, float]:
         """The optics that are set, by the names of the fields."""
-        return self.model_dump(exclude={"exposure_time", *POSE}, exclude_none=True)
+        return self.model_dump(exclude=POSE, exclude_none=True)
 
     def with_defaults(self, shot: Mapping[str, float]) -> "RenderCamera":
         """A copy in which ``shot``, what a source says of itself, fills the fields that are None.

@@ -30,7 +30,10 @@ class Tags:
     iso: Positive
     exposure: Positive | None = None  # s
     aperture: Positive | None = None  # f-number
+    bias: float | None = None  # EV over the render as it is
     focal_length: Positive | None = None  # mm
+    lens: str = ""  # its model
+    focus_distance: Positive | None = None  # m
     taken: str = ""  # "YYYY:MM:DD HH:MM:SS"
     sensor_width: Positive | None = None  # mm, along the longer side
     encoding: Encoding = field(default_factory=Encoding)
@@ -68,6 +71,12 @@ def exif(tags: Tags, height: int, width: int) -> dict[str, float | str]:
         values["ExposureTime"] = tags.exposure
     if tags.aperture:
         values["FNumber"] = tags.aperture
+    if tags.bias is not None:
+        values["ExposureBiasValue"] = tags.bias
+    if tags.lens:
+        values["LensModel"] = tags.lens
+    if tags.focus_distance:
+        values["SubjectDistance"] = tags.focus_distance
     if tags.taken:
         values["DateTimeOriginal"] = tags.taken
     if tags.focal_length:
@@ -92,6 +101,12 @@ def to_attributes(tags: Tags, orientation: int) -> dict[str, str]:
 def shot_to_attributes(shot: Mapping[str, float | str], orientation: int) -> dict[str, str]:
     """As :func:`to_attributes`, of those fields of :class:`Tags` that the image says itself."""
     return {"exif": json.dumps(shot), "orientation": str(orientation)}
+
+
+def exposed_attributes(attributes: Mapping[str, str], tags: Tags) -> dict[str, str]:
+    """The attribute of an image's tags with the exposure that it was given since."""
+    said = {"exposure": tags.exposure, "bias": tags.bias}
+    return {"exif": json.dumps({**json.loads(attributes.get("exif", "{}")), **said})}
 
 
 def from_attributes(attributes: Mapping[str, str], default: Tags) -> tuple[Tags, int]:

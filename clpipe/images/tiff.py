@@ -130,6 +130,9 @@ def exif_fields(tags: Mapping[str, float | str]) -> Directory:
     types: dict[str, tuple[int, Callable[..., Field]]] = {
         "ExposureTime": (33434, rational),
         "FNumber": (33437, rational),
+        "ExposureBiasValue": (37380, signed_rational),
+        "SubjectDistance": (37382, rational),
+        "LensModel": (42036, text),
         "PhotographicSensitivity": (34855, short),
         "DateTimeOriginal": (36867, text),
         "FocalLength": (37386, rational),

@@ -4,7 +4,7 @@ import errno
 import mmap
 import os
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from clpipe.base.system import largest_file, passing_file
 from clpipe.base.types import Array, Floats
 from clpipe.images.attributes import PREFIX
 from clpipe.images.encoding import Encoding
+from clpipe.images.lens_tag import with_lens
 from clpipe.images.openexr import write_channels
 from clpipe.images.openimageio import error_text
 from clpipe.images.pixels import HALF_MAX
@@ -69,6 +70,8 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> Stored:
     spec.attribute("Model", tags.model)
     spec.attribute("Software", f"clpipe {__version__}")
     for name, value in exif(tags, height, width).items():
+        if name == "LensModel" and path.suffix != ".tif":
+            continue
         if name == "ExposureTime":
             # OpenImageIO cuts off after the sixth digit, and 0.01 is 0.0099999998 as float32.
             above = float(np.nextafter(np.float32(value), np.float32(np.inf)))
@@ -77,7 +80,8 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> Stored:
             spec.attribute(name if name == "FNumber" else f"Exif:{name}", value)
     if tags.taken or path.suffix == ".tif":
         spec.attribute("DateTime", tags.taken or NO_TIME)
-    return _write(path, spec, pixels.reshape(height, width, channels))
+    lens = tags.lens if path.suffix != ".tif" else ""  # OpenImageIO writes it into a TIFF
+    return _write(path, spec, pixels.reshape(height, width, channels), lens)
 
 
 def write_exr(
@@ -160,22 +164,30 @@ def write_grey_png(path: Path, pixels: Array) -> Stored:
     return _write(path, spec, pixels[..., np.newaxis])
 
 
-def _write(path: Path, spec: Any, pixels: Array) -> Stored:
+def _write(path: Path, spec: Any, pixels: Array, lens: str = "") -> Stored:
     """Write (height, width, channel) with OpenImageIO, which releases the GIL while it encodes.
+
+    Args:
+        path: the file.
+        spec: the ``oiio.ImageSpec``.
+        pixels: the samples.
+        lens: its model, which is put into the EXIF of a JPEG or a PNG.
 
     Raises:
         ImageError: the file cannot be written.
     """
-    return _stored(path, pixels.nbytes, lambda to: _encode(path.suffix[1:], to, spec, pixels))
+    encode = partial(_encode, path.suffix[1:], spec=spec, pixels=pixels)
+    return _stored(path, pixels.nbytes, encode, lens)
 
 
-def _stored(path: Path, size: int, encode: Callable[[str], None]) -> Stored:
+def _stored(path: Path, size: int, encode: Callable[[str], None], lens: str = "") -> Stored:
     """Write what an encoder makes.
 
     Args:
         path: the file.
         size: of the samples, in bytes.
         encode: writes to a path; an OSError says why it cannot.
+        lens: see :func:`_write`.
 
     Raises:
         ImageError: the file cannot be written.
@@ -191,7 +203,7 @@ def _stored(path: Path, size: int, encode: Callable[[str], None]) -> Stored:
                 mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as encoded,
                 memoryview(encoded) as data,
             ):
-                return write_whole(path, data)
+                return write_whole(path, with_lens(bytes(data), lens) if lens else data)
     except OSError as error:
         raise ImageError(f"{path}: cannot be written: {error.strerror or error}") from None
 

@@ -188,7 +188,8 @@ class ImageLoader:
         """
         shutter = shutter_of(self.settings) if job.subframes else None
         if shutter:
-            source = average(job, self._read, shutter)
+            known = shutter.with_defaults(exposure_time=self.chain.optics.exposure_time)
+            source = average(job, self._read, known)
         else:
             with unchanged(job.path):
                 source = self._read(job.path)

@@ -273,6 +273,6 @@ def tags_of(facts: RawFacts, chain: Chain) -> Tags:
         facts.iso if is_of_file and facts.iso else chain.iso,
         facts.exposure,
         facts.aperture,
-        facts.focal_length,
-        facts.taken,
+        focal_length=facts.focal_length,
+        taken=facts.taken,
     )

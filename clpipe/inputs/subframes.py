@@ -79,7 +79,8 @@ def average(job: Job, read: Callable[[Path], SourceImage], shutter: Rows) -> Sou
     Args:
         job: its files.
         read: reads one.
-        shutter: which part of each row's exposure a frame stands for.
+        shutter: which part of each row's exposure a frame stands for; how long that is, the first
+            frame may say.
 
     Raises:
         ImageError: one cannot be read, is no picture in linear light, or is of another size.
@@ -94,6 +95,8 @@ def average(job: Job, read: Callable[[Path], SourceImage], shutter: Rows) -> Sou
         if pixels.ndim != 3:
             raise ImageError(f"{path}: a mosaic; subframes are averaged of renders")
         if not found:
+            time = source.shot.get("exposure_time")
+            shutter = shutter.with_defaults(exposure_time=time)
             weights = weights_of(shutter, len(job.paths), pixels.shape[0], source.margins)
             total = np.zeros(pixels.shape, np.float32)
         elif (pixels.shape, source.margins) != (total.shape, found[0].margins):

@@ -74,12 +74,14 @@ class Photograph:
         role: what it is.
         camera: its intrinsics.
         pose: R and t, where known.
+        photometry: see :func:`clpipe.chain.photometry.photometry_of`.
     """
 
     file: str
     role: Role
     camera: Intrinsics
     pose: tuple[Matrix, Vector] | None
+    photometry: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -221,7 +223,7 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
                 camera = CAMERA.validate_python(values["intrinsics"])
                 pose = values["pose"]
                 r_and_t = pose and POSE.validate_python((pose["R"], pose["t"]))
-                yield Photograph(shown, role, simplest(camera), r_and_t)
+                yield Photograph(shown, role, simplest(camera), r_and_t, values["photometry"])
             except SidecarError:
                 left_out[f"{CHANGED}, so not used; the same clpipe run makes it again"].append(
                     shown
@@ -262,16 +264,38 @@ def simplest(camera: Intrinsics) -> Intrinsics:
     return replace(camera, model=model, distortion=own)
 
 
+class Responses:
+    """The curves from light to codes of a file's pictures, each once."""
+
+    def __init__(self) -> None:
+        self._curves: list[Any] = []
+
+    def of(self, picture: Photograph) -> dict[str, Any]:
+        """What a file says of a picture's light; its response is the number of one of the list."""
+        if picture.photometry is None:
+            return {}
+        curve = picture.photometry["response"]
+        if curve not in self._curves:
+            self._curves.append(curve)
+        return {"photometry": {**picture.photometry, "response": self._curves.index(curve)}}
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The list, as JSON values; nothing where there is none."""
+        return {"responses": self._curves} if self._curves else {}
+
+
 def cameras_json(pictures: Sequence[Photograph], up: str = "") -> str:
     """A cameras.json, which ``--poses`` reads, too; ``up`` leads to the pictures' folder."""
-    views = []
+    views, responses = [], Responses()
     for each in pictures:
         camera = each.camera
         k = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
         view = {"file": up + each.file, "width": camera.width, "height": camera.height, "K": k}
         view |= dict(zip("Rt", each.pose, strict=True)) if each.pose else {}
-        views.append({**view, "model": camera.model, "distortion": dict(camera.distortion)})
-    return json_text({"note": NOTE, "views": views})
+        view |= {"model": camera.model, "distortion": dict(camera.distortion)}
+        views.append(view | responses.of(each))
+    return json_text({"note": NOTE, **responses.record, "views": views})
 
 
 def colmap(
@@ -336,7 +360,7 @@ def nerfstudio(pictures: Sequence[Photograph], up: str, left_out: Mapping[str, l
     fisheyes = [each for each in pictures if each.camera.model == OPENCV_FISHEYE]
     is_fisheye = len(fisheyes) == len(pictures)
     model = OPENCV_FISHEYE if is_fisheye else OPENCV
-    cameras, frames = [], []
+    cameras, frames, responses = [], [], Responses()
     for each in pictures:
         camera = each.camera
         bent = {name for name, value in camera.distortion.items() if value}
@@ -347,12 +371,12 @@ def nerfstudio(pictures: Sequence[Photograph], up: str, left_out: Mapping[str, l
         sizes = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
         own = {name: camera.distortion.get(name, 0.0) for name in NERFSTUDIO[model]}
         cameras.append({**sizes, "cx": camera.cx, "cy": camera.cy, **own})
-        frames.append(
-            {"file_path": up + each.file, "transform_matrix": to_opengl(*each.pose).tolist()}
-        )
+        placed = {"file_path": up + each.file, "transform_matrix": to_opengl(*each.pose).tolist()}
+        frames.append(placed | responses.of(each))
     if not frames:
         return ""
     shared = cameras[0] if all(each == cameras[0] for each in cameras) else {}
     if not shared:
         frames = [{**frame, **camera} for frame, camera in zip(frames, cameras, strict=True)]
-    return json_text({"note": OPENGL_NOTE, "camera_model": model, **shared, "frames": frames})
+    said = {"note": OPENGL_NOTE, "camera_model": model, **shared, **responses.record}
+    return json_text({**said, "frames": frames})

@@ -11,6 +11,7 @@ from typing import Any
 from clpipe.base.about import __version__, full_version
 from clpipe.base.files import Stored
 from clpipe.chain.chain import Chain
+from clpipe.chain.photometry import photometry_of
 from clpipe.chain.render_camera import POSE
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
@@ -115,6 +116,7 @@ def sidecar(
         | chain.settings.render.with_defaults(source.shot).model_dump(exclude=POSE),
         "intrinsics": intrinsics.record() if intrinsics else None,
         "pose": chain.settings.render.pose,
+        "photometry": photometry_of(chain, result.estimates),
         "noise": noise.record() if noise else None,
         "starts_on": chain.source.label,
         **({"raw": asdict(facts)} if facts else {}),

@@ -23,7 +23,7 @@ from clpipe.engine.device import Device
 from clpipe.engine.runner import Result, Runner
 from clpipe.images.dng import write_dng
 from clpipe.images.read import SourceImage
-from clpipe.images.tags import TAG_ATTRIBUTES, Tags, from_attributes, orientation_of, upright
+from clpipe.images.tags import Tags, from_attributes, orientation_of, upright
 from clpipe.images.write import JPEG_MAX_SIDE, write_display, write_exr, write_npy
 from clpipe.inputs.carry import CARRIED, Aovs
 from clpipe.inputs.find import Job
@@ -37,6 +37,7 @@ from clpipe.outputs.patches import Patch, Patches, patch_name, variance_steps
 from clpipe.outputs.recipes import Recipe, RenditionPlan
 from clpipe.outputs.results import results_of
 from clpipe.outputs.sealed import SIDECAR, remove_sidecar
+from clpipe.outputs.shot import kept_tags, tags_of
 from clpipe.reference.geometry import NO_MARGINS
 from clpipe.stage import Kind
 
@@ -311,12 +312,9 @@ class OutputWriter:
         tags, source_orientation = from_attributes(
             source.attributes, Tags(camera.make, camera.model, chain.iso)
         )
-        tags = tags_of(chain, source, tags)
+        tags = tags_of(chain, source, tags, result.estimates)
         if patch is not None:  # which has not the width of the sensor
             tags = replace(tags, sensor_width=None)
-        tag_attributes = {
-            name: source.attributes[name] for name in TAG_ATTRIBUTES if name in source.attributes
-        }
         orientation = self.picture_orientation(source, chain) if patch is None else 1
         outputs: dict[Path, Stored] = {}
         whose = recipe.key, rendition.frame
@@ -325,7 +323,8 @@ class OutputWriter:
             if self.kept_format == NPY:
                 outputs[path] = write_npy(path, typed(result.kept[step.name], step.stage.writes))
                 continue
-            attributes = attributes_of(step, chain, *whose) | tag_attributes
+            carried_tags = kept_tags(chain, step, source, tags)
+            attributes = attributes_of(step, chain, *whose) | carried_tags
             channels = step.stage.writes.channels
             beyond = NO_MARGINS if step.method.geometry() else step.method.margins
             outputs[path] = write_exr(
@@ -347,7 +346,8 @@ class OutputWriter:
                 outputs[path] = write_dng(path, raw, negative, tags, source_orientation)
             elif FORMATS[format_].ending == "exr":
                 assert result.final is not None
-                attributes = attributes_of(chain.steps[-1], chain, *whose) | tag_attributes
+                carried_tags = kept_tags(chain, chain.steps[-1], source, tags)
+                attributes = attributes_of(chain.steps[-1], chain, *whose) | carried_tags
                 if orientation != 1:
                     attributes |= {"orientation": "1"}
                 half = FORMATS[format_].bits == 16
@@ -382,16 +382,3 @@ def variance_attributes(recipe: Recipe) -> dict[str, str]:
     """The attributes of a variance map; by their kind it can enter no chain."""
     own = attributes_of(recipe.noise[-1], recipe.whole, recipe.key, recipe.rendition.frame)
     return {**own, "stage": "variance", "kind": "variance"}
-
-
-def tags_of(chain: Chain, source: SourceImage, tags: Tags) -> Tags:
-    """The tags of a picture: what is stated of its camera, then what its image carries or says."""
-    optics, own = chain.optics, {**source.shot, **tags.shot}
-    return replace(
-        tags,
-        exposure=chain.settings.render.exposure_time or own.get("exposure_time"),
-        aperture=optics.f_number or tags.aperture,
-        focal_length=optics.focal_length or own.get("focal_length"),
-        sensor_width=optics.sensor_width or own.get("sensor_width"),
-        encoding=chain.settings.output,
-    )

@@ -185,6 +185,8 @@ class StageRole(Enum):
     BALANCE = "its red_gain and blue_gain are those of a raw that enters"
     COLOURS_OF_LIGHT = "it is not done to a raw that enters, whose light the sensor saw"
     COLOURS = "its matrix is that of a raw that enters"
+    FALLOFF = "light falls off by its law"
+    RESPONSE = "it is a part of the curve from light to codes"
     DENOISING = "its strength follows camera and ISO"
     BASELINE = "its noise is that of a baseline"
 

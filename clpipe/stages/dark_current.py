@@ -1,5 +1,6 @@
 """Dark current: charge that heat sets free while the shutter is open."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -43,7 +44,8 @@ class Thermal(Method):
         None,
         "How long charge is gathered.",
         "s",
-        "from exposure or the render's camera; else 0, which is off",
+        "the camera's, by the exposure's EV; else 0, which is off",
+        optics=True,
         ge=0,
         le=86400,
     )
@@ -80,6 +82,9 @@ class Thermal(Method):
     per_electron: float | None = parameter(
         None, "Signal of an electron.", "signal/e-", "from the camera and ISO", gt=0, le=1
     )
+
+    def optics(self) -> Mapping[str, float]:
+        return super().optics() if self.exposure_time else {}  # 0 switches it off
 
     def resolve(self, context: Context) -> "Thermal":
         camera = context.camera

@@ -6,7 +6,7 @@ from typing import ClassVar
 from clpipe.base.types import Floats
 from clpipe.reference.curve import tabulate
 from clpipe.reference.transfer import srgb_curve
-from clpipe.stage import Curve, Kind, Stage, parameter
+from clpipe.stage import Curve, Kind, Stage, StageRole, parameter
 
 
 @lru_cache(maxsize=16)
@@ -40,4 +40,11 @@ class Srgb(Curve):
         return SRGB_TABLE
 
 
-STAGE = Stage("gamma", "Encode for a display.", Kind.RGB, Kind.DISPLAY, (Srgb, Power))
+STAGE = Stage(
+    "gamma",
+    "Encode for a display.",
+    Kind.RGB,
+    Kind.DISPLAY,
+    (Srgb, Power),
+    role=StageRole.RESPONSE,
+)

@@ -1,10 +1,11 @@
 """When each row of the sensor sees the scene: a rolling shutter, and lamps that flicker."""
 
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
 from clpipe.base.types import Doubles, Floats
+from clpipe.camera.optics import USUAL_TIME
 from clpipe.stage import (
     Arguments,
     Context,
@@ -46,7 +47,15 @@ class Rows(Method):
         ge=1,
         le=10_000,
     )
-    exposure_time: float = parameter(0.01, "How long each row is exposed.", "s", gt=0, le=3600)
+    exposure_time: float | None = parameter(
+        None,
+        "How long each row is exposed.",
+        "s",
+        "the camera's, else 0.01",
+        optics=True,
+        gt=0,
+        le=3600,
+    )
     line_time: float = parameter(
         0.0,
         "From the start of a row to that of the next; 0 is a global shutter.",
@@ -64,6 +73,14 @@ class Rows(Method):
         0.0, "Phase of the light when the first row's exposure starts.", "degrees", ge=-360, le=360
     )
 
+    def resolve(self, context: Context) -> Self:
+        return self.with_optics(context).with_defaults(exposure_time=USUAL_TIME)
+
+    @property
+    def time(self) -> float:
+        """How long each row is exposed, s."""
+        return self.exposure_time or USUAL_TIME
+
     def times(self, rows: int) -> Doubles:
         """When the exposure of each row starts, in s: (row,)."""
         return np.arange(rows, dtype=np.float64) * self.line_time
@@ -75,14 +92,14 @@ class Rows(Method):
         the end of the last row's.
         """
         starts = self.times(rows)
-        bounds = np.linspace(0, starts[-1] + self.exposure_time, frames + 1)[:, None]
-        seen = np.clip(bounds, starts, starts + self.exposure_time)
-        return np.asarray(np.diff(seen, axis=0) / self.exposure_time)
+        bounds = np.linspace(0, starts[-1] + self.time, frames + 1)[:, None]
+        seen = np.clip(bounds, starts, starts + self.time)
+        return np.asarray(np.diff(seen, axis=0) / self.time)
 
     @property
     def swing(self) -> np.float32:
         """The flicker that is left after a row's exposure has averaged it."""
-        return np.float32(self.flicker_depth * np.sinc(self.flicker_frequency * self.exposure_time))
+        return np.float32(self.flicker_depth * np.sinc(self.flicker_frequency * self.time))
 
     def passes(self) -> tuple[Pass, ...]:
         if not self.swing:
@@ -101,7 +118,7 @@ class Rows(Method):
     @property
     def start(self) -> np.float32:
         """The light's phase in the middle of the first row's exposure, in periods."""
-        middle = self.flicker_frequency * self.exposure_time / 2
+        middle = self.flicker_frequency * self.time / 2
         before = self.margins.top * float(self.cycles)  # the picture's first row
         return np.float32((middle + self.flicker_phase / 360 - before) % 1)
 

@@ -21,6 +21,7 @@ from clpipe.stage import (
     Pass,
     ReferenceContext,
     Stage,
+    StageRole,
     Unchanged,
     parameter,
 )
@@ -165,4 +166,5 @@ STAGE = Stage(
     Kind.RGB,
     Kind.RGB,
     (VignettingOfLens, NoVignetting, Pa, CosineFourth),
+    role=StageRole.FALLOFF,
 )

@@ -37,7 +37,16 @@ class Gain(Method):
     )
 
     def next_context(self, context: Context) -> Context:
-        return replace(context, headroom=context.headroom + self.headroom)
+        time = self.time(context.exposure_time)
+        return replace(context, headroom=context.headroom + self.headroom, exposure_time=time)
+
+    def time(self, exposure_time: float | None) -> float | None:
+        """How long the shutter is open, s: EVs are its doing, as in a camera's bracket."""
+        return exposure_time and exposure_time * 2.0**self.ev
+
+    def gain_at(self, iso: float) -> float:
+        """What a render's 1.0 is over the sensor's full scale, but for what is metered."""
+        return float(self.gain)
 
     @property
     def gain(self) -> np.float32:

@@ -7,6 +7,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from clpipe.base.types import Floats
+from clpipe.camera.optics import USUAL_TIME
 from clpipe.stage import Arguments, Context, ReferenceContext, parameter
 from clpipe.stages.exposure.gain import Gain
 
@@ -43,7 +44,9 @@ class Photometric(Gain):
         ge=0,
         le=10,
     )
-    exposure_time: float = parameter(0.01, "Exposure time, t.", "s", gt=0, le=86400)
+    exposure_time: float | None = parameter(
+        None, "Exposure time, t.", "s", "the camera's, else 0.01", optics=True, gt=0, le=86400
+    )
     f_number: float | None = parameter(
         None, "F-number of the lens, N.", "", "aperture, else 8", optics=True, gt=0, le=1000
     )
@@ -60,17 +63,20 @@ class Photometric(Gain):
     )
 
     def resolve(self, context: Context) -> Self:
-        return self.with_optics(context).with_defaults(f_number=8.0)
+        return self.with_optics(context).with_defaults(f_number=8.0, exposure_time=USUAL_TIME)
 
     def next_context(self, context: Context) -> Context:
         headroom = context.headroom + self.headroom - math.log2(WHITE)
-        return replace(context, headroom=headroom, exposure_time=self.exposure_time)
+        return replace(context, headroom=headroom, exposure_time=self.time(self.exposure_time))
 
     def factor(self, iso: float) -> np.float32:
         """The value of a render's unit, over the sensor's full scale, at an ISO."""
-        assert self.f_number
+        assert self.f_number and self.exposure_time
         exposure = self.q * self.scale * self.exposure_time / self.f_number**2  # lx s
         return np.float32(exposure * iso / SATURATION * 2.0 ** (self.ev - self.headroom))
+
+    def gain_at(self, iso: float) -> float:
+        return float(self.factor(iso))
 
     def arguments(self, context: Context) -> Arguments:
         return {"gain": self.factor(context.iso)}

@@ -16,6 +16,7 @@ from clpipe.stage import (
     Pass,
     ReferenceContext,
     Stage,
+    StageRole,
     parameter,
 )
 from clpipe.stages.tone_curve.neutral import Neutral
@@ -101,4 +102,5 @@ STAGE = Stage(
     Kind.RGB,
     Kind.RGB,
     (Standard, Neutral, CameraRaw, Linear, File),
+    role=StageRole.RESPONSE,
 )

@@ -1,0 +1,133 @@
+"""What a chain makes of a scene's light: exposure, balance, vignetting and response, as truth."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from clpipe.base.cache import BoundedCache
+from clpipe.base.types import Floats
+from clpipe.chain.chain import Chain, Step
+from clpipe.stage import Kind, Method, ReferenceContext, StageRole, Unchanged
+from clpipe.stages.exposure.gain import Gain
+
+CODES = 256  # of a table of the response, and of its inverse
+FINE = 64  # steps between two of them, by which it is inverted
+DIGITS = 6  # that count, of what is written
+METERED = "metered_ev"  # among the estimates of exposure
+
+Estimates = Mapping[str, Mapping[str, float]]
+Tables = dict[str, list[float]]
+
+RESPONSES: BoundedCache[Tables] = BoundedCache(64)  # by methods; images of a run share them
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """The exposure of a picture.
+
+    Args:
+        ev: over that of the render as it is, with what was metered.
+        gain: what a render's 1.0 is over the sensor's full scale.
+        time: how long the shutter was open, s, where that is known.
+    """
+
+    ev: float
+    gain: float
+    time: float | None
+
+
+def exposure_of(chain: Chain, estimates: Estimates) -> Exposure | None:
+    """The exposure of a picture; None where its chain exposes nothing, as that of a raw.
+
+    Args:
+        chain: of the picture.
+        estimates: what its steps found in the image, by their names.
+    """
+    step = chain.step_in(StageRole.EXPOSURE)
+    if step is None or not isinstance(step.method, Gain):
+        return None
+    metered = estimates.get(step.name, {}).get(METERED, 0.0)
+    time = step.method.next_context(step.context).exposure_time
+    gain = step.method.gain_at(chain.iso) * 2.0**metered
+    return Exposure(step.method.ev + metered, gain, time and time * 2.0**metered)
+
+
+def photometry_of(chain: Chain, estimates: Estimates) -> dict[str, Any] | None:
+    """How a render's light became a picture's, as JSON values; None where nothing exposes it.
+
+    A grey of the render, L, is in the channel c of the picture ``response(x)`` with x = ``gain`` L
+    v ``applied[c]`` / ``light[c]`` (of ``gains``) and v the falloff there, but for noise. Tables of
+    the response are over x = i / 255, and of its inverse over the codes i / 255: where several x
+    have one code, the least of them. x = 1 is the sensor's full scale.
+
+    Args:
+        chain: of the picture.
+        estimates: what its steps found in the image, by their names.
+    """
+    exposure = exposure_of(chain, estimates)
+    if exposure is None:
+        return None
+    return {
+        "ev": _rounded(exposure.ev),
+        "gain": _rounded(exposure.gain),
+        "exposure_time": exposure.time and _rounded(exposure.time),
+        "f_number": chain.optics.f_number,
+        "iso": chain.iso,
+        "gains": _gains(chain, estimates),
+        "falloff": _falloff(chain),
+        "response": response_of(chain),
+    }
+
+
+def _gains(chain: Chain, estimates: Estimates) -> dict[str, list[float]]:
+    """The gains of red, green and blue that the light lacks, and those by which it is balanced."""
+    last = chain.steps[-1]
+    context = last.method.next_context(last.context)
+    step = chain.step_in(StageRole.BALANCE)
+    found = estimates.get(step.name, {}) if step else {}
+    red, blue = context.applied_gains
+    applied = found.get("red_gain", red), found.get("blue_gain", blue)
+    names = {"light": context.gains, "applied": applied if step else context.gains}
+    return {name: [_rounded(red), 1.0, _rounded(blue)] for name, (red, blue) in names.items()}
+
+
+def _falloff(chain: Chain) -> dict[str, Any] | None:
+    """The law by which light falls off towards the corners; None where it does not."""
+    step = chain.step_in(StageRole.FALLOFF)
+    if step is None or isinstance(step.method, Unchanged) or not step.method.passes():
+        return None
+    method = step.method
+    return {"method": method.method, "law": method.summary, "parameters": method.model_dump()}
+
+
+def response_of(chain: Chain) -> Tables | None:
+    """What greys become, as 256 numbers, and the inverse; None of a chain that ends before."""
+    if chain.result is not Kind.DISPLAY:
+        return None
+    steps = [step for step in chain.steps if step.stage.role is StageRole.RESPONSE]
+    methods: tuple[Method, ...] = tuple(step.method for step in steps)
+    return RESPONSES.get(methods, lambda: _tables(steps))
+
+
+def _tables(steps: Sequence[Step]) -> Tables:
+    grey = np.arange(FINE * (CODES - 1) + 1, dtype=np.float32) / np.float32(FINE * (CODES - 1))
+    image: Floats = np.repeat(grey[None, :, None], 3, 2)
+    for step in steps:
+        image = step.method.reference(image, ReferenceContext(step.context, {}, {}))
+    curve = np.maximum.accumulate(np.clip(image[0, :, 1].astype(np.float64), 0, 1))
+    codes = np.arange(CODES) / (CODES - 1)
+    first = np.searchsorted(curve, codes)  # the least x of each code
+    at = np.clip(first, 1, len(curve) - 1)
+    rise = curve[at] - curve[at - 1]
+    part = np.where(rise > 0, (codes - curve[at - 1]) / np.where(rise > 0, rise, 1), 1.0)
+    inverse = (at - 1 + np.clip(part, 0, 1)) / (len(curve) - 1)
+    return {
+        "table": [_rounded(v) for v in curve[::FINE]],
+        "inverse": [_rounded(v) for v in inverse],
+    }
+
+
+def _rounded(value: float) -> float:
+    return float(f"{float(value):.{DIGITS}g}")

@@ -1,0 +1,47 @@
+"""The lens's model in the EXIF of a JPEG or a PNG, where OpenImageIO does not write it."""
+
+import zlib
+
+from PIL import Image
+
+EXIF_IFD, LENS_MODEL = 0x8769, 0xA434
+HEADER = b"Exif\0\0"
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def with_lens(file: bytes, lens: str) -> bytes:
+    """A picture's file with the model of a lens in its EXIF, which it must have.
+
+    Args:
+        file: a JPEG's or a PNG's.
+        lens: the model.
+    """
+    start, end = _place(file)
+    exif = Image.Exif()
+    exif.load(file[start:end])
+    exif.get_ifd(EXIF_IFD)[LENS_MODEL] = lens
+    data = exif.tobytes()
+    if not file.startswith(PNG):
+        return file[: start - 2] + (len(data) + 2).to_bytes(2, "big") + data + file[end:]
+    data = data.removeprefix(HEADER)
+    checked = b"eXIf" + data
+    size, check = len(data), zlib.crc32(checked)
+    chunk = size.to_bytes(4, "big") + checked + check.to_bytes(4, "big")
+    return file[: start - 8] + chunk + file[end + 4 :]
+
+
+def _place(file: bytes) -> tuple[int, int]:
+    """Where the EXIF of a file begins and ends."""
+    if file.startswith(PNG):
+        at = len(PNG)
+        while True:
+            size, kind = int.from_bytes(file[at : at + 4], "big"), file[at + 4 : at + 8]
+            if kind == b"eXIf":
+                return at + 8, at + 8 + size
+            at += 12 + size
+    at = 2
+    while True:
+        size = int.from_bytes(file[at + 2 : at + 4], "big")
+        if file[at + 1] == 0xE1 and file[at + 4 : at + 10] == HEADER:
+            return at + 4, at + 2 + size
+        at += 2 + size

@@ -1,0 +1,53 @@
+"""The shot that a picture's EXIF tells of: what is stated of its camera, and how it was exposed."""
+
+from dataclasses import replace
+
+from clpipe.chain.chain import Chain, Step
+from clpipe.chain.photometry import Estimates, exposure_of
+from clpipe.images.read import SourceImage
+from clpipe.images.tags import TAG_ATTRIBUTES, Tags, exposed_attributes
+from clpipe.stage import StageRole
+
+
+def tags_of(chain: Chain, source: SourceImage, tags: Tags, estimates: Estimates) -> Tags:
+    """The tags of a picture: what is stated of its camera, then what its image carries or says.
+
+    An exposure by some EV more is one of a shutter that is open for longer.
+    """
+    optics, own = chain.optics, {**source.shot, **tags.shot}
+    time, bias = optics.exposure_time or own.get("exposure_time"), tags.bias
+    if exposed := exposure_of(chain, estimates):
+        bias = exposed.ev
+        time = exposed.time or (time and time * 2.0**bias)
+    elif bias is not None:  # it was exposed before it was kept
+        time = tags.exposure
+    calibration = optics.calibration
+    return replace(
+        tags,
+        exposure=time,
+        bias=bias,
+        lens=calibration.name if calibration else tags.lens,
+        focus_distance=optics.focus_distance or tags.focus_distance,
+        aperture=optics.f_number or tags.aperture,
+        focal_length=optics.focal_length or own.get("focal_length"),
+        sensor_width=optics.sensor_width or own.get("sensor_width"),
+        encoding=chain.settings.output,
+    )
+
+
+def kept_tags(chain: Chain, step: Step, source: SourceImage, tags: Tags) -> dict[str, str]:
+    """The attributes by which the image of a step carries the tags that its source carries.
+
+    Behind the exposure it carries that, too, so that the picture made of it says the same.
+
+    Args:
+        chain: of the picture.
+        step: one of its steps.
+        source: the image that entered.
+        tags: of the picture.
+    """
+    own = {name: source.attributes[name] for name in TAG_ATTRIBUTES if name in source.attributes}
+    exposure = chain.step_in(StageRole.EXPOSURE)
+    if exposure is None or chain.steps.index(step) < chain.steps.index(exposure):
+        return own
+    return own | exposed_attributes(own, tags)
