@@ -9,20 +9,23 @@ from typing import Literal
 
 import numpy as np
 
-from clpipe.base.types import Array
+from clpipe.base.types import Array, Mask
+from clpipe.reference import surfaces
 from clpipe.reference.geometry import Geometry, destinations
 
 LayerKind = Literal["depth", "label", "normal", "flow", "colour"]
 
-# How each kind is resampled. Between two surfaces there is neither a depth nor a label, so these
-# are those of one pixel.
+# How each kind is resampled. Between two surfaces there is neither a depth nor a label, a normal or
+# a vector, so there these are those of one pixel.
 RESAMPLING: dict[LayerKind, str] = {
-    "depth": "nearest",
+    "depth": "its inverse bilinear within a surface, else nearest",
     "label": "nearest",
-    "normal": "bilinear, then made as long as 1",
-    "flow": "bilinear, the vectors' ends mapped",
+    "normal": "bilinear within a surface, then made as long as 1, else nearest",
+    "flow": "bilinear within a surface, else nearest, the vectors' ends mapped",
     "colour": "bilinear",
 }
+
+TIE = 1e-6  # px: so near to the border of two pixels, a place is on it
 
 BLOCK = 1 << 17  # pixels that are moved at a time
 
@@ -80,13 +83,14 @@ def warp(
         Each layer, (rows, columns, channel) of its own type, but flow and what is blended of whole
         numbers as float32. It is 0 outside the image and outside the layer's data window, and a
         vector of flow is NaN that ends where the result has no place. Beside them a (rows, columns)
-        mask, float16: 1 where all layers are known, else 0.
+        mask, float16: 1 where all layers are known, else 0. A depth that is not above 0 is not.
     """
     columns, rows = geometry.size(width, height) if geometry else (width, height)
     results = [
         np.empty((rows, columns, layer.pixels.shape[2]), _type_of(layer)) for layer in layers
     ]
     valid = np.ones((rows, columns), np.float16)
+    on_one = [_cells_of(layer) for layer in layers] if geometry else []
     step = max(BLOCK // columns, 1)
     for top in range(0, rows, step):
         part = slice(top, min(top + step, rows))
@@ -94,23 +98,69 @@ def warp(
         at = geometry.origins(x, y, width, height) if geometry else (x, y)
         inside = _within(at[0], at[1], width, height)
         at = np.where(inside, at[0], 0), np.where(inside, at[1], 0)
+        one_surface = np.ones(at[0].shape, bool)
+        for layer, own in zip(layers, on_one, strict=False):
+            if own is not None:
+                corner = np.floor(at[1] - layer.y + 0.5), np.floor(at[0] - layer.x + 0.5)
+                one_surface &= own[_clipped(corner[0], len(own)), _clipped(corner[1], own.shape[1])]
+        moved = (_off_ties(at[0], y), _off_ties(at[1], x)) if geometry else (0.0, 0.0)
+        of_pixel = at[0] + moved[0], at[1] + moved[1]
         for layer, result in zip(layers, results, strict=True):
             of_layer = at[0] - layer.x, at[1] - layer.y
             known = inside & _within(
                 of_layer[0], of_layer[1], layer.pixels.shape[1], layer.pixels.shape[0]
             )
-            if geometry is None or layer.kind in ("depth", "label"):
-                samples = nearest(layer.pixels, *of_layer)
-            else:
-                samples = bilinear(layer.pixels, *of_layer)
+            samples = nearest(layer.pixels, of_pixel[0] - layer.x, of_pixel[1] - layer.y)
+            if geometry is not None and layer.kind != "label":
+                blended = _blended(layer, *of_layer)
+                everywhere = layer.kind == "colour"
+                samples = np.where(everywhere | one_surface[..., None], blended, samples)
                 if layer.kind == "normal":
                     samples = _as_long_as_1(samples)
                 elif layer.kind == "flow":
                     move = Move(geometry, width, height, (x, y), at)
                     samples = mapped(samples, layer.vectors, move)
+            if layer.kind == "depth":
+                valid[part] *= (samples > 0).all(-1)
             result[part] = np.where(known[..., np.newaxis], samples, 0)
             valid[part] *= known
     return results, valid
+
+
+def _cells_of(layer: Layer) -> Mask | None:
+    """Where a layer shows one surface, see :func:`clpipe.reference.surfaces.cells`."""
+    if layer.kind == "depth":
+        return surfaces.cells(_inverse(layer.pixels), surfaces.DEPTH)
+    if layer.kind == "label":
+        return surfaces.cells(layer.pixels, None)
+    if layer.kind == "normal":
+        return surfaces.cells(layer.pixels[..., :3].astype(np.float64), surfaces.NORMAL)
+    if layer.kind == "flow":
+        return surfaces.cells(layer.pixels.astype(np.float64), surfaces.FLOW)
+    return None
+
+
+def _inverse(depth: Array) -> Array:
+    """1 over a depth, float64; NaN where that is none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(depth > 0, 1 / depth.astype(np.float64), np.nan)
+
+
+def _blended(layer: Layer, x: Array, y: Array) -> Array:
+    """A layer between the centres of its pixels."""
+    if layer.kind != "depth":
+        return bilinear(layer.pixels, x, y)
+    with np.errstate(divide="ignore"):
+        return np.asarray(1 / bilinear(_inverse(layer.pixels), x, y))
+
+
+def _off_ties(place: Array, other: Array) -> Array:
+    """What moves places on the border of two pixels into one of them, the other in each other line.
+
+    So nothing that is taken from the nearest pixel moves to one side.
+    """
+    on_border = abs(place - np.rint(place)) < TIE
+    return np.where(on_border, np.where(np.floor(other) % 2 == 0, -0.25, 0.25), 0.0)
 
 
 def nearest(pixels: Array, x: Array, y: Array) -> Array:

@@ -1,0 +1,68 @@
+"""Which neighbouring pixels of a layer show one surface, so that it may be interpolated there."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from clpipe.base.types import Array, Mask
+
+STEEPER = 3.0  # times as steep as both slopes around it, a slope is an edge between surfaces
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """How far neighbours on one surface may be apart at least, and as a share of their values."""
+
+    least: float = 0.0
+    share: float = 0.0
+
+
+# Of inverse depth, which is linear on a plane; of normals; of flow in px.
+DEPTH, NORMAL, FLOW = Tolerance(share=1e-3), Tolerance(least=0.02), Tolerance(least=0.05)
+
+
+def cells(values: Array, tolerance: Tolerance | None) -> Mask:
+    """Whether the four pixels around each corner of a layer's pixels show one surface.
+
+    Two neighbours do where they hardly differ, or no more than the pixels before and behind them
+    lead one to expect, as on a slanted plane. A pixel that is not a number shows none.
+
+    Args:
+        values: (rows, columns, channel).
+        tolerance: None is of labels, which are equal or not.
+
+    Returns:
+        (rows + 1, columns + 1): the corner at (row, column) is that between the pixels (row - 1,
+        column - 1) and (row, column); beyond the edges the pixels there go on.
+
+    >>> slope, edge = np.array([[4.0, 3, 2, 1]]), np.array([[4.0, 4, 2, 2]])
+    >>> cells(slope[..., None], DEPTH)[0].all(), cells(edge[..., None], DEPTH)[0].tolist()
+    (np.True_, [True, True, False, True, True])
+    """
+    across = _linked(values, tolerance)
+    down = _linked(values.swapaxes(0, 1), tolerance).swapaxes(0, 1)
+    padded = np.pad(across, ((1, 1), (1, 1)), constant_values=True)
+    padded[0, 1:-1], padded[-1, 1:-1] = across[0], across[-1]
+    sideways = padded[:-1] & padded[1:]
+    padded = np.pad(down, ((1, 1), (1, 1)), constant_values=True)
+    padded[1:-1, 0], padded[1:-1, -1] = down[:, 0], down[:, -1]
+    return np.asarray(sideways & padded[:, :-1] & padded[:, 1:])
+
+
+def _linked(values: Array, tolerance: Tolerance | None) -> Mask:
+    """Whether each pixel shows one surface with the next one in its row: (rows, columns - 1)."""
+    if tolerance is None:
+        return np.asarray((values[:, 1:] == values[:, :-1]).all(-1))
+    if values.shape[1] == 1:
+        return np.zeros((len(values), 0), bool)
+    with np.errstate(invalid="ignore"):
+        step = values[:, 1:] - values[:, :-1]
+        larger = np.maximum(abs(values[:, 1:]), abs(values[:, :-1]))
+        size = abs(step)
+        near = size <= tolerance.least + tolerance.share * larger
+        mode: Any = "reflect" if step.shape[1] > 1 else "constant"
+        padded = np.pad(step, ((0, 0), (1, 1), (0, 0)), mode=mode)
+        around = np.minimum(padded[:, :-2] * np.sign(step), padded[:, 2:] * np.sign(step))
+        expected = size <= STEEPER * around
+        return np.asarray((near | expected).all(-1) & np.isfinite(step).all(-1))
