@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
@@ -139,3 +140,81 @@ def test_a_frame_of_another_size_fails_alone(frames, clpipe, write_exr):
     assert "f03.exr: it is 39x24, and in/f00.exr, a part of the same exposure, 40x24" in told
     with Image.open("o/f04.jpg") as picture:
         assert picture.size == (40, 24)
+
+
+def turned(degrees, x):
+    """A view of a camera at (x, 0, 0) that has turned about its axis of view."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    r = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return {"R": r.tolist(), "t": (-r @ [x, 0, 0]).tolist()}
+
+
+@pytest.fixture
+def moving(write_exr):
+    """Seven files of an exposure: depth, label and pose of each say its number."""
+    views = []
+    for k in range(7):
+        write_exr(f"in/f{k}.exr", np.full((24, 40, 3), 0.2, np.float32))
+        write_exr(f"in/f{k}_depth.exr", np.full((24, 40, 1), 1.0 + k), "Z")
+        views.append({"file": f"f{k}.exr", "K": K, **turned(2 * k, k)})
+    Path("cameras.json").write_text(json.dumps({"views": views}))
+
+
+K = [[50, 0, 20], [0, 50, 12], [0, 0, 1]]
+SEVEN = ("run", "in", "--device", "numpy", "--poses", "cameras.json", "--carry", "depth")
+SEVEN += ("--set", "shutter.subframes=7")
+
+
+def depths(folder):
+    part = OpenEXR.File(f"{folder}/f0.carried.exr", separate_channels=True).parts[0]
+    return {name: float(c.pixels[3, 3]) for name, c in part.channels.items() if name != "valid"}
+
+
+@pytest.mark.parametrize(("moment", "number"), [("start", 0), ("middle", 3), ("end", 6)])
+def test_what_goes_with_an_exposure_is_that_of_a_moment(clpipe, moving, moment, number):
+    options = () if moment == "middle" else ("--truth-at", moment)
+    clpipe(*SEVEN, "-o", "o", *options)
+    assert list(depths("o").values()) == [1 + number]
+    pose = json.loads(Path("o/f0.json").read_text())["pose"]
+    np.testing.assert_allclose(pose["t"], turned(2 * number, number)["t"], atol=1e-12)
+    again = clpipe(*SEVEN, "-o", "o", *options).stderr
+    assert "there already" in again
+    again = clpipe(*SEVEN, "-o", "o", "--truth-at", "start" if number else "end").stderr
+    assert "there already" not in again
+
+
+def test_all_moments_go_along(clpipe, moving):
+    clpipe(*SEVEN, "-o", "o", "--truth-at", "all")
+    assert depths("o") == {"depth.Z": 4, "start.depth.Z": 1, "end.depth.Z": 7}
+    listed = json.loads(Path("o/f0.json").read_text())["carried"]
+    assert [(each["moment"], each["file"]) for each in listed] == [
+        ("middle", "f3_depth.exr"),
+        ("start", "f0_depth.exr"),
+        ("end", "f6_depth.exr"),
+    ]
+
+
+def test_rows_of_a_rolling_shutter_have_poses(clpipe, moving):
+    given = ("--set", "shutter.exposure_time=0.01", "--set", "shutter.line_time=0.001")
+    clpipe(*SEVEN, "-o", "o", *given)
+    motion = json.loads(Path("o/f0.json").read_text())["motion"]
+    assert len(motion["files"]) == 7 and motion["readout_time"] == pytest.approx(0.023)
+    # 33 ms in seven parts, of which the one of number k has turned by 2 k degrees in its middle.
+    for row, time in (("first_row", 0.005), ("last_row", 0.028)):
+        number = time / 0.033 * 7 - 0.5
+        expected = turned(2 * number, number)
+        np.testing.assert_allclose(motion[row]["R"], expected["R"], atol=1e-9)
+        np.testing.assert_allclose(motion[row]["t"], expected["t"], atol=1e-9)
+    (frame,) = json.loads(Path("o/transforms.json").read_text())["frames"]
+    assert frame["rolling_shutter_time"] == motion["readout_time"]
+    x = [np.array(frame[f"transform_matrix{n}"])[0, 3] for n in ("_first_row", "", "_last_row")]
+    np.testing.assert_allclose(x, [0.5606, 3, 5.4394], atol=1e-3)
+    (view,) = json.loads(Path("o/cameras.json").read_text())["views"]
+    assert view["motion"] == motion
+
+
+def test_a_camera_that_stands_still_has_no_motion(clpipe, moving):
+    views = [{"file": f"f{k}.exr", "K": K, **turned(0, 1)} for k in range(7)]
+    Path("cameras.json").write_text(json.dumps({"views": views}))
+    clpipe(*SEVEN, "-o", "o")
+    assert "motion" not in json.loads(Path("o/f0.json").read_text())

@@ -79,7 +79,7 @@ class Images:
         if not jobs:
             found = find_jobs(self.inputs, output, loader.endings(), self.exclude)
             jobs = loader.exposures(found)
-        jobs = with_views(jobs, self.poses, loader.settings.render)
+        jobs = with_views(jobs, self.poses, loader.settings.render, loader.request.truth_at)
         jobs = self.series.jobs(jobs, loader.settings)
         if self.per_tar:
             tars = self.shard.take(cut(jobs, self.per_tar, output))

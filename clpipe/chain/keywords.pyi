@@ -339,6 +339,7 @@ class RenderCamera(TypedDict, total=False):
     camera_angle_x: Number
     rotation: Several
     translation: Several
+    motion: Several
 
 class Keywords(TypedDict, total=False):
     camera: Text

@@ -13,6 +13,7 @@ Pixels = Annotated[float, Field(gt=0, le=1e7, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Vector = Annotated[tuple[Finite, Finite, Finite], Field(strict=False)]  # or a list
 Matrix = Annotated[tuple[Vector, Vector, Vector], Field(strict=False), AfterValidator(rotation)]
+Pose = Annotated[tuple[Matrix, Vector], Field(strict=False)]
 
 
 class RenderCamera(BaseModel):
@@ -37,6 +38,9 @@ class RenderCamera(BaseModel):
     # From the world to the camera, in OpenCV's axes: x_cam = rotation x + translation.
     rotation: Matrix | None = None
     translation: Vector | None = None
+
+    # While the shutter is open, from its opening to its end, in equal steps of time: poses alike.
+    motion: Annotated[tuple[Pose, ...] | None, Field(strict=False, min_length=2)] = None
 
     @model_validator(mode="after")
     def _check_pose(self) -> Self:
@@ -67,4 +71,4 @@ class RenderCamera(BaseModel):
         return self.model_copy(update={k: v for k, v in shot.items() if k not in own})
 
 
-POSE = {"rotation", "translation"}
+POSE = {"rotation", "translation", "motion"}

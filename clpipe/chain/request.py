@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -30,6 +30,10 @@ DEFAULTS = Settings()
 MOST_PATCHES = 9999  # of an image; the names of their files have four digits
 
 
+Moments = Literal["start", "middle", "end", "all"]
+MOMENTS: tuple[Moments, ...] = get_args(Moments)
+
+
 class Recorded(BaseModel):
     """The part of a request that decides about a picture's bytes, as a sidecar stores it.
 
@@ -53,6 +57,7 @@ class Recorded(BaseModel):
     patches_per_image: Annotated[int, Field(ge=0, le=MOST_PATCHES)] | Literal["grid"]
     augment: bool
     carry: list[str]
+    truth_at: Moments = "middle"
 
     @model_validator(mode="after")
     def _has_patches(self) -> "Recorded":
@@ -83,6 +88,7 @@ class Request:
         max_pixels: larger files are refused; None is the reader's own limit.
         formats: of the last image; () follows from the chain, see :meth:`with_outputs`.
         keep: steps whose image is written too, or "all".
+        truth_at: of an exposure of several files, whose pose and layers go with the picture.
         frames: how many frames of each image; None is one picture instead of a burst.
         truths: which of :data:`clpipe.chain.rendition.TRUTHS` are written beside each picture.
         carry: layers that go along with each picture, as :func:`clpipe.chain.carry.parse_carry`
@@ -110,6 +116,7 @@ class Request:
     formats: tuple[str, ...] = ()
     keep: tuple[str, ...] = ()
     carry: tuple[str, ...] = ()
+    truth_at: Moments = "middle"
     frames: int | None = None
     truths: tuple[str, ...] = ()
     bracket: tuple[float, ...] = ()

@@ -9,7 +9,7 @@ from clpipe.base.errors import RequestError
 from clpipe.chain.files import built_in_configs
 from clpipe.chain.formats import EVERY_FORMAT
 from clpipe.chain.keys import ABOUT
-from clpipe.chain.request import DEFAULTS, MOST_PATCHES
+from clpipe.chain.request import DEFAULTS, MOMENTS, MOST_PATCHES
 from clpipe.commands.completion import (
     cameras,
     configs,
@@ -196,6 +196,15 @@ carry_option = click.option(
     "to OUT/NAME.LAYER.png, too, with 16 bits, in millimetres. FILE is where it is, as "
     "'../depth/{name}.exr', from the image's folder. [default: {name}_LAYER.exr and the like] May "
     "be repeated.",
+)
+
+truth_at_option = click.option(
+    "--truth-at",
+    type=click.Choice(MOMENTS),
+    default="middle",
+    show_default=True,
+    help="Of an exposure of several files (shutter.subframes), whose pose and carried layers go "
+    "with the picture; all has the layers of its start and end, too.",
 )
 
 format_option = click.option(

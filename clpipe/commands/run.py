@@ -18,6 +18,7 @@ from clpipe.commands.chain_options import (
     keep_option,
     patch_options,
     series_options,
+    truth_at_option,
 )
 from clpipe.commands.input_options import (
     exclude_option,
@@ -57,6 +58,7 @@ from clpipe.outputs.patches import PER_IMAGE
     "repeated.",
 )
 @carry_option
+@truth_at_option
 @click.option(
     "--frames",
     type=click.IntRange(1, MOST["frames"]),

@@ -3,7 +3,7 @@
 import os
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -140,6 +140,32 @@ def carry(
         for each, pixels in zip(found, moved, strict=True)
     )
     return Aovs(carried, valid, attributes)
+
+
+def joined(of_moments: Mapping[str, Aovs], named: bool) -> Aovs:
+    """The layers of several moments of an exposure as those of one.
+
+    Args:
+        of_moments: by the names of the moments.
+        named: whether names and channels say the moment, but for the middle's.
+    """
+    layers: list[Aov] = []
+    for moment, own in of_moments.items():
+        prefix = f"{moment}." if named and moment != "middle" else ""
+        layers += [
+            replace(
+                each,
+                name=f"{prefix}{each.name}",
+                channels=tuple(f"{prefix}{channel}" for channel in each.channels),
+                record={**each.record, "layer": f"{prefix}{each.name}", "moment": moment},
+            )
+            for each in own.layers
+        ]
+    first, *others = of_moments.values()
+    valid = first.valid.copy()
+    for other in others:
+        valid *= other.valid
+    return Aovs(tuple(layers), valid, first.attributes)
 
 
 def geometry_of(chain: Chain, orientation: int) -> Geometry | None:

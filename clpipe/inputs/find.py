@@ -60,6 +60,14 @@ class Job:
         """All files of its exposure, the first one first."""
         return (self.path, *self.subframes)
 
+    def at(self, moment: str) -> Path:
+        """The file of its exposure at a moment of it: "start", "middle" or "end".
+
+        Of an even number of files the middle one is the last before the middle.
+        """
+        places = {"start": 0, "middle": (len(self.paths) - 1) // 2, "end": -1}
+        return self.paths[places[moment]]
+
     @property
     def input(self) -> str:
         """The path as it is stored and printed."""

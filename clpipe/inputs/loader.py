@@ -28,7 +28,7 @@ from clpipe.images.read import (
     SourceImage,
     read_source,
 )
-from clpipe.inputs.carry import Aovs, carry
+from clpipe.inputs.carry import Aovs, carry, joined
 from clpipe.inputs.depth import read_depth
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import KeptLoader, kind_message
@@ -229,7 +229,7 @@ class ImageLoader:
         carried, most = request.aov_specs(), request.max_pixels or USUAL_MAX_PIXELS
 
         def depth(chain: Chain, width: int, height: int, margins: Margins) -> Depth:
-            return read_depth(job.path, chain, width, height, margins, carried, most)
+            return read_depth(job.at("middle"), chain, width, height, margins, carried, most)
 
         own = enter(loaded.chain, source.pixels, source.margins, depth, source.shot)
         source = replace(
@@ -256,7 +256,7 @@ class ImageLoader:
         return LoadedImage(self.chain, source, key)
 
     def aovs(self, job: Job, loaded: LoadedImage, orientation: int = 1) -> Aovs:
-        """The layers that go along with a job's picture.
+        """The layers that go along with a job's picture, of the moments that are asked for.
 
         Args:
             job: the image.
@@ -269,7 +269,12 @@ class ImageLoader:
         request = self.request
         most = request.max_pixels or USUAL_MAX_PIXELS
         layers = request.aov_specs()
-        return carry(job.path, loaded.source, loaded.chain, layers, most, orientation)
+        moments = ("middle", "start", "end") if request.truth_at == "all" else (request.truth_at,)
+        given = loaded.source, loaded.chain, layers, most, orientation
+        if not job.subframes:
+            return carry(job.path, *given)
+        of_moments = {moment: carry(job.at(moment), *given) for moment in moments}
+        return joined(of_moments, named=len(moments) > 1)
 
     def is_left_out(self, job: Job, error: Exception) -> bool:
         """Whether an image that cannot enter was only found in a folder, beside others that can."""

@@ -14,24 +14,29 @@ from clpipe.base.errors import RequestError
 from clpipe.chain.keys import RENDER
 from clpipe.chain.methods import make_table
 from clpipe.chain.render_camera import RenderCamera
+from clpipe.chain.request import Moments
 from clpipe.inputs.find import Job
 from clpipe.inputs.render_cameras import View, read_views
 
 ENDING = re.compile(r"\.[A-Za-z]\w{1,4}$")  # of an image's name; frame.0001 has none
 
 
-def with_views(jobs: Sequence[Job], path: Path | None, settings: RenderCamera) -> list[Job]:
+def with_views(
+    jobs: Sequence[Job], path: Path | None, settings: RenderCamera, truth_at: Moments = "middle"
+) -> list[Job]:
     """The jobs of a run, each with the camera that a file has for it.
 
     A view and a render belong together where their paths are equal but for their endings, that of
     the render below the input folder; else where the end of the view's path is the render's; else
     by the names of the files, where no other view and no other render is called so. A job without a
-    view, or with one that cannot be, has a ``problem``.
+    view, or with one that cannot be, has a ``problem``. Of an exposure of several files the camera
+    is that of one moment; where each file has a pose of its own, it has all of them, too.
 
     Args:
         jobs: all of the run.
         path: the file, or COLMAP's folder; None leaves the jobs as they are.
         settings: what holds for all renders.
+        truth_at: which moment of an exposure the camera is that of; "all" is its middle.
 
     Raises:
         RequestError: the file cannot be read, or is of none of the forms, or has a view for no job.
@@ -43,8 +48,13 @@ def with_views(jobs: Sequence[Job], path: Path | None, settings: RenderCamera) -
     given = []
     for job in jobs:
         try:
-            view = views.find(_stem(job.key), called)
-            given.append(_with_view(job, view, settings))
+            files = [_stem(str(PurePosixPath(job.key).with_name(p.name))) for p in job.subframes]
+            of_files = [views.find(_stem(job.key), called)]
+            of_files += [view for file in files if (view := views.get(file, called))]
+            at = job.paths.index(job.at("middle" if truth_at == "all" else truth_at))
+            is_whole = len(of_files) == len(job.paths)
+            own = _with_view(job, of_files[at if is_whole else 0], settings)
+            given.append(_with_motion(own, of_files) if files and is_whole else own)
         except RequestError as error:
             given.append(replace(job, problem=f"--poses {path}: {error}"))
     if all(job.problem for job in given):
@@ -79,6 +89,22 @@ def _with_view(job: Job, view: View, settings: RenderCamera) -> Job:
     return replace(job, values=values, size=view.size)
 
 
+def _with_motion(job: Job, views: Sequence[View]) -> Job:
+    """A job of an exposure during which its camera moves, with the poses of its files.
+
+    Raises:
+        RequestError: a view cannot be a render's.
+    """
+    poses = []
+    for view in views:
+        if view.problem:
+            raise RequestError(f"view {view.name}: {view.problem}")
+        poses.append([view.values.get("rotation"), view.values.get("translation")])
+    if poses[0][0] is None or all(pose == poses[0] for pose in poses):
+        return job
+    return replace(job, values={**job.values, RENDER: {**job.values[RENDER], "motion": poses}})
+
+
 class Views:
     """The views of a file, to be found by the paths of renders without their endings."""
 
@@ -92,6 +118,13 @@ class Views:
             for first in range(len(parts)):
                 self._by_end["/".join(parts[first:])].append(stem)
         self._ends = sorted(self._by_end)
+
+    def get(self, stem: str, called: Mapping[str, int]) -> View | None:
+        """As :meth:`find`; None where there is none, or are several."""
+        try:
+            return self.find(stem, called)
+        except RequestError:
+            return None
 
     def find(self, stem: str, called: Mapping[str, int]) -> View:
         """The view of a render, by its path without its ending.

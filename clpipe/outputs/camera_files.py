@@ -75,6 +75,7 @@ class Photograph:
         camera: its intrinsics.
         pose: R and t, where known.
         photometry: see :func:`clpipe.chain.photometry.photometry_of`.
+        motion: see :func:`clpipe.outputs.motion.motion_records`.
     """
 
     file: str
@@ -82,6 +83,7 @@ class Photograph:
     camera: Intrinsics
     pose: tuple[Matrix, Vector] | None
     photometry: Mapping[str, Any] | None = None
+    motion: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -223,7 +225,8 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
                 camera = CAMERA.validate_python(values["intrinsics"])
                 pose = values["pose"]
                 r_and_t = pose and POSE.validate_python((pose["R"], pose["t"]))
-                yield Photograph(shown, role, simplest(camera), r_and_t, values["photometry"])
+                told = values["photometry"], values.get("motion")
+                yield Photograph(shown, role, simplest(camera), r_and_t, *told)
             except SidecarError:
                 left_out[f"{CHANGED}, so not used; the same clpipe run makes it again"].append(
                     shown
@@ -294,6 +297,7 @@ def cameras_json(pictures: Sequence[Photograph], up: str = "") -> str:
         view = {"file": up + each.file, "width": camera.width, "height": camera.height, "K": k}
         view |= dict(zip("Rt", each.pose, strict=True)) if each.pose else {}
         view |= {"model": camera.model, "distortion": dict(camera.distortion)}
+        view |= {"motion": each.motion} if each.motion else {}
         views.append(view | responses.of(each))
     return json_text({"note": NOTE, **responses.record, "views": views})
 
@@ -345,6 +349,19 @@ def _text(values: Sequence[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
+def _rows_of(picture: Photograph) -> dict[str, Any]:
+    """A moving camera's poses at the first and last row, camera to world, and the times."""
+    motion = picture.motion
+    if not motion:
+        return {}
+    rows = {
+        f"transform_matrix_{name}": to_opengl(motion[name]["R"], motion[name]["t"]).tolist()
+        for name in ("first_row", "last_row")
+    }
+    times = {"exposure_time": motion["exposure_time"]}
+    return {**rows, **times, "rolling_shutter_time": motion["readout_time"]}
+
+
 def nerfstudio(pictures: Sequence[Photograph], up: str, left_out: Mapping[str, list[str]]) -> str:
     """A transforms.json of nerfstudio's; "" where no picture can be in it.
 
@@ -372,7 +389,7 @@ def nerfstudio(pictures: Sequence[Photograph], up: str, left_out: Mapping[str, l
         own = {name: camera.distortion.get(name, 0.0) for name in NERFSTUDIO[model]}
         cameras.append({**sizes, "cx": camera.cx, "cy": camera.cy, **own})
         placed = {"file_path": up + each.file, "transform_matrix": to_opengl(*each.pose).tolist()}
-        frames.append(placed | responses.of(each))
+        frames.append(placed | _rows_of(each) | responses.of(each))
     if not frames:
         return ""
     shared = cameras[0] if all(each == cameras[0] for each in cameras) else {}

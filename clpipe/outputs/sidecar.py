@@ -21,6 +21,7 @@ from clpipe.images.write import versions
 from clpipe.inputs.carry import Aovs
 from clpipe.inputs.find import Job
 from clpipe.inputs.raw import RawImage
+from clpipe.outputs.motion import motion_records
 from clpipe.outputs.patches import Patch, facts_of
 from clpipe.outputs.program import program_digest
 from clpipe.outputs.recipes import Recipe
@@ -116,6 +117,7 @@ def sidecar(
         | chain.settings.render.with_defaults(source.shot).model_dump(exclude=POSE),
         "intrinsics": intrinsics.record() if intrinsics else None,
         "pose": chain.settings.render.pose,
+        **motion_records(chain, source),
         "photometry": photometry_of(chain, result.estimates),
         "noise": noise.record() if noise else None,
         "starts_on": chain.source.label,
