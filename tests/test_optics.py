@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 import clpipe as clpipe_api
-from clpipe.base.errors import RequestError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.camera import lens as by_name
 from clpipe.chain.chain import make_chain
 from clpipe.chain.depth import depth_of_array, with_depth
@@ -265,6 +265,19 @@ def test_a_lens_that_does_not_fit_is_refused(lensfun):
     with pytest.raises(RequestError, match="stage vignetting reads rgb, but mosaic gives mosaic"):
         make_chain(settings_from({"lens": "a", **behind}))
     assert [s.name for s in make_chain(settings_from(behind)).steps] == ["mosaic", "demosaic"]
+
+
+def test_a_lens_for_a_smaller_sensor_is_said_as_such(lensfun):
+    folding = {"method": "ptlens", "b": -0.3, "unit": 0.3}
+    image = np.ones((40, 60, 3), np.float32)
+    for smaller, message in (
+        (True, "Maker 16mm was calibrated on a sensor smaller than"),
+        (False, "fold the image over"),
+    ):
+        lensfun(by_name.LensCalibration("Maker 16mm", 16.0, folding, {}, smaller))
+        pipeline = clpipe_api.Pipeline(lens="a", device="numpy")
+        with pytest.raises(ImageError, match=message):
+            pipeline.process(image, "a")
 
 
 def test_a_lens_of_which_nothing_is_known_is_refused(lensfun):

@@ -1,6 +1,7 @@
 """Overscan: what a data window has beyond the display window, where a lens shows it."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -185,7 +186,7 @@ def test_where_it_is_of_use():
 
 def test_a_render_with_overscan(clpipe, write_exr):
     write_render(write_exr, "in/a.exr")
-    carry = ("--carry", "Z", "--set", f"render.fx={FX}")
+    carry = ("--carry", "Z:label", "--set", f"render.fx={FX}")
     clpipe(*BEND, *carry)
     u, v = seen(WIDTH, HEIGHT)
     assert np.abs(read_image(Path("o/a.exr")).pixels - light(u, v)).max() < 0.005
@@ -262,16 +263,31 @@ def test_truths_and_brackets_have_it_too(clpipe, write_exr):
         assert mosaic.shape == (HEIGHT, WIDTH) and mosaic.min() > 0.3
 
 
+@pytest.mark.parametrize("around", [NO_MARGINS, AROUND], ids=["without", "with"])
+def test_black_corners_are_told(clpipe, write_exr, around):
+    write_render(write_exr, "in/a.exr", around)
+    told = clpipe(*BEND, "--set", f"render.fx={FX}").stderr
+    (black,) = re.findall(r"([\d.]+) % of the picture are black", told) or ["0"]
+    seen = read_image(Path("o/a.exr")).pixels.max(-1) < 0.5
+    assert float(black) == pytest.approx(100 * seen.mean(), abs=1.5)
+    assert ("set distortion.fit=true" in told) == (around == NO_MARGINS)
+    if around == NO_MARGINS:
+        assert float(black) > 1
+        (more,) = re.findall(r"render (\d+) px more on each side", told)
+        assert int(more) <= max(AROUND)
+        assert "black" not in clpipe(*BEND, "--set", "distortion.fit=true").stderr
+
+
 def test_datasets_and_pipelines(write_exr, tmp_path):
     path = write_render(write_exr, "a.exr")
     own = {"stages": ["distortion"], "distortion": BARREL}
-    sample = clpipe_api.Dataset(path, device="numpy", carry="Z", epochs=1, **own)[0]
+    sample = clpipe_api.Dataset(path, device="numpy", carry="Z:label", epochs=1, **own)[0]
     pipe = clpipe_api.Pipeline(device="numpy", **own)
     image = read_image(path, overscan=True).pixels
     made = pipe.process(image, "a", overscan=AROUND).image
     assert np.array_equal(sample["image"], made) and made.shape == (HEIGHT, WIDTH, 3)
     x, y = places(WIDTH, HEIGHT, AROUND)
-    depth, valid = pipe.carry(x + 100 * y, "depth", overscan=AROUND)
+    depth, valid = pipe.carry(x + 100 * y, "label", overscan=AROUND)
     assert np.array_equal(depth, sample["carried.Z"][..., 0]) and valid.all()
     plain = clpipe_api.Pipeline(device="numpy", stages=["motion_blur"], motion_blur={"length": 5.0})
     one = plain.process(image, "a", overscan=AROUND).image

@@ -18,6 +18,7 @@ INSTALL = "pip install 'clpipe[lens]'"
 FAR = 1000.0  # m, at which lensfun's calibrations for infinity stand
 OTHERS = 2  # words of a lens's name, beside the maker, that may be left out
 RECTILINEAR = "RECTILINEAR"  # lensfun's type of the lenses that are known here
+SAME_CROP = 1.01  # ratio of crop factors that are one's
 ASPECT = 1.5  # of the pictures that a lens was calibrated with, where the database says nothing
 
 
@@ -30,12 +31,14 @@ class LensCalibration:
         focal_length: in mm.
         distortion, vignetting: the method of the stage and its parameters; empty where lensfun
             knows none.
+        is_of_smaller_sensor: whether it was calibrated on a smaller sensor than the camera's.
     """
 
     name: str
     focal_length: float
     distortion: Mapping[str, Any]
     vignetting: Mapping[str, Any]
+    is_of_smaller_sensor: bool = False
 
 
 def calibration_of(
@@ -86,7 +89,8 @@ def _calibration(
         if found and found.model.name == "PA":
             terms = (term * ratio ** (2 * i) for i, term in enumerate(found.terms, 1))
             falloff = {"method": "pa"} | dict(zip(("k1", "k2", "k3"), terms, strict=True))
-    return LensCalibration(_full(lens), focal, bend, falloff)
+    is_smaller = crop is not None and lens.crop_factor > crop * SAME_CROP
+    return LensCalibration(_full(lens), focal, bend, falloff, is_smaller)
 
 
 def lens_names() -> list[str]:
@@ -179,7 +183,7 @@ def _found(database: Any, name: str, crop: float | None) -> Any:
         models = sorted({_full(lens) for _, lens in having})
         more = f" or one of {len(models) - 5} others" if len(models) > 5 else ""
         raise KeyedError("lens", f"lens: '{one_line(name)}' may be {' or '.join(models[:5])}{more}")
-    smaller = [lens for lens in best if crop and lens.crop_factor <= crop * 1.01]
+    smaller = [lens for lens in best if crop and lens.crop_factor <= crop * SAME_CROP]
     return max(smaller or best, key=lambda lens: lens.crop_factor if smaller else -lens.crop_factor)
 
 

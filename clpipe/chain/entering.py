@@ -12,6 +12,7 @@ from clpipe.chain.depth import depth_steps, warnings_of, with_depth
 from clpipe.chain.keys import RENDER
 from clpipe.chain.overscan import steps_of_overscan, with_overscan
 from clpipe.chain.settings import overlay
+from clpipe.chain.void import check_void
 from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.stage.method import optics_names
@@ -61,11 +62,12 @@ def enter(
         pixels, margins = np.ascontiguousarray(margins.cropped(pixels)), NO_MARGINS
     elif margins:
         chain = with_overscan(chain, margins)
-    if depth is None or pixels.ndim != 3 or not depth_steps(chain):
-        return Entered(chain, pixels, margins)
     height, width = pixels.shape[:2]
+    warnings = tuple(filter(None, [check_void(chain, width, height)]))
+    if depth is None or pixels.ndim != 3 or not depth_steps(chain):
+        return Entered(chain, pixels, margins, warnings=warnings)
     found = depth(chain, width, height, margins)
-    warnings = tuple(warnings_of(chain, found))
+    warnings += tuple(warnings_of(chain, found))
     return Entered(with_depth(chain, found), pixels, margins, found, warnings)
 
 

@@ -5,20 +5,26 @@ The first pixel's centre is at (0.5, 0.5); OpenCV's cx and cy are smaller by 0.5
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from clpipe.base.errors import RequestError
+from clpipe.base.types import Array
 
 PINHOLE, OPENCV, FULL_OPENCV = "PINHOLE", "OPENCV", "FULL_OPENCV"
 OPENCV_FISHEYE = "OPENCV_FISHEYE"
+POLYNOMIAL = "POLYNOMIAL"  # none of COLMAP's
 COEFFICIENTS = {
     PINHOLE: (),
     OPENCV: ("k1", "k2", "p1", "p2"),
     FULL_OPENCV: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     OPENCV_FISHEYE: ("k1", "k2", "k3", "k4"),
 }
+
+LAWSON = 40  # iterations of a fit
 
 AGREEMENT = 0.01  # of focal lengths; those in mm are often rounded
 
@@ -98,7 +104,61 @@ class Intrinsics:
         residual = self.residual * max(x, y)
         return Intrinsics(width, height, *places, self.model, self.distortion, residual)
 
+    def polynomial(self) -> "Intrinsics":
+        """The same camera by the model of :data:`POLYNOMIAL`, fitted where it is none.
+
+        The radial factor is then 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8, as nerfstudio has it, and
+        the focal length goes with it. ``residual`` has what the fit leaves at most in the picture.
+        """
+        own = self.distortion
+        under = [own.get(f"k{i}", 0.0) for i in (4, 5, 6)]
+        named = {name: own.get(name, 0.0) for name in ("k1", "k2", "k3", "p1", "p2")}
+        if not any(under):
+            return replace(self, model=POLYNOMIAL, distortion={**named, "k4": 0.0})
+        over = [named[f"k{i}"] for i in (1, 2, 3)]
+
+        def bent(r: Array) -> Array:
+            powers = np.stack([r**2, r**4, r**6])
+            return np.asarray(r * (1 + over @ powers) / (1 + under @ powers))
+
+        corners = [(x - self.cx) / self.fx for x in (0, self.width)]
+        heights = [(y - self.cy) / self.fy for y in (0, self.height)]
+        corner = max(math.hypot(x, y) for x in corners for y in heights)
+        r = np.linspace(0, 4 * corner, 4096)
+        seen = bent(r)
+        rising = np.flatnonzero(np.diff(seen) <= 0)
+        last = rising[0] + 1 if rising.size else len(r)
+        shown = np.linspace(0, 1, 512)[1:] * min(corner, seen[:last].max())
+        r = np.interp(shown, seen[:last], r[:last])
+        first, *k, off = _smallest_error(np.stack([r, r**3, r**5, r**7, r**9], 1), bent(r))
+        fitted = {f"k{i}": c / first for i, c in enumerate(k, 1)}
+        tangential = {name: named[name] / first for name in ("p1", "p2")}
+        residual = self.residual + off * max(self.fx, self.fy)
+        own_fx, own_fy = self.fx * first, self.fy * first
+        changed: dict[str, Any] = {"fx": own_fx, "fy": own_fy, "residual": residual, "model": POLYNOMIAL}
+        return replace(self, **changed, distortion={**fitted, **tangential})
+
     def record(self) -> dict[str, Any]:
         """Intrinsics as JSON values; coefficients that are not given are 0."""
         names = COEFFICIENTS[self.model]
         return {**asdict(self), "distortion": {n: self.distortion.get(n, 0.0) for n in names}}
+
+
+def _smallest_error(terms: Array, values: Array) -> list[float]:
+    """The factors of terms, (place, term), whose sum is nearest to values, and their largest error.
+
+    By least squares whose weights grow where the error is large (Lawson, 1961).
+    """
+    scale = abs(terms).max(0)
+    weights = np.ones(len(values))
+    best: tuple[float, Array] = np.inf, np.zeros(len(scale))
+    for _ in range(LAWSON):
+        root = np.sqrt(weights)[:, None]
+        found, *_ = np.linalg.lstsq(terms / scale * root, values * root[:, 0], rcond=None)
+        error = abs(terms / scale @ found - values)
+        best = min(best, (float(error.max()), found), key=lambda each: each[0])
+        if not error.any():
+            break
+        weights = weights * (error / error.mean() + 1e-9)
+        weights /= weights.sum()
+    return [*map(float, best[1] / scale), best[0]]

@@ -14,7 +14,8 @@ from PIL import Image
 
 from clpipe.base.types import Array, Doubles, Mask
 from clpipe.chain.rendition import NOISY
-from clpipe.outputs.camera_files import COLMAP, Photograph, colmap
+from clpipe.outputs.photographs import Photograph
+from clpipe.outputs.views import COLMAP, colmap
 from clpipe.reference.intrinsics import PINHOLE, Intrinsics
 from tools.reconstruction.views import SAME, View
 

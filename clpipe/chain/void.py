@@ -1,0 +1,63 @@
+"""What a lens shows beside a render, where the picture stays black."""
+
+from functools import lru_cache
+from math import ceil
+
+import numpy as np
+
+from clpipe.base.errors import ImageError
+from clpipe.chain.chain import Chain
+from clpipe.reference.geometry import Geometry
+
+POINTS = 128, 96  # across and down the picture, at which it is looked for
+LEAST = 5e-4  # share of the picture, below which nothing is said
+MOST_OVERSCAN = 0.5  # of the longer side, beyond which no overscan is proposed
+
+
+def check_void(chain: Chain, width: int, height: int) -> str:
+    """A warning where a part of a picture is black, as its lens shows more than there is; or "".
+
+    Args:
+        chain: of the picture.
+        width, height: of the image that enters, with its overscan.
+
+    Raises:
+        ImageError: the lens folds the image over.
+    """
+    if chain.geometry is None:
+        return ""
+    try:
+        share, beyond = _void(chain.geometry, width, height)
+    except ImageError as error:
+        lens = chain.optics.calibration
+        if lens and lens.is_of_smaller_sensor:
+            raise ImageError(
+                f"{lens.name} was calibrated on a sensor smaller than that of "
+                f"{chain.camera.name}, whose corners it does not reach; choose a camera with a "
+                "smaller sensor, or a lens for this one"
+            ) from None
+        raise error from None
+    if share < LEAST:
+        return ""
+    most = MOST_OVERSCAN * max(width, height)
+    more = f"render {ceil(beyond)} px more on each side (overscan), or " if beyond < most else ""
+    return (
+        f"{100 * share:.1f} % of the picture are black: there the lens shows what lies beside the "
+        f"render; {more}set distortion.fit=true"
+    )
+
+
+@lru_cache(maxsize=64)
+def _void(geometry: Geometry, width: int, height: int) -> tuple[float, float]:
+    """The share of a picture that has no place in its image, and how far it is beyond it, px."""
+    columns, rows = geometry.size(width, height)
+    places = [
+        np.concatenate([[0.5], (np.arange(n) + 0.5) * (side / n), [side - 0.5]])
+        for n, side in zip(POINTS, (columns, rows), strict=True)
+    ]
+    x, y = np.meshgrid(*places)
+    with np.errstate(all="ignore"):
+        u, v = geometry.origins(x, y, width, height)
+        beyond = np.maximum(np.maximum(-u, u - width), np.maximum(-v, v - height))
+    beyond = np.where(np.isfinite(beyond), beyond, np.inf)
+    return float((beyond[1:-1, 1:-1] > 0).mean()), float(beyond.max())

@@ -1,0 +1,120 @@
+"""The pictures of an output folder with their cameras, as its sidecars say them."""
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter
+
+from clpipe.base.reading import read_bytes
+from clpipe.chain.formats import DNG, ending_of
+from clpipe.chain.render_camera import Matrix, Vector
+from clpipe.chain.rendition import BASELINES, NOISY, PICTURES, Rendition, Role
+from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, values_in
+from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
+
+# What is trained on is of one kind: noisy pictures lie in the folder itself, others below.
+OTHERS = (*PICTURES, *BASELINES)
+
+MODELS = {NOISY: "", **{role: f"models/{Rendition(role).label[1:]}/" for role in OTHERS}}
+
+CHANGED = "a sidecar that was changed since clpipe wrote it"
+
+CAMERA = TypeAdapter(Intrinsics)
+
+POSE: TypeAdapter[tuple[Matrix, Vector]] = TypeAdapter(tuple[Matrix, Vector])
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A picture of an output folder.
+
+    Args:
+        file: its path there.
+        role: what it is.
+        camera: its intrinsics.
+        pose: R and t, where known.
+        photometry: see :func:`clpipe.chain.photometry.photometry_of`.
+        motion: see :func:`clpipe.outputs.motion.motion_records`.
+    """
+
+    file: str
+    role: Role
+    camera: Intrinsics
+    pose: tuple[Matrix, Vector] | None
+    photometry: Mapping[str, Any] | None = None
+    motion: Mapping[str, Any] | None = None
+
+
+def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Photograph]:
+    """The pictures that sidecars of a folder list, in the first format that is no raw.
+
+    Frames of bursts and exposures of brackets are among them; mosaics are not.
+
+    Args:
+        folder: the output folder.
+        left_out: gets the names of those whose camera is not known, by the reason.
+
+    """
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for name in names:
+            path = Path(place, name)
+            if not name.endswith(f".{SIDECAR}") or name.startswith("."):
+                continue
+            shown = path.relative_to(folder).as_posix()
+            try:
+                values = values_in(read_bytes(path), path)
+                role = values and Rendition.from_record(values).role
+                file = values and _picture(path, values) if role in MODELS else None
+                if not values or not role or not file:
+                    continue
+                shown = file.relative_to(folder).as_posix()
+                if values["intrinsics"] is None:
+                    left_out["no known intrinsics, so in none of the files"].append(shown)
+                    continue
+                camera = CAMERA.validate_python(values["intrinsics"])
+                pose = values["pose"]
+                r_and_t = pose and POSE.validate_python((pose["R"], pose["t"]))
+                told = values["photometry"], values.get("motion")
+                yield Photograph(shown, role, simplest(camera), r_and_t, *told)
+            except SidecarError:
+                left_out[f"{CHANGED}, so not used; the same clpipe run makes it again"].append(
+                    shown
+                )
+            except OSError:  # nor does a run take it for a sidecar
+                continue
+            except (KeyError, TypeError, ValueError):
+                left_out["a sidecar that is damaged or of another version"].append(shown)
+
+
+def _picture(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
+    """The picture of a sidecar; None where there is none.
+
+    Raises:
+        KeyError, TypeError, ValueError: the values are damaged.
+    """
+    formats = [each for each in values["request"]["formats"] if each != DNG]
+    if not formats:
+        return None
+    file = sidecar.with_name(f"{sidecar.name.removesuffix(SIDECAR)}{ending_of(formats[0])}")
+    return file if file.name in outputs_in(values) and file.exists() else None
+
+
+def simplest(camera: Intrinsics) -> Intrinsics:
+    """The same camera by the simplest of COLMAP's models that holds it.
+
+    Raises:
+        KeyError: there is no such model.
+
+    >>> camera = Intrinsics(4, 3, 5, 5, 2, 1.5, "FULL_OPENCV", {"k1": 0.1, "k2": 0.0, "k4": 0.0})
+    >>> simplest(camera).model, simplest(camera).distortion["k1"]
+    ('OPENCV', 0.1)
+    """
+    bent = {name for name, value in camera.distortion.items() if value}
+    simple = () if camera.model == OPENCV_FISHEYE else (PINHOLE, OPENCV)
+    model = next((each for each in simple if bent <= {*COEFFICIENTS[each]}), camera.model)
+    own = {name: camera.distortion.get(name, 0.0) for name in COEFFICIENTS[model]}
+    return replace(camera, model=model, distortion=own)

@@ -1,0 +1,161 @@
+"""Views as files hold them: cameras.json, COLMAP's text model, nerfstudio's transforms.json."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from itertools import count
+from typing import Any
+
+from clpipe.base.about import __version__
+from clpipe.outputs.photographs import Photograph
+from clpipe.outputs.sealed import json_text
+from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE
+from clpipe.reference.pose import to_opengl, to_quaternion
+
+CAMERAS, TRANSFORMS, COLMAP = "cameras.json", "transforms.json", "sparse/0"
+
+NOTE = (
+    f"clpipe {__version__}: K in px, the first pixel's centre at (0.5, 0.5); "
+    "x_cam = R X + t, OpenCV's axes; models and coefficients are COLMAP's"
+)
+
+OPENGL_NOTE = (
+    f"clpipe {__version__}: camera to world, OpenGL's axes; the first pixel's centre at (0.5, 0.5)"
+)
+
+# Its k4 of OPENCV is of r^8, which is none of OpenCV's coefficients.
+NERFSTUDIO = {
+    OPENCV: ("k1", "k2", "k3", "k4", "p1", "p2"),
+    OPENCV_FISHEYE: ("k1", "k2", "k3", "k4"),
+}
+
+
+class Responses:
+    """The curves from light to codes of a file's pictures, each once."""
+
+    def __init__(self) -> None:
+        self._curves: list[Any] = []
+
+    def of(self, picture: Photograph) -> dict[str, Any]:
+        """What a file says of a picture's light; its response is the number of one of the list."""
+        if picture.photometry is None:
+            return {}
+        curve = picture.photometry["response"]
+        if curve not in self._curves:
+            self._curves.append(curve)
+        return {"photometry": {**picture.photometry, "response": self._curves.index(curve)}}
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The list, as JSON values; nothing where there is none."""
+        return {"responses": self._curves} if self._curves else {}
+
+
+def cameras_json(pictures: Sequence[Photograph], up: str = "") -> str:
+    """A cameras.json, which ``--poses`` reads, too; ``up`` leads to the pictures' folder."""
+    views, responses = [], Responses()
+    for each in pictures:
+        camera = each.camera
+        k = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
+        view = {"file": up + each.file, "width": camera.width, "height": camera.height, "K": k}
+        view |= dict(zip("Rt", each.pose, strict=True)) if each.pose else {}
+        view |= {"model": camera.model, "distortion": dict(camera.distortion)}
+        view |= {"motion": each.motion} if each.motion else {}
+        views.append(view | responses.of(each))
+    return json_text({"note": NOTE, **responses.record, "views": views})
+
+
+def colmap(
+    pictures: Sequence[Photograph],
+    posed: Sequence[Photograph],
+    left_out: Mapping[str, list[str]],
+) -> dict[str, str]:
+    """COLMAP's text model by the paths of its files; only the cameras where no pose is known.
+
+    https://colmap.github.io/format.html. Pictures with the same camera share it.
+
+    Args:
+        pictures: all.
+        posed: those whose pose is known.
+        left_out: gets the names that the format cannot hold, by the reason.
+    """
+    numbers: dict[str, int] = defaultdict(count(1).__next__)
+    of_file = {}
+    for each in pictures:
+        camera, names = each.camera, COEFFICIENTS[each.camera.model]
+        values = [camera.fx, camera.fy, camera.cx, camera.cy]
+        values += [camera.distortion[name] for name in names]
+        size = f"{camera.width} {camera.height}"
+        of_file[each.file] = numbers[f"{camera.model} {size} {_text(values)}"]
+    cameras = [f"{number} {text}" for text, number in numbers.items()]
+    files = {"cameras.txt": ("CAMERA_ID MODEL WIDTH HEIGHT PARAMS", cameras)}
+    if posed:
+        images = []
+        for number, each in enumerate(posed, 1):
+            if any(letter.isspace() for letter in each.file):
+                why = "a blank in the name, which images.txt cannot hold"
+                left_out[why].append(each.file)
+                continue
+            assert each.pose
+            r, t = each.pose
+            placed = f"{number} {_text([*to_quaternion(r), *t])}"
+            images.append(f"{placed} {of_file[each.file]} {each.file}\n")
+        files["images.txt"] = ("IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and points", images)
+        files["points3D.txt"] = ("none", [])
+    return {
+        f"{COLMAP}/{name}": "\n".join([f"# clpipe {__version__}: {what}", *lines, ""])
+        for name, (what, lines) in files.items()
+    }
+
+
+def _text(values: Sequence[float]) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+def _rows_of(picture: Photograph) -> dict[str, Any]:
+    """A moving camera's poses at the first and last row, camera to world, and the times."""
+    motion = picture.motion
+    if not motion:
+        return {}
+    rows = {
+        f"transform_matrix_{name}": to_opengl(motion[name]["R"], motion[name]["t"]).tolist()
+        for name in ("first_row", "last_row")
+    }
+    times = {"exposure_time": motion["exposure_time"]}
+    return {**rows, **times, "rolling_shutter_time": motion["readout_time"]}
+
+
+def nerfstudio(pictures: Sequence[Photograph], up: str, left_out: Mapping[str, list[str]]) -> str:
+    """A transforms.json of nerfstudio's; "" where no picture can be in it.
+
+    https://docs.nerf.studio/quickstart/data_conventions.html. It counts pixels as COLMAP does. Its
+    k4 is none of OpenCV's, and all pictures are of one model: of more than one, fisheye pictures
+    are left out. A camera that all share stands above the frames, where other readers look for it.
+
+    Args:
+        pictures: those whose pose is known.
+        up: the way from the file's folder to the pictures'.
+        left_out: gets the names that the format cannot hold, by the reason.
+    """
+    fisheyes = [each for each in pictures if each.camera.model == OPENCV_FISHEYE]
+    is_fisheye = len(fisheyes) == len(pictures)
+    model = OPENCV_FISHEYE if is_fisheye else OPENCV
+    cameras, frames, responses = [], [], Responses()
+    for each in pictures:
+        if (each.camera.model == OPENCV_FISHEYE) != is_fisheye:
+            left_out[f"a lens that {TRANSFORMS} cannot hold beside others"].append(each.file)
+            continue
+        assert each.pose
+        camera = each.camera if is_fisheye else each.camera.polynomial()
+        sizes = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
+        own = {name: camera.distortion.get(name, 0.0) for name in NERFSTUDIO[model]}
+        off = {"distortion_residual": camera.residual} if camera.residual else {}
+        cameras.append({**sizes, "cx": camera.cx, "cy": camera.cy, **own, **off})
+        placed = {"file_path": up + each.file, "transform_matrix": to_opengl(*each.pose).tolist()}
+        frames.append(placed | _rows_of(each) | responses.of(each))
+    if not frames:
+        return ""
+    shared = cameras[0] if all(each == cameras[0] for each in cameras) else {}
+    if not shared:
+        frames = [{**frame, **camera} for frame, camera in zip(frames, cameras, strict=True)]
+    said = {"note": OPENGL_NOTE, "camera_model": model, **shared, **responses.record}
+    return json_text({**said, "frames": frames})
