@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from clpipe.scenes.card import split_of
+from clpipe.scenes.members import split_of
 from tests.conftest import ROOT, contents, written
 
 NUMPY = ("--device", "numpy", "-c", "paper")
@@ -41,6 +42,7 @@ def test_a_scene_becomes_a_dataset(clpipe, scene, blender, tmp_path):
     assert "10 of 10 images done, 0 failed" in said.stderr
     made = tmp_path / "set"
     each = ("jpg", "json", "truth_clean.jpg", "truth_clean.json", "carried.exr")
+    each += ("Depth.png", "IndexOB.png")
     models = ("cameras.json", "transforms.json")
     models += tuple(f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D"))
     models += tuple(f"models/truth_clean/{name}" for name in models)
@@ -48,8 +50,8 @@ def test_a_scene_becomes_a_dataset(clpipe, scene, blender, tmp_path):
         *(f"iso{iso}/view_00{n}.{end}" for iso in (100, 400) for n in range(5) for end in each),
         *(f"iso{iso}/{name}" for iso in (100, 400) for name in models),
         *(f"renders/view_00{n}.exr" for n in range(5)),
-        *("renders/cameras.json", "renders/.rendering.json", "dataset.json", "manifest.csv"),
-        *("README.md", "contact_sheet.jpg", "train.txt", "val.txt"),
+        *("renders/cameras.json", "dataset.json", "manifest.csv", "README.md"),
+        *("contact_sheet.jpg", "train.txt", "val.txt", "test.txt"),
     }
     # Pictures are those of clpipe run, and the cameras those of the renders.
     clpipe(
@@ -75,6 +77,8 @@ def test_a_scene_becomes_a_dataset(clpipe, scene, blender, tmp_path):
     rows = list(csv.DictReader(io.StringIO((made / "manifest.csv").read_text())))
     assert [row["split"] for row in rows] == [split_of(n) for n in range(5) for _ in range(2)]
     assert rows[7] == {
+        **{"ev": "0", "gain": "1", "exposure_time": "", "f_number": ""},
+        **{"Depth": "iso400/view_003.Depth.png", "IndexOB": "iso400/view_003.IndexOB.png"},
         **{"view": "view_003", "split": "val", "camera": "sony-a7r2", "iso": "400"},
         "picture": "iso400/view_003.jpg",
         "carried": "iso400/view_003.carried.exr",
@@ -129,23 +133,67 @@ def test_frames_have_flow_and_may_become_more(clpipe, scene, blender, tmp_path):
     again = clpipe(*command, "--frames", "1-3").stderr
     assert "rendered frame_0002  2 of 3" in again
     assert "rendered frame_0001" not in again
-    layers = json.loads((tmp_path / "set/frame_0002.json").read_text())["carried"]
+    layers = json.loads((tmp_path / "set/iso100/frame_0002.json").read_text())["carried"]
     assert [each["layer"] for each in layers] == ["Depth", "Normal", "IndexOB", "Vector"]
     assert 'with views "frames"' in clpipe(*command, "--views", 2, status=2).stderr
+
+
+def test_a_dataset_grows(clpipe, scene, blender, tmp_path):
+    command = ("dataset", scene, "-o", "set", *blender, *NUMPY, "--views", 9)
+    clpipe(*command, "--iso", 800, "--licence", "CC-BY-4.0", "--author", "A. Maker")
+    first = {name: (tmp_path / "set" / name).stat().st_mtime_ns for name in written(Path("set"))}
+    said = clpipe(*command, "--iso", "800,3200").stderr
+    assert "18 of 18 images done (9 of them were there already)" in said
+    clpipe(*command, "--iso", 100)
+    clpipe(*command, "--iso", 100, "--camera", "canon-5d2", "-c", "default")
+    made = written(Path("set"))
+    pictures = [name for name in made if name.endswith(".jpg") and "truth" not in name]
+    folders = ("canon-5d2/iso100", "iso100", "iso3200", "iso800")
+    expected = {f"{f}/view_00{n}.jpg" for f in folders for n in range(9)}
+    assert set(pictures) == expected | {"contact_sheet.jpg"}
+    old = [name for name in first if name.startswith("iso800/view_")]
+    assert all((tmp_path / "set" / name).stat().st_mtime_ns == first[name] for name in old)
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "set/manifest.csv").read_text())))
+    assert {row["picture"] for row in rows} == expected
+    readme = (tmp_path / "set/README.md").read_text()
+    assert all(f"| `{folder}/` |" in readme for folder in folders)
+    assert "**Licence:** CC-BY-4.0" in readme and "**Author:** A. Maker" in readme
+    named = [part.strip("`") for part in re.findall(r"`[\w./]+\.(?:txt|csv|json)`", readme)]
+    assert all(any(f.endswith(name) for f in made) for name in named if "NAME" not in name)
+    for folder in folders:
+        told = json.loads((tmp_path / "set" / folder / "transforms.json").read_text())
+        assert len(told["frames"]) == 9
+        assert told["val_filenames"] == ["view_003.jpg"]
+        assert told["test_filenames"] == ["view_007.jpg"]
+        assert len(told["train_filenames"]) == 7
+        assert (
+            len(json.loads((tmp_path / "set" / folder / "cameras.json").read_text())["views"]) == 9
+        )
+
+
+def test_a_lens_takes_the_focal_length_of_the_scenes_cameras(clpipe, scene, blender, tmp_path):
+    lens = ("--set", "distortion.method=brown_conrady", "--set", "distortion.k1=-0.1")
+    clpipe("dataset", scene, "-o", "set", *blender, *NUMPY[:2], "--views", 1, *lens)
+    told = json.loads((tmp_path / "set/iso100/view_000.json").read_text())
+    assert told["intrinsics"]["fx"] == 40
+    wrong = ("--set", "distortion.method=brown")
+    assert "unknown" in clpipe("dataset", scene, "-o", "n", *blender, *wrong, status=2).stderr
 
 
 def test_cameras_of_a_file_are_rendered(clpipe, scene, blender, tmp_path):
     clpipe("dataset", scene, "-o", "a", *blender, *NUMPY, "--views", 2)
     poses = tmp_path / "a/renders/cameras.json"
     clpipe("dataset", scene, "-o", "b", *blender, *NUMPY, "--poses", poses)
-    asked = json.loads((tmp_path / "b/renders/.rendering.json").read_text())["views"]["cameras"]
+    asked = json.loads((tmp_path / "b/dataset.json").read_text())["views"]["cameras"]
     view = json.loads(poses.read_text())["views"][1]
     assert asked[1] == {"name": "view_001", **{k: v for k, v in view.items() if k != "file"}}
 
 
 def test_renders_that_exist_become_a_dataset(clpipe, write_exr, tmp_path):
     for name in ("a", "sub/b"):
-        write_exr(f"renders/{name}.exr", np.full((12, 16, 3), 0.3, np.float32))
+        pixels = np.full((12, 16, 4), 0.3, np.float32)
+        pixels[..., 3] = 2.5
+        write_exr(f"renders/{name}.exr", pixels, "R,G,B,View.Depth.Z", half=False)
     cameras = {
         "K": [[20, 0, 8], [0, 20, 6], [0, 0, 1]],
         **{"R": np.eye(3).tolist(), "t": [0, 0, 1], "width": 16, "height": 12},
@@ -154,7 +202,17 @@ def test_renders_that_exist_become_a_dataset(clpipe, write_exr, tmp_path):
     (tmp_path / "renders/cameras.json").write_text(json.dumps({"views": views}))
     clpipe("dataset", "renders", "-o", "set", *NUMPY, "--truth", "development", "--format", "png")
     made = written(tmp_path / "set")
-    assert {"a.png", "sub/b.truth.png", "cameras.json", "README.md", "contact_sheet.jpg"} <= {*made}
+    own = {f"iso100/{n}" for n in ("a.png", "sub/b.truth.png", "cameras.json", "a.carried.exr")}
+    assert own | {"README.md", "contact_sheet.jpg"} <= {*made}
+    depth = np.asarray(Image.open(tmp_path / "set/iso100/sub/b.Depth.png"))
+    assert (depth == 2500).all()
+    readme = (tmp_path / "set/README.md").read_text()
+    assert str(tmp_path) not in readme + (tmp_path / "set/manifest.csv").read_text()
+    assert "`Depth` (depth): along the axis of view" in readme
+    transforms = json.loads((tmp_path / "set/iso100/transforms.json").read_text())
+    frame = transforms["frames"][1]
+    assert (tmp_path / "set/iso100" / frame["depth_file_path"]).exists()
+    assert transforms["train_filenames"] == ["a.png", "sub/b.png"]
     assert (tmp_path / "set/train.txt").read_text() == "a\nsub/b\n"
     write_exr("others/a.exr", np.zeros((12, 16, 3), np.float32))
     said = clpipe("dataset", "others", "-o", "set", *NUMPY, status=2).stderr

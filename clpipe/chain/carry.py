@@ -12,7 +12,7 @@ from clpipe.reference.carried import LayerKind
 VALID = "valid"  # the channel that says which pixels are known
 
 
-PNG = "png"  # a kind: depth, which is written as a PNG, too
+PNG = "png"  # a kind: depth or labels, which are written as a PNG, too
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class AovSpec:
         name: what it is called.
         kind: what it holds; None where only the file may say that.
         pattern: of the name of the file that holds it; "" is one of the usual names.
-        png: whether it is depth that is written as a PNG, too.
+        png: whether it is depth, or labels, that are written as a PNG, too.
     """
 
     name: str
@@ -63,6 +63,7 @@ def parse_carry(texts: Sequence[str]) -> tuple[AovSpec, ...]:
             )
         if name.lower() in found:
             raise RequestError(f"--carry {name}: it is there twice")
-        known = "depth" if kind == PNG else kind or kind_named(name)
+        own = kind_named(name)
+        known = (own if own == "label" else "depth") if kind == PNG else kind or own
         found[name.lower()] = AovSpec(name, cast("LayerKind | None", known), pattern, kind == PNG)
     return tuple(found.values())

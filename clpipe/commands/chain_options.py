@@ -193,9 +193,9 @@ carry_option = click.option(
     help="Move a layer as the picture's pixels are moved. It goes to OUT/NAME.carried.exr: "
     "depth, normals, flow, object numbers, of the image's own file or of one beside it. KIND is "
     f"{', '.join(RESAMPLING)}, where its name does not say it, or png: depth in metres, which goes "
-    "to OUT/NAME.LAYER.png, too, with 16 bits, in millimetres. FILE is where it is, as "
-    "'../depth/{name}.exr', from the image's folder. [default: {name}_LAYER.exr and the like] May "
-    "be repeated.",
+    "to OUT/NAME.LAYER.png, too, with 16 bits, in millimetres, or object numbers. FILE is where it "
+    "is, as '../depth/{name}.exr', from the image's folder. [default: {name}_LAYER.exr or alike] "
+    "May be repeated.",
 )
 
 truth_at_option = click.option(

@@ -28,8 +28,9 @@ from clpipe.commands.options import (
 from clpipe.commands.progress import Reporter, follow
 from clpipe.inputs.series import Series, parse_isos
 from clpipe.scenes.blender import Rendering
-from clpipe.scenes.card import write_card
-from clpipe.scenes.source import RENDERS, Source, from_folder, from_scene
+from clpipe.scenes.card import About, write_card
+from clpipe.scenes.record import keep_said
+from clpipe.scenes.source import RENDERS, UNIT, Source, from_folder, from_scene
 from clpipe.scenes.view_request import PATHS, asked_views, parse_box, parse_frames, parse_resolution
 
 # Options that are for a scene alone.
@@ -106,6 +107,12 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
     type=click.Choice(TRUTHS),
     help="Write beside each picture its truth, as clpipe run does; may be repeated.",
 )
+@click.option(
+    "--licence",
+    metavar="TEXT",
+    help="Under which the dataset is published, for its README: CC-BY-4.0, or a sentence.",
+)
+@click.option("--author", metavar="TEXT", help="Whose the dataset is, for its README.")
 @carry_option
 @format_option
 @device_option
@@ -135,13 +142,16 @@ def dataset(
     clpipe dataset scene.blend -o film --frames 1-48 --iso 1600
     clpipe dataset renders/ -o set --iso 100,800 --camera sony-a7r2 --camera canon-5d2
     """
-    series = Series(cameras, parse_isos(isos) if isos is not None else ())
+    series = Series(cameras, parse_isos(isos) if isos is not None else (), always=True)
+    said = {name: options.pop(name) for name in ("licence", "author")}
     rendering = {name: options.pop(name) for name in RENDER_OPTIONS}
     request = Request.from_options(camera=series.camera, iso=series.iso, **options)
+    if not series.isos and "iso" not in request.settings().draws:
+        series = replace(series, isos=(request.settings().iso,))
     series.jobs((), request.settings())  # refuses what is wrong before anything is rendered
     with ExitStack() as stack:
         if source.suffix.lower() == ".blend":
-            request.chain()
+            check_chain(request)
             program = rendering.pop("blender")
             asked = rendering_of(source, output, poses, request.settings().seed, rendering)
             renders = from_scene(stack, asked, output, program)
@@ -149,7 +159,8 @@ def dataset(
             refuse_rendering()
             renders = from_folder(source, output, poses)
         request = replace(request, carry=request.carry or renders.layers)
-        summary = develop(renders, request, output, series, selector, quiet)
+        said = keep_said(output, said)
+        summary = develop(renders, request, output, series, selector, quiet, said)
     if renders.failure:
         raise renders.failure
     sys.exit(summary.exit_status)
@@ -170,6 +181,23 @@ def rendering_of(
     return Rendering(scene.absolute(), (output / RENDERS).absolute(), views, **own, seed=seed)
 
 
+def check_chain(request: Request) -> None:
+    """See that a chain can be made for renders whose cameras are not known yet.
+
+    Raises:
+        RequestError: it cannot.
+    """
+    try:
+        request.chain()
+    except RequestError:
+        try:
+            request.for_image("", {"render": {"fx": 1000.0}}).chain()
+            return  # it lacked nothing but a focal length, which the scene's cameras have
+        except RequestError:
+            pass
+        raise
+
+
 def refuse_rendering() -> None:
     """See that no option is set that is for a scene alone.
 
@@ -188,6 +216,7 @@ def develop(
     series: Series,
     selector: str | None,
     quiet: bool,
+    said: Mapping[str, str],
 ) -> Summary:
     """Develop the renders as they come, and write the dataset's card behind them.
 
@@ -208,6 +237,8 @@ def develop(
     outcomes = made.outcomes(renders.as_rendered(made.jobs, tell))
     follow(made, outcomes, quiet, reporter, stop)
     if not made.summary.interrupted:
-        written = write_card(made.writer, made.jobs, sys.argv[1:], renders.about)
+        unit = renders.about.get(UNIT, "as the renders have it")
+        about = About(renders.about, said["licence"], said["author"], unit, sys.argv[1:])
+        written = write_card(output, RENDERS, about)
         tell(f"wrote {', '.join(map(str, written))}")
     return made.summary

@@ -24,7 +24,8 @@ GROUPS = {
     "Camera": "+config +camera +iso +lens focal_length aperture focus_distance +seed noise_key",
     "Chain": "+set +skip stages start_at until stage_file",
     "Renders": "+views +path box +frames +resolution +samples denoise time_limit blender",
-    "Pictures": "+output +format +keep bracket +patch patches_per_image augment webdataset",
+    "Pictures": "+output +format +keep bracket +patch patches_per_image augment webdataset licence "
+    "author",
     "Truth": "+truth +carry truth_at",
     "Inputs": "+poses +exclude layer transfer dump max_pixels",
     "Batches": "+device +redo jobs memory shard dask quiet json_lines trace +help +help_all",

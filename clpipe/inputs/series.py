@@ -20,21 +20,22 @@ class Series:
     Args:
         cameras: names or profiles.
         isos: sensitivities.
-
+        always: whether one camera or ISO that is named has a folder, too, so that others may come.
     """
 
     cameras: tuple[str, ...] = ()
     isos: tuple[float, ...] = ()
+    always: bool = False
 
     @property
     def camera(self) -> str | None:
-        """The camera of all images, where there is one."""
-        return self.cameras[0] if len(self.cameras) == 1 else None
+        """The camera of all images, where there is one, and no folder for it."""
+        return self.cameras[0] if len(self.cameras) == 1 and not self.always else None
 
     @property
     def iso(self) -> float | None:
-        """The ISO of all images, where there is one."""
-        return self.isos[0] if len(self.isos) == 1 else None
+        """The ISO of all images, where there is one, and no folder for it."""
+        return self.isos[0] if len(self.isos) == 1 and not self.always else None
 
     def under(self, output: Path) -> list[Path]:
         """The folders that its pictures go to, the output folder itself where there is no series.
@@ -82,7 +83,8 @@ class Series:
     def _members(self) -> Iterator[tuple[str, dict[str, Any]]]:
         """Folders, and the settings of what is in them."""
         cameras: list[tuple[str, dict[str, Any]]] = [("", {})]
-        if len(self.cameras) > 1:
+        several = 0 if self.always else 1
+        if len(self.cameras) > several:
             names = [load_camera(camera).name for camera in self.cameras]
             for name in names:
                 if names.count(name) > 1:
@@ -91,7 +93,8 @@ class Series:
                 (f"{name}/", {"camera": camera})
                 for name, camera in zip(names, self.cameras, strict=True)
             ]
-        isos = [(f"iso{iso:g}", {"iso": iso}) for iso in self.isos] if len(self.isos) > 1 else []
+        named = self.isos if len(self.isos) > several else ()
+        isos = [(f"iso{iso:g}", {"iso": iso}) for iso in named]
         for folder, camera in cameras:
             for name, iso in isos or [("", {})]:
                 yield (folder + name).rstrip("/"), {**camera, **iso}

@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 from clpipe.base.errors import ImageError
 from clpipe.base.files import keep_names, make_folder_of, write_whole
@@ -66,8 +67,12 @@ def check_camera_files(folder: Path) -> None:
             )
 
 
-def write_camera_files(folder: Path) -> Written:
+def write_camera_files(folder: Path, splits: Mapping[str, str] = MappingProxyType({})) -> Written:
     """Write the views of an output folder, as its sidecars say them.
+
+    Args:
+        folder: the output folder, or a part of it.
+        splits: what pictures are for, by the names that sidecars have.
 
     Raises:
         ImageError: a file cannot be written or is somebody else's.
@@ -78,7 +83,9 @@ def write_camera_files(folder: Path) -> Written:
     texts: dict[str, str] = {}
     for role, model in MODELS.items():
         own = [each for each in found if each.role == role]
-        texts |= {model + name: text for name, text in texts_of(own, model, left_out).items()}
+        texts |= {
+            model + name: text for name, text in texts_of(own, model, left_out, splits).items()
+        }
     taken = [name for name in texts if _is_taken(folder / name)]
     for name in taken:
         del texts[name]
@@ -106,7 +113,10 @@ def write_camera_files(folder: Path) -> Written:
 
 
 def texts_of(
-    pictures: Sequence[Photograph], model: str, left_out: Mapping[str, list[str]]
+    pictures: Sequence[Photograph],
+    model: str,
+    left_out: Mapping[str, list[str]],
+    splits: Mapping[str, str],
 ) -> dict[str, str]:
     """The files of pictures of one kind, by their names.
 
@@ -114,6 +124,7 @@ def texts_of(
         pictures: sorted.
         model: the folder that the files are for, below the pictures' own.
         left_out: gets the names of those that are not in all of them, by the reason.
+        splits: see :func:`write_camera_files`.
     """
     if not pictures:
         return {}
@@ -124,7 +135,7 @@ def texts_of(
             each.file for each in pictures if not each.pose
         ]
     texts = {CAMERAS: cameras_json(pictures, up), **colmap(pictures, posed, left_out)}
-    if nerf := nerfstudio(posed, up, left_out):
+    if nerf := nerfstudio(posed, up, left_out, splits):
         texts[TRANSFORMS] = nerf
     return texts
 

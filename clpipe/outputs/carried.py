@@ -1,9 +1,10 @@
-"""Writes the layers that go along with a picture: one EXR of all, and depth in millimetres."""
+"""Writes the layers that go along with a picture: one EXR of all, and PNGs of depth and labels."""
 
 from pathlib import Path
 
 import numpy as np
 
+from clpipe.base.errors import ImageError
 from clpipe.base.files import Stored
 from clpipe.base.types import Array
 from clpipe.chain.carry import VALID
@@ -14,21 +15,24 @@ from clpipe.inputs.carry import CARRIED, Aovs
 MM = 1000  # in a metre
 
 
-def write_carried(path: Path, carried: Aovs, depth: str = "") -> Stored:
-    """Write all carried layers as an EXR, or one of them, a depth in metres, as a PNG.
+def write_carried(path: Path, carried: Aovs, layer: str = "") -> Stored:
+    """Write all carried layers as an EXR, or one of them, a depth in metres or labels, as a PNG.
 
     The EXR has the layers' own channels, in their own types, and the channel :data:`VALID`.
 
     Args:
         path: the file.
         carried: the layers.
-        depth: the name of the depth for a PNG.
+        layer: the name of that for a PNG.
 
     Raises:
-        ImageError: the file cannot be written.
+        ImageError: the file cannot be written, or cannot hold the labels.
     """
-    if depth:
-        return write_grey_png(path, millimetres(carried.arrays()[depth][..., 0]))
+    if layer:
+        pixels = carried.arrays()[layer][..., 0]
+        kind = next(each.kind for each in carried.layers if each.name == layer)
+        is_label = kind == "label"
+        return write_grey_png(path, numbers(path, pixels) if is_label else millimetres(pixels))
     planes = {
         name: layer.pixels[..., i]
         for layer in carried.layers
@@ -36,6 +40,31 @@ def write_carried(path: Path, carried: Aovs, depth: str = "") -> Stored:
     }
     own = {f"{PREFIX}{CARRIED}": ",".join(carried.arrays())}
     return write_planes(path, {**planes, VALID: carried.valid}, {**own, **carried.attributes})
+
+
+def png_ending(layer: str) -> str:
+    """What stands behind an image's name in that of a layer's PNG.
+
+    >>> png_ending("Object Index")
+    'Object_Index.png'
+    """
+    return f"{layer.replace(' ', '_')}.png"
+
+
+def numbers(path: Path, labels: Array) -> Array:
+    """Labels as uint16.
+
+    Raises:
+        ImageError: they are no whole numbers from 0 to 65535.
+    """
+    with np.errstate(invalid="ignore"):
+        whole = np.rint(labels).clip(0, 65535).astype(np.uint16)
+    if not np.array_equal(whole, labels):
+        raise ImageError(
+            f"{path}: a PNG of labels holds whole numbers from 0 to 65535; leave :png out, and the "
+            "EXR has them as they are"
+        )
+    return whole
 
 
 def millimetres(depth: Array) -> Array:

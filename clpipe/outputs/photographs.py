@@ -12,6 +12,7 @@ from clpipe.base.reading import read_bytes
 from clpipe.chain.formats import DNG, ending_of
 from clpipe.chain.render_camera import Matrix, Vector
 from clpipe.chain.rendition import BASELINES, NOISY, PICTURES, Rendition, Role
+from clpipe.outputs.carried import png_ending
 from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, values_in
 from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
 
@@ -38,6 +39,8 @@ class Photograph:
         pose: R and t, where known.
         photometry: see :func:`clpipe.chain.photometry.photometry_of`.
         motion: see :func:`clpipe.outputs.motion.motion_records`.
+        name: of what it is a picture of, as its sidecar has it.
+        depth: the PNG of its depth in millimetres, in the folder; "" where there is none.
     """
 
     file: str
@@ -46,6 +49,8 @@ class Photograph:
     pose: tuple[Matrix, Vector] | None
     photometry: Mapping[str, Any] | None = None
     motion: Mapping[str, Any] | None = None
+    name: str = ""
+    depth: str = ""
 
 
 def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Photograph]:
@@ -78,7 +83,9 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
                 camera = CAMERA.validate_python(values["intrinsics"])
                 pose = values["pose"]
                 r_and_t = pose and POSE.validate_python((pose["R"], pose["t"]))
-                told = values["photometry"], values.get("motion")
+                depth = _depth_of(path, values)
+                below = depth.relative_to(folder).as_posix() if depth else ""
+                told = values["photometry"], values.get("motion"), str(values["name"]), below
                 yield Photograph(shown, role, simplest(camera), r_and_t, *told)
             except SidecarError:
                 left_out[f"{CHANGED}, so not used; the same clpipe run makes it again"].append(
@@ -101,6 +108,20 @@ def _picture(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
         return None
     file = sidecar.with_name(f"{sidecar.name.removesuffix(SIDECAR)}{ending_of(formats[0])}")
     return file if file.name in outputs_in(values) and file.exists() else None
+
+
+def _depth_of(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
+    """The PNG of a picture's depth; None where there is none.
+
+    Raises:
+        KeyError, TypeError: the values are damaged.
+    """
+    stem = Path(values["name"]).name
+    for layer in values.get("carried", ()):
+        name = f"{stem}.{png_ending(layer['layer'])}"
+        if layer["kind"] == "depth" and name in outputs_in(values):
+            return sidecar.with_name(name)
+    return None
 
 
 def simplest(camera: Intrinsics) -> Intrinsics:

@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from itertools import count
+from types import MappingProxyType
 from typing import Any
 
 from clpipe.base.about import __version__
@@ -124,7 +125,12 @@ def _rows_of(picture: Photograph) -> dict[str, Any]:
     return {**rows, **times, "rolling_shutter_time": motion["readout_time"]}
 
 
-def nerfstudio(pictures: Sequence[Photograph], up: str, left_out: Mapping[str, list[str]]) -> str:
+def nerfstudio(
+    pictures: Sequence[Photograph],
+    up: str,
+    left_out: Mapping[str, list[str]],
+    splits: Mapping[str, str] = MappingProxyType({}),
+) -> str:
     """A transforms.json of nerfstudio's; "" where no picture can be in it.
 
     https://docs.nerf.studio/quickstart/data_conventions.html. It counts pixels as COLMAP does. Its
@@ -135,6 +141,7 @@ def nerfstudio(pictures: Sequence[Photograph], up: str, left_out: Mapping[str, l
         pictures: those whose pose is known.
         up: the way from the file's folder to the pictures'.
         left_out: gets the names that the format cannot hold, by the reason.
+        splits: what pictures are for, by their names; "train", "val" or "test".
     """
     fisheyes = [each for each in pictures if each.camera.model == OPENCV_FISHEYE]
     is_fisheye = len(fisheyes) == len(pictures)
@@ -150,12 +157,20 @@ def nerfstudio(pictures: Sequence[Photograph], up: str, left_out: Mapping[str, l
         own = {name: camera.distortion.get(name, 0.0) for name in NERFSTUDIO[model]}
         off = {"distortion_residual": camera.residual} if camera.residual else {}
         cameras.append({**sizes, "cx": camera.cx, "cy": camera.cy, **own, **off})
-        placed = {"file_path": up + each.file, "transform_matrix": to_opengl(*each.pose).tolist()}
+        placed: dict[str, Any] = {"file_path": up + each.file}
+        placed |= {"depth_file_path": up + each.depth} if each.depth else {}
+        placed["transform_matrix"] = to_opengl(*each.pose).tolist()
         frames.append(placed | _rows_of(each) | responses.of(each))
     if not frames:
         return ""
     shared = cameras[0] if all(each == cameras[0] for each in cameras) else {}
     if not shared:
         frames = [{**frame, **camera} for frame, camera in zip(frames, cameras, strict=True)]
-    said = {"note": OPENGL_NOTE, "camera_model": model, **shared, **responses.record}
+    lists = {
+        f"{split}_filenames": [
+            up + each.file for each in pictures if splits.get(each.name) == split
+        ]
+        for split in dict.fromkeys(splits.values())
+    }
+    said = {"note": OPENGL_NOTE, "camera_model": model, **shared, **responses.record, **lists}
     return json_text({**said, "frames": frames})

@@ -28,7 +28,7 @@ from clpipe.images.write import JPEG_MAX_SIDE, write_display, write_exr, write_n
 from clpipe.inputs.carry import CARRIED, Aovs
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import attributes_of
-from clpipe.outputs.carried import write_carried
+from clpipe.outputs.carried import png_ending, write_carried
 from clpipe.outputs.existing import Existing
 from clpipe.outputs.folder import RESUMABLE, write_problem
 from clpipe.outputs.negative import negative_of
@@ -127,7 +127,7 @@ class OutputWriter:
         depths = [each.name for each in self.request.aov_specs() if each.png]
         return {
             "": self.path(job, f"{CARRIED}.exr"),
-            **{name: self.path(job, f"{name}.png") for name in depths},
+            **{name: self.path(job, png_ending(name)) for name in depths},
         }
 
     def _kept_steps(self, recipe: Recipe) -> list[str]:

@@ -134,9 +134,14 @@ class Intrinsics:
         fitted = {f"k{i}": c / first for i, c in enumerate(k, 1)}
         tangential = {name: named[name] / first for name in ("p1", "p2")}
         residual = self.residual + off * max(self.fx, self.fy)
-        own_fx, own_fy = self.fx * first, self.fy * first
-        changed: dict[str, Any] = {"fx": own_fx, "fy": own_fy, "residual": residual, "model": POLYNOMIAL}
-        return replace(self, **changed, distortion={**fitted, **tangential})
+        return replace(
+            self,
+            fx=self.fx * first,
+            fy=self.fy * first,
+            model=POLYNOMIAL,
+            distortion={**fitted, **tangential},
+            residual=residual,
+        )
 
     def record(self) -> dict[str, Any]:
         """Intrinsics as JSON values; coefficients that are not given are 0."""

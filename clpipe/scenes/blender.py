@@ -109,7 +109,7 @@ class Renderer(AbstractContextManager["Renderer"]):
         asked = rendering.folder / ASKED
         command = blender_command(program, asked)
         write_new(asked, json.dumps(rendering.record()).encode())
-        self._path = rendering.scene
+        self._path, self._asked = rendering.scene, asked
         self._latest: deque[str] = deque(maxlen=LAST_LINES)
         try:
             self._process = subprocess.Popen(  # noqa: S603 - the user's own Blender
@@ -130,6 +130,7 @@ class Renderer(AbstractContextManager["Renderer"]):
         self.stop()
         with self._process:  # closes what it says, and waits
             pass
+        self._asked.unlink(missing_ok=True)
 
     def stop(self) -> None:
         """End it; what it had begun is lost, and done again by the next one."""

@@ -1,82 +1,62 @@
-"""The card of a dataset: README, contact sheet, manifest, and which views are for training."""
+"""The card of a dataset: README, contact sheet, manifest, and what each view is for."""
 
 import csv
 import io
-import logging
-import os
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
 
 from clpipe.base.about import __version__
 from clpipe.base.files import write_new
 from clpipe.chain.rendition import Rendition
 from clpipe.images.sheet import SHOWN, contact_sheet
-from clpipe.inputs.find import Job
-from clpipe.outputs.camera_files import FILES
-from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, read_sidecar
-from clpipe.outputs.writer import OutputWriter
+from clpipe.outputs.camera_files import FILES, write_camera_files
+from clpipe.scenes.members import PICTURE, Member, members_of, splits_of
 from clpipe.scenes.record import RECORD
 
 SHEET, MANIFEST, README = "contact_sheet.jpg", "manifest.csv", "README.md"
 MOST_ROWS = 12  # of the contact sheet
-PICTURE, TRUTH, CARRIED = "picture", Rendition("clean").suffix.removeprefix("."), "carried"
+TRUTH = Rendition("clean").suffix.removeprefix(".")
+SPLITS = ("train", "val", "test")
 
-# What is raised for values of a forged sidecar.
-DAMAGED = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
-
-log = logging.getLogger(__name__)
-
-
-class Facts(NamedTuple):
-    """What is said of a picture, as texts: its size in px, the variance of the raw's noise."""
-
-    camera: str
-    iso: str
-    size: str
-    law: str
+# What carried layers hold, in which axes and units.
+TRUTHS = {
+    "depth": "along the axis of view, in the renders' unit ({unit}); as PNG in thousandths of it",
+    "normal": "of unit length, in the renders' axes",
+    "flow": "in px of the picture, to the right and down, to where a surface is in another frame; "
+    "of Blender's Vector X and Y are to the frame before, Y up, and Z and W from the next one",
+    "label": "whole numbers, the objects' own",
+    "colour": "linear",
+}
 
 
 @dataclass(frozen=True)
-class Member:
-    """What was made of one view with one camera and ISO.
+class About:
+    """What a dataset's card says that no sidecar knows.
 
     Args:
-        view: the name of its render, without its ending.
-        folder: below the dataset's, by camera and ISO; "" is the dataset's own.
-        files: paths below the dataset's folder: "picture", "truth_clean" and so on, "carried".
-        facts: of the picture.
-        render: what it was made of, below the dataset's folder where it lies there.
-    """
-
-    view: str
-    folder: str
-    files: Mapping[str, str]
-    facts: Facts
-    render: str
-
-
-def split_of(number: int) -> str:
-    """What a view is for: every eighth for validation, from the fourth on; the rest for training.
-
-    >>> [number for number in range(24) if split_of(number) == "val"]
-    [3, 11, 19]
-    """
-    return "val" if number % 8 == 3 else "train"
-
-
-def write_card(
-    writer: OutputWriter, jobs: Sequence[Job], words: Sequence[str], about: Mapping[str, str]
-) -> list[Path]:
-    """Write the card of a dataset, from its sidecars.
-
-    Args:
-        writer: of its pictures.
-        jobs: all of them, those of a view one after the other.
+        renders: texts by their titles.
+        licence: an SPDX identifier or a sentence; "" is not stated.
+        author: whose it is; "" is not stated.
+        unit: of depths and poses.
         words: the command.
-        about: what else its README says: texts by their titles.
+    """
+
+    renders: Mapping[str, str]
+    licence: str
+    author: str
+    unit: str
+    words: Sequence[str]
+
+
+def write_card(folder: Path, renders: str, about: About) -> list[Path]:
+    """Write the card of a dataset, and what its views are for, from all that is there.
+
+    Args:
+        folder: of the dataset.
+        renders: the name of the folder of the renders in it.
+        about: what else is said.
 
     Returns:
         The files.
@@ -84,77 +64,40 @@ def write_card(
     Raises:
         ImageError: a file cannot be read or written.
     """
-    folder = writer.folder
-    members = [member for job in jobs if (member := _member(writer, job))]
-    views = dict.fromkeys(_view(job) for job in jobs)
-    splits = {view: split_of(number) for number, view in enumerate(views)}
+    members = members_of(folder, renders)
+    splits = splits_of(members)
     texts = {
-        f"{split}.txt": "".join(f"{view}\n" for view in views if splits[view] == split)
-        for split in ("train", "val")
+        f"{split}.txt": "".join(f"{view}\n" for view in splits if splits[view] == split)
+        for split in SPLITS
     }
     texts[MANIFEST] = _manifest(members, splits)
-    texts[README] = _readme(folder.resolve().name, members, splits, words, about)
-    written = [folder / name for name in texts]
-    for path, text in zip(written, texts.values(), strict=True):
+    written = [folder / name for name in (*texts, README)]
+    for path, text in zip(written, texts.values(), strict=False):
         write_new(path, text.encode())
     if sheet := _sheet(folder, members):
         write_new(folder / SHEET, sheet)
         written.append(folder / SHEET)
+    of_names = {member.name: splits[member.view] for member in members}
+    for series in dict.fromkeys(member.folder for member in members):
+        write_camera_files(folder / series, of_names)
+    readme = _readme(folder, members, splits, about, bool(sheet))
+    write_new(folder / README, readme.encode())
     return written
-
-
-def _view(job: Job) -> str:
-    return Path(job.key).with_suffix("").as_posix()
-
-
-def _member(writer: OutputWriter, job: Job) -> Member | None:
-    """What was made of a job; None where something of it failed, or is not as it was written."""
-    files: dict[str, str] = {}
-    facts = []
-    for rendition in writer.renditions_of(job):
-        path = writer.path(job, SIDECAR, rendition)
-        try:
-            values = read_sidecar(path)
-            facts.append(_facts(values))
-            first, *others = outputs_in(values)
-        except FileNotFoundError:
-            return None
-        except (SidecarError, *DAMAGED):
-            log.warning("%s; the card goes without it", SidecarError(path))
-            return None
-        place = path.parent.relative_to(writer.folder)
-        files.setdefault(rendition.suffix.removeprefix(".") or PICTURE, (place / first).as_posix())
-        for each in others:
-            if each.endswith(f".{CARRIED}.exr"):
-                files[CARRIED] = (place / each).as_posix()
-    own = job.stem.removesuffix(_view(job)).rstrip("/")
-    below = os.path.relpath(job.path, writer.folder)
-    render = job.input if below.startswith("..") else below
-    return Member(_view(job), own, files, facts[0], render)
-
-
-def _facts(values: Mapping[str, Any]) -> Facts:
-    """What the card says of a picture, by its sidecar.
-
-    Raises:
-        KeyError, TypeError, ValueError, AttributeError, OverflowError: the values are damaged.
-    """
-    noise = (values["noise"] or {}).get("signal", {"a": 0.0, "b": 0.0})
-    size = f"{values['width']:d}x{values['height']:d}"
-    law = f"{noise['a']:.3g} y + {noise['b']:.3g}"
-    return Facts(str(values["camera"]), f"{values['iso']:g}", size, law)
 
 
 def _manifest(members: Sequence[Member], splits: Mapping[str, str]) -> str:
     """A table of all pictures, with their files and what they were made with."""
     kinds = dict.fromkeys(kind for member in members for kind in member.files)
+    names = ("ev", "gain", "exposure_time", "f_number")
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(["view", "split", "camera", "iso", *kinds, "render"])
+    table.writerow(["view", "split", "camera", "iso", *names, *kinds, "render"])
     for member in members:
         files = [member.files.get(kind, "") for kind in kinds]
         facts = member.facts.camera, member.facts.iso
-        table.writerow([member.view, splits[member.view], *facts, *files, member.render])
+        light = [getattr(member.facts, name) for name in names]
+        row = [member.view, splits[member.view], *facts, *light, *files, member.render]
+        table.writerow(row)
     return text.getvalue()
 
 
@@ -164,7 +107,7 @@ def _sheet(folder: Path, members: Sequence[Member]) -> bytes | None:
     for member in members:
         by_view.setdefault(member.view, {})[member.folder] = member
     columns = max((list(row) for row in by_view.values()), key=len, default=[])
-    whole = {view: row for view, row in by_view.items() if len(row) == len(columns)}
+    whole = {view: row for view, row in by_view.items() if list(row) == columns}
     step = -(-len(whole) // MOST_ROWS) or 1
     rows = list(whole.items())[::step]
     pictures = [
@@ -185,47 +128,68 @@ def _truths(member: Member, names: bool = False) -> list[str]:
 
 
 def _readme(
-    title: str,
+    folder: Path,
     members: Sequence[Member],
     splits: Mapping[str, str],
-    words: Sequence[str],
-    about: Mapping[str, str],
+    about: About,
+    has_sheet: bool,
 ) -> str:
     """The README of a dataset, in Markdown."""
     shown = list(splits.values())
-    rows = []
-    for member in {each.folder: each for each in reversed(members)}.values():
-        count = sum(each.folder == member.folder for each in members)
-        camera, iso, size, law = member.facts
-        rows.append(f"| `{member.folder or '.'}/` | {camera} | {iso} | {count} | {size} | {law} |")
-    facts = "\n".join(f"- **{name}:** {text}" for name, text in about.items())
+    of_series: dict[str, list[Member]] = {}
+    for member in members:
+        of_series.setdefault(member.folder, []).append(member)
+    rows = [
+        f"| `{series or '.'}/` | {_all(own, 'camera')} | {_all(own, 'iso')} | {len(own)} | "
+        f"{_all(own, 'size')} | {_range(own, 'ev')} | {_range(own, 'exposure_time')} | "
+        f"{_range(own, 'f_number')} | {_all(own, 'lens')} | {_all(own, 'law')} |"
+        for series, own in of_series.items()
+    ]
+    facts = "\n".join(f"- **{name}:** {text}" for name, text in about.renders.items())
     kinds = dict.fromkeys(kind for member in members for kind in member.files)
-    cameras = ", ".join(f"`{name}`" for name in FILES)
-    return f"""# {title}
+    there = [n for n in FILES if any((folder / series / n).exists() for series in of_series)]
+    cameras = ", ".join(f"`{name}`" for name in there)
+    views = f"- {cameras} in each folder: intrinsics and poses for COLMAP and nerfstudio; in "
+    views += "`cameras.json` x_cam = R X + t, by OpenCV's axes, and places in px from the corner.\n"
+    layers = {each["layer"]: each for member in members for each in member.layers}
+    truths = "".join(
+        f"- `{name}` ({each['kind']}): {TRUTHS[each['kind']].format(unit=about.unit)}.\n"
+        for name, each in layers.items()
+        if each["kind"] in TRUTHS
+    )
+    carried = (
+        f"\n## Truths that go along\n\nIn `NAME.carried.exr`, through the picture's own geometry; "
+        f"`valid` is 1 where all are known.\n\n{truths}"
+        if layers
+        else ""
+    )
+    sheet = f"![Contact sheet]({SHEET})\n\n" if has_sheet else ""
+    words = [Path(word).name if Path(word).is_absolute() else word for word in about.words]
+    counts = ", ".join(f"{shown.count(split)} in `{split}.txt`" for split in SPLITS)
+    return f"""# {folder.resolve().name}
 
 Made by clpipe {__version__}: renders as a camera takes them, with its noise.
 
-![Contact sheet]({SHEET})
-
+{sheet}- **Licence:** {about.licence or "not stated (`--licence`)"}
+- **Author:** {about.author or "not stated (`--author`)"}
 {facts}
-- **Views:** {len(shown)}: {shown.count("train")} for training (`train.txt`) and \
-{shown.count("val")} for validation (`val.txt`), every eighth.
+- **Views:** {len(shown)}: {counts}; of every eight, one for validation and one for tests.
 
-| folder | camera | ISO | pictures | size | variance of the raw's noise |
-|---|---|---|---|---|---|
-{chr(10).join(reversed(rows))}
+| folder | camera | ISO | pictures | size | EV | time, s | f-number | lens | variance of the raw |
+|---|---|---|---|---|---|---|---|---|---|
+{chr(10).join(rows)}
 
-y is the raw's signal, 1 at the white level.
+y is the raw's signal, 1 at the white level. EVs are over the render as it is; `photometry` in each
+sidecar has gains, vignetting and the response.
 
 ## Files
 
-- `{MANIFEST}`: a row for each picture, with its files ({", ".join(kinds)}), camera, ISO and split.
+- `{MANIFEST}`: a row for each picture, with its files ({", ".join(kinds)}), camera, ISO, exposure \
+and split. Paths are below this folder; that of a render is from here.
 - `NAME.json` beside each picture: everything that it was made with. \
 `clpipe replay NAME.json` makes it again, byte for byte.
-- {cameras} in each folder, where the cameras are known: intrinsics and poses for COLMAP and \
-nerfstudio.
-- `{RECORD}`: what the renders were made of. `run.jsonl`: the log.
-
+{views if there else ""}- `{RECORD}`: what the renders were made of. `run.jsonl`: the log.
+{carried}
 ## Made by
 
 ```sh
@@ -233,5 +197,20 @@ nerfstudio.
 ```
 
 The same command makes the same pictures again on the same kind of device, and goes on where it \
-was interrupted.
+was interrupted; other ISOs, cameras and frames go beside.
 """
+
+
+def _all(members: Sequence[Member], fact: str) -> str:
+    """What is said of some pictures, where it differs with how much else there is."""
+    first, *others = dict.fromkeys(getattr(member.facts, fact) for member in members)
+    return f"{first} and {len(others)} others" if others else str(first)
+
+
+def _range(members: Sequence[Member], fact: str) -> str:
+    """The least and the largest number of some pictures."""
+    texts = [text for member in members if (text := getattr(member.facts, fact))]
+    if not texts:
+        return "not known"
+    low, high = min(texts, key=float), max(texts, key=float)
+    return low if low == high else f"{low} to {high}"

@@ -41,6 +41,25 @@ def read_record(folder: Path, made_of: Mapping[str, Any]) -> dict[str, Any]:
     return known or {}
 
 
+def keep_said(folder: Path, said: Mapping[str, str | None]) -> dict[str, str]:
+    """What was said of a folder's dataset now, else before: kept for the next time.
+
+    Args:
+        folder: of the dataset, which has a record.
+        said: texts by their names; None is nothing new.
+
+    Raises:
+        ImageError: the record cannot be written.
+    """
+    path = folder / RECORD
+    known = parse_json(read_bytes(path))
+    before = known.get("said", {})
+    kept = {name: text or str(before.get(name, "")) for name, text in said.items()}
+    if kept != before:
+        write_new(path, (json.dumps({**known, "said": kept}, indent=1) + "\n").encode())
+    return kept
+
+
 def write_record(folder: Path, made_of: Mapping[str, Any], found: Mapping[str, Any]) -> None:
     """Write what a dataset is made of, and what was found in it.
 
@@ -48,4 +67,6 @@ def write_record(folder: Path, made_of: Mapping[str, Any], found: Mapping[str, A
         ImageError: it cannot be written.
     """
     record = {"made_of": made_of, **found}
+    before = read_record(folder, made_of).get("said")
+    record |= {"said": before} if before else {}
     write_new(folder / RECORD, (json.dumps(record, indent=1) + "\n").encode())

@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.digests import digests
-from clpipe.base.errors import RequestError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import write_new
+from clpipe.images.passes import find_layers, kind_of
 from clpipe.inputs.find import Job
 from clpipe.scenes.blender import Renderer, RenderError, Rendering, Scene
 from clpipe.scenes.record import read_record, write_record
 from clpipe.scenes.view_request import made_by
 
-RENDERS = "renders"
+RENDERS, UNIT = "renders", "Unit of depth and poses"
 CAMERAS = "cameras.json"
 FLOW = "Vector"  # the layer that has it, of frames
 
@@ -79,7 +80,7 @@ class Source:
 
 
 def from_folder(folder: Path, output: Path, poses: Path | None) -> Source:
-    """Renders that exist, with the cameras that are asked for or lie among them.
+    """Renders that exist, with the cameras that are asked for or lie among them, and the layers.
 
     Raises:
         RequestError: there is no such folder, or the output folder has another dataset.
@@ -90,7 +91,31 @@ def from_folder(folder: Path, output: Path, poses: Path | None) -> Source:
     read_record(output, made_of)
     own = [path for name in (CAMERAS, "transforms.json") if (path := folder / name).is_file()]
     write_record(output, made_of, {})
-    return Source([str(folder)], poses or next(iter(own), None), about={"Renders": f"`{folder}`"})
+    about = {"Renders": f"`{folder.resolve().name}`"}
+    return Source([str(folder)], poses or next(iter(own), None), layers_in(folder), about)
+
+
+def layers_in(folder: Path) -> tuple[str, ...]:
+    """The depth, labels, normals and flow that every EXR of a folder has, as --carry takes them."""
+    common: dict[str, str] | None = None
+    for path in sorted(folder.rglob("*.exr")):
+        try:
+            found = find_layers(path)
+        except ImageError:  # which the run tells
+            continue
+        own: dict[str, str] = {
+            each.without_rank.rpartition(".")[2]: kind
+            for each in found
+            if (kind := kind_of(each.name, each)) and kind != "colour" and each.name
+        }
+        common = own if common is None else {k: v for k, v in common.items() if own.get(k) == v}
+    return tuple(_carried(name, kind) for name, kind in (common or {}).items())
+
+
+def _carried(name: str, kind: str) -> str:
+    """A layer as --carry takes it: depth and object numbers as PNGs, too."""
+    is_plain = kind == "depth" or (kind == "label" and name.lower().startswith(("index", "object")))
+    return f"{name}:png" if is_plain else name
 
 
 def from_scene(stack: ExitStack, rendering: Rendering, output: Path, program: str | None) -> Source:
@@ -124,7 +149,8 @@ def from_scene(stack: ExitStack, rendering: Rendering, output: Path, program: st
         write_record(output, made_of, {"views": views, "scene": asdict(scene)})
         cameras = {"views": scene.views}
         write_new(rendering.folder / CAMERAS, json.dumps(cameras, indent=1).encode())
-    layers = (*scene.layers, *([FLOW] if "frames" in views else []))
+    depth, normals, numbers = scene.layers
+    layers = (f"{depth}:png", normals, f"{numbers}:png", *([FLOW] if "frames" in views else []))
     names = [Path(view["file"]).stem for view in scene.views]
     folder = output / RENDERS
     about = _about(rendering, scene)
@@ -147,7 +173,7 @@ def _about(rendering: Rendering, scene: Scene) -> dict[str, str]:
         "Scene": f"`{rendering.scene.name}`, rendered by Blender {scene.blender}",
         "Renders": f"`{RENDERS}/`, Cycles, {rendering.samples} samples{limit}, {denoised}; "
         "linear Rec. 709, half floats; depth, normals and object numbers beside",
-        "Unit of depth and poses": unit,
+        UNIT: unit,
         "Objects": objects or "none",
         "Reproducible": "the same Blender on the same kind of processor renders the same pixels"
         + limits,

@@ -1,0 +1,184 @@
+"""What a dataset's folder has, by its sidecars: of each view, camera and ISO files and facts."""
+
+import logging
+import os
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from clpipe.chain.rendition import NOISY, Rendition
+from clpipe.outputs.carried import png_ending
+from clpipe.outputs.sealed import SIDECAR, SidecarError, outputs_in, read_sidecar
+
+PICTURE, CARRIED = "picture", "carried"
+SERIES = re.compile(r"(?:[^/]+/)?iso[0-9.e+]+(?=/)|")  # the folder of a camera and an ISO
+SPLITS = {3: "val", 7: "test"}  # of eight views
+
+# What is raised for values of a forged sidecar.
+DAMAGED = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
+
+log = logging.getLogger(__name__)
+
+
+class Facts(NamedTuple):
+    """What is said of a picture, as texts: its size in px, the variance of the raw's noise."""
+
+    camera: str
+    iso: str
+    size: str
+    law: str
+    ev: str
+    gain: str
+    exposure_time: str
+    f_number: str
+    lens: str
+
+
+@dataclass(frozen=True)
+class Member:
+    """What was made of one view with one camera and ISO.
+
+    Args:
+        view: the name of its render, without its ending.
+        folder: below the dataset's, by camera and ISO; "" is the dataset's own.
+        files: paths below the dataset's folder: "picture", "truth_clean" and so on, "carried", and
+            the PNG of a layer by its name.
+        facts: of the picture.
+        render: what it was made of, from the dataset's folder.
+        layers: that go along, as their records in the sidecar.
+    """
+
+    view: str
+    folder: str
+    files: Mapping[str, str]
+    facts: Facts
+    render: str
+    layers: tuple[Mapping[str, Any], ...]
+
+    @property
+    def name(self) -> str:
+        """Its name in the sidecars."""
+        return f"{self.folder}/{self.view}".lstrip("/")
+
+
+def split_of(number: int) -> str:
+    """What a view is for: of every eight one for validation and one for tests, else training.
+
+    >>> [split_of(number) for number in range(9)].count("train"), split_of(3), split_of(15)
+    (7, 'val', 'test')
+    """
+    return SPLITS.get(number % 8, "train")
+
+
+def splits_of(members: list[Member]) -> dict[str, str]:
+    """What each view is for, by its name, in their order; all pictures of a view for the same."""
+    views = dict.fromkeys(member.view for member in members)
+    return {view: split_of(number) for number, view in enumerate(sorted(views))}
+
+
+def members_of(folder: Path, renders: str) -> list[Member]:
+    """What is there in a dataset's folder, sorted by views, then by cameras and ISOs.
+
+    Args:
+        folder: of the dataset.
+        renders: the name of its folder that has no pictures.
+    """
+    found: dict[str, dict[str, tuple[Path, Mapping[str, Any]]]] = defaultdict(dict)
+    for path in _sidecars(folder, renders):
+        try:
+            values = read_sidecar(path)
+            found[str(values["name"])][str(values["picture"])] = path, values
+        except FileNotFoundError:
+            continue
+        except (SidecarError, *DAMAGED):
+            log.warning("%s; the card goes without it", SidecarError(path))
+    members = []
+    for name, renditions in found.items():
+        try:
+            if member := _member(folder, name, renditions):
+                members.append(member)
+        except DAMAGED:
+            path = next(path for path, _ in renditions.values())
+            log.warning("%s; the card goes without it", SidecarError(path))
+    return sorted(members, key=lambda each: (each.view, each.folder))
+
+
+def _sidecars(folder: Path, renders: str) -> Iterator[Path]:
+    for place, folders, names in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        if Path(place) == folder and renders in folders:
+            folders.remove(renders)
+        yield from (
+            Path(place, name)
+            for name in sorted(names)
+            if name.endswith(f".{SIDECAR}") and not name.startswith(".") and _is_of_picture(name)
+        )
+
+
+def _is_of_picture(name: str) -> bool:
+    return name not in ("dataset.json", "cameras.json", "transforms.json", "run.json")
+
+
+def _member(
+    folder: Path, name: str, renditions: Mapping[str, tuple[Path, Mapping[str, Any]]]
+) -> Member | None:
+    """What was made of a view; None where its picture is not there.
+
+    Raises:
+        KeyError, TypeError, ValueError, AttributeError, OverflowError: the values are damaged.
+    """
+    files: dict[str, str] = {}
+    noisy: Mapping[str, Any] | None = None
+    for suffix, (path, values) in sorted(renditions.items()):
+        first, *others = outputs_in(values)
+        place = path.parent.relative_to(folder)
+        if not (path.parent / first).exists():
+            continue
+        if Rendition.from_record(values).role == NOISY and noisy is None:
+            noisy = values
+        files[suffix.removeprefix(".") or PICTURE] = (place / first).as_posix()
+        stem = Path(name).name
+        for each in others:
+            if each == f"{stem}.{CARRIED}.exr":
+                files[CARRIED] = (place / each).as_posix()
+        for layer in values.get("carried", ()):
+            if (png := f"{stem}.{png_ending(layer['layer'])}") in others:
+                files[str(layer["layer"])] = (place / png).as_posix()
+    if noisy is None:
+        return None
+    own = SERIES.match(name)
+    series = own[0] if own else ""
+    view = name.removeprefix(series).lstrip("/")
+    render = os.path.relpath(Path(str(noisy["input"])).absolute(), folder.absolute())
+    return Member(view, series, files, _facts(noisy), render, tuple(noisy.get("carried", ())))
+
+
+def _facts(values: Mapping[str, Any]) -> Facts:
+    """What the card says of a picture, by its sidecar.
+
+    Raises:
+        KeyError, TypeError, ValueError, AttributeError, OverflowError: the values are damaged.
+    """
+    noise = (values["noise"] or {}).get("signal", {"a": 0.0, "b": 0.0})
+    size = f"{values['width']:d}x{values['height']:d}"
+    law = f"{noise['a']:.3g} y + {noise['b']:.3g}"
+    light = values["photometry"] or {}
+    names = ("ev", "gain", "exposure_time", "f_number")
+    exposed = {n: "" if light.get(n) is None else f"{light[n]:g}" for n in names}
+    camera, iso = str(values["camera"]), f"{values['iso']:g}"
+    return Facts(camera, iso, size, law, **exposed, lens=_lens(values))
+
+
+def _lens(values: Mapping[str, Any]) -> str:
+    """Focal lengths and distortion of a picture in words."""
+    camera = values["intrinsics"]
+    if not camera:
+        return "not known"
+    length = (values.get("output") or {}).get("focal_length")
+    bent = {k: v for k, v in camera["distortion"].items() if v}
+    told = f"{length:g} mm, " if length else ""
+    terms = ", ".join(f"{name} {value:.4g}" for name, value in bent.items())
+    return f"{told}fx {camera['fx']:.1f} px, {camera['model']}{f' ({terms})' if terms else ''}"
