@@ -171,6 +171,13 @@ def test_a_dataset_grows(clpipe, scene, blender, tmp_path):
         )
 
 
+def test_views_that_see_too_little_are_told(clpipe, scene, blender, tmp_path):
+    scene.write_text("a maze")
+    said = clpipe("dataset", scene, "-o", "set", *blender, *NUMPY, "--views", 2).stderr
+    assert "note: 3 of 9 places see too little" in said
+    assert "**Which views:** 3 of 9 places" in (tmp_path / "set/README.md").read_text()
+
+
 def test_a_lens_takes_the_focal_length_of_the_scenes_cameras(clpipe, scene, blender, tmp_path):
     lens = ("--set", "distortion.method=brown_conrady", "--set", "distortion.k1=-0.1")
     clpipe("dataset", scene, "-o", "set", *blender, *NUMPY[:2], "--views", 1, *lens)
@@ -294,6 +301,23 @@ def seen_again(folder, one, two):
     return np.mean(abs(found / z[inside] - 1) < 0.03)
 
 
+def test_views_of_a_room_see_what_the_camera_looks_at(clpipe, tmp_path):
+    """An orbit leads behind the walls; no view is from there, and each sees most objects."""
+    pytest.importorskip("bpy")
+    example(tmp_path, "room_scene.py", "room.blend")
+    small = ("--resolution", "48x32", "--samples", 1, "--device", "numpy", "--no-denoise")
+    said = clpipe("dataset", "room.blend", "-o", "set", "--views", 8, *small).stderr
+    assert "places on the orbit see too little" in said
+    for path in sorted(Path("set/renders").glob("*.exr")):
+        parts = OpenEXR.File(str(path), separate_channels=True).parts
+        channels = {name: c for part in parts for name, c in part.channels.items()}
+        (own,) = (c for name, c in channels.items() if "Index" in name)
+        numbers, counts = np.unique(own.pixels, return_counts=True)
+        assert len(numbers) >= 4 and counts.max() < 0.7 * 48 * 32
+    said = clpipe("dataset", "room.blend", "-o", "box", "--path", "random", *small).stderr
+    assert "24 of 24 images done" in said
+
+
 def test_blender_itself_renders_a_scene(clpipe, tmp_path):
     """Its depth, cameras and object numbers agree with each other, and it makes the same again."""
     pytest.importorskip("bpy")
@@ -301,8 +325,8 @@ def test_blender_itself_renders_a_scene(clpipe, tmp_path):
     small = ("--resolution", "48x32", "--samples", 4, "--device", "numpy", "--path", "arc")
     for name in ("one", "two"):
         clpipe("dataset", "room.blend", "-o", name, "--views", 2, *small)
-    views = json.loads(Path("one/cameras.json").read_text())["views"]
-    assert seen_again(Path("one"), *views) > 0.5  # an arc's ends are far apart
+    views = json.loads(Path("one/iso100/cameras.json").read_text())["views"]
+    assert seen_again(Path("one/iso100"), *views) > 0.5  # an arc's ends are far apart
     one, two = (contents(Path(name) / "renders") for name in ("one", "two"))
     assert {k: v for k, v in one.items() if k[0] != "."} == {
         k: v for k, v in two.items() if k[0] != "."

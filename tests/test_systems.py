@@ -58,7 +58,7 @@ import clpipe
 
 loaded = 0
 for module in pkgutil.walk_packages(clpipe.__path__, "clpipe."):
-    if module.name == "clpipe.scenes.blender_script":  # it runs in Blender
+    if module.name.startswith("clpipe.scenes.blender_"):  # they run in Blender
         continue
     try:
         importlib.import_module(module.name)
@@ -90,7 +90,7 @@ def python(code, *arguments, cwd):
 
 
 def test_every_module_loads(tmp_path):
-    modules = [p for p in (ROOT / "clpipe").rglob("*.py") if p.name != "blender_script.py"]
+    modules = [p for p in (ROOT / "clpipe").rglob("*.py") if not p.name.startswith("blender_")]
     done = python(TAKE_AWAY + LOAD, cwd=tmp_path)
     assert int(done.stdout) == len(modules) - 1  # the package itself
 

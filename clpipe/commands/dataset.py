@@ -30,7 +30,7 @@ from clpipe.inputs.series import Series, parse_isos
 from clpipe.scenes.blender import Rendering
 from clpipe.scenes.card import About, write_card
 from clpipe.scenes.record import keep_said
-from clpipe.scenes.source import RENDERS, UNIT, Source, from_folder, from_scene
+from clpipe.scenes.source import NOTE, RENDERS, UNIT, Source, from_folder, from_scene
 from clpipe.scenes.view_request import PATHS, asked_views, parse_box, parse_frames, parse_resolution
 
 # Options that are for a scene alone.
@@ -229,6 +229,9 @@ def develop(
     made = Run(request, images, where, arguments=sys.argv[1:])
     reporter = Reporter(made, Console(stderr=True), quiet)
     tell = (lambda text: None) if quiet else reporter.print
+
+    if note := renders.about.get(NOTE):
+        tell(f"note: {note}")
 
     def stop() -> None:
         made.stop()

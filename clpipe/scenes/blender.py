@@ -7,7 +7,7 @@ import sys
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import IO, Any, Self
 
@@ -64,6 +64,7 @@ class Scene:
         objects: the names of objects by their index.
         layers: the names of depth, normals and object numbers in its EXRs.
         unit_metres: how long a unit is; None where the scene does not say.
+        notes: of views that see too little, and what was done about it.
     """
 
     blender: str
@@ -71,6 +72,7 @@ class Scene:
     objects: dict[str, list[str]]
     layers: list[str]
     unit_metres: float | None
+    notes: list[str] = field(default_factory=list)
 
 
 def blender_command(program: str | None, asked: Path) -> list[str]:
@@ -144,7 +146,7 @@ class Renderer(AbstractContextManager["Renderer"]):
             RenderError: Blender ended.
         """
         values = self._event("scene")
-        return Scene(**{field.name: values[field.name] for field in fields(Scene)})
+        return Scene(**{each.name: values[each.name] for each in fields(Scene)})
 
     def rendered(self, count: int) -> Iterator[tuple[str, float]]:
         """The name of each view as soon as it is there, and the seconds that it took, or 0.

@@ -5,32 +5,24 @@ happens goes to standard output, a line of JSON behind :data:`MARK` for each eve
 """
 
 import json
-import math
 import os
-import random
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from collections.abc import Mapping
 from operator import attrgetter
 from typing import Any
 
 import bpy
-from mathutils import Matrix, Vector
+
+sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))  # Blender does not
+from blender_views import GEOMETRY, RefusedError, camera_of, fault_in, views_of
 
 MARK = "@clpipe "
 OLDEST = (4, 2)
-FLIP = Matrix(((1, 0, 0), (0, -1, 0), (0, 0, -1)))  # from Blender's camera axes to OpenCV's
 OWNER = attrgetter("library")  # of what comes from another .blend
 UNFINISHED = ".unfinished.exr"
-GEOMETRY = {"MESH", "CURVE", "CURVES", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD"}
-SPAN = math.radians(60)  # of an arc
 TIMES = re.compile(rb"(cycles\.[^\0]*_time\0string\0.{4})([0-9:.]+)", re.DOTALL)
-
-
-class RefusedError(Exception):
-    """Something that the user can mend."""
 
 
 def tell(event: str, **values: Any) -> None:
@@ -127,147 +119,6 @@ def number_objects(scene: Any) -> dict[int, list[str]]:
     return {number: names[number] for number in sorted(names) if number}
 
 
-def size_of(scene: Any) -> tuple[int, int]:
-    """The width and height of a picture in px."""
-    percentage = scene.render.resolution_percentage
-    render = scene.render
-    return render.resolution_x * percentage // 100, render.resolution_y * percentage // 100
-
-
-def camera_of(scene: Any, name: str) -> dict[str, Any]:
-    """A view's camera as a record: K, R and t by OpenCV's axes, pixel centres at +0.5.
-
-    Raises:
-        RefusedError: it is no perspective camera.
-    """
-    camera = scene.camera
-    if camera.data.type != "PERSP":
-        raise RefusedError(f"camera {camera.name}: {camera.data.type}; expected a perspective one")
-    width, height = size_of(scene)
-    aspect = {"scale_x": scene.render.pixel_aspect_x, "scale_y": scene.render.pixel_aspect_y}
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    shape = camera.calc_matrix_camera(depsgraph, x=width, y=height, **aspect)
-    fx, fy = shape[0][0] * width / 2, shape[1][1] * height / 2
-    cx, cy = (1 - shape[0][2]) * width / 2, (1 + shape[1][2]) * height / 2
-    place = camera.evaluated_get(depsgraph).matrix_world
-    rotation = FLIP @ place.to_3x3().normalized().transposed()
-    return {
-        "file": f"{name}.exr",
-        "width": width,
-        "height": height,
-        "K": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
-        "R": [list(row) for row in rotation],
-        "t": list(-(rotation @ place.translation)),
-    }
-
-
-def set_camera(scene: Any, record: Mapping[str, Any]) -> None:
-    """Make the scene's camera that of a record, see :func:`camera_of`."""
-    camera, rotation = scene.camera, Matrix(record["R"])
-    turned = (FLIP @ rotation).transposed()
-    place = -(rotation.transposed() @ Vector(record["t"]))
-    width, height = record["width"], record["height"]
-    (fx, _, cx), (_, fy, cy) = record["K"][0], record["K"][1]
-    data = camera.data
-    data.type, data.sensor_fit, data.sensor_width = "PERSP", "HORIZONTAL", 36.0
-    data.lens = fx * 36.0 / width
-    data.shift_x, data.shift_y = (width / 2 - cx) / width, (cy - height / 2) * fx / fy / width
-    render = scene.render
-    render.resolution_x, render.resolution_y, render.resolution_percentage = width, height, 100
-    render.pixel_aspect_x, render.pixel_aspect_y = max(fy / fx, 1), max(fx / fy, 1)
-    camera.constraints.clear()
-    camera.animation_data_clear()
-    data.animation_data_clear()
-    camera.parent = None
-    camera.matrix_world = Matrix.Translation(place) @ turned.to_4x4()
-
-
-def target_of(scene: Any) -> Any:
-    """What the scene's camera looks at: what it sees in its middle, else the middle of all."""
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    place = scene.camera.evaluated_get(depsgraph).matrix_world
-    forward = -place.col[2].to_3d().normalized()
-    hit, where, *_ = scene.ray_cast(depsgraph, place.translation, forward)
-    if hit:
-        return where
-    corners = [
-        each.matrix_world @ Vector(corner)
-        for each in scene.objects
-        if each.type in GEOMETRY and not each.hide_render
-        for corner in each.bound_box
-    ]
-    if not corners:
-        raise RefusedError("it has no objects")
-    return sum(corners, Vector()) / len(corners)
-
-
-def paths(scene: Any, asked: Mapping[str, Any]) -> Iterator[Any]:
-    """The cameras of generated views: an orbit, an arc, or places in a box.
-
-    Yields:
-        Matrices, as a camera's ``matrix_world``.
-    """
-    count, path = asked["count"], asked["path"]
-    bpy.context.view_layer.update()
-    start, target = scene.camera.matrix_world.copy(), target_of(scene)
-    if path in ("orbit", "arc"):
-        for number in range(count):
-            angle = 2 * math.pi * number / count
-            if path == "arc":
-                angle = SPAN * (number / max(count - 1, 1) - 0.5)
-            about = Matrix.Translation(target) @ Matrix.Rotation(angle, 4, "Z")
-            yield about @ Matrix.Translation(-target) @ start
-        return
-    draw = random.Random(asked["seed"])  # noqa: S311 - places, no secrets
-    reach = (start.translation - target).length / 4
-    middle = start.translation
-    box = asked["box"] or [c - reach for c in middle] + [c + reach for c in middle]
-    for _ in range(count):
-        place = Vector([draw.uniform(a, b) for a, b in zip(box[:3], box[3:], strict=True)])
-        turned = (target - place).to_track_quat("-Z", "Y")
-        yield Matrix.Translation(place) @ turned.to_matrix().to_4x4()
-
-
-def views_of(scene: Any, asked: Mapping[str, Any]) -> Iterator[tuple[str, int, Callable[[], None]]]:
-    """The views to render: the name and number of each, and what sets the scene up for it."""
-    views = asked["views"]
-    if "frames" in views:
-        digits = max(4, len(str(max(views["frames"]))))
-        for frame in views["frames"]:
-            yield f"frame_{frame:0{digits}d}", frame, partial(scene.frame_set, frame)
-    elif "cameras" in views:
-        for number, record in enumerate(views["cameras"]):
-            yield record["name"], number, partial(set_camera, scene, record)
-    else:
-        matrices = list(paths(scene, views))
-        camera = scene.camera
-        camera.constraints.clear()
-        camera.animation_data_clear()
-        camera.parent = None
-        digits = max(3, len(str(len(matrices) - 1)))
-        for number, matrix in enumerate(matrices):
-            yield (
-                f"view_{number:0{digits}d}",
-                number,
-                partial(setattr, camera, "matrix_world", matrix),
-            )
-
-
-def sees_something(scene: Any, record: Mapping[str, Any]) -> bool:
-    """Whether rays through a view's picture meet a surface."""
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    place = scene.camera.evaluated_get(depsgraph).matrix_world
-    (fx, _, cx), (_, fy, cy) = record["K"][0], record["K"][1]
-    for row in range(9):
-        for column in range(9):
-            x = ((column + 0.5) / 9 * record["width"] - cx) / fx
-            y = ((row + 0.5) / 9 * record["height"] - cy) / fy
-            ray = place.to_3x3().normalized() @ Vector((x, -y, -1)).normalized()
-            if scene.ray_cast(depsgraph, place.translation, ray)[0]:
-                return True
-    return False
-
-
 def render_view(scene: Any, folder: str, name: str, number: int, seed: int) -> None:
     """Render a view into NAME.exr, which is there whole or not at all.
 
@@ -305,17 +156,19 @@ def main(asked: Mapping[str, Any]) -> None:
         raise RefusedError("it has no camera; add one, or name cameras with --poses")
     prepare(scene, asked)
     objects = number_objects(scene)
-    views, cameras, blind = list(views_of(scene, asked)), [], []
+    views, notes = views_of(scene, asked)
+    cameras, blind = [], []
     for name, _, set_up in views:
         set_up()
         bpy.context.view_layer.update()
         cameras.append(camera_of(scene, name))
-        if not sees_something(scene, cameras[-1]):
-            blind.append(name)
+        if fault := fault_in(scene, cameras[-1]):
+            blind.append(f"{name} ({fault})")
+    if len(blind) == len(views):
+        raise RefusedError(f"no view sees enough: {', '.join(blind[:5])}")
     if blind:
-        raise RefusedError(
-            f"{len(blind)} of {len(views)} views see nothing: {', '.join(blind[:5])}"
-        )
+        more = f" and {len(blind) - 5} others" if len(blind) > 5 else ""
+        notes.append(f"these views see too little: {', '.join(blind[:5])}{more}")
     unit = scene.unit_settings
     tell(
         "scene",
@@ -324,6 +177,7 @@ def main(asked: Mapping[str, Any]) -> None:
         objects=objects,
         layers=["Depth", "Normal", "Object Index" if bpy.app.version >= (5, 0) else "IndexOB"],
         unit_metres=unit.scale_length if unit.system != "NONE" else None,
+        notes=notes,
     )
     for name in os.listdir(asked["folder"]):
         if name.endswith(UNFINISHED):  # of a Blender that was killed

@@ -17,7 +17,7 @@ from clpipe.scenes.blender import Renderer, RenderError, Rendering, Scene
 from clpipe.scenes.record import read_record, write_record
 from clpipe.scenes.view_request import made_by
 
-RENDERS, UNIT = "renders", "Unit of depth and poses"
+RENDERS, UNIT, NOTE = "renders", "Unit of depth and poses", "Which views"
 CAMERAS = "cameras.json"
 FLOW = "Vector"  # the layer that has it, of frames
 
@@ -175,6 +175,7 @@ def _about(rendering: Rendering, scene: Scene) -> dict[str, str]:
         "linear Rec. 709, half floats; depth, normals and object numbers beside",
         UNIT: unit,
         "Objects": objects or "none",
+        **({NOTE: "; ".join(scene.notes)} if scene.notes else {}),
         "Reproducible": "the same Blender on the same kind of processor renders the same pixels"
         + limits,
     }

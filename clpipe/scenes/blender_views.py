@@ -1,0 +1,250 @@
+"""Which views of a scene are rendered, and whether they see something.
+
+Blender's own Python runs it, without clpipe, for :mod:`clpipe.scenes.blender_script`.
+"""
+
+import math
+import random
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import bpy
+from mathutils import Matrix, Vector
+
+FLIP = Matrix(((1, 0, 0), (0, -1, 0), (0, 0, -1)))  # from Blender's camera axes to OpenCV's
+GEOMETRY = {"MESH", "CURVE", "CURVES", "SURFACE", "META", "FONT", "VOLUME", "POINTCLOUD"}
+SPAN = math.radians(60)  # of an arc
+RAYS = 9  # across a picture, and down, by which it is known what a view sees
+FILLED, FLAT = 0.85, 0.98  # share of a picture, cosine between normals: a wall fills a view
+NEARER = 0.8  # of the way to what a camera looks at
+FINER = 16  # places on a path for each view
+DRAWS = 50  # of places in a box for each view
+
+View = tuple[str, int, Callable[[], object]]  # name, number, and what sets the scene up for it
+
+
+class RefusedError(Exception):
+    """Something that the user can mend."""
+
+
+def size_of(scene: Any) -> tuple[int, int]:
+    """The width and height of a picture in px."""
+    percentage = scene.render.resolution_percentage
+    render = scene.render
+    return render.resolution_x * percentage // 100, render.resolution_y * percentage // 100
+
+
+def camera_of(scene: Any, name: str) -> dict[str, Any]:
+    """A view's camera as a record: K, R and t by OpenCV's axes, pixel centres at +0.5.
+
+    Raises:
+        RefusedError: it is no perspective camera.
+    """
+    camera = scene.camera
+    if camera.data.type != "PERSP":
+        raise RefusedError(f"camera {camera.name}: {camera.data.type}; expected a perspective one")
+    width, height = size_of(scene)
+    aspect = {"scale_x": scene.render.pixel_aspect_x, "scale_y": scene.render.pixel_aspect_y}
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    shape = camera.calc_matrix_camera(depsgraph, x=width, y=height, **aspect)
+    fx, fy = shape[0][0] * width / 2, shape[1][1] * height / 2
+    cx, cy = (1 - shape[0][2]) * width / 2, (1 + shape[1][2]) * height / 2
+    place = camera.evaluated_get(depsgraph).matrix_world
+    rotation = FLIP @ place.to_3x3().normalized().transposed()
+    return {
+        "file": f"{name}.exr",
+        "width": width,
+        "height": height,
+        "K": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
+        "R": [list(row) for row in rotation],
+        "t": list(-(rotation @ place.translation)),
+    }
+
+
+def set_camera(scene: Any, record: Mapping[str, Any]) -> None:
+    """Make the scene's camera that of a record, see :func:`camera_of`."""
+    camera, rotation = scene.camera, Matrix(record["R"])
+    turned = (FLIP @ rotation).transposed()
+    place = -(rotation.transposed() @ Vector(record["t"]))
+    width, height = record["width"], record["height"]
+    (fx, _, cx), (_, fy, cy) = record["K"][0], record["K"][1]
+    data = camera.data
+    data.type, data.sensor_fit, data.sensor_width = "PERSP", "HORIZONTAL", 36.0
+    data.lens = fx * 36.0 / width
+    data.shift_x, data.shift_y = (width / 2 - cx) / width, (cy - height / 2) * fx / fy / width
+    render = scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = width, height, 100
+    render.pixel_aspect_x, render.pixel_aspect_y = max(fy / fx, 1), max(fx / fy, 1)
+    camera.constraints.clear()
+    camera.animation_data_clear()
+    data.animation_data_clear()
+    camera.parent = None
+    camera.matrix_world = Matrix.Translation(place) @ turned.to_4x4()
+
+
+def target_of(scene: Any) -> Any:
+    """What the scene's camera looks at: what it sees in its middle, else the middle of all."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    place = scene.camera.evaluated_get(depsgraph).matrix_world
+    forward = -place.col[2].to_3d().normalized()
+    hit, where, *_ = scene.ray_cast(depsgraph, place.translation, forward)
+    if hit:
+        return where
+    corners = [
+        each.matrix_world @ Vector(corner)
+        for each in scene.objects
+        if each.type in GEOMETRY and not each.hide_render
+        for corner in each.bound_box
+    ]
+    if not corners:
+        raise RefusedError("it has no objects")
+    return sum(corners, Vector()) / len(corners)
+
+
+def place_on(path: str, share: float, start: Any, target: Any) -> Any:
+    """The camera on an orbit or an arc, as ``matrix_world``; ``share`` is of the way, 0 to 1."""
+    angle = 2 * math.pi * share if path == "orbit" else SPAN * (share - 0.5)
+    about = Matrix.Translation(target) @ Matrix.Rotation(angle, 4, "Z")
+    return about @ Matrix.Translation(-target) @ start
+
+
+def on_path(scene: Any, asked: Mapping[str, Any], start: Any, target: Any) -> tuple[list[Any], str]:
+    """The cameras of an orbit or an arc, and a note where some of its places see too little.
+
+    Evenly spaced places; where one of these sees too little, evenly of those that do not.
+
+    Raises:
+        RefusedError: nearly none sees enough.
+    """
+    count, path = asked["count"], asked["path"]
+    whole = count if path == "orbit" else max(count - 1, 1)
+    places = [place_on(path, number / whole, start, target) for number in range(count)]
+    reasons = [fault for place in places if (fault := fault_of(scene, place, target))]
+    if not reasons:
+        return places, ""
+    steps = FINER * count
+    finer = [place_on(path, (k + 0.5) / steps, start, target) for k in range(steps)]
+    good = [place for place in finer if not fault_of(scene, place, target)]
+    if len(good) < count:
+        raise RefusedError(
+            f"of {steps} places on the {path} {len(good)} see enough: {most_of(reasons)}; move the "
+            "scene's camera, or say --path random --box, or --poses"
+        )
+    note = (
+        f"{len(reasons)} of {count} places on the {path} see too little ({most_of(reasons)}); the "
+        f"views are of the {100 * len(good) // steps} % of it that see enough"
+    )
+    return [good[number * len(good) // count] for number in range(count)], note
+
+
+def in_box(scene: Any, asked: Mapping[str, Any], start: Any, target: Any) -> tuple[list[Any], str]:
+    """Cameras in a box that look at the target, and a note where some were drawn again.
+
+    Raises:
+        RefusedError: nearly no place sees enough.
+    """
+    draw = random.Random(asked["seed"])  # noqa: S311 - places, no secrets
+    reach = (start.translation - target).length / 4
+    middle = start.translation
+    box = asked["box"] or [c - reach for c in middle] + [c + reach for c in middle]
+    found: list[Any] = []
+    reasons: list[str] = []
+    while len(found) < asked["count"]:
+        place = Vector([draw.uniform(a, b) for a, b in zip(box[:3], box[3:], strict=True)])
+        turned = (target - place).to_track_quat("-Z", "Y")
+        matrix = Matrix.Translation(place) @ turned.to_matrix().to_4x4()
+        if fault := fault_of(scene, matrix, target):
+            reasons.append(fault)
+        else:
+            found.append(matrix)
+        if len(reasons) > DRAWS * asked["count"]:
+            raise RefusedError(
+                f"of {len(reasons) + len(found)} places in the box {len(found)} see enough: "
+                f"{most_of(reasons)}; say another --box"
+            )
+    return found, f"{len(reasons)} views were drawn again: {most_of(reasons)}" if reasons else ""
+
+
+def most_of(reasons: list[str]) -> str:
+    """The most frequent of some texts."""
+    return max(dict.fromkeys(reasons), key=reasons.count)
+
+
+def views_of(scene: Any, asked: Mapping[str, Any]) -> tuple[list[View], list[str]]:
+    """The views to render, and notes: the name and number of each, what sets the scene up for it.
+
+    Raises:
+        RefusedError: too few places see enough.
+    """
+    views = asked["views"]
+    if "frames" in views:
+        digits = max(4, len(str(max(views["frames"]))))
+        numbered = [(f"frame_{f:0{digits}d}", f) for f in views["frames"]]
+        return [(name, frame, partial(scene.frame_set, frame)) for name, frame in numbered], []
+    if "cameras" in views:
+        records = enumerate(views["cameras"])
+        return [(r["name"], number, partial(set_camera, scene, r)) for number, r in records], []
+    bpy.context.view_layer.update()
+    start, target = scene.camera.matrix_world.copy(), target_of(scene)
+    camera = scene.camera
+    camera.constraints.clear()
+    camera.animation_data_clear()
+    camera.parent = None
+    generate = in_box if views["path"] == "random" else on_path
+    matrices, note = generate(scene, views, start, target)
+    digits = max(3, len(str(len(matrices) - 1)))
+    placed: list[View] = [
+        (f"view_{number:0{digits}d}", number, partial(setattr, camera, "matrix_world", matrix))
+        for number, matrix in enumerate(matrices)
+    ]
+    return placed, [note] if note else []
+
+
+def fault_of(scene: Any, matrix: Any, target: Any) -> str:
+    """Why a camera there would see too little; "" where it sees enough."""
+    scene.camera.matrix_world = matrix
+    bpy.context.view_layer.update()
+    return fault_in(scene, camera_of(scene, ""), target)
+
+
+def fault_in(scene: Any, record: Mapping[str, Any], target: Any = None) -> str:
+    """Why the scene's camera sees too little, by rays through its picture; "" where it does not.
+
+    Args:
+        scene: with the camera in its place.
+        record: of the camera, see :func:`camera_of`.
+        target: what it should look at; None is nothing in particular.
+    """
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    place = scene.camera.evaluated_get(depsgraph).matrix_world
+    turn, eye = place.to_3x3().normalized(), place.translation
+    (fx, _, cx), (_, fy, cy) = record["K"][0], record["K"][1]
+    seen: list[tuple[str, Any]] = []  # the object that each ray meets, and its normal
+    behind = 0
+    for row in range(RAYS):
+        for column in range(RAYS):
+            x = ((column + 0.5) / RAYS * record["width"] - cx) / fx
+            y = ((row + 0.5) / RAYS * record["height"] - cy) / fy
+            ray = turn @ Vector((x, -y, -1)).normalized()
+            hit, _, normal, _, met, _ = scene.ray_cast(depsgraph, eye, ray)
+            if hit:
+                seen.append((met.name, normal))
+                behind += normal.dot(ray) > 0
+    if not seen:
+        return "nothing is there"
+    if behind > len(seen) / 2:
+        return "most surfaces are seen from behind"
+    names = [name for name, _ in seen]
+    name = most_of(names)
+    normals = [normal for own, normal in seen if own == name]
+    share = len(normals) / RAYS**2
+    if share > FILLED and all(normal.dot(normals[0]) > FLAT for normal in normals):
+        return f"{name} fills the view"
+    if target is not None:
+        way = target - eye
+        hit, where, _, _, met, _ = scene.ray_cast(depsgraph, eye, way.normalized())
+        nearer = hit and (where - eye).length < NEARER * way.length
+        if nearer and names.count(met.name) > len(seen) / 2:
+            return f"{met.name} stands before what the camera looks at"
+    return ""
