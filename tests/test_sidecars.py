@@ -178,9 +178,9 @@ def test_a_card_goes_without_what_a_forged_sidecar_holds(clpipe, write_exr, key)
         write_exr(f"in/{name}.exr", np.full((8, 8, 3), 0.25, np.float32))
     run = ("dataset", "in", "-o", "out", "--device", "numpy", "--iso", 100)
     clpipe(*run)
-    values = read_sidecar(Path("out/a.json"))
+    values = read_sidecar(Path("out/iso100/a.json"))
     for odd in ODD:
-        reseal(Path("out/a.json"), {**values, key: odd})
+        reseal(Path("out/iso100/a.json"), {**values, key: odd})
         clpipe(*run)
 
 
@@ -219,9 +219,9 @@ def test_a_dataset_without_what_was_edited_and_cannot_be_made_again(clpipe, writ
         write_exr(f"in/{name}.exr", np.full((8, 8, 3), 0.25, np.float32))
     run = ("dataset", "in", "-o", "out", "--device", "numpy", "--iso", 100)
     clpipe(*run)
-    lay_out_anew(Path("out/a.json"))
+    lay_out_anew(Path("out/iso100/a.json"))
     Path("in/a.exr").write_bytes(b"no picture")
     said = clpipe(*run, status=1).stderr
-    assert f"out/a.json: {CHANGED}" in said
+    assert f"out/iso100/a.json: {CHANGED}" in said
     rows = Path("out/manifest.csv").read_text().splitlines()[1:]
     assert [row.split(",")[0] for row in rows] == ["b"]

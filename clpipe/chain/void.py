@@ -7,7 +7,6 @@ import numpy as np
 
 from clpipe.base.errors import ImageError
 from clpipe.chain.chain import Chain
-from clpipe.reference.geometry import Geometry
 
 POINTS = 128, 96  # across and down the picture, at which it is looked for
 LEAST = 5e-4  # share of the picture, below which nothing is said
@@ -27,7 +26,7 @@ def check_void(chain: Chain, width: int, height: int) -> str:
     if chain.geometry is None:
         return ""
     try:
-        share, beyond = _void(chain.geometry, width, height)
+        share, beyond = _void(chain, width, height)
     except ImageError as error:
         lens = chain.optics.calibration
         if lens and lens.is_of_smaller_sensor:
@@ -39,17 +38,21 @@ def check_void(chain: Chain, width: int, height: int) -> str:
         raise error from None
     if share < LEAST:
         return ""
+    bends = [step.name for step in chain.steps if hasattr(step.method, "fit")]
+    fit = f"set {bends[0]}.fit=true" if bends else "make the picture smaller"
     most = MOST_OVERSCAN * max(width, height)
     more = f"render {ceil(beyond)} px more on each side (overscan), or " if beyond < most else ""
     return (
         f"{100 * share:.1f} % of the picture are black: there the lens shows what lies beside the "
-        f"render; {more}set distortion.fit=true"
+        f"render; {more}{fit}"
     )
 
 
 @lru_cache(maxsize=64)
-def _void(geometry: Geometry, width: int, height: int) -> tuple[float, float]:
+def _void(chain: Chain, width: int, height: int) -> tuple[float, float]:
     """The share of a picture that has no place in its image, and how far it is beyond it, px."""
+    geometry = chain.geometry
+    assert geometry
     columns, rows = geometry.size(width, height)
     places = [
         np.concatenate([[0.5], (np.arange(n) + 0.5) * (side / n), [side - 0.5]])

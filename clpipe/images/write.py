@@ -4,7 +4,7 @@ import errno
 import mmap
 import os
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from clpipe.reference.geometry import NO_MARGINS, Margins
 
 JPEG_MAX_SIDE = 65500
 # Without it, OpenImageIO puts in the time of writing, and no two runs make the same bytes.
+LENS, NO_LENS = "Exif:LensModel", ("jpg", "png")  # whose EXIF OpenImageIO leaves it out of
 NO_TIME = "1970:01:01 00:00:00"
 
 
@@ -70,8 +71,6 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> Stored:
     spec.attribute("Model", tags.model)
     spec.attribute("Software", f"clpipe {__version__}")
     for name, value in exif(tags, height, width).items():
-        if name == "LensModel" and path.suffix != ".tif":
-            continue
         if name == "ExposureTime":
             # OpenImageIO cuts off after the sixth digit, and 0.01 is 0.0099999998 as float32.
             above = float(np.nextafter(np.float32(value), np.float32(np.inf)))
@@ -80,8 +79,7 @@ def write_display(path: Path, pixels: Array, tags: Tags) -> Stored:
             spec.attribute(name if name == "FNumber" else f"Exif:{name}", value)
     if tags.taken or path.suffix == ".tif":
         spec.attribute("DateTime", tags.taken or NO_TIME)
-    lens = tags.lens if path.suffix != ".tif" else ""  # OpenImageIO writes it into a TIFF
-    return _write(path, spec, pixels.reshape(height, width, channels), lens)
+    return _write(path, spec, pixels.reshape(height, width, channels))
 
 
 def write_exr(
@@ -164,30 +162,22 @@ def write_grey_png(path: Path, pixels: Array) -> Stored:
     return _write(path, spec, pixels[..., np.newaxis])
 
 
-def _write(path: Path, spec: Any, pixels: Array, lens: str = "") -> Stored:
+def _write(path: Path, spec: Any, pixels: Array) -> Stored:
     """Write (height, width, channel) with OpenImageIO, which releases the GIL while it encodes.
-
-    Args:
-        path: the file.
-        spec: the ``oiio.ImageSpec``.
-        pixels: the samples.
-        lens: its model, which is put into the EXIF of a JPEG or a PNG.
 
     Raises:
         ImageError: the file cannot be written.
     """
-    encode = partial(_encode, path.suffix[1:], spec=spec, pixels=pixels)
-    return _stored(path, pixels.nbytes, encode, lens)
+    return _stored(path, pixels.nbytes, lambda to: _encode(path.suffix[1:], to, spec, pixels))
 
 
-def _stored(path: Path, size: int, encode: Callable[[str], None], lens: str = "") -> Stored:
+def _stored(path: Path, size: int, encode: Callable[[str], None]) -> Stored:
     """Write what an encoder makes.
 
     Args:
         path: the file.
         size: of the samples, in bytes.
         encode: writes to a path; an OSError says why it cannot.
-        lens: see :func:`_write`.
 
     Raises:
         ImageError: the file cannot be written.
@@ -203,7 +193,7 @@ def _stored(path: Path, size: int, encode: Callable[[str], None], lens: str = ""
                 mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as encoded,
                 memoryview(encoded) as data,
             ):
-                return write_whole(path, with_lens(bytes(data), lens) if lens else data)
+                return write_whole(path, data)
     except OSError as error:
         raise ImageError(f"{path}: cannot be written: {error.strerror or error}") from None
 
@@ -238,6 +228,8 @@ def _encode(format_: str, to: str, spec: Any, pixels: Array) -> None:
         raise OSError(0, error_text(file.geterror() if file else oiio.geterror()))
     if not file.close():
         raise OSError(0, error_text(file.geterror()))
+    if format_ in NO_LENS and (lens := spec.getattribute(LENS)):
+        Path(to).write_bytes(with_lens(Path(to).read_bytes(), lens))
 
 
 @cache
