@@ -35,6 +35,14 @@ poses_option = click.option(
     "OUT/cameras.json, OUT/transforms.json and OUT/sparse/0; see clpipe poses.",
 )
 
+annotations_option = click.option(
+    "--annotations",
+    type=click.Path(path_type=Path),
+    metavar="FILE.json",
+    help="Annotations of the renders in COCO's format: boxes, outlines, masks and keypoints go "
+    "through distortion, resizing and patches as the pixels do, to OUT/annotations.json.",
+)
+
 exclude_option = click.option(
     "--exclude",
     multiple=True,

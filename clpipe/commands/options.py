@@ -27,7 +27,7 @@ GROUPS = {
     "Pictures": "+output +format +keep bracket +patch patches_per_image augment webdataset licence "
     "author",
     "Truth": "+truth +carry truth_at",
-    "Inputs": "+poses +exclude layer transfer dump max_pixels",
+    "Inputs": "+poses +annotations +exclude layer transfer dump max_pixels",
     "Batches": "+device +redo jobs memory shard dask quiet json_lines trace +help +help_all",
 }
 

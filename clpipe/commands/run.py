@@ -7,6 +7,7 @@ from typing import Any, Literal
 import click
 
 from clpipe.base.errors import RequestError
+from clpipe.base.extras import require
 from clpipe.batch.api import MOST
 from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
@@ -21,6 +22,7 @@ from clpipe.commands.chain_options import (
     truth_at_option,
 )
 from clpipe.commands.input_options import (
+    annotations_option,
     exclude_option,
     layer_option,
     max_pixels_option,
@@ -35,8 +37,10 @@ from clpipe.commands.options import (
     quiet_option,
 )
 from clpipe.commands.progress import follow, print_line
+from clpipe.inputs.coco import Coco, read_coco
 from clpipe.inputs.find import Shard, parse_shard
 from clpipe.inputs.series import Series, parse_isos
+from clpipe.outputs.annotations import write_annotations
 from clpipe.outputs.existing import Redo
 from clpipe.outputs.patches import PER_IMAGE
 
@@ -75,6 +79,7 @@ from clpipe.outputs.patches import PER_IMAGE
 @patch_options
 @exclude_option
 @poses_option
+@annotations_option
 @layer_option
 @transfer_option
 @dump_option
@@ -142,6 +147,7 @@ def run(
     isos: str | None,
     exclude: tuple[str, ...],
     poses: Path | None,
+    annotations: Path | None,
     redo: str,
     selectors: tuple[str, ...],
     memory: int | None,
@@ -166,6 +172,9 @@ def run(
     clpipe run renders/ -o out --truth clean --set denoise.luma_strength=2
     """
     series = Series(cameras, parse_isos(isos) if isos is not None else ())
+    coco = None
+    if annotations is not None:
+        coco = read_annotations(annotations, per_tar, shard)
     patches = options["patch"], options["patches_per_image"], options["augment"]
     options["patches_per_image"] = patch_count(*patches)
     made = Run(
@@ -180,7 +189,26 @@ def run(
         click.echo(f"shard {shard.number} of {shard.of} has no images", err=True)
         return
     follow(made, made.outcomes(made.jobs), quiet or json_lines)
+    if coco and not made.summary.interrupted:
+        for folder in series.under(output):
+            for line in write_annotations(folder, coco):
+                click.echo(line, err=True)
     sys.exit(made.summary.exit_status)
+
+
+def read_annotations(path: Path, per_tar: int | None, shard: Shard) -> Coco:
+    """The annotations of a run's renders.
+
+    Raises:
+        RequestError: they cannot be read, or the run has not all of its pictures in its folder.
+    """
+    require("--annotations", "annotations", "pycocotools", "shapely")
+    if per_tar or shard.of > 1:
+        raise RequestError(
+            "--annotations: they are written of all pictures of a folder; leave --webdataset and "
+            "--shard out, or run once more without --shard when all parts are done"
+        )
+    return read_coco(path)
 
 
 def patch_count(

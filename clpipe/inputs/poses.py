@@ -44,12 +44,12 @@ def with_views(
     if path is None:
         return list(jobs)
     views = Views(read_views(path))
-    called = Counter(PurePosixPath(_stem(job.key)).name for job in jobs)
+    called = Counter(PurePosixPath(stem_of(job.key)).name for job in jobs)
     given = []
     for job in jobs:
         try:
-            files = [_stem(str(PurePosixPath(job.key).with_name(p.name))) for p in job.subframes]
-            of_files = [views.find(_stem(job.key), called)]
+            files = [stem_of(str(PurePosixPath(job.key).with_name(p.name))) for p in job.subframes]
+            of_files = [views.find(stem_of(job.key), called)]
             of_files += [view for file in files if (view := views.get(file, called))]
             at = job.paths.index(job.at("middle" if truth_at == "all" else truth_at))
             is_whole = len(of_files) == len(job.paths)
@@ -111,7 +111,7 @@ class Views:
     def __init__(self, views: Sequence[View]) -> None:
         self._by_path: dict[str, list[View]] = defaultdict(list)
         for view in views:
-            self._by_path[_stem(view.name)].append(view)
+            self._by_path[stem_of(view.name)].append(view)
         self._by_end: dict[str, list[str]] = defaultdict(list)
         for stem in self._by_path:
             parts = stem.split("/")
@@ -160,10 +160,10 @@ class Views:
         return views[0]
 
 
-def _stem(name: str) -> str:
+def stem_of(name: str) -> str:
     """The path of an image without its ending.
 
-    >>> _stem("./images/frame.0001"), _stem("a/b.exr"), _stem("../x/c.png")
+    >>> stem_of("./images/frame.0001"), stem_of("a/b.exr"), stem_of("../x/c.png")
     ('images/frame.0001', 'a/b', '../x/c')
     """
     return ENDING.sub("", os.path.normpath(name.replace("\\", "/")))

@@ -73,7 +73,7 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
             try:
                 values = values_in(read_bytes(path), path)
                 role = values and Rendition.from_record(values).role
-                file = values and _picture(path, values) if role in MODELS else None
+                file = values and picture_of(path, values) if role in MODELS else None
                 if not values or not role or not file:
                     continue
                 shown = file.relative_to(folder).as_posix()
@@ -97,7 +97,7 @@ def photographs(folder: Path, left_out: Mapping[str, list[str]]) -> Iterator[Pho
                 left_out["a sidecar that is damaged or of another version"].append(shown)
 
 
-def _picture(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
+def picture_of(sidecar: Path, values: Mapping[str, Any]) -> Path | None:
     """The picture of a sidecar; None where there is none.
 
     Raises:

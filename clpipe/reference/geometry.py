@@ -160,6 +160,28 @@ class Orientation:
         return None
 
 
+@dataclass(frozen=True)
+class Crop:
+    """A part of an image, by its upper left corner and its size."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """See :meth:`Geometry.size`."""
+        return self.width, self.height
+
+    def origins(self, x: Array, y: Array, width: int, height: int) -> tuple[Array, Array]:
+        """See :meth:`Geometry.origins`."""
+        return x + self.left, y + self.top
+
+    def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
+        """See :meth:`Geometry.intrinsics`; those of patches are not told."""
+        return None
+
+
 RESIDUAL = 1e-6  # px, in the image that a geometry gets
 STEP = 1e-3  # px, of the finite differences
 ITERATIONS = 20

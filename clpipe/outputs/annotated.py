@@ -1,0 +1,196 @@
+"""Annotations in COCO's form moved as pixels are: boxes, outlines, masks and keypoints."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from clpipe.base.errors import ImageError
+from clpipe.base.types import Array, Doubles, Mask
+from clpipe.inputs.coco import Record
+from clpipe.reference.carried import Layer, warp
+from clpipe.reference.geometry import Geometry, Margins, destinations
+
+STEP = 2.0  # px, of the pieces in which an outline is mapped
+SIMPLER = 0.05  # px, by which a mapped outline may be off to have fewer corners
+MOST_PLACES = 4096  # of a mask, by which it is known how much of it is cut off
+LEAST = 0.5  # px^2: what is left of a smaller object is left out
+
+
+@dataclass(frozen=True)
+class Way:
+    """How places of a render come into a picture.
+
+    Args:
+        geometry: how pixels move; None leaves them.
+        width, height: of the render.
+        margins: how far it goes on beyond that.
+        after: width and height of the picture.
+    """
+
+    geometry: Geometry | None
+    width: int
+    height: int
+    margins: Margins
+    after: tuple[int, int]
+
+    def places(self, points: Array) -> Doubles:
+        """Where places of the render, (point, 2), are; NaN where the picture cannot show them."""
+        corner = np.array([self.margins.left, self.margins.top])
+        at = (np.asarray(points, np.float64) + corner).T
+        if self.geometry is None:
+            return np.asarray(at.T)
+        whole = self.margins.around(self.width, self.height)
+        start = at * (np.array(self.after) / np.array(whole))[:, None]
+        there = destinations(self.geometry, (at[0], at[1]), (start[0], start[1]), *whole)
+        return np.stack(there, -1)
+
+    def shows(self, points: Array, there: Doubles) -> Mask:
+        """Whether places are in the render and in the picture."""
+        left, top, right, bottom = self.margins
+        low, high = [-left, -top], [self.width + right, self.height + bottom]
+        with np.errstate(invalid="ignore"):
+            inside = (there >= 0) & (there <= np.array(self.after))
+        return np.asarray((inside & (points >= low) & (points <= high)).all(-1))
+
+
+def mapped_annotation(annotation: Record, way: Way) -> Record | None:
+    """What changes of an annotation; None where nothing of its object is in the picture.
+
+    A box is made again of the mapped outline or mask, where there is one; else it is the box around
+    its own mapped edges. ``truncated`` is the share of the object that the picture does not show.
+
+    Raises:
+        ImageError: a mask is of another size than its image.
+    """
+    outline = annotation.get("segmentation") or None
+    changed: Record = {}
+    if isinstance(outline, dict):
+        found = _mapped_mask(outline, way)
+        if found is None:
+            return None
+        changed |= found
+    else:
+        parts = outline or [_box_outline(annotation["bbox"])]
+        clipped = _mapped_outline([np.reshape(part, (-1, 2)) for part in parts], way)
+        if clipped is None:
+            return None
+        polygons, share = clipped
+        low = np.min([part.min(0) for part in polygons], 0)
+        high = np.max([part.max(0) for part in polygons], 0)
+        changed["bbox"] = [*low.round(3).tolist(), *(high - low).round(3).tolist()]
+        area = sum(abs(_area(part)) for part in polygons)
+        changed |= {"area": round(area, 3), "truncated": round(1 - share, 4)}
+        if outline:
+            changed["segmentation"] = [part.round(3).ravel().tolist() for part in polygons]
+    if points := annotation.get("keypoints"):
+        changed |= _mapped_keypoints(points, way)
+    return changed
+
+
+def _box_outline(box: Sequence[float]) -> Array:
+    x, y, width, height = box
+    return np.array([[x, y], [x + width, y], [x + width, y + height], [x, y + height]])
+
+
+def _area(outline: Array) -> float:
+    """The signed area of an outline, (corner, 2), in px^2."""
+    x, y = outline.T
+    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
+
+
+def _mapped_outline(parts: Sequence[Array], way: Way) -> tuple[list[Array], float] | None:
+    """Outlines in the picture, and the share of their area in it; None where nothing is."""
+    from shapely import Polygon, box, make_valid
+    from shapely.ops import unary_union
+
+    left, top, right, bottom = way.margins
+    render = box(-left, -top, way.width + right, way.height + bottom)
+    picture = box(0, 0, *way.after)
+    whole, shown = 0.0, []
+    for part in parts:
+        own = make_valid(Polygon(part))
+        whole += _mapped(own, way)[0]
+        _, pieces = _mapped(own.intersection(render), way)
+        shown += [piece.intersection(picture) for piece in pieces]
+    kept = unary_union(shown).simplify(SIMPLER)
+    outlines = [np.array(piece.exterior.coords)[:-1] for piece in _polygons(kept)]
+    if sum(abs(_area(each)) for each in outlines) < LEAST:
+        return None
+    return outlines, min(sum(each.area for each in shown) / whole, 1.0)
+
+
+def _polygons(shape: Any) -> list[Any]:
+    """The polygons of a shape of shapely's."""
+    parts = getattr(shape, "geoms", [shape])
+    return [each for each in parts if each.geom_type == "Polygon" and each.area > 0]
+
+
+def _mapped(shape: Any, way: Way) -> tuple[float, list[Any]]:
+    """The area of a shape where it comes to lie, with what cannot be shown, and its polygons."""
+    from shapely import Polygon, make_valid
+
+    area, found = 0.0, []
+    for polygon in _polygons(shape):
+        corners = np.array(polygon.exterior.coords)
+        dense = np.concatenate(
+            [
+                np.linspace(a, b, max(int(np.hypot(*(b - a)) / STEP), 1), endpoint=False)
+                for a, b in pairwise(corners)
+            ]
+        )
+        there = way.places(dense)
+        known = np.isfinite(there).all(-1)
+        if known.sum() >= 3:
+            moved = make_valid(Polygon(there[known]))
+            area += moved.area / known.mean()
+            found += _polygons(moved)
+    return area, found
+
+
+def _mapped_mask(encoded: Record, way: Way) -> Record | None:
+    """A run-length encoded mask in the picture, its area and box; None where nothing is in it.
+
+    Raises:
+        ImageError: it is of another size than its image.
+    """
+    from pycocotools import mask as coder
+
+    height, width = encoded["size"]
+    if (width, height) != (way.width, way.height):
+        of = f"an image of {way.width}x{way.height}"
+        raise ImageError(f"a mask of {width}x{height} pixels in {of}")
+    is_text = not isinstance(encoded["counts"], list)
+    own = encoded if is_text else coder.frPyObjects(encoded, height, width)
+    mask = coder.decode(own)[..., None]
+    layer = Layer("label", mask, way.margins.left, way.margins.top)
+    (moved,), _ = warp([layer], way.geometry, *way.margins.around(width, height))
+    if not moved.any():
+        return None
+    packed = coder.encode(np.asfortranarray(moved[..., 0]))
+    counts: Any = packed["counts"].decode("ascii")
+    if not is_text:
+        flat = moved[..., 0].ravel(order="F")
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], flat, [2]])))
+        counts = np.diff(np.concatenate([[0], edges])).tolist()
+    y, x = np.nonzero(mask[..., 0])
+    some = slice(None, None, max(len(x) // MOST_PLACES, 1))
+    points = np.stack([x[some], y[some]], -1) + 0.5
+    return {
+        "segmentation": {"size": list(moved.shape[:2]), "counts": counts},
+        "bbox": coder.toBbox(packed).tolist(),
+        "area": float(moved.sum()),
+        "truncated": round(1 - float(way.shows(points, way.places(points)).mean()), 4),
+    }
+
+
+def _mapped_keypoints(points: Sequence[float], way: Way) -> Record:
+    """Keypoints in the picture; those beside it are not labelled there."""
+    found = np.reshape(np.asarray(points, np.float64), (-1, 3))
+    there = way.places(found[:, :2])
+    inside = way.shows(found[:, :2], there) & (found[:, 2] > 0)
+    kept = np.where(inside[:, None], np.column_stack([there.round(3), found[:, 2]]), 0)
+    values = [int(v) if i % 3 == 2 else v for i, v in enumerate(kept.ravel().tolist())]
+    return {"keypoints": values, "num_keypoints": int(inside.sum())}

@@ -1,0 +1,156 @@
+"""Annotations of renders as those of their pictures: COCO's boxes, outlines, masks and keypoints.
+
+They go through what moves the pixels (distortion, resizing, patches), as the sidecars say it. COCO
+counts places in px from the corner, as clpipe does (https://cocodataset.org/#format-data).
+"""
+
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from clpipe.base.errors import ClpipeError, ImageError, RequestError
+from clpipe.base.files import write_new
+from clpipe.base.reading import read_bytes
+from clpipe.chain.chain import Chain
+from clpipe.chain.overscan import with_overscan
+from clpipe.chain.rendition import NOISY, Rendition
+from clpipe.chain.request import Request
+from clpipe.images.tags import FLIPS
+from clpipe.inputs.coco import Coco, Record
+from clpipe.inputs.poses import Views, stem_of
+from clpipe.inputs.render_cameras import View
+from clpipe.outputs.annotated import Way, mapped_annotation
+from clpipe.outputs.patches import patch_name
+from clpipe.outputs.photographs import picture_of
+from clpipe.outputs.sealed import SIDECAR, SidecarError, json_text, values_in
+from clpipe.reference.geometry import (
+    Composition,
+    Crop,
+    Margins,
+    Orientation,
+)
+
+ANNOTATIONS = "annotations.json"
+LENGTHS = ("focal_length", "sensor_width")  # that an image may say of itself
+
+
+def write_annotations(folder: Path, coco: Coco) -> list[str]:
+    """Write the annotations of all noisy pictures of a folder, as COCO's format has them.
+
+    Args:
+        folder: of a run, or of one of its series.
+        coco: of the renders.
+
+    Returns:
+        Lines for people: what was written, and what could not be.
+
+    Raises:
+        ImageError: the file cannot be written.
+    """
+    views = Views([View(image["file_name"], {"image": image}) for image in coco.values["images"]])
+    images: list[Record] = []
+    found: list[Record] = []
+    lines: list[str] = []
+    sidecars = list(_sidecars(folder))
+    called = Counter(
+        PurePosixPath(name).name
+        for name in {stem_of(str(values["input"])) for _, values in sidecars}
+    )
+    unnamed = 0
+    for path, values in sidecars:
+        try:
+            view = views.find(stem_of(str(values["input"])), called)
+        except RequestError:
+            unnamed += 1
+            continue
+        source = view.values["image"]
+        try:
+            for file, way in _pictures(path, values, source):
+                name, (width, height) = file.relative_to(folder).as_posix(), way.after
+                own = {"id": len(images) + 1, "file_name": name, "width": width, "height": height}
+                images.append(source | own)
+                for each in coco.of_image[source["id"]]:
+                    if mapped := mapped_annotation(each, way):
+                        ids = {"id": len(found) + 1, "image_id": len(images)}
+                        found.append({**each, **mapped, **ids})
+        except (ClpipeError, KeyError, TypeError, ValueError) as error:
+            lines.append(f"warning: {path}: its annotations are left out: {error}")
+    if unnamed:
+        lines.append(f"warning: {unnamed} pictures are of renders that {coco.file} does not name")
+    written = {**coco.values, "images": images, "annotations": found}
+    write_new(folder / ANNOTATIONS, json_text(written).encode())
+    told = f"{len(found)} annotations of {len(images)} pictures"
+    return [f"wrote {folder / ANNOTATIONS}: {told}", *lines]
+
+
+def _sidecars(folder: Path) -> Iterator[tuple[Path, Mapping[str, Any]]]:
+    """The sidecars of noisy pictures, sorted."""
+    found = sorted(
+        Path(place, name)
+        for place, _, names in os.walk(folder)
+        for name in names
+        if name.endswith(f".{SIDECAR}") and not name.startswith(".")
+    )
+    for path in found:
+        try:
+            values = values_in(read_bytes(path), path)
+            if values and Rendition.from_record(values).role == NOISY:
+                yield path, values
+        except (SidecarError, OSError, KeyError, TypeError, ValueError):
+            continue  # which the run has told
+
+
+def _pictures(path: Path, values: Mapping[str, Any], source: Record) -> Iterator[tuple[Path, Way]]:
+    """The pictures of a sidecar: each file, and how a render's places come into it.
+
+    Raises:
+        ImageError: the render is of another size than the annotations say.
+        KeyError, TypeError, ValueError: the values are damaged.
+        ClpipeError: the chain cannot be made again.
+    """
+    chain = chain_of(values)
+    parts = chain.geometry.parts if chain.geometry else ()
+    own = source["width"], source["height"]
+    size = chain.size(*chain.margins.around(*own))
+    if size != (values["width"], values["height"]):
+        raise ImageError(
+            f"the annotations are of {source['width']}x{source['height']} pixels, of which a "
+            f"picture of {size[0]}x{size[1]} would be made, but it has "
+            f"{values['width']}x{values['height']}"
+        )
+    if "patches" not in values:
+        file = picture_of(path, values)
+        if file:
+            yield file, Way(Composition(parts) if parts else None, *own, chain.margins, size)
+        return
+    side = values["request"]["patch"]
+    formats = values["request"]["formats"]
+    stem = path.name.removesuffix(f".{SIDECAR}")
+    for number, patch in enumerate(values["patches"]):
+        left, top = patch["place"]
+        turned = Orientation(*FLIPS[patch["turn"]])
+        cut = (*parts, Crop(left, top, side, side), turned)
+        file = path.with_name(f"{stem}{patch_name(number)}.{formats[0]}")
+        yield file, Way(Composition(cut), *own, chain.margins, (side, side))
+
+
+def chain_of(values: Mapping[str, Any]) -> Chain:
+    """The chain of a picture, as its sidecar says it.
+
+    Raises:
+        ClpipeError: it cannot be made again.
+        KeyError, TypeError, ValueError: the values are damaged.
+    """
+    request = Request.from_record(values["request"])
+    settings = request.settings()
+    known = settings.render.model_dump(exclude_none=True)
+    said = {name: values["output"].get(name) for name in LENGTHS if name not in known}
+    said = {name: value for name, value in said.items() if value is not None}
+    if said:
+        image = {**request.image, "render": {**request.image.get("render", {}), **said}}
+        request = request.for_image(request.image_name, image)
+    chain = request.chain()
+    overscan = values.get("overscan")
+    return with_overscan(chain, Margins(**overscan)) if overscan else chain
