@@ -274,7 +274,7 @@ def test_a_lens_for_a_smaller_sensor_is_said_as_such(lensfun):
         (True, "Maker 16mm was calibrated on a sensor smaller than"),
         (False, "fold the image over"),
     ):
-        lensfun(by_name.LensCalibration("Maker 16mm", 16.0, folding, {}, smaller))
+        lensfun(by_name.LensCalibration("Maker 16mm", 16.0, folding, {}, 1.0, smaller))
         pipeline = clpipe_api.Pipeline(lens="a", device="numpy")
         with pytest.raises(ImageError, match=message):
             pipeline.process(image, "a")

@@ -119,6 +119,21 @@ def test_a_lens_and_a_raw_say_the_same(clpipe, grey):
     assert raw[0xA434] == tags[0xA434]
 
 
+def test_the_equivalent_focal_length_follows_from_what_is_known(clpipe, grey):
+    """From the focal length in px and mm, or of a lens by name from the camera's sensor."""
+    pose = {"R": np.eye(3).tolist(), "t": [0, 0, 0], "K": [[24, 0, 18], [0, 24, 12], [0, 0, 1]]}
+    Path("cameras.json").write_text(json.dumps({"views": [{"file": "a.exr", **pose}]}))
+    run = ("run", "in/a.exr", *RUN)
+    clpipe(*run, "-o", "o", "--poses", "cameras.json", "--focal-length", 16)
+    assert exif("o/a.png")[0xA405] == 24  # 24 px of 36 are as 16 mm of 24, and 24 of 36
+    clpipe(*run, "-o", "p", "--focal-length", 16)
+    assert 0xA405 not in exif("p/a.png")
+    pytest.importorskip("lensfunpy")
+    zoom = ("--lens", "Canon EF 24-70mm f/2.8L", "--focal-length", 35)
+    clpipe(*run, "-o", "q", *zoom, "--camera", "sony-a7r2")
+    assert exif("q/a.png")[0xA405] == 35
+
+
 @pytest.mark.parametrize("style", ["standard", "neutral", "camera_raw", "linear"])
 def test_a_picture_is_what_its_photometry_says(clpipe, write_exr, style):
     ramp = np.linspace(0.002, 1.6, 40 * 30, dtype=np.float32).reshape(30, 40, 1).repeat(3, 2)

@@ -31,6 +31,7 @@ class LensCalibration:
         focal_length: in mm.
         distortion, vignetting: the method of the stage and its parameters; empty where lensfun
             knows none.
+        crop_factor: of the sensor that the picture is of: the diagonal of 35 mm film over its own.
         is_of_smaller_sensor: whether it was calibrated on a smaller sensor than the camera's.
     """
 
@@ -38,6 +39,7 @@ class LensCalibration:
     focal_length: float
     distortion: Mapping[str, Any]
     vignetting: Mapping[str, Any]
+    crop_factor: float = 1.0
     is_of_smaller_sensor: bool = False
 
 
@@ -90,7 +92,8 @@ def _calibration(
             terms = (term * ratio ** (2 * i) for i, term in enumerate(found.terms, 1))
             falloff = {"method": "pa"} | dict(zip(("k1", "k2", "k3"), terms, strict=True))
     is_smaller = crop is not None and lens.crop_factor > crop * SAME_CROP
-    return LensCalibration(_full(lens), focal, bend, falloff, is_smaller)
+    own = crop or lens.crop_factor
+    return LensCalibration(_full(lens), focal, bend, falloff, own, is_smaller)
 
 
 def lens_names() -> list[str]:

@@ -1,11 +1,12 @@
 """The shot that a picture's EXIF tells of: what is stated of its camera, and how it was exposed."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.photometry import Estimates, exposure_of
 from clpipe.images.read import SourceImage
-from clpipe.images.tags import TAG_ATTRIBUTES, Tags, exposed_attributes
+from clpipe.images.tags import TAG_ATTRIBUTES, Tags, exposed_attributes, sensor_width
 from clpipe.stage import StageRole
 
 
@@ -30,9 +31,34 @@ def tags_of(chain: Chain, source: SourceImage, tags: Tags, estimates: Estimates)
         focus_distance=optics.focus_distance or tags.focus_distance,
         aperture=optics.f_number or tags.aperture,
         focal_length=optics.focal_length or own.get("focal_length"),
-        sensor_width=optics.sensor_width or own.get("sensor_width"),
+        sensor_width=sensor_of(chain, source, own),
         encoding=chain.settings.output,
     )
+
+
+def sensor_of(chain: Chain, source: SourceImage, own: Mapping[str, float]) -> float | None:
+    """The width of a picture's sensor in mm, along the longer side; None where it is not known.
+
+    It is stated, or follows from the focal length in mm and in px, or is that of the camera which
+    a lens by name stands on.
+
+    Args:
+        chain: of the picture.
+        source: the image, as it was loaded.
+        own: what that says of its shot.
+    """
+    optics = chain.optics
+    if stated := optics.sensor_width or own.get("sensor_width"):
+        return stated
+    length = optics.focal_length or own.get("focal_length")
+    if length is None or source.pixels.ndim != 3:
+        return None
+    width, height = source.margins.inside(*source.pixels.shape[1::-1])
+    if camera := chain.intrinsics_of_render(width, height, source.shot):
+        return length / camera.fx * max(width, height)
+    if lens := optics.calibration:
+        return sensor_width(length, length * lens.crop_factor, height, width)
+    return None
 
 
 def kept_tags(chain: Chain, step: Step, source: SourceImage, tags: Tags) -> dict[str, str]:
