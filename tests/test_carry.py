@@ -361,3 +361,35 @@ def test_names_that_say_what_they_belong_to():
     assert owner_of(Path("in/table_top.exr")) is None
     with pytest.raises(RequestError, match="twice"):
         parse_carry(["a:depth", "A:label"])
+
+
+@pytest.mark.parametrize("turned", [(), ("--augment",)])
+def test_patches_have_their_layers(clpipe, render, turned):
+    """Each patch's are those of the picture, at its place, turned as it is."""
+    render(height=40, width=56, only=("R", "G", "B", "View.Depth.Z", "View.IndexOB.X"))
+    given = (*RUN, "in", *HALF, *carrying("Depth:png", "IndexOB"))
+    clpipe(*given)
+    whole, depth = planes(), np.asarray(Image.open("out/a.Depth.png"))
+    patches = ("--patch", 12, "--patches-per-image", 4, *turned)
+    clpipe(*[each if each != "out" else "patches" for each in given], *patches, "--format", "png")
+    places = json.loads(Path("patches/a.json").read_text())["patches"]
+    for number, patch in enumerate(places):
+        left, top = patch["place"]
+
+        def cut(image, left=left, top=top, turn=patch["turn"]):
+            return upright(image[top : top + 12, left : left + 12], turn)
+
+        own = planes(Path(f"patches/a_{number:04}.carried.exr"))
+        assert own.keys() == whole.keys()
+        for name, plane in own.items():
+            np.testing.assert_array_equal(plane, cut(whole[name]))
+        png = np.asarray(Image.open(f"patches/a_{number:04}.Depth.png"))
+        np.testing.assert_array_equal(png, cut(depth))
+    again = [each if each != "out" else "patches" for each in given]
+    assert "there already" in clpipe(*again, *patches, "--format", "png").stderr
+
+
+def test_patches_that_are_turned_have_no_vectors(clpipe, render):
+    render(height=40, width=56)
+    given = (*RUN, "in", *carrying("Normal"), "--patch", 12, "--format", "png")
+    assert "augment flips and turns patches" in clpipe(*given, "--augment", status=1).stderr

@@ -429,7 +429,6 @@ def test_the_variance_of_patches(clpipe, renders):
     [
         (("--patch", 12, "--format", "dng"), "--patch: dng holds whole images"),
         (("--patch", 12, "--patches-per-image", "grit"), "found 'grit'; expected 1 to 9999, or"),
-        (("--patch", 12, "--carry", "Depth"), "--patch: no layers go along"),
         (("--augment",), "--augment: it is about patches; say --patch SIZE"),
     ],
 )

@@ -165,8 +165,10 @@ class ImageWorker:
             height, width = loaded.source.pixels.shape[:2]
             state.patches = every_patch(patches, loaded.chain, width, height, job.key)
         if any(map(self.writer.carries, renditions)):
-            orientation = self.writer.picture_orientation(loaded.source, loaded.chain)
-            state.aovs = state.loader.aovs(job, loaded, orientation)
+            upright = self.writer.picture_orientation(loaded.source, loaded.chain)
+            state.aovs = state.loader.aovs(job, loaded, 1 if patches else upright)
+            if patches and patches.augment:
+                state.aovs.check_turns()
         state.source = loaded.source
         recipes = self.writer.plan_of(job).recipes(loaded.chain, loaded.key)
         state.recipes = [recipe for recipe in recipes if recipe.rendition in renditions]

@@ -16,7 +16,6 @@ from clpipe.chain.identity import noise_key, of_frame
 from clpipe.dataset.developer import MAX_CHAINS, Developer, Sample, SampleSpec
 from clpipe.engine.device import open_device
 from clpipe.images.read import SourceImage
-from clpipe.inputs.carry import Aovs
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.inputs.raw import RawImage
@@ -117,7 +116,7 @@ class SampleLoader:
                 named = {**along.arrays(), VALID: along.valid}
                 carried = {f"carried.{name}": array for name, array in named.items()}
                 if self.patches and self.patches.augment:
-                    check_turns(along)
+                    along.check_turns()
         except (ImageError, RequestError, MemoryError) as error:
             raise ImageError(loader.error_text(job, error)) from None
         if loaded is None:
@@ -201,17 +200,3 @@ class SampleLoader:
             if self._opened is None or self._opened.process != os.getpid():
                 self._opened = Developer(open_device(self._device), self._spec)
             return self._opened
-
-
-def check_turns(carried: Aovs) -> None:
-    """See that layers can be flipped and turned, which vectors are not by moving their pixels.
-
-    Raises:
-        RequestError: one holds vectors.
-    """
-    for layer in carried.layers:
-        if layer.kind in ("normal", "flow"):
-            raise RequestError(
-                f"--carry {layer.name}: augment flips and turns patches, but not the directions "
-                f"that a layer of {layer.kind} holds; leave one of them out"
-            )

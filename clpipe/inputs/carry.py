@@ -2,7 +2,7 @@
 
 import os
 from bisect import bisect_left
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.digests import digests, stamp_of
-from clpipe.base.errors import ImageError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import unchanged
 from clpipe.base.text import one_of
 from clpipe.base.types import Array
@@ -69,6 +69,24 @@ class Aovs:
     layers: tuple[Aov, ...]
     valid: Array
     attributes: Mapping[str, str]
+
+    def changed(self, change: Callable[[Array], Array]) -> "Aovs":
+        """Layers whose pixels are changed, as those of a patch are cut out."""
+        layers = (replace(layer, pixels=change(layer.pixels)) for layer in self.layers)
+        return replace(self, layers=tuple(layers), valid=change(self.valid))
+
+    def check_turns(self) -> None:
+        """See that layers can be flipped and turned, which vectors are not by moving their pixels.
+
+        Raises:
+            RequestError: one holds vectors.
+        """
+        for layer in self.layers:
+            if layer.kind in ("normal", "flow"):
+                raise RequestError(
+                    f"--carry {layer.name}: augment flips and turns patches, but not the "
+                    f"directions that a layer of {layer.kind} holds; leave one of them out"
+                )
 
     def arrays(self) -> dict[str, Array]:
         """The layers as they were asked for, (height, width, channel); a Cryptomatte's in one."""

@@ -120,14 +120,16 @@ class OutputWriter:
         is_first = rendition.is_first and rendition.ev in (None, *self.request.bracket[:1])
         return bool(self.request.carry) and is_first
 
-    def _carried_files(self, job: Job, rendition: Rendition) -> dict[str, Path]:
-        """The files of carried layers: that of all, "", and the PNG of each depth by its name."""
+    def _carried_files(
+        self, job: Job, rendition: Rendition, patch: int | None = None
+    ) -> dict[str, Path]:
+        """The files of carried layers: that of all, "", and the PNGs of some by their names."""
         if not self.carries(rendition):
             return {}
         depths = [each.name for each in self.request.aov_specs() if each.png]
         return {
-            "": self.path(job, f"{CARRIED}.exr"),
-            **{name: self.path(job, png_ending(name)) for name in depths},
+            "": self.path(job, f"{CARRIED}.exr", patch=patch),
+            **{name: self.path(job, png_ending(name), patch=patch) for name in depths},
         }
 
     def _kept_steps(self, recipe: Recipe) -> list[str]:
@@ -175,11 +177,6 @@ class OutputWriter:
                     f"--patch: {format_} holds whole images; write patches with --format npy, png, "
                     "tif or jpg"
                 )
-        if self.request.carry:
-            raise RequestError(
-                "--patch: no layers go along with patches in files; leave --carry out, or use "
-                "clpipe.Dataset"
-            )
         if self.request.baselines:
             raise RequestError(
                 "--patch: the noise of a baseline is measured on whole pictures; leave one of "
@@ -239,7 +236,8 @@ class OutputWriter:
         numbers = range(count) if self.patches else (None,)
         endings = [ending_of(format_) for format_ in self.formats_of(rendition)]
         pictures = [self.path(job, ending, rendition, n) for n in numbers for ending in endings]
-        pictures += self._carried_files(job, rendition).values()
+        for n in numbers:
+            pictures += self._carried_files(job, rendition, n).values()
         endings = [f"{step}.{self.kept_format}" for step in self.keep_of(rendition)]
         kept = [self.path(job, ending, rendition, n) for n in numbers for ending in endings]
         return Existing(self.path(job, SIDECAR, rendition), pictures, kept)
@@ -297,8 +295,11 @@ class OutputWriter:
         for number, part in parts_of(recipe, result, patches):
             outputs |= self._write(job, recipe, source, part, number)
         if carried:
-            for layer, path in self._carried_files(job, recipe.rendition).items():
-                outputs[path] = write_carried(path, carried, layer)
+            own: list[tuple[int | None, Aovs]]
+            own = [(n, carried.changed(patch.cut_out)) for n, patch in enumerate(patches)]
+            for number, layers in own or [(None, carried)]:
+                for layer, path in self._carried_files(job, recipe.rendition, number).items():
+                    outputs[path] = write_carried(path, layers, layer)
         return outputs
 
     def _write(
