@@ -11,6 +11,8 @@ from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.dataset.arrays import packed
 from clpipe.dataset.numbering import Numbering
+from clpipe.engine.buffers import Pool
+from clpipe.engine.flow import Flow
 from clpipe.images.tags import FLIPS, upright
 from clpipe.outputs.patches import Cutting, first_place
 from clpipe.reference.cfa import PATTERNS
@@ -192,6 +194,27 @@ def test_samples_do_not_depend_on_order_shards_and_epochs(renders):
     assert len(set(places)) > 12 and places[:9] != places[9:]
     other = api.Dataset(renders, iso=ISO, patch=api.Patches(16, 3), seed=1)
     assert [tuple(s["place"]) for s in other] != places[:9]
+
+
+def test_no_buffer_goes_while_an_image_is_on_the_way(renders, monkeypatch):
+    """Memory of the host that a device works in would be freed under its kernels."""
+    flows, replaced = [], []
+    start, reserve = Flow.start, Pool.reserve
+
+    def started(flow, *given):
+        flows.append(flow)
+        return start(flow, *given)
+
+    def reserved(pool, *given):
+        before, on_the_way = pool.generation, len(flows[-1]._tiles)
+        reserve(pool, *given)
+        if pool.generation != before:
+            replaced.append(on_the_way)
+
+    monkeypatch.setattr(Flow, "start", started)
+    monkeypatch.setattr(Pool, "reserve", reserved)
+    list(api.Dataset(renders, iso=ISO, patch=api.Patches(16, 3), epochs=2))
+    assert len(replaced) > 1 and not any(replaced)
 
 
 def test_training_goes_on_where_it_was(renders):

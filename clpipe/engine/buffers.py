@@ -119,6 +119,11 @@ class Pool:
         self.buffers: dict[str, Any] = {}
         self.generation = 0  # counts up when a buffer is replaced
 
+    def has(self, sizes: Mapping[str, int], memory: int) -> bool:
+        """Whether :meth:`reserve` would release none of its buffers and make none."""
+        is_there = all(n in self.buffers and self.buffers[n].size >= s for n, s in sizes.items())
+        return is_there and self.bytes <= memory
+
     def reserve(self, sizes: Mapping[str, int], memory: int) -> None:
         """Make sure that there are buffers of at least these sizes (bytes by name).
 

@@ -144,7 +144,10 @@ class Flow:
         # Nothing is known of what buffers hold until all is enqueued.
         known, self._launch_cache, after = self._launch_cache, LaunchCache(), LaunchCache()
         tiling, task = image.tiling, image.task
-        self.pool.reserve(self._transfers.needs(tiling.sizes), memory)
+        needs = self._transfers.needs(tiling.sizes)
+        if not self.pool.has(needs, memory):
+            self.drain()  # a buffer's memory on the host goes with it, whatever writes there
+        self.pool.reserve(needs, memory)
         if task.plan.incremental and image.is_whole:
             numbers, after = known.next(
                 image.calls,
