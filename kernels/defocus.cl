@@ -1,29 +1,50 @@
-// Light spread over discs. Tap k is three numbers: how far it is to the right and down, and the radius at
-// which a disc's edge is there. `radii` has those of all pixels of the whole image, below 0 in front of
-// what is in focus, with `reach` mirrored pixels on every side and a vector more at the right. An image larger
-// than it, as one that kernels are tried on, repeats its last row and vector.
+// Light spread over discs, and hidden by what is in front. Tap k is four numbers: how far it is to the right
+// and down, the radius at which a disc's edge is there, and its weight for what is hidden. `radii` has those
+// of all pixels of the whole image, below 0 in front of what is in focus, with `reach` mirrored pixels on
+// every side and a vector more at the right. An image larger than it, as one that kernels are tried on,
+// repeats its last row and vector.
+typedef struct { rgb light; vf total; } surface;
+
+INLINE void add(surface *to, vf share, rgb c) {
+    to->light.r += share * c.r;
+    to->light.g += share * c.g;
+    to->light.b += share * c.b;
+    to->total += share;
+}
+
+INLINE vf unit(vf x) { return vmin(vmax(x, (vf)(0.0f)), (vf)(1.0f)); }
+
+INLINE vf area(vf radius) { return vmax(radius + 0.5f, 3.14159265f * (radius * radius) + 0.261799388f); }
+
 INLINE rgb defocus(site at, src_image src, __global const float *radii, int columns, int rows, int reach,
                    __global const float *taps, int count) {
     const int last_x = columns - 2 * reach - LANES, last_y = rows - 2 * reach - 1;
     const int x = (int)at.x < last_x ? (int)at.x : last_x, y = (int)at.y < last_y ? (int)at.y : last_y;
     __global const float *here = radii + (long)(y + reach) * columns + (x + reach);
-    const vf own = load(here), size = vmax(own, -own);
-    rgb light = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
-    vf total = (vf)(0.0f);
+    const vf own = load(here), size = vmax(own, -own), own_area = area(size);
+    const vf none = (vf)(0.0f), all = (vf)(1.0f);
+    surface front = {{none, none, none}, none}, level = front, behind = front;
+    vf free = none;
     for (int k = 0; k < count; ++k) {
-        __global const float *tap = taps + 3 * k;
+        __global const float *tap = taps + 4 * k;
         const int dx = (int)tap[0], dy = (int)tap[1];
+        const float soft = 0.5f - tap[2];
         const vf there = load(here + (long)dy * columns + dx);
-        vf disc = vmax(there, -there);
-        disc = there > own ? vmin(disc, size) : disc;
-        const vf cover = vmin(vmax(disc + (0.5f - tap[2]), (vf)(0.0f)), (vf)(1.0f));
-        const vf weight = cover / vmax(disc + 0.5f, 3.14159265f * (disc * disc) + 0.261799388f);
+        const vf disc = vmax(there, -there), weight = unit(disc + soft) / area(disc);
+        const vf nearer = unit(own - there), farther = unit(there - own);
         const rgb c = src_tap(src, dx, dy);
-        light.r += weight * c.r;
-        light.g += weight * c.g;
-        light.b += weight * c.b;
-        total += weight;
+        add(&front, nearer * weight, c);
+        add(&level, (all - nearer - farther) * weight, c);
+        add(&behind, farther * (weight + tap[3]), c);
+        free += (all - nearer) * (unit(size + soft) / own_area);
     }
-    const rgb spread = {light.r / total, light.g / total, light.b / total};
+    const vi seen = behind.total > none;
+    const vf left = all - vmin(front.total, all);
+    const vf covered = seen ? left * vmin(level.total / free, all) : left;
+    const vf of_front = all / vmax(front.total, all), of_level = covered / level.total;
+    const vf of_behind = (left - covered) / (seen ? behind.total : all);
+    const rgb spread = {front.light.r * of_front + level.light.r * of_level + behind.light.r * of_behind,
+                        front.light.g * of_front + level.light.g * of_level + behind.light.g * of_behind,
+                        front.light.b * of_front + level.light.b * of_level + behind.light.b * of_behind};
     return spread;
 }

@@ -12,6 +12,7 @@ from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.reference.image import tap
 
+HIDDEN = 1.0  # a weight, see aperture_taps
 FAR = 1e9  # from here on a surface is infinitely far; Blender's sky is at 1e10
 
 
@@ -55,27 +56,31 @@ def checked_depth(pixels: Array) -> Floats:
 
 @lru_cache(maxsize=64)
 def aperture_taps(blades: int, largest: float) -> Floats:
-    """The places that a disc may cover, with its edge: (tap, 3) float32, by rows.
+    """The places that a disc may cover, with its edge: (tap, 4) float32, by rows.
 
-    Each is dx and dy in px from the pixel that light falls on to the one it comes from, and the
-    radius of the aperture's image whose edge is there: that of a circle around its corners.
+    Each is dx and dy in px from the pixel that light falls on to the one it comes from, the radius
+    of the aperture's image whose edge is there (that of a circle around its corners), and the
+    weight with which it stands for a surface that another hides.
 
     Args:
         blades: corners of the aperture, of which one is below the middle; 0 is round.
         largest: radius of a disc, in px.
 
-    >>> aperture_taps(0, 0.75).astype(int).tolist()
+    >>> aperture_taps(0, 0.75)[:, :3].astype(int).tolist()
     [[0, -1, 1], [-1, 0, 1], [0, 0, 0], [1, 0, 1], [0, 1, 1]]
     """
     reach = reach_of(largest)
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1].astype(np.float64)
     radius = np.hypot(x, y)
+    # The nearest pixels before all others.
+    hidden = HIDDEN / (1 + (x * x + y * y) ** 2)
     if blades:
         sides = (2 * np.arange(blades) + 1) * np.pi / blades
         across = np.multiply.outer(np.sin(sides), x) + np.multiply.outer(np.cos(sides), y)
         radius = across.max(0) / np.cos(np.pi / blades)
     kept = radius < largest + 0.5
-    return np.ascontiguousarray(np.stack([x[kept], y[kept], radius[kept]], 1), np.float32)
+    taps = [x[kept], y[kept], radius[kept], hidden[kept]]
+    return np.ascontiguousarray(np.stack(taps, 1), np.float32)
 
 
 def reach_of(largest: float) -> int:
@@ -88,27 +93,49 @@ def reach_of(largest: float) -> int:
 
 
 def defocus(image: Floats, radii: Floats, taps: Floats) -> Floats:
-    """Each pixel's light spread over its disc.
+    """Each pixel's light spread over its disc, and hidden by what is in front.
 
     The light of pixel q counts at p where its disc, with an edge 1 px wide, covers p, divided by
-    the disc's area. What lies behind p counts with the smaller disc of both, so that what is sharp
-    hides it.
+    the disc's area. Seen from p, what is around belongs to surfaces in front of p's own, to that,
+    or behind it, with 1 px of radius between them. The first take what their discs cover of p's
+    aperture. Of what is left, p's own surface takes the share of its disc's area where it is, of
+    that where nothing in front hides it: inside the edge of something that is out of focus, light
+    from behind passes by. That place is hidden in the render, and looks as what is nearest behind.
+
+    Layers around a pixel are after Jimenez ("Next generation post processing in Call of Duty",
+    SIGGRAPH 2014), what is hidden after Kraus and Strengert ("Depth-of-field rendering by pyramidal
+    image processing", Eurographics 2007).
 
     Args:
         image: (height, width, 3).
         radii: of the discs in px, (height, width); below 0 in front of what is in focus.
         taps: see :func:`aperture_taps`.
     """
-    half, third, circle = np.float32(0.5), np.float32(np.pi / 12), np.float32(np.pi)
+    zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
     own, size = radii, abs(radii)
-    light: Floats = np.zeros(image.shape, np.float32)
-    total: Floats = np.zeros(radii.shape, np.float32)
-    for dx, dy, edge in taps:
+    area = _area(size)
+    light: Floats = np.zeros((3, *image.shape), np.float32)  # of what is in front, level and behind
+    total: Floats = np.zeros((3, *radii.shape), np.float32)
+    free: Floats = np.zeros(radii.shape, np.float32)
+    for dx, dy, edge, hidden in taps:
         there = tap(radii, int(dx), int(dy))
         disc = abs(there)
-        disc = np.where(there > own, np.minimum(disc, size), disc)
-        cover = np.clip(disc + (half - edge), np.float32(0), np.float32(1))
-        weight = cover / np.maximum(disc + half, circle * (disc * disc) + third)
-        light += weight[..., None] * tap(image, int(dx), int(dy))
-        total += weight
-    return np.asarray(light / total[..., None])
+        weight = np.clip(disc + (half - edge), zero, one) / _area(disc)
+        nearer, farther = np.clip(own - there, zero, one), np.clip(there - own, zero, one)
+        level = one - nearer - farther
+        shares = np.stack([nearer * weight, level * weight, farther * (weight + hidden)])
+        light += shares[..., None] * tap(image, int(dx), int(dy))
+        total += shares
+        free += (one - nearer) * (np.clip(size + (half - edge), zero, one) / area)
+    in_front, level, behind = total
+    left = one - np.minimum(in_front, one)
+    covered = np.where(behind > 0, left * np.minimum(level / free, one), left)
+    of_behind = (left - covered) / np.where(behind > 0, behind, one)
+    shares = np.stack([one / np.maximum(in_front, one), covered / level, of_behind])
+    return np.asarray((light * shares[..., None]).sum(0))
+
+
+def _area(radius: Floats) -> Floats:
+    """What a disc with a soft edge covers, in px."""
+    whole = np.float32(np.pi) * (radius * radius) + np.float32(np.pi / 12)
+    return np.asarray(np.maximum(radius + np.float32(0.5), whole))
