@@ -13,7 +13,7 @@ import clpipe as clpipe_api
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.carry import parse_carry
 from clpipe.images.tags import upright
-from clpipe.inputs.carry import owner_of
+from clpipe.inputs.companions import owner_of
 from clpipe.reference.carried import Layer, nearest, warp
 from clpipe.reference.geometry import Composition, Orientation, destinations
 from tests.conftest import written

@@ -175,7 +175,7 @@ def test_where_it_is_of_use():
         return steps_of_overscan(make_chain(settings_from(settings)))
 
     assert count() == 0 and count(distortion={**BARREL, "k1": 0.0}) == 0
-    assert count(distortion=BARREL) == 4
+    assert count(distortion=BARREL) == 5
     stages = ["vignetting", "distortion", "resize"]
     bent_last = {"stages": stages, "distortion": BARREL, "vignetting": {"method": "pa", "k1": -0.1}}
     assert count(**bent_last) == 0  # it counts from the middle of its image

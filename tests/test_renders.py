@@ -41,7 +41,7 @@ PICTURES = {
     "exr_odd/TestImages_WideColorGamut.exr": (800, 800, 1.0991, 0.96227, 1.0819),
 }
 REFUSALS = {
-    "exr_odd/MultiResolution_WavyLinesCube.exr": "a cube map",
+    "exr_odd/MultiResolution_WavyLinesCube.exr": "a texture",
     "exr_odd/v2_LowResLeftView_Trunks.exr": "a deep image",
 }
 ACES = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)

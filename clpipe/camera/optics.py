@@ -78,6 +78,13 @@ class Optics:
         """The numbers that are known, by their names."""
         return {name: value for name in NUMBERS if (value := getattr(self, name)) is not None}
 
+    def without_view(self) -> "Optics":
+        """A copy in which nothing is known of focal length, sensor and principal point."""
+        gone: dict[str, Any] = dict.fromkeys(
+            (*IN_PIXELS, "focal_length", "sensor_width", "camera_angle_x")
+        )
+        return replace(self, **gone)
+
     def set_to(self, used: Mapping[str, float]) -> "Optics":
         """A copy in which what a step used of aperture and focus holds where nothing else is known.
 

@@ -181,7 +181,7 @@ class Chain:
             method, context = self.settings.method(name), replace(step.context, clean=True)
             with validation_errors(name, type(method)), user_code_errors(f"stage {name}", folder):
                 own = method.noise_free(context)
-                left.append((step, own and own.with_margins(step.method.margins)))
+                left.append((step, own and own.as_for(step.method)))
         return self._with(left, clean=True)
 
     def _with(self, methods: Sequence[tuple[Step, Method | None]], clean: bool) -> "Chain":

@@ -11,10 +11,12 @@ from clpipe.chain.chain import Chain, make_chain
 from clpipe.chain.depth import depth_steps, warnings_of, with_depth
 from clpipe.chain.keys import RENDER
 from clpipe.chain.overscan import steps_of_overscan, with_overscan
+from clpipe.chain.panorama import with_panorama
 from clpipe.chain.settings import overlay
 from clpipe.chain.void import check_void
 from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import NO_MARGINS, Margins
+from clpipe.reference.panorama import Panorama
 from clpipe.stage.method import optics_names
 
 
@@ -38,6 +40,7 @@ def enter(
     margins: Margins = NO_MARGINS,
     depth: Callable[[Chain, int, int, Margins], Depth] | None = None,
     shot: Mapping[str, float] | None = None,
+    panorama: Panorama | None = None,
 ) -> Entered:
     """An image with the chain for it.
 
@@ -48,6 +51,7 @@ def enter(
         depth: gives the depth for a chain that needs it, of an image of some width and height with
             some margins; None leaves it out.
         shot: what the image says of its camera, which holds where nothing else is stated.
+        panorama: what the image is an atlas of, where it is one.
 
     Raises:
         ImageError: what ``depth`` raises.
@@ -58,6 +62,8 @@ def enter(
         chain = _with_shot(chain, tuple(said.items())) if said else chain
         width, height = margins.inside(*pixels.shape[1::-1])
         chain.intrinsics_of_render(width, height, said)
+    if panorama:
+        chain = with_panorama(chain, panorama)
     if margins and not steps_of_overscan(chain):
         pixels, margins = np.ascontiguousarray(margins.cropped(pixels)), NO_MARGINS
     elif margins:

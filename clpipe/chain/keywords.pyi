@@ -16,6 +16,28 @@ Whole = int | np.integer[Any] | Draw
 Text = str | Draw
 Several = Sequence[Any] | np.ndarray[Any, Any] | Draw
 
+class Projection(TypedDict, total=False):
+    method: Draw | Literal["none", "kannala_brandt", "unified", "double_sphere", "f_theta"]
+    cx: Number
+    cy: Number
+    width: Whole
+    height: Whole
+    field_of_view: Number
+    source: Draw | Literal["auto", "map"]
+    face_angle: Number
+    views: Text
+    filter: Draw | Literal["bicubic", "lanczos3"]
+    fx: Number
+    fy: Number
+    k1: Number
+    k2: Number
+    k3: Number
+    k4: Number
+    alpha: Number
+    beta: Number
+    xi: Number
+    k5: Number
+
 class Shutter(TypedDict, total=False):
     method: Draw | Literal["rows"]
     subframes: Whole
@@ -353,6 +375,7 @@ class Keywords(TypedDict, total=False):
     dump: Text
     stages: Sequence[str]
     skip: Sequence[str]
+    projection: Projection
     shutter: Shutter
     defocus: Defocus
     motion_blur: MotionBlur

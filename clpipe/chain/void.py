@@ -7,6 +7,8 @@ import numpy as np
 
 from clpipe.base.errors import ImageError
 from clpipe.chain.chain import Chain
+from clpipe.chain.panorama import projection_of
+from clpipe.reference.geometry import Composition
 
 POINTS = 128, 96  # across and down the picture, at which it is looked for
 LEAST = 5e-4  # share of the picture, below which nothing is said
@@ -38,6 +40,11 @@ def check_void(chain: Chain, width: int, height: int) -> str:
         raise error from None
     if share < LEAST:
         return ""
+    if projection_of(chain):
+        return (
+            f"{100 * share:.1f} % of the lens's field are black: no view shows what is there; give "
+            "the other faces, or make field_of_view smaller"
+        )
     bends = [step.name for step in chain.steps if hasattr(step.method, "fit")]
     fit = f"set {bends[0]}.fit=true" if bends else "make the picture smaller"
     most = MOST_OVERSCAN * max(width, height)
@@ -63,4 +70,10 @@ def _void(chain: Chain, width: int, height: int) -> tuple[float, float]:
         u, v = geometry.origins(x, y, width, height)
         beyond = np.maximum(np.maximum(-u, u - width), np.maximum(-v, v - height))
     beyond = np.where(np.isfinite(beyond), beyond, np.inf)
-    return float((beyond[1:-1, 1:-1] > 0).mean()), float(beyond.max())
+    inside = np.s_[1:-1, 1:-1]
+    black = beyond[inside] > 0
+    if projection := projection_of(chain):
+        rest = Composition(geometry.parts[1:])
+        x, y = rest.origins(x[inside], y[inside], *projection.size(width, height))
+        black = black[np.isfinite(projection.lens.rays(x, y)[0])]
+    return float(black.mean()) if black.size else 1.0, float(beyond.max())

@@ -14,6 +14,8 @@ from clpipe.base.errors import RequestError
 from clpipe.batch.run_log import Summary
 from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
+from clpipe.chain.panorama import projection_of
+from clpipe.chain.registry import stage_in
 from clpipe.chain.rendition import CLEAN, TRUTHS
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import carry_option, format_option, series_options
@@ -26,12 +28,17 @@ from clpipe.commands.options import (
     quiet_option,
 )
 from clpipe.commands.progress import Reporter, follow
+from clpipe.inputs.around import wide_of
 from clpipe.inputs.series import Series, parse_isos
+from clpipe.reference.panorama import CUBE
+from clpipe.reference.projection import seen_faces
+from clpipe.reference.wide import MODELS
 from clpipe.scenes.blender import Rendering
 from clpipe.scenes.card import About, write_card
 from clpipe.scenes.record import keep_said
 from clpipe.scenes.source import NOTE, RENDERS, UNIT, Source, from_folder, from_scene
 from clpipe.scenes.view_request import PATHS, asked_views, parse_box, parse_frames, parse_resolution
+from clpipe.stage import StageRole
 
 # Options that are for a scene alone.
 VIEW_OPTIONS = ("views", "path", "box", "frames")
@@ -113,6 +120,12 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
     help="Under which the dataset is published, for its README: CC-BY-4.0, or a sentence.",
 )
 @click.option("--author", metavar="TEXT", help="Whose the dataset is, for its README.")
+@click.option(
+    "--lens-model",
+    type=click.Choice(sorted(MODELS)),
+    help="Render faces of a cube, and look at them through a wide lens of that model, whose "
+    "coefficients are those of --set projection.fx=300 and so on.",
+)
 @carry_option
 @format_option
 @device_option
@@ -124,6 +137,8 @@ def dataset(
     isos: str | None,
     poses: Path | None,
     selector: str | None,
+    lens_model: str | None,
+    assignments: tuple[str, ...],
     quiet: bool,
     **options: Any,
 ) -> None:
@@ -145,7 +160,11 @@ def dataset(
     series = Series(cameras, parse_isos(isos) if isos is not None else (), always=True)
     said = {name: options.pop(name) for name in ("licence", "author")}
     rendering = {name: options.pop(name) for name in RENDER_OPTIONS}
-    request = Request.from_options(camera=series.camera, iso=series.iso, **options)
+    if lens_model:
+        assignments = (f"{stage_in(StageRole.VIEW).name}.method={lens_model}", *assignments)
+    request = Request.from_options(
+        camera=series.camera, iso=series.iso, assignments=assignments, **options
+    )
     if not series.isos and "iso" not in request.settings().draws:
         series = replace(series, isos=(request.settings().iso,))
     series.jobs((), request.settings())  # refuses what is wrong before anything is rendered
@@ -154,6 +173,7 @@ def dataset(
             check_chain(request)
             program = rendering.pop("blender")
             asked = rendering_of(source, output, poses, request.settings().seed, rendering)
+            asked = replace(asked, faces=faces_of(request, asked.resolution))
             renders = from_scene(stack, asked, output, program)
         else:
             refuse_rendering()
@@ -179,6 +199,30 @@ def rendering_of(
     views = asked_views(**named, poses=poses, seed=seed)
     # Blender has a working directory of its own.
     return Rendering(scene.absolute(), (output / RENDERS).absolute(), views, **own, seed=seed)
+
+
+def faces_of(request: Request, resolution: tuple[int, int] | None) -> dict[str, Any] | None:
+    """The faces of a cube that a wide lens sees; None without such a lens.
+
+    Args:
+        request: with the lens.
+        resolution: of a face; None is as fine as the picture where that is finest.
+
+    Raises:
+        RequestError: a face is no square.
+        ImageError: the lens cannot be.
+    """
+    projection = projection_of(request.chain()) if wide_of(request.settings()) else None
+    if projection is None:
+        return None
+    side, names = seen_faces(projection.lens)
+    if resolution and resolution[0] != resolution[1]:
+        raise RequestError(
+            f"--resolution: found {resolution[0]}x{resolution[1]}; a wide lens looks at the faces "
+            f"of a cube, which are squares, here of {side}x{side} px"
+        )
+    side = resolution[0] if resolution else side
+    return {"side": side, "turns": {name: CUBE[name] for name in names}}
 
 
 def check_chain(request: Request) -> None:

@@ -109,8 +109,6 @@ def _refusal(spec: Any, has_levels: bool) -> str:
     """Why a part is not a picture, whatever its channels are called; "" where it may be one."""
     if spec.deep:
         return "a deep image (many samples a pixel); flatten it in the renderer first"
-    if "CubeFace" in str(spec.getattribute("textureformat")):
-        return "a cube map, not a picture"
     return "a texture (one image in several sizes), not a picture" if has_levels else ""
 
 

@@ -38,6 +38,7 @@ from clpipe.images.pixels import (
 )
 from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import NO_MARGINS, Margins
+from clpipe.reference.panorama import Panorama
 from clpipe.reference.transfer import inverse_srgb_curve
 from clpipe.stage import Kind
 
@@ -58,7 +59,8 @@ class SourceImage:
     focal_length and sensor_width (mm). ``subframes`` are the names and SHA-256 of files that were
     averaged.
     ``depth`` is there where the chain needs it. ``margins`` say how far ``pixels``, and depth, go
-    on beyond the picture.
+    on beyond the picture. ``envmap`` is OpenImageIO's name of the map that the file says it is, and
+    ``panorama`` what an atlas of several views is one of.
     """
 
     pixels: Array
@@ -70,6 +72,8 @@ class SourceImage:
     subframes: tuple[tuple[str, str], ...] = ()
     depth: Depth | None = None
     margins: Margins = NO_MARGINS
+    envmap: str = ""
+    panorama: Panorama | None = None
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,7 @@ class _Decoded:
     chromaticities: Any  # as the file states them; None: linear sRGB's
     neutral: Any  # OpenEXR's adoptedNeutral, as the file states it
     margins: Margins
+    envmap: str = ""
 
 
 def read_image(
@@ -110,7 +115,7 @@ def read_image(
 
     Raises:
         ImageError: the file is missing, empty, damaged, not an image, not linear float, deep, a
-            cube map, a texture or too large, or it lacks the channels or the layer; the message
+            texture or too large, or it lacks the channels or the layer; the message
             names the file and the reason.
     """
     try:
@@ -146,6 +151,7 @@ def read_image(
         decoded.attributes,
         decoded.shot,
         margins=decoded.margins,
+        envmap=decoded.envmap,
     )
 
 
@@ -271,6 +277,7 @@ def _decode(
             CIE_XYZ if location.xyz else spec.getattribute("chromaticities"),
             spec.getattribute("adoptedNeutral"),
             margins,
+            str(spec.getattribute("textureformat") or ""),
         )
 
 

@@ -14,7 +14,7 @@ from clpipe.chain.carry import AovSpec
 from clpipe.chain.chain import Chain
 from clpipe.chain.depth import depth_steps
 from clpipe.images.passes import read_layer
-from clpipe.inputs.carry import Finder, FoundLayer
+from clpipe.inputs.companions import Finder, FoundLayer
 from clpipe.reference.defocus import Depth, checked_depth
 from clpipe.reference.geometry import Margins
 

@@ -15,7 +15,7 @@ from clpipe.base.text import printable
 from clpipe.chain.rendition import Rendition
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import RENDER_SUFFIXES
-from clpipe.inputs.carry import owner_of
+from clpipe.inputs.companions import owner_of
 from clpipe.inputs.manifest import MANIFEST_SUFFIXES, read_manifest
 
 T = TypeVar("T")
@@ -39,6 +39,7 @@ class Job:
         written: the path as the user wrote it, where ``path`` has been made absolute.
         subframes: further files of the same exposure.
         size: the width and height in px that it must have; None is any.
+        around: whether its files are views of one place, and no sub-frames.
         problem: why it cannot be made, as far as that is known before it is read.
     """
 
@@ -54,6 +55,7 @@ class Job:
     subframes: tuple[Path, ...] = ()
     size: tuple[int, int] | None = None
     problem: str = ""
+    around: bool = False
 
     @property
     def paths(self) -> tuple[Path, ...]:

@@ -16,6 +16,7 @@ from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import RENDER
 from clpipe.chain.methods import base_name, stage_named
 from clpipe.chain.overscan import steps_of_overscan
+from clpipe.chain.registry import stage_in
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
 from clpipe.images.claims import Claim, claim_of, plain_claim
@@ -28,7 +29,9 @@ from clpipe.images.read import (
     SourceImage,
     read_source,
 )
+from clpipe.inputs.around import CUBE_MAP, grouped, read_around, wide_of
 from clpipe.inputs.carry import Aovs, carry, joined
+from clpipe.inputs.carry_around import carry_around
 from clpipe.inputs.depth import read_depth
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import KeptLoader, kind_message
@@ -37,7 +40,7 @@ from clpipe.inputs.raw import RawImage, RawLoader, may_be_dump
 from clpipe.inputs.subframes import average, exposures, shutter_of
 from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import Margins
-from clpipe.stage import Kind
+from clpipe.stage import Kind, StageRole
 
 
 @dataclass(frozen=True)
@@ -144,7 +147,9 @@ class ImageLoader:
         Raises:
             RequestError: they cannot be.
         """
-        return list(jobs) if self.kept else exposures(jobs, self.settings)
+        if self.kept:
+            return list(jobs)
+        return grouped(exposures(jobs, self.settings), wide_of(self.settings))
 
     def check(self, jobs: Sequence[Job]) -> None:
         """See that the values of single images are allowed.
@@ -186,13 +191,21 @@ class ImageLoader:
             ImageError: it cannot be read, is of another kind or size, or is written to at the same
                 time.
         """
-        shutter = shutter_of(self.settings) if job.subframes else None
+        wide = None if self.kept else wide_of(self.settings)
+        shutter = shutter_of(self.settings) if job.subframes and not wide else None
+        if wide and not self.raw.takes(job.path):
+            return read_around(job, self._read, wide)
         if shutter:
             known = shutter.with_defaults(exposure_time=self.chain.optics.exposure_time)
             source = average(job, self._read, known)
         else:
             with unchanged(job.path):
                 source = self._read(job.path)
+        if source.envmap == CUBE_MAP:
+            raise ImageError(
+                f"{job.path}: a cube map, not a picture; look at it through a wide lens, as with "
+                f"{stage_in(StageRole.VIEW).name}.method=kannala_brandt"
+            )
         width, height = source.margins.inside(*source.pixels.shape[1::-1])
         if job.size and job.size != (width, height):
             raise ImageError(
@@ -231,7 +244,8 @@ class ImageLoader:
         def depth(chain: Chain, width: int, height: int, margins: Margins) -> Depth:
             return read_depth(job.at("middle"), chain, width, height, margins, carried, most)
 
-        own = enter(loaded.chain, source.pixels, source.margins, depth, source.shot)
+        around = source.panorama
+        own = enter(loaded.chain, source.pixels, source.margins, depth, source.shot, around)
         source = replace(
             source,
             pixels=own.pixels,
@@ -271,6 +285,8 @@ class ImageLoader:
         layers = request.aov_specs()
         moments = ("middle", "start", "end") if request.truth_at == "all" else (request.truth_at,)
         given = loaded.source, loaded.chain, layers, most, orientation
+        if loaded.source.panorama and layers:
+            return carry_around(job.paths, *given)
         if not job.subframes:
             return carry(job.path, *given)
         of_moments = {moment: carry(job.at(moment), *given) for moment in moments}

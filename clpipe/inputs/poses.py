@@ -48,11 +48,15 @@ def with_views(
     given = []
     for job in jobs:
         try:
-            files = [stem_of(str(PurePosixPath(job.key).with_name(p.name))) for p in job.subframes]
-            of_files = [views.find(stem_of(job.key), called)]
+            several = () if job.around else job.subframes
+            files = [stem_of(str(PurePosixPath(job.key).with_name(p.name))) for p in several]
+            own_name = stem_of(job.key)
+            if job.around and not views.get(own_name, called):
+                own_name = stem_of(str(PurePosixPath(job.key).with_name(job.path.name)))
+            of_files = [views.find(own_name, called)]
             of_files += [view for file in files if (view := views.get(file, called))]
             at = job.paths.index(job.at("middle" if truth_at == "all" else truth_at))
-            is_whole = len(of_files) == len(job.paths)
+            is_whole = len(of_files) == len(job.paths) and not job.around
             own = _with_view(job, of_files[at if is_whole else 0], settings)
             given.append(_with_motion(own, of_files) if files and is_whole else own)
         except RequestError as error:

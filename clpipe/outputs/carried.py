@@ -10,7 +10,8 @@ from clpipe.base.types import Array
 from clpipe.chain.carry import VALID
 from clpipe.images.attributes import PREFIX
 from clpipe.images.write import write_grey_png, write_planes
-from clpipe.inputs.carry import CARRIED, Aovs
+from clpipe.inputs.carry import Aovs
+from clpipe.inputs.companions import CARRIED
 
 MM = 1000  # in a metre
 

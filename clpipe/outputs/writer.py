@@ -25,7 +25,8 @@ from clpipe.images.dng import write_dng
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import Tags, from_attributes, orientation_of, upright
 from clpipe.images.write import JPEG_MAX_SIDE, write_display, write_exr, write_npy
-from clpipe.inputs.carry import CARRIED, Aovs
+from clpipe.inputs.carry import Aovs
+from clpipe.inputs.companions import CARRIED
 from clpipe.inputs.find import Job
 from clpipe.inputs.kept import attributes_of
 from clpipe.outputs.carried import png_ending, write_carried

@@ -217,7 +217,8 @@ def mapped(samples: Array, vectors: Sequence[Vector], move: Move) -> Array:
             at + sign * samples[..., channel]
             for at, (channel, sign) in zip(move.origins, channels, strict=True)
         ]
-        there = destinations(move.geometry, (ends[0], ends[1]), move.to, move.width, move.height)
+        size = move.width, move.height
+        there = destinations(move.geometry, (ends[0], ends[1]), move.to, *size, move.origins)
         for to, end, (channel, sign) in zip(move.to, there, channels, strict=True):
             result[..., channel] = sign * (end - to)
     return result

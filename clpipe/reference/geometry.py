@@ -74,6 +74,22 @@ class Geometry(Protocol):
         ...
 
 
+class Destined:
+    """A geometry that says itself where a place of the image is in its result."""
+
+    def destinations(
+        self, x: Array, y: Array, at: tuple[Array, Array], width: int, height: int
+    ) -> tuple[Array, Array]:
+        """Where places of the image that it gets are in its result; NaN where nowhere.
+
+        Args:
+            x, y: the places.
+            at: places of the image in whose view they are meant, from which a vector leads there.
+            width, height: of the image that it gets.
+        """
+        raise NotImplementedError(type(self).__name__)
+
+
 @dataclass(frozen=True)
 class Scaling:
     """Rows and columns made fewer; the edges stay where they are.
@@ -193,17 +209,19 @@ def destinations(
     start: tuple[Array, Array],
     width: int,
     height: int,
+    at: tuple[Array, Array] | None = None,
 ) -> tuple[Array, Array]:
     """Where places of the image that a geometry gets are in its result: the inverse of its origins.
 
     Newton's method in two dimensions, the Jacobian by finite differences, until a place's origin is
-    within :data:`RESIDUAL` of what it should be.
+    within :data:`RESIDUAL` of what it should be; of a :class:`Destined` it is asked for.
 
     Args:
         geometry: how the pixels move.
         to: x and y of the places, float64 of any shape.
         start: places of the result nearby, of that shape.
         width, height: of the image that it gets.
+        at: see :meth:`Destined.destinations`; None is the places themselves.
 
     Returns:
         x and y; NaN where no place is found, as beyond the radius where a lens turns.
@@ -214,6 +232,11 @@ def destinations(
     >>> x.round(6).tolist(), y.round(6).tolist()
     ([7.0], [2.0])
     """
+    parts = geometry.parts if isinstance(geometry, Composition) else (geometry,)
+    if parts and isinstance(parts[0], Destined):
+        first = parts[0].destinations(*to, at or to, width, height)
+        size = parts[0].size(width, height)
+        return destinations(Composition(parts[1:]), first, start, *size) if parts[1:] else first
     shape = to[0].shape
     goal = np.stack([np.ravel(each) for each in to]).astype(np.float64)
     found = np.stack([np.ravel(each) for each in start]).astype(np.float64)

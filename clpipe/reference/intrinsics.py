@@ -130,7 +130,7 @@ class Intrinsics:
         last = rising[0] + 1 if rising.size else len(r)
         shown = np.linspace(0, 1, 512)[1:] * min(corner, seen[:last].max())
         r = np.interp(shown, seen[:last], r[:last])
-        first, *k, off = _smallest_error(np.stack([r, r**3, r**5, r**7, r**9], 1), bent(r))
+        first, *k, off = smallest_error(np.stack([r, r**3, r**5, r**7, r**9], 1), bent(r))
         fitted = {f"k{i}": c / first for i, c in enumerate(k, 1)}
         tangential = {name: named[name] / first for name in ("p1", "p2")}
         residual = self.residual + off * max(self.fx, self.fy)
@@ -149,7 +149,7 @@ class Intrinsics:
         return {**asdict(self), "distortion": {n: self.distortion.get(n, 0.0) for n in names}}
 
 
-def _smallest_error(terms: Array, values: Array) -> list[float]:
+def smallest_error(terms: Array, values: Array) -> list[float]:
     """The factors of terms, (place, term), whose sum is nearest to values, and their largest error.
 
     By least squares whose weights grow where the error is large (Lawson, 1961).

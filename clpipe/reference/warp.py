@@ -159,14 +159,8 @@ class Warp:
 
     def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
         """See :meth:`Resampler.reach`."""
-        first, last = _lines(self, axis, *size)
         number = 1 if axis == "rows" else 0
-        of_image, of_picture = size[number], self.resized(*size)[number]
-        line = np.arange(of_picture) * of_image
-        before = int((-(-line // of_picture) - first).max())
-        behind = int((last - line // of_picture).max())
-        low, high = (-(-each * of_image // of_picture) for each in (low, high))
-        return max(low + before, 0), max(high + behind + 1, 0)
+        return reach_of(*_lines(self, axis, *size), size[number], low, high)
 
     def reference(self, image: Floats) -> Floats:
         """The bent image, (height, width, 3) float32 in and out; black where the lens sees none."""
@@ -177,6 +171,22 @@ class Warp:
         for channel, ways in enumerate(zip(fields, fields, strict=True)):
             result[..., channel] = gather(image[..., channel], *ways, FILTERS[self.filter])
         return result
+
+
+def reach_of(first: Array, last: Array, of_image: int, low: int, high: int) -> tuple[int, int]:
+    """See :meth:`clpipe.reference.resample.Resampler.reach`.
+
+    Args:
+        first, last: the first and the last old line of which each new one is made.
+        of_image: how many old ones there are.
+        low, high: how far new lines begin before and end behind a place.
+    """
+    of_picture = len(first)
+    line = np.arange(of_picture) * of_image
+    before = int((-(-line // of_picture) - first).max())
+    behind = int((last - line // of_picture).max())
+    low, high = (-(-each * of_image // of_picture) for each in (low, high))
+    return max(low + before, 0), max(high + behind + 1, 0)
 
 
 def gather(plane: Floats, across: Floats, down: Floats, polynomials: Floats) -> Floats:

@@ -38,6 +38,9 @@ class Rendering:
         time_limit: seconds for each view; None has none.
         denoise: whether the renderer takes its own noise away.
         seed: of the light paths.
+        faces: of a cube, which are rendered in place of each view: their "side" in px, and
+            "turns", the rotation from each one's axes to the camera's, by its name; None renders
+            views.
     """
 
     scene: Path
@@ -48,6 +51,7 @@ class Rendering:
     time_limit: float | None
     denoise: bool
     seed: int
+    faces: Mapping[str, Any] | None = None
 
     def record(self) -> dict[str, Any]:
         """The rendering as JSON values."""

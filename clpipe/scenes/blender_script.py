@@ -16,7 +16,15 @@ from typing import Any
 import bpy
 
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))  # Blender does not
-from blender_views import GEOMETRY, RefusedError, camera_of, fault_in, views_of
+from blender_views import (
+    GEOMETRY,
+    RefusedError,
+    camera_of,
+    face_camera,
+    fault_in,
+    set_face,
+    views_of,
+)
 
 MARK = "@clpipe "
 OLDEST = (4, 2)
@@ -169,6 +177,9 @@ def main(asked: Mapping[str, Any]) -> None:
     if blind:
         more = f" and {len(blind) - 5} others" if len(blind) > 5 else ""
         notes.append(f"these views see too little: {', '.join(blind[:5])}{more}")
+    faces = asked["faces"]
+    if faces:  # a cube has no focal length
+        cameras = [{k: record[k] for k in ("file", "R", "t")} for record in cameras]
     unit = scene.unit_settings
     tell(
         "scene",
@@ -182,14 +193,21 @@ def main(asked: Mapping[str, Any]) -> None:
     for name in os.listdir(asked["folder"]):
         if name.endswith(UNFINISHED):  # of a Blender that was killed
             os.remove(os.path.join(asked["folder"], name))
+    own, face = scene.camera, face_camera(scene) if faces else None
     for name, number, set_up in views:
-        seconds = 0.0
-        if not os.path.exists(os.path.join(asked["folder"], f"{name}.exr")):
-            began = time.perf_counter()
+        began, made = time.perf_counter(), 0
+        turns = faces["turns"] if faces else {"": None}
+        for turned, (ending, turn) in enumerate(turns.items()):
+            file = f"{name}_{ending}" if faces else name
+            if os.path.exists(os.path.join(asked["folder"], f"{file}.exr")):
+                continue
+            scene.camera = own
             set_up()
-            render_view(scene, asked["folder"], name, number, asked["seed"])
-            seconds = time.perf_counter() - began
-        tell("rendered", name=name, seconds=seconds)
+            if faces:
+                set_face(scene, face, turn, faces["side"])
+            render_view(scene, asked["folder"], file, len(turns) * number + turned, asked["seed"])
+            made += 1
+        tell("rendered", name=name, seconds=time.perf_counter() - began if made else 0.0)
 
 
 if __name__ == "__main__":

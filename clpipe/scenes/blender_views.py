@@ -83,6 +83,36 @@ def set_camera(scene: Any, record: Mapping[str, Any]) -> None:
     camera.matrix_world = Matrix.Translation(place) @ turned.to_4x4()
 
 
+def face_camera(scene: Any) -> Any:
+    """A camera for faces of a cube, which goes where the scene's camera goes."""
+    data = scene.camera.data.copy()
+    data.animation_data_clear()
+    data.type, data.sensor_fit, data.angle = "PERSP", "AUTO", math.radians(90)
+    data.shift_x = data.shift_y = 0
+    data.dof.use_dof = False
+    face = bpy.data.objects.new("clpipe face", data)
+    scene.collection.objects.link(face)
+    face.parent = scene.camera
+    return face
+
+
+def set_face(scene: Any, face: Any, turn: list[list[float]], side: int) -> None:
+    """Make a face of a cube the scene's view.
+
+    Args:
+        scene: with the camera in its place.
+        face: see :func:`face_camera`.
+        turn: from the face's axes to the camera's, by OpenCV's axes.
+        side: of the face, in px.
+    """
+    face.matrix_basis = (FLIP @ Matrix(turn) @ FLIP).to_4x4()
+    render = scene.render
+    render.resolution_x = render.resolution_y = side
+    render.resolution_percentage, render.pixel_aspect_x, render.pixel_aspect_y = 100, 1, 1
+    scene.camera = face
+    bpy.context.view_layer.update()
+
+
 def target_of(scene: Any) -> Any:
     """What the scene's camera looks at: what it sees in its middle, else the middle of all."""
     depsgraph = bpy.context.evaluated_depsgraph_get()

@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ class Source:
         about: what the dataset's card says of them, by its titles.
         renderer: what makes them; None where all of them are there.
         names: of the views, in their order, where they are made.
+        faces: of a cube, whose files each view has; none where it is one file.
         failure: why rendering ended early.
     """
 
@@ -42,14 +43,20 @@ class Source:
     about: Mapping[str, str] = field(default_factory=dict)
     renderer: Renderer | None = None
     names: Sequence[str] = ()
+    faces: Sequence[str] = ()
     failure: RenderError | None = None
     _is_stopped: bool = False
 
     def jobs(self) -> list[Job] | None:
         """The renders that are made; None where they are to be found."""
         (folder,) = self.inputs
-        named = [f"{name}.exr" for name in self.names]
-        return [Job(Path(folder) / name, name, listed=False) for name in named] or None
+        jobs = []
+        for name in self.names:
+            files = [Path(folder) / f"{name}_{face}.exr" for face in self.faces]
+            first, *others = files or [Path(folder) / f"{name}.exr"]
+            found = Job(first, f"{name}.exr", listed=False)
+            jobs.append(replace(found, subframes=tuple(others), around=bool(files)))
+        return jobs or None
 
     def stop(self) -> None:
         """Render no more."""
@@ -141,7 +148,8 @@ def from_scene(stack: ExitStack, rendering: Rendering, output: Path, program: st
     made_of = json.loads(json.dumps(made_of))
     known = read_record(output, made_of)
     renderer = None
-    if known.get("views") == views and _are_there(rendering.folder, known["scene"]):
+    faces = list(rendering.faces["turns"]) if rendering.faces else []
+    if known.get("views") == views and _are_there(rendering.folder, known["scene"], faces):
         scene = Scene(**known["scene"])
     else:
         renderer = stack.enter_context(Renderer(rendering, program))
@@ -154,11 +162,13 @@ def from_scene(stack: ExitStack, rendering: Rendering, output: Path, program: st
     names = [Path(view["file"]).stem for view in scene.views]
     folder = output / RENDERS
     about = _about(rendering, scene)
-    return Source([str(folder)], folder / CAMERAS, layers, about, renderer, names)
+    return Source([str(folder)], folder / CAMERAS, layers, about, renderer, names, faces)
 
 
-def _are_there(folder: Path, scene: Mapping[str, Any]) -> bool:
+def _are_there(folder: Path, scene: Mapping[str, Any], faces: Sequence[str]) -> bool:
     names = [view["file"] for view in scene["views"]]
+    if faces:
+        names = [f"{Path(name).stem}_{face}.exr" for name in names for face in faces]
     return os.path.isfile(folder / CAMERAS) and all(os.path.isfile(folder / n) for n in names)
 
 

@@ -17,6 +17,7 @@ from clpipe.stage.bases import (
     InFocalLengths,
     Noiseless,
     OfDepth,
+    OfPanorama,
     Unchanged,
     odd_size,
 )
@@ -56,6 +57,7 @@ __all__ = [
     "NoiseScope",
     "Noiseless",
     "OfDepth",
+    "OfPanorama",
     "Pass",
     "Pointwise",
     "Reduction",

@@ -1,6 +1,6 @@
 """Parts that several methods have in common: bases to derive from, and a check of window sizes."""
 
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from clpipe.base.types import Floats
 from clpipe.camera.lens import LensCalibration
 from clpipe.reference.curve import curve_index
 from clpipe.reference.defocus import Depth
+from clpipe.reference.panorama import Panorama
 from clpipe.stage.context import Context, ReferenceContext
 from clpipe.stage.method import Method, parameter
 from clpipe.stage.passes import Arguments, Pass, TableLookup
@@ -112,6 +113,14 @@ class OfDepth(Method):
         Raises:
             RequestError: it cannot.
         """
+        raise NotImplementedError(type(self).__name__)
+
+
+class OfPanorama(Method):
+    """A method that makes a picture of what is seen all around."""
+
+    def with_panorama(self, panorama: Panorama) -> Self:
+        """The (resolved) method for an image that is the atlas of a panorama."""
         raise NotImplementedError(type(self).__name__)
 
 

@@ -2,7 +2,7 @@
 
 import weakref
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.optics import Optics
@@ -32,6 +32,10 @@ class Context:
     white_level: float | None = None
     # Of the image, which holds it: chains are kept longer. Chains of one structure are alike.
     depth: weakref.ref[Depth] | None = field(default=None, compare=False, repr=False)
+
+    def without_view(self) -> "Context":
+        """The context of a picture that is no longer in the render's perspective."""
+        return replace(self, optics=self.optics.without_view())
 
     def noise_parameters(self) -> tuple[float, float]:
         """The a and b of the noise that was added, else the camera's; of a clean image, zeros."""

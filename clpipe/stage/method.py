@@ -89,6 +89,10 @@ class Method(BaseModel):
         other._margins = margins
         return other
 
+    def as_for(self, other: "Method") -> Self:
+        """The (resolved) method for the image that another (resolved) one of its step is for."""
+        return self.with_margins(other.margins)
+
     def optics(self) -> Mapping[str, float]:
         """Facts of the optics that this method, as it was set, states, by the names of Optics."""
         return {n: v for n in optics_names(type(self)) if (v := getattr(self, n)) is not None}
@@ -179,6 +183,7 @@ class StageRole(Enum):
 
     EXPOSURE = "its ev is what a bracket adds to"
     SHUTTER = "its subframes are files of one exposure"
+    VIEW = "it makes pictures of what is seen all around"
     PATTERN = "its pattern is that of a raw that enters"
     LEVELS = "its black_level and white_level are those of a raw that enters"
     BALANCE_OF_LIGHT = "its red_gain and blue_gain are taken out, as a raw's light has them"

@@ -13,6 +13,7 @@ from pkgutil import iter_modules
 from clpipe.stage import Stage
 
 DEFAULT_CHAIN = (
+    "projection",
     "shutter",
     "defocus",
     "motion_blur",

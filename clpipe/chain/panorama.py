@@ -1,0 +1,28 @@
+"""Chains whose image is an atlas of what is all around, as a wide lens sees it."""
+
+from dataclasses import replace
+
+from clpipe.chain.chain import Chain
+from clpipe.reference.panorama import Panorama
+from clpipe.reference.projection import Projection
+from clpipe.stage import OfPanorama
+
+
+def with_panorama(chain: Chain, panorama: Panorama) -> Chain:
+    """The chain for an image that is the atlas of a panorama.
+
+    Plans and kernels differ from those of the chain in numbers alone.
+    """
+    steps = tuple(
+        replace(step, method=step.method.with_panorama(panorama))
+        if isinstance(step.method, OfPanorama)
+        else step
+        for step in chain.steps
+    )
+    return replace(chain, steps=steps)
+
+
+def projection_of(chain: Chain) -> Projection | None:
+    """The projection that moves a chain's pixels first; None where there is none."""
+    parts = chain.geometry.parts if chain.geometry else ()
+    return parts[0] if parts and isinstance(parts[0], Projection) else None

@@ -1,0 +1,247 @@
+"""What is seen all around, in several files or one: grouped, read, and put into one image."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from clpipe.base.digests import joint_digest
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.reading import unchanged
+from clpipe.base.types import Array
+from clpipe.chain.chain import step_names
+from clpipe.chain.registry import stage_in
+from clpipe.chain.settings import Settings
+from clpipe.images.read import SourceImage
+from clpipe.inputs.companions import SEPARATORS
+from clpipe.inputs.find import Job
+from clpipe.inputs.poses import stem_of
+from clpipe.inputs.render_cameras import read_views
+from clpipe.reference.panorama import (
+    CUBE,
+    OPENEXR_CUBE,
+    LatitudeLongitude,
+    Panorama,
+    Rotation,
+    View,
+    Views,
+)
+from clpipe.stage import StageRole
+from clpipe.stages.projection import Wide
+
+FACES = 6
+RIGHT_ANGLE = 90.0
+ONE_POINT = 1e-6  # of the largest distance: views of one point are this near to each other
+
+CUBE_MAP, LATITUDE_LONGITUDE = "CubeFace Environment", "LatLong Environment"
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The views that files of one place are, by what stands at the end of their names.
+
+    Args:
+        views: their cameras, as a file has them; None are faces of a cube.
+        angle: of a cube's face, in degrees.
+        source: the file that says it, for messages.
+    """
+
+    views: dict[str, tuple[Rotation, tuple[float, float, float, float] | None]]
+    angle: float = RIGHT_ANGLE
+    source: str = ""
+
+    def view(self, name: str, width: int, height: int) -> View:
+        """The view of a file of some size."""
+        rotation, camera = self.views[name]
+        if camera is None:
+            return View.of_angle(rotation, width, height, self.angle)
+        return View(rotation, *camera, width, height)
+
+    def called(self, path: Path) -> tuple[str, str] | None:
+        """The name before a view's, and that; None of another file.
+
+        >>> Rig({"front": ()}).called(Path("a/view00_front.exr"))
+        ('view00', 'front')
+        """
+        for name in self.views:
+            before = path.stem[: -len(name)]
+            if path.stem.endswith(name) and len(before) > 1 and before[-1] in SEPARATORS:
+                return before[:-1], name
+        return None
+
+
+def wide_of(settings: Settings) -> Wide | None:
+    """The wide lens that makes pictures of what is all around; None where there is none."""
+    name = stage_in(StageRole.VIEW).name
+    if name not in step_names(settings):
+        return None
+    method = settings.method(name)
+    return method if isinstance(method, Wide) else None
+
+
+def rig_of(wide: Wide) -> Rig:
+    """The rig of a wide lens: of ``views``, else a cube.
+
+    Raises:
+        RequestError: the file of views cannot be read, or they are no rig.
+    """
+    if wide.views is None:
+        return Rig({name: (turn, None) for name, turn in CUBE.items()}, _angle(wide))
+    path, place = Path(wide.views), f"{stage_in(StageRole.VIEW).name}.views"
+    try:
+        read = read_views(path)
+    except RequestError as error:
+        raise RequestError(str(error).replace("--poses", place, 1)) from None
+    views: dict[str, tuple[Rotation, tuple[float, float, float, float] | None]] = {}
+    points = []
+    for each in read:
+        known = each.values
+        camera = tuple(float(known.get(key, 0)) for key in ("fx", "fy", "cx", "cy"))
+        if each.problem or not all(camera[:2]) or "rotation" not in known:
+            why = each.problem or "its fx, fy, cx, cy and its pose are needed"
+            raise RequestError(f"{place} {path}: view {each.name}: {why}")
+        of_camera = np.array(known["rotation"], float)
+        points.append(-of_camera.T @ np.array(known["translation"], float))
+        turn = tuple(tuple(map(float, row)) for row in of_camera.T)
+        views[PurePosixPath(stem_of(each.name)).name] = turn, camera  # type: ignore[assignment]
+    spread = np.ptp(points, 0).max()
+    if spread > ONE_POINT * max(abs(np.array(points)).max(), 1):
+        raise RequestError(
+            f"{place} {path}: its cameras are up to {spread:g} apart; a picture is made of views "
+            "from one point"
+        )
+    return Rig(views, source=str(path))
+
+
+def _angle(wide: Wide) -> float:
+    return wide.face_angle or RIGHT_ANGLE
+
+
+def grouped(jobs: Sequence[Job], wide: Wide | None) -> list[Job]:
+    """The jobs with the files of one place made one, which is called as they are but for the view.
+
+    Files that are no view are jobs of their own.
+
+    Raises:
+        RequestError: they are sub-frames, or what is known of them differs.
+    """
+    if wide is None:
+        return list(jobs)
+    rig = rig_of(wide)
+    places: dict[object, list[tuple[str, Job]]] = {}
+    for job in jobs:
+        found = None if job.around else rig.called(job.path)
+        place = id(job) if found is None else (job.path.parent, found[0], job.path.suffix)
+        places.setdefault(place, []).append((found[1] if found else "", job))
+    result = []
+    order = list(rig.views)
+    for own in places.values():
+        name, first = own[0]
+        if not name:
+            result.append(first)
+            continue
+        (name, first), *others = sorted(own, key=lambda each: order.index(each[0]))
+        if different := next((job for _, job in others if job.values != first.values), None):
+            raise RequestError(
+                f"{different.label}: its values differ from those of {first.label}, which is seen "
+                "from the same point"
+            )
+        if any(job.subframes for _, job in own):
+            raise RequestError(
+                f"{first.path}: views of one point cannot be sub-frames, too; set "
+                f"{stage_in(StageRole.SHUTTER).name}.subframes=1"
+            )
+        key = PurePosixPath(first.key)
+        stem = key.stem[: -len(name) - 1]
+        result.append(
+            replace(
+                first,
+                key=str(key.with_name(f"{stem}{key.suffix}")),
+                subframes=tuple(job.path for _, job in others),
+                around=True,
+            )
+        )
+    return result
+
+
+def read_around(job: Job, read: Callable[[Path], SourceImage], wide: Wide) -> SourceImage:
+    """The image of a job that a wide lens looks at: an atlas, and what it is one of.
+
+    A render that is no panorama by its file or name stays as it is.
+
+    Raises:
+        ImageError: a file cannot be read, or is of another size than the first.
+    """
+    sources: list[SourceImage] = []
+    for path in job.paths:
+        with unchanged(path):
+            sources.append(read(path))
+    first = sources[0]
+    for path, other in zip(job.paths, sources, strict=True):
+        if other.pixels.ndim != 3 or other.pixels.shape != first.pixels.shape:
+            size = "a mosaic" if other.pixels.ndim != 3 else _size(other.pixels)
+            raise ImageError(
+                f"{path}: it is {size}, and {job.path}, of the same place, {_size(first.pixels)}"
+            )
+    panorama = panorama_of(job.paths, wide, first.envmap, *first.pixels.shape[1::-1])
+    if panorama is None:
+        return first
+    images = [piece for each in sources for piece in pieces(panorama, each.pixels)]
+    warnings = [
+        f"{path.name}: {warning}"
+        for path, each in zip(job.paths, sources, strict=True)
+        for warning in each.warnings
+    ]
+    digests = [each.sha256 for each in sources]
+    several = len(sources) > 1
+    names = [path.name for path in job.paths]
+    return replace(
+        first,
+        pixels=panorama.atlas(images, wide.filter),
+        sha256=joint_digest(digests) if several else first.sha256,
+        warnings=tuple(dict.fromkeys(warnings)) if several else first.warnings,
+        subframes=tuple(zip(names, digests, strict=True)) if several else (),
+        panorama=panorama,
+    )
+
+
+def panorama_of(
+    paths: Sequence[Path], wide: Wide, envmap: str, width: int, height: int
+) -> Panorama | None:
+    """What files of some size are; None of a single view, as which any render can be seen.
+
+    Args:
+        paths: the files.
+        wide: how they are looked at.
+        envmap: what the first file says of itself.
+        width, height: of each.
+
+    Raises:
+        ImageError: a cube map is not six squares.
+    """
+    if wide.source == "map" or (envmap == LATITUDE_LONGITUDE and len(paths) == 1):
+        return LatitudeLongitude(width, height, on_edges=envmap == LATITUDE_LONGITUDE)
+    if envmap == CUBE_MAP:
+        if height != FACES * width or width < 2:
+            raise ImageError(
+                f"{paths[0]}: a cube map of {width}x{height} pixels; its faces are squares, one "
+                "below the other"
+            )
+        place = (width - 1) / 2, (width - 1) / 2, width / 2, width / 2
+        return Views(tuple(View(turn, *place, width, width) for turn in OPENEXR_CUBE))
+    rig = rig_of(wide)
+    names = [rig.called(path) for path in paths]
+    if not all(names):
+        return None
+    return Views(tuple(rig.view(name[1], width, height) for name in names if name))
+
+
+def pieces(panorama: Panorama, image: Array) -> Iterator[Array]:
+    """The views in a file's image: one, or those of a cube map."""
+    is_cube = isinstance(panorama, Views) and len(image) == FACES * panorama.views[0].height
+    yield from np.split(image, FACES) if is_cube else [image]
+
+
+def _size(pixels: Array) -> str:
+    return f"{pixels.shape[1]}x{pixels.shape[0]}"

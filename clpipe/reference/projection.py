@@ -1,0 +1,184 @@
+"""A picture of a panorama through a wide lens: the place of the atlas that each pixel shows."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, ClassVar
+
+import numpy as np
+
+from clpipe.base.errors import ImageError
+from clpipe.base.types import Array, Floats
+from clpipe.reference.geometry import Destined
+from clpipe.reference.intrinsics import Intrinsics
+from clpipe.reference.panorama import CUBE, FRONT, LatitudeLongitude, Panorama, View, Views
+from clpipe.reference.resample import PADDING, Axis, Parameters
+from clpipe.reference.warp import FILTERS, gather, reach_of
+from clpipe.reference.wide import WideLens
+
+FACE = 256  # places across a face, at which it is looked for
+
+NOWHERE = -1e6  # px: a place that is in no image
+
+Facts = tuple[tuple[str, float], ...]
+
+
+@dataclass(frozen=True)
+class Projection(Destined):
+    """How a wide picture is made of an image: its geometry, and its resampling.
+
+    It is a :class:`~clpipe.reference.geometry.Geometry`, and a
+    :class:`~clpipe.reference.resample.Resampler`.
+
+    Args:
+        lens: the lens.
+        filter: of :data:`clpipe.reference.warp.FILTERS`.
+        panorama: what the image is; None makes it a single view ahead, or a map.
+        is_map: whether it is a map of longitude and latitude, without a border.
+        angle: of a single view's field, in degrees across.
+        shot: what is known of the camera of a single view, see :meth:`Intrinsics.of_render`.
+    """
+
+    parameters: ClassVar[Parameters] = (
+        ("across", "__global const float *restrict"),
+        ("down", "__global const float *restrict"),
+        ("pitch", "uint"),
+        ("lines", "uint"),
+    )
+
+    lens: WideLens
+    filter: str
+    panorama: Panorama | None = None
+    is_map: bool = False
+    angle: float | None = None
+    shot: Facts = ()
+
+    def of_image(self, width: int, height: int) -> Panorama:
+        """What an image of some size is.
+
+        Raises:
+            ImageError: the focal length of a view is not known.
+        """
+        if self.panorama:
+            return self.panorama
+        if self.is_map:
+            return LatitudeLongitude(width, height, border=0)
+        if self.angle:
+            return Views((View.of_angle(FRONT, width, height, self.angle),), border=0)
+        known = Intrinsics.of_render(width, height, dict(self.shot))
+        if known is None:
+            raise ImageError(
+                "projection: the focal length of the render is not known: set render.fx, or "
+                "render.focal_length and render.sensor_width, or projection.face_angle; or give "
+                "the six faces of a cube, *_front, *_right, *_back, *_left, *_up and *_down"
+            )
+        place = known.fx, known.fy, known.cx, known.cy
+        return Views((View(FRONT, *place, width, height),), border=0)
+
+    @property
+    def support(self) -> int:
+        """How many pixels on either side of a place have a weight."""
+        return len(FILTERS[self.filter]) // 2
+
+    @property
+    def scale(self) -> float:
+        """See :attr:`Resampler.scale`."""
+        return 1.0
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """See :meth:`Geometry.size`."""
+        return self.lens.picture
+
+    def resized(self, width: int, height: int) -> tuple[int, int]:
+        """See :meth:`Resampler.resized`."""
+        return self.lens.picture
+
+    def origins(self, x: Array, y: Array, width: int, height: int) -> tuple[Array, Array]:
+        """See :meth:`Geometry.origins`; NaN beyond the field, and where there is no view."""
+        return self.of_image(width, height).places(self.lens.rays(x, y))
+
+    def destinations(
+        self, x: Array, y: Array, at: tuple[Array, Array], width: int, height: int
+    ) -> tuple[Array, Array]:
+        """See :meth:`Destined.destinations`."""
+        return self.lens.seen(self.of_image(width, height).rays(x, y, at))
+
+    def intrinsics(self, before: Intrinsics | None, width: int, height: int) -> Intrinsics | None:
+        """See :meth:`Geometry.intrinsics`; those of the lens, whatever they were before."""
+        return self.lens.intrinsics()
+
+    def values(self, width: int, height: int) -> Mapping[str, Any]:
+        """See :meth:`Resampler.values`."""
+        across, down = _ways(self, width, height)
+        lines, pitch = across.shape
+        flat = {"across": across.reshape(-1), "down": down.reshape(-1)}
+        return {**flat, "pitch": np.uint32(pitch), "lines": np.uint32(lines)}
+
+    def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
+        """See :meth:`Resampler.needed`."""
+        first, last = _lines(self, axis, *size)
+        return int(first[start:stop].min()), int(last[start:stop].max()) + 1
+
+    def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
+        """See :meth:`Resampler.reach`."""
+        of_image = size[1 if axis == "rows" else 0]
+        return reach_of(*_lines(self, axis, *size), of_image, low, high)
+
+    def reference(self, image: Floats) -> Floats:
+        """The picture, (height, width, 3) float32, of an image; black where nothing is seen."""
+        height, width = image.shape[:2]
+        columns, rows = self.lens.picture
+        across, down = (each[:rows, :columns] for each in _ways(self, width, height))
+        channels = [gather(image[..., c], across, down, FILTERS[self.filter]) for c in range(3)]
+        return np.stack(channels, -1)
+
+
+def seen_faces(lens: WideLens) -> tuple[int, list[str]]:
+    """The side in px of a cube's faces that are as fine as a picture, and those that it shows."""
+    cube = Views(tuple(View.of_angle(turn, FACE, FACE, 90.0) for turn in CUBE.values()), border=0)
+    width, height = lens.picture
+    x, y = np.meshgrid(np.linspace(0, width, FACE), np.linspace(0, height, FACE))
+    _, row = cube.places(lens.rays(x, y))
+    numbers = np.unique(np.minimum(row[np.isfinite(row)], FACE * len(CUBE) - 1) // FACE)
+    # In the middle, where a face is coarsest, it has half a side for a radian.
+    side = 2 * int(np.ceil(lens.finest))
+    return side, [list(CUBE)[int(number)] for number in numbers]
+
+
+@lru_cache(maxsize=4)
+def _ways(projection: Projection, width: int, height: int) -> tuple[Floats, Floats]:
+    """How far it is from each pixel to the place that it shows, across and down, in px.
+
+    Float32, (height, width) of the picture with :data:`PADDING` more each, which a kernel reads.
+    """
+    columns, rows = (each + PADDING for each in projection.lens.picture)
+    across, down = (np.full((rows, columns), NOWHERE, np.float32) for _ in range(2))
+    block = max((1 << 20) // columns, 1)
+    for top in range(0, rows - PADDING, block):
+        part = slice(top, min(top + block, rows - PADDING))
+        y, x = np.mgrid[part, 0 : columns - PADDING] + 0.5
+        place = projection.origins(x, y, width, height)
+        seen = np.isfinite(place[0])
+        across[part, : x.shape[1]] = np.where(seen, place[0] - x, NOWHERE)
+        down[part, : x.shape[1]] = np.where(seen, place[1] - y, NOWHERE)
+    return across, down
+
+
+@lru_cache(maxsize=8)
+def _lines(projection: Projection, axis: Axis, width: int, height: int) -> tuple[Array, Array]:
+    """The first and the last old row, or column, of which each new one is made at most."""
+    columns, rows = projection.lens.picture
+    number, size = (1, height) if axis == "rows" else (0, width)
+    way = _ways(projection, width, height)[number][:rows, :columns]
+    seen = way > NOWHERE / 2
+    places = way + (np.arange(rows)[:, None] if number else np.arange(columns))
+    first = np.where(seen, places, np.inf).min(number)
+    last = np.where(seen, places, -np.inf).max(number)
+    support = projection.support
+    same = np.arange(len(first)) * size // len(first)
+    first = np.where(np.isinf(first), same, np.floor(first) - support)
+    last = np.where(np.isinf(last), same, np.floor(last) + support + 1)
+    # The border mirrors as many lines as the filter has beyond the edge.
+    first = np.clip(np.minimum(first, size - 1 - support), 0, size - 1)
+    last = np.clip(np.maximum(last, support), 0, size - 1)
+    return first.astype(np.int64), last.astype(np.int64)

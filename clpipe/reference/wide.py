@@ -1,0 +1,175 @@
+"""Wide lenses: how far from the principal point a ray at some angle to the axis is seen.
+
+All of them are turned about the axis, and see also what is beside and behind the camera. The angle
+to the axis is theta, and the distance from the principal point, in focal lengths, r.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from clpipe.base.errors import ImageError
+from clpipe.base.types import Array
+from clpipe.reference.intrinsics import OPENCV_FISHEYE, Intrinsics, smallest_error
+
+Coefficients = tuple[float, ...]
+
+ANGLES = 1 << 16  # of a table from the axis to the edge of the field
+
+
+def kannala_brandt(theta: Array, k: Coefficients) -> Array:
+    """r = theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9: OpenCV's fisheye model.
+
+    Kannala and Brandt, "A generic camera model and calibration method for conventional, wide-angle
+    and fish-eye lenses", PAMI 2006.
+    """
+    square = theta * theta
+    return theta * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
+
+
+def unified(theta: Array, k: Coefficients) -> Array:
+    """r = sin / (alpha sqrt(beta sin^2 + cos^2) + (1 - alpha) cos), k being alpha and beta.
+
+    Khomutenko, Garcia and Martinet, "An enhanced unified camera model", RA-L 2016, equation 6.
+    """
+    alpha, beta = k
+    sine, cosine = np.sin(theta), np.cos(theta)
+    return sine / (alpha * np.sqrt(beta * sine * sine + cosine * cosine) + (1 - alpha) * cosine)
+
+
+def double_sphere(theta: Array, k: Coefficients) -> Array:
+    """r = sin / (alpha sqrt(sin^2 + (xi + cos)^2) + (1 - alpha) (xi + cos)), k being xi and alpha.
+
+    Usenko, Demmel and Cremers, "The double sphere camera model", 3DV 2018, equations 40 to 42.
+    """
+    xi, alpha = k
+    sine, shifted = np.sin(theta), xi + np.cos(theta)
+    return sine / (alpha * np.hypot(sine, shifted) + (1 - alpha) * shifted)
+
+
+def f_theta(theta: Array, k: Coefficients) -> Array:
+    """r = k1 theta + k2 theta^2 + ... + k5 theta^5: the polynomial of NVIDIA's F-theta cameras."""
+    return np.asarray(np.polynomial.polynomial.polyval(theta, (0.0, *k)))
+
+
+MODELS: dict[str, Callable[[Array, Coefficients], Array]] = {
+    "kannala_brandt": kannala_brandt,
+    "unified": unified,
+    "double_sphere": double_sphere,
+    "f_theta": f_theta,
+}
+
+
+@dataclass(frozen=True)
+class WideLens:
+    """A wide lens with a sensor behind it.
+
+    Args:
+        model: of :data:`MODELS`.
+        coefficients: of the model.
+        fx, fy: focal lengths in px.
+        field_of_view: the angle, in degrees, through the axis, that is seen.
+        size: width and height of the picture in px; None is that of the whole field, to either side
+            of the principal point.
+        centre: the principal point in px from the corner; None of one of them is the middle.
+    """
+
+    model: str
+    coefficients: Coefficients
+    fx: float
+    fy: float
+    field_of_view: float
+    size: tuple[int, int] | None = None
+    centre: tuple[float | None, float | None] = (None, None)
+
+    @property
+    def picture(self) -> tuple[int, int]:
+        """The width and height of the picture.
+
+        Raises:
+            ImageError: the model turns back within the field of view.
+        """
+        if self.size:
+            return self.size
+        edge = float(_table(self)[1][-1])
+        return 2 * int(np.ceil(edge * self.fx)), 2 * int(np.ceil(edge * self.fy))
+
+    @property
+    def finest(self) -> float:
+        """The most px of the picture for a radian away from the axis."""
+        angles, radii = _table(self)
+        return float(np.diff(radii).max() / angles[1] * max(self.fx, self.fy))
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """cx and cy in px from the corner."""
+        middle = (side / 2 for side in self.picture)
+        cx, cy = (m if c is None else c for c, m in zip(self.centre, middle, strict=True))
+        return cx, cy
+
+    def rays(self, x: Array, y: Array) -> Array:
+        """The directions that places of the picture see.
+
+        Args:
+            x, y: in px from the corner, float64 of any shape.
+
+        Returns:
+            (3, ...): to the right, down and along the axis, of length 1; NaN beyond the field.
+        """
+        cx, cy = self.principal_point
+        across, down = (x - cx) / self.fx, (y - cy) / self.fy
+        r = np.hypot(across, down)
+        angles, radii = _table(self)
+        theta = np.interp(r, radii, angles, right=np.nan)
+        ratio = np.sin(theta) / np.where(r > 0, r, 1)
+        return np.stack([across * ratio, down * ratio, np.cos(theta)])
+
+    def seen(self, rays: Array) -> tuple[Array, Array]:
+        """The places of the picture, x and y, where directions, (3, ...), are seen.
+
+        NaN beyond the field. It is the inverse of :meth:`rays`.
+        """
+        cx, cy = self.principal_point
+        side = np.hypot(rays[0], rays[1])
+        theta = np.arctan2(side, rays[2])
+        theta = np.where(theta <= np.radians(self.field_of_view / 2), theta, np.nan)
+        ratio = MODELS[self.model](theta, self.coefficients) / np.where(side > 0, side, 1)
+        return cx + self.fx * rays[0] * ratio, cy + self.fy * rays[1] * ratio
+
+    def intrinsics(self) -> Intrinsics:
+        """The picture's, by OpenCV's fisheye model; where it is another, by a fit to the field."""
+        (width, height), (cx, cy) = self.picture, self.principal_point
+        k: list[float] = [*self.coefficients]
+        longer, off = 1.0, 0.0
+        if self.model != "kannala_brandt":
+            angles, radii = (each[:: ANGLES // 512] for each in _table(self))
+            odd = np.stack([angles**n for n in (1, 3, 5, 7, 9)], 1)
+            longer, *k, off = smallest_error(odd[1:], radii[1:])
+            k = [each / longer for each in k]
+        fx, fy = self.fx * longer, self.fy * longer
+        named = {f"k{i}": each for i, each in enumerate(k, 1)}
+        residual = off * max(self.fx, self.fy)
+        return Intrinsics(width, height, fx, fy, cx, cy, OPENCV_FISHEYE, named, residual)
+
+
+@lru_cache(maxsize=32)
+def _table(lens: WideLens) -> tuple[Array, Array]:
+    """Angles from the axis to the edge of the field, and the r of each.
+
+    Raises:
+        ImageError: r does not grow with the angle.
+    """
+    angles = np.linspace(0, np.radians(lens.field_of_view / 2), ANGLES + 1)
+    with np.errstate(all="ignore"):
+        radii = MODELS[lens.model](angles, lens.coefficients)
+        turns = ~(np.diff(radii) > 0)
+    if turns.any():
+        seen = np.degrees(angles[int(turns.argmax())])
+        raise ImageError(
+            f"projection: {lens.model} with these coefficients sees no farther than "
+            f"{2 * seen:.1f} degrees, but field_of_view is {lens.field_of_view:g}; make it "
+            "smaller, or use coefficients with which r grows up to there"
+        )
+    return angles, radii

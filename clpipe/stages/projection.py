@@ -1,0 +1,280 @@
+"""Wide lenses, to 220 degrees: the picture is made of what a render shows all around.
+
+That is six faces of a cube, several overlapping views, a map of longitude and latitude, or one
+render. For each pixel of the picture the direction that it sees is found from the model
+(:mod:`clpipe.reference.wide`), and each channel is gathered where that is
+(:mod:`clpipe.reference.projection`).
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, ClassVar, Literal, Self
+
+from pydantic import PrivateAttr
+
+from clpipe.base.errors import RequestError
+from clpipe.base.types import Floats
+from clpipe.reference.panorama import Panorama
+from clpipe.reference.projection import Projection
+from clpipe.reference.warp import FILTERS
+from clpipe.reference.wide import WideLens
+from clpipe.stage import (
+    Arguments,
+    CompileTime,
+    Context,
+    Kind,
+    Method,
+    OfPanorama,
+    Pass,
+    ReferenceContext,
+    Resample,
+    Stage,
+    StageRole,
+    Unchanged,
+    parameter,
+)
+
+
+class NoProjection(Unchanged):
+    """The picture is in the render's own perspective."""
+
+    method: ClassVar = "none"
+    summary: ClassVar = "the render's own perspective"
+
+
+class Wide(OfPanorama):
+    """A wide lens, with the sensor behind it."""
+
+    kernel: ClassVar = "projection"
+
+    cx: float | None = parameter(
+        None, "Principal point, from the left edge: OpenCV's cx + 0.5.", "px", "the middle"
+    )
+    cy: float | None = parameter(
+        None, "Principal point, from the upper edge: OpenCV's cy + 0.5.", "px", "the middle"
+    )
+    width: int | None = parameter(
+        None, "Of the picture.", "px", "that of the whole field", ge=1, le=65536
+    )
+    height: int | None = parameter(
+        None, "Of the picture.", "px", "that of the whole field", ge=1, le=65536
+    )
+    field_of_view: float = parameter(
+        180.0, "What is seen, through the axis; beyond it is black.", "deg", gt=1, le=220
+    )
+    source: Literal["auto", "map"] = parameter(
+        "auto",
+        "What the render is: a map of longitude and latitude, or what its file and the files' "
+        "names say: a map, a cube, else a view in perspective.",
+    )
+    face_angle: float | None = parameter(
+        None,
+        "Of a face of a cube, or of a view, across.",
+        "deg",
+        "90 for a cube, the render's focal length",
+        gt=1,
+        lt=179,
+    )
+    views: str | None = parameter(
+        None,
+        "The cameras of overlapping renders, in a form of --poses; the world's axes are the "
+        "picture's, and files end with the views' names.",
+        "",
+        "the faces of a cube",
+        file=True,
+    )
+    filter: Literal["bicubic", "lanczos3"] = parameter(
+        "bicubic",
+        "How pixels are weighted: bicubic (Catmull-Rom), or lanczos3, which is sharper and rings.",
+        structural=True,
+    )
+
+    _panorama: Panorama | None = PrivateAttr(None)
+    _shot: tuple[tuple[str, float], ...] = PrivateAttr(())
+
+    def with_panorama(self, panorama: Panorama) -> Self:
+        other = self.model_copy()
+        other._panorama = panorama
+        return other
+
+    def as_for(self, other: Method) -> Self:
+        own = super().as_for(other)
+        around = other._panorama if isinstance(other, Wide) else None
+        return own.with_panorama(around) if around else own
+
+    def resolve(self, context: Context) -> Self:
+        own = self.model_copy()
+        own._shot = tuple(context.optics.known.items())
+        return own
+
+    def next_context(self, context: Context) -> Context:
+        return context.without_view()
+
+    def lens(self) -> WideLens:
+        """The lens."""
+        raise NotImplementedError(type(self).__name__)
+
+    def _lens(self, coefficients: tuple[float, ...], fx: float, fy: float) -> WideLens:
+        """A lens of the method's model."""
+        whole = WideLens(self.method, coefficients, fx, fy, self.field_of_view)
+        if self.width and self.height:
+            size = self.width, self.height
+        else:
+            width, height = whole.picture
+            size = self.width or width, self.height or height
+        return replace(whole, size=size, centre=(self.cx, self.cy))
+
+    def geometry(self) -> Projection:
+        facts = self._panorama, self.source == "map", self.face_angle, self._shot
+        return Projection(self.lens(), self.filter, *facts)
+
+    def passes(self) -> tuple[Pass, ...]:
+        projection = self.geometry()
+        access = Resample(projection, projection.support)
+        return (Pass("projection", access, ("filter", "taps", "powers")),)
+
+    def arguments(self, context: Context) -> Arguments:
+        filter_ = FILTERS[self.filter]
+        taps, powers = filter_.shape
+        return {
+            "filter": filter_,
+            "taps": CompileTime(str(taps)),
+            "powers": CompileTime(str(powers)),
+        }
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        return self.geometry().reference(image)
+
+
+class InPixels(Wide):
+    """A model that counts in focal lengths."""
+
+    fx: float | None = parameter(
+        None, "Focal length across.", "px", "none: it must be set", gt=0, le=1e7
+    )
+    fy: float | None = parameter(None, "Focal length down.", "px", "fx", gt=0, le=1e7)
+
+    def resolve(self, context: Context) -> Self:
+        """The method with both focal lengths.
+
+        Raises:
+            RequestError: there is none.
+        """
+        if not self.fx:
+            raise RequestError(
+                f"projection.fx: {self.method} needs the lens's focal length in px; about the "
+                "picture's width over the field of view in radians"
+            )
+        return super().resolve(context).with_defaults(fy=self.fx)
+
+    def coefficients(self) -> tuple[float, ...]:
+        """The model's, in its order."""
+        raise NotImplementedError(type(self).__name__)
+
+    def lens(self) -> WideLens:
+        assert self.fx
+        assert self.fy
+        return self._lens(self.coefficients(), self.fx, self.fy)
+
+
+EXAMPLE: Mapping[str, Any] = {"face_angle": 60.0, "width": 181, "height": 140}
+
+
+class KannalaBrandt(InPixels):
+    """r = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8), a being the angle to the axis.
+
+    OpenCV's fisheye model, COLMAP's OPENCV_FISHEYE (Kannala and Brandt, PAMI 2006). With zeros it
+    is the equidistant projection.
+    """
+
+    method: ClassVar = "kannala_brandt"
+    summary: ClassVar = "OpenCV's fisheye: a polynomial of the angle to the axis"
+    example: ClassVar = {**EXAMPLE, "fx": 170.0, "fy": 174.0, "k1": -0.02, "k2": 0.003, "cx": 80.0}
+
+    k1: float = parameter(0.0, "Of the angle squared.", ge=-1e4, le=1e4)
+    k2: float = parameter(0.0, "Of its fourth power.", ge=-1e4, le=1e4)
+    k3: float = parameter(0.0, "Of its sixth power.", ge=-1e4, le=1e4)
+    k4: float = parameter(0.0, "Of its eighth power.", ge=-1e4, le=1e4)
+
+    def coefficients(self) -> tuple[float, ...]:
+        return self.k1, self.k2, self.k3, self.k4
+
+
+class Unified(InPixels):
+    """The enhanced unified camera model, EUCM (Khomutenko, Garcia and Martinet, RA-L 2016).
+
+    With beta = 1 it is the unified model of Geyer and Daniilidis, with xi = alpha / (1 - alpha).
+    """
+
+    method: ClassVar = "unified"
+    summary: ClassVar = "the enhanced unified camera model (EUCM)"
+    example: ClassVar = {**EXAMPLE, "fx": 170.0, "alpha": 0.6, "beta": 1.1, "field_of_view": 190.0}
+
+    alpha: float = parameter(0.6, "0 is a perspective view.", ge=0, le=1)
+    beta: float = parameter(1.0, "Of the square of the way across the axis.", gt=0, le=100)
+
+    def coefficients(self) -> tuple[float, ...]:
+        return self.alpha, self.beta
+
+
+class DoubleSphere(InPixels):
+    """The double-sphere camera model (Usenko, Demmel and Cremers, 3DV 2018)."""
+
+    method: ClassVar = "double_sphere"
+    summary: ClassVar = "the double-sphere camera model"
+    example: ClassVar = {**EXAMPLE, "fx": 160.0, "xi": -0.2, "alpha": 0.59, "source": "map"}
+
+    xi: float = parameter(-0.2, "From one sphere's centre to the other's.", ge=-1, le=2)
+    alpha: float = parameter(0.6, "From the second sphere's centre to the pinhole.", ge=0, le=1)
+
+    def coefficients(self) -> tuple[float, ...]:
+        return self.xi, self.alpha
+
+
+class FTheta(Wide):
+    """r = k1 a + k2 a^2 + k3 a^3 + k4 a^4 + k5 a^5 in px, a being the angle to the axis in radians.
+
+    NVIDIA's F-theta model by its polynomial from angles to pixels.
+    """
+
+    method: ClassVar = "f_theta"
+    summary: ClassVar = "NVIDIA's F-theta: a polynomial from the angle in radians to px"
+    example: ClassVar = {**EXAMPLE, "k1": 170.0, "k2": -1.5, "k3": 2.0, "filter": "lanczos3"}
+
+    k1: float | None = parameter(None, "Of the angle.", "px", "none: it must be set", gt=0, le=1e7)
+    k2: float = parameter(0.0, "Of its square.", "px", ge=-1e7, le=1e7)
+    k3: float = parameter(0.0, "Of its cube.", "px", ge=-1e7, le=1e7)
+    k4: float = parameter(0.0, "Of its fourth power.", "px", ge=-1e7, le=1e7)
+    k5: float = parameter(0.0, "Of its fifth power.", "px", ge=-1e7, le=1e7)
+
+    def resolve(self, context: Context) -> Self:
+        """The method with what it knows of the render.
+
+        Raises:
+            RequestError: there is no k1.
+        """
+        if not self.k1:
+            raise RequestError("projection.k1: f_theta needs it, the focal length in px a radian")
+        return super().resolve(context)
+
+    def lens(self) -> WideLens:
+        assert self.k1
+        return self._lens((self.k1, self.k2, self.k3, self.k4, self.k5), 1.0, 1.0)
+
+
+METHODS: tuple[type[Method], ...] = (
+    NoProjection,
+    KannalaBrandt,
+    Unified,
+    DoubleSphere,
+    FTheta,
+)
+
+STAGE = Stage(
+    "projection",
+    "Look at what is all around through a wide lens.",
+    Kind.RGB,
+    Kind.RGB,
+    METHODS,
+    role=StageRole.VIEW,
+)

@@ -1,0 +1,19 @@
+// A picture through a wide lens: each pixel gathered at the place of an image that it shows, with a filter.
+// `across` and `down` are how far away that is, `pitch` to a row of `lines`; rows and lanes beyond the
+// picture read the last.
+#include "lib/gather.h"
+
+INLINE rgb projection(site at, __global const float *r, __global const float *g, __global const float *b,
+                      extent from, __global const float *across, __global const float *down, uint pitch,
+                      uint lines, __global const float *filter, int taps, int powers) {
+    const uint row = at.y < lines ? at.y : lines - 1, last = pitch - LANES;
+    const size_t here = (size_t)row * pitch + (at.x < last ? at.x : last);
+    const vf right = load(across + here), below = load(down + here);
+    // A loop, because three copies of what is in it take three times as long to compile.
+    __global const float *planes[3] = {r, g, b};
+    vf channels[3];
+#pragma unroll 1
+    for (int c = 0; c < 3; ++c) channels[c] = bent(at, planes[c], from, right, below, filter, taps, powers);
+    const rgb v = {channels[0], channels[1], channels[2]};
+    return v;
+}
