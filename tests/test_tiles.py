@@ -24,7 +24,7 @@ from clpipe.engine.tiles import (
     tiling_of,
 )
 from clpipe.reference.cfa import PATTERNS
-from clpipe.stage import Kind
+from clpipe.stage import Kind, StageRole
 from tests.test_contributing import block
 
 METHODS = [
@@ -127,7 +127,8 @@ def is_in_tiles(device, monkeypatch, stage, method):
     image = example(chain.source, (150, 203))
     image[::2] *= 0.5  # so that red and blue differ
     result, count = in_tiles(runner, image, 70, 56, monkeypatch)
-    assert count >= 6
+    # A wide lens's picture is as large of the smallest image, by which memory is measured out.
+    assert count >= (3 if stage.role is StageRole.VIEW else 6)
     if method.method in ("gray_world", "white_patch"):
         assert result.estimates["white_balance"]["red_gain"] != 1
 

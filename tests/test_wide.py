@@ -21,6 +21,7 @@ from clpipe.reference.panorama import (
     View,
     Views,
 )
+from clpipe.reference.projection import seen_faces
 from clpipe.reference.wide import WideLens
 from tests.test_tiles import in_tiles
 
@@ -375,6 +376,40 @@ def test_poses_and_camera_files_are_the_wide_cameras(write, clpipe):
     frames = json.loads(Path("o/transforms.json").read_text())
     assert frames["camera_model"] == "OPENCV_FISHEYE"
     assert frames["distortion_residual"] == pytest.approx(lens_of("unified").intrinsics().residual)
+
+
+def test_a_dataset_of_faces_that_exist(write, clpipe):
+    for view in ("one", "two"):
+        for name, image in zip(CUBE, images_of(PANORAMAS["cube"]), strict=True):
+            depth = np.full(image.shape[:2], 2, np.float32)
+            write(f"in/{view}_{name}.exr", **colours(image), **{"Depth.Z": depth})
+    _, _, *rest = options_of("unified")
+    chosen = ("--lens-model", "unified", *rest, "--device", "numpy", "--stages", "projection,gamma")
+    clpipe("dataset", "in", "-o", "set", "--iso", "100", *chosen, "--truth", "clean", status=2)
+    clpipe("dataset", "in", "-o", "set", "--iso", "100", *chosen[:-2])
+    made = {path.name for path in Path("set/iso100").iterdir()}
+    assert {"one.jpg", "two.jpg", "one.Depth.png", "one.truth_clean.jpg"} <= made
+    assert "2 in `train.txt`" in Path("set/README.md").read_text()
+    record = json.loads(Path("set/iso100/one.json").read_text())
+    turns = [view["rotation"] for view in record["panorama"]["views"]]
+    assert turns == [np.array(turn).tolist() for turn in CUBE.values()]
+    replayed = clpipe("replay", "set/iso100/one.json", "-o", "again", "--device", "numpy").output
+    assert "the same bytes" in replayed
+
+
+def test_only_faces_that_a_lens_sees_are_rendered():
+    side, names = seen_faces(lens_of("kannala_brandt", field_of_view=80.0))
+    assert names == ["front"]
+    assert side == 2 * 62
+    assert seen_faces(lens_of("unified", field_of_view=170.0))[1] == [
+        "front",
+        "right",
+        "left",
+        "up",
+        "down",
+    ]
+    assert len(seen_faces(lens_of("unified", field_of_view=220.0))[1]) == 5
+    assert len(seen_faces(lens_of("unified", field_of_view=200.0))[1]) == 5
 
 
 def test_a_cube_map_that_is_none(write, clpipe):

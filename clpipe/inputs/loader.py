@@ -177,7 +177,10 @@ class ImageLoader:
             mosaic = len(self.reads.channels) == 1
             found = claim_of(job.path, mosaic)
             claim = found or plain_claim(min(stamp_of(job.path)[0], most), 1)
-        return claim if claim.width * claim.height <= most else plain_claim(0, 0)
+        if claim.width * claim.height > most:
+            return plain_claim(0, 0)
+        files = len(job.paths) if job.around else 1
+        return Claim(claim.width, claim.height * files, claim.image * files, claim.reading * files)
 
     def opens(self, job: Job) -> bool:
         """Whether the header of a job's file can be read."""

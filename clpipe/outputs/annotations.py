@@ -111,6 +111,8 @@ def _pictures(path: Path, values: Mapping[str, Any], source: Record) -> Iterator
         ClpipeError: the chain cannot be made again.
     """
     chain = chain_of(values)
+    if "panorama" in values:
+        raise ImageError("annotations of what is seen all around do not go through a wide lens")
     parts = chain.geometry.parts if chain.geometry else ()
     own = source["width"], source["height"]
     size = chain.size(*chain.margins.around(*own))

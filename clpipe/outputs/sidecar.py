@@ -102,6 +102,7 @@ def sidecar(
         "input_modified": stamps[0][1],
         "sha256": source.sha256,
         **({"subframes": subframe_records(source, stamps)} if source.subframes else {}),
+        **({"panorama": source.panorama.record} if source.panorama else {}),
         "layer": source.layer,
         "name": job.stem,
         "picture": rendition.suffix,

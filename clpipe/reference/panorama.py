@@ -6,9 +6,9 @@ camera whose picture is made of it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -50,6 +50,11 @@ class Panorama(Protocol):
     @property
     def size(self) -> tuple[int, int]:
         """The atlas's width and height in px."""
+        ...
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """What it is, as JSON values."""
         ...
 
     def places(self, rays: Array) -> tuple[Array, Array]:
@@ -119,6 +124,11 @@ class Views:
         """See :attr:`Panorama.size`."""
         first, more = self.views[0], 2 * self.border
         return first.width + more, (first.height + more) * len(self.views)
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """See :attr:`Panorama.record`; the rotations lead from a view's axes to the picture's."""
+        return {"views": [asdict(view) for view in self.views]}
 
     def places(self, rays: Array) -> tuple[Array, Array]:
         """See :meth:`Panorama.places`."""
@@ -197,6 +207,11 @@ class LatitudeLongitude:
     def size(self) -> tuple[int, int]:
         """See :attr:`Panorama.size`."""
         return self.width + 2 * self.border, self.height + 2 * self.border
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """See :attr:`Panorama.record`."""
+        return {"map": {"width": self.width, "height": self.height, "on_edges": self.on_edges}}
 
     @property
     def _steps(self) -> tuple[float, float]:

@@ -139,7 +139,8 @@ def seen_faces(lens: WideLens) -> tuple[int, list[str]]:
     width, height = lens.picture
     x, y = np.meshgrid(np.linspace(0, width, FACE), np.linspace(0, height, FACE))
     _, row = cube.places(lens.rays(x, y))
-    numbers = np.unique(np.minimum(row[np.isfinite(row)], FACE * len(CUBE) - 1) // FACE)
+    # The lower edge of a face is its own.
+    numbers = np.unique(np.maximum(np.ceil(row[np.isfinite(row)]) - 1, 0) // FACE)
     # In the middle, where a face is coarsest, it has half a side for a radian.
     side = 2 * int(np.ceil(lens.finest))
     return side, [list(CUBE)[int(number)] for number in numbers]

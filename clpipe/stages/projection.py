@@ -177,7 +177,7 @@ class InPixels(Wide):
         return self._lens(self.coefficients(), self.fx, self.fy)
 
 
-EXAMPLE: Mapping[str, Any] = {"face_angle": 60.0, "width": 181, "height": 140}
+EXAMPLE: Mapping[str, Any] = {"face_angle": 30.0, "width": 203, "height": 150}
 
 
 class KannalaBrandt(InPixels):
@@ -189,7 +189,7 @@ class KannalaBrandt(InPixels):
 
     method: ClassVar = "kannala_brandt"
     summary: ClassVar = "OpenCV's fisheye: a polynomial of the angle to the axis"
-    example: ClassVar = {**EXAMPLE, "fx": 170.0, "fy": 174.0, "k1": -0.02, "k2": 0.003, "cx": 80.0}
+    example: ClassVar = {**EXAMPLE, "fx": 380.0, "fy": 390.0, "k1": -0.2, "k2": 0.03, "cx": 110.0}
 
     k1: float = parameter(0.0, "Of the angle squared.", ge=-1e4, le=1e4)
     k2: float = parameter(0.0, "Of its fourth power.", ge=-1e4, le=1e4)
@@ -208,7 +208,7 @@ class Unified(InPixels):
 
     method: ClassVar = "unified"
     summary: ClassVar = "the enhanced unified camera model (EUCM)"
-    example: ClassVar = {**EXAMPLE, "fx": 170.0, "alpha": 0.6, "beta": 1.1, "field_of_view": 190.0}
+    example: ClassVar = {**EXAMPLE, "fx": 380.0, "alpha": 0.6, "beta": 1.1, "field_of_view": 190.0}
 
     alpha: float = parameter(0.6, "0 is a perspective view.", ge=0, le=1)
     beta: float = parameter(1.0, "Of the square of the way across the axis.", gt=0, le=100)
@@ -222,7 +222,7 @@ class DoubleSphere(InPixels):
 
     method: ClassVar = "double_sphere"
     summary: ClassVar = "the double-sphere camera model"
-    example: ClassVar = {**EXAMPLE, "fx": 160.0, "xi": -0.2, "alpha": 0.59, "source": "map"}
+    example: ClassVar = {**EXAMPLE, "fx": 380.0, "xi": -0.2, "alpha": 0.59}
 
     xi: float = parameter(-0.2, "From one sphere's centre to the other's.", ge=-1, le=2)
     alpha: float = parameter(0.6, "From the second sphere's centre to the pinhole.", ge=0, le=1)
@@ -239,7 +239,7 @@ class FTheta(Wide):
 
     method: ClassVar = "f_theta"
     summary: ClassVar = "NVIDIA's F-theta: a polynomial from the angle in radians to px"
-    example: ClassVar = {**EXAMPLE, "k1": 170.0, "k2": -1.5, "k3": 2.0, "filter": "lanczos3"}
+    example: ClassVar = {**EXAMPLE, "k1": 380.0, "k2": -1.5, "k3": 2.0, "filter": "lanczos3"}
 
     k1: float | None = parameter(None, "Of the angle.", "px", "none: it must be set", gt=0, le=1e7)
     k2: float = parameter(0.0, "Of its square.", "px", ge=-1e7, le=1e7)
