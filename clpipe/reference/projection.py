@@ -135,12 +135,11 @@ class Projection(Destined):
 
 def seen_faces(lens: WideLens) -> tuple[int, list[str]]:
     """The side in px of a cube's faces that are as fine as a picture, and those that it shows."""
-    cube = Views(tuple(View.of_angle(turn, FACE, FACE, 90.0) for turn in CUBE.values()), border=0)
+    cube = Views(tuple(View.of_angle(turn, FACE, FACE, 90.0) for turn in CUBE.values()))
     width, height = lens.picture
     x, y = np.meshgrid(np.linspace(0, width, FACE), np.linspace(0, height, FACE))
     _, row = cube.places(lens.rays(x, y))
-    # The lower edge of a face is its own.
-    numbers = np.unique(np.maximum(np.ceil(row[np.isfinite(row)]) - 1, 0) // FACE)
+    numbers = np.unique(row[np.isfinite(row)] * len(CUBE) // cube.size[1])
     # In the middle, where a face is coarsest, it has half a side for a radian.
     side = 2 * int(np.ceil(lens.finest))
     return side, [list(CUBE)[int(number)] for number in numbers]
