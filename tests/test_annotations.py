@@ -1,4 +1,4 @@
-"""--annotations: COCO's boxes, outlines, masks and keypoints go where the pixels go."""
+"""--annotations: those of COCO, KITTI and BOP go where the pixels go."""
 
 import json
 from pathlib import Path
@@ -156,6 +156,145 @@ def test_each_series_and_a_resumed_run_have_theirs(clpipe, coco):
     said = clpipe(*run, *BARREL).stderr
     assert "there already" in said and "wrote o/iso800/annotations.json: 5 annotations of 1" in said
     assert Path("o/iso800/annotations.json").read_bytes() == other
+
+
+def box_of(points):
+    return [*np.min(points, 0).tolist(), *np.max(points, 0).tolist()]
+
+
+K = [110.0, 0.0, 79.5, 0.0, 110.0, 59.5, 0.0, 0.0, 1.0]
+
+
+@pytest.fixture
+def kitti(coco):
+    """The same shapes as KITTI's labels, and a calibration."""
+    matrix = [*K[:3], 10.0, *K[3:6], 0.5, *K[6:], 0.01]
+    numbers = " ".join(map(str, matrix))
+    calibration = "".join(f"P{n}: {numbers}\n" for n in range(4)) + "R0_rect: 1 0 0 0 1 0 0 0 1\n"
+    lines = []
+    for number, points in SHAPES.items():
+        box = " ".join(f"{v - 0.5:.2f}" for v in box_of(points))
+        lines.append(f"Car {0.25 if number == 2 else 0} 0 -1.5 {box} 1.5 1.6 4 1 1.5 {number} 0.1")
+    lines.append("DontCare -1 -1 -10 150 100 158 110 -1 -1 -1 -1000 -1000 -1000 -10")
+    for name, text in (("label_2", "\n".join(lines)), ("calib", calibration)):
+        folder = Path("kitti", name)
+        folder.mkdir(parents=True)
+        (folder / "a.txt").write_text(text)
+    return lines
+
+
+def labels(path):
+    return [line.split() for line in Path(path).read_text().splitlines()]
+
+
+AS_KITTI = ("--device", "numpy", "--skip", "noise", "--format", "png")
+AS_KITTI += ("--annotations", "kitti/label_2")
+
+
+def test_kittis_labels_and_calibration(clpipe, kitti):
+    smaller = ("--set", "resize.scale=0.5")
+    said = clpipe("run", "in/a.exr", "-o", "o", *AS_KITTI, *PLAIN, *smaller).stderr
+    assert "wrote o/label_2, o/calib: 4 annotations of 1 pictures" in said
+    for line, now in zip(kitti, labels("o/label_2/a.txt"), strict=True):
+        before = line.split()
+        box = (np.array(before[4:8], float) + 0.5) / 2 - 0.5
+        clipped = np.clip(box, -0.5, [79.5, 59.5, 79.5, 59.5])
+        assert np.array(now[4:8], float) == pytest.approx(clipped, abs=0.011)
+        assert now[8:] == before[8:] and now[0] == before[0] and now[2:4] == before[2:4]
+        shown = np.prod(clipped[2:] - clipped[:2]) / np.prod(box[2:] - box[:2])
+        cut = float(before[1])
+        assert float(now[1]) == pytest.approx(cut if cut < 0 else 1 - (1 - cut) * shown, abs=0.006)
+    matrices = {words[0]: np.array(words[1:], float) for words in labels("o/calib/a.txt")}
+    p2 = matrices["P2:"].reshape(3, 4)
+    # A place in space is seen half as far from the corner.
+    place = np.array([1, 2, 5, 1.0])
+    was = np.array([*K[:3], 10, *K[3:6], 0.5, *K[6:], 0.01]).reshape(3, 4) @ place
+    now = p2 @ place
+    assert now[:2] / now[2] + 0.5 == pytest.approx((was[:2] / was[2] + 0.5) / 2)
+    assert matrices["R0_rect:"].tolist() == [1, 0, 0, 0, 1, 0, 0, 0, 1]
+
+
+def test_kittis_boxes_go_through_a_lens_and_into_patches(clpipe, kitti):
+    clpipe("run", "in/a.exr", "-o", "o", *AS_KITTI, *PLAIN, *BARREL, "--set", "distortion.p1=0")
+    picture, found = seen("o/a.png"), labels("o/label_2/a.txt")
+    for channel, words in enumerate(found[:3]):
+        rows, columns = np.nonzero(picture[..., channel] > 0.5)
+        left, top, right, bottom = (float(v) + 0.5 for v in words[4:8])
+        # The box of a bent box has the shape in it, and not much more.
+        assert left < columns.min() + 0.6 and top < rows.min() + 0.6
+        assert right > columns.max() + 0.4 and bottom > rows.max() + 0.4
+        assert (right - left) * (bottom - top) < 1.35 * np.ptp(columns) * np.ptp(rows)
+    patches = ("--patch", 48, "--patches-per-image", "grid")
+    clpipe("run", "in/a.exr", "-o", "p", *AS_KITTI, *PLAIN, *patches)
+    boxes = [
+        np.array(words[4:8], float) + 0.5
+        for path in sorted(Path("p/label_2").glob("*.txt"))
+        for words in labels(path)
+        if words[0] == "Car"
+    ]
+    assert len(boxes) > 4
+    assert all((box >= 0).all() and (box <= 48).all() for box in boxes)
+    said = clpipe("run", "in/a.exr", "-o", "q", *AS_KITTI, *PLAIN, *patches, "--augment").stderr
+    assert "flipped and turned patches have no poses" in said
+
+
+def test_bops_scene(clpipe, coco, write_exr):
+    masks = np.stack([mask_of(points) for points in SHAPES.values()], -1).astype(np.float32)
+    write_exr("in/000003.exr", masks, half=False)
+    visible = masks[..., 0] * (np.arange(WIDTH) < 50)
+    folder = Path("bop")
+    for kind in ("mask", "mask_visib"):
+        (folder / kind).mkdir(parents=True)
+    of_kind = {"mask": masks[..., 0], "mask_visib": visible}
+    for kind, mask in of_kind.items():
+        whole = np.where(mask > 0.5, 255, 0).astype(np.uint8)
+        Image.fromarray(whole).save(folder / kind / "000003_000000.png")
+    pose = {"cam_R_m2c": [1, 0, 0, 0, 1, 0, 0, 0, 1], "cam_t_m2c": [0, 0, 1], "obj_id": 5}
+    count = int((masks[..., 0] > 0.5).sum())
+    info = {"bbox_obj": [0, 0, 1, 1], "bbox_visib": [0, 0, 1, 1], "px_count_all": count}
+    info |= {"px_count_valid": count, "px_count_visib": 1, "visib_fract": 0.5}
+    second = {**info, "bbox_obj": [80, 85, 40, 30], "bbox_visib": [-1, -1, -1, -1]}
+    gone = {**info, "bbox_obj": [300, 300, 5, 5], "bbox_visib": [-1, -1, -1, -1]}
+    write = {"scene_gt": [pose] * 3, "scene_gt_info": [info, second, gone]}
+    write["scene_camera"] = {"cam_K": K, "depth_scale": 0.1}
+    for name, values in write.items():
+        (folder / f"{name}.json").write_text(json.dumps({"3": values}))
+    options = ("--device", "numpy", "--skip", "noise", "--format", "png")
+    options += ("--annotations", "bop/scene_gt.json", *PLAIN, *BARREL, "--set", "resize.scale=0.5")
+    said = clpipe("run", "in/000003.exr", "-o", "o", *options).stderr
+    assert "2 annotations of 1 pictures" in said
+    read = {name: json.loads(Path(f"o/{name}.json").read_text())["3"] for name in write}
+    assert read["scene_gt"] == [pose] * 2
+    shown = seen("o/000003.png")[..., 0] > 0.5
+    with Image.open("o/mask/000003_000000.png") as image:
+        mask = np.asarray(image) > 0
+    assert np.mean(mask != shown) < 0.012
+    first, other = read["scene_gt_info"]
+    rows, columns = np.nonzero(mask)
+    size = np.ptp(columns) + 1, np.ptp(rows) + 1
+    assert first["bbox_obj"] == [columns.min(), rows.min(), *size]
+    assert first["px_count_all"] == pytest.approx(mask.sum(), abs=1)
+    with Image.open("o/mask_visib/000003_000000.png") as image:
+        assert first["px_count_visib"] == (np.asarray(image) > 0).sum()
+    assert first["visib_fract"] == first["px_count_visib"] / first["px_count_all"]
+    assert other["bbox_visib"] == [-1, -1, -1, -1]
+    camera = read["scene_camera"]
+    assert camera["file_name"] == "000003.png" and camera["depth_scale"] == 0.1
+    assert camera["cam_K"][2] == pytest.approx(80 / 2 - 0.5)
+    assert camera["cam_K"][0] == pytest.approx(55)
+    assert camera["model"].endswith("OPENCV") and camera["distortion"]["k1"] == -0.25
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("Car 0 0", "line 1"), ("Car 0 0 0 9 9 1 1 1 1 1 1 1 1 1", "a box with left <= right")],
+)
+def test_labels_that_are_none(clpipe, kitti, text, message):
+    Path("kitti/label_2/a.txt").write_text(text)
+    said = clpipe("run", "in", "-o", "o", *AS_KITTI, status=2).stderr
+    assert message in " ".join(said.split()) and not Path("o").exists()
+    Path("kitti/label_2/a.txt").unlink()
+    assert "has no labels" in clpipe("run", "in", "-o", "o", *AS_KITTI, status=2).stderr
 
 
 @pytest.mark.parametrize(

@@ -38,9 +38,9 @@ poses_option = click.option(
 annotations_option = click.option(
     "--annotations",
     type=click.Path(path_type=Path),
-    metavar="FILE.json",
-    help="Annotations of the renders in COCO's format: boxes, outlines, masks and keypoints go "
-    "through distortion, resizing and patches as the pixels do, to OUT/annotations.json.",
+    metavar="FILE|FOLDER",
+    help="Annotations of the renders, COCO's, BOP's (scene_gt.json) or KITTI's (a folder of "
+    "labels): they go through distortion, resizing and patches as the pixels do, into OUT.",
 )
 
 exclude_option = click.option(

@@ -37,8 +37,11 @@ from clpipe.commands.options import (
     quiet_option,
 )
 from clpipe.commands.progress import follow, print_line
-from clpipe.inputs.coco import Coco, read_coco
+from clpipe.inputs.annotations import Annotations, parsed
+from clpipe.inputs.bop import is_by_image, read_bop
+from clpipe.inputs.coco import read_coco
 from clpipe.inputs.find import Shard, parse_shard
+from clpipe.inputs.kitti import read_kitti
 from clpipe.inputs.series import Series, parse_isos
 from clpipe.outputs.annotations import write_annotations
 from clpipe.outputs.existing import Redo
@@ -172,9 +175,9 @@ def run(
     clpipe run renders/ -o out --truth clean --set denoise.luma_strength=2
     """
     series = Series(cameras, parse_isos(isos) if isos is not None else ())
-    coco = None
+    annotated = None
     if annotations is not None:
-        coco = read_annotations(annotations, per_tar, shard)
+        annotated = read_annotations(annotations, per_tar, shard)
     patches = options["patch"], options["patches_per_image"], options["augment"]
     options["patches_per_image"] = patch_count(*patches)
     made = Run(
@@ -189,14 +192,14 @@ def run(
         click.echo(f"shard {shard.number} of {shard.of} has no images", err=True)
         return
     follow(made, made.outcomes(made.jobs), quiet or json_lines)
-    if coco and not made.summary.interrupted:
+    if annotated and not made.summary.interrupted:
         for folder in series.under(output):
-            for line in write_annotations(folder, coco):
+            for line in write_annotations(folder, annotated):
                 click.echo(line, err=True)
     sys.exit(made.summary.exit_status)
 
 
-def read_annotations(path: Path, per_tar: int | None, shard: Shard) -> Coco:
+def read_annotations(path: Path, per_tar: int | None, shard: Shard) -> Annotations:
     """The annotations of a run's renders.
 
     Raises:
@@ -208,7 +211,10 @@ def read_annotations(path: Path, per_tar: int | None, shard: Shard) -> Coco:
             "--annotations: they are written of all pictures of a folder; leave --webdataset and "
             "--shard out, or run once more without --shard when all parts are done"
         )
-    return read_coco(path)
+    if path.is_dir():
+        return read_kitti(path)
+    values = parsed(path)
+    return read_bop(path) if is_by_image(values) else read_coco(path, values)
 
 
 def patch_count(

@@ -35,6 +35,17 @@ def plain_claim(width: int, height: int) -> Claim:
     return Claim(width, height, width * height * FLOAT, width * height * 3 * FLOAT)
 
 
+def display_size(path: Path) -> tuple[int, int]:
+    """The width and height of the picture that a file claims.
+
+    Raises:
+        ImageError: it cannot be opened.
+    """
+    with open_image(path) as file:
+        spec = file.spec()
+        return spec.full_width, spec.full_height
+
+
 def claim_of(path: Path, mosaic: bool = False) -> Claim | None:
     """What a file claims; None of one that cannot be opened.
 

@@ -5,11 +5,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import OpenImageIO as oiio
 
 from clpipe.base.errors import ImageError
 from clpipe.base.reading import check_regular
 from clpipe.base.text import printable
+from clpipe.base.types import Array
 
 ERROR_LENGTH = 400  # characters; some repeat what they found, of any length
 
@@ -78,3 +80,16 @@ def error_text(text: str) -> str:
         return "it is damaged, or of no known format"
     line = printable(text)
     return line if len(line) <= ERROR_LENGTH else f"{line[:ERROR_LENGTH]}..."
+
+
+def read_grey(path: Path) -> Array:
+    """The first channel of a picture in whole numbers or floats, (height, width), as it is.
+
+    Raises:
+        ImageError: the file cannot be read.
+    """
+    with open_image(path) as file:
+        pixels = file.read_image(0, 0, 0, 1)
+        if pixels is None:
+            raise ImageError(f"{path}: {error_text(file.geterror())}")
+        return np.asarray(pixels)[..., 0]

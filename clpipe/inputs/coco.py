@@ -6,22 +6,19 @@ https://cocodataset.org/#format-data
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
 from clpipe.base.errors import RequestError
-from clpipe.base.reading import parse_json, read_bytes
+from clpipe.inputs.annotations import AnnotatedRender, Record, refuse
 
-LARGEST = 1 << 30  # bytes of a file
 LISTS = ("images", "annotations", "categories")
-
-Record = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Coco:
-    """Annotations of renders.
+    """Annotations of renders, see :class:`~clpipe.inputs.annotations.Annotations`.
 
     Args:
         file: where they are from.
@@ -33,19 +30,21 @@ class Coco:
     values: Mapping[str, Any]
     of_image: Mapping[Any, Sequence[Record]]
 
+    @property
+    def renders(self) -> list[AnnotatedRender]:
+        """The records of the images."""
+        return [
+            AnnotatedRender(image["file_name"], (image["width"], image["height"]), image)
+            for image in self.values["images"]
+        ]
 
-def read_coco(path: Path) -> Coco:
-    """Read annotations in COCO's format.
+
+def read_coco(path: Path, values: Any) -> Coco:
+    """Annotations in COCO's format, from the values of a file.
 
     Raises:
-        RequestError: it cannot be read, or is of another form; the message says where.
+        RequestError: they are of another form; the message says where.
     """
-    try:
-        values = parse_json(read_bytes(path, LARGEST))
-    except OSError as error:
-        raise RequestError(f"--annotations {path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise RequestError(f"--annotations {path}: no valid JSON ({error})") from None
     lists = [values.get(name) if isinstance(values, dict) else None for name in LISTS]
     for name, found in zip(LISTS, lists, strict=True):
         if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
@@ -56,14 +55,14 @@ def read_coco(path: Path) -> Coco:
     for number, image in enumerate(images):
         sizes = [image.get(name) for name in ("width", "height")]
         if not all(isinstance(side, int) and side > 0 for side in sizes):
-            _refuse(path, f"images[{number}]", f"width and height {sizes}", "whole px above 0")
+            refuse(path, f"images[{number}]", f"width and height {sizes}", "whole px above 0")
         if not isinstance(image.get("file_name"), str) or image.get("id") in of_image:
-            _refuse(path, f"images[{number}]", "no file_name, or an id that is there twice", "both")
+            refuse(path, f"images[{number}]", "no file_name, or an id that is there twice", "both")
         of_image[image.get("id")] = []
     for number, each in enumerate(annotations):
         place = f"annotations[{number}]"
         if each.get("image_id") not in of_image:
-            _refuse(path, place, f"image_id {each.get('image_id')!r}", "that of an image")
+            refuse(path, place, f"image_id {each.get('image_id')!r}", "that of an image")
         _check(path, place, each)
         of_image[each["image_id"]].append(each)
     return Coco(path, values, of_image)
@@ -78,26 +77,21 @@ def _check(path: Path, place: str, annotation: Record) -> None:
     box, points = annotation.get("bbox"), annotation.get("keypoints", [])
     outline = annotation.get("segmentation", [])
     if box is not None and not (_numbers(box) and len(box) == 4):
-        _refuse(path, f"{place}.bbox", box, "x, y, width and height")
+        refuse(path, f"{place}.bbox", box, "x, y, width and height")
     if not _numbers(points) or len(points) % 3:
-        _refuse(path, f"{place}.keypoints", points, "x, y and visibility of each")
+        refuse(path, f"{place}.keypoints", points, "x, y and visibility of each")
     if isinstance(outline, dict):
         if not {"size", "counts"} <= outline.keys():
-            _refuse(path, f"{place}.segmentation", list(outline), "size and counts")
+            refuse(path, f"{place}.segmentation", list(outline), "size and counts")
     elif not isinstance(outline, list) or not all(
         _numbers(part) and len(part) >= 6 and len(part) % 2 == 0 for part in outline
     ):
-        _refuse(path, f"{place}.segmentation", outline, "outlines of three places and more")
+        refuse(path, f"{place}.segmentation", outline, "outlines of three places and more")
     if box is None and not outline:
-        _refuse(path, place, "neither bbox nor segmentation", "one of them")
+        refuse(path, place, "neither bbox nor segmentation", "one of them")
 
 
 def _numbers(values: Any) -> bool:
     return isinstance(values, list) and all(
         isinstance(v, int | float) and np.isfinite(v) for v in values
     )
-
-
-def _refuse(path: Path, place: str, found: Any, expected: str) -> NoReturn:
-    text = str(found)
-    raise RequestError(f"--annotations {path}: {place}: found {text[:100]}; expected {expected}")

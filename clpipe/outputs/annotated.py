@@ -1,7 +1,7 @@
 """Annotations in COCO's form moved as pixels are: boxes, outlines, masks and keypoints."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -9,9 +9,17 @@ import numpy as np
 
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Doubles, Mask
-from clpipe.inputs.coco import Record
+from clpipe.inputs.annotations import Record
 from clpipe.reference.carried import Layer, warp
-from clpipe.reference.geometry import Geometry, Margins, destinations
+from clpipe.reference.geometry import (
+    Composition,
+    Crop,
+    Geometry,
+    Margins,
+    Orientation,
+    destinations,
+)
+from clpipe.reference.intrinsics import Intrinsics
 
 STEP = 2.0  # px, of the pieces in which an outline is mapped
 SIMPLER = 0.05  # px, by which a mapped outline may be off to have fewer corners
@@ -55,6 +63,37 @@ class Way:
             inside = (there >= 0) & (there <= np.array(self.after))
         return np.asarray((inside & (points >= low) & (points <= high)).all(-1))
 
+    @property
+    def is_turned(self) -> bool:
+        """Whether the picture is flipped or turned."""
+        turns = [part for part in self.parts if isinstance(part, Orientation)]
+        return any(turn != Orientation(False, False, False) for turn in turns)
+
+    @property
+    def parts(self) -> tuple[Geometry, ...]:
+        """What moves pixels, one after the other."""
+        return self.geometry.parts if isinstance(self.geometry, Composition) else ()
+
+    def camera(self, before: Intrinsics) -> Intrinsics | None:
+        """The intrinsics of the picture, which is not turned; None where they are not known.
+
+        Args:
+            before: those of the render.
+
+        Raises:
+            RequestError: what moves pixels contradicts them.
+        """
+        found: Intrinsics | None = before
+        size = self.margins.around(self.width, self.height)
+        for part in self.parts:
+            if isinstance(part, Crop) and found:
+                cx, cy = found.cx - part.left, found.cy - part.top
+                found = replace(found, width=part.width, height=part.height, cx=cx, cy=cy)
+            elif not isinstance(part, Orientation):
+                found = part.intrinsics(found, *size)
+            size = part.size(*size)
+        return found
+
 
 def mapped_annotation(annotation: Record, way: Way) -> Record | None:
     """What changes of an annotation; None where nothing of its object is in the picture.
@@ -78,9 +117,7 @@ def mapped_annotation(annotation: Record, way: Way) -> Record | None:
         if clipped is None:
             return None
         polygons, share = clipped
-        low = np.min([part.min(0) for part in polygons], 0)
-        high = np.max([part.max(0) for part in polygons], 0)
-        changed["bbox"] = [*low.round(3).tolist(), *(high - low).round(3).tolist()]
+        changed["bbox"] = _bounds(polygons)
         area = sum(abs(_area(part)) for part in polygons)
         changed |= {"area": round(area, 3), "truncated": round(1 - share, 4)}
         if outline:
@@ -88,6 +125,32 @@ def mapped_annotation(annotation: Record, way: Way) -> Record | None:
     if points := annotation.get("keypoints"):
         changed |= _mapped_keypoints(points, way)
     return changed
+
+
+def mapped_box(box: Sequence[float], way: Way) -> tuple[list[float], float] | None:
+    """The box around a box's mapped edges in the picture, and the share of it there.
+
+    None where nothing of it is in the picture.
+    """
+    clipped = _mapped_outline([_box_outline(box)], way)
+    if clipped is None:
+        return None
+    outlines, share = clipped
+    return _bounds(outlines), share
+
+
+def _bounds(outlines: Sequence[Array]) -> list[float]:
+    """The box of outlines: x, y, width and height."""
+    low = np.min([part.min(0) for part in outlines], 0)
+    high = np.max([part.max(0) for part in outlines], 0)
+    return [*low.round(3).tolist(), *(high - low).round(3).tolist()]
+
+
+def moved_mask(mask: Array, way: Way) -> Array:
+    """A mask of the render, (height, width) of 0 and 1, in the picture."""
+    layer = Layer("label", mask[..., None], way.margins.left, way.margins.top)
+    (moved,), _ = warp([layer], way.geometry, *way.margins.around(way.width, way.height))
+    return np.asarray(moved[..., 0])
 
 
 def _box_outline(box: Sequence[float]) -> Array:
@@ -164,22 +227,21 @@ def _mapped_mask(encoded: Record, way: Way) -> Record | None:
         raise ImageError(f"a mask of {width}x{height} pixels in {of}")
     is_text = not isinstance(encoded["counts"], list)
     own = encoded if is_text else coder.frPyObjects(encoded, height, width)
-    mask = coder.decode(own)[..., None]
-    layer = Layer("label", mask, way.margins.left, way.margins.top)
-    (moved,), _ = warp([layer], way.geometry, *way.margins.around(width, height))
+    mask = coder.decode(own)
+    moved = moved_mask(mask, way)
     if not moved.any():
         return None
-    packed = coder.encode(np.asfortranarray(moved[..., 0]))
+    packed = coder.encode(np.asfortranarray(moved))
     counts: Any = packed["counts"].decode("ascii")
     if not is_text:
-        flat = moved[..., 0].ravel(order="F")
+        flat = moved.ravel(order="F")
         edges = np.flatnonzero(np.diff(np.concatenate([[0], flat, [2]])))
         counts = np.diff(np.concatenate([[0], edges])).tolist()
-    y, x = np.nonzero(mask[..., 0])
+    y, x = np.nonzero(mask)
     some = slice(None, None, max(len(x) // MOST_PLACES, 1))
     points = np.stack([x[some], y[some]], -1) + 0.5
     return {
-        "segmentation": {"size": list(moved.shape[:2]), "counts": counts},
+        "segmentation": {"size": list(moved.shape), "counts": counts},
         "bbox": coder.toBbox(packed).tolist(),
         "area": float(moved.sum()),
         "truncated": round(1 - float(way.shows(points, way.places(points)).mean()), 4),

@@ -1,7 +1,6 @@
-"""Annotations of renders as those of their pictures: COCO's boxes, outlines, masks and keypoints.
+"""Annotations of renders as those of their pictures.
 
-They go through what moves the pixels (distortion, resizing, patches), as the sidecars say it. COCO
-counts places in px from the corner, as clpipe does (https://cocodataset.org/#format-data).
+They go through what moves the pixels (distortion, resizing, patches), as the sidecars say it.
 """
 
 import os
@@ -11,20 +10,21 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.base.errors import ClpipeError, ImageError, RequestError
-from clpipe.base.files import write_new
 from clpipe.base.reading import read_bytes
 from clpipe.chain.chain import Chain
 from clpipe.chain.overscan import with_overscan
 from clpipe.chain.rendition import NOISY, Rendition
 from clpipe.chain.request import Request
+from clpipe.images.claims import display_size
 from clpipe.images.tags import FLIPS
-from clpipe.inputs.coco import Coco, Record
+from clpipe.inputs.annotations import Annotations
 from clpipe.inputs.poses import Views, stem_of
 from clpipe.inputs.render_cameras import View
-from clpipe.outputs.annotated import Way, mapped_annotation
+from clpipe.outputs.annotated import Way
+from clpipe.outputs.annotation_files import files_for
 from clpipe.outputs.patches import patch_name
 from clpipe.outputs.photographs import picture_of
-from clpipe.outputs.sealed import SIDECAR, SidecarError, json_text, values_in
+from clpipe.outputs.sealed import SIDECAR, SidecarError, values_in
 from clpipe.reference.geometry import (
     Composition,
     Crop,
@@ -32,57 +32,51 @@ from clpipe.reference.geometry import (
     Orientation,
 )
 
-ANNOTATIONS = "annotations.json"
 LENGTHS = ("focal_length", "sensor_width")  # that an image may say of itself
 
 
-def write_annotations(folder: Path, coco: Coco) -> list[str]:
-    """Write the annotations of all noisy pictures of a folder, as COCO's format has them.
+def write_annotations(folder: Path, annotations: Annotations) -> list[str]:
+    """Write the annotations of all noisy pictures of a folder, in the format that they have.
 
     Args:
         folder: of a run, or of one of its series.
-        coco: of the renders.
+        annotations: of the renders.
 
     Returns:
         Lines for people: what was written, and what could not be.
 
     Raises:
-        ImageError: the file cannot be written.
+        ImageError: a file cannot be written.
     """
-    views = Views([View(image["file_name"], {"image": image}) for image in coco.values["images"]])
-    images: list[Record] = []
-    found: list[Record] = []
+    views = Views([View(each.name, {"render": each}) for each in annotations.renders])
+    files = files_for(annotations)
     lines: list[str] = []
     sidecars = list(_sidecars(folder))
     called = Counter(
         PurePosixPath(name).name
         for name in {stem_of(str(values["input"])) for _, values in sidecars}
     )
-    unnamed = 0
+    unnamed = pictures = found = 0
     for path, values in sidecars:
         try:
             view = views.find(stem_of(str(values["input"])), called)
         except RequestError:
             unnamed += 1
             continue
-        source = view.values["image"]
+        render = view.values["render"]
         try:
-            for file, way in _pictures(path, values, source):
-                name, (width, height) = file.relative_to(folder).as_posix(), way.after
-                own = {"id": len(images) + 1, "file_name": name, "width": width, "height": height}
-                images.append(source | own)
-                for each in coco.of_image[source["id"]]:
-                    if mapped := mapped_annotation(each, way):
-                        ids = {"id": len(found) + 1, "image_id": len(images)}
-                        found.append({**each, **mapped, **ids})
+            size = render.size or display_size(Path(str(values["input"])))
+            for file, way in _pictures(path, values, size):
+                found += files.add(file.relative_to(folder).as_posix(), way, render)
+                pictures += 1
         except (ClpipeError, KeyError, TypeError, ValueError) as error:
             lines.append(f"warning: {path}: its annotations are left out: {error}")
     if unnamed:
-        lines.append(f"warning: {unnamed} pictures are of renders that {coco.file} does not name")
-    written = {**coco.values, "images": images, "annotations": found}
-    write_new(folder / ANNOTATIONS, json_text(written).encode())
-    told = f"{len(found)} annotations of {len(images)} pictures"
-    return [f"wrote {folder / ANNOTATIONS}: {told}", *lines]
+        lines.append(
+            f"warning: {unnamed} pictures are of renders that {annotations.file} does not name"
+        )
+    written = ", ".join(map(str, files.write(folder)))
+    return [f"wrote {written}: {found} annotations of {pictures} pictures", *lines]
 
 
 def _sidecars(folder: Path) -> Iterator[tuple[Path, Mapping[str, Any]]]:
@@ -102,8 +96,15 @@ def _sidecars(folder: Path) -> Iterator[tuple[Path, Mapping[str, Any]]]:
             continue  # which the run has told
 
 
-def _pictures(path: Path, values: Mapping[str, Any], source: Record) -> Iterator[tuple[Path, Way]]:
+def _pictures(
+    path: Path, values: Mapping[str, Any], own: tuple[int, int]
+) -> Iterator[tuple[Path, Way]]:
     """The pictures of a sidecar: each file, and how a render's places come into it.
+
+    Args:
+        path: of the sidecar.
+        values: its values.
+        own: width and height of the render.
 
     Raises:
         ImageError: the render is of another size than the annotations say.
@@ -114,11 +115,10 @@ def _pictures(path: Path, values: Mapping[str, Any], source: Record) -> Iterator
     if "panorama" in values:
         raise ImageError("annotations of what is seen all around do not go through a wide lens")
     parts = chain.geometry.parts if chain.geometry else ()
-    own = source["width"], source["height"]
     size = chain.size(*chain.margins.around(*own))
     if size != (values["width"], values["height"]):
         raise ImageError(
-            f"the annotations are of {source['width']}x{source['height']} pixels, of which a "
+            f"the annotations are of {own[0]}x{own[1]} pixels, of which a "
             f"picture of {size[0]}x{size[1]} would be made, but it has "
             f"{values['width']}x{values['height']}"
         )

@@ -1,0 +1,100 @@
+"""Annotations in BOP's format: scene_gt.json, with what lies beside it.
+
+scene_gt_info.json has boxes and visibility, scene_camera.json cameras, and the folders mask and
+mask_visib a PNG for each object of each image:
+https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from clpipe.inputs.annotations import AnnotatedRender, Record, parsed, refuse
+
+POSES, INFOS, CAMERAS = "scene_gt.json", "scene_gt_info.json", "scene_camera.json"
+MASKS = ("mask", "mask_visib")
+BOXES = ("bbox_obj", "bbox_visib")
+DIGITS = 6  # of an image's number in the names of files
+
+
+@dataclass(frozen=True)
+class BopObject:
+    """An object in an image.
+
+    Args:
+        pose: its record in scene_gt.json, which stays.
+        info: that in scene_gt_info.json; empty where there is none.
+        masks: the PNGs of the whole object and of what is seen, by their folders' names.
+    """
+
+    pose: Record
+    info: Record
+    masks: Mapping[str, Path]
+
+
+@dataclass(frozen=True)
+class Bop:
+    """A scene, see :class:`~clpipe.inputs.annotations.Annotations`.
+
+    Args:
+        file: scene_gt.json.
+        renders: a list of :class:`BopObject` for each image, which is called by its number.
+        cameras: of images, by their numbers, as scene_camera.json has them.
+    """
+
+    file: Path
+    renders: Sequence[AnnotatedRender]
+    cameras: Mapping[int, Record]
+
+
+def read_bop(path: Path) -> Bop:
+    """Read a scene.
+
+    Raises:
+        RequestError: a file cannot be read, or is of another form; the message says where.
+    """
+    poses = _by_image(path)
+    infos = _by_image(beside) if (beside := path.with_name(INFOS)).is_file() else {}
+    cameras = _by_image(beside) if (beside := path.with_name(CAMERAS)).is_file() else {}
+    renders: list[AnnotatedRender] = []
+    for image, objects in poses.items():
+        own: Any = infos.get(image, [{}] * len(objects))
+        if not isinstance(objects, list) or not all(isinstance(each, dict) for each in objects):
+            refuse(path, str(image), objects, "a list of objects")
+        if not isinstance(own, list) or len(own) != len(objects):
+            refuse(path.with_name(INFOS), str(image), own, f"a list of {len(objects)} objects")
+        found = []
+        for number, (pose, info) in enumerate(zip(objects, own, strict=True)):
+            _check(path.with_name(INFOS), f"{image}[{number}]", info)
+            name = f"{image:0{DIGITS}d}_{number:0{DIGITS}d}.png"
+            files = {kind: path.with_name(kind) / name for kind in MASKS}
+            masks = {kind: file for kind, file in files.items() if file.is_file()}
+            found.append(BopObject(pose, info, masks))
+        renders.append(AnnotatedRender(f"{image:0{DIGITS}d}", None, found))
+    return Bop(path, renders, cameras)
+
+
+def is_by_image(values: Any) -> bool:
+    """Whether values are of BOP's form: images by their numbers."""
+    return isinstance(values, dict) and bool(values) and all(key.isdecimal() for key in values)
+
+
+def _by_image(path: Path) -> dict[int, Record]:
+    values = parsed(path)
+    if not is_by_image(values):
+        refuse(path, "it", values, "images by their numbers")
+    return {int(key): value for key, value in values.items()}
+
+
+def _check(path: Path, place: str, info: Record) -> None:
+    for name in BOXES if isinstance(info, dict) else ():
+        box = info.get(name, [0] * 4)
+        if not isinstance(box, list) or len(box) != 4 or not all(_is_number(v) for v in box):
+            refuse(path, f"{place}.{name}", box, "x, y, width and height")
+    if not isinstance(info, dict):
+        refuse(path, place, info, "an object")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -1,0 +1,117 @@
+"""Annotations in KITTI's format: a folder of labels, with the calibration beside it.
+
+A line of a label is type, truncated, occluded, alpha, the box (left, top, right, bottom, in px from
+the centre of the first pixel), height, width and length, x, y and z, rotation_y, and in results a
+score: https://www.cvlibs.net/datasets/kitti (the object development kit's readme).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from clpipe.base.errors import RequestError
+from clpipe.base.reading import read_bytes
+from clpipe.base.types import Doubles
+from clpipe.inputs.annotations import LARGEST, AnnotatedRender, refuse
+
+FIELDS = 15  # of a line, but for a score
+CALIBRATION = "calib"  # the folder beside that of the labels
+MATRICES = ("P0", "P1", "P2", "P3")  # of cameras, of which the labels' is the third
+CENTRE = 0.5  # px: where the first pixel's centre is from the corner
+
+
+@dataclass(frozen=True)
+class KittiObject:
+    """A line of a label.
+
+    Args:
+        words: all of it.
+        truncated: the share of the object beyond the picture; below 0 is not said.
+        box: left, top, right and bottom, in px from the corner.
+    """
+
+    words: tuple[str, ...]
+    truncated: float
+    box: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Kitti:
+    """A folder of labels, see :class:`~clpipe.inputs.annotations.Annotations`.
+
+    Args:
+        file: the folder.
+        renders: a list of :class:`KittiObject` for each image.
+        calibrations: of each image, by its name: lines that are none, and matrices, by their names.
+    """
+
+    file: Path
+    renders: Sequence[AnnotatedRender]
+    calibrations: Mapping[str, Mapping[str, Doubles]]
+
+
+def read_kitti(folder: Path) -> Kitti:
+    """Read a folder of labels.
+
+    Raises:
+        RequestError: there is none, or a file is of another form; the message says where.
+    """
+    files = sorted(folder.glob("*.txt"))
+    if not files:
+        raise RequestError(
+            f"--annotations {folder}: has no labels; a folder of KITTI's has NAME.txt of each image"
+        )
+    renders, calibrations = [], {}
+    for path in files:
+        renders.append(AnnotatedRender(path.stem, None, _objects(path)))
+        beside = folder.parent / CALIBRATION / path.name
+        if beside.is_file():
+            calibrations[path.stem] = _calibration(beside)
+    return Kitti(folder, renders, calibrations)
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return read_bytes(path, LARGEST).decode().splitlines()
+    except OSError as error:
+        raise RequestError(f"--annotations {path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise RequestError(f"--annotations {path}: it is no text") from None
+
+
+def _objects(path: Path) -> list[KittiObject]:
+    found = []
+    for number, line in enumerate(_lines(path), 1):
+        words = tuple(line.split())
+        if not words:
+            continue
+        try:
+            numbers = [float(word) for word in words[1:]]
+        except ValueError:
+            numbers = []
+        left, top, right, bottom = numbers[3:7] if len(numbers) >= FIELDS - 1 else (0, 0, 0, 0)
+        if len(words) not in (FIELDS, FIELDS + 1) or not np.isfinite(numbers).all():
+            refuse(path, f"line {number}", line, f"a type and {FIELDS - 1} numbers")
+        if right < left or bottom < top:
+            refuse(path, f"line {number}", line, "a box with left <= right and top <= bottom")
+        box = left + CENTRE, top + CENTRE, right + CENTRE, bottom + CENTRE
+        found.append(KittiObject(words, numbers[0], box))
+    return found
+
+
+def _calibration(path: Path) -> dict[str, Doubles]:
+    found = {}
+    for number, line in enumerate(_lines(path), 1):
+        name, colon, rest = line.partition(":")
+        if not colon:
+            continue
+        try:
+            values = np.array([float(word) for word in rest.split()])
+        except ValueError:
+            values = np.empty(0)
+        if name in MATRICES and (values.size != 12 or not np.isfinite(values).all()):
+            refuse(path, f"line {number}", line, "12 numbers of a matrix")
+        found[name] = values
+    return found

@@ -1,0 +1,285 @@
+"""Files of annotations, in the format that those of the renders have: COCO's, KITTI's or BOP's."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any, Protocol
+
+import numpy as np
+
+from clpipe.base.errors import ImageError
+from clpipe.base.files import write_new
+from clpipe.base.types import Array, Doubles
+from clpipe.images.openimageio import read_grey
+from clpipe.images.write import write_grey_png
+from clpipe.inputs.annotations import AnnotatedRender, Annotations, Record
+from clpipe.inputs.bop import BOXES, CAMERAS, DIGITS, INFOS, MASKS, POSES, Bop, BopObject
+from clpipe.inputs.coco import Coco
+from clpipe.inputs.kitti import CALIBRATION, CENTRE, MATRICES, Kitti, KittiObject
+from clpipe.outputs.annotated import Way, mapped_annotation, mapped_box, moved_mask
+from clpipe.outputs.sealed import json_text
+from clpipe.reference.intrinsics import COEFFICIENTS, PINHOLE, Intrinsics
+
+ANNOTATIONS = "annotations.json"
+LABELS = "label_2"
+NOTHING = [-1, -1, -1, -1]  # BOP's box of what is not seen
+CAMERA_MATRIX = (0, 4, 2, 5)  # of fx, fy, cx and cy among the nine numbers of one
+TURNED = "flipped and turned patches have no poses; leave --augment out"
+
+
+class Files(Protocol):
+    """The annotations of a folder's pictures, as they are collected."""
+
+    def add(self, file: str, way: Way, render: AnnotatedRender) -> int:
+        """Add those of a picture.
+
+        Args:
+            file: the picture, from the folder.
+            way: how the render's places come into it.
+            render: what is annotated of its render.
+
+        Returns:
+            How many there are.
+
+        Raises:
+            ImageError: they cannot be mapped.
+        """
+        ...
+
+    def write(self, folder: Path) -> list[Path]:
+        """Write all; the files, or folders of them.
+
+        Raises:
+            ImageError: a file cannot be written.
+        """
+        ...
+
+
+def files_for(annotations: Annotations) -> Files:
+    """What collects annotations in the format of the renders' own."""
+    if isinstance(annotations, Kitti):
+        return KittiFiles(annotations)
+    if isinstance(annotations, Bop):
+        return BopFiles(annotations)
+    assert isinstance(annotations, Coco)
+    return CocoFiles(annotations)
+
+
+class CocoFiles:
+    """One file of all pictures, see :class:`Files`."""
+
+    def __init__(self, coco: Coco) -> None:
+        self._coco = coco
+        self._images: list[Record] = []
+        self._found: list[Record] = []
+
+    def add(self, file: str, way: Way, render: AnnotatedRender) -> int:
+        """See :meth:`Files.add`."""
+        source, (width, height) = render.content, way.after
+        mapped = [
+            {**each, **own}
+            for each in self._coco.of_image[source["id"]]
+            if (own := mapped_annotation(each, way))
+        ]
+        own = {"id": len(self._images) + 1, "file_name": file, "width": width, "height": height}
+        self._images.append(source | own)
+        for each in mapped:
+            ids = {"id": len(self._found) + 1, "image_id": len(self._images)}
+            self._found.append({**each, **ids})
+        return len(mapped)
+
+    def write(self, folder: Path) -> list[Path]:
+        """See :meth:`Files.write`."""
+        lists = {"images": self._images, "annotations": self._found}
+        path = folder / ANNOTATIONS
+        write_new(path, json_text({**self._coco.values, **lists}).encode())
+        return [path]
+
+
+class KittiFiles:
+    """A label, and a calibration where the render has one, for each picture; see :class:`Files`.
+
+    Places in space and the angles there are the camera's, and stay; what is less than half a pixel
+    in the picture is left out.
+    """
+
+    def __init__(self, kitti: Kitti) -> None:
+        self._kitti = kitti
+        self._texts: dict[str, str] = {}
+
+    def add(self, file: str, way: Way, render: AnnotatedRender) -> int:
+        """See :meth:`Files.add`."""
+        if way.is_turned:
+            raise ImageError(TURNED)
+        lines = [line for each in render.content if (line := _kitti_line(each, way))]
+        name = PurePosixPath(file).with_suffix(".txt")
+        self._texts[f"{LABELS}/{name}"] = "".join(f"{line}\n" for line in lines)
+        if known := self._kitti.calibrations.get(render.name):
+            self._texts[f"{CALIBRATION}/{name}"] = _kitti_calibration(known, way)
+        return len(lines)
+
+    def write(self, folder: Path) -> list[Path]:
+        """See :meth:`Files.write`."""
+        for name, text in self._texts.items():
+            write_new(folder / name, text.encode())
+        return [folder / name for name in dict.fromkeys(name.split("/")[0] for name in self._texts)]
+
+
+def _kitti_line(known: KittiObject, way: Way) -> str:
+    """A line of a label; "" where its box is not in the picture."""
+    left, top, right, bottom = known.box
+    found = mapped_box([left, top, right - left, bottom - top], way)
+    if found is None:
+        return ""
+    (x, y, width, height), shown = found
+    words = list(known.words)
+    if known.truncated >= 0:
+        words[1] = f"{1 - (1 - known.truncated) * shown:.2f}"
+    edges = x, y, x + width, y + height
+    words[4:8] = [f"{edge - CENTRE:.2f}" for edge in edges]
+    return " ".join(words)
+
+
+def _kitti_calibration(known: Mapping[str, Doubles], way: Way) -> str:
+    lines = []
+    for name, values in known.items():
+        own = values
+        if name in MATRICES:
+            matrix = values.reshape(3, 4)
+            camera = _camera_of(matrix[:, :3].ravel(), way)
+            before = matrix[:, :3]
+            own = (_matrix_of(camera) @ np.linalg.solve(before, matrix)).ravel()
+        lines.append(f"{name}: {' '.join(f'{value:.12e}' for value in own)}\n")
+    return "".join(lines)
+
+
+class BopFiles:
+    """scene_gt.json, scene_gt_info.json, scene_camera.json and masks; see :class:`Files`.
+
+    Poses are the camera's, and stay. Images are numbered as the renders where each has one picture,
+    else one after the other; scene_camera.json says which file an image is.
+    """
+
+    def __init__(self, bop: Bop) -> None:
+        self._bop = bop
+        self._pictures: list[tuple[str, AnnotatedRender, Record, list[_Seen]]] = []
+
+    def add(self, file: str, way: Way, render: AnnotatedRender) -> int:
+        """See :meth:`Files.add`."""
+        if way.is_turned:
+            raise ImageError(TURNED)
+        camera: Record = {"file_name": file}
+        if known := self._bop.cameras.get(int(render.name)):
+            camera = {**known, **camera}
+            if "cam_K" in known:
+                after = _camera_of(known["cam_K"], way)
+                camera["cam_K"] = _matrix_of(after).ravel().tolist()
+                if after.model != PINHOLE:  # which BOP has no word for
+                    terms = {n: after.distortion.get(n, 0.0) for n in COEFFICIENTS[after.model]}
+                    camera |= {"model": after.model, "distortion": terms}
+        seen = [_Seen(each, way) for each in render.content]
+        self._pictures.append((file, render, camera, seen))
+        return sum(each.is_there for each in seen)
+
+    def write(self, folder: Path) -> list[Path]:
+        """See :meth:`Files.write`."""
+        names = [render.name for _, render, _, _ in self._pictures]
+        is_one = len(set(names)) == len(names)
+        poses: Record = {}
+        infos: Record = {}
+        cameras: Record = {}
+        written: dict[str, Record] = {POSES: poses, INFOS: infos, CAMERAS: cameras}
+        for number, (_, render, camera, seen) in enumerate(self._pictures):
+            image = int(render.name) if is_one else number
+            own = [each for each in seen if each.is_there]
+            poses[str(image)] = [each.known.pose for each in own]
+            infos[str(image)] = [each.info for each in own]
+            cameras[str(image)] = camera
+            for place, each in enumerate(own):
+                for kind, mask in each.masks.items():
+                    name = f"{image:0{DIGITS}d}_{place:0{DIGITS}d}.png"
+                    (folder / kind).mkdir(parents=True, exist_ok=True)
+                    write_grey_png(folder / kind / name, np.where(mask, 255, 0).astype(np.uint8))
+        for name, values in written.items():
+            write_new(folder / name, json_text(values).encode())
+        kinds = dict.fromkeys(k for *_, seen in self._pictures for each in seen for k in each.masks)
+        return [folder / name for name in (*written, *kinds)]
+
+
+class _Seen:
+    """An object of BOP's in a picture.
+
+    Args:
+        known: it in the render.
+        way: how places come into the picture.
+    """
+
+    def __init__(self, known: BopObject, way: Way) -> None:
+        self.known = known
+        self.masks: dict[str, Array] = {}
+        self.info: Record = dict(known.info)
+        counts: dict[str, tuple[int, int]] = {}  # px in the render and in the picture
+        shares: list[float] = []
+        for kind, box in zip(MASKS, BOXES, strict=True):
+            if kind in known.masks:
+                before = _mask(known.masks[kind], way)
+                self.masks[kind] = after = moved_mask(before, way)
+                counts[kind] = int(before.sum()), int(after.sum())
+                self.info[box] = _box_of(after)
+            elif box in known.info and known.info[box] != NOTHING:
+                found = mapped_box(known.info[box], way)
+                self.info[box] = [round(v) for v in found[0]] if found else NOTHING
+                shares.append(found[1] if found else 0.0)
+        self.is_there = any(n for _, n in counts.values()) if counts else any(shares) or not shares
+        whole, seen = counts.get(MASKS[0]), counts.get(MASKS[1])
+        if whole and whole[0]:
+            grown = whole[1] / whole[0]
+            for name in ("px_count_all", "px_count_valid"):
+                if name in known.info:
+                    self.info[name] = round(known.info[name] * grown)
+        if seen:
+            self.info["px_count_visib"] = seen[1]
+            if self.info.get("px_count_all"):
+                self.info["visib_fract"] = min(seen[1] / self.info["px_count_all"], 1.0)
+
+
+def _mask(path: Path, way: Way) -> Array:
+    """A mask, (height, width) of 0 and 1.
+
+    Raises:
+        ImageError: it cannot be read, or is of another size than the render.
+    """
+    mask = read_grey(path)
+    if mask.shape[1::-1] != (way.width, way.height):
+        raise ImageError(
+            f"{path}: a mask of {mask.shape[1]}x{mask.shape[0]} pixels of a render of "
+            f"{way.width}x{way.height}"
+        )
+    return (mask > 0).astype(np.uint8)
+
+
+def _box_of(mask: Array) -> list[int]:
+    """The box of a mask, by whole pixels: x, y, width and height."""
+    rows, columns = np.nonzero(mask)
+    if not rows.size:
+        return NOTHING
+    x, y = int(columns.min()), int(rows.min())
+    return [x, y, int(columns.max()) + 1 - x, int(rows.max()) + 1 - y]
+
+
+def _camera_of(matrix: Sequence[float] | Array, way: Way) -> Intrinsics:
+    """The picture's camera, from the render's matrix, whose pixels count from their centres.
+
+    Raises:
+        ImageError: it is not known.
+    """
+    fx, fy, cx, cy = (float(matrix[i]) for i in CAMERA_MATRIX)
+    before = Intrinsics(way.width, way.height, fx, fy, cx + CENTRE, cy + CENTRE)
+    found = way.camera(before)
+    if found is None:
+        raise ImageError("the picture's camera is not known")
+    return replace(found, cx=found.cx - CENTRE, cy=found.cy - CENTRE)
+
+
+def _matrix_of(camera: Intrinsics) -> Any:
+    return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], float)
