@@ -88,9 +88,10 @@ def carry_around(
             continue
         along = (pixels * ahead[..., None]).astype(np.float32)
         carried.append(Aov(each.name, each.kind, each.channels, along, record))
-        name = f"{each.name}.{DISTANCE}"
-        record = {**record, "layer": name, "channels": [name]}
-        carried.append(Aov(name, each.kind, (name,), pixels, record))
+        layer = each.channels[0].rpartition(".")[0] or each.name
+        name, channel = f"{each.name}.{DISTANCE}", f"{layer}.{DISTANCE}"
+        record = {**record, "layer": name, "channels": [channel]}
+        carried.append(Aov(name, each.kind, (channel,), pixels, record))
     attributes: dict[str, str] = {}
     for each in of_files[0]:
         attributes |= cryptomatte_attributes(each.file, each.location.part)

@@ -17,6 +17,7 @@ from clpipe.inputs.bop import BOXES, CAMERAS, DIGITS, INFOS, MASKS, POSES, Bop, 
 from clpipe.inputs.coco import Coco
 from clpipe.inputs.kitti import CALIBRATION, CENTRE, MATRICES, Kitti, KittiObject
 from clpipe.outputs.annotated import Way, mapped_annotation, mapped_box, moved_mask
+from clpipe.outputs.photographs import simplest
 from clpipe.outputs.sealed import json_text
 from clpipe.reference.intrinsics import COEFFICIENTS, PINHOLE, Intrinsics
 
@@ -278,7 +279,7 @@ def _camera_of(matrix: Sequence[float] | Array, way: Way) -> Intrinsics:
     found = way.camera(before)
     if found is None:
         raise ImageError("the picture's camera is not known")
-    return replace(found, cx=found.cx - CENTRE, cy=found.cy - CENTRE)
+    return replace(simplest(found), cx=found.cx - CENTRE, cy=found.cy - CENTRE)
 
 
 def _matrix_of(camera: Intrinsics) -> Any:

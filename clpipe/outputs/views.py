@@ -166,11 +166,12 @@ def nerfstudio(
     shared = cameras[0] if all(each == cameras[0] for each in cameras) else {}
     if not shared:
         frames = [{**frame, **camera} for frame, camera in zip(frames, cameras, strict=True)]
-    lists = {
-        f"{split}_filenames": [
-            up + each.file for each in pictures if splits.get(each.name) == split
-        ]
+    of_split = {
+        split: [up + each.file for each in pictures if splits.get(each.name) == split]
         for split in dict.fromkeys(splits.values())
     }
+    if "val" in of_split:  # nerfstudio wants all three where it finds one
+        of_split.setdefault("test", of_split["val"])
+    lists = {f"{split}_filenames": files for split, files in of_split.items()}
     said = {"note": OPENGL_NOTE, "camera_model": model, **shared, **responses.record, **lists}
     return json_text({**said, "frames": frames})
