@@ -13,6 +13,7 @@ import OpenImageIO as oiio
 import pytest
 
 import clpipe as package
+from clpipe.reference.panorama import CUBE
 from tests.conftest import ROOT, STILL_LIFE, WRITTEN, written
 from tests.dng import write_dng
 from tests.markdown import RUN, PageRunner, blocks
@@ -48,6 +49,10 @@ def material(tmp_path_factory):
     for number in range(1, 5):
         part = still_life[100 * number : 100 * number + 64, 300:396]
         write(folder / "renders" / f"000{number}.exr", part, oiio.HALF)
+    (folder / "faces").mkdir()
+    for number, face in enumerate(CUBE):
+        part = still_life[200:264, 100 * number : 100 * number + 64]
+        write(folder / "faces" / f"room_{face}.exr", part, oiio.HALF)
     small = still_life[200:264, 300:396]
     write(folder / "render.png", small, oiio.UINT8)
     write(folder / "render16.tif", small, oiio.UINT16)

@@ -183,7 +183,7 @@ NO_STAGES = {
     ("inputs/kept.py", "sensor_noise"),
     ("explorer/view.py", "mosaic"),
     ("inputs/render_cameras.py", "distortion"),
-    ("outputs/views.py", "distortion"),
+    ("outputs/photographs.py", "distortion"),
 }
 
 

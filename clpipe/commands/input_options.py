@@ -38,9 +38,10 @@ poses_option = click.option(
 annotations_option = click.option(
     "--annotations",
     type=click.Path(path_type=Path),
-    metavar="FILE|FOLDER",
-    help="Annotations of the renders, COCO's, BOP's (scene_gt.json) or KITTI's (a folder of "
-    "labels): they go through distortion, resizing and patches as the pixels do, into OUT.",
+    metavar="PATH",
+    help="COCO's, BOP's or KITTI's annotations of renders: a JSON file of COCO's, a scene_gt.json, "
+    "or a folder of labels. They go through distortion, resizing and patches as the pixels do, "
+    "into OUT.",
 )
 
 exclude_option = click.option(

@@ -21,7 +21,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 # The options of commands that have many, by the heading that they stand under. "+" is before those
 # that --help shows, briefly; --help-all shows all in full.
 GROUPS = {
-    "Camera": "+config +camera +iso +lens focal_length aperture focus_distance +seed noise_key",
+    "Camera": "+config +camera +iso +lens lens_model focal_length aperture focus_distance +seed "
+    "noise_key",
     "Chain": "+set +skip stages start_at until stage_file",
     "Renders": "+views +path box +frames +resolution +samples denoise time_limit blender",
     "Pictures": "+output +format +keep bracket +patch patches_per_image augment webdataset licence "

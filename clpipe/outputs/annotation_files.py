@@ -17,9 +17,9 @@ from clpipe.inputs.bop import BOXES, CAMERAS, DIGITS, INFOS, MASKS, POSES, Bop, 
 from clpipe.inputs.coco import Coco
 from clpipe.inputs.kitti import CALIBRATION, CENTRE, MATRICES, Kitti, KittiObject
 from clpipe.outputs.annotated import Way, mapped_annotation, mapped_box, moved_mask
-from clpipe.outputs.photographs import simplest
+from clpipe.outputs.photographs import lens_record, simplest
 from clpipe.outputs.sealed import json_text
-from clpipe.reference.intrinsics import COEFFICIENTS, PINHOLE, Intrinsics
+from clpipe.reference.intrinsics import PINHOLE, Intrinsics
 
 ANNOTATIONS = "annotations.json"
 LABELS = "label_2"
@@ -176,8 +176,7 @@ class BopFiles:
                 after = _camera_of(known["cam_K"], way)
                 camera["cam_K"] = _matrix_of(after).ravel().tolist()
                 if after.model != PINHOLE:  # which BOP has no word for
-                    terms = {n: after.distortion.get(n, 0.0) for n in COEFFICIENTS[after.model]}
-                    camera |= {"model": after.model, "distortion": terms}
+                    camera |= lens_record(after)
         seen = [_Seen(each, way) for each in render.content]
         self._pictures.append((file, render, camera, seen))
         return sum(each.is_there for each in seen)

@@ -139,3 +139,8 @@ def simplest(camera: Intrinsics) -> Intrinsics:
     model = next((each for each in simple if bent <= {*COEFFICIENTS[each]}), camera.model)
     own = {name: camera.distortion.get(name, 0.0) for name in COEFFICIENTS[model]}
     return replace(camera, model=model, distortion=own)
+
+
+def lens_record(camera: Intrinsics) -> dict[str, Any]:
+    """How cameras.json says a picture's lens: COLMAP's model, and its coefficients by name."""
+    return {"model": camera.model, "distortion": dict(camera.distortion)}

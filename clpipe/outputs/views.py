@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Any
 
 from clpipe.base.about import __version__
-from clpipe.outputs.photographs import Photograph
+from clpipe.outputs.photographs import Photograph, lens_record
 from clpipe.outputs.sealed import json_text
 from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE
 from clpipe.reference.pose import to_opengl, to_quaternion
@@ -59,7 +59,7 @@ def cameras_json(pictures: Sequence[Photograph], up: str = "") -> str:
         k = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
         view = {"file": up + each.file, "width": camera.width, "height": camera.height, "K": k}
         view |= dict(zip("Rt", each.pose, strict=True)) if each.pose else {}
-        view |= {"model": camera.model, "distortion": dict(camera.distortion)}
+        view |= lens_record(camera)
         view |= {"motion": each.motion} if each.motion else {}
         views.append(view | responses.of(each))
     return json_text({"note": NOTE, **responses.record, "views": views})
