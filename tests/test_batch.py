@@ -212,6 +212,7 @@ def test_devices_develop_at_the_same_time(renders, tmp_path, monkeypatch):
 def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, monkeypatch):
     renders(30)
     (tmp_path / "out").mkdir()
+    monkeypatch.setattr("clpipe.batch.threads.COMMITTED", 2)
     worker, jobs = worker_of(tmp_path)
     batch = Batch(worker, [None], threads=2)
     decode, decoded, seen = ImageWorker.decode, [], []
@@ -225,7 +226,7 @@ def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, m
         time.sleep(0.01)  # whoever waits for outcomes is slow
         seen.append(len(decoded) - done)
     assert batch.in_flight == 4
-    assert max(seen) <= batch.in_flight + 1
+    assert max(seen) <= batch.in_flight + 2 + 1
 
 
 @pytest.mark.slow
@@ -447,6 +448,7 @@ def test_the_folder_has_gone(clpipe, renders, monkeypatch):
     def fail_to_write(path, spec, pixels):
         stored = real(path, spec, pixels)
         if path.name == "r002.jpg":
+            wait_for(Path("out"), 2)
             Path("out").rename("elsewhere")
         return stored
 
@@ -454,7 +456,7 @@ def test_the_folder_has_gone(clpipe, renders, monkeypatch):
     result = clpipe("run", "in", *RUN, "--jobs", 1, status=1)
     assert "out: " in result.stderr and "the same command goes on" in result.stderr
     assert not Path("out").exists()
-    assert {"r000.jpg", "r000.json", "r002.jpg"} <= set(written(Path("elsewhere")))
+    assert {"r000.jpg", "r000.json"} <= set(written(Path("elsewhere")))
 
 
 def test_a_manifest_and_draws(clpipe, renders):

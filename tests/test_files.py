@@ -9,7 +9,7 @@ import pytest
 
 from clpipe.base import files
 from clpipe.base.errors import ImageError, OutputError
-from clpipe.base.files import write_whole
+from clpipe.base.files import FileGroup, deferred_files, keep_names, write_whole
 from clpipe.batch.outcome import DONE, Outcome
 from clpipe.batch.run_log import RunLog, read_log
 from clpipe.inputs.find import Job
@@ -38,6 +38,54 @@ def test_an_error_in_between_leaves_the_file_as_it_was(tmp_path):
     with pytest.raises(TypeError):
         write_whole(tmp_path / "a", b"after", "no bytes")
     assert [p.read_bytes() for p in tmp_path.iterdir()] == [b"before"]
+
+
+def test_deferred_files_are_on_the_disk_before_they_have_names(tmp_path, monkeypatch):
+    done = []
+    monkeypatch.setattr(files, "file_to_disk", lambda path: done.append("disk"))
+    replace = Path.replace
+    renamed = lambda path, to: done.append(to.name) or replace(path, to)  # noqa: E731
+    monkeypatch.setattr(Path, "replace", renamed)
+    groups = []
+    for letter in "ab":
+        with deferred_files() as group:
+            write_whole(tmp_path / f"{letter}.jpg", PARTS[0])
+            write_whole(tmp_path / f"{letter}.json", PARTS[1])
+            keep_names(tmp_path)
+        groups.append(group)
+    write_whole(tmp_path / "c", b"not deferred")
+    assert [p.name for p in tmp_path.iterdir() if p.name[0] != "."] == ["c"]
+    done.clear()
+    assert FileGroup.commit(groups) == [None, None]
+    assert done == [*["disk"] * 2, "a.jpg", "a.json", *["disk"] * 2, "b.jpg", "b.json"]
+    assert {p.name for p in tmp_path.iterdir()} == {"a.jpg", "a.json", "b.jpg", "b.json", "c"}
+    picture, sidecar = tmp_path / "a.jpg", tmp_path / "a.json"
+    assert sidecar.stat().st_mtime_ns >= picture.stat().st_ctime_ns
+
+
+def test_a_group_that_fails_leaves_nothing_and_the_others_are_whole(tmp_path):
+    groups = []
+    for letter in "abc":
+        (tmp_path / letter).mkdir()
+        with deferred_files() as group:
+            write_whole(tmp_path / letter / "picture", b"x")
+            write_whole(tmp_path / letter / "sidecar", b"y")
+        groups.append(group)
+    (tmp_path / "b/sidecar").mkdir()  # a folder, which no file can replace
+    first, second, third = FileGroup.commit(groups)
+    assert first is third is None
+    assert "b/sidecar: cannot be written: Is a directory" in str(second)
+    found = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
+    assert found == {"a/picture", "a/sidecar", "b/picture", "c/picture", "c/sidecar"}
+    with pytest.raises(TypeError):
+        write_and_fail(tmp_path / "d")
+    assert not list(tmp_path.glob("*d*"))
+
+
+def write_and_fail(path):
+    with deferred_files():
+        write_whole(path, b"x")
+        raise TypeError
 
 
 def test_no_link_is_followed(tmp_path, monkeypatch):

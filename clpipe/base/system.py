@@ -13,6 +13,7 @@ import shutil
 import stat
 import tempfile
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -32,6 +33,7 @@ fcntl, msvcrt, resource = (_optional(name) for name in ("fcntl", "msvcrt", "reso
 HOLDABLE = 2**40 if fcntl else 2**30
 
 _ARENA_MAX = -8  # of glibc's mallopt: the most heaps
+_SYNC_FILE_RANGE_WRITE = 2  # of Linux: begin with what was not begun
 
 # Without O_BINARY, Windows writes "\r\n" for "\n".
 _PLAIN = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
@@ -219,13 +221,13 @@ def save_addresses() -> None:
     """
     os.environ["MALLOC_ARENA_MAX"] = "1"
     with contextlib.suppress(OSError, TypeError, AttributeError):  # another C library
-        ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)
+        _libc().mallopt(_ARENA_MAX, 1)
 
 
 def give_back_memory() -> None:
     """Give memory that was freed, and that the C library keeps for later, back to the system."""
     with contextlib.suppress(OSError, TypeError, AttributeError):  # another C library
-        ctypes.CDLL(None).malloc_trim(0)
+        _libc().malloc_trim(0)
 
 
 def bring_to_disk(folder: Path) -> None:
@@ -241,6 +243,43 @@ def bring_to_disk(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+@cache
+def _libc() -> ctypes.CDLL:
+    """The C library.
+
+    Raises:
+        TypeError: this system does not give it so.
+    """
+    return ctypes.CDLL(None)
+
+
+def file_to_disk(path: Path) -> None:
+    """Have a file's bytes outlive a loss of power.
+
+    Raises:
+        OSError: they cannot be brought to the disk.
+    """
+    descriptor = os.open(path, os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def begin_writing(path: Path) -> None:
+    """Begin to bring a file's bytes to the disk, and do not wait; nothing where that is unknown.
+
+    Of several files the disk then makes one piece of work.
+    """
+    with contextlib.suppress(OSError, TypeError, AttributeError):  # another C library
+        begin = _libc().sync_file_range
+        descriptor = os.open(path, os.O_RDWR)
+        try:
+            begin(descriptor, ctypes.c_int64(0), ctypes.c_int64(0), _SYNC_FILE_RANGE_WRITE)
+        finally:
+            os.close(descriptor)
 
 
 def processors() -> int:

@@ -4,8 +4,10 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
+
+import numpy as np
 
 from clpipe.batch.outcome import DONE, FAILED, Outcome, Span
 from clpipe.images.read import SourceImage
@@ -37,6 +39,12 @@ class JobState:
     clipped: float = 0.0  # the share of clipped pixels, of the rendition that has most
     patches: list[Patch] = field(default_factory=list)  # that are made in place of pictures
     old: int = 0  # renditions that another program has made
+
+    def drop_pixels(self) -> None:
+        """Give the memory of the image back; its size is still known."""
+        if self.source:
+            empty = np.broadcast_to(np.float16(0), self.source.pixels.shape)
+            self.source = replace(self.source, pixels=empty)
 
     @contextmanager
     def timed(self, step: str) -> Iterator[None]:

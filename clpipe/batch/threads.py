@@ -22,7 +22,7 @@ from clpipe.batch.job_state import JobState
 from clpipe.batch.outcome import FAILED, Outcome
 from clpipe.batch.room import Room, host_bytes, usual_room
 from clpipe.batch.runners import Runners
-from clpipe.batch.work import ImageWorker
+from clpipe.batch.work import ImageWorker, Written
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.images.openimageio import set_codec_threads
@@ -34,6 +34,12 @@ Decoded = tuple[JobState, deque[Recipe]]
 
 # A rendition between a device and its files.
 Developed = tuple[JobState, Recipe, Result, Device | None]
+
+# A rendition whose files have not their names yet, None where it failed, and whether it is its
+# job's last one.
+Encoded = tuple[JobState, Written | None, bool]
+
+COMMITTED = 64  # renditions at a time at most; more would make those that wait for them late
 
 
 @dataclass(frozen=True)
@@ -105,11 +111,14 @@ class Batch:
         self._lock = threading.Lock()
         self._taking = threading.Lock()  # held while a job is waited for
         self._places = threading.Semaphore(self.in_flight)
+        # Jobs without an outcome, or whose outcome nobody has taken; their memory is small.
+        self._unfinished = threading.Semaphore(self.in_flight + COMMITTED)
         size = usual_room() if room is None else room
         self._room = Room(size, self.devices, partial(worker.reserve, results))
         self._results = threading.Semaphore(results)
         self._decoded: queue.SimpleQueue[Decoded | None] = queue.SimpleQueue()
         self._developed: queue.SimpleQueue[Developed | None] = queue.SimpleQueue()
+        self._encoded: queue.Queue[Encoded | None] = queue.Queue(2 * COMMITTED)
         # None: a thread that decodes has ended, or one of any kind has failed.
         self._outcomes: queue.SimpleQueue[Outcome | None] = queue.SimpleQueue()
 
@@ -142,10 +151,11 @@ class Batch:
             for i, device in enumerate(self.devices)
         ]
         encoders = [self._start(f"encode {i}", self._encode_all) for i in numbers]
+        committer = self._start("write", self._commit_all)
         try:
             yield from self._finished(len(decoders))
         finally:
-            self._close(decoders, developers, encoders)
+            self._close(decoders, developers, encoders, committer)
 
     def _start(self, name: str, work: Callable[..., None], *arguments: Any) -> threading.Thread:
         """Start a thread. An error that it does not handle ends the run."""
@@ -183,8 +193,7 @@ class Batch:
                 ended += 1
                 continue
             finished += 1
-            self._room.leave(outcome.job.stem)
-            self._places.release()
+            self._unfinished.release()
             yield outcome
         if self._failure:
             raise self._failure
@@ -194,6 +203,7 @@ class Batch:
         decoders: Sequence[threading.Thread],
         developers: Sequence[threading.Thread],
         encoders: Sequence[threading.Thread],
+        committer: threading.Thread,
     ) -> None:
         """Let all threads end, also those that wait."""
         self.stop()
@@ -201,6 +211,7 @@ class Batch:
         self._is_needed.set()
         self._room.open()
         for _ in decoders:
+            self._unfinished.release()
             self._places.release()
         for _ in developers:
             self._decoded.put(None)
@@ -212,9 +223,12 @@ class Batch:
             self._developed.put(None)
         for thread in encoders:
             thread.join()
+        self._encoded.put(None)
+        committer.join()
 
     def _next(self) -> Job | None:
         """The next job, once there is a place for it; None where none is to come."""
+        self._unfinished.acquire()
         self._places.acquire()
         with self._taking:
             if self._stopping.is_set():
@@ -231,10 +245,12 @@ class Batch:
             try:
                 state = self._worker.decode(job, partial(self._admit, job, waits))
             except OutputError as error:
+                self._leave(job)
                 self._outcomes.put(Outcome(job, FAILED, error=failure_text(job, error)))
                 self._fail(error)
                 continue
             except BaseException as error:  # nothing that one image does may end the thread
+                self._leave(job)
                 self._outcomes.put(Outcome(job, FAILED, error=failure_text(job, error)))
                 continue
             for seconds in waits:  # for room, which is no decoding
@@ -244,9 +260,11 @@ class Batch:
             if state.recipes:
                 self._decoded.put((state, deque(state.recipes)))
             else:
+                self._leave(job)
                 self._outcomes.put(state.outcome())
             del state
-        self._places.release()  # for the next thread, which has no job to wait for either
+        self._unfinished.release()  # for the next thread, which has no job to wait for either
+        self._places.release()
         self._outcomes.put(None)
 
     def _admit(self, job: Job, waits: list[float]) -> None:
@@ -362,26 +380,61 @@ class Batch:
         if result:
             self._developed.put((state, recipe, result, device))
         else:
-            self._count_written(state)
+            self._hand_on(state, None)
 
     def _encode_all(self) -> None:
         while developed := self._developed.get():
             state = developed[0]
+            written = None
             try:
-                self._worker.encode(*developed)
+                written = self._worker.encode(*developed)
             except OutputError as error:
                 state.error = f"{state.job.path}: {error}"
                 self._fail(error)
             except BaseException as error:
                 state.error = failure_text(state.job, error)
-            self._count_written(state)
+            self._hand_on(state, written)
             del developed, state
 
-    def _count_written(self, state: JobState) -> None:
-        """One rendition less to wait for; with the last one the job is finished."""
+    def _hand_on(self, state: JobState, written: Written | None) -> None:
+        """One rendition less to wait for; with the last one the job's memory is free."""
         self._results.release()
-        with self._lock:
+        with self._lock:  # so that the last one comes behind the others
             state.unwritten -= 1
-            is_finished = state.unwritten == 0
-        if is_finished:
-            self._outcomes.put(state.outcome())
+            is_last = state.unwritten == 0
+            if is_last:
+                state.drop_pixels()
+                self._leave(state.job)
+            self._encoded.put((state, written, is_last))
+
+    def _leave(self, job: Job) -> None:
+        """Give a job's place, and its room in memory, to others."""
+        self._room.leave(job.stem)
+        self._places.release()
+
+    def _commit_all(self) -> None:
+        """Bring to the disk, together, what was encoded while the disk had the renditions before.
+
+        In the order in which they were encoded, so that a job's outcome follows its last rendition.
+        """
+        while first := self._encoded.get():
+            taken: list[Encoded] = [first]
+            while len(taken) < COMMITTED:
+                try:
+                    encoded = self._encoded.get_nowait()
+                except queue.Empty:
+                    break
+                if encoded is None:
+                    self._encoded.put(None)  # for the loop's end
+                    break
+                taken.append(encoded)
+            try:
+                self._worker.commit([(state, files) for state, files, _ in taken if files])
+            except OutputError as error:
+                self._fail(error)
+            except BaseException as error:
+                for state, _, _ in taken:
+                    state.error = failure_text(state.job, error)
+            for state, _, is_last in taken:
+                if is_last:
+                    self._outcomes.put(state.outcome())

@@ -3,14 +3,13 @@
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence, Set
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, TypeVar
 
-import numpy as np
-
 from clpipe.base.digests import stamp_of
-from clpipe.base.errors import ImageError, NoPictureError, RequestError
+from clpipe.base.errors import ImageError, NoPictureError, OutputError, RequestError
+from clpipe.base.files import FileGroup, deferred_files
 from clpipe.base.types import Array
 from clpipe.batch.job_state import JobState
 from clpipe.batch.outcome import LEFT_OUT, SKIPPED, Span
@@ -36,6 +35,19 @@ from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Written:
+    """A rendition that is written, but not under its names yet.
+
+    Args:
+        group: what gives its files their names.
+        files: all of them, relative to the output folder.
+    """
+
+    group: FileGroup
+    files: Sequence[str]
 
 
 class ImageWorker:
@@ -216,10 +228,7 @@ class ImageWorker:
             name = threading.current_thread().name
             state.spans += [Span(t.name, name, t.start, t.seconds) for t in timings or []]
             if result and recipe is state.recipes[-1] and DNG not in self.writer.formats:
-                # Of the pixels only their shape is still needed; their memory is not.
-                assert state.source
-                empty = np.broadcast_to(np.float16(0), state.source.pixels.shape)
-                state.source = replace(state.source, pixels=empty)
+                state.drop_pixels()
             return result
 
         return finish
@@ -252,41 +261,87 @@ class ImageWorker:
 
     def encode(
         self, state: JobState, recipe: Recipe, result: Result, device: Device | None
-    ) -> None:
+    ) -> Written | None:
         """Write one rendition and then its sidecar.
+
+        Returns:
+            The files, which have not their names yet, see :meth:`commit`; None where it fails.
 
         Raises:
             OutputError: nothing can be written any more.
         """
-        writer, job = self.writer, state.job
-        assert state.source
+        written = None
         with state.timed("encode"):
             try:
-                carried = None
-                if writer.carries(recipe.rendition):
-                    carried, state.aovs = state.aovs, None
-                files = writer.write(job, recipe, state.source, result, carried, state.patches)
-                clipped = None if recipe.noise else clipped_share(result, recipe.chain)
-                if recipe.chain.source is not Kind.DISPLAY:  # a photograph was clipped before
-                    state.clipped = max(state.clipped, clipped or 0.0)
-                path = writer.path(job, SIDECAR, recipe.rendition)
-                record = sidecar(
-                    job,
-                    writer.record_of(state.request, recipe.rendition),
-                    state.stamps,
-                    recipe,
-                    device,
-                    state.source,
-                    result,
-                    files,
-                    clipped,
-                    carried,
-                    state.patches,
-                )
-                write_sidecar(path, record)
-                state.outputs += [str(f.relative_to(writer.folder)) for f in (*files, path)]
+                with deferred_files() as group:
+                    written = Written(group, self._encode(state, recipe, result, device))
             except (ImageError, MemoryError) as error:
-                writer.check_folder()
-                state.error = state.loader.error_text(job, error)
+                self.fail(state, error)
         if result.encoded is not None and device and not state.patches:
             self._spare.give(result.encoded)
+        return written
+
+    def commit(self, encoded: Sequence[tuple[JobState, Written]]) -> None:
+        """Bring renditions to the disk, together, and give their files their names.
+
+        Raises:
+            OutputError: nothing can be written any more; what could not is noted.
+        """
+        failure: OutputError | None = None
+        errors = FileGroup.commit([written.group for _, written in encoded])
+        for (state, written), error in zip(encoded, errors, strict=True):
+            if error is None:
+                state.outputs += written.files
+                continue
+            try:
+                self.fail(state, error)
+            except OutputError as reason:
+                state.error, failure = f"{state.job.path}: {reason}", reason
+        if failure:
+            raise failure
+
+    def fail(self, state: JobState, error: Exception) -> None:
+        """Note that a state's files cannot be written.
+
+        Raises:
+            OutputError: nothing can be written any more.
+        """
+        self.writer.check_folder()
+        state.error = state.loader.error_text(state.job, error)
+
+    def _encode(
+        self, state: JobState, recipe: Recipe, result: Result, device: Device | None
+    ) -> list[str]:
+        """Write one rendition and then its sidecar.
+
+        Returns:
+            The files, relative to the output folder.
+
+        Raises:
+            ImageError, MemoryError: it cannot be written.
+        """
+        writer, job = self.writer, state.job
+        assert state.source
+        carried = None
+        if writer.carries(recipe.rendition):
+            carried, state.aovs = state.aovs, None
+        files = writer.write(job, recipe, state.source, result, carried, state.patches)
+        clipped = None if recipe.noise else clipped_share(result, recipe.chain)
+        if recipe.chain.source is not Kind.DISPLAY:  # a photograph was clipped before
+            state.clipped = max(state.clipped, clipped or 0.0)
+        path = writer.path(job, SIDECAR, recipe.rendition)
+        record = sidecar(
+            job,
+            writer.record_of(state.request, recipe.rendition),
+            state.stamps,
+            recipe,
+            device,
+            state.source,
+            result,
+            files,
+            clipped,
+            carried,
+            state.patches,
+        )
+        write_sidecar(path, record)
+        return [str(f.relative_to(writer.folder)) for f in (*files, path)]

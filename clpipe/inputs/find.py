@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -75,7 +76,7 @@ class Job:
         """The path as it is stored and printed."""
         return self.written or str(self.path)
 
-    @property
+    @cached_property
     def stem(self) -> str:
         """The path of its outputs in the output folder, without an ending."""
         return self.name or str(Path(self.key).with_suffix(""))

@@ -130,7 +130,7 @@ def remove_sidecar(path: Path) -> None:
     """
     try:
         path.unlink()
-        keep_names(path.parent)
+        keep_names(path.parent, at_once=True)
     except FileNotFoundError:
         pass
     except OSError as error:
