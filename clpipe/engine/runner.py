@@ -119,6 +119,7 @@ class Runner:
         self.incremental = incremental
         self._arguments = {s.name: s.method.arguments(s.context) for s in chain.steps}
         self._own_plans: dict[tuple[bool, ...], Plan] = {}
+        self._estimates: BoundedCache[dict[str, dict[str, float]]] = BoundedCache(32)  # by size
         # Shared with the runners of other chains, by a chain's structure.
         self._plans: BoundedCache[Plan] = BoundedCache(64)
         self._tables: BoundedCache[Array] = BoundedCache(32)
@@ -263,7 +264,9 @@ class Runner:
 
         check_resamplings(plan, *image.shape[1::-1])
         results = self.device.submit(plan, image, bind, options)
-        return lambda: self._result(plan, results(), self._estimates_for(*image.shape[1::-1]))
+        size = image.shape[1::-1]
+        found = self._estimates.get(size, lambda: self._estimates_for(*size))
+        return lambda: self._result(plan, results(), found)
 
     def _estimates_for(self, width: int, height: int) -> dict[str, dict[str, float]]:
         """Numbers that follow from the size of the steps' images, by step."""

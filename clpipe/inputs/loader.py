@@ -111,12 +111,12 @@ class ImageLoader:
         """The entry of kept images; None where images enter at the first step."""
         return None if self.request.start_at is None else KeptLoader(self.request, self.folder)
 
-    @property
+    @cached_property
     def reads_overscan(self) -> bool:
         """Whether what a render has beyond its picture is read, too."""
         return self.kept is not None or steps_of_overscan(self.chain) > 0
 
-    @property
+    @cached_property
     def raw(self) -> RawLoader:
         """The entry of raws and dumps."""
         return RawLoader(self.request, self.settings.dump_format)
