@@ -20,7 +20,7 @@ from clpipe.base.errors import OutputError
 from clpipe.batch import dask_client as cluster
 from clpipe.batch import dask_worker, work
 from clpipe.batch.dask_worker import (
-    RunSpec,
+    DaskSpec,
     WorkerEnvironment,
     probe_worker,
     share_of,
@@ -273,7 +273,7 @@ def test_a_worker_sees_the_same_files(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "probe").touch()
     where, first = Where(Path("out"), ("numpy",)), Job(Path("a.exr"), "a.exr")
-    spec = RunSpec(ResolvedRequest(formats=("jpg",)), where, first, "run", tmp_path).anchored()
+    spec = DaskSpec(ResolvedRequest(formats=("jpg",)), where, first, tmp_path).anchored()
     spec = replace(spec, first=spec.anchored_job(first))
     assert probe_worker(spec, "probe", None).startswith("does not see the output folder")
     (tmp_path / "probe").rename(tmp_path / "out" / "probe")

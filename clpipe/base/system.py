@@ -12,7 +12,7 @@ import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -284,6 +284,21 @@ def begin_writing(path: Path) -> None:
 
 def processors() -> int:
     """How many processors this process may run on; all, where the system does not tell it."""
+    return len(processor_numbers()) or os.cpu_count() or 1
+
+
+def processor_numbers() -> list[int]:
+    """The processors that this process may run on; none where the system does not tell it."""
     if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+        return sorted(os.sched_getaffinity(0))
+    return []
+
+
+def stay_on(numbers: Collection[int]) -> None:
+    """Have all threads of this process that start from now on stay on some processors.
+
+    Nothing happens where the system cannot do it, or has taken one of them away.
+    """
+    if hasattr(os, "sched_setaffinity"):
+        with contextlib.suppress(OSError):
+            os.sched_setaffinity(0, numbers)

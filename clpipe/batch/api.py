@@ -22,7 +22,13 @@ from clpipe.outputs.existing import Redo
 from clpipe.outputs.patches import Patches
 
 # The most that may be asked for; the least is 1.
-MOST = {"frames": MAX_FRAMES, "jobs": 1024, "webdataset": 10**6, "max_pixels": MAX_PIXELS}
+MOST = {
+    "frames": MAX_FRAMES,
+    "jobs": 1024,
+    "processes": 1024,
+    "webdataset": 10**6,
+    "max_pixels": MAX_PIXELS,
+}
 
 Texts = str | Path | Sequence[str | Path]  # one, or several
 
@@ -56,6 +62,7 @@ def run(
     device: str | int | Sequence[str | int] = (),
     memory: int | str | None = None,
     jobs: int | None = None,
+    processes: int | None = None,
     dask: str | None = None,
     trace: str | Path | None = None,
     **settings: Any,
@@ -79,7 +86,7 @@ def run(
         **settings: what a configuration file may hold, over ``config``.
         patch: the sides of patches in px, or with how many and how: ``Patches(128, per_image=4)``.
         start_at, until, frames, bracket, poses, layer, transfer, max_pixels, redo, webdataset,
-            shard, jobs, dask, trace: as the options of ``clpipe run``.
+            shard, jobs, processes, dask, trace: as the options of ``clpipe run``.
 
     Returns:
         A run that begins when it is iterated.
@@ -88,7 +95,13 @@ def run(
         RequestError: a name or value that is not allowed, an input that is not there, or a result
             that would overwrite something. One image's failure is its outcome, and no error.
     """
-    numbers = {"frames": frames, "jobs": jobs, "webdataset": webdataset, "max_pixels": max_pixels}
+    numbers = {
+        "frames": frames,
+        "jobs": jobs,
+        "processes": processes,
+        "webdataset": webdataset,
+        "max_pixels": max_pixels,
+    }
     for name, number in numbers.items():
         if number is not None and not 1 <= number <= MOST[name]:
             raise RequestError(f"found {name} {number}; expected 1 to {MOST[name]}")
@@ -141,5 +154,6 @@ def run(
         jobs,
         Redo(redo),
         None if trace is None else Path(trace),
+        processes,
     )
     return Run(request, images, where, dask)

@@ -20,7 +20,7 @@ from clpipe.base.errors import ClpipeError, ClusterError, RequestError
 from clpipe.base.extras import require
 from clpipe.batch.dask_worker import (
     ChunkReport,
-    RunSpec,
+    DaskSpec,
     WorkerEnvironment,
     as_written,
     check_same,
@@ -29,9 +29,9 @@ from clpipe.batch.dask_worker import (
     halt,
     probe_worker,
     run_chunk,
-    shifted,
 )
 from clpipe.batch.outcome import FAILED, Outcome
+from clpipe.batch.spec import shifted
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.folder import remove_unfinished
@@ -48,7 +48,7 @@ SHORT, LONG = 15.0, 60.0  # s; after a shorter chunk they grow, after a longer o
 
 
 @contextlib.contextmanager
-def connected(address: str, spec: RunSpec) -> Iterator["Cluster"]:
+def connected(address: str, spec: DaskSpec) -> Iterator["Cluster"]:
     """The cluster of a scheduler.
 
     Raises:
@@ -103,7 +103,7 @@ async def _reach(address: str) -> None:
 class Cluster:
     """The workers of a cluster, with the interface of a :class:`clpipe.batch.threads.Batch`."""
 
-    def __init__(self, client: Any, address: str, spec: RunSpec) -> None:
+    def __init__(self, client: Any, address: str, spec: DaskSpec) -> None:
         self._client = client
         self._address = address
         self._spec = spec.anchored()

@@ -18,45 +18,34 @@ import numpy as np
 from clpipe.base.about import __version__
 from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.batch.outcome import Outcome
-from clpipe.batch.room import usual_room
+from clpipe.batch.spec import RunSpec, shifted
 from clpipe.batch.threads import Batch
-from clpipe.batch.where import Where
-from clpipe.batch.work import ImageWorker
 from clpipe.chain.paths import from_folder
-from clpipe.chain.request import ResolvedRequest
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.discovery import DeviceInfo, choose_all, find_devices
 from clpipe.images.write import versions
 from clpipe.inputs.find import Job
-from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.folder import write_problem
 from clpipe.outputs.program import program_digest
-from clpipe.outputs.writer import OutputWriter
 
 
 @dataclass(frozen=True)
-class RunSpec:
-    """A run, as it is sent to a worker.
+class DaskSpec(RunSpec):
+    """A run, as it is sent to a worker of Dask's.
 
     Args:
-        request: what is asked for.
-        where: to which folder, and with which devices of a worker.
-        first: the job whose chain is compiled early.
-        run: a name that no other run has.
         folder: where relative paths start.
+        run: a name that no other run has.
         workers: the addresses of all workers there are.
         environment: what every worker must be.
     """
 
-    request: ResolvedRequest
-    where: Where
-    first: Job
-    run: str = field(default_factory=lambda: secrets.token_hex(8))
     folder: Path = field(default_factory=Path.cwd)
+    run: str = field(default_factory=lambda: secrets.token_hex(8))
     workers: tuple[str, ...] = ()
     environment: "WorkerEnvironment | None" = None
 
-    def anchored(self) -> "RunSpec":
+    def anchored(self) -> "DaskSpec":
         """The same run with names of files absolute, for workers in other folders."""
         folder, asked = self.folder, self.request
         request = replace(
@@ -163,7 +152,7 @@ def device_text(info: DeviceInfo) -> str:
     return f"{info.label}, driver {info.driver}, {platform}, {info.lanes} lanes{target}"
 
 
-def probe_worker(spec: RunSpec, probe: str, size: int | None) -> WorkerEnvironment | str:
+def probe_worker(spec: DaskSpec, probe: str, size: int | None) -> WorkerEnvironment | str:
     """The environment of this process; where it cannot be a worker of a run, the reason.
 
     Args:
@@ -185,7 +174,7 @@ def probe_worker(spec: RunSpec, probe: str, size: int | None) -> WorkerEnvironme
     return environment
 
 
-def run_chunk(spec: RunSpec, jobs: Sequence[Job]) -> ChunkReport:
+def run_chunk(spec: DaskSpec, jobs: Sequence[Job]) -> ChunkReport:
     """Do a chunk of a run, on a worker."""
     from distributed import get_worker
 
@@ -207,7 +196,8 @@ def run_chunk(spec: RunSpec, jobs: Sequence[Job]) -> ChunkReport:
                     {"the others": spec.environment, worker.address: environment}
                 )
             share = share_of(worker.address, spec.workers)
-            batch = _batches[spec.run] = _batch(spec, worker.state.nthreads, share)
+            devices = _devices(spec.where.devices, spec.where.memory, share)
+            batch = _batches[spec.run] = spec.batch(devices, worker.state.nthreads, share[1])
             if spec.run in _halted:
                 batch.stop()
             since = time.time() - time.perf_counter()
@@ -222,38 +212,11 @@ def run_chunk(spec: RunSpec, jobs: Sequence[Job]) -> ChunkReport:
     return ChunkReport(outcomes, time.perf_counter() - began, error)
 
 
-def _batch(spec: RunSpec, threads: int, share: tuple[int, int]) -> Batch:
-    """The batch of one chunk.
-
-    Args:
-        spec: the run.
-        threads: where the run does not say how many.
-        share: which of the workers of this machine this one is, and of how many.
-    """
-    where = spec.where
-    loader, writer = (
-        ImageLoader(spec.request, spec.folder),
-        OutputWriter(where.output, spec.request),
-    )
-    chain = loader.first_chain([spec.first])
-    worker = ImageWorker(loader, writer, chain, where.redo, where.trace is not None)
-    devices = _devices(where.devices, where.memory, share)
-    return Batch(worker, devices, where.threads or threads, usual_room(share[1]))
-
-
 def halt(run: str) -> None:
     """Let a run's images in flight be finished and no more be begun, on a worker."""
     _halted.add(run)
     if batch := _batches.get(run):
         batch.stop()
-
-
-def shifted(outcome: Outcome, seconds: float, prefix: str = "") -> Outcome:
-    """An outcome with the times of another clock, and a prefix before the names of threads."""
-    spans = tuple(
-        replace(s, worker=prefix + s.worker, start=s.start + seconds) for s in outcome.spans
-    )
-    return replace(outcome, spans=spans)
 
 
 def check_same_environment(environments: Mapping[str, Any]) -> None:

@@ -14,8 +14,11 @@ from typing import TYPE_CHECKING
 
 from clpipe.base.about import full_version
 from clpipe.base.errors import OutputError, RequestError
+from clpipe.base.processors import available_processors
 from clpipe.batch.outcome import Outcome
+from clpipe.batch.processes import Processes, usual_processes
 from clpipe.batch.run_log import RunLog, Summary, log_name
+from clpipe.batch.spec import RunSpec
 from clpipe.batch.tar_batch import TarBatch
 from clpipe.batch.tars import Tar, cut
 from clpipe.batch.threads import Batch
@@ -122,13 +125,14 @@ class Run:
         # A checkout asks git for the version that log and sidecars have; here nobody waits for it.
         threading.Thread(target=full_version, daemon=True).start()
         check_output(where.output)
+        check_processes(where, dask, images.per_tar)
         self.where = where
         self.notes: list[str] = []
         self._images = images
         self._dask = dask
         self._arguments = arguments
         self._echo = echo
-        self._running: Batch | Cluster | None = None
+        self._running: Batch | Cluster | Processes | None = None
         self._is_stopped = False
         self._loader = ImageLoader(request)
         self.jobs, self._tars = images.jobs(self._loader, where.output)
@@ -173,7 +177,7 @@ class Run:
         images, where = self._images, self.where
         start = {"arguments": list(self._arguments), "images": len(self.jobs)}
         with ExitStack() as stack:
-            batch = self._running = stack.enter_context(self._batch())
+            batch = self._running = stack.enter_context(self._batch(jobs))
             if self._is_stopped:
                 batch.stop()
             stack.enter_context(output_folder(where.output, images.shard))
@@ -220,6 +224,17 @@ class Run:
             if not unlogged:
                 log.end(self.summary)
 
+    def _processes(self, jobs: Iterable[Job]) -> int:
+        """How many processes do the jobs."""
+        where = self.where
+        if where.processes:
+            return where.processes
+        if self._tars or jobs is not self.jobs:  # they may come one after the other
+            return 1
+        # The first one's size stands for all, whose headers nobody has read.
+        claim = self._loader.claim(self.jobs[0])
+        return usual_processes(len(self.jobs), claim, available_processors())
+
     def _look_behind(self, folders: Sequence[Path]) -> None:
         """Write the views of a run's folders, and note what else there is to say of it."""
         if self.summary.interrupted:
@@ -238,8 +253,8 @@ class Run:
                 "more"
             )
 
-    def _batch(self) -> "AbstractContextManager[Batch | Cluster]":
-        """What does the jobs: this machine, with or without tars, or a cluster.
+    def _batch(self, jobs: Iterable[Job]) -> "AbstractContextManager[Batch | Cluster | Processes]":
+        """What does the jobs: this machine, with or without tars, its processes, or a cluster.
 
         Raises:
             RequestError: the cluster cannot be used.
@@ -247,10 +262,12 @@ class Run:
         """
         if self._dask is not None:
             from clpipe.batch.dask_client import connected
-            from clpipe.batch.dask_worker import RunSpec
+            from clpipe.batch.dask_worker import DaskSpec
 
-            return connected(self._dask, RunSpec(self._request, self.where, self.jobs[0]))
+            return connected(self._dask, DaskSpec(self._request, self.where, self.jobs[0]))
         where = self.where
+        if (count := self._processes(jobs)) > 1:
+            return nullcontext(Processes(RunSpec(self._request, where, self.jobs[0]), count))
         devices: list[Device | None] = [*open_devices(where.devices, where.memory)] or [None]
         if self._tars:
             own = self._loader, self.writer, self._chain
@@ -258,6 +275,22 @@ class Run:
         is_traced = where.trace is not None
         worker = ImageWorker(self._loader, self.writer, self._chain, where.redo, is_traced)
         return nullcontext(Batch(worker, devices, where.threads))
+
+
+def check_processes(where: Where, dask: str | None, per_tar: int | None) -> None:
+    """See that several processes are only asked for where they do the work.
+
+    Raises:
+        RequestError: something else does it.
+    """
+    if where.processes is None or where.processes == 1:
+        return
+    if dask is not None:
+        raise RequestError("--processes: with --dask the cluster's workers are the processes")
+    if per_tar:
+        raise RequestError(
+            "--processes: a tar is packed by one process; run several, each with a --shard"
+        )
 
 
 def check_output(folder: Path) -> None:

@@ -18,6 +18,7 @@ class Where:
         threads: how many decode, and how many encode; None is one for each processor.
         redo: which pictures that are there already are made again.
         trace: the file of a timeline; None is none.
+        processes: how many share the work on this machine; None is as many as pay.
     """
 
     output: Path
@@ -26,3 +27,4 @@ class Where:
     threads: int | None = None
     redo: Redo = Redo.OLD
     trace: Path | None = None
+    processes: int | None = None

@@ -29,7 +29,8 @@ GROUPS = {
     "author",
     "Truth": "+truth +carry truth_at",
     "Inputs": "+poses +annotations +exclude layer transfer dump max_pixels",
-    "Batches": "+device +redo jobs memory shard dask quiet json_lines trace +help +help_all",
+    "Batches": "+device +redo jobs processes memory shard dask quiet json_lines trace +help "
+    "+help_all",
 }
 
 

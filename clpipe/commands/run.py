@@ -113,6 +113,13 @@ from clpipe.outputs.patches import PER_IMAGE
     help="Threads that decode, and as many that encode. [default: one for each processor]",
 )
 @click.option(
+    "--processes",
+    type=click.IntRange(1, MOST["processes"]),
+    metavar="N",
+    help="Processes that share the work, each with its part of the processors and devices. "
+    "[default: as many as pay for the number and size of the images]",
+)
+@click.option(
     "--shard",
     default="1/1",
     metavar="I/N",
@@ -155,6 +162,7 @@ def run(
     selectors: tuple[str, ...],
     memory: int | None,
     threads: int | None,
+    processes: int | None,
     shard: Shard,
     per_tar: int | None,
     dask: str | None,
@@ -183,7 +191,7 @@ def run(
     made = Run(
         Request.from_options(camera=series.camera, iso=series.iso, **options),
         Images(inputs, exclude, poses, series, shard, per_tar),
-        Where(output, selectors, memory, threads, Redo(redo), trace),
+        Where(output, selectors, memory, threads, Redo(redo), trace, processes),
         dask,
         sys.argv[1:],
         print_line if json_lines else None,

@@ -1,0 +1,139 @@
+"""What a process of a run on this machine does: its share of the images, as they come to it.
+
+Its standard input brings what :class:`clpipe.batch.processes.Processes` sends, its standard output
+takes what became of it. It ends when there is no more to do, and at once when the run's process is
+gone. Signals are for that process, which says when to stop.
+"""
+
+import gc
+import logging
+import os
+import queue
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from clpipe.base.errors import ClpipeError
+from clpipe.base.files import remove_temporary_files
+from clpipe.base.system import stay_on
+from clpipe.batch.interrupt import SIGNALS
+from clpipe.batch.outcome import Outcome
+from clpipe.batch.pipes import Pipe
+from clpipe.batch.spec import RunSpec
+from clpipe.batch.threads import Batch
+from clpipe.engine.device import Device, open_devices
+from clpipe.inputs.find import Job
+
+SOON = 0.02  # s for which outcomes are collected, as each message has its price
+
+
+@dataclass(frozen=True)
+class Seat:
+    """Which of a run's processes one is.
+
+    Args:
+        number: from 0 on.
+        of: how many there are.
+        threads: that decode, and that encode, where the run does not say how many.
+        processors: on which it stays; () is wherever the system puts it.
+        level: of what is logged.
+    """
+
+    number: int
+    of: int
+    threads: int
+    processors: tuple[int, ...] = ()
+    level: int = logging.INFO
+
+
+def main() -> None:
+    """Do what standard input says."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    pipe = Pipe(sys.stdin.buffer, os.fdopen(os.dup(1), "wb"))
+    os.dup2(2, 1)  # what libraries print is no message
+    gc.freeze()  # what is imported stays: looking through it again and again takes time
+    spec, seat = pipe.receive()
+    if seat.processors:
+        stay_on(seat.processors)
+    logger = logging.getLogger("clpipe")
+    logger.setLevel(seat.level)
+    logger.addHandler(_Forwarder(pipe))
+    try:
+        _work(pipe, spec, seat)
+    except ClpipeError as error:
+        pipe.send("failed", error)
+    pipe.send("end")
+    os._exit(0)  # the thread that reads would wait for ever
+
+
+def _work(pipe: Pipe, spec: RunSpec, seat: Seat) -> None:
+    """Do the jobs that come, and send what became of them.
+
+    Raises:
+        ClpipeError: the process cannot go on.
+    """
+    where = spec.where
+    share = seat.number, seat.of
+    devices: list[Device | None] = [*open_devices(where.devices, where.memory, share)] or [None]
+    pipe.send("ready")
+    batch = spec.batch(devices, seat.threads, seat.of)
+    jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+    threading.Thread(target=_listen, args=(pipe, jobs, batch), daemon=True).start()
+    finished: queue.SimpleQueue[Outcome | None] = queue.SimpleQueue()
+    teller = threading.Thread(target=_tell, args=(pipe, finished))
+    teller.start()
+    try:
+        for outcome in batch.run(iter(jobs.get, None)):
+            finished.put(outcome)
+    finally:
+        finished.put(None)
+        teller.join()
+
+
+def _listen(pipe: Pipe, jobs: "queue.SimpleQueue[Job | None]", batch: Batch) -> None:
+    """Take jobs in, until it is said that there are no more."""
+    try:
+        what, *values = pipe.receive()
+        while what == "jobs":
+            for job in values[0]:
+                jobs.put(job)
+            what, *values = pipe.receive()
+        if what == "stop":
+            batch.stop()
+        jobs.put(None)
+    except EOFError:  # the run's process was killed
+        remove_temporary_files()
+        os._exit(1)
+
+
+def _tell(pipe: Pipe, finished: "queue.SimpleQueue[Outcome | None]") -> None:
+    """Send outcomes, several at a time."""
+    for first in iter(finished.get, None):
+        time.sleep(SOON)
+        outcomes = [first, *_waiting(finished)]
+        pipe.send("outcomes", [each for each in outcomes if each])
+        if None in outcomes:
+            return
+
+
+def _waiting(finished: "queue.SimpleQueue[Outcome | None]") -> Iterator[Outcome | None]:
+    while True:
+        try:
+            yield finished.get_nowait()
+        except queue.Empty:
+            return
+
+
+class _Forwarder(logging.Handler):
+    """Sends what is logged to the run's process, which prints it."""
+
+    def __init__(self, pipe: Pipe) -> None:
+        super().__init__()
+        self._pipe = pipe
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._pipe.send("log", record.levelno, record.getMessage())

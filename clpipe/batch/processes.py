@@ -1,0 +1,301 @@
+"""Many images through processes on this machine, each with its share of processors and devices.
+
+One process of Python ends at some 500 small images a second, however many processors there are:
+its threads take turns at the interpreter's lock. So a run has several, where that pays. This one
+holds the output folder and the log, hands jobs out, and takes in what became of them; each of the
+others runs a :class:`clpipe.batch.threads.Batch`. Where one dies, its jobs go to others, which see
+by the sidecars what is done already.
+"""
+
+import contextlib
+import json
+import logging
+import os
+import queue
+import subprocess
+import sys
+import threading
+from collections import Counter, deque
+from collections.abc import Generator, Iterable, Sequence
+from dataclasses import dataclass, field
+
+from clpipe.base.errors import ClpipeError, DeviceError, RequestError
+from clpipe.base.processors import available_processors
+from clpipe.base.system import processor_numbers
+from clpipe.batch.local_worker import Seat
+from clpipe.batch.outcome import FAILED, Outcome
+from clpipe.batch.pipes import Pipe
+from clpipe.batch.spec import RunSpec, shifted
+from clpipe.images.claims import Claim
+from clpipe.inputs.find import Job
+from clpipe.outputs.folder import remove_unfinished
+
+log = logging.getLogger(__name__)
+
+# The model of an image's CPU time by which processes are counted (docs/performance.md): ms under
+# the interpreter's lock, ms of all, and ms more of each megapixel.
+LOCKED, OF_IMAGE, OF_MEGAPIXEL = 2.0, 3.0, 25.0
+SHARE = 0.5  # of a process's time that the lock may be held; beyond, threads wait for it
+WORTH = 500  # images of each process; to start one takes as long as some hundred small ones
+
+AHEAD = 64  # jobs that a process may have before it
+DEATHS = 3  # of processes that took a job, after which it is given up; or of those that only start
+
+PROGRAM = "import json, sys; sys.path[:] = json.loads({path!r}); {start}"
+START = "from clpipe.batch.local_worker import main; main()"
+THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")  # up to PoCL 3.1, and from 4 on
+
+
+def usual_processes(images: int, claim: Claim, processors: int) -> int:
+    """How many processes a run has where nobody says how many.
+
+    Args:
+        images: of the run.
+        claim: of the first of them.
+        processors: that there are.
+
+    >>> small, large = Claim(512, 512, 0, 0), Claim(6000, 4000, 0, 0)
+    >>> [usual_processes(10_000, small, n) for n in (1, 2, 8, 64)]
+    [1, 1, 3, 25]
+    >>> usual_processes(800, small, 64), usual_processes(10_000, large, 64)
+    (1, 1)
+    """
+    megapixels = claim.width * claim.height / 1e6
+    each = OF_IMAGE + OF_MEGAPIXEL * megapixels
+    fed = max(each / LOCKED * SHARE, 1.0)  # processors that the threads of one process keep busy
+    return max(min(int(processors / fed), images // WORTH), 1)
+
+
+@dataclass
+class _Process:
+    """One of the processes, as this one sees it."""
+
+    seat: Seat
+    popen: "subprocess.Popen[bytes]"
+    pipe: Pipe
+    listener: threading.Thread = field(default_factory=threading.Thread)
+    jobs: dict[str, Job] = field(default_factory=dict)  # before it, by their stems
+    is_alone: bool = False  # whether what it has is all it gets
+    is_ready: bool = False  # it has its devices
+    has_worked: bool = False
+
+    def close(self) -> int:
+        """Wait for its end; its status."""
+        self.pipe.hang_up()
+        status = self.popen.wait()
+        self.listener.join()
+        self.pipe.close()
+        return status
+
+
+class Processes:
+    """The processes of a run, with the interface of a :class:`clpipe.batch.threads.Batch`.
+
+    Args:
+        spec: the run.
+        count: how many.
+    """
+
+    def __init__(self, spec: RunSpec, count: int) -> None:
+        self._spec = spec
+        self._count = count
+        self._messages: queue.SimpleQueue[tuple[_Process | None, tuple[object, ...]]]
+        self._messages = queue.SimpleQueue()
+        self._processes: list[_Process] = []
+        self._left: deque[Job] = deque()
+        self._suspects: deque[Job] = deque()  # whose processes died; each is tried alone in the end
+        self._deaths: Counter[str] = Counter()  # by stems of jobs
+        self._still_born = 0  # processes in a row that ended before they were ready
+        self._said: set[str] = set()
+        self._failure: ClpipeError | None = None
+        self._is_stopping = False
+
+    def stop(self) -> None:
+        """Let no more images in; those in flight are finished. May be called by a signal."""
+        self._is_stopping = True
+        self._messages.put((None, ("stop",)))
+
+    def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
+        """Do every job; one that fails is reported and the others go on.
+
+        Outcomes come as jobs are finished, in any order.
+
+        Raises:
+            DeviceError: there is no usable device, or a kernel does not compile.
+            OutputError: nothing can be written any more.
+        """
+        every = list(jobs)
+        self._left = deque(every)
+        try:
+            # The kernels are compiled, and kept for the others, by the first one.
+            self._processes.append(self._start(0))
+            self._hand_out()
+            while not self._is_finished:
+                process, message = self._messages.get()
+                if process is None:
+                    self._tell_to_stop()
+                else:
+                    yield from self._heard(process, message)
+                    self._hand_out()
+        finally:
+            self._end()
+            patches = self._spec.request.patch is not None
+            remove_unfinished(self._spec.where.output, every, patches)  # by processes that died
+        if self._failure:
+            raise self._failure
+
+    @property
+    def _is_finished(self) -> bool:
+        if any(process.jobs for process in self._processes):
+            return False
+        if self._is_stopping:
+            return not self._processes
+        return not self._left and not self._suspects
+
+    def _start(self, number: int) -> _Process:
+        """Start one of the processes.
+
+        Raises:
+            RequestError: the system does not let it.
+        """
+        every, count = processor_numbers(), self._count
+        share = max(available_processors() // count, 1)
+        own: tuple[int, ...] = ()
+        if len(every) == available_processors() >= count:
+            own = tuple(every[number * len(every) // count : (number + 1) * len(every) // count])
+            share = len(own)
+        seat = Seat(number, count, share, own, logging.getLogger("clpipe").getEffectiveLevel())
+        limits = {name: os.environ.get(name, str(share)) for name in THREADS}
+        program = PROGRAM.format(path=json.dumps(sys.path), start=START)
+        try:
+            popen = subprocess.Popen(  # noqa: S603 - this program
+                [sys.executable, "-c", program],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                env={**os.environ, **limits},
+            )
+        except OSError as error:
+            raise RequestError(
+                f"--processes: {self._count}: no process can be started ({error.strerror}); ask "
+                "for fewer"
+            ) from None
+        assert popen.stdin
+        assert popen.stdout
+        process = _Process(seat, popen, Pipe(popen.stdout, popen.stdin))
+        self._send(process, self._spec, seat)
+        process.listener = threading.Thread(target=self._listen, args=(process,), daemon=True)
+        process.listener.start()
+        return process
+
+    def _listen(self, process: _Process) -> None:
+        try:
+            while True:
+                self._messages.put((process, process.pipe.receive()))
+        except (EOFError, OSError):
+            self._messages.put((process, ("gone",)))
+
+    @staticmethod
+    def _send(process: _Process, *message: object) -> None:
+        """Send a message; that a process has gone, the thread that listens to it says."""
+        with contextlib.suppress(OSError):
+            process.pipe.send(*message)
+
+    def _heard(self, process: _Process, message: tuple[object, ...]) -> Iterable[Outcome]:
+        """What a message from a process leads to: the outcomes of jobs."""
+        match message:
+            case ("ready",):
+                process.is_ready, self._still_born = True, 0
+            case ("outcomes", list(outcomes)):
+                process.has_worked = True
+                for outcome in outcomes:
+                    del process.jobs[outcome.job.stem]
+                process.is_alone &= bool(process.jobs)
+                return [shifted(each, 0.0, f"{process.seat.number} ") for each in outcomes]
+            case ("log", int(level), str(text)):
+                if text not in self._said:  # each of them says it
+                    self._said.add(text)
+                    log.log(level, "%s", text)
+            case ("failed", ClpipeError() as error):
+                self._failure = self._failure or error
+                process.jobs.clear()
+                self.stop()
+            case ("end",) | ("gone",):
+                return self._lost(process) if process in self._processes else ()
+        return ()
+
+    def _hand_out(self) -> None:
+        """Give each process its next jobs, and start processes while there is something for them.
+
+        Raises:
+            RequestError: no process can be started.
+        """
+        if self._is_stopping:
+            return
+        has_worked = any(process.has_worked for process in self._processes)
+        while len(self._processes) < self._count and has_worked and self._left:
+            taken = {process.seat.number for process in self._processes}
+            self._processes.append(self._start(min({*range(self._count)} - taken)))
+        for process in self._processes:
+            if process.is_alone:
+                continue
+            threads = self._spec.where.threads or process.seat.threads
+            most = max(min(AHEAD, len(self._left) // (2 * self._count)), threads + 3)
+            if len(process.jobs) > most // 2:  # one or two more are not worth a message
+                continue
+            count = min(most - len(process.jobs), len(self._left))
+            if not count and self._suspects and not process.jobs:
+                process.is_alone = True
+                self._give(process, [self._suspects.popleft()])
+            elif count:
+                self._give(process, [self._left.popleft() for _ in range(count)])
+
+    def _give(self, process: _Process, jobs: Sequence[Job]) -> None:
+        process.jobs |= {job.stem: job for job in jobs}
+        self._send(process, "jobs", jobs)
+
+    def _lost(self, process: _Process) -> Iterable[Outcome]:
+        """A process has ended; what it had before it goes to others.
+
+        Raises:
+            DeviceError: they end as they start.
+        """
+        self._processes.remove(process)
+        status = process.close()
+        was_alone, jobs = process.is_alone, list(process.jobs.values())
+        process.jobs.clear()
+        if self._is_stopping:
+            return []
+        self._still_born += not process.is_ready
+        if self._still_born >= DEATHS:
+            raise DeviceError(
+                f"--processes: {DEATHS} processes in a row ended before they had opened a device, "
+                f"the last one {_ended(status)}; --processes 1 does without"
+            )
+        for job in jobs:
+            self._deaths[job.stem] += 1
+        given_up = [job for job in jobs if was_alone and self._deaths[job.stem] >= DEATHS]
+        self._suspects.extend(job for job in jobs if job not in given_up)
+        if not self._processes:
+            self._processes.append(self._start(process.seat.number))
+        text = f"killed the process that took it, {DEATHS} times; the last one {_ended(status)}"
+        return [Outcome(job, FAILED, error=f"{job.path}: {text}") for job in given_up]
+
+    def _tell_to_stop(self) -> None:
+        for process in self._processes:
+            self._send(process, "stop")
+
+    def _end(self) -> None:
+        """Let all processes end, and wait for them."""
+        for process in self._processes:
+            self._send(process, "stop" if process.jobs else "end")
+        for process in self._processes:
+            process.close()
+
+
+def _ended(status: int) -> str:
+    """How a process has ended, by its status.
+
+    >>> _ended(-9), _ended(1)
+    ('by signal 9', 'with status 1')
+    """
+    return f"by signal {-status}" if status < 0 else f"with status {status}"

@@ -1,0 +1,181 @@
+"""A run by several processes on this machine: the same bytes, whoever dies."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clpipe as package
+from clpipe.base.errors import DeviceError, RequestError
+from clpipe.batch import processes
+from clpipe.batch.run_log import read_log
+from tests.conftest import ROOT, contents, statuses, written
+
+RUN = ("-o", "out", "--iso", 3200)
+TWO = (*RUN, "--processes", 2)
+DEADLY = """
+import os, signal
+from clpipe.batch.work import ImageWorker
+decode = ImageWorker.decode
+def planted(self, job, admit):
+    if job.path.name == "deadly.exr":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return decode(self, job, admit)
+ImageWorker.decode = planted
+"""
+
+
+@pytest.fixture
+def renders(write_exr, tmp_path, monkeypatch):
+    """A folder of small renders of two sizes."""
+    monkeypatch.chdir(tmp_path)
+
+    def write(count):
+        rng = np.random.default_rng(0)
+        for i in range(count):
+            size = (24, 32) if i % 2 else (17, 40)
+            write_exr(f"in/r{i:03}.exr", rng.random((*size, 3)).astype(np.float32))
+
+    return write
+
+
+def start(*arguments):
+    command = [sys.executable, "-m", "clpipe", "run", "in", *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def children(process):
+    found = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    names = {pid: Path(f"/proc/{pid}/cmdline").read_text() for pid in found}
+    return [int(pid) for pid, name in names.items() if "local_worker" in name]
+
+
+def wait_until(is_so):
+    for _ in range(6000):
+        if is_so():
+            return
+        time.sleep(0.01)
+    raise AssertionError
+
+
+def pictures():
+    return len(list(Path("out").glob("*.json")))
+
+
+@pytest.mark.slow
+def test_two_processes_make_the_bytes_of_one(clpipe, renders):
+    renders(24)
+    Path("in/damaged.exr").write_bytes(b"no EXR")
+    truth = ("--truth", "clean", "--trace", "t.json")
+    clpipe("run", "in", "-o", "whole", *RUN[2:], *truth[:2], status=1)
+    told = clpipe("run", "in", *TWO, *truth, status=1)
+    assert contents("out") == contents("whole")
+    assert told.stderr.count("in/damaged.exr: cannot be read") == 1
+    assert "24 of 25 images done, 1 failed" in told.stderr
+    first, *images, last = read_log(Path("out/run.jsonl"))
+    assert (first["event"], len(images), last["event"]) == ("start", 25, "end")
+    events = json.loads(Path("t.json").read_text())["traceEvents"]
+    assert {e["args"]["name"].split()[0] for e in events if e["ph"] == "M"} == {"0", "1"}
+    again = clpipe("run", "in", *TWO, *truth[:2], status=1)
+    assert "24 of them were there already" in again.stderr
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_takes_nothing_with_it(clpipe, renders):
+    renders(120)
+    clpipe("run", "in", "-o", "whole", *RUN[2:])
+    process = start(*TWO)
+    wait_until(lambda: pictures() > 2)
+    os.kill(children(process)[0], signal.SIGKILL)
+    assert "120 of 120 images done" in process.communicate()[1]
+    assert process.returncode == 0
+    assert contents("out") == contents("whole")
+    assert not [name for name in written(Path("out")) if ".part." in name]
+
+
+@pytest.mark.slow
+def test_processes_end_with_the_one_that_started_them(clpipe, renders):
+    renders(300)
+    process = start(*TWO)
+    wait_until(lambda: pictures() > 2)
+    others = children(process)
+    process.kill()
+    process.communicate()
+    wait_until(lambda: not any(Path(f"/proc/{pid}/status").exists() for pid in others))
+    assert 2 < pictures() < 300
+    told = clpipe("run", "in", *RUN)
+    assert "300 of 300 images done (" in told.stderr
+
+
+@pytest.mark.slow
+def test_stopped_once_what_is_begun_is_finished(renders):
+    renders(300)
+    process = start(*TWO)
+    wait_until(lambda: pictures() > 2)
+    process.send_signal(signal.SIGINT)
+    stderr = process.communicate()[1]
+    assert process.returncode == 130
+    assert "not begun" in stderr
+    found = written(Path("out"))
+    assert 6 <= len(found) < 600
+    assert {Path(n).stem for n in found if n.endswith("json")} == {
+        Path(n).stem for n in found if n.endswith("jpg")
+    }
+    last = read_log(Path("out/run.jsonl"))[-1]
+    assert last["interrupted"]
+    assert last["done"] == len(found) // 2
+
+
+@pytest.mark.slow
+def test_an_image_that_kills_processes_fails_alone(clpipe, renders, monkeypatch):
+    renders(9)
+    Path("in/r005.exr").rename("in/deadly.exr")
+    monkeypatch.setattr(processes, "START", f"exec({DEADLY!r}); {processes.START}")
+    told = clpipe("run", "in", *TWO, "--device", "numpy", status=1)
+    assert "in/deadly.exr: killed the process that took it, 3 times; the last one by signal 9" in (
+        told.stderr
+    )
+    assert "8 of 9 images done, 1 failed" in told.stderr
+    found = statuses("out")
+    assert [name for name, status in found.items() if status == "failed"] == ["deadly.exr"]
+
+
+def test_processes_that_end_as_they_start(renders, monkeypatch):
+    renders(3)
+    monkeypatch.setattr(processes, "START", "sys.exit(7)")
+    run = package.run("in", "out", processes=2)
+    with pytest.raises(DeviceError, match=r"3 processes in a row ended before .* with status 7"):
+        list(run)
+
+
+def test_errors_of_a_process_are_the_runs(renders):
+    renders(3)
+    run = package.run("in", "out", processes=2, device="no such device")
+    with pytest.raises(DeviceError, match="no such device"):
+        list(run)
+    with pytest.raises(RequestError, match="processes: a tar is packed by one process"):
+        package.run("in", "out", processes=2, webdataset=2)
+    with pytest.raises(RequestError, match="processes: with --dask the cluster"):
+        package.run("in", "out", processes=2, dask="tcp://127.0.0.1:1")
+
+
+def test_whoever_stops_listening_leaves_no_process(renders):
+    renders(40)
+    run = iter(package.run("in", "out", processes=2, device="numpy"))
+    assert next(run).status == "done"
+    before = threads_of_pipes()
+    run.close()
+    assert threads_of_pipes() <= before
+    assert not (Path("out") / ".part").exists()
+    assert pictures() < 40
+
+
+def threads_of_pipes():
+    return len(Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split())
