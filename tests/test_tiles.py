@@ -10,9 +10,10 @@ from clpipe.base.errors import ImageError
 from clpipe.chain.chain import make_chain
 from clpipe.chain.registry import all_stages, load_stage_file
 from clpipe.chain.settings import Settings, settings_from
+from clpipe.engine.bindings import step_buffer
 from clpipe.engine.check import NOISE, chain_for, example
 from clpipe.engine.extents import Box, whole_image
-from clpipe.engine.ir import Plan
+from clpipe.engine.ir import Lines, Plan
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result, Runner, cut_out
 from clpipe.engine.tiles import (
@@ -108,6 +109,22 @@ def cut(whole: Result, boxes: list[Box]) -> Result:
     )
     kept = {name: cut_out(image, boxes) for name, image in whole.kept.items()}
     return Result(final, encoded, kept, whole.estimates)
+
+
+@pytest.mark.parametrize("lanes", [1, 8, 16])
+def test_tables_of_lines_are_as_long_as_the_image_that_has_them(lanes):
+    wide = {"projection": {"method": "kannala_brandt", "fx": 200.0, "source": "map"}}
+    chain = make_chain(settings_from({"iso": 3200, **wide}))
+    plan = Runner(chain, None).plan()
+    sizes = buffer_sizes(plan, extents := whole_image(plan, 120, 60, lanes))
+    lines = [launch for launch in plan.launches if isinstance(launch, Lines)]
+    assert lines
+    for launch in lines:
+        extent = extents[launch.level]
+        assert extent.width > 400  # of a render of 120
+        vectors = -(-max(extent.width, extent.height) // lanes)
+        for op in launch.ops:
+            assert sizes[step_buffer(op.pass_.writes, op.step)] >= 4 * vectors * lanes
 
 
 @pytest.mark.parametrize(("stage", "method"), METHODS)

@@ -47,11 +47,12 @@ def buffer_sizes(plan: Plan, extents: Extents, ends: int = 1) -> dict[str, int]:
     if plan.encoded:
         encoded = last.stored.width * last.stored.height * len(plan.encoded.channels)
         sizes |= {f"dst{i}": encoded for i in range(ends)}
-    # Line tables are the image's: whole blocks of rows, and the last vector.
-    longest = round_up(max(first.width, first.height), max(first.lanes, 4)) + 2 * first.lanes
     for launch in plan.launches:
         match launch:
-            case Lines(ops=ops):
+            case Lines(ops=ops, level=level):
+                image, lanes = extents[level], first.lanes
+                # They are the image's, not the tile's: whole blocks of rows, and the last vector.
+                longest = round_up(max(image.width, image.height), max(lanes, 4)) + 2 * lanes
                 sizes |= {step_buffer(op.pass_.writes, op.step): longest * 4 for op in ops}
             case Launch(sums=sums, level=level) if sums:
                 sizes[step_buffer("sums", sums.step)] = extents[level].blocks * 16
