@@ -1,6 +1,7 @@
 """--annotations: those of COCO, KITTI and BOP go where the pixels go."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -199,7 +200,9 @@ def test_kittis_labels_and_calibration(clpipe, kitti):
         before = line.split()
         box = (np.array(before[4:8], float) + 0.5) / 2 - 0.5
         clipped = np.clip(box, -0.5, [79.5, 59.5, 79.5, 59.5])
-        assert np.array(now[4:8], float) == pytest.approx(clipped, abs=0.011)
+        # KITTI's places are pixels' centres.
+        kept = np.clip(clipped, 0, [79, 59, 79, 59])
+        assert np.array(now[4:8], float) == pytest.approx(kept, abs=0.011)
         assert now[8:] == before[8:] and now[0] == before[0] and now[2:4] == before[2:4]
         shown = np.prod(clipped[2:] - clipped[:2]) / np.prod(box[2:] - box[:2])
         cut = float(before[1])
@@ -222,7 +225,8 @@ def test_kittis_boxes_go_through_a_lens_and_into_patches(clpipe, kitti):
         left, top, right, bottom = (float(v) + 0.5 for v in words[4:8])
         # The box of a bent box has the shape in it, and not much more.
         assert left < columns.min() + 0.6 and top < rows.min() + 0.6
-        assert right > columns.max() + 0.4 and bottom > rows.max() + 0.4
+        assert right > min(columns.max(), WIDTH - 1) + 0.4
+        assert bottom > min(rows.max(), HEIGHT - 1) + 0.4
         assert (right - left) * (bottom - top) < 1.35 * np.ptp(columns) * np.ptp(rows)
     patches = ("--patch", 48, "--patches-per-image", "grid")
     clpipe("run", "in/a.exr", "-o", "p", *AS_KITTI, *PLAIN, *patches)
@@ -238,17 +242,26 @@ def test_kittis_boxes_go_through_a_lens_and_into_patches(clpipe, kitti):
     assert "flipped and turned patches have no poses" in said
 
 
-def test_bops_scene(clpipe, coco, write_exr):
+AS_BOP = ("--device", "numpy", "--skip", "noise", "--format", "png")
+AS_BOP += ("--annotations", "bop/scene_gt.json", *PLAIN, *BARREL, "--set", "resize.scale=0.5")
+
+
+@pytest.fixture
+def bop(write_exr):
+    """A scene of three objects, the last beside the picture; its files by name, its masks."""
     masks = np.stack([mask_of(points) for points in SHAPES.values()], -1).astype(np.float32)
     write_exr("in/000003.exr", masks, half=False)
     visible = masks[..., 0] * (np.arange(WIDTH) < 50)
     folder = Path("bop")
     for kind in ("mask", "mask_visib"):
         (folder / kind).mkdir(parents=True)
-    of_kind = {"mask": masks[..., 0], "mask_visib": visible}
-    for kind, mask in of_kind.items():
-        whole = np.where(mask > 0.5, 255, 0).astype(np.uint8)
-        Image.fromarray(whole).save(folder / kind / "000003_000000.png")
+    nothing = np.zeros_like(visible)
+    of_kind = {"mask": [masks[..., 0], masks[..., 2], nothing]}
+    of_kind["mask_visib"] = [visible, nothing, nothing]
+    for kind, of_objects in of_kind.items():
+        for number, mask in enumerate(of_objects):
+            whole = np.where(mask > 0.5, 255, 0).astype(np.uint8)
+            Image.fromarray(whole).save(folder / kind / f"000003_00000{number}.png")
     pose = {"cam_R_m2c": [1, 0, 0, 0, 1, 0, 0, 0, 1], "cam_t_m2c": [0, 0, 1], "obj_id": 5}
     count = int((masks[..., 0] > 0.5).sum())
     info = {"bbox_obj": [0, 0, 1, 1], "bbox_visib": [0, 0, 1, 1], "px_count_all": count}
@@ -259,12 +272,15 @@ def test_bops_scene(clpipe, coco, write_exr):
     write["scene_camera"] = {"cam_K": K, "depth_scale": 0.1}
     for name, values in write.items():
         (folder / f"{name}.json").write_text(json.dumps({"3": values}))
-    options = ("--device", "numpy", "--skip", "noise", "--format", "png")
-    options += ("--annotations", "bop/scene_gt.json", *PLAIN, *BARREL, "--set", "resize.scale=0.5")
-    said = clpipe("run", "in/000003.exr", "-o", "o", *options).stderr
+    return write, of_kind
+
+
+def test_bops_scene(clpipe, coco, bop):
+    write, _ = bop
+    said = clpipe("run", "in/000003.exr", "-o", "o", *AS_BOP).stderr
     assert "2 annotations of 1 pictures" in said
     read = {name: json.loads(Path(f"o/{name}.json").read_text())["3"] for name in write}
-    assert read["scene_gt"] == [pose] * 2
+    assert read["scene_gt"] == write["scene_gt"][:2]
     shown = seen("o/000003.png")[..., 0] > 0.5
     with Image.open("o/mask/000003_000000.png") as image:
         mask = np.asarray(image) > 0
@@ -283,6 +299,20 @@ def test_bops_scene(clpipe, coco, write_exr):
     assert camera["cam_K"][2] == pytest.approx(80 / 2 - 0.5)
     assert camera["cam_K"][0] == pytest.approx(55)
     assert camera["model"] == "OPENCV" and camera["distortion"]["k1"] == -0.25
+
+
+def test_bops_masks_are_of_all_or_of_none(clpipe, coco, bop):
+    clpipe("run", "in/000003.exr", "-o", "o", *AS_BOP)
+    with_mask = json.loads(Path("o/scene_gt_info.json").read_text())["3"][1]
+    Path("bop/mask/000003_000001.png").unlink()
+    said = clpipe("run", "in/000003.exr", "-o", "p", *AS_BOP, status=2).stderr
+    assert "3[1]: found no bop/mask/000003_000001.png; expected masks of all or of none" in said
+    for kind in bop[1]:
+        shutil.rmtree(Path("bop", kind))
+    clpipe("run", "in/000003.exr", "-o", "p", *AS_BOP)
+    boxes = [each["bbox_obj"] for each in json.loads(Path("p/scene_gt_info.json").read_text())["3"]]
+    assert min(np.abs(np.subtract(box, with_mask["bbox_obj"])).max() for box in boxes) <= 1.5
+    assert not Path("p/mask").exists()
 
 
 @pytest.mark.parametrize(
@@ -321,6 +351,7 @@ def test_what_is_refused(clpipe, coco, change, message):
 
 def test_annotations_of_another_size_are_told(clpipe, coco):
     coco["images"][0]["width"] = 100
+    del coco["annotations"][3]  # a mask, which is refused
     Path("coco.json").write_text(json.dumps(coco))
     said = clpipe("run", "in", "-o", "o", *RUN).stderr
     assert "the annotations are of 100x120 pixels" in said
@@ -328,3 +359,57 @@ def test_annotations_of_another_size_are_told(clpipe, coco):
     Path("coco.json").write_text(json.dumps(coco))
     said = clpipe("run", "in", "-o", "o", *RUN).stderr
     assert "1 pictures are of renders that coco.json does not name" in said
+
+
+def first(coco, **values):
+    coco["annotations"][0] |= values
+
+
+def mask_with(counts, size=(HEIGHT, WIDTH)):
+    return lambda coco: first(coco, segmentation={"size": list(size), "counts": counts})
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (mask_with([-5, HEIGHT * WIDTH + 5]), "annotations[0].segmentation.counts"),
+        (mask_with([5, 5]), "found runs of 10 pixels; expected 19200 in all"),
+        (mask_with("zzzz"), "found zzzz; expected run lengths"),
+        (mask_with("08Q"), "it is cut off"),
+        (mask_with([HEIGHT * WIDTH], (HEIGHT, 7)), "found [120, 7]; expected [120, 160]"),
+        (lambda coco: first(coco, segmentation=[[0, 0, 1e12, 0, 9, 9]]), "outlines of three"),
+        (lambda coco: first(coco, bbox=[0, 0, float("1e300"), 1]), "x, y, width and height"),
+        (
+            lambda coco: coco["images"].append({**coco["images"][0], "id": 8}),
+            "found images/a.jpg a second time",
+        ),
+    ],
+)
+def test_coco_files_that_are_none(clpipe, coco, damage, message):
+    damage(coco)
+    Path("coco.json").write_text(json.dumps(coco))
+    said = clpipe("run", "in", "-o", "o", *RUN, status=2).stderr
+    assert message in said
+    assert not Path("o").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("label_2/a.txt", "Car 0 0 0 a b c d 1 1 1 1 1 1 1", "a type and 14 numbers"),
+        ("label_2/a.txt", "Car 0 0 0 1e9 1e9 2e9 2e9 1 1 1 1 1 1 1", "a box with left <= right"),
+        ("label_2/a.txt", "Car 0 0 0 1 1 nan 3 1 1 1 1 1 1 1", "a type and 14 numbers"),
+        ("scene_gt.json", '{"3": 5}', "found 5; expected a list of objects"),
+        ("scene_gt.json", '{"3": []}', "3.cam_K: found [1, 2]; expected nine numbers"),
+    ],
+)
+def test_kittis_and_bops_files_that_are_none(clpipe, write_exr, name, text, message):
+    write_exr("in/a.exr", np.zeros((8, 9, 3), np.float32))
+    path = Path("of", name)
+    path.parent.mkdir(parents=True)
+    path.write_text(text)
+    path.with_name("scene_camera.json").write_text('{"3": {"cam_K": [1, 2]}}')
+    asked = path if path.suffix == ".json" else path.parent
+    said = clpipe("run", "in", "-o", "o", "--annotations", asked, status=2).stderr
+    assert message in said
+    assert not Path("o").exists()

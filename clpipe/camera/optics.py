@@ -9,11 +9,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from clpipe.base.errors import KeyedError
+from clpipe.base.errors import KeyedError, RequestError
 from clpipe.camera.lens import LensCalibration
 
 ROUNDING = 0.01  # of a length or an f-number; those of lenses are nominal
 PLACES = 1e-4  # of what counts in px
+
+NOMINAL = 0.1  # of a lens's focal length on a sensor; makers round, and shapes of pictures differ
+FILM_WIDTH, FILM_DIAGONAL = 36.0, math.hypot(36, 24)  # mm, of 35 mm film
 
 USUAL_TIME = 0.01  # s, of an exposure of which nothing says how long it is
 
@@ -35,6 +38,8 @@ class Optics:
         focus_distance: in m.
         exposure_time: in s.
         calibration: of the lens that is named.
+        is_sensor_of_lens: whether nothing states the sensor's width, and it is that of the camera
+            which the lens stands on, of a picture of 3:2; see :meth:`for_image`.
         places: where each of them is stated.
     """
 
@@ -50,6 +55,7 @@ class Optics:
     focus_distance: float | None = None
     exposure_time: float | None = None
     calibration: LensCalibration | None = None
+    is_sensor_of_lens: bool = False
     places: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
@@ -73,6 +79,50 @@ class Optics:
                 raise KeyedError(place, f"{place}: {value:g}, but {first}: {known:g}; set one")
         return cls(**values, places=places)
 
+    def with_lens(self, lens: LensCalibration) -> "Optics":
+        """A copy with a lens: its focal length, and its sensor where nothing says how wide one is.
+
+        >>> Optics().with_lens(LensCalibration("a", 50.0, {}, {}, crop_factor=1.5)).sensor_width
+        24.0
+        """
+        places = {"focal_length": "lens", **self.places}
+        own = replace(self, calibration=lens, focal_length=lens.focal_length, places=places)
+        stated = self.fx, self.sensor_width, self.pixel_pitch, self.camera_angle_x
+        if any(each is not None for each in stated):
+            return own
+        width = FILM_WIDTH / lens.crop_factor
+        places = {**places, "sensor_width": "the sensor of its camera"}
+        return replace(own, sensor_width=width, is_sensor_of_lens=True, places=places)
+
+    def for_image(self, width: int, height: int) -> dict[str, float]:
+        """What is known for an image of that size in px, by the names of the fields.
+
+        The sensor of a lens by name has the diagonal that lensfun knows of it, whatever the
+        picture's shape.
+
+        Raises:
+            RequestError: the focal length in px that is stated is not that of the lens there.
+        """
+        known, lens = self.known, self.calibration
+        if lens is None:
+            return known
+        sensor = FILM_DIAGONAL / lens.crop_factor * max(width, height) / math.hypot(width, height)
+        if self.is_sensor_of_lens:
+            known["sensor_width"] = sensor
+        of_lens, fx = lens.focal_length / sensor * max(width, height), self.fx
+        if self.camera_angle_x:
+            fx = width / 2 / math.tan(self.camera_angle_x / 2)
+        stated = self.sensor_width if not self.is_sensor_of_lens else self.pixel_pitch
+        if fx and not stated and abs(fx - of_lens) > NOMINAL * of_lens:
+            place = self.places.get("fx") or self.places.get("camera_angle_x")
+            raise RequestError(
+                f"{place}: the focal length of this render of {width}x{height} pixels is {fx:.0f} "
+                f"px, but lens: {lens.name} at {lens.focal_length:g} mm makes it {of_lens:.0f} px "
+                f"on the sensor of its camera, {sensor:.1f} mm wide; name a lens that fits, or say "
+                "that the sensor is another with render.sensor_width"
+            )
+        return known
+
     @property
     def known(self) -> dict[str, float]:
         """The numbers that are known, by their names."""
@@ -83,7 +133,7 @@ class Optics:
         gone: dict[str, Any] = dict.fromkeys(
             (*IN_PIXELS, "focal_length", "sensor_width", "camera_angle_x")
         )
-        return replace(self, **gone)
+        return replace(self, **gone, is_sensor_of_lens=False)
 
     def set_to(self, used: Mapping[str, float]) -> "Optics":
         """A copy in which what a step used of aperture and focus holds where nothing else is known.
@@ -97,4 +147,5 @@ class Optics:
         return replace(self, **new) if new else self
 
 
-NUMBERS = tuple(f.name for f in fields(Optics) if f.name not in ("calibration", "places"))
+OTHERS = ("calibration", "is_sensor_of_lens", "places")
+NUMBERS = tuple(f.name for f in fields(Optics) if f.name not in OTHERS)

@@ -27,6 +27,7 @@ from clpipe.stage import (
     Method,
     Noiseless,
     NoiseScope,
+    OfPanorama,
     Resample,
     Stage,
     StageRole,
@@ -134,8 +135,10 @@ class Chain:
         self, width: int, height: int, shot: Mapping[str, float]
     ) -> Intrinsics | None:
         """The intrinsics of what enters, of its size without margins; see :meth:`intrinsics`."""
-        optics = self.optics
-        return Intrinsics.of_render(width, height, {**shot, **optics.known}, optics.places)
+        known = {**shot, **self.optics.for_image(width, height)}
+        if self.optics.is_sensor_of_lens and "sensor_width" in shot:
+            known["sensor_width"] = shot["sensor_width"]
+        return Intrinsics.of_render(width, height, known, self.optics.places)
 
     @cached_property
     def _resamplings(self) -> tuple[Resampler, ...]:
@@ -318,12 +321,22 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     context = Context(camera=camera, iso=settings.iso, optics=optics, exposure_time=time)
     steps: list[Step] = []
     before, takes_lens = "the input", not settings.lens
+    wide = ""  # the step behind which the picture is no longer in perspective
     for name, own in methods.items():
         stage = all_stages()[base_name(name)].reading(kind)
         with validation_errors(name, type(own)), user_code_errors(f"stage {name}", stage.folder):
             fits = stage.reads is (kind or stage.reads)
-            method = own.resolve(context) if fits or isinstance(own, FromLens) else own
+            method = own
+            if fits or isinstance(own, FromLens):
+                try:
+                    method = own.resolve(context)
+                except RequestError:
+                    _check_behind(wide, name, own, is_at_work=True)
+                    raise
             takes_lens |= isinstance(own, FromLens) and not isinstance(method, Unchanged)
+            _check_behind(wide, name, own, bool(method.passes()))
+            if isinstance(method, OfPanorama):
+                wide = f"{name}.method={method.method}"
             if not fits:
                 if isinstance(method, Unchanged) and stage.reads is stage.writes:
                     continue  # so that gamma can be skipped without what does nothing behind it
@@ -361,12 +374,38 @@ def optics_of(settings: Settings, camera: Camera, methods: Mapping[str, Method])
         return optics
     set_to = optics.focal_length, optics.f_number, optics.focus_distance
     lens = calibration_of(settings.lens, camera, *set_to)
-    places = {"focal_length": "lens", **optics.places}
-    return replace(optics, calibration=lens, focal_length=lens.focal_length, places=places)
+    return optics.with_lens(lens)
 
 
 # By the keys of settings that state optics: what they state.
 SETTINGS = dict(zip(LENS[1:], ("focal_length", "f_number", "focus_distance"), strict=True))
+
+
+def _check_behind(wide: str, name: str, method: Method, is_at_work: bool) -> None:
+    """See that a step can stand behind one that makes the picture of a wide lens.
+
+    Args:
+        wide: that one, for the message; "" where there is none.
+        name: of the step.
+        method: as it was set.
+        is_at_work: whether it does anything.
+
+    Raises:
+        RequestError: it is of pictures in perspective.
+    """
+    if not wide or not is_at_work:
+        return
+    if isinstance(method, FromLens):
+        raise KeyedError(
+            "lens", f"lens: it is of pictures in perspective, but {wide} is a lens; leave one out"
+        )
+    if "fx" in type(method).model_fields:
+        raise KeyedError(
+            name,
+            f"{name}.method={method.method}: it counts in the focal lengths of a picture in "
+            f"perspective, but {wide} makes that of a wide lens; leave it out, or take a method "
+            "that counts in px or in the picture's size",
+        )
 
 
 def _unused_lens(settings: Settings, methods: Mapping[str, Method]) -> str:

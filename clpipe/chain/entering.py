@@ -58,9 +58,13 @@ def enter(
         RequestError: what is known of the camera contradicts itself, or the depth is of no use.
     """
     if chain.steps[0].name == chain.names[0] and pixels.ndim == 3:
-        said = {k: v for k, v in (shot or {}).items() if k not in chain.optics.known}
-        chain = _with_shot(chain, tuple(said.items())) if said else chain
         width, height = margins.inside(*pixels.shape[1::-1])
+        optics = chain.optics
+        of_lens = ("sensor_width",) if optics.is_sensor_of_lens else ()
+        own = optics.for_image(width, height)
+        said = {k: v for k, v in (shot or {}).items() if k not in own or k in of_lens}
+        said |= {name: own[name] for name in of_lens if name not in said}
+        chain = _with_shot(chain, tuple(said.items())) if said else chain
         chain.intrinsics_of_render(width, height, said)
     if panorama:
         chain = with_panorama(chain, panorama)

@@ -161,6 +161,11 @@ def dataset(
     said = {name: options.pop(name) for name in ("licence", "author")}
     rendering = {name: options.pop(name) for name in RENDER_OPTIONS}
     if lens_model:
+        method = f"{stage_in(StageRole.VIEW).name}.method="
+        if others := [each for each in assignments if each.startswith(method)]:
+            raise RequestError(
+                f"--lens-model: found {lens_model}, but --set {others[0]}; leave one out"
+            )
         assignments = (f"{stage_in(StageRole.VIEW).name}.method={lens_model}", *assignments)
     request = Request.from_options(
         camera=series.camera, iso=series.iso, assignments=assignments, **options

@@ -13,9 +13,9 @@ from pydantic import TypeAdapter
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
 from clpipe.camera.gain_stage import Positive
+from clpipe.camera.optics import FILM_DIAGONAL
 from clpipe.images.encoding import Encoding
 
-FILM_DIAGONAL = math.hypot(36, 24)  # mm, of a frame of 35 mm film
 TAG_ATTRIBUTES = ("exif", "orientation")  # the attributes by which an image carries its tags
 DATE = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")  # as EXIF has it
 NOT_CARRIED = ("sensor_width", "encoding")  # the fields of tags that no image carries

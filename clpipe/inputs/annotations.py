@@ -10,6 +10,8 @@ from clpipe.base.reading import parse_json, read_bytes
 
 LARGEST = 1 << 30  # bytes of a file
 
+FARTHEST = 1e5  # px from the corner of a render, of a place in it or beside it
+
 Record = dict[str, Any]
 
 

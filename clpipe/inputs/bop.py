@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from clpipe.inputs.annotations import AnnotatedRender, Record, parsed, refuse
+from clpipe.inputs.annotations import FARTHEST, AnnotatedRender, Record, parsed, refuse
 
 POSES, INFOS, CAMERAS = "scene_gt.json", "scene_gt_info.json", "scene_camera.json"
 MASKS = ("mask", "mask_visib")
@@ -59,9 +59,9 @@ def read_bop(path: Path) -> Bop:
     cameras = _by_image(beside) if (beside := path.with_name(CAMERAS)).is_file() else {}
     renders: list[AnnotatedRender] = []
     for image, objects in poses.items():
-        own: Any = infos.get(image, [{}] * len(objects))
         if not isinstance(objects, list) or not all(isinstance(each, dict) for each in objects):
             refuse(path, str(image), objects, "a list of objects")
+        own: Any = infos.get(image, [{}] * len(objects))
         if not isinstance(own, list) or len(own) != len(objects):
             refuse(path.with_name(INFOS), str(image), own, f"a list of {len(objects)} objects")
         found = []
@@ -70,8 +70,15 @@ def read_bop(path: Path) -> Bop:
             name = f"{image:0{DIGITS}d}_{number:0{DIGITS}d}.png"
             files = {kind: path.with_name(kind) / name for kind in MASKS}
             masks = {kind: file for kind, file in files.items() if file.is_file()}
+            if found and masks.keys() != found[0].masks.keys():
+                kind = min({*masks} ^ {*found[0].masks})
+                refuse(path, f"{image}[{number}]", f"no {files[kind]}", "masks of all or of none")
             found.append(BopObject(pose, info, masks))
         renders.append(AnnotatedRender(f"{image:0{DIGITS}d}", None, found))
+    for image, camera in cameras.items():
+        matrix = camera.get("cam_K", [0] * 9) if isinstance(camera, dict) else None
+        if not isinstance(matrix, list) or len(matrix) != 9 or not all(map(_is_number, matrix)):
+            refuse(path.with_name(CAMERAS), f"{image}.cam_K", matrix, "nine numbers")
     return Bop(path, renders, cameras)
 
 
@@ -96,5 +103,6 @@ def _check(path: Path, place: str, info: Record) -> None:
         refuse(path, place, info, "an object")
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+def _is_number(value: Any) -> bool:
+    is_one = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_one and abs(value) <= FARTHEST

@@ -14,7 +14,7 @@ import numpy as np
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import read_bytes
 from clpipe.base.types import Doubles
-from clpipe.inputs.annotations import LARGEST, AnnotatedRender, refuse
+from clpipe.inputs.annotations import FARTHEST, LARGEST, AnnotatedRender, refuse
 
 FIELDS = 15  # of a line, but for a score
 CALIBRATION = "calib"  # the folder beside that of the labels
@@ -91,11 +91,13 @@ def _objects(path: Path) -> list[KittiObject]:
             numbers = [float(word) for word in words[1:]]
         except ValueError:
             numbers = []
-        left, top, right, bottom = numbers[3:7] if len(numbers) >= FIELDS - 1 else (0, 0, 0, 0)
-        if len(words) not in (FIELDS, FIELDS + 1) or not np.isfinite(numbers).all():
+        if len(numbers) not in (FIELDS - 1, FIELDS) or not np.isfinite(numbers).all():
             refuse(path, f"line {number}", line, f"a type and {FIELDS - 1} numbers")
-        if right < left or bottom < top:
-            refuse(path, f"line {number}", line, "a box with left <= right and top <= bottom")
+        left, top, right, bottom = numbers[3:7]
+        if right < left or bottom < top or max(map(abs, numbers[3:7])) > FARTHEST:
+            refuse(
+                path, f"line {number}", line, "a box with left <= right and top <= bottom, in px"
+            )
         box = left + CENTRE, top + CENTRE, right + CENTRE, bottom + CENTRE
         found.append(KittiObject(words, numbers[0], box))
     return found

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Doubles, Mask
 from clpipe.inputs.annotations import Record
+from clpipe.inputs.coco import runs_of
 from clpipe.reference.carried import Layer, warp
 from clpipe.reference.geometry import (
     Composition,
@@ -221,13 +221,10 @@ def _mapped_mask(encoded: Record, way: Way) -> Record | None:
     """
     from pycocotools import mask as coder
 
-    height, width = encoded["size"]
-    if (width, height) != (way.width, way.height):
-        of = f"an image of {way.width}x{way.height}"
-        raise ImageError(f"a mask of {width}x{height} pixels in {of}")
     is_text = not isinstance(encoded["counts"], list)
-    own = encoded if is_text else coder.frPyObjects(encoded, height, width)
-    mask = coder.decode(own)
+    runs = runs_of(encoded["counts"])
+    values = np.arange(len(runs), dtype=np.uint8) % 2
+    mask = np.repeat(values, runs).reshape((way.height, way.width), order="F")
     moved = moved_mask(mask, way)
     if not moved.any():
         return None

@@ -136,8 +136,10 @@ def _kitti_line(known: KittiObject, way: Way) -> str:
     words = list(known.words)
     if known.truncated >= 0:
         words[1] = f"{1 - (1 - known.truncated) * shown:.2f}"
-    edges = x, y, x + width, y + height
-    words[4:8] = [f"{edge - CENTRE:.2f}" for edge in edges]
+    # KITTI's places are centres of pixels, of which the picture has none beyond its outermost.
+    corners = np.reshape([x, y, x + width, y + height], (2, 2)) - CENTRE
+    edges = np.clip(corners, 0, np.array(way.after) - 1)
+    words[4:8] = [f"{edge:.2f}" for edge in edges.ravel()]
     return " ".join(words)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.photometry import Estimates, exposure_of
 from clpipe.images.read import SourceImage
-from clpipe.images.tags import TAG_ATTRIBUTES, Tags, exposed_attributes, sensor_width
+from clpipe.images.tags import TAG_ATTRIBUTES, Tags, exposed_attributes
 from clpipe.stage import StageRole
 
 
@@ -48,17 +48,15 @@ def sensor_of(chain: Chain, source: SourceImage, own: Mapping[str, float]) -> fl
         own: what that says of its shot.
     """
     optics = chain.optics
-    if stated := optics.sensor_width or own.get("sensor_width"):
+    stated = None if optics.is_sensor_of_lens else optics.sensor_width
+    if stated := stated or own.get("sensor_width"):
         return stated
     length = optics.focal_length or own.get("focal_length")
     if length is None or source.pixels.ndim != 3:
         return None
     width, height = source.margins.inside(*source.pixels.shape[1::-1])
-    if camera := chain.intrinsics_of_render(width, height, source.shot):
-        return length / camera.fx * max(width, height)
-    if lens := optics.calibration:
-        return sensor_width(length, length * lens.crop_factor, height, width)
-    return None
+    camera = chain.intrinsics_of_render(width, height, source.shot)
+    return length / camera.fx * max(width, height) if camera else None
 
 
 def kept_tags(chain: Chain, step: Step, source: SourceImage, tags: Tags) -> dict[str, str]:

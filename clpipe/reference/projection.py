@@ -10,7 +10,7 @@ import numpy as np
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.reference.geometry import Destined
-from clpipe.reference.intrinsics import Intrinsics
+from clpipe.reference.intrinsics import AGREEMENT, Intrinsics
 from clpipe.reference.panorama import CUBE, FRONT, LatitudeLongitude, Panorama, View, Views
 from clpipe.reference.resample import PADDING, Axis, Parameters
 from clpipe.reference.warp import FILTERS, gather, reach_of
@@ -57,14 +57,17 @@ class Projection(Destined):
         """What an image of some size is.
 
         Raises:
-            ImageError: the focal length of a view is not known.
+            ImageError: the focal length of a view is not known, or is said to be another.
         """
         if self.panorama:
+            self._check(self.panorama)
             return self.panorama
         if self.is_map:
             return LatitudeLongitude(width, height, border=0)
         if self.angle:
-            return Views((View.of_angle(FRONT, width, height, self.angle),), border=0)
+            single = Views((View.of_angle(FRONT, width, height, self.angle),), border=0)
+            self._check(single)
+            return single
         known = Intrinsics.of_render(width, height, dict(self.shot))
         if known is None:
             raise ImageError(
@@ -74,6 +77,22 @@ class Projection(Destined):
             )
         place = known.fx, known.fy, known.cx, known.cy
         return Views((View(FRONT, *place, width, height),), border=0)
+
+    def _check(self, panorama: Panorama) -> None:
+        """See that what is known of the render's focal length is so in a panorama.
+
+        Raises:
+            ImageError: it is not.
+        """
+        if not isinstance(panorama, Views):
+            return
+        view = panorama.views[0]
+        known = Intrinsics.of_render(view.width, view.height, dict(self.shot))
+        if known and abs(known.fx - view.fx) > AGREEMENT * view.fx:
+            raise ImageError(
+                f"projection: render's focal length is {known.fx:.4g} px, but that of a view of "
+                f"{view.width}x{view.height} pixels is {view.fx:.4g} px by its angle; leave one out"
+            )
 
     @property
     def support(self) -> int:
