@@ -284,3 +284,41 @@ def test_a_lens_of_which_nothing_is_known_is_refused(lensfun):
     lensfun(by_name.LensCalibration("a", 24.0, {}, {}))
     with pytest.raises(RequestError, match="knows neither distortion nor vignetting of it"):
         make_chain(settings_from({"lens": "a"}))
+
+
+CANON = ("--lens", "Canon EF 24-70mm f/2.8L", "--focal-length", 24, "--skip", "noise")
+
+
+@pytest.mark.parametrize("size", [(60, 40), (80, 45)])
+def test_a_lens_by_name_says_how_wide_its_sensor_is(clpipe, write_exr, size):
+    width, height = size
+    write_exr("in/a.exr", np.full((height, width, 3), 0.3, np.float32))
+    cosine = ("--set", "vignetting.method=cosine_fourth", "--aperture", 2.8)
+    clpipe("run", "in", "-o", "o", "--device", "numpy", *CANON, *cosine)
+    told = json.loads(Path("o/a.json").read_text())
+    # By the diagonal, as lensfun's crop factors are.
+    sensor = np.hypot(36, 24) * width / np.hypot(*size)
+    fx = 24 / sensor * width
+    assert told["intrinsics"]["fx"] == pytest.approx(fx, rel=0.03)  # ptlens has a linear term
+    falloff = told["photometry"]["falloff"]["parameters"]
+    assert falloff["focal_length"] == 24
+    assert falloff["sensor_width"] == pytest.approx(sensor, rel=1e-6)
+    stated = ("--set", "render.sensor_width=22.3")
+    clpipe("run", "in", "-o", "p", "--device", "numpy", *CANON, *cosine, *stated)
+    told = json.loads(Path("p/a.json").read_text())
+    assert told["photometry"]["falloff"]["parameters"]["sensor_width"] == 22.3
+
+
+def test_a_lens_by_name_is_not_that_of_other_poses(clpipe, write_exr):
+    write_exr("in/a.exr", np.full((40, 60, 3), 0.3, np.float32))
+    view = {"file": "a.exr", "width": 60, "height": 40, "R": np.eye(3).tolist(), "t": [0, 0, 0]}
+    for fx, status in ((40.0, 0), (42.0, 0), (83.0, 1)):
+        k = [[fx, 0, 30], [0, fx, 20], [0, 0, 1]]
+        Path("cameras.json").write_text(json.dumps({"views": [{**view, "K": k}]}))
+        told = clpipe(
+            *("run", "in", "-o", f"o{fx}", "--device", "numpy", "--poses", "cameras.json"),
+            *CANON,
+            status=status,
+        ).stderr
+        text = "render.fx: the focal length of this render of 60x40 pixels is 83 px, but lens: "
+        assert (text in told) == bool(status)

@@ -155,6 +155,11 @@ def test_a_dataset_grows(clpipe, scene, blender, tmp_path):
     assert all((tmp_path / "set" / name).stat().st_mtime_ns == first[name] for name in old)
     rows = list(csv.DictReader(io.StringIO((tmp_path / "set/manifest.csv").read_text())))
     assert {row["picture"] for row in rows} == expected
+    (tmp_path / "set").rename(tmp_path / "moved")
+    clpipe(command[0], scene, "-o", "moved", *command[4:], "--iso", "100,200")
+    moved = list(csv.DictReader(io.StringIO((tmp_path / "moved/manifest.csv").read_text())))
+    assert {row["render"] for row in moved} == {f"renders/view_00{n}.exr" for n in range(9)}
+    (tmp_path / "moved").rename(tmp_path / "set")
     readme = (tmp_path / "set/README.md").read_text()
     assert all(f"| `{folder}/` |" in readme for folder in folders)
     assert "**Licence:** CC-BY-4.0" in readme and "**Author:** A. Maker" in readme

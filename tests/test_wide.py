@@ -7,7 +7,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from clpipe.base.errors import ImageError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.chain import make_chain
 from clpipe.chain.panorama import with_panorama
 from clpipe.chain.settings import settings_from
@@ -292,6 +292,44 @@ def test_lenses_that_cannot_be(write, clpipe, options, status, message):
     assert "Traceback" not in told
 
 
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"vignetting": {"method": "cosine_fourth"}}, "vignetting.method=cosine_fourth: it counts"),
+        ({"vignetting": {"method": "cosine_fourth", "fx": 60.0}}, "makes that of a wide lens"),
+        (
+            {"distortion": {"method": "brown_conrady", "k1": -0.1}},
+            "distortion.method=brown_conrady",
+        ),
+        ({"motion_blur": {"rotation": 1.0}}, "motion_blur.method=linear"),
+        ({"defocus": {"method": "thin_lens"}}, "defocus.method=thin_lens"),
+        ({"lens": "Canon EF 24-70mm f/2.8L", "focal_length": 24.0}, "lens: it is of pictures in"),
+    ],
+)
+def test_what_is_of_perspective_pictures_is_refused_behind_a_wide_lens(more, message):
+    wide = {"projection": {"method": "kannala_brandt", **LENSES["kannala_brandt"]}}
+    with pytest.raises(RequestError) as error:
+        make_chain(settings_from({**wide, **more}))
+    assert message in str(error.value)
+    make_chain(settings_from({**wide, "vignetting": {"method": "pa", "k1": -0.2}}))
+
+
+def test_a_view_has_one_focal_length(write, clpipe):
+    write("in/room.exr", **colours(light(rays_of(faces([FRONT])[0]))))
+    wide = options_of("kannala_brandt", face_angle=90.0)
+    for said, of_view in ((SIDE / 2, 0), (1.4 * SIDE, 1)):
+        options = (*RUN, *wide, "--set", f"render.fx={said}")
+        told = clpipe("run", "in", "-o", "o", *options, status=of_view).output
+        assert ("leave one out" in told) == bool(of_view)
+    for name, image in zip(CUBE, images_of(PANORAMAS["cube"]), strict=True):
+        write(f"cube/room_{name}.exr", **colours(image))
+    lengths = ("--focal-length", 35, "--set", "render.sensor_width=36")
+    told = clpipe("run", "cube", "-o", "o", *RUN, *wide, *lengths, status=1).output
+    assert "render's focal length is 93.33 px, but that of a view of 96x96 pixels is 48" in (
+        " ".join(told.split())
+    )
+
+
 def plane_and_sky(rays):
     """The distance of a floor 1 below, and of a wall 2 behind; the sky is 1000 away."""
     _, y, z = unit(rays)
@@ -389,7 +427,12 @@ def test_a_dataset_of_faces_that_exist(write, clpipe):
     clpipe("dataset", "in", "-o", "set", "--iso", "100", *chosen[:-2])
     made = {path.name for path in Path("set/iso100").iterdir()}
     assert {"one.jpg", "two.jpg", "one.Depth.png", "one.truth_clean.jpg"} <= made
-    assert "2 in `train.txt`" in Path("set/README.md").read_text()
+    readme = Path("set/README.md").read_text()
+    assert "2 in `train.txt`" in readme
+    assert "`Depth` (depth): along the axis of view" in readme
+    assert "`Depth.Distance` (depth): the distance from the camera" in readme
+    other = (*chosen[:-2], "--set", "projection.method=double_sphere")
+    assert "leave one out" in clpipe("dataset", "in", "-o", "n", *other, status=2).output
     record = json.loads(Path("set/iso100/one.json").read_text())
     turns = [view["rotation"] for view in record["panorama"]["views"]]
     assert turns == [np.array(turn).tolist() for turn in CUBE.values()]

@@ -11,6 +11,7 @@ from clpipe.base.about import __version__
 from clpipe.base.files import write_new
 from clpipe.chain.rendition import Rendition
 from clpipe.images.sheet import SHOWN, contact_sheet
+from clpipe.inputs.carry_around import DISTANCE
 from clpipe.outputs.camera_files import FILES, write_camera_files
 from clpipe.scenes.members import PICTURE, Member, members_of, splits_of
 from clpipe.scenes.record import RECORD
@@ -29,6 +30,7 @@ TRUTHS = {
     "label": "whole numbers, the objects' own",
     "colour": "linear",
 }
+AWAY = "the distance from the camera, in the renders' unit ({unit})"  # of a wide lens's depth
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,7 @@ def _readme(
     views += "`cameras.json` x_cam = R X + t, by OpenCV's axes, and places in px from the corner.\n"
     layers = {each["layer"]: each for member in members for each in member.layers}
     truths = "".join(
-        f"- `{name}` ({each['kind']}): {TRUTHS[each['kind']].format(unit=about.unit)}.\n"
+        f"- `{name}` ({each['kind']}): {_held(name, each['kind']).format(unit=about.unit)}.\n"
         for name, each in layers.items()
         if each["kind"] in TRUTHS
     )
@@ -214,3 +216,8 @@ def _range(members: Sequence[Member], fact: str) -> str:
         return "not known"
     low, high = min(texts, key=float), max(texts, key=float)
     return low if low == high else f"{low} to {high}"
+
+
+def _held(layer: str, kind: str) -> str:
+    """What a carried layer holds."""
+    return AWAY if layer.endswith(f".{DISTANCE}") else TRUTHS[kind]

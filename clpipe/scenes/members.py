@@ -98,7 +98,7 @@ def members_of(folder: Path, renders: str) -> list[Member]:
     members = []
     for name, renditions in found.items():
         try:
-            if member := _member(folder, name, renditions):
+            if member := _member(folder, renders, name, renditions):
                 members.append(member)
         except DAMAGED:
             path = next(path for path, _ in renditions.values())
@@ -123,9 +123,12 @@ def _is_of_picture(name: str) -> bool:
 
 
 def _member(
-    folder: Path, name: str, renditions: Mapping[str, tuple[Path, Mapping[str, Any]]]
+    folder: Path,
+    renders: str,
+    name: str,
+    renditions: Mapping[str, tuple[Path, Mapping[str, Any]]],
 ) -> Member | None:
-    """What was made of a view; None where its picture is not there.
+    """What was made of a view; None where its picture is not there; see :func:`members_of`.
 
     Raises:
         KeyError, TypeError, ValueError, AttributeError, OverflowError: the values are damaged.
@@ -152,7 +155,10 @@ def _member(
     own = SERIES.match(name)
     series = own[0] if own else ""
     view = name.removeprefix(series).lstrip("/")
-    render = os.path.relpath(Path(str(noisy["input"])).absolute(), folder.absolute())
+    said = Path(str(noisy["input"]))
+    render = os.path.relpath(said.absolute(), folder.absolute())
+    if (folder / renders / said.name).exists():  # wherever the dataset was when it was made
+        render = f"{renders}/{said.name}"
     return Member(view, series, files, _facts(noisy), render, tuple(noisy.get("carried", ())))
 
 
