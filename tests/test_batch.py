@@ -535,7 +535,7 @@ def start(folder, *arguments, environment=None):
 def wait_for(folder, count):
     """Wait until so many pictures are there."""
     for _ in range(6000):
-        if len(list(folder.glob("*.json"))) >= count:
+        if len([path for path in folder.glob("*.json") if path.name[0] != "."]) >= count:
             return
         time.sleep(0.01)
     raise AssertionError(f"{folder} never held {count} pictures")

@@ -66,7 +66,7 @@ def wait_until(is_so):
 
 
 def pictures():
-    return len(list(Path("out").glob("*.json")))
+    return len(list(Path("out").glob("r*.json")))
 
 
 @pytest.mark.slow

@@ -19,15 +19,16 @@ from dataclasses import dataclass
 from clpipe.base.errors import ClpipeError
 from clpipe.base.files import remove_temporary_files
 from clpipe.base.system import stay_on
+from clpipe.batch.in_turn import InTurn, Jobs
 from clpipe.batch.interrupt import SIGNALS
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.pipes import Pipe
+from clpipe.batch.room import usual_room
 from clpipe.batch.spec import RunSpec
 from clpipe.batch.threads import Batch
 from clpipe.engine.device import Device, open_devices
-from clpipe.inputs.find import Job
 
-SOON = 0.02  # s for which outcomes are collected, as each message has its price
+SOON = 0.005  # s for which outcomes are collected, as each message has its price
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Seat:
         of: how many there are.
         threads: that decode, and that encode, where the run does not say how many.
         processors: on which it stays; () is wherever the system puts it.
+        in_turn: whether one thread does all of one image after the other.
         level: of what is logged.
     """
 
@@ -46,6 +48,7 @@ class Seat:
     of: int
     threads: int
     processors: tuple[int, ...] = ()
+    in_turn: bool = False
     level: int = logging.INFO
 
 
@@ -80,21 +83,29 @@ def _work(pipe: Pipe, spec: RunSpec, seat: Seat) -> None:
     share = seat.number, seat.of
     devices: list[Device | None] = [*open_devices(where.devices, where.memory, share)] or [None]
     pipe.send("ready")
-    batch = spec.batch(devices, seat.threads, seat.of)
-    jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+    jobs: Jobs = queue.SimpleQueue()
+    batch: Batch | InTurn
+    if seat.in_turn and len(devices) == 1:
+        batch = InTurn(
+            spec.worker(), devices[0], usual_room(seat.of), lambda: pipe.send("compiled")
+        )
+        running = batch.run(jobs)
+    else:
+        batch = spec.batch(devices, seat.threads, seat.of)
+        running = batch.run(iter(jobs.get, None))
     threading.Thread(target=_listen, args=(pipe, jobs, batch), daemon=True).start()
     finished: queue.SimpleQueue[Outcome | None] = queue.SimpleQueue()
     teller = threading.Thread(target=_tell, args=(pipe, finished))
     teller.start()
     try:
-        for outcome in batch.run(iter(jobs.get, None)):
+        for outcome in running:
             finished.put(outcome)
     finally:
         finished.put(None)
         teller.join()
 
 
-def _listen(pipe: Pipe, jobs: "queue.SimpleQueue[Job | None]", batch: Batch) -> None:
+def _listen(pipe: Pipe, jobs: Jobs, batch: Batch | InTurn) -> None:
     """Take jobs in, until it is said that there are no more."""
     try:
         what, *values = pipe.receive()

@@ -20,6 +20,7 @@ from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from clpipe.base.errors import ClpipeError, DeviceError, RequestError
+from clpipe.base.memory import available_memory
 from clpipe.base.processors import available_processors
 from clpipe.base.system import processor_numbers
 from clpipe.batch.local_worker import Seat
@@ -36,9 +37,11 @@ log = logging.getLogger(__name__)
 # the interpreter's lock, ms of all, and ms more of each megapixel.
 LOCKED, OF_IMAGE, OF_MEGAPIXEL = 2.0, 3.0, 25.0
 SHARE = 0.5  # of a process's time that the lock may be held; beyond, threads wait for it
-WORTH = 500  # images of each process; to start one takes as long as some hundred small ones
+WORTH = 2000  # ms of work of each process; to start one takes 600
+SMALL = 2.5  # megapixels, up to which reading need not go on beside developing
+ROOM = 400 << 20  # bytes for each process
 
-AHEAD = 64  # jobs that a process may have before it
+AHEAD, LEAST = 64, 12  # jobs that a process may have before it, and small ones towards the end
 DEATHS = 3  # of processes that took a job, after which it is given up; or of those that only start
 
 PROGRAM = "import json, sys; sys.path[:] = json.loads({path!r}); {start}"
@@ -55,15 +58,17 @@ def usual_processes(images: int, claim: Claim, processors: int) -> int:
         processors: that there are.
 
     >>> small, large = Claim(512, 512, 0, 0), Claim(6000, 4000, 0, 0)
-    >>> [usual_processes(10_000, small, n) for n in (1, 2, 8, 64)]
-    [1, 1, 3, 25]
-    >>> usual_processes(800, small, 64), usual_processes(10_000, large, 64)
+    >>> [usual_processes(100_000, small, n) for n in (1, 2, 4)]
+    [1, 2, 4]
+    >>> usual_processes(300, small, 4), usual_processes(10_000, large, 64)
     (1, 1)
     """
-    megapixels = claim.width * claim.height / 1e6
-    each = OF_IMAGE + OF_MEGAPIXEL * megapixels
-    fed = max(each / LOCKED * SHARE, 1.0)  # processors that the threads of one process keep busy
-    return max(min(int(processors / fed), images // WORTH), 1)
+    each = OF_IMAGE + OF_MEGAPIXEL * claim.megapixels
+    # Processors that the threads of one process keep busy.
+    fed = 1.0 if claim.megapixels <= SMALL else max(each / LOCKED * SHARE, 1.0)
+    free = available_memory()
+    fit = processors if free is None else free // ROOM
+    return max(min(int(processors / fed), int(images * each / WORTH), fit), 1)
 
 
 @dataclass
@@ -77,7 +82,6 @@ class _Process:
     jobs: dict[str, Job] = field(default_factory=dict)  # before it, by their stems
     is_alone: bool = False  # whether what it has is all it gets
     is_ready: bool = False  # it has its devices
-    has_worked: bool = False
 
     def close(self) -> int:
         """Wait for its end; its status."""
@@ -94,17 +98,20 @@ class Processes:
     Args:
         spec: the run.
         count: how many.
+        claim: of the first image, which stands for all.
     """
 
-    def __init__(self, spec: RunSpec, count: int) -> None:
+    def __init__(self, spec: RunSpec, count: int, claim: Claim) -> None:
         self._spec = spec
         self._count = count
+        self._is_small = claim.megapixels <= SMALL
         self._messages: queue.SimpleQueue[tuple[_Process | None, tuple[object, ...]]]
         self._messages = queue.SimpleQueue()
         self._processes: list[_Process] = []
         self._left: deque[Job] = deque()
         self._suspects: deque[Job] = deque()  # whose processes died; each is tried alone in the end
         self._deaths: Counter[str] = Counter()  # by stems of jobs
+        self._has_worked = False  # one of them, which so has kept the kernels
         self._still_born = 0  # processes in a row that ended before they were ready
         self._said: set[str] = set()
         self._failure: ClpipeError | None = None
@@ -127,8 +134,8 @@ class Processes:
         every = list(jobs)
         self._left = deque(every)
         try:
-            # The kernels are compiled, and kept for the others, by the first one.
-            self._processes.append(self._start(0))
+            wanted = min(self._count, max(len(every), 1))
+            self._processes += [self._start(number) for number in range(wanted)]
             self._hand_out()
             while not self._is_finished:
                 process, message = self._messages.get()
@@ -164,7 +171,10 @@ class Processes:
         if len(every) == available_processors() >= count:
             own = tuple(every[number * len(every) // count : (number + 1) * len(every) // count])
             share = len(own)
-        seat = Seat(number, count, share, own, logging.getLogger("clpipe").getEffectiveLevel())
+        in_turn = share == 1 and self._is_small
+        seat = Seat(
+            number, count, share, own, in_turn, logging.getLogger("clpipe").getEffectiveLevel()
+        )
         limits = {name: os.environ.get(name, str(share)) for name in THREADS}
         program = PROGRAM.format(path=json.dumps(sys.path), start=START)
         try:
@@ -205,8 +215,10 @@ class Processes:
         match message:
             case ("ready",):
                 process.is_ready, self._still_born = True, 0
+            case ("compiled",):
+                self._has_worked = True
             case ("outcomes", list(outcomes)):
-                process.has_worked = True
+                self._has_worked = True
                 for outcome in outcomes:
                     del process.jobs[outcome.job.stem]
                 process.is_alone &= bool(process.jobs)
@@ -224,22 +236,23 @@ class Processes:
         return ()
 
     def _hand_out(self) -> None:
-        """Give each process its next jobs, and start processes while there is something for them.
+        """Give each process its next jobs, and start others where some have died.
 
         Raises:
             RequestError: no process can be started.
         """
         if self._is_stopping:
             return
-        has_worked = any(process.has_worked for process in self._processes)
-        while len(self._processes) < self._count and has_worked and self._left:
+        while len(self._processes) < self._count and self._left and self._has_worked:
             taken = {process.seat.number for process in self._processes}
             self._processes.append(self._start(min({*range(self._count)} - taken)))
-        for process in self._processes:
+        # The kernels are compiled, and kept for the others, by the first one.
+        for process in self._processes if self._has_worked else self._processes[:1]:
             if process.is_alone:
                 continue
             threads = self._spec.where.threads or process.seat.threads
-            most = max(min(AHEAD, len(self._left) // (2 * self._count)), threads + 3)
+            least = LEAST if process.seat.in_turn else threads + 3
+            most = max(min(AHEAD, len(self._left) // (2 * self._count)), least)
             if len(process.jobs) > most // 2:  # one or two more are not worth a message
                 continue
             count = min(most - len(process.jobs), len(self._left))

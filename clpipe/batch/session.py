@@ -28,6 +28,7 @@ from clpipe.batch.work import ImageWorker
 from clpipe.chain.isos import draw_note
 from clpipe.chain.request import Request
 from clpipe.engine.device import Device, open_devices
+from clpipe.images.claims import Claim
 from clpipe.images.read import PICTURE_SUFFIXES
 from clpipe.inputs.find import Job, Shard, find_jobs
 from clpipe.inputs.loader import ImageLoader
@@ -224,15 +225,13 @@ class Run:
             if not unlogged:
                 log.end(self.summary)
 
-    def _processes(self, jobs: Iterable[Job]) -> int:
-        """How many processes do the jobs."""
+    def _processes(self, jobs: Iterable[Job], claim: Claim) -> int:
+        """How many processes do the jobs; the claim is of the first one."""
         where = self.where
         if where.processes:
             return where.processes
         if self._tars or jobs is not self.jobs:  # they may come one after the other
             return 1
-        # The first one's size stands for all, whose headers nobody has read.
-        claim = self._loader.claim(self.jobs[0])
         return usual_processes(len(self.jobs), claim, available_processors())
 
     def _look_behind(self, folders: Sequence[Path]) -> None:
@@ -266,8 +265,11 @@ class Run:
 
             return connected(self._dask, DaskSpec(self._request, self.where, self.jobs[0]))
         where = self.where
-        if (count := self._processes(jobs)) > 1:
-            return nullcontext(Processes(RunSpec(self._request, where, self.jobs[0]), count))
+        # The first one's size stands for all, whose headers nobody has read.
+        claim = self._loader.claim(self.jobs[0])
+        if (count := self._processes(jobs, claim)) > 1:
+            spec = RunSpec(self._request, where, self.jobs[0])
+            return nullcontext(Processes(spec, count, claim))
         devices: list[Device | None] = [*open_devices(where.devices, where.memory)] or [None]
         if self._tars:
             own = self._loader, self.writer, self._chain

@@ -32,6 +32,14 @@ class RunSpec:
     first: Job
     folder: Path | None = None
 
+    def worker(self) -> ImageWorker:
+        """What is done to each image."""
+        where = self.where
+        loader = ImageLoader(self.request, self.folder)
+        writer = OutputWriter(where.output, self.request)
+        chain = loader.first_chain([self.first])
+        return ImageWorker(loader, writer, chain, where.redo, where.trace is not None)
+
     def batch(self, devices: Sequence[Device | None], threads: int, sharing: int) -> Batch:
         """What does a part of the run.
 
@@ -40,12 +48,8 @@ class RunSpec:
             threads: where the run does not say how many.
             sharing: how many processes share the machine's memory.
         """
-        where = self.where
-        loader = ImageLoader(self.request, self.folder)
-        writer = OutputWriter(where.output, self.request)
-        chain = loader.first_chain([self.first])
-        worker = ImageWorker(loader, writer, chain, where.redo, where.trace is not None)
-        return Batch(worker, devices, where.threads or threads, usual_room(sharing))
+        number = self.where.threads or threads
+        return Batch(self.worker(), devices, number, usual_room(sharing))
 
 
 def shifted(outcome: Outcome, seconds: float, prefix: str = "") -> Outcome:

@@ -78,6 +78,24 @@ def failure_text(job: Job, error: BaseException) -> str:
     return f"{job.path}: {reason}"
 
 
+def bytes_of(worker: ImageWorker, job: Job, most: int, in_numpy: bool) -> int:
+    """The bytes of memory that a job's image takes, see :func:`~clpipe.batch.room.host_bytes`.
+
+    Args:
+        worker: what is done to it.
+        job: the image.
+        most: how many results there are at a time at most.
+        in_numpy: whether NumPy develops it.
+    """
+    writer = worker.writer
+    results = min(len(writer.renditions_of(job)), most)
+    beside = 2 * worker.layers + bool(job.subframes)
+    # Baselines are measured on floats.
+    formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
+    kinds = results, formats, writer.request.keep, beside, in_numpy
+    return host_bytes(worker.loader.claim(job), worker.chain, *kinds)
+
+
 class Batch:
     """One run over many images.
 
@@ -277,12 +295,7 @@ class Batch:
         if not self._is_needed.is_set():
             writer.check_folder()
         self._is_needed.set()
-        results = min(len(writer.renditions_of(job)), self.threads + len(self.devices))
-        beside = 2 * worker.layers + bool(job.subframes)
-        # Baselines are measured on floats.
-        formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
-        kinds = results, formats, writer.request.keep, beside, None in self.devices
-        size = host_bytes(worker.loader.claim(job), worker.chain, *kinds)
+        size = bytes_of(worker, job, self.threads + len(self.devices), None in self.devices)
         start = time.perf_counter()
         self._room.enter(job.stem, size)
         waits.append(time.perf_counter() - start)

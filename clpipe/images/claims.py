@@ -29,6 +29,11 @@ class Claim:
     image: int
     reading: int
 
+    @property
+    def megapixels(self) -> float:
+        """Its size."""
+        return self.width * self.height / 1e6
+
 
 def plain_claim(width: int, height: int) -> Claim:
     """The claim of a mosaic which is read as it is and becomes floats."""
