@@ -1,4 +1,5 @@
-"""Many images in one thread: all of one is done, then the next is begun.
+"""Many images in one thread: all of one is done, then the next is begun; a second one only waits
+for the disk.
 
 A process that has one processor needs no more. In :class:`clpipe.batch.threads.Batch` threads take
 turns at the interpreter's lock some fifty times an image, which of a small image's time is a third.
@@ -6,7 +7,8 @@ turns at the interpreter's lock some fifty times an image, which of a small imag
 
 import queue
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 
 from clpipe.base.errors import ClpipeError, DeviceError, OutputError
@@ -23,6 +25,8 @@ from clpipe.inputs.find import Job
 TOGETHER = 16  # images that are brought to the disk at a time, at most
 
 Jobs = queue.SimpleQueue[Job | None]  # None: there are no more
+
+Made = tuple[JobState, list[Written]]  # a job, and its renditions, which have no names yet
 
 
 class InTurn:
@@ -65,30 +69,39 @@ class InTurn:
             DeviceError: the device cannot be used any more.
         """
         set_codec_threads(1)
-        made: list[tuple[JobState, list[Written]]] = []
-        try:
-            while True:
-                try:
-                    job = jobs.get_nowait()
-                except queue.Empty:
-                    yield from self._committed(made)
-                    job = jobs.get()
-                if job is None or self._stopping.is_set():
-                    break
-                made.append(self._make(job))
-                if len(made) >= TOGETHER:
-                    yield from self._committed(made)
-            yield from self._committed(made)
-        finally:
-            for _, files in made:
-                for each in files:
-                    each.group.discard()
-            if self._device:
-                self._device.drain()
+        made: list[Made] = []
+        committing: Future[list[Outcome]] | None = None
+        with ThreadPoolExecutor(1, "write") as beside:
+            try:
+                while True:
+                    try:
+                        job = jobs.get_nowait()
+                    except queue.Empty:
+                        yield from committing.result() if committing else ()
+                        committing = None
+                        yield from self._commit(made)
+                        made = []
+                        job = jobs.get()
+                    if job is None or self._stopping.is_set():
+                        break
+                    made.append(self._make(job))
+                    if len(made) >= TOGETHER:
+                        yield from committing.result() if committing else ()
+                        committing = beside.submit(self._commit, made)
+                        made = []
+                yield from committing.result() if committing else ()
+                yield from self._commit(made)
+                made = []
+            finally:
+                for _, files in made:
+                    for each in files:
+                        each.group.discard()
+                if self._device:
+                    self._device.drain()
         if self._failure:
             raise self._failure
 
-    def _make(self, job: Job) -> tuple[JobState, list[Written]]:
+    def _make(self, job: Job) -> Made:
         """Do all of a job, but bring nothing to the disk."""
         worker = self._worker
         state, files = JobState(job, worker.loader), list[Written]()
@@ -134,17 +147,13 @@ class InTurn:
             self._room.started()
         self._room.enter(job.stem, bytes_of(self._worker, job, 1, self._device is None))
 
-    def _committed(
-        self, made: list[tuple[JobState, list[Written]]]
-    ) -> Generator[Outcome, None, None]:
-        """The outcomes of what was made, when it is on the disk."""
+    def _commit(self, made: Sequence[Made]) -> list[Outcome]:
+        """Bring to the disk what was made; the outcomes."""
         try:
             self._worker.commit([(state, each) for state, files in made for each in files])
         except OutputError as error:
             self._fail(error)
-        outcomes = [state.outcome() for state, _ in made]
-        made.clear()
-        yield from outcomes
+        return [state.outcome() for state, _ in made]
 
     def _fail(self, error: ClpipeError) -> None:
         self._failure = self._failure or error

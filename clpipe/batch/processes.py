@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 # the interpreter's lock, ms of all, and ms more of each megapixel.
 LOCKED, OF_IMAGE, OF_MEGAPIXEL = 2.0, 3.0, 25.0
 SHARE = 0.5  # of a process's time that the lock may be held; beyond, threads wait for it
-WORTH = 2000  # ms of work of each process; to start one takes 600
+WORTH = 1200  # ms of work of each process; to start one takes 600
 SMALL = 2.5  # megapixels, up to which reading need not go on beside developing
 ROOM = 400 << 20  # bytes for each process
 
