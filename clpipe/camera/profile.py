@@ -287,7 +287,9 @@ def load_camera(name: str) -> Camera:
         RequestError: there is no such camera or file, or the file is not a valid profile.
     """
     built_in = built_in_cameras()
-    path = built_in.get(built_in_name(name) or "", Path(name))
+    if own := built_in.get(built_in_name(name) or ""):
+        return _built_in(own)
+    path = Path(name)
     if path.suffix != ".toml":
         near = get_close_matches(comparable(name), camera_names(), n=1, cutoff=0.5)
         nearest = camera_names()[near[0]] if near else None
@@ -299,6 +301,11 @@ def load_camera(name: str) -> Camera:
     except UnicodeDecodeError as error:
         raise RequestError(f"{path}: not valid TOML: {error}") from None
     return parse_camera(text, str(path))
+
+
+@cache
+def _built_in(path: Path) -> Camera:
+    return parse_camera(read_text(path), str(path))
 
 
 def parse_camera(text: str, source: str) -> Camera:

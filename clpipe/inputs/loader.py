@@ -161,7 +161,8 @@ class ImageLoader:
         # What is only of a camera's file was checked when it was found there.
         if rows := [job for job in jobs if job.place or job.values.keys() - {RENDER}]:
             check_rows(rows, self.settings, carries)
-        if not all(job in rows or carries(job.path) for job in jobs):
+        checked = {id(job) for job in rows}
+        if not all(id(job) in checked or carries(job.path) for job in jobs):
             check_cameras(self.settings)
 
     def claim(self, job: Job) -> Claim:
