@@ -6,15 +6,20 @@ from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
+from clpipe.base.buckets import stamp_of_url, url_of
 from clpipe.base.files import sha256_of
 
 
 def stamp_of(path: Path) -> tuple[int, int]:
-    """The size of a file in bytes and its time of change in ns; zeros where it has no status."""
+    """The size of a file in bytes and its time of change in ns; zeros where it has no status.
+
+    Of one that stands for a URL, see :func:`clpipe.base.buckets.stamp_of_url`.
+    """
     try:
         info = path.stat()
     except (OSError, ValueError):  # or no file can have this name
-        return (0, 0)
+        url = url_of(path)
+        return stamp_of_url(url) if url else (0, 0)
     return info.st_size, info.st_mtime_ns
 
 

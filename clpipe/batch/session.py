@@ -4,6 +4,7 @@ The commands that make pictures and :func:`clpipe.run` all go this way.
 """
 
 import logging
+import secrets
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -13,10 +14,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from clpipe.base.about import full_version
+from clpipe.base.buckets import upload, url_of
 from clpipe.base.errors import OutputError, RequestError
+from clpipe.base.files import discard
 from clpipe.base.processors import available_processors
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.processes import Processes, usual_processes
+from clpipe.batch.remote_tars import RemoteTars
 from clpipe.batch.run_log import RunLog, Summary, log_name
 from clpipe.batch.spec import RunSpec
 from clpipe.batch.tar_batch import TarBatch
@@ -125,7 +129,7 @@ class Run:
     ) -> None:
         # A checkout asks git for the version that log and sidecars have; here nobody waits for it.
         threading.Thread(target=full_version, daemon=True).start()
-        check_output(where.output)
+        check_output(where.output, images.per_tar)
         check_processes(where, dask, images.per_tar)
         self.where = where
         self.notes: list[str] = []
@@ -190,12 +194,26 @@ class Run:
                     check_camera_files(folder)
             trace = stack.enter_context(Trace(where.trace)) if where.trace else None
             remove_unfinished(where.output, self.jobs, self._request.patch is not None)
+            if url := url_of(where.output):
+                stack.callback(discard, where.output)
+                stack.callback(self._send_log, url)
             run_log = RunLog(where.output / log_name(images.shard), start, self._echo)
             stack.enter_context(closing(run_log))
             running = stack.enter_context(closing(batch.run(jobs)))
             self.summary.began = time.perf_counter()
             yield from self._counted(running, run_log, trace)
             self._look_behind(folders)
+
+    def _send_log(self, url: str) -> None:
+        """Put the log beside the tars, under a name that no other run has.
+
+        Raises:
+            OutputError: it cannot be written there.
+        """
+        path = self.where.output / log_name(self._images.shard)
+        if path.exists():
+            began = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
+            upload(path, f"{url}/{path.stem}.{began}-{secrets.token_hex(2)}.jsonl")
 
     def _counted(
         self, running: Iterable[Outcome], log: RunLog, trace: Trace | None
@@ -273,7 +291,9 @@ class Run:
         devices: list[Device | None] = [*open_devices(where.devices, where.memory)] or [None]
         if self._tars:
             own = self._loader, self.writer, self._chain
-            return nullcontext(TarBatch(self._tars, *own, where, devices))
+            is_remote = url_of(where.output) is not None
+            remote = RemoteTars(self._tars, self._request, where.redo) if is_remote else None
+            return nullcontext(TarBatch(self._tars, *own, where, devices, remote))
         is_traced = where.trace is not None
         worker = ImageWorker(self._loader, self.writer, self._chain, where.redo, is_traced)
         return nullcontext(Batch(worker, devices, where.threads))
@@ -295,12 +315,16 @@ def check_processes(where: Where, dask: str | None, per_tar: int | None) -> None
         )
 
 
-def check_output(folder: Path) -> None:
-    """See that the name of the output folder is not that of a picture.
+def check_output(folder: Path, per_tar: int | None = None) -> None:
+    """See that the name of the output folder is not that of a picture, and that a URL gets tars.
 
     Raises:
-        RequestError: it is.
+        RequestError: it is, or gets pictures.
     """
+    if (url := url_of(folder)) and not per_tar:
+        raise RequestError(
+            f"--output: found {url}; behind a URL go tars alone: say --webdataset N as well"
+        )
     if folder.suffix.lower() in (*PICTURE_SUFFIXES, ".dng") and not folder.is_dir():
         raise RequestError(
             f"--output: found {folder}, the name of a picture; name the folder to write to: "

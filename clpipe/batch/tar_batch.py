@@ -19,6 +19,7 @@ from typing import Any
 from clpipe.base.errors import ImageError, OutputError
 from clpipe.base.files import Stored, keep_names, passing_files, whole_file
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, Outcome
+from clpipe.batch.remote_tars import RemoteTars
 from clpipe.batch.tars import OF_PATCHES, STAGING, Members, Tar, prepare
 from clpipe.batch.threads import Batch
 from clpipe.batch.where import Where
@@ -124,13 +125,16 @@ class Packer:
         self._statuses[outcome.job.stem] = outcome.status
         return len(self._statuses) == len(self._tar.jobs)
 
-    def pack(self) -> None:
+    def pack(self, remote: RemoteTars | None = None) -> None:
         """Write the tar, unless it would stay the same, and remove the folder of its pictures.
 
         Images that failed are left out. Where some failed and none is new, the tar stays as it is.
 
+        Args:
+            remote: what sends it on; None leaves it here.
+
         Raises:
-            OutputError: it cannot be written.
+            OutputError: it cannot be written, or sent.
         """
         try:
             members = list(self._members())
@@ -143,6 +147,8 @@ class Packer:
         except FileNotFoundError as error:
             raise OutputError(f"{error.filename}: has gone; {RESUMABLE}") from None
         shutil.rmtree(self._tar.staging, ignore_errors=True)
+        if remote:
+            remote.send(self._tar, self._statuses)
 
     def _is_new(self, name: str, source: Source) -> bool:
         """Whether a member is not in the old tar as it is to be."""
@@ -257,6 +263,7 @@ class TarBatch(Batch):
         loader, writer, chain: as for :class:`clpipe.batch.work.ImageWorker`.
         where: how the run goes about it.
         devices: as for the base.
+        remote: the URL that they go to; None leaves them in their folder.
     """
 
     def __init__(
@@ -267,10 +274,12 @@ class TarBatch(Batch):
         chain: Chain,
         where: Where,
         devices: Sequence[Device | None],
+        remote: RemoteTars | None = None,
     ) -> None:
         folders = {job.stem: tar.staging.name for tar in tars for job in tar.jobs}
         staged = StagedWriter(writer.folder, writer.request, folders)
         self._tars = tars
+        self._remote = remote
         self._redo = where.redo
         self._packers = Packers(tars, staged)
         worker = TarWorker(
@@ -288,6 +297,15 @@ class TarBatch(Batch):
             OutputError: nothing can be written any more.
             DeviceError: a kernel does not compile.
         """
+        if self._remote:
+            there = list(filter(self._remote.has, self._tars))
+            self._tars = [tar for tar in self._tars if tar not in there]
+            jobs = [job for tar in self._tars for job in tar.jobs]
+            for tar in there:
+                for job in tar.jobs:
+                    yield Outcome(replace(job, name=f"{tar.name}/{job.stem}"), SKIPPED)
+            if not jobs:
+                return
         prepare(self._tars, self._redo is Redo.ALL)
         packing: Future[None] | None = None
         with ThreadPoolExecutor(1, "pack") as pool:
@@ -298,7 +316,7 @@ class TarBatch(Batch):
                 if is_last:
                     if packing:
                         packing.result()
-                    packing = pool.submit(packer.pack)
+                    packing = pool.submit(packer.pack, self._remote)
                     self._packers.drop(outcome.job)
             if packing:
                 packing.result()

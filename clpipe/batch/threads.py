@@ -74,8 +74,8 @@ def failure_text(job: Job, error: BaseException) -> str:
         reason = str(error)
     else:
         reason = f"unexpected {type(error).__name__}: {error}".removesuffix(": ")
-    log.debug("%s: %s", job.path, reason, exc_info=error)
-    return f"{job.path}: {reason}"
+    log.debug("%s: %s", job.shown, reason, exc_info=error)
+    return f"{job.shown}: {reason.replace(str(job.path), job.shown)}"
 
 
 def bytes_of(worker: ImageWorker, job: Job, most: int, in_numpy: bool) -> int:

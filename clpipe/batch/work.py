@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, TypeVar
 
+from clpipe.base.buckets import fetched
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, NoPictureError, OutputError, RequestError
 from clpipe.base.files import FileGroup, deferred_files
@@ -109,8 +110,9 @@ class ImageWorker:
                 state.request = self._request_of(state)
                 renditions = self._missing(state)
                 if renditions:
-                    admit()
-                    self._load(state, renditions)
+                    with fetched(job.paths):
+                        admit()
+                        self._load(state, renditions)
                 else:
                     state.status = SKIPPED
             except (ImageError, RequestError, MemoryError) as error:

@@ -12,9 +12,11 @@ from typing import Any, TypeVar
 import click
 from click.core import ParameterSource
 
+from clpipe.base.buckets import is_url
 from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
 from clpipe.images.dump import TYPES
+from clpipe.inputs.spool import place_of_url
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -130,11 +132,18 @@ dump_option = click.option(
 
 
 class OutputPath(click.Path):
-    """A file or folder to write to; "" is refused, which would else be the working directory."""
+    """A file or folder to write to; "" is refused, which would else be the working directory.
+
+    What lies behind a URL is for ``clpipe run`` alone.
+    """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if not value:
             raise RequestError("--output: it is empty; name what to write to")
+        if is_url(value) and ctx:
+            if ctx.info_name == "run":
+                return place_of_url(value)
+            raise RequestError(f"--output: found {value}; only clpipe run writes behind URLs")
         return super().convert(value, param, ctx)
 
 

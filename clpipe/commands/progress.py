@@ -120,7 +120,7 @@ class Reporter:
             return
         for warning in outcome.warnings:
             if outcome.status == DONE:
-                self.print(f"clpipe: {outcome.job.path}: warning: {warning}")
+                self.print(f"clpipe: {outcome.job.shown}: warning: {warning}")
         if self._bar and self._several:
             self._show(self._state())
         elif self._summary.total > FEW:
@@ -128,7 +128,7 @@ class Reporter:
                 self._said = time.perf_counter()
                 self.print(self._state(with_count=True))
         elif outcome.status == DONE:
-            self.print(f"{outcome.job.path} -> {self._files(outcome)}")
+            self.print(f"{outcome.job.shown} -> {self._files(outcome)}")
 
     def _files(self, outcome: Outcome) -> str:
         first, *others = self._writer.renditions_of(outcome.job)

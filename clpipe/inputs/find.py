@@ -11,6 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
+from clpipe.base.buckets import is_url, listed, url_of
 from clpipe.base.errors import RequestError
 from clpipe.base.text import printable
 from clpipe.chain.rendition import Rendition
@@ -18,6 +19,7 @@ from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import RENDER_SUFFIXES
 from clpipe.inputs.companions import owner_of
 from clpipe.inputs.manifest import MANIFEST_SUFFIXES, read_manifest
+from clpipe.inputs.spool import place_of_url
 
 T = TypeVar("T")
 
@@ -72,6 +74,11 @@ class Job:
         return self.paths[places[moment]]
 
     @property
+    def shown(self) -> str:
+        """The file as messages and logs name it: by its URL where it has one."""
+        return url_of(self.path) or str(self.path)
+
+    @property
     def input(self) -> str:
         """The path as it is stored and printed."""
         return self.written or str(self.path)
@@ -84,7 +91,7 @@ class Job:
     @property
     def label(self) -> str:
         """The job as an error names it."""
-        return f"{self.path} ({self.place})" if self.place else str(self.path)
+        return f"{self.shown} ({self.place})" if self.place else self.shown
 
 
 def find_jobs(
@@ -118,8 +125,10 @@ def find_jobs(
     for text in inputs:
         if not text:
             raise RequestError("an input is empty; give files, folders, globs or manifests")
-        path = Path(text)
-        if os.path.isdir(text):
+        path = place_of_url(text) if is_url(text) else Path(text)
+        if is_url(text) and path.suffix.lower() not in MANIFEST_SUFFIXES:
+            jobs += _jobs_behind(text, endings, excluded)
+        elif os.path.isdir(text):
             files = images_in(path, output, endings, excluded)
             if not files:
                 listed = ", ".join(e for e in endings if e not in RAW_SUFFIXES)
@@ -131,7 +140,10 @@ def find_jobs(
             jobs += [Job(p, p.relative_to(path).as_posix(), listed=False) for p in files]
         elif path.suffix.lower() in MANIFEST_SUFFIXES:
             jobs += [
-                Job(row.path, row.key, row.name, True, row.values, row.frames, row.place)
+                Job(
+                    *(row.path, row.key, row.name, True, row.values, row.frames, row.place),
+                    written=url_of(row.path) or "",
+                )
                 for row in read_manifest(path)
             ]
         elif glob.has_magic(text) and not os.path.exists(text):
@@ -177,6 +189,28 @@ class Exclusion:
         for pattern in matching:
             self.unused.pop(pattern, None)
         return bool(matching)
+
+
+def _jobs_behind(url: str, endings: Sequence[str], excluded: Exclusion) -> list[Job]:
+    """The jobs of a URL: of a file, of all images below it, or of those that a glob matches.
+
+    Raises:
+        RequestError: it cannot be listed, or there are none.
+    """
+    is_glob = glob.has_magic(url)
+    root = url.rstrip("/")
+    jobs = []
+    for each in listed(url):
+        is_below = each.startswith(f"{root}/") and not is_glob
+        key = each.removeprefix(f"{root}/") if is_below else each.rpartition("/")[2]
+        hidden = any(part.startswith(".") for part in key.split("/"))
+        suffix = Path(key).suffix.lower()
+        if (is_below and (hidden or suffix not in endings)) or key in excluded:
+            continue
+        jobs.append(Job(place_of_url(each), key, listed=not is_below, written=each))
+    if not jobs:
+        raise RequestError(f"{url}: no image is there (looked for {', '.join(endings[:6])} ...)")
+    return jobs
 
 
 def images_in(

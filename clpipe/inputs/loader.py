@@ -306,7 +306,8 @@ class ImageLoader:
         if isinstance(error, KindError):
             return kind_message(error, self.chain, self.request.start_at)
         message = str(error) or "there is not enough memory for it"
-        return message if str(job.path) in message else f"{job.path}: {message}"
+        message = message.replace(str(job.path), job.shown)
+        return message if job.shown in message else f"{job.shown}: {message}"
 
     def __getstate__(self) -> dict[str, Any]:
         # Cached values stay with the process: they may hold classes of stage files.

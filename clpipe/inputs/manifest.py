@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
+from clpipe.base.buckets import fetch_text, is_url
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import read_bytes
 from clpipe.base.text import one_of
@@ -20,6 +21,7 @@ from clpipe.chain.paths import from_folder
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import toml_value, value_text
+from clpipe.inputs.spool import place_of_url
 from clpipe.inputs.tables import OWN, PLAIN, TEXTS, csv_records, json_records
 
 MANIFEST_SUFFIXES = (".csv", ".jsonl")
@@ -196,6 +198,7 @@ def _report(faults: Sequence[str]) -> None:
 
 
 def _text(path: Path) -> str:
+    fetch_text(path)
     try:
         data = read_bytes(path, MANIFEST_BYTES)
     except OSError as error:
@@ -254,8 +257,13 @@ def _row(folder: Path, place: str, record: Mapping[str, Any]) -> Row:
             values[column] = value.split()
         elif column in PLAIN:
             values[column] = value
-    key = name or key_of(folder, folder / path)
-    return Row(folder / path, key, name, from_folder(folder, values), frames, place)
+    if is_url(path):
+        own = place_of_url(path)
+        key = name or own.name
+    else:
+        own = folder / path
+        key = name or key_of(folder, own)
+    return Row(own, key, name, from_folder(folder, values), frames, place)
 
 
 def check_output_name(name: str) -> None:

@@ -1,0 +1,249 @@
+"""Inputs and tars behind URLs, on a file system that fails in many ways."""
+
+import io
+import json
+import random
+import tarfile
+from collections import Counter
+from pathlib import Path
+from typing import ClassVar
+
+import fsspec
+import numpy as np
+import pytest
+from fsspec.implementations.memory import MemoryFileSystem
+
+import clpipe as package
+from clpipe.base import buckets
+from clpipe.base.errors import OutputError, RequestError
+from clpipe.batch.run_log import read_log
+from tests.conftest import contents, written
+
+RUN = ("--iso", 3200, "--device", "numpy", "--skip", "noise")
+
+
+class Flaky(MemoryFileSystem):
+    """A bucket in memory: requests fail, or bring half a file, by chance."""
+
+    protocol = "flaky"
+    store: ClassVar = {}
+    pseudo_dirs: ClassVar = [""]
+    rate = 0.0
+    luck = random.Random(0)
+    failures: ClassVar = Counter()
+    forbidden = ""
+
+    @classmethod
+    def _strip_protocol(cls, path):
+        return MemoryFileSystem._strip_protocol(path.replace("flaky://", "memory://"))
+
+    def unstrip_protocol(self, name):
+        return f"flaky:/{name}"
+
+    def _may_fail(self, what, path):
+        if self.forbidden and self.forbidden in path:
+            raise PermissionError("the token has expired")
+        if self.luck.random() < self.rate:
+            self.failures[what] += 1
+            raise self.luck.choice([OSError("503 slow down"), TimeoutError(), ConnectionError()])
+
+    def find(self, path, *arguments, **more):
+        self._may_fail("find", path)
+        return super().find(path, *arguments, **more)
+
+    def info(self, path, **more):
+        self._may_fail("info", path)
+        return super().info(path, **more)
+
+    def cat_file(self, path, *arguments, **more):
+        self._may_fail("cat", path)
+        return super().cat_file(path, *arguments, **more)
+
+    def get_file(self, remote, local, **more):
+        self._may_fail("get", remote)
+        super().get_file(remote, local, **more)
+        if self.rate and not self.failures[f"half of {remote}"]:
+            self.failures[f"half of {remote}"] += 1
+            data = Path(local).read_bytes()
+            Path(local).write_bytes(data[: len(data) // 2])
+
+    def put_file(self, local, remote, **more):
+        self._may_fail("put", remote)
+        super().put_file(local, remote, **more)
+
+
+@pytest.fixture
+def bucket(write_exr, clpipe, monkeypatch):
+    """Seven renders in a bucket, and here."""
+    monkeypatch.setattr(buckets, "FIRST_WAIT", 0.0)
+    monkeypatch.setattr(buckets, "TRIES", 30)
+    fsspec.register_implementation("flaky", Flaky, clobber=True)
+    system = fsspec.filesystem("flaky")
+    Flaky.store.clear()
+    Flaky.pseudo_dirs[:] = [""]
+    Flaky.failures.clear()
+    for number in range(7):
+        name = f"x{number % 2}/r{number}.exr"
+        rng = np.random.default_rng(number)
+        write_exr(f"in/{name}", rng.random((16, 24, 3)).astype(np.float32))
+        system.pipe_file(f"/b/renders/{name}", Path("in", name).read_bytes())
+    system.pipe_file("/b/renders/notes.txt", b"no image")
+    yield system
+    Flaky.rate, Flaky.forbidden = 0.0, ""
+
+
+def tars(system, folder="/b/set"):
+    """The members of each tar, with their bytes."""
+    found = {}
+    for path in system.find(folder):
+        if path.endswith(".tar"):
+            with tarfile.open(fileobj=io.BytesIO(system.cat_file(path))) as tar:
+                names = [(info.name, tar.extractfile(info).read()) for info in tar]
+            found[path.rpartition("/")[2]] = names
+    return found
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.3])
+def test_renders_behind_a_url_make_the_pictures_of_files(bucket, clpipe, rate):
+    clpipe("run", "in", "-o", "whole", *RUN)
+    Flaky.rate = rate
+    told = clpipe("run", "flaky://b/renders", "-o", "o", *RUN).stderr
+    assert "7 of 7 images done, 0 failed" in told
+    pictures = {n: data for n, data in contents("o").items() if n.endswith(".jpg")}
+    # What is drawn for an image belongs to its name among the inputs and to its bytes.
+    assert pictures == {n: d for n, d in contents("whole").items() if n.endswith(".jpg")}
+    assert json.loads(Path("o/x0/r0.json").read_text())["input"] == "flaky://b/renders/x0/r0.exr"
+    _, *images, _ = read_log(Path("o/run.jsonl"))
+    assert {each["input"] for each in images} == {
+        f"flaky://b/renders/x{n % 2}/r{n}.exr" for n in range(7)
+    }
+    assert bool(Flaky.failures) == (rate > 0)
+    assert Flaky.failures["half of /b/renders/x0/r0.exr"] == (rate > 0)
+    again = clpipe("run", "flaky://b/renders", "-o", "o", *RUN).stderr
+    assert "(7 of them were there already)" in again
+    Flaky.rate = 0.0
+    bucket.pipe_file("/b/renders/x0/r0.exr", Path("in/x1/r1.exr").read_bytes())
+    again = clpipe("run", "flaky://b/renders", "-o", "o", *RUN).stderr
+    assert "(6 of them were there already)" in again
+
+
+def test_files_globs_and_manifests_behind_urls(bucket, clpipe):
+    bucket.pipe_file(
+        "/b/renders/list.csv", b"path,name\nx0/r0.exr,one\nflaky://b/renders/x1/r1.exr,\n"
+    )
+    clpipe("run", "flaky://b/renders/x0/r2.exr", "-o", "a", *RUN)
+    clpipe("run", "flaky://b/renders/x0/*.exr", "-o", "b", *RUN)
+    clpipe("run", "flaky://b/renders/list.csv", "-o", "c", *RUN)
+    Path("own.csv").write_text("path\nflaky://b/renders/x1/r3.exr\nin/x0/r0.exr\n")
+    clpipe("run", "own.csv", "-o", "d", *RUN)
+    found = {f: [n for n in written(Path(f)) if n.endswith(".jpg")] for f in "abcd"}
+    assert found["a"] == ["r2.jpg"]
+    assert found["b"] == ["r0.jpg", "r2.jpg", "r4.jpg", "r6.jpg"]
+    assert found["c"] == ["one.jpg", "r1.jpg"]
+    assert found["d"] == ["in/x0/r0.jpg", "r3.jpg"]
+
+
+def test_what_is_wrong_with_a_url_is_said(bucket, clpipe, monkeypatch):
+    monkeypatch.setattr(buckets, "TRIES", 2)
+
+    def told(*arguments, status):
+        text = clpipe("run", *arguments, *RUN, status=status).stderr
+        assert "Traceback" not in text
+        return " ".join(text.split())
+
+    assert "flaky://b/none: no image is there" in told("flaky://b/none", "-o", "o", status=2)
+    assert "nosuch://b/x.exr: " in told("nosuch://b/x.exr", "-o", "o", status=2)
+    assert "'..'" in told("flaky://b/../x.exr", "-o", "o", status=2)
+    text = told("in", "-o", "flaky://b/set", status=2)
+    assert "found flaky://b/set; behind a URL go tars alone: say --webdataset N" in text
+    text = clpipe("meter", "in", "-o", "flaky://b/m.csv", status=2).stderr
+    assert "only clpipe run writes behind URLs" in text
+    Flaky.forbidden = "r3"
+    text = told("flaky://b/renders", "-o", "o", status=1)
+    assert "flaky://b/renders/x1/r3.exr: cannot be read: the token has expired" in text
+    assert "6 of 7 images done, 1 failed" in text
+    Flaky.forbidden, Flaky.rate = "", 1.0
+    assert "flaky://b/renders: cannot be listed: " in told("flaky://b/renders", "-o", "p", status=2)
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.25])
+def test_tars_behind_a_url_are_those_of_a_folder(bucket, clpipe, rate):
+    clpipe("run", "in", "-o", "here", "--webdataset", 3, *RUN)
+    Flaky.rate = rate
+    clpipe("run", "in", "-o", "flaky://b/set", "--webdataset", 3, *RUN)
+    Flaky.rate = 0.0
+    sent = tars(bucket)
+    assert sorted(sent) == ["000000.tar", "000001.tar", "000002.tar"]
+    for name, members in sent.items():
+        with tarfile.open(Path("here", name)) as tar:
+            assert members == [(info.name, tar.extractfile(info).read()) for info in tar]
+    index = json.loads(bucket.cat_file("/b/set/000002.index.json"))
+    assert index["samples"] == ["x1/r5"] and index["failed"] == []
+    assert index["size"] == bucket.info("/b/set/000002.tar")["size"]
+    logs = [each for each in bucket.find("/b/set") if each.endswith(".jsonl")]
+    assert len(logs) == 1
+    Flaky.rate = rate
+    told = clpipe("run", "in", "-o", "flaky://b/set", "--webdataset", 3, *RUN).stderr
+    assert "7 of 7 images done (7 of them were there already)" in told
+    told = clpipe("run", "in", "-o", "flaky://b/set", "--webdataset", 3, "--redo", "damaged", *RUN)
+    assert "(7 of them were there already)" in told.stderr
+
+
+def test_a_run_that_was_cut_off_goes_on(bucket, clpipe, monkeypatch):
+    command = ("run", "in", "-o", "flaky://b/set", "--webdataset", 3, *RUN)
+    monkeypatch.setattr(buckets, "TRIES", 1)
+    Flaky.forbidden = "000001.tar"
+    told = clpipe(*command, status=1).stderr
+    assert "flaky://b/set/000001.tar: cannot be written: the token has expired" in told
+    assert sorted(tars(bucket)) == ["000000.tar"]
+    Flaky.forbidden = ""
+    before = bucket.modified("/b/set/000000.tar")
+    told = clpipe(*command).stderr
+    assert "7 of 7 images done (3 of them were there already)" in told
+    assert bucket.modified("/b/set/000000.tar") == before
+    assert sorted(tars(bucket)) == ["000000.tar", "000001.tar", "000002.tar"]
+    # A tar that was cut off, and one whose index was: both are made again.
+    whole = tars(bucket)
+    data = bucket.cat_file("/b/set/000001.tar")
+    bucket.pipe_file("/b/set/000001.tar", data[:-512])
+    bucket.pipe_file("/b/set/000002.index.json", b'{"cl')
+    assert "(3 of them were there already)" in clpipe(*command).stderr
+    assert tars(bucket) == whole
+    bucket.pipe_file("/b/set/000001.tar", bytes(len(data)))  # its size is right
+    assert "(7 of them were there already)" in clpipe(*command).stderr
+    assert "(4 of them were there already)" in clpipe(*command, "--redo", "damaged").stderr
+    assert tars(bucket) == whole
+    assert "already" not in clpipe(*command, "--seed", 5).stderr
+
+
+def test_what_lies_behind_a_url_is_looked_at(bucket, clpipe):
+    command = ("run", "in", "-o", "flaky://b/set", "--webdataset", 3, *RUN)
+    bucket.pipe_file("/b/set/000001.tar", b"mine")
+    assert (
+        "000001.tar: has no index, so clpipe did not write it" in clpipe(*command, status=2).stderr
+    )
+    clpipe(*command, "--redo", "all")
+    assert len(tars(bucket)) == 3
+    told = clpipe(*command[:5], 4, *RUN, status=2).stderr
+    assert "000002.tar: is of another run, as this one makes 2 tars" in told
+
+
+def test_an_image_that_fails_is_tried_again(bucket, clpipe):
+    Path("in/x0/r2.exr").write_bytes(b"no EXR")
+    command = ("run", "in", "-o", "flaky://b/set", "--webdataset", 3, *RUN)
+    clpipe(*command, status=1)
+    assert json.loads(bucket.cat_file("/b/set/000000.index.json"))["failed"] == ["x0/r2"]
+    told = clpipe(*command, status=1).stderr
+    assert "6 of 7 images done (4 of them were there already), 1 failed" in told
+
+
+def test_from_python(bucket, monkeypatch):
+    made = package.run("flaky://b/renders", "flaky://b/set", device="numpy", webdataset=4)
+    assert Counter(each.status for each in made) == {"done": 7}
+    assert sorted(tars(bucket)) == ["000000.tar", "000001.tar"]
+    with pytest.raises(RequestError, match="say --webdataset N"):
+        package.run("in", "flaky://b/set")
+    monkeypatch.setattr(buckets, "TRIES", 1)
+    Flaky.forbidden = "000000.index"
+    with pytest.raises(OutputError, match="the token has expired"):
+        list(package.run("in", "flaky://b/other", device="numpy", webdataset=4))
