@@ -121,6 +121,8 @@ def test_renders_behind_a_url_make_the_pictures_of_files(bucket, clpipe, rate):
     assert Flaky.failures["half of /b/renders/x0/r0.exr"] == (rate > 0)
     again = clpipe("run", "flaky://b/renders", "-o", "o", *RUN).stderr
     assert "(7 of them were there already)" in again
+    said = clpipe("replay", "o/x0/r2.json", "-o", "again", *RUN[2:4]).output
+    assert "the same bytes" in said
     Flaky.rate = 0.0
     bucket.pipe_file("/b/renders/x0/r0.exr", Path("in/x1/r1.exr").read_bytes())
     again = clpipe("run", "flaky://b/renders", "-o", "o", *RUN).stderr
@@ -152,7 +154,9 @@ def test_what_is_wrong_with_a_url_is_said(bucket, clpipe, monkeypatch):
         return " ".join(text.split())
 
     assert "flaky://b/none: no image is there" in told("flaky://b/none", "-o", "o", status=2)
-    assert "nosuch://b/x.exr: " in told("nosuch://b/x.exr", "-o", "o", status=2)
+    assert "nosuch://b/x: " in told("nosuch://b/x", "-o", "o", status=2)
+    text = told("flaky://b/gone.exr", "in/x0/r0.exr", "-o", "o", status=1)
+    assert "flaky://b/gone.exr: cannot be read: " in text and "1 of 2 images done" in text
     assert "'..'" in told("flaky://b/../x.exr", "-o", "o", status=2)
     text = told("in", "-o", "flaky://b/set", status=2)
     assert "found flaky://b/set; behind a URL go tars alone: say --webdataset N" in text

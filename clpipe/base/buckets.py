@@ -94,7 +94,8 @@ def listed(url: str) -> list[str]:
         system.invalidate_cache()
         if any(letter in path for letter in "*["):
             return [each for each in system.glob(path) if not system.isdir(each)]
-        return [path] if system.isfile(path) else system.find(path)
+        is_file = not url.endswith("/") and system.isfile(path)
+        return [path] if is_file else system.find(path)
 
     try:
         return sorted(system.unstrip_protocol(each) for each in _retried(found))
@@ -129,8 +130,8 @@ def fetched(paths: Iterable[Path]) -> Iterator[None]:
             path.unlink(missing_ok=True)
 
 
-def fetch_text(path: Path) -> None:
-    """Fetch a small file that stands for a URL, and leave it there.
+def fetch(path: Path) -> None:
+    """Fetch a file that stands for a URL, where it does, and leave it there.
 
     Raises:
         RequestError: it cannot be fetched.

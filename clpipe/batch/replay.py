@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.about import __version__
+from clpipe.base.buckets import fetch, is_url, url_of
 from clpipe.base.digests import digests
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.registry import code_files
@@ -14,6 +15,7 @@ from clpipe.chain.rendition import BASELINES, TRUTHS, Rendition
 from clpipe.chain.request import Request
 from clpipe.inputs.find import Job
 from clpipe.inputs.manifest import check_output_name
+from clpipe.inputs.spool import place_of_url
 from clpipe.outputs.sealed import SidecarError, outputs_in, read_sidecar
 
 CODE = (".py", ".cl")  # the endings of files that are run
@@ -177,7 +179,11 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
         truths=(rendition.role,) if rendition.role in TRUTHS else (),
         baselines=(rendition.role,) if rendition.role in BASELINES else (),
     )
-    path = inputs[0] if inputs else Path(values["input"])
+    said = str(values["input"])
+    path = inputs[0] if inputs else Path(said)
+    if not inputs and is_url(said):
+        path = place_of_url(said)
+        fetch(path)
     others = tuple(path.parent / str(each["file"]) for each in values.get("subframes", ())[1:])
     job = Job(
         path,
@@ -186,6 +192,7 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
         values=request.image,
         renditions=(rendition,),
         subframes=others,
+        written=url_of(path) or "",
     )
     return Replay(request, job, surroundings_in(values), digests_in(values))
 

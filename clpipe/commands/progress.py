@@ -11,6 +11,7 @@ import click
 from rich.console import Console
 from rich.text import Text
 
+from clpipe.base.buckets import url_of
 from clpipe.base.text import duration, one_line
 from clpipe.batch.interrupt import interruptible
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, Outcome
@@ -132,7 +133,8 @@ class Reporter:
 
     def _files(self, outcome: Outcome) -> str:
         first, *others = self._writer.renditions_of(outcome.job)
-        text = str(self._writer.existing(outcome.job, first).pictures[0])
+        path = self._writer.existing(outcome.job, first).pictures[0]
+        text = url_of(path) or str(path)
         if others:
             text += f" and {len(others)} more"
         seconds = sum(outcome.seconds(step) for step in self._summary.seconds)
@@ -206,7 +208,8 @@ class Reporter:
             speed = summary.megapixels / summary.elapsed
             text += f"; {summary.elapsed:.1f} s, {speed:.3g} MP/s; {summary.shares()}"
         self.print(text)
-        if self._bar and self._several and counts[DONE]:
+        is_here = url_of(self._writer.folder) is None
+        if self._bar and self._several and counts[DONE] and is_here:
             self.print(f"look at it: clpipe report {shlex.quote(str(self._writer.folder))}")
 
 

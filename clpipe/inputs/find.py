@@ -198,6 +198,8 @@ def _jobs_behind(url: str, endings: Sequence[str], excluded: Exclusion) -> list[
         RequestError: it cannot be listed, or there are none.
     """
     is_glob = glob.has_magic(url)
+    if not is_glob and Path(url).suffix.lower() in endings:  # one that is missing fails alone
+        return [Job(place_of_url(url), url.rpartition("/")[2], written=url)]
     root = url.rstrip("/")
     jobs = []
     for each in listed(url):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
-from clpipe.base.buckets import fetch_text, is_url
+from clpipe.base.buckets import fetch, is_url
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import read_bytes
 from clpipe.base.text import one_of
@@ -198,7 +198,7 @@ def _report(faults: Sequence[str]) -> None:
 
 
 def _text(path: Path) -> str:
-    fetch_text(path)
+    fetch(path)
     try:
         data = read_bytes(path, MANIFEST_BYTES)
     except OSError as error:
