@@ -60,7 +60,7 @@ def usual_processes(images: int, claim: Claim, processors: int) -> int:
     >>> small, large = Claim(512, 512, 0, 0), Claim(6000, 4000, 0, 0)
     >>> [usual_processes(100_000, small, n) for n in (1, 2, 4)]
     [1, 2, 4]
-    >>> usual_processes(300, small, 4), usual_processes(10_000, large, 64)
+    >>> usual_processes(200, small, 4), usual_processes(10_000, large, 64)
     (1, 1)
     """
     each = OF_IMAGE + OF_MEGAPIXEL * claim.megapixels

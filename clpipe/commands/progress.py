@@ -208,8 +208,7 @@ class Reporter:
             speed = summary.megapixels / summary.elapsed
             text += f"; {summary.elapsed:.1f} s, {speed:.3g} MP/s; {summary.shares()}"
         self.print(text)
-        is_here = url_of(self._writer.folder) is None
-        if self._bar and self._several and counts[DONE] and is_here:
+        if self._bar and self._several and counts[DONE] and not url_of(self._writer.folder):
             self.print(f"look at it: clpipe report {shlex.quote(str(self._writer.folder))}")
 
 
