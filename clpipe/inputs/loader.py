@@ -92,7 +92,7 @@ class ImageLoader:
     @cached_property
     def chain(self) -> Chain:
         """The chain of an image that carries no settings."""
-        return self.request.chain()
+        return self.request.chain_from(self.settings, self.request.start_at)
 
     @cached_property
     def reads(self) -> Kind:
