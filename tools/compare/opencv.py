@@ -49,6 +49,7 @@ from clpipe.chain.request import Request
 from clpipe.commands.printing import show
 from clpipe.engine.bench import scene
 from clpipe.engine.device import Device, open_device
+from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Runner
 from clpipe.images.read import read_image
 from clpipe.inputs.find import find_jobs
@@ -119,7 +120,7 @@ def compare_arrays(device: Device, width: int, height: int, repeat: int) -> list
 
         works: dict[str, Work] = {
             "memory": lambda: runner.run(image, "compare"),
-            "device": lambda: runner.run(image, "compare", download=False),
+            "device": lambda: runner.run(image, "compare", RunOptions(download=False)),
             WHOLE: whole,
             BANDS: bands,
         }

@@ -17,8 +17,10 @@ Stage by stage, with the parameters of clpipe's own chain:
   would cost twice as much.
 - sharpen: an unsharp mask of the same sigma, amount and limit. Less: it is added to luma, and does
   not scale the colours.
-- tone_curve, gamma, eight bits: one table, cv2.LUT. Less: the curve is on each channel, and hues
-  turn where ``neutral`` keeps them.
+- tone_curve: by the largest colour, with tables, cv2.LUT; gamma, eight bits: another table.
+
+It does not go through the camera's colours (inverse_color_matrix, color_matrix), so its noise is
+another one in colours.
 
 There is no clipping to a display, no tile, and no size but an even one.
 """
@@ -36,7 +38,6 @@ from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain
 from clpipe.reference.curve import to_8_bit
 from clpipe.reference.transfer import srgb_curve
-from clpipe.stages.tone_curve.neutral import neutral
 
 CODES = 65536  # of 16 bits
 TOP = CODES - 1
@@ -91,7 +92,13 @@ class OpenCVChain:
         self.radius, self.amount = sharpen.radius, np.float32(sharpen.amount)
         self.limit = np.float32(sharpen.limit / root_of_top)
         light = np.clip((np.arange(CODES) / TOP * root_of_top) ** 2 - offset, 0, 1)
-        self.display = to_8_bit(np.float32(srgb_curve(neutral(np.float32(light)))))
+        self.light, style = np.float32(light), of["tone_curve"]
+        # By the largest colour: what the others are multiplied with, and what is added.
+        to_high = style.curve(self.light)
+        self.part = style.colourfulness(self.light) * to_high / np.maximum(self.light, 1e-9)
+        self.part = np.float32(self.part)
+        self.base = np.float32(to_high - self.light * self.part)
+        self.display = to_8_bit(np.float32(srgb_curve(np.arange(CODES) / TOP)))
         self.to_colours = cv2.COLOR_YCrCb2BGR if bgr else cv2.COLOR_YCrCb2RGB
 
     def blur(self, render: Array) -> Floats:
@@ -138,7 +145,16 @@ class OpenCVChain:
         self._sharpen(y)
         merged = cv2.merge([self._codes(plane) for plane in (y, cr, cb)])
         cv2.cvtColor(merged, self.to_colours, merged)
-        return cv2.LUT(merged, self.display)
+        colours = cv2.split(merged)
+        high = cv2.max(cv2.max(colours[0], colours[1]), colours[2])
+        part, base = cv2.LUT(high, self.part), cv2.LUT(high, self.base)
+        styled = []
+        for codes in colours:
+            light = cv2.LUT(codes, self.light)
+            light *= part
+            light += base
+            styled.append(cv2.LUT(self._codes(light), self.display))
+        return cv2.merge(styled)
 
     def _sharpen(self, y: Floats) -> None:
         detail = cv2.GaussianBlur(y, (9, 9), self.radius)
