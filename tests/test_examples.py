@@ -1,12 +1,17 @@
 """tools/examples, as they are, on a few small renders."""
 
 import os
+import re
+import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
+from clpipe.commands.run import run
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.tools
@@ -62,3 +67,16 @@ def test_slurm_makes_what_one_machine_makes(start, clpipe, tmp_path):
     assert pictures(tmp_path / "slurm") == whole
     logs = {p.name for p in (tmp_path / "slurm").glob("*.jsonl")}
     assert logs == {f"run.{i}-of-2.jsonl" for i in "12"}
+
+
+def test_kubernetes_shares_out_all_tars():
+    job = yaml.safe_load((EXAMPLES / "kubernetes_job.yaml").read_text())["spec"]
+    (container,) = job["template"]["spec"]["containers"]
+    (script,) = container["args"]
+    parts = re.findall(r'--shard "\$\(\(JOB_COMPLETION_INDEX \+ 1\)\)/(\d+)"', script)
+    assert job["completionMode"] == "Indexed"
+    assert parts == [str(job["completions"])]
+    words = shlex.split(script.replace("$((JOB_COMPLETION_INDEX + 1))", "1"))
+    assert Path(words[1]).name == "clpipe"
+    known = {option for each in run.params for option in each.opts}
+    assert {word for word in words if word.startswith("-")} <= known
