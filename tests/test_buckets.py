@@ -17,6 +17,7 @@ import clpipe as package
 from clpipe.base import buckets
 from clpipe.base.errors import OutputError, RequestError
 from clpipe.batch.run_log import read_log
+from clpipe.engine.process_folder import process_folder
 from tests.conftest import contents, written
 
 RUN = ("--iso", 3200, "--device", "numpy", "--skip", "noise")
@@ -251,3 +252,70 @@ def test_from_python(bucket, monkeypatch):
     Flaky.forbidden = "000000.index"
     with pytest.raises(OutputError, match="the token has expired"):
         list(package.run("in", "flaky://b/other", device="numpy", webdataset=4))
+
+
+def test_one_render_by_several_isos_and_processes(bucket, clpipe):
+    told = clpipe(
+        *("run", "flaky://b/renders/x0", "-o", "o", *RUN[2:], "--iso", "100,200,400,800"),
+        *("--jobs", 4),
+    ).stderr
+    assert "16 of 16 images done, 0 failed" in told
+    rows = "".join(f"flaky://b/renders/x1/r1.exr,a{n},{n}\n" for n in range(12))
+    Path("twice.csv").write_text(f"path,name,seed\n{rows}")
+    assert "12 of 12 images done" in clpipe("run", "twice.csv", "-o", "p", *RUN).stderr
+    left = process_folder()
+    assert left and not list(left.glob("fetched-*"))
+
+
+def test_manifests_behind_urls_do_not_lead_out_of_their_bucket(bucket, clpipe, tmp_path):
+    bucket.pipe_file("/b/lists/a.csv", b"path\n../renders/x0/r0.exr\n")
+    clpipe("run", "flaky://b/lists/a.csv", "-o", "o", *RUN)
+    sidecar = json.loads(next(Path("o").rglob("*.json")).read_text())
+    assert sidecar["input"] == "flaky://b/renders/x0/r0.exr"
+    for path in (b"../../../../tmp/x.exr", b"/etc/x.exr", b"..\\x.exr"):
+        bucket.pipe_file("/b/lists/b.csv", b"path\n" + path + b"\n")
+        told = clpipe("run", "flaky://b/lists/b.csv", "-o", "p", *RUN, status=2).stderr
+        assert "leads out of flaky://b" in told or "expected a URL without" in told
+
+
+def test_a_listing_that_fails_is_no_empty_bucket(bucket, clpipe, monkeypatch):
+    monkeypatch.setattr(buckets, "TRIES", 1)
+    bucket.pipe_file("/b/set/000000.tar", b"somebody's")
+
+    def refused(self, path, *arguments, **more):
+        raise PermissionError("not allowed to list")
+
+    command = ("run", "in", "-o", "flaky://b/set", "--webdataset", 3, *RUN)
+    with monkeypatch.context() as patch:
+        patch.setattr(Flaky, "find", refused)
+        assert "cannot be listed: not allowed to list" in clpipe(*command, status=2).stderr
+    assert bucket.cat_file("/b/set/000000.tar") == b"somebody's"
+    bucket.pipe_file("/b/set/old/000000.index.json", b"{}")  # of another folder
+    assert "000000.tar: has no index" in clpipe(*command, status=2).stderr
+
+
+def test_a_file_system_of_several_schemes(bucket, clpipe, monkeypatch):
+    monkeypatch.setattr(Flaky, "unstrip_protocol", lambda self, name: f"other:/{name}")
+    clpipe("run", "flaky://b/renders", "-o", "o", *RUN)
+    assert [n for n in written(Path("o")) if n.endswith(".jpg")] == [
+        *(f"x0/r{n}.jpg" for n in (0, 2, 4, 6)),
+        *(f"x1/r{n}.jpg" for n in (1, 3, 5)),
+    ]
+    clpipe("run", "flaky://b/r*s/x1/*.exr", "-o", "p", *RUN)
+    assert [n for n in written(Path("p")) if n.endswith(".jpg")] == ["r1.jpg", "r3.jpg", "r5.jpg"]
+
+
+def test_an_input_that_changes_while_its_tar_is_made(bucket, clpipe, monkeypatch):
+    command = ("run", "in", "-o", "flaky://b/set", "--webdataset", 7, *RUN)
+    put = Flaky.put_file
+
+    def changing(self, local, remote, **more):
+        if remote.endswith(".tar"):
+            Path("in/x0/r0.exr").write_bytes(Path("in/x1/r1.exr").read_bytes())
+        put(self, local, remote, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Flaky, "put_file", changing)
+        clpipe(*command)
+    assert "already" not in clpipe(*command).stderr  # it is of the old input
+    assert "(7 of them were there already)" in clpipe(*command).stderr

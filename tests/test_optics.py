@@ -12,6 +12,7 @@ from PIL import Image
 import clpipe as clpipe_api
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.camera import lens as by_name
+from clpipe.camera.optics import Optics
 from clpipe.chain.chain import make_chain
 from clpipe.chain.depth import depth_of_array, with_depth
 from clpipe.chain.settings import overlay, settings_from
@@ -322,3 +323,16 @@ def test_a_lens_by_name_is_not_that_of_other_poses(clpipe, write_exr):
         ).stderr
         text = "render.fx: the focal length of this render of 60x40 pixels is 83 px, but lens: "
         assert (text in told) == bool(status)
+
+
+def test_a_pixel_pitch_says_how_wide_the_sensor_is():
+    lens = by_name.LensCalibration("a", 50.0, {}, {})
+    # 50 mm on pixels of 500 um, which is not the sensor of the lens's camera.
+    Optics(fx=100.0, pixel_pitch=500.0).with_lens(lens).for_image(60, 40)
+    with pytest.raises(RequestError, match="makes it 83 px on the sensor of its camera"):
+        Optics(fx=100.0, places={"fx": "render.fx"}).with_lens(lens).for_image(60, 40)
+
+
+def test_a_stage_that_does_not_fit_is_told_by_its_kinds():
+    with pytest.raises(RequestError, match="stage optical_blur reads rgb, but mosaic gives mosaic"):
+        make_chain(settings_from({"stages": ["exposure", "mosaic", "optical_blur", "demosaic"]}))

@@ -179,3 +179,52 @@ def test_whoever_stops_listening_leaves_no_process(renders):
 
 def threads_of_pipes():
     return len(Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split())
+
+
+BROKEN = """
+from clpipe.base.errors import DeviceError
+from clpipe.batch.work import ImageWorker
+def broken(self, device):
+    import time; time.sleep(0.3)
+    raise DeviceError("a kernel does not compile")
+ImageWorker.runners = broken
+"""
+
+
+@pytest.mark.parametrize("side", [24, 1700])
+def test_a_kernel_that_does_not_compile_ends_the_run(write_exr, clpipe, monkeypatch, side):
+    """Also where all images are handed out already, and whoever decodes waits for more."""
+    for i in range(2):
+        write_exr(f"in/r{i}.exr", np.zeros((side, side, 3), np.float32))
+    monkeypatch.setattr(processes, "START", f"exec({BROKEN!r}); {processes.START}")
+    told = clpipe("run", "in", *TWO, "--device", "numpy", status=3).stderr
+    assert "a kernel does not compile" in told
+
+
+ALWAYS = """
+import os
+from clpipe.batch.work import ImageWorker
+ImageWorker.decode = lambda *arguments: os._exit(9)
+"""
+
+
+def test_processes_that_all_die_end_the_run(renders, monkeypatch):
+    renders(60)
+    monkeypatch.setattr(processes, "START", f"exec({ALWAYS!r}); {processes.START}")
+    monkeypatch.setattr(processes, "FUTILE", 4)
+    with pytest.raises(DeviceError, match=r"4 processes in a row ended before .* with status 9"):
+        list(package.run("in", "out", processes=2, device="numpy"))
+
+
+def test_nothing_runs_from_the_working_directory_and_nothing_is_left(renders, tmp_path, clpipe):
+    renders(4)
+    Path("json.py").write_text("raise SystemExit('not yours')\n")
+    Path("signal.py").write_text("raise SystemExit('not yours')\n")
+    place = tmp_path / "temporary"
+    place.mkdir()
+    command = [sys.executable, "-P", "-m", "clpipe", "run", "in", *map(str, TWO)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(place)}
+    done = subprocess.run([*command, "--device", "numpy"], env=environment, capture_output=True)
+    assert done.returncode == 0, done.stderr
+    assert pictures() == 4
+    assert not [path for path in place.rglob("*") if path.is_file()]

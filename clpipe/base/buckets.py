@@ -10,8 +10,11 @@ Credentials are fsspec's business alone: those of the environment and of its own
 import contextlib
 import hashlib
 import os
+import posixpath
 import random
 import re
+import secrets
+import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -62,8 +65,9 @@ def place_of(url: str, folder: Path) -> Path:
     found = _URL.fullmatch(url)
     assert found
     parts = found[2].split("/")
-    if ".." in parts or "" in parts[:-1]:
-        raise RequestError(f"{url}: expected a URL without '..' and empty parts")
+    has_drive = os.name == "nt" and ":" in found[2]
+    if {"..", "."} & {*parts} or "" in parts[:-1] or "\\" in url or has_drive:
+        raise RequestError(f"{url}: expected a URL without '..', '.', backslashes and empty parts")
     return folder / SPOOL / found[1] / found[2]
 
 
@@ -77,30 +81,72 @@ def url_of(path: Path) -> str | None:
         return None
     parts = path.parts
     scheme, *rest = parts[parts.index(SPOOL) + 1 :] if SPOOL in parts else ("",)
-    return f"{scheme}://{'/'.join(rest)}" if rest else None
+    return f"{scheme}://{'/'.join(rest)}" if rest and ".." not in rest else None
 
 
-def listed(url: str) -> list[str]:
+def beside(folder: Path, text: str) -> str | None:
+    """The URL of a path that counts from a folder which stands for one; None where it is a file's.
+
+    Raises:
+        RequestError: it leads out of the bucket.
+
+    >>> beside(Path("/tmp/clpipe-spool/s3/b/lists"), "../r/a.exr"), beside(Path("/tmp"), "a.exr")
+    ('s3://b/r/a.exr', None)
+    """
+    url = url_of(folder)
+    if url is None:
+        return None
+    scheme, _, rest = url.partition("://")
+    bucket = rest.split("/")[0]
+    joined = posixpath.normpath(posixpath.join(rest, text))
+    if joined.split("/")[0] != bucket or text.startswith("/"):
+        raise RequestError(f"path: found {text}, which leads out of {scheme}://{bucket}")
+    return f"{scheme}://{joined}"
+
+
+def is_glob(url: str) -> bool:
+    """Whether a URL is a pattern: "?" begins what a server is asked."""
+    return any(letter in url for letter in "*[")
+
+
+def listed(url: str, may_be_missing: bool = False) -> list[str]:
     """The URLs of all files below one, at any depth, or of those that a glob matches, sorted.
 
     A URL of a file gives itself. The listing stays known, so that stamps cost nothing.
+
+    Args:
+        url: the URL.
+        may_be_missing: whether there may be nothing; then there are no files.
 
     Raises:
         RequestError: it cannot be listed.
     """
     system, path = _opened(url)
+    above, root = url.rstrip("/"), path.rstrip("/")
+    if is_glob(url):  # up to the part that is a pattern
+        parts = above.split("/")
+        count = len(parts) - next(i for i, part in enumerate(parts) if is_glob(part))
+        above, root = "/".join(parts[:-count]), "/".join(root.split("/")[:-count])
 
     def found() -> Iterable[str]:
         system.invalidate_cache()
-        if any(letter in path for letter in "*["):
+        if is_glob(url):
             return [each for each in system.glob(path) if not system.isdir(each)]
         is_file = not url.endswith("/") and system.isfile(path)
         return [path] if is_file else system.find(path)
 
     try:
-        return sorted(system.unstrip_protocol(each) for each in _retried(found))
+        files = _retried(found)
+    except FileNotFoundError as error:
+        if may_be_missing:
+            return []
+        raise RequestError(f"{url}: cannot be listed: {_reason(error)}") from None
     except Exception as error:
         raise RequestError(f"{url}: cannot be listed: {_reason(error)}") from None
+    # By the scheme that was asked for: a file system may have several.
+    return sorted(
+        url if each == path else f"{above}/{each[len(root) :].lstrip('/')}" for each in files
+    )
 
 
 def stamp_of_url(url: str) -> tuple[int, int]:
@@ -112,22 +158,28 @@ def stamp_of_url(url: str) -> tuple[int, int]:
 
 
 @contextlib.contextmanager
-def fetched(paths: Iterable[Path]) -> Iterator[None]:
-    """Files that stand for URLs, there meanwhile; others are left alone.
+def fetched(paths: Iterable[Path]) -> Iterator[list[Path]]:
+    """Where files that stand for URLs are meanwhile, each by itself; others are where they were.
 
     Raises:
         ImageError: one cannot be fetched.
     """
     made: list[Path] = []
+    found: list[Path] = []
     try:
         for path in paths:
-            if (url := url_of(path)) and not path.exists():
-                made.append(path)
-                _fetch(url, path)
-        yield
+            url = url_of(path)
+            if url is None or path.exists():
+                found.append(path)
+                continue
+            root = Path(*path.parts[: path.parts.index(SPOOL)])
+            made.append(root / f"fetched-{secrets.token_hex(8)}")  # others may read it, too
+            found.append(place_of(url, made[-1]))
+            _fetch(url, found[-1])
+        yield found
     finally:
-        for path in made:
-            path.unlink(missing_ok=True)
+        for folder in made:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def fetch(path: Path) -> None:
@@ -225,7 +277,7 @@ def _stamp(info: Mapping[str, Any]) -> tuple[int, int]:
     """Size, and a number of what says that a file changed: ETag, checksum or time."""
     said = next((str(v) for name in CHANGES if (v := info.get(name)) is not None), "")
     number = int.from_bytes(hashlib.sha256(said.encode()).digest()[:7]) if said else 0
-    return int(info.get("size") or 0), number
+    return int(info.get("size") or 0), number // 100 * 100  # as a file's time, of which NTFS keeps
 
 
 def _retried(work: Callable[[], T]) -> T:

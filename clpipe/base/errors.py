@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from clpipe.base.text import one_line
 
@@ -31,6 +32,9 @@ class KeyedError(RequestError):
     def __init__(self, key: str, message: str) -> None:
         super().__init__(message)
         self.key = key
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return KeyedError, (self.key, *self.args)
 
 
 class ImageError(ClpipeError):

@@ -81,6 +81,8 @@ class InTurn:
                         committing = None
                         yield from self._commit(made)
                         made = []
+                        if self._stopping.is_set():
+                            break
                         job = jobs.get()
                     if job is None or self._stopping.is_set():
                         break
@@ -106,7 +108,7 @@ class InTurn:
         worker = self._worker
         state, files = JobState(job, worker.loader), list[Written]()
         try:
-            state = worker.decode(job, partial(self._admit, job))
+            state = worker.decode(job, self._admit)
             for asked in tuple(state.recipes):
                 if state.error:
                     break
@@ -143,7 +145,11 @@ class InTurn:
         """
         if self._runners is None:
             self._worker.writer.check_folder()
-            self._compiled()
+            try:
+                self._compiled()
+            except ClpipeError as error:  # of which all that follows would fail
+                self._fail(error)
+                raise
             self._room.started()
         self._room.enter(job.stem, bytes_of(self._worker, job, 1, self._device is None))
 
@@ -153,6 +159,9 @@ class InTurn:
             self._worker.commit([(state, each) for state, files in made for each in files])
         except OutputError as error:
             self._fail(error)
+        except BaseException as error:
+            for state, _ in made:
+                state.error = failure_text(state.job, error)
         return [state.outcome() for state, _ in made]
 
     def _fail(self, error: ClpipeError) -> None:

@@ -9,24 +9,24 @@ import gc
 import logging
 import os
 import queue
-import signal
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NoReturn
 
 from clpipe.base.errors import ClpipeError
-from clpipe.base.files import remove_temporary_files
+from clpipe.base.files import discard, remove_temporary_files
 from clpipe.base.system import stay_on
 from clpipe.batch.in_turn import InTurn, Jobs
-from clpipe.batch.interrupt import SIGNALS
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.pipes import Pipe
 from clpipe.batch.room import usual_room
 from clpipe.batch.spec import RunSpec
 from clpipe.batch.threads import Batch
 from clpipe.engine.device import Device, open_devices
+from clpipe.engine.process_folder import process_folder
 
 SOON = 0.005  # s for which outcomes are collected, as each message has its price
 
@@ -54,8 +54,6 @@ class Seat:
 
 def main() -> None:
     """Do what standard input says."""
-    for number in SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
     pipe = Pipe(sys.stdin.buffer, os.fdopen(os.dup(1), "wb"))
     os.dup2(2, 1)  # what libraries print is no message
     gc.freeze()  # what is imported stays: looking through it again and again takes time
@@ -70,7 +68,14 @@ def main() -> None:
     except ClpipeError as error:
         pipe.send("failed", error)
     pipe.send("end")
-    os._exit(0)  # the thread that reads would wait for ever
+    _leave(0)
+
+
+def _leave(status: int) -> NoReturn:
+    """End, whatever other threads wait for, and leave no folder behind."""
+    if process_folder.cache_info().currsize and (folder := process_folder()):
+        discard(folder)
+    os._exit(status)
 
 
 def _work(pipe: Pipe, spec: RunSpec, seat: Seat) -> None:
@@ -92,7 +97,7 @@ def _work(pipe: Pipe, spec: RunSpec, seat: Seat) -> None:
         running = batch.run(jobs)
     else:
         batch = spec.batch(devices, seat.threads, seat.of)
-        running = batch.run(iter(jobs.get, None))
+        running = batch.run(iter(jobs.get, None), wake=lambda: jobs.put(None))
     threading.Thread(target=_listen, args=(pipe, jobs, batch), daemon=True).start()
     finished: queue.SimpleQueue[Outcome | None] = queue.SimpleQueue()
     teller = threading.Thread(target=_tell, args=(pipe, finished))
@@ -108,17 +113,17 @@ def _work(pipe: Pipe, spec: RunSpec, seat: Seat) -> None:
 def _listen(pipe: Pipe, jobs: Jobs, batch: Batch | InTurn) -> None:
     """Take jobs in, until it is said that there are no more."""
     try:
-        what, *values = pipe.receive()
-        while what == "jobs":
-            for job in values[0]:
-                jobs.put(job)
+        while True:
             what, *values = pipe.receive()
-        if what == "stop":
-            batch.stop()
-        jobs.put(None)
+            for job in values[0] if what == "jobs" else ():
+                jobs.put(job)
+            if what == "stop":
+                batch.stop()
+            if what != "jobs":
+                jobs.put(None)
     except EOFError:  # the run's process was killed
         remove_temporary_files()
-        os._exit(1)
+        _leave(1)
 
 
 def _tell(pipe: Pipe, finished: "queue.SimpleQueue[Outcome | None]") -> None:

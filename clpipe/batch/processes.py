@@ -43,8 +43,13 @@ ROOM = 400 << 20  # bytes for each process
 
 AHEAD, LEAST = 64, 12  # jobs that a process may have before it, and small ones towards the end
 DEATHS = 3  # of processes that took a job, after which it is given up; or of those that only start
+FUTILE = 20  # of processes in a row, of which none has done anything
 
-PROGRAM = "import json, sys; sys.path[:] = json.loads({path!r}); {start}"
+PROGRAM = (
+    "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "
+    "signal.signal(signal.SIGTERM, signal.SIG_IGN); "
+    "import json, sys; sys.path[:] = json.loads({path!r}); {start}"
+)
 START = "from clpipe.batch.local_worker import main; main()"
 THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")  # up to PoCL 3.1, and from 4 on
 
@@ -85,7 +90,6 @@ class _Process:
 
     def close(self) -> int:
         """Wait for its end; its status."""
-        self.pipe.hang_up()
         status = self.popen.wait()
         self.listener.join()
         self.pipe.close()
@@ -113,6 +117,7 @@ class Processes:
         self._deaths: Counter[str] = Counter()  # by stems of jobs
         self._has_worked = False  # one of them, which so has kept the kernels
         self._still_born = 0  # processes in a row that ended before they were ready
+        self._futile = 0  # processes that ended since the last outcome
         self._said: set[str] = set()
         self._failure: ClpipeError | None = None
         self._is_stopping = False
@@ -135,7 +140,8 @@ class Processes:
         self._left = deque(every)
         try:
             wanted = min(self._count, max(len(every), 1))
-            self._processes += [self._start(number) for number in range(wanted)]
+            for number in range(wanted):
+                self._processes.append(self._start(number))
             self._hand_out()
             while not self._is_finished:
                 process, message = self._messages.get()
@@ -179,7 +185,7 @@ class Processes:
         program = PROGRAM.format(path=json.dumps(sys.path), start=START)
         try:
             popen = subprocess.Popen(  # noqa: S603 - this program
-                [sys.executable, "-c", program],
+                [sys.executable, "-P", "-c", program],  # nothing from the working directory
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 env={**os.environ, **limits},
@@ -201,7 +207,7 @@ class Processes:
         try:
             while True:
                 self._messages.put((process, process.pipe.receive()))
-        except (EOFError, OSError):
+        except Exception:  # mostly EOFError; what cannot be understood is as if it had gone
             self._messages.put((process, ("gone",)))
 
     @staticmethod
@@ -218,7 +224,7 @@ class Processes:
             case ("compiled",):
                 self._has_worked = True
             case ("outcomes", list(outcomes)):
-                self._has_worked = True
+                self._has_worked, self._futile = True, 0
                 for outcome in outcomes:
                     del process.jobs[outcome.job.stem]
                 process.is_alone &= bool(process.jobs)
@@ -279,9 +285,14 @@ class Processes:
         if self._is_stopping:
             return []
         self._still_born += not process.is_ready
-        if self._still_born >= DEATHS:
+        self._futile += 1
+        log.warning("a process ended %s; its %d images go to others", _ended(status), len(jobs))
+        if self._still_born >= DEATHS or self._futile >= FUTILE:
+            count, before = FUTILE, "made an image"
+            if self._still_born >= DEATHS:
+                count, before = DEATHS, "opened a device"
             raise DeviceError(
-                f"--processes: {DEATHS} processes in a row ended before they had opened a device, "
+                f"--processes: {count} processes in a row ended before they had {before}, "
                 f"the last one {_ended(status)}; --processes 1 does without"
             )
         for job in jobs:
@@ -303,6 +314,10 @@ class Processes:
             self._send(process, "stop" if process.jobs else "end")
         for process in self._processes:
             process.close()
+        while not self._messages.empty():  # what came with the last images
+            process_, message = self._messages.get()
+            if process_ and message[0] in ("failed", "log"):
+                self._heard(process_, message)
 
 
 def _ended(status: int) -> str:

@@ -5,9 +5,11 @@ SHA-256, and what became of its images. It is begun before the tar is sent and c
 is there. So a tar without one is somebody else's; where it is not complete the tar is made again.
 """
 
+import glob
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from clpipe.base.about import full_version
@@ -18,6 +20,7 @@ from clpipe.base.files import discard, sha256_of, write_whole
 from clpipe.batch.outcome import FAILED
 from clpipe.batch.tars import NUMBERED, Tar
 from clpipe.chain.request import ResolvedRequest
+from clpipe.inputs.find import Job
 from clpipe.outputs.existing import Redo
 from clpipe.outputs.program import program_digest
 
@@ -37,14 +40,14 @@ class RemoteTars:
     """
 
     def __init__(self, tars: Sequence[Tar], request: ResolvedRequest, redo: Redo) -> None:
+        self._asked = request
         self._request = json.dumps(request.record(), sort_keys=True, default=str)
         self._redo = redo
         url = url_of(tars[0].folder)
         assert url
-        try:
-            self._there = {each.rpartition("/")[2] for each in listed(url)}
-        except RequestError:  # most have no folders that are empty
-            self._there = set()
+        below = [each.removeprefix(f"{url}/") for each in listed(url, may_be_missing=True)]
+        self._there = {name for name in below if "/" not in name}
+        self._keys = {tar.name: self._key(tar) for tar in tars}  # of inputs as they are now
         for name in sorted(self._there):
             match = NUMBERED.fullmatch(name)
             if match and int(match[2]) >= tars[0].of:
@@ -68,7 +71,7 @@ class RemoteTars:
         if self._redo is Redo.ALL or tar.name not in self._there:
             return False
         index = self._index_of(tar)
-        if index.get("key") != self._key(tar) or index.get("failed") != []:
+        if index.get("key") != self._keys[tar.name] or index.get("failed") != []:
             return False
         if self._redo is not Redo.MISSING and index.get("program") != program_digest():
             return False
@@ -108,11 +111,21 @@ class RemoteTars:
     def _key(self, tar: Tar) -> str:
         """A digest of what decides a tar, besides the program."""
         jobs = [
-            (job.stem, job.key, dict(job.values), job.frames, list(map(stamp_of, job.paths)))
+            (
+                job.stem,
+                job.key,
+                self._record_of(job),
+                job.frames,
+                list(map(stamp_of, files_of(job))),
+            )
             for job in tar.jobs
         ]
         text = json.dumps([self._request, jobs], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()
+
+    def _record_of(self, job: Job) -> Mapping[str, Any]:
+        """What a job's own values ask for, with the digests of files that they name."""
+        return self._asked.for_image(job.key, job.values).record() if job.values else {}
 
     def _index_of(self, tar: Tar) -> dict[str, Any]:
         """What a tar's index says; nothing where it is damaged."""
@@ -129,13 +142,24 @@ class RemoteTars:
             "program": program_digest(),
             "tar": tar.name,
         }
-        record |= {"key": self._key(tar), "samples": [job.stem for job in tar.jobs], **more}
+        record |= {"key": self._keys[tar.name], "samples": [job.stem for job in tar.jobs], **more}
         path = tar.path.with_name(f"{_stem(tar)}{INDEX}")
         write_whole(path, json.dumps(record).encode())
         url = url_of(path)
         assert url
         upload(path, url)
         discard(path)
+
+
+def files_of(job: Job) -> list[Path]:
+    """A job's files, and those on this machine that go with it by their names."""
+    beside = [
+        each
+        for path in job.paths
+        if url_of(path) is None
+        for each in sorted(path.parent.glob(f"{glob.escape(path.stem)}_*"))
+    ]
+    return [*job.paths, *beside]
 
 
 def _stem(tar: Tar) -> str:
@@ -145,7 +169,7 @@ def _stem(tar: Tar) -> str:
 def _is_whole(tar: Tar, index: Mapping[str, Any]) -> bool:
     """Whether a tar's bytes are those that its index says."""
     try:
-        with fetched([tar.path]):
-            return sha256_of(tar.path)[0] == index.get("sha256")
+        with fetched([tar.path]) as (path,):
+            return sha256_of(path)[0] == index.get("sha256")
     except (ImageError, OSError):
         return False

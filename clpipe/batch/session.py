@@ -205,15 +205,14 @@ class Run:
             self._look_behind(folders)
 
     def _send_log(self, url: str) -> None:
-        """Put the log beside the tars, under a name that no other run has.
-
-        Raises:
-            OutputError: it cannot be written there.
-        """
+        """Put the log beside the tars, under a name that no other run has."""
         path = self.where.output / log_name(self._images.shard)
         if path.exists():
             began = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
-            upload(path, f"{url}/{path.stem}.{began}-{secrets.token_hex(2)}.jsonl")
+            try:
+                upload(path, f"{url}/{path.stem}.{began}-{secrets.token_hex(2)}.jsonl")
+            except OutputError as error:  # which is no reason to hide one of the run's own
+                log.warning("%s; the log of this run is lost", error)
 
     def _counted(
         self, running: Iterable[Outcome], log: RunLog, trace: Trace | None

@@ -8,7 +8,7 @@ import os
 import shutil
 import tarfile
 import threading
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -287,7 +287,9 @@ class TarBatch(Batch):
         )
         super().__init__(worker, devices, where.threads)
 
-    def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
+    def run(
+        self, jobs: Iterable[Job], wake: Callable[[], None] = lambda: None
+    ) -> Generator[Outcome, None, None]:
         """Do every job, as the base does; a tar is packed while the next one is made.
 
         What a killed run left is removed first.
@@ -298,7 +300,9 @@ class TarBatch(Batch):
             DeviceError: a kernel does not compile.
         """
         if self._remote:
-            there = list(filter(self._remote.has, self._tars))
+            there = [tar for tar in self._tars if not self.is_stopping and self._remote.has(tar)]
+            if self.is_stopping:
+                return
             self._tars = [tar for tar in self._tars if tar not in there]
             jobs = [job for tar in self._tars for job in tar.jobs]
             for tar in there:
@@ -309,7 +313,7 @@ class TarBatch(Batch):
         prepare(self._tars, self._redo is Redo.ALL)
         packing: Future[None] | None = None
         with ThreadPoolExecutor(1, "pack") as pool:
-            for outcome in super().run(jobs):
+            for outcome in super().run(jobs, wake):
                 packer = self._packers.of(outcome.job)
                 is_last = packer.add(outcome)
                 yield packer.packed(outcome)

@@ -144,7 +144,14 @@ class Batch:
         """Let no more images in; those in flight are finished."""
         self._stopping.set()
 
-    def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
+    @property
+    def is_stopping(self) -> bool:
+        """Whether no more images are let in."""
+        return self._stopping.is_set()
+
+    def run(
+        self, jobs: Iterable[Job], wake: Callable[[], None] = lambda: None
+    ) -> Generator[Outcome, None, None]:
         """Do every job; one that fails is reported and the others go on. A batch runs once.
 
         Outcomes come as jobs are finished, in any order.
@@ -152,6 +159,7 @@ class Batch:
         Args:
             jobs: the images. What is no list is asked for each when there is a place for it; it may
                 take its time, and what it raises ends the run.
+            wake: makes it end, where a thread may be waiting for it when the run ends early.
 
         Raises:
             OutputError: nothing can be written any more. What was in flight is reported before.
@@ -173,6 +181,7 @@ class Batch:
         try:
             yield from self._finished(len(decoders))
         finally:
+            wake()
             self._close(decoders, developers, encoders, committer)
 
     def _start(self, name: str, work: Callable[..., None], *arguments: Any) -> threading.Thread:
@@ -261,7 +270,7 @@ class Batch:
         while job := self._next():
             waits: list[float] = []
             try:
-                state = self._worker.decode(job, partial(self._admit, job, waits))
+                state = self._worker.decode(job, partial(self._admit, waits))
             except OutputError as error:
                 self._leave(job)
                 self._outcomes.put(Outcome(job, FAILED, error=failure_text(job, error)))
@@ -285,7 +294,7 @@ class Batch:
         self._places.release()
         self._outcomes.put(None)
 
-    def _admit(self, job: Job, waits: list[float]) -> None:
+    def _admit(self, waits: list[float], job: Job) -> None:
         """Wait until there is room for a job's image, and note how long: it is decoded next.
 
         Raises:

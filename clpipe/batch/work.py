@@ -96,23 +96,26 @@ class ImageWorker:
         half = self.loader.kept is None and self.chain.source is Kind.RGB
         return Runners(self.writer, device, self.chain, half)
 
-    def decode(self, job: Job, admit: Callable[[], None]) -> JobState:
+    def decode(self, job: Job, admit: Callable[[Job], None]) -> JobState:
         """Load a job's image, unless all of its pictures are done already.
 
         Args:
             job: the image.
-            admit: called where something is to be made; it may raise ImageError.
+            admit: called where something is to be made, with the job as it is read; it may raise
+                ImageError.
         """
-        state = JobState(job, self.loader)
+        state, here = JobState(job, self.loader), job
         with state.timed("decode"):
             try:
                 state.loader = self.loader.for_job(job)
                 state.request = self._request_of(state)
                 renditions = self._missing(state)
                 if renditions:
-                    with fetched(job.paths):
-                        admit()
-                        self._load(state, renditions)
+                    with fetched(job.paths) as (first, *others):
+                        if first != job.path:
+                            here = replace(job, path=first, subframes=tuple(others))
+                        admit(here)
+                        self._load(state, here, renditions)
                 else:
                     state.status = SKIPPED
             except (ImageError, RequestError, MemoryError) as error:
@@ -120,7 +123,7 @@ class ImageWorker:
                     state.status = LEFT_OUT
                     state.reason = str(error) if isinstance(error, NoPictureError) else ""
                 else:
-                    state.error = state.loader.error_text(job, error)
+                    state.error = state.loader.error_text(here, error)
         return state
 
     def _request_of(self, state: JobState) -> Mapping[str, Any]:
@@ -160,13 +163,17 @@ class ImageWorker:
         """
         return self.writer.existing(job, rendition).found(job, request, self._redo.verifies)
 
-    def _load(self, state: JobState, renditions: Set[Rendition]) -> None:
+    def _load(self, state: JobState, job: Job, renditions: Set[Rendition]) -> None:
         """Load a state's image, and decide which renditions are made of it.
+
+        Args:
+            state: the state.
+            job: its job, with the files where they are.
+            renditions: what is missing.
 
         Raises:
             ImageError, RequestError, MemoryError: it cannot be read, or cannot enter the chain.
         """
-        job = state.job
         state.stamps = [stamp_of(path) for path in job.paths]
         source = state.loader.read(job)
         loaded = state.loader.enter(job, source)

@@ -112,7 +112,7 @@ class Optics:
         of_lens, fx = lens.focal_length / sensor * max(width, height), self.fx
         if self.camera_angle_x:
             fx = width / 2 / math.tan(self.camera_angle_x / 2)
-        stated = self.sensor_width if not self.is_sensor_of_lens else self.pixel_pitch
+        stated = None if self.is_sensor_of_lens else self.sensor_width or self.pixel_pitch
         if fx and not stated and abs(fx - of_lens) > NOMINAL * of_lens:
             place = self.places.get("fx") or self.places.get("camera_angle_x")
             raise RequestError(

@@ -334,8 +334,9 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
                     _check_behind(wide, name, own, is_at_work=True)
                     raise
             takes_lens |= isinstance(own, FromLens) and not isinstance(method, Unchanged)
-            _check_behind(wide, name, own, bool(method.passes()))
-            if isinstance(method, OfPanorama):
+            if fits or isinstance(own, FromLens):  # or it was not resolved
+                _check_behind(wide, name, own, bool(method.passes()))
+            if fits and isinstance(method, OfPanorama):
                 wide = f"{name}.method={method.method}"
             if not fits:
                 if isinstance(method, Unchanged) and stage.reads is stage.writes:

@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
-from clpipe.base.buckets import is_url, listed, url_of
+from clpipe.base.buckets import is_glob, is_url, listed, url_of
 from clpipe.base.errors import RequestError
 from clpipe.base.text import printable
 from clpipe.chain.rendition import Rendition
@@ -197,19 +197,24 @@ def _jobs_behind(url: str, endings: Sequence[str], excluded: Exclusion) -> list[
     Raises:
         RequestError: it cannot be listed, or there are none.
     """
-    is_glob = glob.has_magic(url)
-    if not is_glob and Path(url).suffix.lower() in endings:  # one that is missing fails alone
+    is_pattern = is_glob(url)
+    if not is_pattern and Path(url).suffix.lower() in endings:  # one that is missing fails alone
         return [Job(place_of_url(url), url.rpartition("/")[2], written=url)]
     root = url.rstrip("/")
     jobs = []
     for each in listed(url):
-        is_below = each.startswith(f"{root}/") and not is_glob
+        is_below = each.startswith(f"{root}/") and not is_pattern
         key = each.removeprefix(f"{root}/") if is_below else each.rpartition("/")[2]
         hidden = any(part.startswith(".") for part in key.split("/"))
         suffix = Path(key).suffix.lower()
         if (is_below and (hidden or suffix not in endings)) or key in excluded:
             continue
-        jobs.append(Job(place_of_url(each), key, listed=not is_below, written=each))
+        try:
+            path = place_of_url(each)
+        except RequestError as error:
+            log.warning("%s; it is left out", error)
+            continue
+        jobs.append(Job(path, key, listed=not is_below, written=each))
     if not jobs:
         raise RequestError(f"{url}: no image is there (looked for {', '.join(endings[:6])} ...)")
     return jobs

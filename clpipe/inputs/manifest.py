@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
-from clpipe.base.buckets import fetch, is_url
+from clpipe.base.buckets import beside, fetch, is_url
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import read_bytes
 from clpipe.base.text import one_of
@@ -257,9 +257,9 @@ def _row(folder: Path, place: str, record: Mapping[str, Any]) -> Row:
             values[column] = value.split()
         elif column in PLAIN:
             values[column] = value
-    if is_url(path):
-        own = place_of_url(path)
-        key = name or own.name
+    if url := path if is_url(path) else beside(folder, path):
+        own = place_of_url(url)
+        key = name or (own.name if is_url(path) else key_of(folder, own))
     else:
         own = folder / path
         key = name or key_of(folder, own)

@@ -11,6 +11,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+from clpipe.base.buckets import url_of
 from clpipe.base.digests import digests, joint_digest, stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
@@ -182,7 +183,8 @@ def _same_input(values: Mapping[str, Any], job: Job, verify: bool) -> bool:
         was, now = stamps_in(values), [stamp_of(path) for path in job.paths]
         if [size for size, _ in was] != [size for size, _ in now]:
             return False
-        if (was != now or verify) and values["sha256"] != _digest_of(job):
+        reads = verify and url_of(job.path) is None  # what is behind a URL is told by its stamp
+        if (was != now or reads) and values["sha256"] != _digest_of(job):
             return False
         layers = (*values.get("carried", ()), *values.get("depth", ()))
         return all(_is_same(job, each, verify) for each in layers)
