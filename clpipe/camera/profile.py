@@ -194,9 +194,10 @@ class Camera(BaseModel):
         Raises as :meth:`noise`.
         """
         stage = self.gain_stage(iso)
-        table = stage.color_bias or [(0.0,) * 4] * len(stage.iso)
+        if not stage.color_bias:
+            return 0.0, 0.0, 0.0, 0.0
         one, two, three, four = (
-            stage.between(iso, of) / self.signal_range for of in zip(*table, strict=True)
+            stage.between(iso, of) / self.signal_range for of in zip(*stage.color_bias, strict=True)
         )
         return one, two, three, four
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import one_of
@@ -33,16 +33,21 @@ from clpipe.stage import (
     StageRole,
     Unchanged,
 )
+from clpipe.stage.context import asks_for_noise
 
 
 @dataclass(frozen=True)
 class Step:
-    """A stage in its place in a chain: its method, resolved, and the context that it reads."""
+    """A stage in its place in a chain: its method, resolved, and the context that it reads.
+
+    ``follows_noise`` is False where the method was resolved without a look at the noise.
+    """
 
     name: str
     stage: Stage
     method: Method
     context: Context
+    follows_noise: bool = True
 
     @property
     def adds_noise(self) -> bool:
@@ -181,7 +186,11 @@ class Chain:
         left = []
         for step in self.steps:
             name, folder = step.name, step.stage.folder
-            method, context = self.settings.method(name), replace(step.context, clean=True)
+            method = self.settings.method(name)
+            if not step.follows_noise and type(method).noise_free is Method.noise_free:
+                left.append((step, step.method.without_noise()))  # as it would be resolved again
+                continue
+            context = replace(step.context, clean=True)
             with validation_errors(name, type(method)), user_code_errors(f"stage {name}", folder):
                 own = method.noise_free(context)
                 left.append((step, own and own.as_for(step.method)))
@@ -326,10 +335,10 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
         stage = all_stages()[base_name(name)].reading(kind)
         with validation_errors(name, type(own)), user_code_errors(f"stage {name}", stage.folder):
             fits = stage.reads is (kind or stage.reads)
-            method = own
+            method, follows_noise = own, True
             if fits or isinstance(own, FromLens):
                 try:
-                    method = own.resolve(context)
+                    method, follows_noise = asks_for_noise(partial(own.resolve, context))
                 except RequestError:
                     _check_behind(wide, name, own, is_at_work=True)
                     raise
@@ -347,7 +356,8 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
                 after = replace(after, optics=after.optics.set_to(method.optics()))
         if stage.folder:
             check_passes(name, stage, method, context)
-        steps.append(Step(name, stage, method, context))
+        # What a user's stage looks at, nobody knows.
+        steps.append(Step(name, stage, method, context, follows_noise or bool(stage.folder)))
         context = after
         kind, before = stage.writes, name
     if not takes_lens:
