@@ -228,3 +228,17 @@ def test_nothing_runs_from_the_working_directory_and_nothing_is_left(renders, tm
     assert done.returncode == 0, done.stderr
     assert pictures() == 4
     assert not [path for path in place.rglob("*") if path.is_file()]
+
+
+def test_fewer_processes_where_the_system_gives_no_more(renders, monkeypatch):
+    renders(6)
+    start_ = processes.Processes._start
+
+    def limited(self, number):
+        if number:
+            raise RequestError("no process can be started")
+        return start_(self, number)
+
+    monkeypatch.setattr(processes.Processes, "_start", limited)
+    run = package.run("in", "out", processes=3, device="numpy")
+    assert [outcome.status for outcome in run] == ["done"] * 6

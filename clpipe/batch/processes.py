@@ -141,7 +141,13 @@ class Processes:
         try:
             wanted = min(self._count, max(len(every), 1))
             for number in range(wanted):
-                self._processes.append(self._start(number))
+                try:
+                    self._processes.append(self._start(number))
+                except RequestError:
+                    if not self._processes:
+                        raise
+                    self._count = number  # the system lets there be no more
+                    break
             self._hand_out()
             while not self._is_finished:
                 process, message = self._messages.get()
