@@ -82,6 +82,22 @@ def test_a_group_that_fails_leaves_nothing_and_the_others_are_whole(tmp_path):
     assert not list(tmp_path.glob("*d*"))
 
 
+def test_an_error_that_nobody_expected_leaves_no_part_of_a_group(tmp_path, monkeypatch):
+    groups = []
+    for letter in "ab":
+        with deferred_files() as group:
+            write_whole(tmp_path / letter, b"x")
+        groups.append(group)
+
+    def fail(path):
+        raise MemoryError
+
+    monkeypatch.setattr(files, "file_to_disk", fail)
+    with pytest.raises(MemoryError):
+        FileGroup.commit(groups)
+    assert not list(tmp_path.iterdir())
+
+
 def write_and_fail(path):
     with deferred_files():
         write_whole(path, b"x")

@@ -113,7 +113,7 @@ class FileGroup:
                 begin_writing(beside)
         errors: list[ImageError | None] = []
         folders: dict[Path, None] = {}
-        for group in groups:
+        for number, group in enumerate(groups):
             try:
                 group._bring_to_disk()
                 group._rename()
@@ -122,6 +122,10 @@ class FileGroup:
             except ImageError as error:
                 group.discard()
                 errors.append(error)
+            except BaseException:  # which nobody expected
+                for left in groups[number:]:
+                    left.discard()
+                raise
         for folder in folders:
             keep_names(folder)
         return errors
