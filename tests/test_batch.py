@@ -776,14 +776,14 @@ def test_what_nobody_expected_fails_its_image_alone(
 
     renders(6)
     run = ("run", "in", "-o", "out", "--device", "numpy", "--stages", "exposure,gamma")
-    with monkeypatch.context() as patch, caplog.at_level(logging.DEBUG, "clpipe.batch.threads"):
+    with monkeypatch.context() as patch, caplog.at_level(logging.DEBUG, "clpipe.batch.job_state"):
         patch.setattr(owner, name, planted)
         told = clpipe(*run, status=1).stderr
     (failed,) = [key for key, status in statuses("out").items() if status == "failed"]
     assert f"clpipe: in/{failed}: {text}" in told
     assert "5 of 6 images done, 1 failed" in told
     assert not [name for name in written(Path("out")) if name.startswith(failed[:4])]
-    records = [r for r in caplog.records if r.name == "clpipe.batch.threads"]
+    records = [r for r in caplog.records if r.name == "clpipe.batch.job_state"]
     assert [r.levelname for r in records] == ["DEBUG"] * (not isinstance(error, MemoryError))
     assert all(r.exc_info[1] is error for r in records)
     clpipe(*run)

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from clpipe.base.buckets import is_url
 from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
 from clpipe.base.text import one_of, several
@@ -19,7 +18,7 @@ from clpipe.chain.request import Request
 from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS
 from clpipe.inputs.find import parse_shard
 from clpipe.inputs.series import Series, check_isos
-from clpipe.inputs.spool import place_of_url
+from clpipe.inputs.spool import path_of
 from clpipe.outputs.existing import Redo
 from clpipe.outputs.patches import Patches
 
@@ -150,7 +149,7 @@ def run(
         webdataset,
     )
     where = Where(
-        place_of_url(str(output)) if is_url(str(output)) else Path(output),
+        path_of(str(output)),
         several(device),
         parse_size(memory) if isinstance(memory, str) else memory,
         jobs,

@@ -12,11 +12,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 
 from clpipe.base.errors import ClpipeError, DeviceError, OutputError
-from clpipe.batch.job_state import JobState
+from clpipe.batch.job_state import JobState, failure_text
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.room import Room
 from clpipe.batch.runners import Runners
-from clpipe.batch.threads import bytes_of, failure_text
 from clpipe.batch.work import ImageWorker, Written
 from clpipe.engine.device import Device
 from clpipe.images.openimageio import set_codec_threads
@@ -151,7 +150,7 @@ class InTurn:
                 self._fail(error)
                 raise
             self._room.started()
-        self._room.enter(job.stem, bytes_of(self._worker, job, 1, self._device is None))
+        self._room.enter(job.stem, self._worker.bytes_of(job, 1, self._device is None))
 
     def _commit(self, made: Sequence[Made]) -> list[Outcome]:
         """Bring to the disk what was made; the outcomes."""

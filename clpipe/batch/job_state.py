@@ -1,5 +1,6 @@
 """A job from the start of its decoding to its outcome."""
 
+import logging
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from clpipe.base.errors import ClpipeError
 from clpipe.batch.outcome import DONE, FAILED, Outcome, Span
 from clpipe.images.read import SourceImage
 from clpipe.inputs.carry import Aovs
@@ -16,6 +18,8 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.patches import Patch
 from clpipe.outputs.recipes import Recipe
+
+log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -76,3 +80,18 @@ class JobState:
             self.clipped,
             self.old,
         )
+
+
+def failure_text(job: Job, error: BaseException) -> str:
+    """The message of an image that failed of an error that nobody expected.
+
+    Its traceback goes to the log, at the level DEBUG.
+    """
+    if isinstance(error, MemoryError):
+        reason = "there is not enough memory for it"
+    elif isinstance(error, ClpipeError):
+        reason = str(error)
+    else:
+        reason = f"unexpected {type(error).__name__}: {error}".removesuffix(": ")
+    log.debug("%s: %s", job.shown, reason, exc_info=error)
+    return f"{job.shown}: {reason.replace(str(job.path), job.shown)}"

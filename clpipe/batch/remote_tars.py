@@ -79,14 +79,6 @@ class RemoteTars:
             return False
         return self._redo is not Redo.DAMAGED or _is_whole(tar, index)
 
-    def begin(self, tar: Tar) -> None:
-        """Say that a tar is ours, before it is sent.
-
-        Raises:
-            OutputError: that cannot be written.
-        """
-        self._write(tar, {})
-
     def send(self, tar: Tar, statuses: Mapping[str, str]) -> None:
         """Send a tar that is packed, and let go of it here.
 
@@ -100,7 +92,7 @@ class RemoteTars:
         failed = sorted(stem for stem, status in statuses.items() if status == FAILED)
         if not tar.path.exists():  # all of them failed
             return
-        self.begin(tar)
+        self._write(tar, {})  # it is ours from now on
         digest, size = sha256_of(tar.path)
         url = url_of(tar.path)
         assert url

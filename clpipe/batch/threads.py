@@ -16,11 +16,11 @@ from functools import partial
 from typing import Any
 
 from clpipe.base.cpu_time import CpuTimer
-from clpipe.base.errors import ClpipeError, DeviceError, OutputError, RequestError
+from clpipe.base.errors import DeviceError, OutputError, RequestError
 from clpipe.base.processors import available_processors
-from clpipe.batch.job_state import JobState
+from clpipe.batch.job_state import JobState, failure_text
 from clpipe.batch.outcome import FAILED, Outcome
-from clpipe.batch.room import Room, host_bytes, usual_room
+from clpipe.batch.room import Room, usual_room
 from clpipe.batch.runners import Runners
 from clpipe.batch.work import ImageWorker, Written
 from clpipe.engine.device import Device
@@ -61,39 +61,6 @@ def depth_of(device: Device | None) -> int:
 
 def no_result() -> None:
     """The result of what is not developed."""
-
-
-def failure_text(job: Job, error: BaseException) -> str:
-    """The message of an image that failed of an error that nobody expected.
-
-    Its traceback goes to the log, at the level DEBUG.
-    """
-    if isinstance(error, MemoryError):
-        reason = "there is not enough memory for it"
-    elif isinstance(error, ClpipeError):
-        reason = str(error)
-    else:
-        reason = f"unexpected {type(error).__name__}: {error}".removesuffix(": ")
-    log.debug("%s: %s", job.shown, reason, exc_info=error)
-    return f"{job.shown}: {reason.replace(str(job.path), job.shown)}"
-
-
-def bytes_of(worker: ImageWorker, job: Job, most: int, in_numpy: bool) -> int:
-    """The bytes of memory that a job's image takes, see :func:`~clpipe.batch.room.host_bytes`.
-
-    Args:
-        worker: what is done to it.
-        job: the image.
-        most: how many results there are at a time at most.
-        in_numpy: whether NumPy develops it.
-    """
-    writer = worker.writer
-    results = min(len(writer.renditions_of(job)), most)
-    beside = 2 * worker.layers + bool(job.subframes)
-    # Baselines are measured on floats.
-    formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
-    kinds = results, formats, writer.request.keep, beside, in_numpy
-    return host_bytes(worker.loader.claim(job), worker.chain, *kinds)
 
 
 class Batch:
@@ -304,7 +271,7 @@ class Batch:
         if not self._is_needed.is_set():
             writer.check_folder()
         self._is_needed.set()
-        size = bytes_of(worker, job, self.threads + len(self.devices), None in self.devices)
+        size = worker.bytes_of(job, self.threads + len(self.devices), None in self.devices)
         start = time.perf_counter()
         self._room.enter(job.stem, size)
         waits.append(time.perf_counter() - start)
@@ -411,7 +378,7 @@ class Batch:
             try:
                 written = self._worker.encode(*developed)
             except OutputError as error:
-                state.error = f"{state.job.path}: {error}"
+                state.error = f"{state.job.shown}: {error}"
                 self._fail(error)
             except BaseException as error:
                 state.error = failure_text(state.job, error)

@@ -14,6 +14,7 @@ from clpipe.base.files import FileGroup, deferred_files
 from clpipe.base.types import Array
 from clpipe.batch.job_state import JobState
 from clpipe.batch.outcome import LEFT_OUT, SKIPPED, Span
+from clpipe.batch.room import host_bytes
 from clpipe.batch.runners import Runners, SpareArrays
 from clpipe.chain.baseline import with_noise
 from clpipe.chain.chain import Chain
@@ -85,6 +86,22 @@ class ImageWorker:
     def layers(self) -> int:
         """How many layers are read beside an image: those that go along with it, and its depth."""
         return len(self.writer.request.carry) + bool(depth_steps(self.chain))
+
+    def bytes_of(self, job: Job, most: int, in_numpy: bool) -> int:
+        """The bytes of memory that a job's image takes, see :func:`~clpipe.batch.room.host_bytes`.
+
+        Args:
+            job: the image.
+            most: how many results there are at a time at most.
+            in_numpy: whether NumPy develops it.
+        """
+        writer = self.writer
+        results = min(len(writer.renditions_of(job)), most)
+        beside = 2 * self.layers + bool(job.subframes)
+        # Baselines are measured on floats.
+        formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
+        kinds = results, formats, writer.request.keep, beside, in_numpy
+        return host_bytes(self.loader.claim(job), self.chain, *kinds)
 
     def runners(self, device: Device | None) -> "Runners":
         """The runners of a device; the kernels of the first chain are compiled here.
@@ -305,7 +322,7 @@ class ImageWorker:
             try:
                 self.fail(state, error)
             except OutputError as reason:
-                state.error, failure = f"{state.job.path}: {reason}", reason
+                state.error, failure = f"{state.job.shown}: {reason}", reason
         if failure:
             raise failure
 

@@ -19,7 +19,7 @@ from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import RENDER_SUFFIXES
 from clpipe.inputs.companions import owner_of
 from clpipe.inputs.manifest import MANIFEST_SUFFIXES, read_manifest
-from clpipe.inputs.spool import place_of_url
+from clpipe.inputs.spool import path_of, place_of_url
 
 T = TypeVar("T")
 
@@ -125,7 +125,7 @@ def find_jobs(
     for text in inputs:
         if not text:
             raise RequestError("an input is empty; give files, folders, globs or manifests")
-        path = place_of_url(text) if is_url(text) else Path(text)
+        path = path_of(text)
         if is_url(text) and path.suffix.lower() not in MANIFEST_SUFFIXES:
             jobs += _jobs_behind(text, endings, excluded)
         elif os.path.isdir(text):

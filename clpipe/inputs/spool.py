@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from clpipe.base.buckets import place_of
+from clpipe.base.buckets import is_url, place_of
 from clpipe.base.errors import RequestError
 from clpipe.engine.process_folder import process_folder
 
@@ -17,3 +17,8 @@ def place_of_url(url: str) -> Path:
     if folder is None:
         raise RequestError(f"{url}: there is no folder for temporary files with room (TMPDIR)")
     return place_of(url, folder)
+
+
+def path_of(text: str) -> Path:
+    """The path that a text names, or that stands for it where it is a URL; errors as above."""
+    return place_of_url(text) if is_url(text) else Path(text)
