@@ -15,11 +15,12 @@ from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import one_of, several
 from clpipe.base.types import Array, plain
 from clpipe.base.validation import typed
-from clpipe.chain.chain import Chain, make_chain
+from clpipe.chain.chain import Chain
 from clpipe.chain.depth import depth_of_array
 from clpipe.chain.entering import enter
 from clpipe.chain.files import load_settings
 from clpipe.chain.identity import image_key, noise_key
+from clpipe.chain.making import make_chain
 from clpipe.chain.overscan import margins_of_array
 from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.clipping import MUCH, clipped_share, clipping_text

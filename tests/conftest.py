@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from click.testing import Result as ClickResult
 
 from clpipe.batch.run_log import read_log
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.commands.main import main
 from clpipe.engine import programs

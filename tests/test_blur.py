@@ -5,8 +5,8 @@ import pytest
 
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import load_camera
-from clpipe.chain.chain import make_chain
 from clpipe.chain.files import load_settings
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.runner import Runner
 from clpipe.stages.motion_blur import streak

@@ -8,8 +8,8 @@ import pytest
 
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import load_camera
-from clpipe.chain.chain import make_chain
 from clpipe.chain.files import built_in_configs, load_settings, toml_text
+from clpipe.chain.making import make_chain
 from clpipe.chain.methods import default_method
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import overlay, settings_from

@@ -180,7 +180,7 @@ def test_a_name_can_be_set_more_than_once(pip_pocl):
 RAW = """if True:
     import hashlib, sys
     import numpy as np
-    from clpipe.chain.chain import make_chain
+    from clpipe.chain.making import make_chain
     from clpipe.chain.settings import Settings
     from clpipe.engine.check import example
     from clpipe.engine.device import open_device

@@ -7,7 +7,7 @@ from scipy.stats import kurtosis
 
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import load_camera, parse_camera
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.reference.cfa import PATTERNS
 from clpipe.stage import Context

@@ -9,8 +9,8 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from clpipe.analysis.signature import signature
 from clpipe.camera.profile import DEFAULT_CAMERA, load_camera
-from clpipe.chain.chain import make_chain
 from clpipe.chain.files import load_settings
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import overlay, settings_from
 from clpipe.engine.runner import Runner
 from clpipe.reference.cfa import PATTERNS, red_site

@@ -9,8 +9,8 @@ import pytest
 
 import clpipe as clpipe_api
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.chain.chain import make_chain
 from clpipe.chain.depth import depth_of_array, with_depth
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.runner import Runner
 from clpipe.images.read import read_image

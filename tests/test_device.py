@@ -12,7 +12,7 @@ import pyopencl as cl
 import pytest
 
 from clpipe.base.errors import DeviceError, ImageError
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings, settings_from
 from clpipe.commands.devices import device_rows
 from clpipe.engine import hardware

@@ -10,7 +10,7 @@ import pytest
 from clpipe.base.errors import DeviceError, DeviceFailedError
 from clpipe.batch.threads import Batch
 from clpipe.batch.work import ImageWorker
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
 from clpipe.engine import device as devices

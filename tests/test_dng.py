@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from clpipe.base.errors import ImageError
 from clpipe.camera.profile import SRGB_TO_XYZ, load_camera
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.images.dng import write_dng
 from clpipe.images.raw import read_facts, read_raw

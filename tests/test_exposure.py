@@ -8,7 +8,7 @@ import OpenImageIO as oiio
 import pytest
 
 from clpipe.base.errors import RequestError
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.runner import Runner
 from clpipe.inputs.manifest import read_manifest

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.images.read import SourceImage
 from clpipe.outputs.sidecar import intrinsics_of

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.engine.check import (

@@ -11,7 +11,7 @@ import pytest
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.camera import lens as by_name
 from clpipe.camera.profile import load_camera
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.check import example
 from clpipe.engine.extents import whole_image

@@ -8,8 +8,8 @@ from PIL import Image
 
 import clpipe as api
 from clpipe.base.errors import RequestError
-from clpipe.chain.chain import make_chain
 from clpipe.chain.files import load_config, load_configs, load_settings
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.images.read import read_image
 from tests.conftest import cli_output as clpipe

@@ -7,8 +7,8 @@ import pytest
 
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import built_in_cameras
-from clpipe.chain.chain import make_chain
 from clpipe.chain.files import load_settings
+from clpipe.chain.making import make_chain
 from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
 from clpipe.inputs.manifest import Row, check_rows, read_manifest

@@ -39,8 +39,8 @@ from clpipe.analysis.matching.space import (
     variants_of,
 )
 from clpipe.analysis.signature import flat_places, luma, signature
-from clpipe.chain.chain import make_chain
 from clpipe.chain.files import load_config, load_settings
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings, overlay
 from clpipe.commands.match import Follower
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding, through_jpeg

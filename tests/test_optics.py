@@ -13,8 +13,8 @@ import clpipe as clpipe_api
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.camera import lens as by_name
 from clpipe.camera.optics import Optics
-from clpipe.chain.chain import make_chain
 from clpipe.chain.depth import depth_of_array, with_depth
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import overlay, settings_from
 from clpipe.images.read import read_image
 from clpipe.stage import Resample
@@ -239,7 +239,7 @@ def lensfun(monkeypatch):
     """A database of one lens."""
 
     def use(calibration):
-        monkeypatch.setattr("clpipe.chain.chain.calibration_of", lambda *given: calibration)
+        monkeypatch.setattr("clpipe.chain.making.calibration_of", lambda *given: calibration)
 
     use(CALIBRATED)
     return use

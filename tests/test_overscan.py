@@ -10,8 +10,8 @@ import pytest
 
 import clpipe as clpipe_api
 from clpipe.base.errors import ImageError
-from clpipe.chain.chain import make_chain
 from clpipe.chain.depth import depth_of_array, with_depth
+from clpipe.chain.making import make_chain
 from clpipe.chain.overscan import steps_of_overscan, with_overscan
 from clpipe.chain.settings import settings_from
 from clpipe.engine.check import example

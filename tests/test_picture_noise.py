@@ -8,7 +8,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from clpipe.base.errors import RequestError
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.commands.main import main
 from clpipe.engine.plan import make_plan

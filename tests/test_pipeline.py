@@ -5,8 +5,8 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
-from clpipe.chain.chain import make_chain
 from clpipe.chain.files import load_config
+from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import settings_from
 from clpipe.engine.runner import Runner

@@ -3,8 +3,8 @@
 import pytest
 
 from clpipe.base.errors import RequestError
-from clpipe.chain.chain import make_chain
 from clpipe.chain.files import load_config
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.bindings import EncodedCurves
 from clpipe.engine.codegen import write_kernel

@@ -18,7 +18,7 @@ from rich.console import Console
 from clpipe.base.errors import DeviceError
 from clpipe.batch.run_log import Summary
 from clpipe.batch.where import Where
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.commands import progress
 from clpipe.commands.notices import NOTICES

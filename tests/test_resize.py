@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.check import example
 from clpipe.engine.codegen import write_kernel

@@ -8,7 +8,7 @@ from scipy.stats import chi2, kurtosis, norm, poisson, tukeylambda
 
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import built_in_cameras, load_camera
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.plan import make_plan
 from clpipe.engine.runner import Runner

@@ -7,7 +7,7 @@ import pyopencl as cl
 import pytest
 
 from clpipe.base.errors import ImageError
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages, load_stage_file
 from clpipe.chain.settings import Settings, settings_from
 from clpipe.engine.bindings import step_buffer

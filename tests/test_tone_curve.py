@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clpipe.base.errors import RequestError
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.stage import run_reference
 from clpipe.stages.inverse_tone_curve import Standard as InverseStandard

@@ -9,7 +9,7 @@ import pyopencl as cl
 import pytest
 
 from clpipe.base.errors import DeviceFailedError
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine import programs
 from clpipe.engine.check import example

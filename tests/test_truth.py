@@ -10,7 +10,7 @@ import pytest
 
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import DEFAULT_CAMERA, load_camera
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.overscan import with_overscan
 from clpipe.chain.registry import all_stages
 from clpipe.chain.rendition import CLEAN, DEVELOPMENT, MOSAIC, VARIANCE

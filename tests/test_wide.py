@@ -8,7 +8,7 @@ import OpenEXR
 import pytest
 
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.panorama import with_panorama
 from clpipe.chain.settings import settings_from
 from clpipe.engine.runner import Runner

@@ -7,7 +7,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Floats, Mask
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import holds_mosaic, photograph_facts, read_finished, read_image

@@ -7,9 +7,10 @@ from functools import lru_cache
 import numpy as np
 
 from clpipe.base.types import Array
-from clpipe.chain.chain import Chain, make_chain
+from clpipe.chain.chain import Chain
 from clpipe.chain.depth import depth_steps, warnings_of, with_depth
 from clpipe.chain.keys import RENDER
+from clpipe.chain.making import make_chain
 from clpipe.chain.overscan import steps_of_overscan, with_overscan
 from clpipe.chain.panorama import with_panorama
 from clpipe.chain.settings import overlay

@@ -14,10 +14,11 @@ from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of, several
 from clpipe.base.validation import first_fault
 from clpipe.chain.carry import AovSpec, parse_carry
-from clpipe.chain.chain import Chain, make_chain
+from clpipe.chain.chain import Chain
 from clpipe.chain.files import load_configs
 from clpipe.chain.formats import EVERY_FORMAT, NPY
 from clpipe.chain.keys import KEYS, TABLES
+from clpipe.chain.making import make_chain
 from clpipe.chain.registry import code_files, load_stage_file
 from clpipe.chain.rendition import BASELINES, MOSAIC, TRUTHS
 from clpipe.chain.settings import Settings, overlay

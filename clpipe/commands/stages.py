@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.base.text import one_of
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages, load_stage_file
 from clpipe.chain.request import DEFAULTS
 from clpipe.chain.settings import Settings, overlay

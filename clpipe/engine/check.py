@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.types import Array
-from clpipe.chain.chain import Chain, make_chain
+from clpipe.chain.chain import Chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device

@@ -9,8 +9,8 @@ from pydantic import BaseModel
 from clpipe.base.errors import KeyedError
 from clpipe.camera.lens import INSTALL, lens_names
 from clpipe.camera.profile import built_in_cameras, load_camera
-from clpipe.chain.chain import step_names
 from clpipe.chain.keys import ABOUT, LENS, TYPES
+from clpipe.chain.making import step_names
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings

@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from clpipe.chain.chain import step_names
 from clpipe.chain.files import config_text
 from clpipe.chain.keys import KEYS, TABLES
+from clpipe.chain.making import step_names
 from clpipe.chain.request import Request
 from clpipe.chain.toml import value_text
 from clpipe.explorer.explorer import Explorer

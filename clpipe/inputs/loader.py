@@ -9,11 +9,12 @@ from typing import Any
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, KindError, NoPictureError, RequestError
 from clpipe.base.reading import unchanged
-from clpipe.chain.chain import Chain, entry
+from clpipe.chain.chain import Chain
 from clpipe.chain.entering import enter
 from clpipe.chain.identity import image_key
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import RENDER
+from clpipe.chain.making import entry
 from clpipe.chain.methods import base_name, stage_named
 from clpipe.chain.overscan import steps_of_overscan
 from clpipe.chain.registry import stage_in

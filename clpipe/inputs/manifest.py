@@ -12,10 +12,10 @@ from clpipe.base.buckets import beside, fetch, is_url
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import read_bytes
 from clpipe.base.text import one_of
-from clpipe.chain.chain import step_names
 from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import TABLES
+from clpipe.chain.making import step_names
 from clpipe.chain.methods import TABLE_MODELS, base_name
 from clpipe.chain.paths import from_folder
 from clpipe.chain.registry import all_stages

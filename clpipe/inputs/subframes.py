@@ -12,7 +12,7 @@ from clpipe.base.digests import joint_digest
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import unchanged
 from clpipe.base.types import Array, Doubles, Floats
-from clpipe.chain.chain import step_names
+from clpipe.chain.making import step_names
 from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import Settings
 from clpipe.images.read import SourceImage

@@ -15,8 +15,9 @@ from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import several
 from clpipe.base.types import plain
 from clpipe.base.validation import typed
-from clpipe.chain.chain import Chain, make_chain
+from clpipe.chain.chain import Chain
 from clpipe.chain.files import load_settings
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import overlay
 from clpipe.stage import NoiseScope
 from clpipe.torch.table import Drawn, Table

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.types import Array
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import settings_from
 from clpipe.engine.bench import scene

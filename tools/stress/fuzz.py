@@ -83,8 +83,8 @@ def ways(suffix: str) -> tuple[Callable[[Path], object], ...]:
     from clpipe.batch.replay import replay_of
     from clpipe.batch.tars import Members, is_own
     from clpipe.camera.profile import load_camera
-    from clpipe.chain.chain import make_chain
     from clpipe.chain.files import load_settings
+    from clpipe.chain.making import make_chain
     from clpipe.chain.render_camera import RenderCamera
     from clpipe.chain.request import Request
     from clpipe.chain.settings import settings_from

@@ -33,7 +33,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from clpipe.chain.chain import Chain, make_chain
+from clpipe.chain.chain import Chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings

@@ -12,7 +12,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.text import one_line
 from clpipe.base.types import Floats
 from clpipe.camera.profile import Matrix
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.images.attributes import read_attributes
 from clpipe.images.dump import Dump, read_dump
 from clpipe.images.raw import RAW_SUFFIXES, RawFacts, read_facts, read_raw

@@ -25,7 +25,7 @@ from clpipe.analysis.matching.space import (
     variants_of,
 )
 from clpipe.base.types import Doubles, Mask
-from clpipe.chain.chain import make_chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.device import Device
 

@@ -11,7 +11,8 @@ from clpipe.analysis.matching.scenes import Scene
 from clpipe.analysis.matching.space import RESIZE
 from clpipe.base.cache import BoundedCache
 from clpipe.base.types import Array, Floats
-from clpipe.chain.chain import Chain, make_chain, step_names
+from clpipe.chain.chain import Chain
+from clpipe.chain.making import make_chain, step_names
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings

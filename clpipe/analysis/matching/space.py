@@ -13,7 +13,8 @@ from functools import cached_property
 from typing import Any, Union, get_args, get_origin
 
 from clpipe.base.errors import ClpipeError
-from clpipe.chain.chain import Chain, make_chain
+from clpipe.chain.chain import Chain
+from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings, overlay
 from clpipe.stage import Method

@@ -1,0 +1,227 @@
+"""Chains made of settings: each parameter resolved, and what does not fit refused."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+
+from clpipe.base.errors import KeyedError, RequestError
+from clpipe.base.text import one_of
+from clpipe.camera.lens import calibration_of
+from clpipe.camera.optics import Optics
+from clpipe.camera.profile import Camera, load_camera
+from clpipe.chain.chain import Chain, Step
+from clpipe.chain.isos import check_cameras
+from clpipe.chain.keys import LENS, NOISE, RENDER
+from clpipe.chain.methods import base_name, numbered, validation_errors
+from clpipe.chain.registry import all_stages, check_passes, user_code_errors
+from clpipe.chain.settings import Settings
+from clpipe.stage import (
+    Context,
+    FromLens,
+    Kind,
+    Method,
+    OfPanorama,
+    Stage,
+    Unchanged,
+)
+from clpipe.stage.context import asks_for_noise
+
+
+def make_chain(
+    settings: Settings,
+    source: Kind | None = None,
+    start_at: str | None = None,
+    until: str | None = None,
+) -> Chain:
+    """The chain of settings, every parameter resolved.
+
+    A stage that is listed a second time is called ``stage_2``, and so on. Settings with draws give
+    an example, that of the image key "", after a check of all that can be drawn; the chain of an
+    image is made of its :meth:`Settings.drawn`.
+
+    Args:
+        settings: all values that are set.
+        source: the kind of image that enters; None is that of :func:`entry`, or, with ``start_at``,
+            what that step reads.
+        start_at: the first step to run. The steps before it are resolved too, because what they do
+            to the image (pattern, gains, noise, levels) has been done.
+        until: the last step to run.
+
+    Raises:
+        RequestError: image kinds that do not fit, an unknown camera, an ISO outside its range, or a
+            step that is not in the chain.
+    """
+    check_cameras(settings)
+    draws, settings = settings.draws, settings.drawn("")
+    camera = load_camera(settings.camera)
+    steps = resolved_steps(settings, camera, source or (None if start_at else entry(settings)))
+    names = [step.name for step in steps]
+    for name in settings.parameters:
+        if name not in names and name not in all_stages():
+            raise KeyedError(name, one_of("stage in this chain", name, names))
+    first, last = 0, len(steps)
+    for name in (n for n in (start_at, until) if n is not None):
+        if name not in names:
+            raise RequestError(one_of("stage in this chain", name, names))
+    if start_at is not None:
+        first = names.index(start_at)
+    if until is not None:
+        last = names.index(until) + 1
+    if first >= last:
+        raise RequestError(
+            f"nothing is left to do; {start_at} comes after {until}"
+            if steps
+            else "stages: nothing is left to do; no stage is listed, or every one was skipped"
+        )
+    if source is None:
+        source = steps[first].stage.reads
+    chain = Chain(tuple(steps[first:last]), source, camera, settings, tuple(names), draws)
+    noiseless = NOISE in settings.skip and any(step.adds_noise for step in chain.steps)
+    return chain.without_noise() if noiseless else chain
+
+
+def entry(settings: Settings) -> Kind:
+    """The kind of image that enters a whole chain: linear RGB, or display where the first stage
+    reads that.
+
+    >>> entry(Settings(stages=("inverse_gamma", "mosaic"))).label, entry(Settings()).label
+    ('display', 'rgb')
+    """
+    stages = (all_stages().get(base_name(name)) for name in settings.stages)
+    first = next((s for s in stages if s and s.name not in settings.skip), None)
+    return Kind.DISPLAY if first and first.reads is Kind.DISPLAY else Kind.RGB
+
+
+def step_names(settings: Settings) -> list[str]:
+    """The names of the steps that are not skipped; a repeated stage gets a number.
+
+    >>> step_names(Settings(stages=("exposure", "mosaic", "exposure"), skip=("mosaic",)))
+    ['exposure', 'exposure_2']
+    """
+    return [name for name in numbered(settings.stages) if name not in settings.skip]
+
+
+def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:
+    """The steps of settings, in order, each resolved with what the steps before it did.
+
+    A step that does nothing is left out where it does not fit.
+
+    Args:
+        settings: all values that are set.
+        camera: the camera of the settings.
+        kind: the kind of image that enters; None is what the first step reads.
+
+    Raises:
+        RequestError: image kinds do not fit.
+    """
+    methods = {name: settings.method(name) for name in step_names(settings)}
+    optics = optics_of(settings, camera, methods)
+    time = optics.exposure_time
+    context = Context(camera=camera, iso=settings.iso, optics=optics, exposure_time=time)
+    steps: list[Step] = []
+    before, takes_lens = "the input", not settings.lens
+    wide = ""  # the step behind which the picture is no longer in perspective
+    for name, own in methods.items():
+        stage = all_stages()[base_name(name)].reading(kind)
+        with validation_errors(name, type(own)), user_code_errors(f"stage {name}", stage.folder):
+            fits = stage.reads is (kind or stage.reads)
+            method, follows_noise = own, True
+            if fits or isinstance(own, FromLens):
+                try:
+                    method, follows_noise = asks_for_noise(partial(own.resolve, context))
+                except RequestError:
+                    _check_behind(wide, name, own, is_at_work=True)
+                    raise
+            takes_lens |= isinstance(own, FromLens) and not isinstance(method, Unchanged)
+            if fits or isinstance(own, FromLens):  # or it was not resolved
+                _check_behind(wide, name, own, bool(method.passes()))
+            if fits and isinstance(method, OfPanorama):
+                wide = f"{name}.method={method.method}"
+            if not fits:
+                if isinstance(method, Unchanged) and stage.reads is stage.writes:
+                    continue  # so that gamma can be skipped without what does nothing behind it
+                raise RequestError(misfit(name, stage, before, kind or stage.reads))
+            after = method.next_context(context)
+            if method.passes():
+                after = replace(after, optics=after.optics.set_to(method.optics()))
+        if stage.folder:
+            check_passes(name, stage, method, context)
+        # What a user's stage looks at, nobody knows.
+        steps.append(Step(name, stage, method, context, follows_noise or bool(stage.folder)))
+        context = after
+        kind, before = stage.writes, name
+    if not takes_lens:
+        raise KeyedError("lens", _unused_lens(settings, methods))
+    return steps
+
+
+def optics_of(settings: Settings, camera: Camera, methods: Mapping[str, Method]) -> Optics:
+    """The optics that settings, the render's camera and the steps of a chain state.
+
+    Raises:
+        RequestError: two statements contradict each other, or the lens that is named cannot be
+            found, or set so.
+    """
+    stated = [
+        (key, name, value)
+        for key, name in SETTINGS.items()
+        if (value := getattr(settings, key)) is not None
+    ]
+    stated += [(f"{RENDER}.{name}", name, v) for name, v in settings.render.optics.items()]
+    for step, method in methods.items():
+        stated += [(f"{step}.{name}", name, value) for name, value in method.optics().items()]
+    optics = Optics.of(stated)
+    if not settings.lens:
+        return optics
+    set_to = optics.focal_length, optics.f_number, optics.focus_distance
+    lens = calibration_of(settings.lens, camera, *set_to)
+    return optics.with_lens(lens)
+
+
+# By the keys of settings that state optics: what they state.
+SETTINGS = dict(zip(LENS[1:], ("focal_length", "f_number", "focus_distance"), strict=True))
+
+
+def _check_behind(wide: str, name: str, method: Method, is_at_work: bool) -> None:
+    """See that a step can stand behind one that makes the picture of a wide lens.
+
+    Args:
+        wide: that one, for the message; "" where there is none.
+        name: of the step.
+        method: as it was set.
+        is_at_work: whether it does anything.
+
+    Raises:
+        RequestError: it is of pictures in perspective.
+    """
+    if not wide or not is_at_work:
+        return
+    if isinstance(method, FromLens):
+        raise KeyedError(
+            "lens", f"lens: it is of pictures in perspective, but {wide} is a lens; leave one out"
+        )
+    if "fx" in type(method).model_fields:
+        raise KeyedError(
+            name,
+            f"{name}.method={method.method}: it counts in the focal lengths of a picture in "
+            f"perspective, but {wide} makes that of a wide lens; leave it out, or take a method "
+            "that counts in px or in the picture's size",
+        )
+
+
+def _unused_lens(settings: Settings, methods: Mapping[str, Method]) -> str:
+    """The message for a lens that is named, and that no step takes."""
+    known = "lensfun knows neither distortion nor vignetting of it as it is set"
+    stages = " or ".join(s.name for s in all_stages().values() if "lens" in s.by_name)
+    takes_it = any(isinstance(method, FromLens) for method in methods.values())
+    why = known if takes_it else f"no step takes it; that is done by {stages} with method lens"
+    return f"lens: found {settings.lens}, but {why}; leave it out"
+
+
+def misfit(name: str, stage: Stage, before: str, kind: Kind) -> str:
+    """The message for a stage that cannot follow: why, and which stages could stand between."""
+    bridges = [s.name for s in all_stages().values() if (s.reads, s.writes) == (kind, stage.reads)]
+    help_ = f"put {' or '.join(bridges)} between them" if bridges else f"leave out {name} as well"
+    if before == "the input":
+        help_ += f", or enter there with an image of that kind: --start-at {name}"
+    return f"stage {name} reads {stage.reads.label}, but {before} gives {kind.label}; {help_}"
