@@ -155,7 +155,8 @@ def test_what_is_wrong_with_a_url_is_said(bucket, clpipe, monkeypatch):
         return " ".join(text.split())
 
     assert "flaky://b/none: no image is there" in told("flaky://b/none", "-o", "o", status=2)
-    assert "nosuch://b/x: " in told("nosuch://b/x", "-o", "o", status=2)
+    for url in ("nosuch://b/x", "nosuch://b/x.exr"):
+        assert f"clpipe: {url}: Protocol not known" in told(url, "-o", "o", status=2)
     text = told("flaky://b/gone.exr", "in/x0/r0.exr", "-o", "o", status=1)
     assert "flaky://b/gone.exr: cannot be read: " in text and "1 of 2 images done" in text
     assert "'..'" in told("flaky://b/../x.exr", "-o", "o", status=2)

@@ -40,7 +40,7 @@ INSTALL = "pip install 'clpipe[cloud]'"
 CHANGES = ["ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime"]
 CHANGES += ["updated", "modified", "created"]
 
-# What does not pass.
+# What does not pass: nothing there, no permission, or what a file system cannot do at all.
 FINAL = (FileNotFoundError, PermissionError, IsADirectoryError, NotImplementedError)
 
 
@@ -102,6 +102,15 @@ def beside(folder: Path, text: str) -> str | None:
     if joined.split("/")[0] != bucket or text.startswith("/"):
         raise RequestError(f"path: found {text}, which leads out of {scheme}://{bucket}")
     return f"{scheme}://{joined}"
+
+
+def check_url(url: str) -> None:
+    """See that fsspec knows a URL's scheme; nothing is asked of a server.
+
+    Raises:
+        RequestError: it does not, or a package is not installed.
+    """
+    _opened(url)
 
 
 def is_glob(url: str) -> bool:

@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
-from clpipe.base.buckets import is_glob, is_url, listed, url_of
+from clpipe.base.buckets import check_url, is_glob, is_url, listed, url_of
 from clpipe.base.errors import RequestError
 from clpipe.base.text import printable
 from clpipe.chain.rendition import Rendition
@@ -199,6 +199,7 @@ def _jobs_behind(url: str, endings: Sequence[str], excluded: Exclusion) -> list[
     """
     is_pattern = is_glob(url)
     if not is_pattern and Path(url).suffix.lower() in endings:  # one that is missing fails alone
+        check_url(url)
         return [Job(place_of_url(url), url.rpartition("/")[2], written=url)]
     root = url.rstrip("/")
     jobs = []
