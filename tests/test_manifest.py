@@ -1,6 +1,7 @@
 """Manifests: what their rows say, and what is said of a row that is wrong."""
 
 import json
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from clpipe.chain.files import load_settings
 from clpipe.chain.making import make_chain
 from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
+from clpipe.chain.toml import toml_value
 from clpipe.inputs.manifest import Row, check_rows, read_manifest
 from tests.conftest import noise_report
 
@@ -353,3 +355,31 @@ def test_values_that_rows_share_are_checked_once(tmp_path, monkeypatch):
     checked = check_rows(rows, settings_from({}), lambda path: path.suffix == ".dng")
     assert len(checked) == 100
     assert len(overlaid) == 1 + 50 + 2  # the faulty ones are named one by one
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0",
+        "-0",
+        "+5",
+        "007",
+        "1.50",
+        "1.",
+        "-.5",
+        "1_000",
+        "0x10",
+        "1e3",
+        "12345678901234567890",
+        "-0.0",
+        "1.5.2",
+        "٣",
+        "00.5",
+    ],
+)
+def test_a_plain_number_is_what_toml_says(text: str) -> None:
+    try:
+        expected = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        expected = float(text) if text in ("1.", "-.5") else text
+    assert repr(toml_value(text)) == repr(expected)

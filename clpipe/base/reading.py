@@ -79,7 +79,9 @@ def read_bytes(path: Path, most: int = TEXT_BYTES) -> bytes:
     """
     size = check_regular(path).st_size
     with path.open("rb") as file:
-        data = b"" if size > most else file.read(most + 1)  # it may grow
+        data = b"" if size > most else file.read(size + 1)
+        if len(data) > size:  # it has grown
+            data += file.read(most + 1 - len(data))
     if max(size, len(data)) > most:
         found = in_words(max(size, len(data)))
         raise OSError(errno.EFBIG, f"it has {found}; at most {in_words(most)} are read")

@@ -135,7 +135,7 @@ def replay_of(
     return replay
 
 
-def _values(path: Path) -> dict[str, Any]:
+def _values(path: Path) -> Mapping[str, Any]:
     """The values of a sidecar of this version.
 
     Raises:

@@ -25,7 +25,7 @@ from clpipe.batch.threads import Batch
 from clpipe.batch.where import Where
 from clpipe.batch.work import ImageWorker
 from clpipe.chain.chain import Chain
-from clpipe.chain.rendition import FIRST, Rendition
+from clpipe.chain.rendition import Rendition
 from clpipe.engine.device import Device
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
@@ -47,12 +47,9 @@ class StagedWriter(OutputWriter):
 
     folders: Mapping[str, str] = field(default_factory=dict)  # by the stem of a job
 
-    def path(
-        self, job: Job, ending: str, rendition: Rendition = FIRST, patch: int | None = None
-    ) -> Path:
-        """The file of a job with an ending, until it is packed."""
-        path = super().path(job, ending, rendition, patch).relative_to(self.folder)
-        return self.folder / self.folders[job.stem] / path
+    def name(self, job: Job, ending: str) -> str:
+        """The name of a job's file, until it is packed."""
+        return f"{self.folder}/{self.folders[job.stem]}/{job.stem}{ending}"
 
     def existing(self, job: Job, rendition: Rendition) -> Existing:
         """The files of a rendition, in a folder that is clpipe's own."""

@@ -124,10 +124,11 @@ class ImageWorker:
         state, here = JobState(job, self.loader), job
         with state.timed("decode"):
             try:
-                state.loader = self.loader.for_job(job)
-                state.request = self._request_of(state)
+                job.check()
+                state.request = self._request_of(job)
                 renditions = self._missing(state)
                 if renditions:
+                    state.loader = self.loader.for_job(job)
                     with fetched(job.paths) as (first, *others):
                         if first != job.path:
                             here = replace(job, path=first, subframes=tuple(others))
@@ -143,12 +144,12 @@ class ImageWorker:
                     state.error = state.loader.error_text(here, error)
         return state
 
-    def _request_of(self, state: JobState) -> Mapping[str, Any]:
-        """The record of the request for a state's image."""
-        job = state.job
-        if state.loader is self.loader:
+    def _request_of(self, job: Job) -> Mapping[str, Any]:
+        """The record of the request for a job's image."""
+        if not self.loader.has_own_values(job):
             return {**self._general_request, "image_name": job.key}
-        return self.writer.request.for_image(job.key, job.values).record()
+        own = self.writer.request.for_image(job.key, job.values)
+        return own.record_over(self._general_request)
 
     @cached_property
     def _general_request(self) -> Mapping[str, Any]:

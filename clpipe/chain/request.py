@@ -304,11 +304,23 @@ class Request:
         Raises:
             RequestError: as :meth:`settings`.
         """
-        values = {name: getattr(self, name) for name in RECORDED}
+        return _as_read_back(
+            {**{name: getattr(self, name) for name in RECORDED}, "files": self._files()}
+        )
+
+    def record_over(self, record: Mapping[str, Any]) -> dict[str, Any]:
+        """The same, from the record of a request that differs in the image alone.
+
+        Raises:
+            RequestError: as :meth:`settings`.
+        """
+        own = {"image": self.image, "image_name": self.image_name, "files": self._files()}
+        return {**record, **_as_read_back(own)}
+
+    def _files(self) -> dict[str, str]:
+        """The SHA-256 of all files that are named."""
         code = code_files([Path(file) for file in self.stage_files])
-        values["files"] = digests([*self.settings().files(), *map(str, code)])
-        record: dict[str, Any] = json.loads(json.dumps(values))  # as it is read back
-        return record
+        return digests([*self.settings().files(), *map(str, code)])
 
     def _general(self) -> Settings:
         """The options over the configuration: the settings of all images, nothing drawn."""
@@ -332,3 +344,9 @@ class ResolvedRequest(Request):
     """
 
     truth_keep: tuple[str, ...] = ()
+
+
+def _as_read_back(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values as JSON gives them back."""
+    read: dict[str, Any] = json.loads(json.dumps(values))
+    return read

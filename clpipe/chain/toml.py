@@ -28,6 +28,7 @@ def line_of(text: str, key: str) -> int | None:
 
 
 POINTED = re.compile(r"[+-]?(\d+\.|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
+PLAIN_NUMBER = re.compile(r"[+-]?(?:0|[1-9]\d{0,99})(\.\d+)?", re.ASCII)
 
 
 def parse_assignment(text: str) -> tuple[str, str, Any]:
@@ -55,6 +56,8 @@ def toml_value(text: str) -> Any:
     >>> toml_value(".5"), toml_value("-2."), toml_value(".")
     (0.5, -2.0, '.')
     """
+    if plain := PLAIN_NUMBER.fullmatch(text):  # which a parser takes thirty times as long for
+        return float(text) if plain[1] else int(text)
     try:
         table = parse_toml(f"value = {text}")
     except ValueError:

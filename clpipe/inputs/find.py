@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from clpipe.base.buckets import check_url, is_glob, is_url, listed, url_of
-from clpipe.base.errors import RequestError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.text import printable
 from clpipe.chain.rendition import Rendition
 from clpipe.images.raw import RAW_SUFFIXES
@@ -59,6 +59,15 @@ class Job:
     size: tuple[int, int] | None = None
     problem: str = ""
     around: bool = False
+
+    def check(self) -> None:
+        """See that nothing is known that keeps it from being made.
+
+        Raises:
+            ImageError: there is.
+        """
+        if self.problem:
+            raise ImageError(f"{self.label}: {self.problem}")
 
     @property
     def paths(self) -> tuple[Path, ...]:

@@ -71,12 +71,15 @@ class ImageLoader:
         Raises:
             ImageError: the job cannot be made.
         """
-        if job.problem:
-            raise ImageError(f"{job.label}: {job.problem}")
+        job.check()
         return self._for_values(job)
 
+    def has_own_values(self, job: Job) -> bool:
+        """Whether settings hold for one job alone."""
+        return bool(job.values) or self.has_draws
+
     def _for_values(self, job: Job) -> "ImageLoader":
-        if not job.values and not self.has_draws:
+        if not self.has_own_values(job):
             return self
         return ImageLoader(self.request.for_image(job.key, job.values), self.folder)
 

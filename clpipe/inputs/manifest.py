@@ -14,7 +14,7 @@ from clpipe.base.reading import read_bytes
 from clpipe.base.text import one_of
 from clpipe.chain.identity import MAX_FRAMES
 from clpipe.chain.isos import check_cameras
-from clpipe.chain.keys import TABLES
+from clpipe.chain.keys import TABLES, check_type
 from clpipe.chain.making import step_names
 from clpipe.chain.methods import TABLE_MODELS, base_name
 from clpipe.chain.paths import from_folder
@@ -25,6 +25,7 @@ from clpipe.inputs.spool import place_of_url
 from clpipe.inputs.tables import OWN, PLAIN, TEXTS, csv_records, json_records
 
 MANIFEST_SUFFIXES = (".csv", ".jsonl")
+ALONE = ("seed", "noise_key")  # values that no other depends on, and often differ by row
 MANIFEST_BYTES = 256 * 2**20  # enough for two million rows
 
 
@@ -83,8 +84,7 @@ def read_manifest(path: Path) -> list[Row]:
     for line, record in read(path, text, _check_column):
         place = f"{path}, row {line}"
         try:
-            row = _row(path.parent, place, record())
-            row = replace(row, values=alike.setdefault(repr(row.values), row.values))
+            row = _row(path.parent, place, record(), alike)
             other = makers.setdefault(row.stem, row)
             if other is not row:
                 raise RequestError(
@@ -168,21 +168,28 @@ def check_rows(
     steps = step_names(settings)
     faults: list[str] = []
     checked: list[Settings] = []
-    known: dict[tuple[int, bool], Settings] = {}  # rows may share their values
+    known: dict[tuple[str, bool], Settings] = {}  # rows may share their values
     for row in rows:
         carried = carries(row.path)
-        if shared := known.get((id(row.values), carried)):
-            checked.append(shared)
-            continue
+        alone = {
+            key: value
+            for key, value in row.values.items()
+            if key in ALONE and not isinstance(value, Mapping)
+        }
+        others = {key: value for key, value in row.values.items() if key not in alone}
+        alike = repr(others), carried
         try:
-            own = overlay(settings, row.values)
-            if not carried:
-                check_cameras(own)
-                for step in row.values:
-                    if step not in (*PLAIN, *TABLES, *steps):
-                        raise RequestError(one_of("stage in this chain", step, steps))
-            checked.append(own)
-            known[id(row.values), carried] = own
+            if alike not in known:
+                own = overlay(settings, others)
+                if not carried:
+                    check_cameras(own)
+                    for step in others:
+                        if step not in (*PLAIN, *TABLES, *steps):
+                            raise RequestError(one_of("stage in this chain", step, steps))
+                known[alike] = own
+            for key, value in alone.items():
+                check_type(key, value)
+            checked.append(replace(known[alike], **alone) if alone else known[alike])
         except RequestError as error:
             faults.append(f"{row.place}: {error}")
     _report(faults)
@@ -232,8 +239,16 @@ def _check_column(name: str) -> None:
         raise RequestError(one_of(f"key of {step}", parameter, fields))
 
 
-def _row(folder: Path, place: str, record: Mapping[str, Any]) -> Row:
+def _row(
+    folder: Path, place: str, record: Mapping[str, Any], alike: dict[str, Mapping[str, Any]]
+) -> Row:
     """A row from its values by column.
+
+    Args:
+        folder: of the manifest.
+        place: the manifest and the row.
+        record: the values.
+        alike: values of other rows, which are shared where they are the same.
 
     Raises:
         RequestError: path, name or frames are not allowed.
@@ -263,7 +278,8 @@ def _row(folder: Path, place: str, record: Mapping[str, Any]) -> Row:
     else:
         own = folder / path
         key = name or key_of(folder, own)
-    return Row(own, key, name, from_folder(folder, values), frames, place)
+    values = from_folder(folder, values)
+    return Row(own, key, name, alike.setdefault(repr(values), values), frames, place)
 
 
 def check_output_name(name: str) -> None:

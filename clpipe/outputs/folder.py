@@ -98,7 +98,8 @@ def _locked(path: Path, length: int, first: int) -> int:
 
 def remove_unfinished(folder: Path, jobs: Iterable[Job], patches: bool = False) -> None:
     """Remove the unfinished files that a killed run left of these jobs, or of their patches."""
-    stems = {str(Path(job.stem).with_name(shortened(Path(job.stem).name))) for job in jobs}
+    named = (os.path.split(job.stem) for job in jobs)
+    stems = {os.path.join(folder, shortened(name)) for folder, name in named}
 
     def is_ours(stem: str) -> bool:
         return stem in stems or (patches and without_patch(stem) in stems)

@@ -7,7 +7,7 @@ from pathlib import Path
 from clpipe.base.reading import read_bytes
 from clpipe.inputs.find import Job
 from clpipe.outputs.sealed import SIDECAR, SidecarError, values_in
-from clpipe.outputs.writer import OutputWriter
+from clpipe.outputs.writer import OutputWriter, ending_behind
 
 
 def pictures_without_input(writer: OutputWriter, jobs: Sequence[Job], inputs: Sequence[str]) -> int:
@@ -21,22 +21,27 @@ def pictures_without_input(writer: OutputWriter, jobs: Sequence[Job], inputs: Se
         jobs: all of it.
         inputs: as the user gave them.
     """
-    own = {writer.path(job, SIDECAR, each) for job in jobs for each in writer.renditions_of(job)}
-    beside = {Path(job.input).parent for job in jobs}
+    own = {
+        writer.name(job, ending_behind(SIDECAR, each))
+        for job in jobs
+        for each in writer.renditions_of(job)
+    }
+    beside = {Path(text) for text in {os.path.dirname(job.input) for job in jobs}}
     below = [Path(text) for text in inputs if os.path.isdir(text)]
     count = 0
     for place, folders, names in os.walk(writer.folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        for path in (Path(place, name) for name in names if name.endswith(f".{SIDECAR}")):
-            if path in own:
+        for name in names:
+            if not name.endswith(f".{SIDECAR}") or f"{place}/{name}" in own:
                 continue
+            path = Path(place, name)
             try:
                 values = values_in(read_bytes(path), path) or {}
             except (OSError, SidecarError):
                 continue
-            name = values.get("input")
-            if not isinstance(name, str) or os.path.lexists(name):
+            render = values.get("input")
+            if not isinstance(render, str) or os.path.lexists(render):
                 continue
-            was = Path(name)
+            was = Path(render)
             count += was.parent in beside or any(was.is_relative_to(each) for each in below)
     return count

@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -52,9 +52,46 @@ def sealed(record: Mapping[str, Any]) -> bytes:
     return head + _seal_of(head)
 
 
+class Parts(Mapping[str, Any]):
+    """A sidecar's values, each of which is parsed when it is asked for, as most are not.
+
+    Args:
+        data: a sidecar's bytes, whose digest fits, so that :func:`json_text` has laid them out.
+
+    Raises:
+        ValueError: they hold half a character, see :func:`~clpipe.base.reading.parse_json`.
+
+    >>> parts = Parts(sealed({"a": [{"b": 1}, {"c": 2}], "d": 3}))
+    >>> parts["a"], parts["d"], "b" in parts, list(parts)
+    ([{'b': 1}, {'c': 2}], 3, False, ['a', 'd', 'sidecar_sha256'])
+    """
+
+    def __init__(self, data: bytes) -> None:
+        if b"\\u" in data:
+            parse_json(data)
+        pairs = (part.split(b": ", 1) for part in data.split(b'\n  "')[1:])
+        self._texts = {key: value for key, *value in pairs}
+
+    def __getitem__(self, key: str) -> Any:
+        (text,) = self._texts[json.dumps(key)[1:].encode()]
+        try:
+            return parse_json(text.removesuffix(b"\n}\n").removesuffix(b","))
+        except ValueError:
+            raise KeyError(key) from None
+
+    def __contains__(self, key: object) -> bool:
+        return json.dumps(key)[1:].encode() in self._texts
+
+    def __iter__(self) -> Iterator[str]:
+        return (json.loads(b'"' + key) for key in self._texts)
+
+    def __len__(self) -> int:
+        return len(self._texts)
+
+
 def values_in(
     data: bytes, name: Path | str, parse: Callable[[bytes], Any] = parse_json
-) -> dict[str, Any] | None:
+) -> Mapping[str, Any] | None:
     """The values of a sidecar that is as clpipe wrote it, of which only :data:`OWN` is sure.
 
     Args:
@@ -74,7 +111,7 @@ def values_in(
             values = parse(data)
         except ValueError:
             values = None
-        if isinstance(values, dict) and OWN in values:
+        if isinstance(values, Mapping) and OWN in values:
             return values
     if is_sidecar(data):
         raise SidecarError(name)
@@ -87,8 +124,8 @@ def is_sidecar(data: bytes) -> bool:
     return is_cut or bool(_BEGINNING.match(data) or _END.search(data))
 
 
-def read_sidecar(path: Path) -> dict[str, Any]:
-    """A sidecar's values; see :func:`values_in`.
+def read_sidecar(path: Path, parse: Callable[[bytes], Any] = parse_json) -> Mapping[str, Any]:
+    """A sidecar's values, as ``parse`` makes them; see :func:`values_in`.
 
     Raises:
         FileNotFoundError: it is missing, or is empty, as a loss of power may leave it.
@@ -103,7 +140,7 @@ def read_sidecar(path: Path) -> dict[str, Any]:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
     if not data.strip(b"\0"):
         raise FileNotFoundError(path)
-    values = values_in(data, path)
+    values = values_in(data, path, parse)
     if values is None:
         raise ImageError(
             f"{path}: clpipe did not write this file, and would overwrite it with its sidecar; "

@@ -3,8 +3,9 @@
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from clpipe.base.errors import ImageError, OutputError, RequestError
 from clpipe.base.files import Stored, keep_names
@@ -41,6 +42,34 @@ from clpipe.outputs.sealed import SIDECAR, remove_sidecar
 from clpipe.outputs.shot import kept_tags, tags_of
 from clpipe.reference.geometry import NO_MARGINS
 from clpipe.stage import Kind
+
+
+class Endings(NamedTuple):
+    """What is behind a job's stem in the names of a rendition's files.
+
+    Args:
+        sidecar: in that of the sidecar.
+        pictures: in those that every such rendition has.
+        others: in those of further files that may be written.
+    """
+
+    sidecar: str
+    pictures: tuple[str, ...]
+    others: tuple[str, ...]
+
+    @property
+    def every(self) -> tuple[str, ...]:
+        """All of them."""
+        return (self.sidecar, *self.pictures, *self.others)
+
+
+def ending_behind(ending: str, rendition: Rendition, patch: int | None = None) -> str:
+    """All that is behind a job's stem in the name of a file.
+
+    >>> ending_behind("jpg", Rendition("clean"), 3)
+    '_0003.truth_clean.jpg'
+    """
+    return f"{patch_name(patch)}{rendition.suffix}.{ending}"
 
 
 @dataclass(frozen=True)
@@ -125,13 +154,15 @@ class OutputWriter:
         self, job: Job, rendition: Rendition, patch: int | None = None
     ) -> dict[str, Path]:
         """The files of carried layers: that of all, "", and the PNGs of some by their names."""
+        endings = self._carried_endings(rendition).items()
+        return {name: self.path(job, ending, patch=patch) for name, ending in endings}
+
+    def _carried_endings(self, rendition: Rendition) -> dict[str, str]:
+        """The endings of :meth:`_carried_files`."""
         if not self.carries(rendition):
             return {}
         depths = [each.name for each in self.request.aov_specs() if each.png]
-        return {
-            "": self.path(job, f"{CARRIED}.exr", patch=patch),
-            **{name: self.path(job, png_ending(name), patch=patch) for name in depths},
-        }
+        return {"": f"{CARRIED}.exr", **{name: png_ending(name) for name in depths}}
 
     def _kept_steps(self, recipe: Recipe) -> list[str]:
         """The steps of a rendition's chain whose image is written, too."""
@@ -193,13 +224,12 @@ class OutputWriter:
             RequestError: one is.
         """
         real_folder = os.path.realpath(self.folder)
-        inputs = {os.path.realpath(job.path) for job in jobs}
+        inputs = set(map(os.path.realpath, {str(job.path) for job in jobs}))
         inside = {path for path in inputs if path.startswith(real_folder + os.sep)}
         makers: dict[str, Job] = {}
         for job in jobs:
             for rendition in self.renditions_of(job):
-                files = self.existing(job, rendition)
-                for path in map(str, (files.sidecar, *files.pictures, *files.others)):
+                for path in (self.name(job, ending) for ending in self._endings(rendition).every):
                     if inside and os.path.realpath(path) in inside:
                         raise RequestError(
                             f"{path} is an input and would be overwritten; "
@@ -216,7 +246,11 @@ class OutputWriter:
         self, job: Job, ending: str, rendition: Rendition = FIRST, patch: int | None = None
     ) -> Path:
         """The file of a job with an ending; ``patch`` is the number of a patch of the rendition."""
-        return self.folder / f"{job.stem}{patch_name(patch)}{rendition.suffix}.{ending}"
+        return Path(self.name(job, ending_behind(ending, rendition, patch)))
+
+    def name(self, job: Job, ending: str) -> str:
+        """The name of a job's file; ``ending`` is all that is behind the job's stem."""
+        return f"{self.folder}/{job.stem}{ending}"
 
     def check_size(self, source: SourceImage, chain: Chain) -> None:
         """See that what a chain makes of an image fits into the formats.
@@ -233,15 +267,32 @@ class OutputWriter:
         never written, so kept images need not be there. Of a grid of patches, whose number follows
         from the image, the first is named.
         """
-        count = self.patches.least if self.patches else 0
-        numbers = range(count) if self.patches else (None,)
-        endings = [ending_of(format_) for format_ in self.formats_of(rendition)]
-        pictures = [self.path(job, ending, rendition, n) for n in numbers for ending in endings]
+        endings = self._endings(rendition)
+        pictures, others = (
+            [Path(self.name(job, ending)) for ending in own]
+            for own in (endings.pictures, endings.others)
+        )
+        return Existing(Path(self.name(job, endings.sidecar)), pictures, others)
+
+    def _endings(self, rendition: Rendition) -> "Endings":
+        """What is behind a job's stem in the names of a rendition's files."""
+        if found := self._known_endings.get(rendition):
+            return found
+        numbers = range(self.patches.least) if self.patches else (None,)
+        formats = [ending_of(format_) for format_ in self.formats_of(rendition)]
+        kept = [f"{step}.{self.kept_format}" for step in self.keep_of(rendition)]
+        pictures = [ending_behind(each, rendition, n) for n in numbers for each in formats]
         for n in numbers:
-            pictures += self._carried_files(job, rendition, n).values()
-        endings = [f"{step}.{self.kept_format}" for step in self.keep_of(rendition)]
-        kept = [self.path(job, ending, rendition, n) for n in numbers for ending in endings]
-        return Existing(self.path(job, SIDECAR, rendition), pictures, kept)
+            carried = self._carried_endings(rendition).values()
+            pictures += [ending_behind(each, FIRST, n) for each in carried]
+        others = [ending_behind(each, rendition, n) for n in numbers for each in kept]
+        found = Endings(ending_behind(SIDECAR, rendition), tuple(pictures), tuple(others))
+        self._known_endings[rendition] = found
+        return found
+
+    @cached_property
+    def _known_endings(self) -> "dict[Rendition, Endings]":
+        return {}
 
     def check_folder(self) -> None:
         """See that the output folder can still be written to.
