@@ -53,6 +53,7 @@ class Camera(BaseModel):
     black_level: Annotated[float, Field(ge=0, le=65535)]
     white_level: Annotated[float, Field(gt=0, le=65535)]
     white_balance_gains: tuple[Positive, Positive]  # red, blue
+    filter_array: str = ""  # a name or rows of letters, see the stage mosaic; "" is a Bayer pattern
     xyz_to_camera: Matrix | None = None  # XYZ to camera RGB at D65, as a DNG's ColorMatrix2
     row_noise_ratio: NotNegative = 0.0  # row sigma over read noise, for stages without a table
     column_noise_ratio: NotNegative = 0.0

@@ -13,6 +13,7 @@ from clpipe.chain.draws import Draw
 from clpipe.chain.methods import validation_errors
 from clpipe.chain.registry import user_code_errors
 from clpipe.chain.settings import Settings
+from clpipe.reference.filter_array import FilterArray
 from clpipe.reference.geometry import NO_MARGINS, Composition, Margins
 from clpipe.reference.intrinsics import Intrinsics
 from clpipe.reference.random import Stream, stream_of
@@ -102,6 +103,12 @@ class Chain:
         return last.context.optics.set_to(last.method.optics())
 
     @property
+    def array(self) -> FilterArray | None:
+        """The filter array of its mosaic, where that has no Bayer pattern."""
+        last = self.steps[-1]
+        return last.method.next_context(last.context).array
+
+    @property
     def result(self) -> Kind:
         """The kind of image that comes out."""
         return self.steps[-1].stage.writes if self.steps else self.source
@@ -179,7 +186,8 @@ class Chain:
         left = []
         for step in self.steps:
             name, folder = step.name, step.stage.folder
-            method = self.settings.method(name)
+            is_set = bool(self.settings.parameters.get(name))
+            method = step.stage.chosen(self.settings.method(name), is_set, step.context)
             if not step.follows_noise and type(method).noise_free is Method.noise_free:
                 left.append((step, step.method.without_noise()))  # as it would be resolved again
                 continue

@@ -121,8 +121,9 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
     steps: list[Step] = []
     before, takes_lens = "the input", not settings.lens
     wide = ""  # the step behind which the picture is no longer in perspective
-    for name, own in methods.items():
+    for name, as_set in methods.items():
         stage = all_stages()[base_name(name)].reading(kind)
+        own = stage.chosen(as_set, bool(settings.parameters.get(name)), context)
         with validation_errors(name, type(own)), user_code_errors(f"stage {name}", stage.folder):
             fits = stage.reads is (kind or stage.reads)
             method, follows_noise = own, True
@@ -141,6 +142,7 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
                 if isinstance(method, Unchanged) and stage.reads is stage.writes:
                     continue  # so that gamma can be skipped without what does nothing behind it
                 raise RequestError(misfit(name, stage, before, kind or stage.reads))
+            _check_array(name, method, context)
             after = method.next_context(context)
             if method.passes():
                 after = replace(after, optics=after.optics.set_to(method.optics()))
@@ -206,6 +208,23 @@ def _check_behind(wide: str, name: str, method: Method, is_at_work: bool) -> Non
             f"{name}.method={method.method}: it counts in the focal lengths of a picture in "
             f"perspective, but {wide} makes that of a wide lens; leave it out, or take a method "
             "that counts in px or in the picture's size",
+        )
+
+
+def _check_array(name: str, method: Method, context: Context) -> None:
+    """See that a method which knows Bayer patterns alone has one.
+
+    Raises:
+        KeyedError: the mosaic has another filter array.
+    """
+    array = context.array
+    if array and any("pattern" in pass_.all_arguments for pass_ in method.passes()):
+        fitting = [m.method for m in all_stages()[base_name(name)].methods if m.any_array]
+        rest = f"take {name}.method={' or '.join(fitting)}" if fitting else f"skip {name}"
+        raise KeyedError(
+            name,
+            f"{name}.method={method.method}: it knows Bayer patterns alone, but the mosaic is "
+            f"{array.name}; {rest}",
         )
 
 

@@ -103,14 +103,22 @@ def compare(
     return total
 
 
-def chain_for(
-    stage: Stage, method: type[Method], values: Mapping[str, Any], pattern: Pattern
-) -> Chain:
-    """One method of a stage as a chain that starts on what it reads, in that pattern."""
+# Filter arrays that are no Bayer patterns: of odd and even periods, with and without clear pixels.
+ARRAYS = ("x-trans", "RGBW", "RCCB", "RGB/GBR/BRG", "mono")
+
+
+def laid(pattern: str) -> dict[str, str]:
+    """The parameters of the stage mosaic that lay a Bayer pattern, or another array."""
+    return {"pattern": pattern} if pattern in PATTERNS else {"method": "array", "array": pattern}
+
+
+def chain_for(stage: Stage, method: type[Method], values: Mapping[str, Any], pattern: str) -> Chain:
+    """One method of a stage as a chain that starts on what it reads, in that pattern or array."""
     before = {Kind.MOSAIC: ("mosaic",), Kind.RAW: ("mosaic", "quantize")}.get(stage.reads, ())
-    parameters: dict[str, dict[str, Any]] = {"mosaic": {"pattern": pattern}}
+    parameters: dict[str, dict[str, Any]] = {"mosaic": dict(laid(pattern))}
     own = {"method": method.method, **method.example, **values}
-    parameters[stage.name] = parameters.get(stage.name, {}) | own
+    others = parameters.get(stage.name, {})
+    parameters[stage.name] = {k: v for k, v in others.items() if k in method.model_fields} | own
     settings = Settings(iso=ISO, stages=(*before, stage.name), parameters=parameters)
     return make_chain(settings, start_at=stage.name)
 
@@ -129,7 +137,8 @@ def check_method(
     patterns: Sequence[Pattern] | None = None,
     values: Mapping[str, Any] | None = None,
 ) -> Check:
-    """One method of a stage, in these patterns (None is all) if it depends on the pattern.
+    """One method of a stage, in these patterns (None is all) if it depends on the pattern; one that
+    takes any filter array in :data:`ARRAYS`, too.
 
     ``values`` are parameters that choose a variant of the method; a variant is checked in the first
     of the patterns.
@@ -138,11 +147,12 @@ def check_method(
     # A variant reads the pattern through the same functions as the method's default.
     if values or not depends_on_pattern(stage, method, values):
         patterns = patterns[:1]
-    total = Difference()
-    for pattern in patterns:
+    takes_any = method.any_array and stage.reads is Kind.MOSAIC and not values
+    total, every = Difference(), (*patterns, *(ARRAYS if takes_any else ()))
+    for pattern in every:
         total += compare(device, chain_for(stage, method, values, pattern), sizes)
     label = variant_label(method, values)
-    return Check(stage.name, label, len(patterns) * len(sizes), total, method.tolerance)
+    return Check(stage.name, label, len(every) * len(sizes), total, method.tolerance)
 
 
 # Every source of noise at work.

@@ -29,6 +29,7 @@ from clpipe.engine.kernel_builder import KernelBuilder
 from clpipe.engine.ops import Op
 from clpipe.engine.sources import LIBRARY, files_text
 from clpipe.engine.work_items import PARTIALS, RUN, columns_of, local_size, summed_together
+from clpipe.reference.filter_array import MIRRORED
 from clpipe.stage import Kind, LineTable, TableLookup
 
 # What is known of the origin when compiling: it is in whole blocks, so the rows that share a
@@ -85,7 +86,9 @@ def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
             text += files_text(kernels_of([launch.op]), seen)
         case Border():
             at = "(uint)get_global_id(0), (uint)get_global_id(1)"
-            body = f"    fill_border({builder.slot(launch.slot, True)}, {at}, e);\n"
+            down, across = (n if n > MIRRORED else 0 for n in launch.period or (0, 0))
+            plane = builder.slot(launch.slot, True)
+            body = f"    fill_border({plane}, {at}, {down}, {across}, e);\n"
     signature = ",\n    ".join(p.declaration for p in builder.parameters.values())
     size = 1 if isinstance(launch, Finalize) else local_size(lanes)
     setup = "".join(f"    {line}\n" for line in builder.setup)

@@ -135,9 +135,10 @@ class Device:
 
     def _borders(self, plan: Plan, written: Launch) -> Iterator[Call]:
         """The calls that fill the borders of the planes that a launch has written."""
-        slots = plan.slots[written.writes.number] if written.writes else ()
-        for slot in slots:
-            border = Border(slot, written.level)
+        if not (image := written.writes):
+            return
+        for slot in plan.slots[image.number]:
+            border = Border(slot, written.level, image.period)
             yield self._border_calls.get(border, partial(self._call, plan, border))
 
     def submit(

@@ -255,7 +255,7 @@ class Flow:
             if extent.is_empty:
                 continue
             calls = [image.calls[number]]
-            if isinstance(launch, Launch) and extent.is_small:
+            if isinstance(launch, Launch) and (extent.is_small or launch.has_period):
                 calls += image.borders(launch)
             events = []
             for call in calls:

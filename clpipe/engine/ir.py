@@ -13,11 +13,16 @@ from clpipe.stage import Kind, Pointwise, Resample, Stencil
 
 @dataclass(frozen=True)
 class Image:
-    """An image between launches."""
+    """An image between launches.
+
+    ``period`` is that of a mosaic whose array a mirrored border would not go on with: its rows and
+    columns.
+    """
 
     number: int
     kind: Kind
     level: int = 0
+    period: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,11 @@ class Launch:
         """The op that opens the group and reads images by itself, if one does."""
         opens = self.ops and isinstance(self.ops[0].pass_.access, Stencil | Resample)
         return self.ops[0] if opens else None
+
+    @property
+    def has_period(self) -> bool:
+        """Whether it writes a mosaic with a period, whose border it does not fill."""
+        return self.writes is not None and self.writes.period is not None
 
     @property
     def stencil(self) -> Stencil | None:
@@ -102,11 +112,13 @@ class Finalize:
 class Border:
     """One launch that fills the border of a plane, after stores that do not fill it.
 
-    It is in no plan: only images that are hardly wider than two borders need it.
+    It is in no plan: only images that are hardly wider than two borders need it, and mosaics with a
+    ``period``.
     """
 
     slot: int
     level: int = 0
+    period: tuple[int, int] | None = None
     name: str = "border"
 
 

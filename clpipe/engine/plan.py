@@ -33,8 +33,9 @@ INCREMENTAL_BORDER = 4
 
 
 class _Planner:
-    def __init__(self, source: Kind, fold: bool) -> None:
+    def __init__(self, source: Kind, fold: bool, period: tuple[int, int] | None) -> None:
         self.kind = source
+        self.period = period
         self.fold = fold
         self.launches: list[AnyLaunch] = []
         self.lines: dict[int, list[Op]] = {}  # by level
@@ -52,7 +53,8 @@ class _Planner:
         return len(self.resamplings)
 
     def new_image(self) -> Image:
-        image = Image(len(self.images), self.kind, self.level)
+        period = self.period if self.kind in (Kind.MOSAIC, Kind.RAW) else None
+        image = Image(len(self.images), self.kind, self.level, period)
         self.images.append(image)
         return image
 
@@ -203,7 +205,9 @@ def make_plan(
         chain = chain.through(keep)
     last = chain.steps[-1].name
     final = final or last in keep
-    planner = _Planner(chain.source, fold)
+    array = chain.array
+    period = array.period if array and array.needs_border else None
+    planner = _Planner(chain.source, fold, period)
     kept: dict[str, Image] = {}
     arguments = {step.name: step.method.arguments(step.context) for step in chain.steps}
     for name, ops in chain_ops(chain, arguments):

@@ -9,6 +9,7 @@ What a stage file may import is all in ``__all__`` here, and only from here. The
 """
 
 from clpipe.base.types import Array, Floats
+from clpipe.stage.arrays import PERIOD, levels_table, period_of
 from clpipe.stage.bases import (
     AboutAxis,
     Curve,
@@ -40,6 +41,7 @@ from clpipe.stage.passes import (
 )
 
 __all__ = [
+    "PERIOD",
     "AboutAxis",
     "Argument",
     "Arguments",
@@ -68,8 +70,10 @@ __all__ = [
     "Stencil",
     "TableLookup",
     "Unchanged",
+    "levels_table",
     "odd_size",
     "parameter",
+    "period_of",
     "run_reference",
     "variant_label",
     "variants",

@@ -11,6 +11,7 @@ from clpipe.camera.optics import Optics
 from clpipe.camera.profile import IDENTITY, Camera, Matrix
 from clpipe.reference.cfa import Pattern, red_site
 from clpipe.reference.defocus import Depth
+from clpipe.reference.filter_array import FilterArray
 from clpipe.reference.random import Stream
 from clpipe.stage.passes import CompileTime, NoiseScope
 
@@ -39,6 +40,7 @@ class Context:
     camera: Camera
     iso: float
     pattern: Pattern = "RGGB"
+    array: FilterArray | None = None  # of a mosaic that has no Bayer pattern
     gains: tuple[float, float] = (1.0, 1.0)  # red, blue: taken out by inverse_white_balance
     applied_gains: tuple[float, float] = (1.0, 1.0)  # red, blue: put back by white_balance
     exposure_time: float | None = None  # s, where exposure knows it

@@ -72,6 +72,8 @@ class Method(BaseModel):
     # Parameters of which one may be set: a configuration's gives way to an option's, and that to a
     # manifest's.
     alternatives: ClassVar[frozenset[str]] = frozenset()
+    # Whether it takes mosaics of any filter array, where others of its stage know Bayer's alone.
+    any_array: ClassVar[bool] = False
     # Whether its image may go on beyond the picture: it does the same everywhere, or counts places
     # from the picture, which ``margins`` says.
     overscan: ClassVar[bool] = False
@@ -202,7 +204,8 @@ class Stage:
 
     ``explain`` describes in a few lines how automatic parameters follow from the context. ``also``
     are further kinds that it may read; it then writes the same kind. ``role`` is what it is beyond
-    its chain.
+    its chain. ``usual`` gives the method where nothing is set of the stage, by its context; None is
+    the default.
     """
 
     name: str
@@ -214,6 +217,18 @@ class Stage:
     folder: Path | None = None  # of a plug-in's kernel files
     also: tuple[Kind, ...] = ()
     role: StageRole | None = None
+    usual: Callable[[Context], Method | None] | None = None
+
+    def chosen(self, method: Method, is_set: bool, context: Context) -> Method:
+        """The method at a place of a chain: the one that is set, or what is usual there.
+
+        Args:
+            method: as the settings have it.
+            is_set: whether they say anything of the stage.
+            context: of the step.
+        """
+        usual = None if is_set or not self.usual else self.usual(context)
+        return usual or method
 
     def reading(self, kind: Kind | None) -> "Stage":
         """The stage where an image of a kind enters it; the stage as it is if it reads no such."""

@@ -8,7 +8,7 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import by_site
 from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stage, StageRole
-from clpipe.stages.white_balance.gains import CameraGains
+from clpipe.stages.white_balance.gains import CameraGains, OfArray
 
 
 class Gains(CameraGains):
@@ -22,12 +22,17 @@ class Gains(CameraGains):
     method: ClassVar = "gains"
     kernel: ClassVar = "site_gains"
     summary: ClassVar = "divide red and blue by the camera's white balance gains"
+    any_array: ClassVar = True
 
     @property
     def factors(self) -> tuple[np.float32, np.float32]:
         """The factors of red and blue."""
         red, blue = self.gains
         return np.float32(1 / red), np.float32(1 / blue)
+
+    def resolve(self, context: Context) -> CameraGains:
+        own = super().resolve(context)
+        return ArrayGains.on(context.array, own) if context.array else own
 
     def next_context(self, context: Context) -> Context:
         return replace(context, gains=self.gains)
@@ -46,6 +51,19 @@ class Gains(CameraGains):
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         red, blue = self.factors
         return image * by_site(image.shape, given.context.pattern, red, np.float32(1), blue)
+
+
+class ArrayGains(OfArray, Gains):
+    """The same, on any filter array: white fills the most sensitive channel."""
+
+    function: ClassVar = "white_to_level"
+    inverse: ClassVar = False
+
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+        return before * self.factors_at(signal.shape[:2]) ** 2
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        return image * self.factors_at(image.shape)
 
 
 STAGE = Stage(

@@ -1,13 +1,23 @@
 """The colour filter array."""
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
+from clpipe.reference.filter_array import (
+    LETTERS,
+    NAMED,
+    FilterArray,
+    kernel_table,
+    parse_array,
+    tiled,
+)
 from clpipe.stage import (
+    PERIOD,
     Arguments,
     Context,
     Kind,
@@ -17,6 +27,7 @@ from clpipe.stage import (
     Stage,
     StageRole,
     parameter,
+    period_of,
 )
 
 
@@ -38,7 +49,7 @@ class Bayer(Method):
     )
 
     def next_context(self, context: Context) -> Context:
-        return replace(context, pattern=self.pattern)
+        return replace(context, pattern=self.pattern, array=None)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("mosaic", arguments=("pattern",)),)
@@ -51,11 +62,81 @@ class Bayer(Method):
         return by_site(image.shape, self.pattern, red, green, blue)
 
 
+class AnyArray(Method):
+    """A filter array of any period to 8x8: mono, RCCB, Quad Bayer, X-Trans, or rows of letters.
+
+    Channels are R, G, B, W (clear), Y, C, M, I (near infrared) and L (no filter at all). What each
+    sees of white-balanced red, green and blue follows from the camera's white balance; white is 1
+    in all of them. Behind inverse_white_balance white fills the most sensitive channel, as that is
+    what a camera exposes for.
+
+    >>> from clpipe.stage import run_reference
+    >>> image = np.float32([1, 2, 3]) * np.ones((1, 4, 1), np.float32)
+    >>> run_reference(AnyArray(array="RRGG/GGBB"), image).tolist()
+    [[1.0, 1.0, 2.0, 2.0]]
+    """
+
+    method: ClassVar = "array"
+    kernel: ClassVar = "filter_array"
+    summary: ClassVar = "a filter array of any period: by name, or rows of letters"
+    other_examples: ClassVar = ({"array": "RGBW"},)
+    any_array: ClassVar = True
+
+    array: str = parameter(
+        "x-trans",
+        "The filter array: "
+        + ", ".join(NAMED)
+        + "; or its rows, with letters of "
+        + f"{LETTERS} and / between, such as RG/GB.",
+        structural=True,
+    )
+
+    def resolve(self, context: Context) -> "Method":
+        self._laid(context)  # or it is refused
+        return self
+
+    def _laid(self, context: Context) -> FilterArray:
+        return parse_array(self.array, context.camera.white_balance_gains)
+
+    def next_context(self, context: Context) -> Context:
+        return replace(context, array=self._laid(context))
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("filter_array", arguments=("responses", *PERIOD)),)
+
+    def arguments(self, context: Context) -> Arguments:
+        array = self._laid(context)
+        return {"responses": responses_table(array), **period_of(array)}
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        table = responses_of(self._laid(given.context))
+        red, green, blue = (tiled(table[:, c], image.shape) for c in range(3))
+        return (image[..., 0] * red + image[..., 1] * green) + image[..., 2] * blue
+
+
+def responses_of(array: FilterArray) -> Floats:
+    """What the filter at each place lets through: (row, colour, column)."""
+    colours = [{k: float(v[c]) for k, v in array.responses.items()} for c in range(3)]
+    return np.stack([array.by_place(each) for each in colours], axis=1)
+
+
+@lru_cache(maxsize=64)  # one object for the same array, so that it is uploaded once
+def responses_table(array: FilterArray) -> Floats:
+    """The same, as kernels load it."""
+    return kernel_table(responses_of(array))
+
+
+def _of_camera(context: Context) -> Method | None:
+    array = context.camera.filter_array
+    return AnyArray(array=array) if array else None
+
+
 STAGE = Stage(
     "mosaic",
     "Lay a colour filter array over the image.",
     Kind.RGB,
     Kind.MOSAIC,
-    (Bayer,),
+    (Bayer, AnyArray),
     role=StageRole.PATTERN,
+    usual=_of_camera,
 )

@@ -129,11 +129,19 @@ INLINE int mirrored(int place, int n, int border) {
     return within < n ? within : period - within;
 }
 
+// The pixel that stands at a place of a side of n, or of the border around it: the nearest one in whole periods
+// of a filter array, or, without a period, or on a side that is shorter, the mirrored one.
+INLINE int stand_in(int place, int n, int border, int period) {
+    if (!period || n < period) return mirrored(place, n, border);
+    if (place < 0) return place + (period - 1 - place) / period * period;
+    return place < n ? place : place - ((place - n) / period + 1) * period;
+}
+
 // One place of a plane and its border, `column` and `row` counted from the border's corner.
-INLINE void fill_border(__global float *plane, uint column, uint row, extent e) {
+INLINE void fill_border(__global float *plane, uint column, uint row, int down, int across, extent e) {
     const int border = (int)e.border, columns = (int)e.columns;
     const int x = (int)column - border, y = (int)row - border;
-    const int from_x = mirrored(x, columns, border), from_y = mirrored(y, (int)e.rows, border);
+    const int from_x = stand_in(x, columns, border, across), from_y = stand_in(y, (int)e.rows, border, down);
     __global float *origin = plane + (size_t)border * e.pitch + border_left(e);
     if (x < columns + border && (x != from_x || y != from_y))
         origin[(long)y * (long)e.pitch + x] = origin[(long)from_y * (long)e.pitch + from_x];

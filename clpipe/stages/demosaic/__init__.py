@@ -1,18 +1,30 @@
 """Demosaicing: three colours at every pixel from one; each algorithm has its own file."""
 
-from clpipe.stage import Kind, Stage
+from clpipe.stage import Context, Kind, Method, Stage
 from clpipe.stages.demosaic.bilinear import Bilinear
 from clpipe.stages.demosaic.bounded import Bounded
 from clpipe.stages.demosaic.edge_directed import EdgeDirected
 from clpipe.stages.demosaic.edge_directed_median import EdgeDirectedMedian
+from clpipe.stages.demosaic.linear_mmse import Gray, LinearMmse
 from clpipe.stages.demosaic.malvar2004 import Malvar2004
 from clpipe.stages.demosaic.median import Median
 from clpipe.stages.demosaic.menon2007 import Menon2007
+
+
+def _of_array(context: Context) -> Method | None:
+    if not context.array:
+        return None
+    return Gray() if context.array.is_gray else LinearMmse()
+
 
 STAGE = Stage(
     "demosaic",
     "Give every pixel its two missing colours.",
     Kind.MOSAIC,
     Kind.RGB,
-    (Bounded, EdgeDirectedMedian, EdgeDirected, Median, Bilinear, Malvar2004, Menon2007),
+    (
+        *(Bounded, EdgeDirectedMedian, EdgeDirected, Median, Bilinear, Malvar2004, Menon2007),
+        *(LinearMmse, Gray),
+    ),
+    usual=_of_array,
 )

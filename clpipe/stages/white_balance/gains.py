@@ -4,10 +4,13 @@ from dataclasses import replace
 from typing import ClassVar, Self
 
 import numpy as np
+from pydantic import PrivateAttr
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
+from clpipe.reference.filter_array import FilterArray, tiled
 from clpipe.stage import (
+    PERIOD,
     Arguments,
     Context,
     Method,
@@ -15,7 +18,9 @@ from clpipe.stage import (
     Pointwise,
     ReferenceContext,
     Unchanged,
+    levels_table,
     parameter,
+    period_of,
 )
 
 
@@ -65,7 +70,7 @@ class CameraGains(Method):
         None, "White balance gain of blue, green = 1.", auto="from the camera", gt=0, le=64
     )
 
-    def resolve(self, context: Context) -> Self:
+    def resolve(self, context: Context) -> "CameraGains":
         red, blue = context.camera.white_balance_gains
         return self.with_defaults(red_gain=red, blue_gain=blue)
 
@@ -74,6 +79,38 @@ class CameraGains(Method):
         """The (resolved) gains of red and blue."""
         assert self.red_gain is not None and self.blue_gain is not None
         return self.red_gain, self.blue_gain
+
+
+class OfArray(CameraGains):
+    """Gains on a filter array that is no Bayer pattern: one for each of its channels."""
+
+    kernel: ClassVar = "filter_array"
+    function: ClassVar = "level_to_white"
+    inverse: ClassVar = True  # whether white becomes 1, or is 1
+
+    _array: FilterArray = PrivateAttr()
+
+    @classmethod
+    def on(cls, array: FilterArray, own: CameraGains) -> Self:
+        """The (resolved) gains on a filter array."""
+        made = cls(**own.model_dump())
+        made._array = replace(array, gains=own.gains)
+        return made
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass(self.function, arguments=("factors", *PERIOD)),)
+
+    def arguments(self, context: Context) -> Arguments:
+        table = levels_table(self._array, self.inverse)
+        return {"factors": table, **period_of(self._array)}
+
+    def factors_at(self, shape: tuple[int, ...]) -> Floats:
+        """The factor of each pixel of a mosaic, (height, width)."""
+        rows, columns = self._array.period
+        return tiled(levels_table(self._array, self.inverse)[:rows, :columns], shape)
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        return np.minimum(image * self.factors_at(image.shape), np.float32(1))
 
 
 class Gains(CameraGains):
@@ -88,6 +125,11 @@ class Gains(CameraGains):
     method: ClassVar = "gains"
     kernel: ClassVar = "site_gains"
     summary: ClassVar = "fixed gains, by default the camera's"
+    any_array: ClassVar = True
+
+    def resolve(self, context: Context) -> CameraGains:
+        own = super().resolve(context)
+        return ArrayGains.on(context.array, own) if context.array else own
 
     def next_context(self, context: Context) -> Context:
         return replace(context, applied_gains=self.gains)
@@ -103,6 +145,10 @@ class Gains(CameraGains):
         return apply_gains(image, given.context, *map(np.float32, self.gains))
 
 
+class ArrayGains(OfArray, Gains):
+    """The same, on any filter array."""
+
+
 class AsShot(Gains):
     """min(y * gain, 1), with the gains that ``inverse_white_balance`` divided by, else 1."""
 
@@ -116,9 +162,14 @@ class AsShot(Gains):
         None, "Gain of blue, green = 1.", auto="as inverse_white_balance used it", gt=0, le=64
     )
 
-    def resolve(self, context: Context) -> Self:
+    def resolve(self, context: Context) -> CameraGains:
         red, blue = context.gains
-        return self.with_defaults(red_gain=red, blue_gain=blue)
+        own = self.with_defaults(red_gain=red, blue_gain=blue)
+        return ArrayAsShot.on(context.array, own) if context.array else own
+
+
+class ArrayAsShot(OfArray, AsShot):
+    """The same, on any filter array."""
 
 
 class Unbalanced(Unchanged):
@@ -126,3 +177,4 @@ class Unbalanced(Unchanged):
 
     method: ClassVar = "none"
     summary: ClassVar = "no gains"
+    any_array: ClassVar = True

@@ -1,0 +1,21 @@
+"""What stages share that know filter arrays of any period: arguments of their kernels."""
+
+from functools import lru_cache
+
+from clpipe.base.types import Floats
+from clpipe.reference.filter_array import FilterArray, kernel_table
+from clpipe.stage.passes import CompileTime
+
+PERIOD = ("rows", "columns")  # arguments of ``kernels/lib/table.h``
+
+
+def period_of(array: FilterArray) -> dict[str, CompileTime]:
+    """The period as compiled-in arguments."""
+    return dict(zip(PERIOD, (CompileTime(f"{size}u") for size in array.period), strict=True))
+
+
+@lru_cache(maxsize=64)  # one object for the same array, so that it is uploaded once
+def levels_table(array: FilterArray, inverse: bool) -> Floats:
+    """The level of white at each place, or its inverse, as kernels load it: (row, column)."""
+    levels = {k: 1 / v if inverse else v for k, v in array.levels.items()}
+    return kernel_table(array.by_place(levels))

@@ -1,0 +1,83 @@
+"""Demosaicing for any filter array."""
+
+from functools import lru_cache
+from typing import ClassVar
+
+import numpy as np
+
+from clpipe.base.types import Floats
+from clpipe.reference.cfa import Pattern
+from clpipe.reference.filter_array import FilterArray, kernel_table, parse_array
+from clpipe.reference.linear_mmse import RADIUS, filters, linear_mmse
+from clpipe.stage import (
+    PERIOD,
+    Arguments,
+    Context,
+    Method,
+    Pass,
+    Pointwise,
+    ReferenceContext,
+    Stencil,
+    period_of,
+)
+
+
+@lru_cache(maxsize=4)
+def of_bayer(pattern: Pattern) -> FilterArray:
+    """A Bayer pattern as a filter array."""
+    return parse_array(f"{pattern[:2]}/{pattern[2:]}")
+
+
+@lru_cache(maxsize=16)  # one object for the same array, so that it is uploaded once
+def weights_table(array: FilterArray) -> Floats:
+    """The filters of an array as kernels load them: (row, tap, channel, column)."""
+    return kernel_table(filters(array).transpose(0, 2, 3, 1))
+
+
+class LinearMmse(Method):
+    """For each place of the period, the linear filter of 7x7 that leaves the least mean square
+    error under a model of images (after Trussell and Hartley, ICIP 2002).
+
+    >>> from clpipe.stage import run_reference
+    >>> run_reference(LinearMmse(), np.full((4, 4), 0.5, np.float32))[1, 2].round(6).tolist()
+    [0.5, 0.5, 0.5]
+    """
+
+    method: ClassVar = "linear_mmse"
+    kernel: ClassVar = "demosaic_linear_mmse"
+    summary: ClassVar = "the best linear filters of 7x7, for any filter array"
+    any_array: ClassVar = True
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("linear_mmse", Stencil(RADIUS), ("weights", *PERIOD)),)
+
+    @staticmethod
+    def _array(context: Context) -> FilterArray:
+        return context.array or of_bayer(context.pattern)
+
+    def arguments(self, context: Context) -> Arguments:
+        array = self._array(context)
+        return {"weights": weights_table(array), **period_of(array)}
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        return linear_mmse(image, self._array(given.context))
+
+
+class Gray(Method):
+    """The mosaic in red, green and blue alike: for a sensor without filters.
+
+    >>> from clpipe.stage import run_reference
+    >>> run_reference(Gray(), np.float32([[0.25]])).tolist()
+    [[[0.25, 0.25, 0.25]]]
+    """
+
+    method: ClassVar = "gray"
+    kernel: ClassVar = "demosaic_gray"
+    summary: ClassVar = "no colours: for a sensor without filters"
+    any_array: ClassVar = True
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("gray", Pointwise()),)
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        return np.repeat(image[..., None], 3, axis=-1)
