@@ -9,7 +9,7 @@ import numpy as np
 
 from clpipe.analysis.edges import slopes_of
 from clpipe.analysis.intensity import bin_edges, noise_by_intensity, pool_curves
-from clpipe.analysis.pictures import SITES, WHOLE, Picture
+from clpipe.analysis.pictures import WHOLE, Picture
 from clpipe.analysis.repeats import check_repeats
 from clpipe.analysis.report import NoiseReport
 from clpipe.analysis.selection import select_unclipped
@@ -24,6 +24,8 @@ from clpipe.stage import Kind
 
 # The share of pixels that count, the channels, the correlations of pairs of them, covariances.
 Parts = tuple[float, tuple[Channel, ...], dict[tuple[str, str], float], dict[str, Doubles]]
+
+CORRELATED = 4  # sites of a mosaic, of which each pair is correlated
 
 
 def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseReport:
@@ -218,14 +220,16 @@ def mosaic_channels(
     edges: Doubles,
     freedom: float,
 ) -> Parts:
-    """The four sites of a mosaic, each as one plane, and the whole mosaic as one plane."""
-    height, width = (size // 2 * 2 for size in clean.shape)
+    """The sites of a mosaic, each as one plane, and the whole mosaic as one plane."""
+    own = sites(first.pattern)
+    steps = next(iter(own.values()))
+    height, width = (size // at.step * at.step for size, at in zip(clean.shape, steps, strict=True))
     whole_mask = np.zeros((height, width), bool)
     centred, standard = (np.zeros((len(noise), height, width), np.float32) for _ in range(2))
     channels, curves = [], []
     slices = {
-        name: np.s_[..., rows.start : height : 2, columns.start : width : 2]
-        for name, (rows, columns) in sites(first.pattern).items()
+        name: np.s_[..., rows.start : height : rows.step, columns.start : width : columns.step]
+        for name, (rows, columns) in own.items()
     }
     for name, at in slices.items():
         mask = select_unclipped(clean[at], clipped[at], edges, start[at])
@@ -247,7 +251,7 @@ def mosaic_channels(
     sigma = float(noise.std(dtype=np.float64))
     channels.append(replace(channel, whole_sigma=sigma, size=noise.size))
     correlations = {}
-    for a, b in combinations(SITES, 2):
+    for a, b in combinations(slices if len(slices) <= CORRELATED else (), 2):
         both = whole_mask[slices[a]] & whole_mask[slices[b]]
         correlations[a, b] = correlation(standard[slices[a]], standard[slices[b]], both)
     return float(whole_mask.mean()), tuple(channels), correlations, {}

@@ -12,10 +12,8 @@ from clpipe.chain.settings import Settings
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import holds_mosaic, photograph_facts, read_finished, read_image
 from clpipe.inputs.kept import embedded_settings
-from clpipe.reference.cfa import Pattern
 from clpipe.stage import Context, Kind
 
-SITES = ("R", "G1", "G2", "B")  # the channels of a mosaic; G1 is in the rows of red
 WHOLE = "mosaic"  # the channel of all sites together
 
 
@@ -31,7 +29,7 @@ class Picture:
     path: Path
     kind: str
     pixels: Floats
-    pattern: Pattern = "RGGB"
+    pattern: str = "RGGB"  # Bayer's, or rows of letters
     black: float | None = None
     white: float | None = None
     balance: str = ""  # of a kept mosaic, in words: the white balance gains taken out and applied
@@ -59,7 +57,7 @@ class Picture:
         return clipped
 
 
-def load_picture(path: Path, pattern: Pattern = "RGGB") -> Picture:
+def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
     """Read an image of any stage: a kept EXR, a render, a mosaic or a finished picture.
 
     A kept raw is converted from DN to signal by its own levels. A mosaic without clpipe's settings
@@ -101,12 +99,12 @@ def load_picture(path: Path, pattern: Pattern = "RGGB") -> Picture:
     balance = f"without the gains {removed} and with the gains {applied}"
     black, white = context.black_level, context.white_level
     if black is None or white is None:  # not digitised, so nothing clips at a lower end
-        clean = Picture(path, "mosaic", pixels, context.pattern, white=1.0)
+        clean = Picture(path, "mosaic", pixels, context.filters.pattern, white=1.0)
         return replace(clean, balance=balance, iso=iso)
     lowest = -black / (white - black)
     if kind == Kind.RAW.label:
         pixels = (pixels - np.float32(black)) / np.float32(white - black)
-    return Picture(path, "mosaic", pixels, context.pattern, lowest, 1.0, balance, iso)
+    return Picture(path, "mosaic", pixels, context.filters.pattern, lowest, 1.0, balance, iso)
 
 
 def context_after(settings: Settings, stage: str | None) -> Context:

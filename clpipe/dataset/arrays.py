@@ -8,7 +8,7 @@ import numpy as np
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.text import one_of
 from clpipe.base.types import Array
-from clpipe.reference.cfa import Pattern, sites
+from clpipe.reference.cfa import sites
 from clpipe.stage import Kind
 
 DTYPES = ("float16", "float32", "uint16")
@@ -34,7 +34,7 @@ def dtype_named(dtype: Any) -> str | None:
     return name
 
 
-def packed(mosaic: Array, pattern: Pattern) -> Array:
+def packed(mosaic: Array, pattern: str) -> Array:
     """A mosaic of even height and width as planes: (4, height / 2, width / 2) in R, Gr, Gb, B.
 
     Gr is green in the rows of red.
@@ -45,7 +45,7 @@ def packed(mosaic: Array, pattern: Pattern) -> Array:
     return np.stack([mosaic[site] for site in sites(pattern).values()])
 
 
-def unpacked(planes: Array, pattern: Pattern) -> Array:
+def unpacked(planes: Array, pattern: str) -> Array:
     """The mosaic of planes, as :func:`packed` makes them.
 
     >>> unpacked(np.array([2, 1, 4, 3]).reshape(4, 1, 1), "GRBG").tolist()
@@ -113,12 +113,12 @@ class ArrayFormat:
             image = image * np.float32(HIGHEST)
         return self.ordered(self._typed(image, self.dtype))
 
-    def mosaic(self, mosaic: Array, pattern: Pattern) -> Array:
+    def mosaic(self, mosaic: Array, pattern: str) -> Array:
         """A raw, (height, width) in DN or in signal, as a sample has it."""
         mosaic = self._typed(mosaic, self.dtype or "uint16")
         return packed(mosaic, pattern) if self.raw == "packed" else mosaic
 
-    def variance(self, variance: Array, pattern: Pattern) -> Array:
+    def variance(self, variance: Array, pattern: str) -> Array:
         """A variance of each pixel, (height, width), as a sample has it: float32."""
         variance = packed(variance, pattern) if self.raw == "packed" else variance
         return np.require(variance, requirements=("C", "W"))

@@ -52,6 +52,11 @@ class SampleSpec:
                 f"found patch {patches.size}; a packed raw has planes of half the size, so give an "
                 "even one"
             )
+        if self.arrays.raw == "packed" and chain.array:
+            raise RequestError(
+                f"raw='packed': its planes are of a Bayer pattern, but the mosaic is "
+                f"{chain.array.name}; say raw='mosaic'"
+            )
         self.arrays.check(chain.result)
         if self.truth:
             picture_without_noise(self.truth, chain)  # refuses a chain that adds no noise

@@ -15,6 +15,7 @@ from clpipe.dataset.arrays import packed, unpacked
 from clpipe.images.arrays import as_array
 from clpipe.outputs.patches import pattern_of
 from clpipe.pipeline import Pipeline
+from clpipe.reference.cfa import PATTERNS
 
 FIRST, LAST = (
     "crosstalk",
@@ -118,6 +119,10 @@ class RawNoise(ReadOnly):
     def _noisy(self, pipeline: Pipeline, raw: Array, key: str) -> Array:
         """One raw with noise, of two or three dimensions."""
         is_packed = raw.ndim == 3 and len(raw) == PACKED
+        if is_packed and self._pattern not in PATTERNS:
+            raise RequestError(
+                f"found planes, but the mosaic is {self._pattern}, no Bayer pattern; give mosaics"
+            )
         mosaic = unpacked(raw, self._pattern) if is_packed else raw.reshape(raw.shape[-2:])
         noisy = pipeline.process(mosaic, key).image
         noisy = packed(noisy, self._pattern) if is_packed else noisy.reshape(raw.shape)

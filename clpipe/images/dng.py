@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from clpipe.base.about import __version__
-from clpipe.base.errors import ImageError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import Stored, write_whole
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.camera.noise import NoiseModel
@@ -20,8 +20,8 @@ from clpipe.camera.profile import SRGB_TO_XYZ
 from clpipe.images import tiff
 from clpipe.images.encoding import SIMULATED
 from clpipe.images.tags import Tags, exif
-from clpipe.reference.cfa import Pattern, red_site
 from clpipe.reference.curve import to_8_bit
+from clpipe.reference.filter_array import FilterArray
 from clpipe.reference.transfer import srgb_curve
 
 PREVIEW_SIDE = 512  # px, at most
@@ -39,65 +39,109 @@ class Negative:
     """What a raw converter needs to know of a raw.
 
     ``step`` is the step of the chain whose image is the raw; None is the image that enters the
-    chain. Levels are in DN; ``gains`` are those of white balance for red and blue (green = 1).
-    ``xyz_to_camera`` is the 3x3 matrix from CIE XYZ under D65 to the sensor's RGB before white
-    balance. ``noise`` is None where it is unknown. ``tone`` is the tone curve that the raw is meant
-    for: on linear sRGB, (height, width, 3), in units of the white level.
+    chain. Levels are in DN. ``array`` is its filter array, with the gains of white balance.
+    ``xyz_to_camera`` is the matrix from CIE XYZ under D65 to the raw's channels before white
+    balance: (channel, 3). ``noise`` is None where it is unknown. ``tone`` is the tone curve that
+    the raw is meant for: on linear sRGB, (height, width, 3), in units of the white level.
     """
 
     step: str | None
-    pattern: Pattern
+    array: FilterArray
     black_level: float
     white_level: int
-    gains: tuple[float, float]
     xyz_to_camera: Doubles
     noise: NoiseModel | None
     tone: Callable[[Floats], Floats]
 
 
-def xyz_to_camera(colours: Doubles, gains: tuple[float, float]) -> Doubles:
-    """The 3x3 ColorMatrix of a raw: CIE XYZ under D65 to the sensor's RGB before white balance.
+# What a DNG calls channels (CFAPattern).
+CODES = {"R": 0, "G": 1, "B": 2, "C": 3, "M": 4, "Y": 5, "W": 6}
 
-    It maps the white D65 to 1/gain, which is AsShotNeutral, so a converter needs no chromatic
-    adaptation. It is scaled as Adobe's matrices: the white D50 becomes 1 in the strongest channel.
+
+def planes_of(array: FilterArray) -> list[str]:
+    """The channels of an array in the order of a DNG's planes.
+
+    What stands for green is in the middle, where converters that know red, green and blue alone
+    look for it.
+    """
+    own = list(array.channels)
+    middle = [letter for letter in own if letter not in "RB"]
+    return (
+        own
+        if "G" in own
+        else [*(x for x in "R" if x in own), *middle, *(x for x in "B" if x in own)]
+    )
+
+
+def check_array(array: FilterArray) -> None:
+    """See that a DNG can hold the raw of a filter array.
+
+    Raises:
+        RequestError: it has a channel that DNG does not know.
+    """
+    unknown = [letter for letter in array.channels if letter not in CODES]
+    if unknown and not array.is_gray:
+        raise RequestError(
+            f"--format dng: {array.name} has the channel {unknown[0]}, which DNG does not know; it "
+            f"knows {', '.join(CODES)}, and sensors of one channel"
+        )
+
+
+def xyz_to_camera(colours: Doubles, array: FilterArray) -> Doubles:
+    """The ColorMatrix of a raw, (channel, 3): CIE XYZ under D65 to its channels, not balanced.
+
+    It maps the white D65 to AsShotNeutral, so a converter needs no chromatic adaptation. It is
+    scaled as Adobe's matrices: the white D50 becomes 1 in the strongest channel.
 
     Args:
         colours: 3x3, linear sRGB to the mosaic's colours after white balance.
-        gains: white balance gains of red and blue.
+        array: the filter array, with the gains of white balance.
 
     >>> from clpipe.camera.profile import load_camera
+    >>> from clpipe.reference.filter_array import parse_array
     >>> camera = load_camera("sony-a7r2")
-    >>> xyz_to_camera(camera.srgb_to_camera(), camera.white_balance_gains).round(3).tolist()[0]
+    >>> array = parse_array("RG/GB", camera.white_balance_gains)
+    >>> xyz_to_camera(camera.srgb_to_camera(), array).round(3).tolist()[0]
     [0.663, -0.19, -0.048]
     """
-    red, blue = gains
-    matrix = np.diag([1 / red, 1, 1 / blue]) @ colours @ np.linalg.inv(SRGB_TO_XYZ)
+    seen = np.stack([array.responses[letter] for letter in planes_of(array)])
+    levels = [array.levels[letter] for letter in planes_of(array)]
+    matrix = np.diag(levels) @ seen @ colours @ np.linalg.inv(SRGB_TO_XYZ)
     return np.asarray(matrix / (matrix @ D50_XYZ).max())
 
 
 def preview(dn: Array, negative: Negative) -> Array:
     """A small sRGB picture of a mosaic, (height, width, 3) uint8, at most 512 pixels a side.
 
-    Each pixel is one red, green and blue site of the mosaic, as noisy as they are, and has the tone
+    Each pixel is one period of the mosaic, the mean of each channel's sites, and has the tone
     curve: RawTherapee makes its own curve so that its picture has as many dark and bright pixels.
     """
-    rows, columns = (max(side // 2, 1) for side in dn.shape)
+    array = negative.array
+    down, across = array.period
+    rows, columns = max(dn.shape[0] // down, 1), max(dn.shape[1] // across, 1)
     block = -(-max(rows, columns) // PREVIEW_SIDE)
-    high, wide, middle = max(rows // block, 1), max(columns // block, 1), block // 2 * 2
-    red_x, red_y = red_site(negative.pattern)
+    high, wide = max(rows // block, 1), max(columns // block, 1)
+    middle_y, middle_x = block // 2 * down, block // 2 * across
 
     def site(x: int, y: int) -> Floats:
-        top, left = min(middle + y, dn.shape[0] - 1), min(middle + x, dn.shape[1] - 1)
-        found = dn[top :: 2 * block, left :: 2 * block]
+        top, left = min(middle_y + y, dn.shape[0] - 1), min(middle_x + x, dn.shape[1] - 1)
+        found = dn[top :: down * block, left :: across * block]
         return found[:high, :wide].astype(np.float32)
 
-    green = (site(1 - red_x, red_y) + site(red_x, 1 - red_y)) / 2
-    planes = np.stack([site(red_x, red_y), green, site(1 - red_x, 1 - red_y)], axis=-1)
+    def mean(letter: str) -> Floats:
+        found = [site(x, y) for y, x in np.argwhere(array.letters == letter).tolist()]
+        return np.asarray(sum(found[1:], found[0]) / len(found), np.float32)
+
+    planes = np.stack([mean(letter) for letter in planes_of(array)], axis=-1)
     signal = (planes - negative.black_level) / (negative.white_level - negative.black_level)
-    neutral = np.array([1 / negative.gains[0], 1, 1 / negative.gains[1]])
+    neutral = np.array([array.levels[letter] for letter in planes_of(array)])
     clipped = np.clip(signal / neutral, 0, 1) * neutral
-    to_camera = negative.xyz_to_camera @ SRGB_TO_XYZ
-    linear = clipped @ np.linalg.inv(to_camera).T * to_camera.sum(1)[1]
+    if array.is_gray:
+        linear = np.repeat(clipped, 3, axis=-1)
+    else:
+        to_camera = negative.xyz_to_camera @ SRGB_TO_XYZ
+        strongest = neutral.argmax()
+        linear = clipped @ np.linalg.pinv(to_camera).T * to_camera.sum(1)[strongest]
     picture = negative.tone(np.clip(linear, 0, 1).astype(np.float32))
     shown = np.clip(picture.astype(np.float64), 0, 1)  # which rounding may leave
     return to_8_bit(srgb_curve(shown).astype(np.float32))
@@ -125,7 +169,14 @@ def main_directory(
     Its offsets are 0 until the file is laid out. Arguments as :func:`write_dng`, with the preview.
     """
     whole_name = tags.model if tags.model.startswith(tags.make) else f"{tags.make} {tags.model}"
-    red, blue = negative.gains
+    neutral = [negative.array.levels[letter] for letter in planes_of(negative.array)]
+    colour: tiff.Directory = {}
+    if not negative.array.is_gray:  # which has no colours
+        colour = {
+            50721: tiff.signed_rational(*negative.xyz_to_camera.ravel().round(7)),  # ColorMatrix1
+            50728: tiff.rational(*neutral),  # AsShotNeutral
+            50778: tiff.short(D65),  # CalibrationIlluminant1
+        }
     return {
         **tiff.image_fields(small, subfile_type=1, photometric=2),  # RGB
         **noise_fields(negative),
@@ -143,21 +194,28 @@ def main_directory(
         50706: tiff.byte(1, 4, 0, 0),  # DNGVersion
         50707: tiff.byte(1, 1, 0, 0),  # DNGBackwardVersion
         50708: tiff.text(SIMULATED + whole_name),  # UniqueCameraModel
-        50721: tiff.signed_rational(*negative.xyz_to_camera.ravel().round(7)),  # ColorMatrix1
-        50728: tiff.rational(1 / red, 1, 1 / blue),  # AsShotNeutral
-        50778: tiff.short(D65),  # CalibrationIlluminant1
+        **colour,
     }
 
 
 def raw_directory(dn: Array, negative: Negative) -> tiff.Directory:
     """The directory of the mosaic, (height, width) in DN; its offset is 0 until it is known."""
+    array = negative.array
+    filters: tiff.Directory = {}
+    if not array.is_gray:
+        filters = {
+            33421: tiff.short(*array.period),  # CFARepeatPatternDim
+            33422: tiff.byte(
+                *(CODES[letter] for row in array.rows for letter in row)
+            ),  # CFAPattern
+            50710: tiff.byte(*(CODES[letter] for letter in planes_of(array))),  # CFAPlaneColor
+            50711: tiff.short(1),  # CFALayout: rectangular
+        }
     return {
-        **tiff.image_fields(dn, subfile_type=0, photometric=32803),  # a colour filter array
+        # A colour filter array, or LinearRaw.
+        **tiff.image_fields(dn, subfile_type=0, photometric=32803 if filters else 34892),
         **noise_fields(negative),
-        33421: tiff.short(2, 2),  # CFARepeatPatternDim
-        33422: tiff.byte(*("RGB".index(colour) for colour in negative.pattern)),  # CFAPattern
-        50710: tiff.byte(0, 1, 2),  # CFAPlaneColor
-        50711: tiff.short(1),  # CFALayout: rectangular
+        **filters,
         50713: tiff.short(1, 1),  # BlackLevelRepeatDim
         50714: tiff.rational(negative.black_level),  # BlackLevel
         50717: tiff.long(negative.white_level),  # WhiteLevel
@@ -173,7 +231,8 @@ def noise_fields(negative: Negative) -> tiff.Directory:
     directory, so both have it.
     """
     noise = negative.noise
-    return {51041: tiff.double(*[noise.a, noise.b] * 3)} if noise else {}
+    planes = len(negative.array.channels)
+    return {51041: tiff.double(*[noise.a, noise.b] * planes)} if noise else {}
 
 
 def write_dng(

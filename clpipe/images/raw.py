@@ -17,13 +17,14 @@ import numpy as np
 
 from clpipe.base.errors import ImageError
 from clpipe.base.reading import check_regular
-from clpipe.base.types import Floats
+from clpipe.base.types import Array, Floats
 from clpipe.camera.profile import SRGB_TO_XYZ, Matrix
 from clpipe.images.dng import D65
 from clpipe.images.encoding import SIMULATED
 from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS, check_size
 from clpipe.images.tags import DATE
-from clpipe.reference.cfa import PATTERNS, Pattern
+from clpipe.reference.cfa import PATTERNS
+from clpipe.reference.filter_array import MONO
 
 RAW_SUFFIXES = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef"),
@@ -60,7 +61,7 @@ class RawFacts:
     iso: float | None
     exposure: float | None  # s
     visible_area: tuple[int, int, int, int]  # of the sensor, px: left, top, width, height
-    pattern: Pattern  # of the visible area
+    pattern: str  # of the visible area: Bayer's, or rows of letters with / between
     black_levels: tuple[int, int, int, int]  # of the pattern's four sites, row by row
     white_level: int
     as_shot: tuple[float, float, float]  # white balance multipliers of red, green, blue
@@ -98,7 +99,7 @@ def read_facts(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> RawFacts:
             raise ImageError(f"{path}: names no camera, ISO or exposure; {DUMP_HINT}")
         size = raw.sizes
         by_colour = raw.black_level_per_channel
-        cell = raw.raw_colors_visible[:2, :2].ravel()
+        cell = np.resize(_colours(raw)[:2, :2], 4)
         first, second, third, fourth = (int(by_colour[c]) for c in cell)
         red, green, blue = map(float, raw.camera_whitebalance[:3])
         matrix = _matrix(raw.rgb_xyz_matrix[:3])
@@ -158,12 +159,11 @@ def read_raw(path: Path, facts: RawFacts, max_pixels: int = USUAL_MAX_PIXELS) ->
     with _opened(path, max_pixels) as raw:
         _pattern(path, raw)
         mosaic = np.array(raw.raw_image_visible, np.float32)
+        blacks = np.array(raw.black_level_per_channel, np.float32)[_colours(raw)]
     # For a file whose pixels were removed, LibRaw returns whatever was in memory.
     if path.stat().st_size * 8 < LEAST_BITS * mosaic.size or mosaic.min() == mosaic.max():
         raise ImageError(f"{path}: holds no pixels, only metadata")
-    for site, black in enumerate(facts.black_levels):
-        mosaic[site // 2 :: 2, site % 2 :: 2] += np.float32(facts.black_level - black)
-    return mosaic
+    return mosaic + np.float32(facts.black_level) - blacks
 
 
 def check_raw(path: Path) -> None:
@@ -226,29 +226,36 @@ def _shot(raw: Any) -> tuple[float, float, float, float]:
     return other.iso_speed, other.shutter_speed, other.aperture, other.focal_length
 
 
-def _pattern(path: Path, raw: Any) -> Pattern:
-    """The Bayer pattern of the visible area.
+def _colours(raw: Any) -> Array:
+    """The number of each pixel's colour in the visible area, as LibRaw counts them."""
+    colours = np.asarray(raw.raw_colors_visible)
+    return np.zeros_like(colours) if raw.num_colors == 1 else colours
+
+
+def _pattern(path: Path, raw: Any) -> str:
+    """The filter array of the visible area: a Bayer pattern, or rows of letters.
 
     Raises:
-        ImageError: there is none.
+        ImageError: there is none, or it has colours besides red, green and blue.
     """
     if raw.raw_type.name != "Flat" or raw.raw_pattern is None:
         raise ImageError(
-            f"{path}: holds every colour at every pixel (a LinearRaw DNG, or a sensor without a "
-            "colour filter array); a Bayer mosaic is needed"
+            f"{path}: holds every colour at every pixel (a LinearRaw DNG of three colours); "
+            "a mosaic is needed"
         )
-    if raw.raw_pattern.shape != (2, 2):
-        height, width = raw.raw_pattern.shape
-        raise ImageError(
-            f"{path}: its colours repeat every {width}x{height} pixels (X-Trans, or another); "
-            "a Bayer mosaic is needed"
-        )
+    if raw.num_colors == 1:
+        return MONO
+    height, width = raw.raw_pattern.shape
     letters = raw.color_desc.decode()
-    spelled = "".join(letters[c] for c in raw.raw_colors_visible[:2, :2].ravel())
-    for pattern in PATTERNS:
-        if pattern == spelled:
-            return pattern
-    raise ImageError(f"{path}: its pattern is {spelled}; one of {', '.join(PATTERNS)} is needed")
+    rows = ["".join(letters[c] for c in row[:width]) for row in _colours(raw)[:height]]
+    if "".join(rows) in PATTERNS:
+        return "".join(rows)
+    if {*"".join(rows)} == {*"RGB"} and (height, width) != (2, 2):
+        return "/".join(rows)
+    raise ImageError(
+        f"{path}: its pattern is {'/'.join(rows)}; one of {', '.join(PATTERNS)} is needed, or a "
+        "larger one of red, green and blue, or one colour alone"
+    )
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,8 @@ from clpipe.images.raw import RAW_SUFFIXES, RawFacts, read_facts, read_raw
 from clpipe.images.read import RENDER_SUFFIXES, SourceImage
 from clpipe.images.tags import Tags, to_attributes
 from clpipe.inputs.plausibility import brightness_warnings, input_warnings
+from clpipe.reference.cfa import PATTERNS
+from clpipe.reference.filter_array import parse_array
 from clpipe.stage import Kind, StageRole
 
 UNKNOWN_COLOURS = "its colour matrix is unknown; its colours stay those of the sensor"
@@ -151,8 +153,10 @@ class RawLoader:
                 f"{self.request.start_at} reads {chain.source.label}"
             )
         name = name_of(StageRole.PATTERN)
-        pattern = settings.parameters.get(name, {}).get("pattern", "RGGB")
-        if chain.steps[0].context.pattern != pattern:
+        own = settings.parameters.get(name, {})
+        pattern = own.get("array") or own.get("pattern", "RGGB")
+        context = chain.steps[0].context
+        if pattern != (context.array.name if context.array else context.pattern):
             raise ImageError(
                 f"{path}: its pattern is {pattern}, which the {name} stage says, but the chain has "
                 f"none; list {name} and what makes DN first (they are not run on a raw)"
@@ -228,10 +232,16 @@ def settings_of(facts: RawFacts | Dump) -> tuple[Settings, dict[str, str]]:
     iso = facts.iso or Settings().iso
     if not facts.iso:
         warnings["no_iso"] = f"it does not say its ISO; {iso:g} is taken for denoising (--iso)"
-    parameters = unseen | {name_of(StageRole.PATTERN): {"pattern": facts.pattern}}
+    is_bayer = facts.pattern in PATTERNS
+    laid = {"pattern": facts.pattern} if is_bayer else {"method": "array", "array": facts.pattern}
+    parameters = unseen | {name_of(StageRole.PATTERN): laid}
     if 0 <= facts.black_level < facts.white_level:
         levels = {"black_level": float(facts.black_level), "white_level": float(facts.white_level)}
         parameters[name_of(StageRole.LEVELS)] = levels
+    if not is_bayer and parse_array(facts.pattern).is_gray:
+        none = {"method": "none"}
+        parameters |= {balance: none, colours: none}
+        return Settings(camera=camera, iso=iso, parameters=parameters), warnings
     if facts.gains:
         red_and_blue = dict(zip(("red_gain", "blue_gain"), facts.gains, strict=True))
         light = name_of(StageRole.BALANCE_OF_LIGHT)

@@ -1,5 +1,6 @@
 """The raw of a chain as a negative: what a DNG stores beside the samples."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -7,7 +8,7 @@ from numpy.typing import NDArray
 
 from clpipe.base.errors import RequestError
 from clpipe.chain.chain import Chain
-from clpipe.images.dng import Negative, xyz_to_camera
+from clpipe.images.dng import Negative, check_array, xyz_to_camera
 from clpipe.stage import Context, Kind, StageRole, run_reference
 from clpipe.stages.tone_curve.neutral import Neutral
 
@@ -41,13 +42,14 @@ def negative_of(chain: Chain) -> Negative:
             f"--format dng: found a white level of {white:g}, but DNG wants whole DN; "
             f"--set {(first if is_input else makers[-1]).name}.white_level={white:.0f}"
         )
+    array = replace(context.filters, gains=gains)
+    check_array(array)
     return Negative(
         step=None if is_input else makers[-1].name,
-        pattern=context.pattern,
+        array=array,
         black_level=black,
         white_level=int(white),
-        gains=gains,
-        xyz_to_camera=xyz_to_camera(_colours(context, end, is_input), gains),
+        xyz_to_camera=xyz_to_camera(_colours(context, end, is_input), array),
         noise=context.noise,
         tone=partial(run_reference, Neutral()),
     )

@@ -1,5 +1,6 @@
 """Where in a picture patches are cut, and how they are turned; what is said of them. Pure."""
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from clpipe.chain.truth import signal_and_noise, variance_of
 from clpipe.engine.extents import Box
 from clpipe.images.tags import FLIPS, upright
 from clpipe.outputs.negative import negative_of
-from clpipe.reference.cfa import Pattern
+from clpipe.reference.cfa import PATTERNS
 from clpipe.stage import Stencil
 
 PER_IMAGE = 16  # patches, unless another number is asked for
@@ -54,8 +55,10 @@ class Patch:
 
 
 @lru_cache(maxsize=64)
-def first_place(pattern: Pattern, orientation: int, size: int) -> tuple[int, int]:
-    """The first column and row, each 0 or 1, of a patch that has the pattern when it is turned.
+def first_place(pattern: str, orientation: int, size: int) -> tuple[int, int] | None:
+    """The first column and row of a patch that has the pattern when it is turned.
+
+    None where there is none. ``pattern`` is as :func:`pattern_of` gives it.
 
     So a mosaic keeps its pattern, and no pixel is interpolated or thrown away: the CFA-preserving
     augmentation of Liu et al., "Learning Raw Image Denoising with Bayer Pattern Unification and
@@ -64,14 +67,27 @@ def first_place(pattern: Pattern, orientation: int, size: int) -> tuple[int, int
     >>> first_place("RGGB", 2, 128), first_place("GRBG", 5, 128)  # left to right; transposed
     ((1, 0), (1, 1))
     """
-    cell = np.array(list(pattern)).reshape(2, 2)
-    side = 2 + size % 2
-    places = ((x, y) for y in (0, 1) for x in (0, 1))
-    return next(
-        (x, y)
-        for x, y in places
-        if (upright(np.tile(cell, (2, 2))[y:, x:][:side, :side], orientation)[:2, :2] == cell).all()
-    )
+    cell = cell_of(pattern)
+    rows, columns = cell.shape
+    around = math.lcm(rows, columns)  # both ways, since a turn may swap them
+    side = around + size % around
+    field = np.tile(cell, (4 * around // rows, 4 * around // columns))
+    for y in range(rows):
+        for x in range(columns):
+            turned = upright(field[y:, x:][:side, :side], orientation)
+            if (turned[:rows, :columns] == cell).all():
+                return x, y
+    return None
+
+
+def cell_of(pattern: str) -> Array:
+    """The letters of one period of a pattern, (row, column).
+
+    >>> cell_of("GRBG").tolist(), cell_of("RW/WB").tolist()
+    ([['G', 'R'], ['B', 'G']], [['R', 'W'], ['W', 'B']])
+    """
+    rows = (pattern[:2], pattern[2:]) if pattern in PATTERNS else pattern.split("/")
+    return np.array([list(row) for row in rows])
 
 
 @dataclass(frozen=True)
@@ -83,14 +99,14 @@ class Cutting:
     Args:
         size: of the sides of a patch, in px.
         width, height: of the picture, at least as large.
-        pattern: of its mosaic.
+        pattern: of its mosaic, as :func:`pattern_of` gives it.
         augment: whether patches are flipped and turned.
     """
 
     size: int
     width: int
     height: int
-    pattern: Pattern
+    pattern: str
     augment: bool
 
     def drawn(self, numbers: Sequence[int], owner: str) -> list[Patch]:
@@ -102,9 +118,9 @@ class Cutting:
         patches = []
         for u_turn, u_left, u_top in draws:
             orientation = self._orientation(u_turn)
-            x, y = first_place(self.pattern, orientation, self.size)
-            left = x + 2 * int(u_left * ((self.width - self.size - x) // 2 + 1))
-            top = y + 2 * int(u_top * ((self.height - self.size - y) // 2 + 1))
+            (x, y), (down, across) = self._first(orientation), self._period
+            left = x + across * int(u_left * ((self.width - self.size - x) // across + 1))
+            top = y + down * int(u_top * ((self.height - self.size - y) // down + 1))
             patches.append(Patch(left, top, self.size, orientation))
         return patches
 
@@ -116,16 +132,17 @@ class Cutting:
     def in_grid(self, numbers: Sequence[int], owner: str) -> list[Patch]:
         """Patches side by side, by their numbers, row by row; the last end where the picture does.
 
-        Patches move by up to a pixel where the pattern wants that. ``owner`` as for :meth:`drawn`.
+        Patches move by less than a period of the pattern where it wants that. ``owner`` as for
+        :meth:`drawn`.
         """
         patches = []
         for number, (u_turn,) in zip(numbers, self._draws(numbers, owner, ("turn",)), strict=True):
             row, column = divmod(number, self._columns)
             orientation = self._orientation(u_turn)
-            x, y = first_place(self.pattern, orientation, self.size)
+            (x, y), (down, across) = self._first(orientation), self._period
             left = min(column * self.size, self.width - self.size)
             top = min(row * self.size, self.height - self.size)
-            left, top = max(left - (left - x) % 2, x), max(top - (top - y) % 2, y)
+            left, top = max(left - (left - x) % across, x), max(top - (top - y) % down, y)
             patches.append(Patch(left, top, self.size, orientation))
         return patches
 
@@ -146,12 +163,20 @@ class Cutting:
         if not self.augment:
             return 1
         spare = self.width - self.size, self.height - self.size
+        places = {turn: first_place(self.pattern, turn, self.size) for turn in FLIPS}
         fits = [
-            orientation
-            for orientation in FLIPS
-            if all(np.less_equal(first_place(self.pattern, orientation, self.size), spare))
+            turn for turn, place in places.items() if place and all(np.less_equal(place, spare))
         ]
         return fits[int(number * len(fits))]
+
+    def _first(self, orientation: int) -> tuple[int, int]:
+        place = first_place(self.pattern, orientation, self.size)
+        assert place  # or the orientation would not be taken
+        return place
+
+    @property
+    def _period(self) -> tuple[int, ...]:
+        return cell_of(self.pattern).shape
 
 
 @dataclass(frozen=True)
@@ -227,10 +252,10 @@ def without_patch(name: str) -> str:
     return re.sub(r"_\d{4,}$", "", name)
 
 
-def pattern_of(chain: Chain) -> Pattern:
-    """The CFA pattern of a chain's mosaic."""
+def pattern_of(chain: Chain) -> str:
+    """The filter array of a chain's mosaic: a Bayer pattern, such as "RGGB", or rows of letters."""
     last = chain.steps[-1]
-    return last.method.next_context(last.context).pattern
+    return last.method.next_context(last.context).filters.pattern
 
 
 def every_patch(patches: Patches, chain: Chain, width: int, height: int, key: str) -> list[Patch]:
@@ -270,8 +295,9 @@ def variance_at(noise: Sequence[Step], signal: Array, patch: Patch | None) -> Ar
     """
     if patch is None:
         return variance_of(noise, signal)
-    # A row and a column more, so that the first pixel has the colour of an image's first one.
-    x, y = patch.left % 2, patch.top % 2
+    # Rows and columns more, so that the first pixel has the colour of an image's first one.
+    down, across = noise[0].context.filters.period
+    x, y = patch.left % across, patch.top % down
     padded = np.pad(signal, ((y, 0), (x, 0), (0, 0))[: signal.ndim], mode="edge")
     return variance_of(noise, padded)[y:, x:]
 
@@ -284,9 +310,9 @@ def facts_of(chain: Chain) -> dict[str, Any]:
     except RequestError:  # there is no raw
         return facts
     return facts | {
-        "cfa": raw.pattern,
+        "cfa": pattern_of(chain),
         "black_level": float(raw.black_level),
         "white_level": float(raw.white_level),
-        "gains": np.array([raw.gains[0], 1, raw.gains[1]], np.float32),
+        "gains": np.array([raw.array.gains[0], 1, raw.array.gains[1]], np.float32),
         "xyz_to_camera": raw.xyz_to_camera.astype(np.float32),
     }

@@ -1,5 +1,6 @@
 """The Bayer patterns, as ``kernels/lib/cfa.h`` has them."""
 
+from collections import Counter
 from typing import Literal, get_args
 
 import numpy as np
@@ -10,7 +11,7 @@ Pattern = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 PATTERNS: tuple[Pattern, ...] = get_args(Pattern)
 
 
-def red_site(pattern: Pattern) -> tuple[int, int]:
+def red_site(pattern: str) -> tuple[int, int]:
     """Column and row (each 0 or 1) of red in the 2x2 cell; the pattern spells the cell by rows.
 
     >>> red_site("GRBG")
@@ -19,12 +20,27 @@ def red_site(pattern: Pattern) -> tuple[int, int]:
     return pattern.index("R") % 2, pattern.index("R") // 2
 
 
-def sites(pattern: Pattern) -> dict[str, tuple[slice, slice]]:
+def sites(pattern: str) -> dict[str, tuple[slice, slice]]:
     """The rows and columns of R, G1, G2 and B in a mosaic; G1 is in the rows of red.
+
+    Of an array that is no Bayer pattern, in rows of letters, each place of its period.
 
     >>> sites("GRBG")["R"]
     (slice(0, None, 2), slice(1, None, 2))
+    >>> list(sites("RW/WB")), sites("L")["L"]
+    (['R', 'W1', 'W2', 'B'], (slice(0, None, 1), slice(0, None, 1)))
     """
+    if pattern not in PATTERNS:
+        rows = pattern.split("/")
+        count = Counter("".join(rows))
+        seen: Counter[str] = Counter()
+        found = {}
+        for y, row in enumerate(rows):
+            for x, letter in enumerate(row):
+                seen[letter] += 1
+                name = f"{letter}{seen[letter]}" if count[letter] > 1 else letter
+                found[name] = np.s_[y :: len(rows), x :: len(row)]
+        return found
     x, y = red_site(pattern)
     places = {"R": (y, x), "G1": (y, 1 - x), "G2": (1 - y, x), "B": (1 - y, 1 - x)}
     return {name: np.s_[row::2, column::2] for name, (row, column) in places.items()}

@@ -12,6 +12,7 @@ import numpy as np
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
 from clpipe.base.types import Array, Doubles, Floats
+from clpipe.reference.cfa import PATTERNS
 
 MAX_PERIOD = 8
 MIRRORED = 2  # the longest period that a mirrored border (reflect-101) goes on with
@@ -34,8 +35,10 @@ PASSES: dict[str, tuple[float, float, float]] = {
 }
 LETTERS = "".join(PASSES)
 
+MONO = "L"  # the pattern of a sensor without filters
+
 NAMED = {
-    "mono": "L",
+    "mono": MONO,
     "RCCB": "RW/WB",
     "RCCC": "RW/WW",
     "RYYB": "RY/YB",
@@ -69,6 +72,12 @@ class FilterArray:
     def period(self) -> tuple[int, int]:
         """After how many rows and columns it repeats."""
         return len(self.rows), len(self.rows[0])
+
+    @property
+    def pattern(self) -> str:
+        """A Bayer pattern, such as "RGGB", or the rows with / between."""
+        joined = "".join(self.rows)
+        return joined if joined in PATTERNS and len(self.rows) == 2 else "/".join(self.rows)
 
     @property
     def letters(self) -> Array:

@@ -11,7 +11,7 @@ from clpipe.camera.optics import Optics
 from clpipe.camera.profile import IDENTITY, Camera, Matrix
 from clpipe.reference.cfa import Pattern, red_site
 from clpipe.reference.defocus import Depth
-from clpipe.reference.filter_array import FilterArray
+from clpipe.reference.filter_array import FilterArray, parse_array
 from clpipe.reference.random import Stream
 from clpipe.stage.passes import CompileTime, NoiseScope
 
@@ -65,6 +65,11 @@ class Context:
             return 0.0, 0.0
         model = self.noise or self.camera.noise(self.iso)
         return model.a, model.b
+
+    @property
+    def filters(self) -> FilterArray:
+        """The filter array of the mosaic, a Bayer pattern or any other."""
+        return self.array or parse_array(f"{self.pattern[:2]}/{self.pattern[2:]}")
 
     @property
     def cfa(self) -> CompileTime:

@@ -19,7 +19,8 @@ from clpipe.images.raw import RAW_SUFFIXES, RawFacts, read_facts, read_raw
 from clpipe.images.read import RENDER_SUFFIXES, read_image
 from clpipe.inputs.kept import embedded_settings
 from clpipe.inputs.raw import may_be_dump
-from clpipe.reference.cfa import Pattern
+from clpipe.reference.cfa import PATTERNS, Pattern
+from clpipe.reference.filter_array import MONO
 from clpipe.stage import Kind
 
 MOSAICS = (*RENDER_SUFFIXES, ".png")  # endings of files with a mosaic that are not camera raws
@@ -213,17 +214,29 @@ def _from_kept(
         camera.model,
         overrides.iso or chain.iso,
         f"{ev:+g} EV",
-        _sensor(overrides, context.pattern, black, white),
+        _sensor(overrides, context.filters.pattern, black, white),
         signal=kind == Kind.MOSAIC.label,
         gains=camera.white_balance_gains,
         xyz_to_camera=camera.xyz_to_camera,
     )
 
 
-def _sensor(overrides: FrameOverrides, pattern: Pattern, black: float, white: float) -> Sensor:
-    """Pattern and levels: the user's, else those of the file."""
+def _sensor(overrides: FrameOverrides, pattern: str, black: float, white: float) -> Sensor:
+    """Pattern and levels: the user's, else those of the file.
+
+    Raises:
+        RequestError: its mosaic has another filter array than Bayer's.
+    """
+    if pattern == MONO:  # whose sites are alike, whatever they are called
+        pattern = PATTERNS[0]
+    own = next((each for each in PATTERNS if each == pattern), None)
+    if own is None:
+        raise RequestError(
+            f"calibrate: found frames of the filter array {pattern}; it knows Bayer patterns and "
+            "sensors of one channel"
+        )
     return Sensor(
-        overrides.pattern or pattern,
+        overrides.pattern or own,
         black if overrides.black_level is None else overrides.black_level,
         white if overrides.white_level is None else overrides.white_level,
     )

@@ -6,8 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.reference.cfa import Pattern
-from clpipe.reference.filter_array import FilterArray, kernel_table, parse_array
+from clpipe.reference.filter_array import FilterArray, kernel_table
 from clpipe.reference.linear_mmse import RADIUS, filters, linear_mmse
 from clpipe.stage import (
     PERIOD,
@@ -20,12 +19,6 @@ from clpipe.stage import (
     Stencil,
     period_of,
 )
-
-
-@lru_cache(maxsize=4)
-def of_bayer(pattern: Pattern) -> FilterArray:
-    """A Bayer pattern as a filter array."""
-    return parse_array(f"{pattern[:2]}/{pattern[2:]}")
 
 
 @lru_cache(maxsize=16)  # one object for the same array, so that it is uploaded once
@@ -51,16 +44,12 @@ class LinearMmse(Method):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("linear_mmse", Stencil(RADIUS), ("weights", *PERIOD)),)
 
-    @staticmethod
-    def _array(context: Context) -> FilterArray:
-        return context.array or of_bayer(context.pattern)
-
     def arguments(self, context: Context) -> Arguments:
-        array = self._array(context)
+        array = context.filters
         return {"weights": weights_table(array), **period_of(array)}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        return linear_mmse(image, self._array(given.context))
+        return linear_mmse(image, given.context.filters)
 
 
 class Gray(Method):
