@@ -159,7 +159,7 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
     return [
         ("noise" + ("; variance = a * intensity + b" if laws else ""), size),
         ("autocorrelation (independent noise: 0; left after 2x2: 0.25)", shape),
-        ("correlation between channels", across),
+        *([("correlation between channels", across)] if pairs else []),
         *([("covariance of the channels", covariance_rows(report))] if report.covariances else []),
         ("tails of standardised noise", far),
         ("sigma by intensity", curve),

@@ -20,6 +20,7 @@ from clpipe.camera.profile import SRGB_TO_XYZ
 from clpipe.images import tiff
 from clpipe.images.encoding import SIMULATED
 from clpipe.images.tags import Tags, exif
+from clpipe.reference.cfa import PATTERNS
 from clpipe.reference.curve import to_8_bit
 from clpipe.reference.filter_array import FilterArray
 from clpipe.reference.transfer import srgb_curve
@@ -71,6 +72,17 @@ def planes_of(array: FilterArray) -> list[str]:
         if "G" in own
         else [*(x for x in "R" if x in own), *middle, *(x for x in "B" if x in own)]
     )
+
+
+BEHIND = ", filter array "  # a model's name, where it has another one than it is known for
+
+
+def array_suffix(array: FilterArray) -> str:
+    """What the name of a model ends in, to which converters attach what they know of its colours.
+
+    Readers of periods that converters do not know find the array there, too.
+    """
+    return "" if array.pattern in PATTERNS else f"{BEHIND}{array.pattern}"
 
 
 def check_array(array: FilterArray) -> None:
@@ -193,7 +205,9 @@ def main_directory(
         EXIF_IFD: tiff.long(0),
         50706: tiff.byte(1, 4, 0, 0),  # DNGVersion
         50707: tiff.byte(1, 1, 0, 0),  # DNGBackwardVersion
-        50708: tiff.text(SIMULATED + whole_name),  # UniqueCameraModel
+        50708: tiff.text(
+            SIMULATED + whole_name + array_suffix(negative.array)
+        ),  # UniqueCameraModel
         **colour,
     }
 

@@ -19,7 +19,7 @@ from clpipe.base.errors import ImageError
 from clpipe.base.reading import check_regular
 from clpipe.base.types import Array, Floats
 from clpipe.camera.profile import SRGB_TO_XYZ, Matrix
-from clpipe.images.dng import D65
+from clpipe.images.dng import BEHIND, D65
 from clpipe.images.encoding import SIMULATED
 from clpipe.images.pixels import MAX_PIXELS, USUAL_MAX_PIXELS, check_size
 from clpipe.images.tags import DATE
@@ -40,6 +40,7 @@ ORIENTATIONS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
 
 # What stands before the EXIF in files that are not TIFF: in a CR3's boxes, in a RAF's JPEG.
 EXIF_MARKS = (b"CMT1", b"CMT2", b"Exif\0\0")
+MODEL = "Tag 0xC614"  # UniqueCameraModel of a DNG
 PARTS = ("EXIF", "Image")  # exifread's prefixes of tags, in order of preference
 EXIF_BYTES = 1 << 20  # the most that a tag has, and where in a file that is no TIFF a mark stands
 MOST_READS = 200_000  # by exifread, which reads each of a tag's values by itself; usual are 1,000
@@ -91,7 +92,7 @@ def read_facts(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> RawFacts:
     """
     exif = read_exif(path)
     with _opened(path, max_pixels) as raw:
-        pattern = _pattern(path, raw)
+        pattern = _pattern(path, raw, exif)
         speed, shutter, aperture, focal_length = _shot(raw)
         iso = speed or exif.number("ISOSpeedRatings", 0)
         exposure = exif.number("ExposureTime", shutter)
@@ -157,7 +158,6 @@ def read_raw(path: Path, facts: RawFacts, max_pixels: int = USUAL_MAX_PIXELS) ->
         ImageError: as :func:`read_facts`; or the file holds no pixels.
     """
     with _opened(path, max_pixels) as raw:
-        _pattern(path, raw)
         mosaic = np.array(raw.raw_image_visible, np.float32)
         blacks = np.array(raw.black_level_per_channel, np.float32)[_colours(raw)]
     # For a file whose pixels were removed, LibRaw returns whatever was in memory.
@@ -232,7 +232,7 @@ def _colours(raw: Any) -> Array:
     return np.zeros_like(colours) if raw.num_colors == 1 else colours
 
 
-def _pattern(path: Path, raw: Any) -> str:
+def _pattern(path: Path, raw: Any, exif: "Exif") -> str:
     """The filter array of the visible area: a Bayer pattern, or rows of letters.
 
     Raises:
@@ -245,6 +245,13 @@ def _pattern(path: Path, raw: Any) -> str:
         )
     if raw.num_colors == 1:
         return MONO
+    own = exif.text(MODEL).partition(BEHIND)[2]  # which LibRaw may take for another one
+    if {*own} - {*"RGB/"}:
+        raise ImageError(
+            f"{path}: its filter array is {own}; of a DNG those of red, green and blue are taken"
+        )
+    if own:
+        return own
     height, width = raw.raw_pattern.shape
     letters = raw.color_desc.decode()
     rows = ["".join(letters[c] for c in row[:width]) for row in _colours(raw)[:height]]
