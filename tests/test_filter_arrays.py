@@ -1,0 +1,255 @@
+"""Filter arrays of any period: kernels, tiles, truth, DNGs, and how well they are demosaiced."""
+
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rawpy
+from PIL import Image
+
+from clpipe.base.errors import KeyedError, RequestError
+from clpipe.chain.making import make_chain
+from clpipe.chain.settings import settings_from
+from clpipe.dataset import Dataset
+from clpipe.engine.check import ARRAYS, NOISE, compare, laid
+from clpipe.engine.runner import Runner
+from clpipe.images.raw import read_facts, read_raw
+from clpipe.images.read import read_image
+from clpipe.reference.filter_array import NAMED, beyond, parse_array, tiled
+from clpipe.reference.linear_mmse import linear_mmse
+from clpipe.stages.demosaic.malvar2004 import malvar2004
+from clpipe.stages.mosaic import responses_of
+from tests.conftest import STILL_LIFE
+from tests.test_tiles import in_tiles
+
+GAINS = (2.0, 1.6)
+BLIND = ("mono", "RCCC")  # arrays that cannot tell all colours
+RAW = ("sensor_noise", "row_noise", "column_noise")
+
+
+def on(array: str, **settings):
+    """A chain whose mosaic has that array."""
+    return make_chain(settings_from({"iso": 800, "mosaic": laid(array), **settings}))
+
+
+def mosaic_of(image: np.ndarray, array) -> np.ndarray:
+    table = responses_of(array)
+    return sum(image[..., c] * tiled(table[:, c], image.shape) for c in range(3)).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("bayer", "unknown filter array 'bayer'; allowed: mono, RCCB"),
+        ("RG/GX", "'X'; a channel is one of R"),
+        ("RG/G", "rows of one length"),
+        ("RG//GB", "rows of one length"),
+        ("/".join(["RGB"] * 9), "at most 8x8"),
+        ("R" * 9, "at most 8x8"),
+    ],
+)
+def test_what_is_no_filter_array(text, message):
+    with pytest.raises(RequestError, match=message):
+        parse_array(text)
+
+
+def test_the_arrays_of_makers():
+    counts = {name: {c: text.count(c) for c in "RGB"} for name, text in NAMED.items()}
+    assert counts["x-trans"] == {"R": 8, "G": 20, "B": 8}
+    assert counts["quad-RGGB"] == {"R": 4, "G": 8, "B": 4}
+    xtrans = parse_array("x-trans").letters
+    for axis in (0, 1):  # every row and column has all three
+        assert all({*line} == {*"RGB"} for line in np.moveaxis(xtrans, axis, 0))
+
+
+def test_a_clear_pixel_saturates_first(develop):
+    light = np.full((8, 8, 3), 0.9, np.float32)
+    kept = develop(
+        light,
+        numpy=True,
+        keep=("normalize",),
+        mosaic=laid("RGBW"),
+        skip=["noise"],
+        exposure={"ev": 1.5},
+        inverse_color_matrix={"method": "none"},
+    ).kept["normalize"]
+    array = parse_array("RGBW", (2.77, 1.36))  # of the default camera
+    letters = tiled(array.by_place({"R": 0, "G": 1, "B": 2, "W": 3}), kept.shape)
+    assert (kept[letters == 3] == 1).all()
+    for number, letter in enumerate("RGB"):
+        expected = 0.9 * 2**0.5 * array.levels[letter]
+        assert kept[letters == number] == pytest.approx(expected, abs=1e-4)
+    assert array.levels["W"] == 1 > array.levels["G"] > array.levels["B"] > array.levels["R"]
+
+
+@pytest.mark.parametrize("array", ["x-trans", "RGBW"])
+def test_the_raw_is_the_same_bit_for_bit(device, scalar_device, array):
+    until = {"stages": [*settings_from({}).stages[:25]], **NOISE}
+    chain = on(array, **until)
+    assert chain.steps[-1].name == "quantize"
+    for each in (device, scalar_device):
+        found = compare(each, chain, [(37, 53), (1, 40), (40, 1)], half=True)
+        assert (found.largest, found.differing) == (0, 0)
+
+
+@pytest.mark.parametrize("array", ["x-trans", "RGB/GBR/BRG"])
+def test_tiles_and_patches_have_the_bits_of_the_whole(device, monkeypatch, array):
+    chain = on(array, stages=["mosaic", "inverse_white_balance", "white_balance", "demosaic"])
+    image = np.random.default_rng(3).random((203, 310, 3)).astype(np.float16)
+    runner = Runner(chain, device, keep=("mosaic",), encode=False, final=True)
+    _, count = in_tiles(runner, image, 96, 64, monkeypatch)
+    assert count > 3
+
+
+@pytest.mark.parametrize("array", [*NAMED, "RG/GB", "RGB/GBR/BRG"])
+def test_flat_colours_stay(array):
+    own = parse_array(array, GAINS)
+    colours = [(0.5, 0.5, 0.5)]
+    colours += [(0.8, 0.3, 0.2), (0.1, 0.6, 0.9)] if array not in BLIND else []
+    if own.is_gray:
+        assert on(array).step_named("demosaic").method.method == "gray"
+        return
+    for colour in colours:
+        flat = np.ones((13, 17, 1), np.float32) * np.float32(colour)
+        assert linear_mmse(mosaic_of(flat, own), own) == pytest.approx(flat, abs=2e-6)
+
+
+def test_beyond_an_edge_an_array_goes_on():
+    array = parse_array("x-trans")
+    for size, period in product((6, 7, 11), (3, 6)):
+        place = beyond(size, period, 5)
+        assert ((place - np.arange(-5, size + 5)) % period == 0).all()
+        assert place.min() >= 0
+        assert place.max() < size
+    assert array.needs_border
+    assert not parse_array("RW/WB").needs_border
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"demosaic": {"method": "menon2007"}},
+            "demosaic.method=menon2007: it knows Bayer patterns alone, but the mosaic is x-trans; "
+            "take demosaic.method=linear_mmse or gray",
+        ),
+        (
+            {"white_balance": {"method": "gray_world"}},
+            "white_balance.method=gray_world: .*take white_balance.method=as_shot or gains or none",
+        ),
+        ({"mosaic": {"method": "array", "array": "q"}}, "unknown filter array 'q'"),
+    ],
+)
+def test_what_knows_bayer_patterns_alone(settings, message):
+    with pytest.raises(RequestError, match=message):
+        on("x-trans", **settings) if "mosaic" not in settings else make_chain(
+            settings_from(settings)
+        )
+
+
+def test_a_camera_says_its_array(clpipe, tmp_path):
+    profile = tmp_path / "mono.toml"
+    text = next(Path(__file__).parents[1].glob("clpipe/camera/profiles/sony-a7r2.toml")).read_text()
+    profile.write_text(text.replace("iso_range", 'filter_array = "mono"\niso_range', 1))
+    clpipe("run", STILL_LIFE, "-o", "out", "--camera", profile, "--until", "demosaic")
+    image = read_image(Path("out/still_life.exr")).pixels
+    assert (image[..., 0] == image[..., 1]).all()
+    clpipe("run", STILL_LIFE, "-o", "bayer", "--camera", profile, "--set", "mosaic.pattern=GRBG")
+    profile.write_text(text.replace("iso_range", 'filter_array = "RG/G"\niso_range', 1))
+    result = clpipe("run", STILL_LIFE, "-o", "bad", "--camera", profile, status=2)
+    assert "rows of one length" in result.stderr
+    assert not Path("bad").exists()
+
+
+def test_an_image_kept_on_the_way_goes_on(clpipe):
+    run = ("run", STILL_LIFE, "--set", "mosaic.method=array", "--iso", "1600")
+    clpipe(*run, "-o", "whole", "--keep", "normalize")
+    clpipe("run", "whole/still_life.normalize.exr", "-o", "again", "--start-at", "white_balance")
+    one, two = (Path(p) for p in ("whole/still_life.jpg", "again/still_life.normalize.jpg"))
+    assert np.array_equal(Image.open(one), Image.open(two))
+    report = clpipe(
+        "measure", "whole/still_life.normalize.exr", "--truth", *["whole/still_life.normalize.exr"]
+    )
+    assert "G20" in report.stdout
+
+
+@pytest.mark.parametrize("array", ["x-trans", "mono", "quad-RGGB", "RCCB"])
+def test_a_dng_of_another_array(clpipe, array):
+    clpipe(
+        *("run", STILL_LIFE, "-o", "out", "--format", "dng", "--format", "png"),
+        *("--keep", "quantize", "--set", "mosaic.method=array", "--set", f"mosaic.array={array}"),
+    )
+    path = Path("out/still_life.dng")
+    kept = read_image(Path("out/still_life.quantize.exr"), mosaic=True).pixels
+    with rawpy.imread(str(path)) as raw:
+        assert np.array_equal(raw.raw_image, kept)
+        if array == "x-trans":
+            letters = np.array(list(raw.color_desc.decode()))[raw.raw_pattern]
+            assert np.array_equal(letters, parse_array(array).letters)
+            developed = raw.postprocess(use_camera_wb=True, no_auto_bright=True).astype(float)
+            ours = np.asarray(Image.open("out/still_life.png"), float)
+            both = [image[::8, ::8].ravel() for image in (developed, ours)]
+            assert np.corrcoef(both)[0, 1] > 0.95
+        assert raw.num_colors == (1 if array == "mono" else 3)
+    if array == "RCCB":  # LibRaw takes what is clear for green
+        result = clpipe("run", path, "-o", "again", status=1)
+        assert "its filter array is RW/WB" in result.stderr
+        return
+    facts = read_facts(path)
+    assert facts.pattern == "/".join(parse_array(array).rows)
+    assert np.array_equal(read_raw(path, facts), kept)
+    clpipe("run", path, "-o", "again", "--format", "png")
+    one, two = (np.asarray(Image.open(f"{f}/still_life.png"), int) for f in ("out", "again"))
+    assert np.abs(one - two).mean() < 0.5
+
+
+def test_an_array_that_no_dng_holds(clpipe):
+    options = ("--set", "mosaic.method=array", "--set", "mosaic.array=RGGB-IR")
+    result = clpipe("run", STILL_LIFE, "-o", "out", "--format", "dng", *options, status=2)
+    assert "RGGB-IR has the channel I, which DNG does not know" in result.stderr
+
+
+def test_a_dataset_of_another_array():
+    options = {"mosaic": {"method": "array", "array": "quad-RGGB"}, "iso": 800}
+    data = Dataset(STILL_LIFE, patch=32, raw="mosaic", variance=True, **options)
+    sample = data[3]
+    assert sample["cfa"] == "RRGG/RRGG/GGBB/GGBB"
+    assert (sample["place"] % 4 == 0).all()
+    assert sample["raw"].shape == (32, 32) == sample["variance"].shape
+    with pytest.raises(RequestError, match="raw='packed': its planes are of a Bayer pattern"):
+        Dataset(STILL_LIFE, patch=32, raw="packed", **options)
+
+
+def cpsnr(image: np.ndarray, truth: np.ndarray) -> float:
+    inside = np.s_[10:-10, 10:-10]
+    levels = [np.rint(np.clip(each, 0, 1) * 255)[inside] for each in (image, truth)]
+    return float(10 * np.log10(255**2 / ((levels[0] - levels[1]) ** 2).mean()))
+
+
+def test_how_well_arrays_are_demosaiced(shared_data):
+    """CPSNR on parts of eight of the Kodak set; those of the whole are in docs/quality.md."""
+    images = [
+        np.asarray(Image.open(path).convert("RGB"))[128:384, 256:512] / np.float32(255)
+        for path in sorted((shared_data / "kodak").glob("*.png"))
+    ]
+
+    def mean(name: str) -> float:
+        array = parse_array(name, GAINS)
+        return float(np.mean([cpsnr(linear_mmse(mosaic_of(i, array), array), i) for i in images]))
+
+    bayer = parse_array("RG/GB")
+    malvar = np.mean([cpsnr(malvar2004(mosaic_of(i, bayer), "RGGB"), i) for i in images])
+    assert mean("RG/GB") > malvar + 3
+    for name, least in {"x-trans": 36.6, "RCCB": 36.7, "RGBW": 34.2, "quad-RGGB": 30.8}.items():
+        assert mean(name) > least, name
+
+
+def test_settings_that_draw_an_array(clpipe):
+    choices = "{choice=['x-trans','RCCB']}"
+    options = ("--set", "mosaic.method=array", "--set", f"mosaic.array={choices}")
+    clpipe("run", STILL_LIFE, "-o", "out", *options, "--device", "numpy", "--until", "mosaic")
+    assert Path("out/still_life.exr").exists()
+    assert ARRAYS  # what clpipe check goes through
+    with pytest.raises(KeyedError):
+        settings_from({"mosaic": {"method": "array", "pattern": "RGGB"}})
