@@ -16,6 +16,7 @@ from clpipe.engine.check import ARRAYS, NOISE, compare, laid
 from clpipe.engine.runner import Runner
 from clpipe.images.raw import read_facts, read_raw
 from clpipe.images.read import read_image
+from clpipe.pipeline import Pipeline
 from clpipe.reference.filter_array import NAMED, beyond, parse_array, tiled
 from clpipe.reference.linear_mmse import linear_mmse
 from clpipe.stages.demosaic.malvar2004 import malvar2004
@@ -41,7 +42,7 @@ def mosaic_of(image: np.ndarray, array) -> np.ndarray:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("bayer", "unknown filter array 'bayer'; allowed: mono, RCCB"),
+        ("bayer", "unknown filter array 'bayer'; allowed: RGGB, BGGR"),
         ("RG/GX", "'X'; a channel is one of R"),
         ("RG/G", "rows of one length"),
         ("RG//GB", "rows of one length"),
@@ -160,6 +161,9 @@ def test_a_camera_says_its_array(clpipe, tmp_path):
     result = clpipe("run", STILL_LIFE, "-o", "bad", "--camera", profile, status=2)
     assert "rows of one length" in result.stderr
     assert not Path("bad").exists()
+    profile.write_text(text.replace("iso_range", 'filter_array = "GBRG"\niso_range', 1))
+    (step,) = Pipeline(camera=str(profile), stages=["mosaic"]).chain.steps
+    assert (step.method.method, step.method.pattern) == ("bayer", "GBRG")
 
 
 def test_an_image_kept_on_the_way_goes_on(clpipe):

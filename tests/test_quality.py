@@ -43,6 +43,6 @@ def test_the_tables(tmp_path, capsys, monkeypatch):
 
 def test_every_chain_can_be_made():
     for choice, _ in quality.DEMOSAIC.values():
-        assert clpipe.Pipeline(stages=["mosaic", "demosaic"], demosaic=choice).chain
+        assert quality.camera_of(choice).chain
     for settings in (*quality.DENOISE.values(), *quality.SHARPNESS.values()):
         assert clpipe.Pipeline(**settings).chain

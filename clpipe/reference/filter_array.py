@@ -38,6 +38,7 @@ LETTERS = "".join(PASSES)
 MONO = "L"  # the pattern of a sensor without filters
 
 NAMED = {
+    **{pattern: f"{pattern[:2]}/{pattern[2:]}" for pattern in PATTERNS},
     "mono": MONO,
     "RCCB": "RW/WB",
     "RCCC": "RW/WW",

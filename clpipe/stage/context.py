@@ -69,7 +69,7 @@ class Context:
     @property
     def filters(self) -> FilterArray:
         """The filter array of the mosaic, a Bayer pattern or any other."""
-        return self.array or parse_array(f"{self.pattern[:2]}/{self.pattern[2:]}")
+        return self.array or parse_array(self.pattern)
 
     @property
     def cfa(self) -> CompileTime:

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.reference.cfa import Pattern, by_site
+from clpipe.reference.cfa import PATTERNS, Pattern, by_site
 from clpipe.reference.filter_array import (
     LETTERS,
     NAMED,
@@ -127,8 +127,11 @@ def responses_table(array: FilterArray) -> Floats:
 
 
 def _of_camera(context: Context) -> Method | None:
-    array = context.camera.filter_array
-    return AnyArray(array=array) if array else None
+    if not (name := context.camera.filter_array):
+        return None
+    array = parse_array(name)
+    bayer = next((pattern for pattern in PATTERNS if pattern == array.pattern), None)
+    return Bayer(pattern=bayer) if bayer else AnyArray(array=name)
 
 
 STAGE = Stage(

@@ -26,7 +26,9 @@ import clpipe
 from clpipe.base.types import Array
 from clpipe.chain.registry import all_stages
 from clpipe.images.read import read_image
+from clpipe.reference.cfa import PATTERNS
 from clpipe.reference.curve import to_8_bit
+from clpipe.reference.filter_array import NAMED
 from clpipe.stages import DEFAULT_CHAIN
 from tools import RENDER, ROOT
 from tools.compare.charts import slanted_edge
@@ -55,6 +57,12 @@ DEMOSAIC: dict[str, tuple[Choice, float | None]] = {
     "edge_directed_median, 5": ({"method": "edge_directed_median", "size": 5}, None),
     "malvar2004": ({"method": "malvar2004"}, 33.53),
     "menon2007": ({"method": "menon2007"}, 37.47),
+    "linear_mmse": ({"method": "linear_mmse"}, None),
+    **{
+        f"linear_mmse, {name}": ({"method": "linear_mmse", "array": name}, None)
+        for name in NAMED
+        if name not in ("mono", *PATTERNS)
+    },
 }
 TOLERANCE = 0.05
 BEFORE_DEMOSAIC = DEFAULT_CHAIN.index("demosaic")
@@ -103,9 +111,16 @@ def kodak(folder: Path) -> list[Array]:
     return [np.asarray(Image.open(path).convert("RGB")) for path in paths]
 
 
+def camera_of(choice: Choice) -> clpipe.Pipeline:
+    """A mosaic, of an "array" or RGGB, and a method of demosaicing."""
+    own = {key: value for key, value in choice.items() if key != "array"}
+    laid = {"method": "array", "array": choice["array"]} if "array" in choice else {}
+    return clpipe.Pipeline(stages=["mosaic", "demosaic"], demosaic=own, mosaic=laid)
+
+
 def demosaicing(truths: Sequence[Array], choice: Choice) -> float:
     """The mean CPSNR of a method over eight-bit pictures."""
-    camera = clpipe.Pipeline(stages=["mosaic", "demosaic"], demosaic=choice)
+    camera = camera_of(choice)
     results = camera.process_many(truth / np.float32(255) for truth in truths)
     pairs = zip(results, truths, strict=True)
     return float(np.mean([cpsnr(to_8_bit(result.image), truth) for result, truth in pairs]))
