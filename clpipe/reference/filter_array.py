@@ -37,7 +37,7 @@ LETTERS = "".join(PASSES)
 
 MONO = "L"  # the pattern of a sensor without filters
 
-NAMED = {
+NAMED: dict[str, str] = {
     **{pattern: f"{pattern[:2]}/{pattern[2:]}" for pattern in PATTERNS},
     "mono": MONO,
     "RCCB": "RW/WB",
