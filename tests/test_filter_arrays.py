@@ -191,10 +191,12 @@ def test_a_dng_of_another_array(clpipe, array):
         if array == "x-trans":
             letters = np.array(list(raw.color_desc.decode()))[raw.raw_pattern]
             assert np.array_equal(letters, parse_array(array).letters)
+        if array in ("x-trans", "RCCB"):
             developed = raw.postprocess(use_camera_wb=True, no_auto_bright=True).astype(float)
             ours = np.asarray(Image.open("out/still_life.png"), float)
-            both = [image[::8, ::8].ravel() for image in (developed, ours)]
-            assert np.corrcoef(both)[0, 1] > 0.95
+            for channel in range(3):
+                both = [image[::8, ::8, channel].ravel() for image in (developed, ours)]
+                assert np.corrcoef(both)[0, 1] > 0.95
         assert raw.num_colors == (1 if array == "mono" else 3)
     if array == "RCCB":  # LibRaw takes what is clear for green
         result = clpipe("run", path, "-o", "again", status=1)

@@ -66,12 +66,9 @@ def planes_of(array: FilterArray) -> list[str]:
     look for it.
     """
     own = list(array.channels)
-    middle = [letter for letter in own if letter not in "RB"]
-    return (
-        own
-        if "G" in own
-        else [*(x for x in "R" if x in own), *middle, *(x for x in "B" if x in own)]
-    )
+    if "G" in own or not {*"RB"} <= {*own}:
+        return own
+    return ["R", *(letter for letter in own if letter not in "RB"), "B"]
 
 
 BEHIND = ", filter array "  # a model's name, where it has another one than it is known for
