@@ -102,6 +102,11 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
         clean = Picture(path, "mosaic", pixels, context.filters.pattern, white=1.0)
         return replace(clean, balance=balance, iso=iso)
     lowest = -black / (white - black)
+    if kind == Kind.RAW.label and context.knots:
+        raise ImageError(
+            f"{path}: has fewer DN by a curve (quantize.method=pwl); give what --keep normalize "
+            "makes of it"
+        )
     if kind == Kind.RAW.label:
         pixels = (pixels - np.float32(black)) / np.float32(white - black)
     return Picture(path, "mosaic", pixels, context.filters.pattern, lowest, 1.0, balance, iso)

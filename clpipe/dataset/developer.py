@@ -14,7 +14,7 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.truth import noisy_mosaic, picture_without_noise
-from clpipe.dataset.arrays import ArrayFormat
+from clpipe.dataset.arrays import HIGHEST, ArrayFormat
 from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result, Runner
@@ -74,11 +74,18 @@ def raw_step(chain: Chain, arrays: ArrayFormat) -> str:
     """
     if not arrays.is_in_dn:
         return noisy_mosaic(chain).steps[-1].name
-    names = [step.name for step in chain.steps if step.stage.writes is Kind.RAW]
+    steps = [step for step in chain.steps if step.stage.writes is Kind.RAW]
+    names = [step.name for step in steps]
     if not names:
         raise RequestError(
             f"the chain {chain.label} makes no raw in DN, which quantize does; put that stage in, "
             "or say dtype='float32' for a raw in signal"
+        )
+    after = steps[-1].method.next_context(steps[-1].context)
+    if not after.knots and (after.white_level or 0) > HIGHEST:
+        raise RequestError(
+            f"the raw in DN goes to {after.white_level:.0f}, which uint16 does not hold; say "
+            "dtype='float32' for a raw in signal, or quantize.method=pwl"
         )
     return names[-1]
 

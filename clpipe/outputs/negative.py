@@ -12,6 +12,8 @@ from clpipe.images.dng import Negative, check_array, xyz_to_camera
 from clpipe.stage import Context, Kind, StageRole, run_reference
 from clpipe.stages.tone_curve.neutral import Neutral
 
+MOST_DN = 2**16 - 1
+
 
 def negative_of(chain: Chain) -> Negative:
     """The raw of a chain: what its last stage that gives DN makes, else the raw that enters it.
@@ -41,6 +43,16 @@ def negative_of(chain: Chain) -> Negative:
         raise RequestError(
             f"--format dng: found a white level of {white:g}, but DNG wants whole DN; "
             f"--set {(first if is_input else makers[-1]).name}.white_level={white:.0f}"
+        )
+    if context.knots:
+        raise RequestError(
+            "--format dng: the raw has fewer DN by a curve (quantize.method=pwl), which converters "
+            "do not take; use --format npy, or --keep quantize"
+        )
+    if white > MOST_DN:
+        raise RequestError(
+            f"--format dng: found a white level of {white:.0f}, but it holds DN of 16 bits; use "
+            "--format npy, or quantize.method=pwl"
         )
     array = replace(context.filters, gains=gains)
     check_array(array)

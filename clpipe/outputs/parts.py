@@ -56,12 +56,15 @@ def samples(result: Result, format_: Format) -> Array:
     return result.final if format_.floats else to_16_bit(result.final)
 
 
-def typed(image: Floats, kind: Kind) -> Array:
+def typed(image: Floats, kind: Kind, white_level: float | None = None) -> Array:
     """An image as ``.npy`` holds it: uint16 in DN, float16 of display values, else float32.
+
+    DN of more than 16 bits, by their white level, are uint32.
 
     >>> typed(np.array([[511.0, 7e4]]), Kind.RAW)
     array([[  511, 65535]], dtype=uint16)
     """
     if kind is Kind.RAW:
-        return np.clip(np.rint(image), 0, 65535).astype(np.uint16)
+        dtype = np.uint16 if white_level is None or white_level <= 65535 else np.uint32
+        return np.clip(np.rint(image), 0, np.iinfo(dtype).max).astype(dtype)
     return image.astype(np.float16 if kind is Kind.DISPLAY else np.float32, copy=False)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from clpipe.base.errors import ImageError, OutputError, RequestError
 from clpipe.base.files import Stored, keep_names
-from clpipe.chain.chain import Chain
+from clpipe.chain.chain import Chain, Step
 from clpipe.chain.formats import DNG, FORMATS, NPY, ending_of
 from clpipe.chain.rendition import (
     BASELINES,
@@ -374,7 +374,9 @@ class OutputWriter:
         for step in (chain.step_named(name) for name in self._kept_steps(recipe)):
             path = self.path(job, f"{step.name}.{self.kept_format}", rendition, patch)
             if self.kept_format == NPY:
-                outputs[path] = write_npy(path, typed(result.kept[step.name], step.stage.writes))
+                outputs[path] = write_npy(
+                    path, typed(result.kept[step.name], step.stage.writes, _white(step))
+                )
                 continue
             carried_tags = kept_tags(chain, step, source, tags)
             attributes = attributes_of(step, chain, *whose) | carried_tags
@@ -392,7 +394,7 @@ class OutputWriter:
             elif format_ == NPY:
                 assert result.final is not None
                 image = upright(result.final, orientation)
-                outputs[path] = write_npy(path, typed(image, chain.result))
+                outputs[path] = write_npy(path, typed(image, chain.result, _white(chain.steps[-1])))
             elif format_ == DNG:
                 negative = negative_of(chain)
                 raw = result.kept[negative.step] if negative.step else source.pixels
@@ -429,6 +431,12 @@ class OutputWriter:
                 keep_names(self.folder / place)
         except OSError as error:
             raise ImageError(f"{folder}: cannot be made: {error.strerror}") from None
+
+
+def _white(step: Step) -> float | None:
+    """The white level of a step's image in DN; of DN that a curve has made fewer, their own."""
+    context = step.method.next_context(step.context)
+    return context.knots[-1][1] if context.knots else context.white_level
 
 
 def variance_attributes(recipe: Recipe) -> dict[str, str]:

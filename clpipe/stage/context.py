@@ -10,6 +10,7 @@ from clpipe.camera.noise import NoiseModel
 from clpipe.camera.optics import Optics
 from clpipe.camera.profile import IDENTITY, Camera, Matrix
 from clpipe.reference.cfa import Pattern, red_site
+from clpipe.reference.companding import Knots
 from clpipe.reference.defocus import Depth
 from clpipe.reference.filter_array import FilterArray, parse_array
 from clpipe.reference.random import Stream
@@ -47,6 +48,8 @@ class Context:
     headroom: float = 0.0  # stops by which exposure darkened the scene
     colours: Matrix = IDENTITY  # linear sRGB to what red, green and blue are, white-balanced
     noise: NoiseModel | None = None  # of the sensor noise that was added
+    full_scale: float = 1.0  # the signal at the white level: above 1 behind several readouts
+    knots: Knots = ()  # of companding, DN to fewer DN; () is none
     optics: Optics = field(default_factory=Optics, compare=False, repr=False)
     clean: bool = False  # the image has no noise, and nothing may follow from what it would have
     black_level: float | None = None  # DN, as quantize used them

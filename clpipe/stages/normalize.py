@@ -1,13 +1,17 @@
 """Levels: from DN to signal, the first step of a raw converter."""
 
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 from pydantic import model_validator
 
+from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
+from clpipe.reference.companding import along_pieces, knots_in, pieces_of
 from clpipe.stage import (
     Arguments,
+    CompileTime,
     Context,
     Kind,
     Method,
@@ -38,7 +42,7 @@ class Linear(Method):
         "DN",
         "as quantize used it, else from the camera",
         ge=0,
-        le=65535,
+        le=2**24 - 1,
     )
     white_level: float | None = parameter(
         None,
@@ -46,7 +50,7 @@ class Linear(Method):
         "DN",
         "as quantize used it, else from the camera",
         gt=0,
-        le=65535,
+        le=2**24 - 1,
     )
 
     @model_validator(mode="after")
@@ -84,11 +88,69 @@ class Linear(Method):
         return (image - np.float32(self.black_level)) * scale
 
 
+class Pwl(Linear):
+    """The same, after the inverse of the curve of ``quantize.method=pwl``.
+
+    >>> from clpipe.stage import run_reference
+    >>> knots = [[0.0, 0.0], [1023.0, 511.0], [4095.0, 1023.0]]
+    >>> back = Pwl(black_level=0, white_level=4095, knots=knots)
+    >>> run_reference(back, np.float32([[0, 511, 1023]])).round(3).tolist()
+    [[0.0, 0.25, 1.0]]
+    """
+
+    method: ClassVar = "pwl"
+    kernel: ClassVar = "companding"
+    summary: ClassVar = "the same, of DN that quantize.method=pwl made fewer"
+    example: ClassVar = {"knots": [[0.0, 0.0], [4096.0, 512.0], [16383.0, 1023.0]]}
+
+    knots: list[list[float]] | None = parameter(
+        None, "Those of quantize.", auto="as quantize used them"
+    )
+
+    @model_validator(mode="after")
+    def _rising(self) -> "Pwl":
+        if self.knots is not None:
+            knots_in(self.knots)
+        return self
+
+    def resolve(self, context: Context) -> "Linear":
+        filled = super().resolve(context)
+        if self.knots is None and not context.knots:
+            raise RequestError(
+                "normalize.method=pwl: no knots are known; set normalize.knots, or quantize with "
+                "quantize.method=pwl"
+            )
+        return filled.with_defaults(knots=[list(pair) for pair in context.knots])
+
+    @property
+    def _pieces(self) -> Floats:
+        assert self.knots is not None
+        return pieces_of(knots_in(self.knots), inverse=True)
+
+    def next_context(self, context: Context) -> Context:
+        return replace(context, knots=())
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("expand", arguments=("black_level", "scale", "pieces", "count")),)
+
+    def arguments(self, context: Context) -> Arguments:
+        count = CompileTime(str(len(self._pieces)))
+        return {**super().arguments(context), "pieces": self._pieces, "count": count}
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        return super().reference(along_pieces(image, self._pieces), given)
+
+
+def _of_curve(context: Context) -> Method | None:
+    return Pwl() if context.knots else None
+
+
 STAGE = Stage(
     "normalize",
     "Apply the levels: DN to signal.",
     Kind.RAW,
     Kind.MOSAIC,
-    (Linear,),
+    (Linear, Pwl),
     role=StageRole.LEVELS,
+    usual=_of_curve,
 )

@@ -1,17 +1,40 @@
 """The analogue-to-digital converter."""
 
 from dataclasses import replace
+from math import ceil, log2
 from typing import ClassVar
 
 import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.types import Floats
-from clpipe.stage import Arguments, Context, Kind, Method, Pass, ReferenceContext, Stage, parameter
+from clpipe.reference.companding import (
+    Knots,
+    along_pieces,
+    knots_in,
+    pieces_of,
+    usual_knots,
+)
+from clpipe.stage import (
+    Arguments,
+    CompileTime,
+    Context,
+    Kind,
+    Method,
+    Pass,
+    ReferenceContext,
+    Stage,
+    parameter,
+)
+
+MAX_BITS = 24  # whole DN that a float32 holds
+MAX_DN = 2**MAX_BITS - 1
 
 
 class Linear(Method):
     """Signal to DN: black + y * (white - black), rounded to nearest and clipped to 0..white.
+
+    Behind several readouts white is the last one's, and there are as many bits more.
 
     >>> from clpipe.stage import run_reference
     >>> signal = np.float32([[-1, 0, 0.1, 0.5, 7]])
@@ -29,13 +52,13 @@ class Linear(Method):
         "",
         "from the levels",
         ge=8,
-        le=16,
+        le=MAX_BITS,
     )
     black_level: float | None = parameter(
-        None, "DN without light.", "DN", "from the camera", ge=0, le=65535
+        None, "DN without light.", "DN", "from the camera", ge=0, le=MAX_DN
     )
     white_level: float | None = parameter(
-        None, "DN at full scale; more light clips.", "DN", "from the camera", gt=0, le=65535
+        None, "DN at full scale; more light clips.", "DN", "from the camera", gt=0, le=MAX_DN
     )
 
     @model_validator(mode="after")
@@ -60,8 +83,11 @@ class Linear(Method):
     def resolve(self, context: Context) -> "Linear":
         camera = context.camera
         black, white = camera.black_level, camera.white_level
-        if self.bits and self.bits != camera.bits:
-            scale = (2**self.bits - 1) / (2**camera.bits - 1)
+        bits = self.bits
+        if bits is None and context.full_scale > 1:  # a DN is that of the first readout
+            bits = min(camera.bits + ceil(log2(context.full_scale)), MAX_BITS)
+        if bits and bits != camera.bits:
+            scale = (2**bits - 1) / (2**camera.bits - 1)
             black, white = float(round(black * scale)), float(round(white * scale))
         filled = self.with_defaults(black_level=black, white_level=white)
         assert filled.white_level is not None
@@ -76,18 +102,91 @@ class Linear(Method):
 
     def arguments(self, context: Context) -> Arguments:
         return {
-            "range": np.float32(self._range),
+            "range": np.float32(self._range / context.full_scale),
             "black_level": np.float32(self.black_level),
             "white_level": np.float32(self.white_level),
         }
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
         """In DN^2; rounding adds 1/12, and clipping, which reduces variance, is not modelled."""
-        return before * np.float32(self._range**2) + np.float32(1 / 12)
+        scale = self._range / context.full_scale
+        return before * np.float32(scale**2) + np.float32(1 / 12)
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        dn = np.rint(image * np.float32(self._range) + np.float32(self.black_level))
+        scale = np.float32(self._range / given.context.full_scale)
+        dn = np.rint(image * scale + np.float32(self.black_level))
         return np.minimum(np.maximum(dn, np.float32(0)), np.float32(self.white_level))
 
 
-STAGE = Stage("quantize", "Digitise: signal to DN.", Kind.MOSAIC, Kind.RAW, (Linear,))
+class Pwl(Linear):
+    """The same, and then fewer DN by a curve of straight pieces, as HDR sensors send them.
+
+    ``normalize`` goes back by itself.
+
+    >>> from clpipe.stage import run_reference
+    >>> knots = [[0.0, 0.0], [1023.0, 511.0], [4095.0, 1023.0]]
+    >>> few = Pwl(black_level=0, white_level=4095, knots=knots)
+    >>> run_reference(few, np.float32([[0, 0.125, 0.5, 1]])).tolist()
+    [[0.0, 256.0, 682.0, 1023.0]]
+    """
+
+    method: ClassVar = "pwl"
+    kernel: ClassVar = "companding"
+    summary: ClassVar = "the same, and fewer bits by a curve of straight pieces"
+    example: ClassVar = {"result_bits": 10}
+
+    result_bits: int = parameter(12, "Bits of what comes out.", ge=8, le=16)
+    knots: list[list[float]] | None = parameter(
+        None,
+        "Where pieces meet: DN before and after, from [0, 0] to the white level.",
+        auto="near a square root",
+    )
+
+    @model_validator(mode="after")
+    def _rising(self) -> "Pwl":
+        if self.knots is None:
+            return self
+        last = knots_in(self.knots)[-1]
+        if last[1] >= 2**self.result_bits:
+            raise ValueError(
+                f"knots: found {last[1]:g} in the end, which {self.result_bits} bits do not hold"
+            )
+        if self.white_level is not None and last[0] != self.white_level:
+            raise ValueError(
+                f"knots: found {last[0]:g} in the end, but the white level is {self.white_level:g}"
+            )
+        return self
+
+    def resolve(self, context: Context) -> "Linear":
+        filled = super().resolve(context)
+        assert isinstance(filled, Pwl)
+        assert filled.white_level is not None
+        usual = usual_knots(filled.white_level, 2**self.result_bits - 1)
+        filled = filled.with_defaults(knots=[list(pair) for pair in usual])
+        return type(self).model_validate(filled.model_dump())
+
+    @property
+    def _knots(self) -> Knots:
+        assert self.knots is not None
+        return knots_in(self.knots)
+
+    def next_context(self, context: Context) -> Context:
+        return replace(super().next_context(context), knots=self._knots)
+
+    def passes(self) -> tuple[Pass, ...]:
+        names = ("range", "black_level", "white_level", "pieces", "count")
+        return (Pass("compand", arguments=names),)
+
+    def arguments(self, context: Context) -> Arguments:
+        pieces = pieces_of(self._knots)
+        count = CompileTime(str(len(pieces)))
+        return {**super().arguments(context), "pieces": pieces, "count": count}
+
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
+        return None
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        return np.rint(along_pieces(super().reference(image, given), pieces_of(self._knots)))
+
+
+STAGE = Stage("quantize", "Digitise: signal to DN.", Kind.MOSAIC, Kind.RAW, (Linear, Pwl))

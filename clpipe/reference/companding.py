@@ -1,0 +1,67 @@
+"""Companding: DN to fewer DN by a curve of straight pieces (PWL), as HDR sensors send them."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+
+from clpipe.base.types import Doubles, Floats
+
+Knots = tuple[tuple[float, float], ...]
+
+OCTAVES = 7  # between the knots of the usual curve's ends; each piece has a quarter of the next's
+
+
+def usual_knots(white: float, result: float) -> Knots:
+    """Knots near a square root, along which shot noise has one size: (DN, result).
+
+    >>> usual_knots(16384, 128)[:3], usual_knots(16384, 128)[-1]
+    (((0.0, 0.0), (1.0, 1.0), (4.0, 2.0)), (16384.0, 128.0))
+    """
+    inner = [
+        (round(white / 4.0**i), round(result / 2.0**i))
+        for i in reversed(range(OCTAVES + 1))
+        if result / 2.0**i >= 1
+    ]
+    return ((0.0, 0.0), *((float(x), float(y)) for x, y in inner))
+
+
+def knots_in(pairs: Sequence[Sequence[float]]) -> Knots:
+    """Knots from pairs of numbers.
+
+    Raises:
+        ValueError: they are no pairs, do not begin at 0, or do not rise.
+
+    >>> knots_in([[0, 0], [1023, 511], [4095, 1023]])[1]
+    (1023.0, 511.0)
+    """
+    right = len(pairs) > 1 and all(len(pair) == 2 for pair in pairs)
+    knots = tuple((float(pair[0]), float(pair[-1])) for pair in pairs) if right else ()
+    rising = all(a[0] < b[0] and a[1] < b[1] for a, b in pairwise(knots))
+    if not right or not rising or knots[0] != (0, 0):
+        raise ValueError(
+            f"found {pairs}; expected pairs of DN before and after, from [0, 0] on, rising in both"
+        )
+    return knots
+
+
+@lru_cache(maxsize=64)  # one object for the same knots, so that it is uploaded once
+def pieces_of(knots: Knots, inverse: bool = False) -> Floats:
+    """The pieces between knots, or of the inverse: (piece, 3), beginning, value there, and slope."""
+    points: Doubles = np.array(knots)[:, ::-1] if inverse else np.array(knots)
+    slopes = np.diff(points[:, 1]) / np.diff(points[:, 0])
+    return np.ascontiguousarray(np.column_stack([points[:-1], slopes]), np.float32)
+
+
+def along_pieces(x: Floats, pieces: Floats) -> Floats:
+    """The curve at these places.
+
+    >>> along_pieces(np.float32([1, 3]), pieces_of(((0, 0), (2, 2), (4, 3)))).tolist()
+    [1.0, 2.5]
+    """
+    begin, value, slope = pieces[0]
+    result = value + (x - begin) * slope
+    for begin, value, slope in pieces[1:]:
+        result = np.where(x >= begin, value + (x - begin) * slope, result)
+    return np.asarray(result, np.float32)

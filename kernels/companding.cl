@@ -1,0 +1,22 @@
+// Companding by a curve of straight pieces: DN to fewer DN, and back. `pieces` has for each piece where it begins,
+// what it begins with, and its slope.
+INLINE vf along_pieces(vf x, __global const float *pieces, int count) {
+    vf v = pieces[1] + (x - pieces[0]) * pieces[2];
+    for (int i = 1; i < count; ++i) {
+        __global const float *own = pieces + 3 * i;
+        const vf beyond = own[1] + (x - own[0]) * own[2];
+        v = x >= own[0] ? beyond : v;
+    }
+    return v;
+}
+
+// After the ADC, whose DN are whole.
+INLINE vf compand(vf y, site at, float range, float black_level, float white_level, __global const float *pieces, int count) {
+    const vf dn = vmin(vmax(nearest(y * range + black_level), (vf)(0.0f)), (vf)(white_level));
+    return nearest(along_pieces(dn, pieces, count));
+}
+
+// Before the levels.
+INLINE vf expand(vf dn, site at, float black_level, float scale, __global const float *pieces, int count) {
+    return (along_pieces(dn, pieces, count) - black_level) * scale;
+}
