@@ -46,17 +46,9 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
             are no repeats of one scene.
         ImageError: no pixel counts.
     """
-    check_partners(images, truth)
+    clean, freedom, noise = against(images, truth)
     first = images[0]
-    frames = np.stack([image.pixels for image in images])
-    clipped = clipped_samples(images, frames)
-    if truth:
-        clean, freedom, noise = truth.pixels, 1.0, frames - truth.pixels
-    else:
-        freedom = (len(images) - 1) / len(images)
-        clean = frames.mean(0, dtype=np.float64).astype(np.float32)
-        noise = (frames - clean) / np.float32(freedom**0.5)
-        check_repeats(images, clean, noise)
+    clipped = clipped_samples(images, np.stack([image.pixels for image in images]))
     start = ~truth.clipped() if truth else np.ones(clean.shape, bool)
     if not start.any():
         raise nothing_counts(first)
@@ -85,6 +77,22 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
         at_edges=at_edges(clean, noise, start) if clean.ndim == 3 else math.nan,
         rounding=sum(picture.step**2 / 12 for picture in (first, truth) if picture),
     )
+
+
+def against(images: Sequence[Picture], truth: Picture | None) -> tuple[Floats, float, Floats]:
+    """The clean image, the share of freedom that it leaves, and the noise of each image.
+
+    Arguments and errors as for :func:`measure`.
+    """
+    check_partners(images, truth)
+    frames = np.stack([image.pixels for image in images])
+    if truth:
+        return truth.pixels, 1.0, frames - truth.pixels
+    freedom = (len(images) - 1) / len(images)
+    clean = frames.mean(0, dtype=np.float64).astype(np.float32)
+    noise = (frames - clean) / np.float32(freedom**0.5)
+    check_repeats(images, clean, noise)
+    return clean, freedom, noise
 
 
 def at_edges(clean: Floats, noise: Floats, unclipped: Mask) -> float:

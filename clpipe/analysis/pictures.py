@@ -99,17 +99,20 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
     balance = f"without the gains {removed} and with the gains {applied}"
     black, white = context.black_level, context.white_level
     if black is None or white is None:  # not digitised, so nothing clips at a lower end
-        clean = Picture(path, "mosaic", pixels, context.filters.pattern, white=1.0)
+        highest = context.full_scale
+        clean = Picture(path, "mosaic", pixels, context.filters.pattern, white=highest)
         return replace(clean, balance=balance, iso=iso)
-    lowest = -black / (white - black)
+    full = np.float32(context.full_scale)
+    lowest = float(-black / (white - black) * full)
     if kind == Kind.RAW.label and context.knots:
         raise ImageError(
             f"{path}: has fewer DN by a curve (quantize.method=pwl); give what --keep normalize "
             "makes of it"
         )
     if kind == Kind.RAW.label:
-        pixels = (pixels - np.float32(black)) / np.float32(white - black)
-    return Picture(path, "mosaic", pixels, context.filters.pattern, lowest, 1.0, balance, iso)
+        pixels = (pixels - np.float32(black)) / np.float32(white - black) * full
+    highest = float(full)
+    return Picture(path, "mosaic", pixels, context.filters.pattern, lowest, highest, balance, iso)
 
 
 def context_after(settings: Settings, stage: str | None) -> Context:

@@ -1,6 +1,7 @@
 """``clpipe measure``: the noise of images, as tables, JSON or a plot."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -10,6 +11,7 @@ from clpipe.analysis.measure import measure as measure_images
 from clpipe.analysis.pictures import load_picture
 from clpipe.analysis.pooling import pool_by_iso
 from clpipe.analysis.report import UNITS, NoiseReport
+from clpipe.analysis.snr import FEWEST, SnrStep, record_of, snr_curve
 from clpipe.analysis.spatial import LAGS, LineNoise
 from clpipe.analysis.statistics import SIGMAS, gaussian_beyond
 from clpipe.base.errors import RequestError
@@ -42,9 +44,19 @@ from clpipe.stages.picture_noise import UNKNOWN
     metavar="FILE.png",
     help="Draw noise by intensity, autocorrelation and tails.",
 )
+@click.option(
+    "--snr",
+    is_flag=True,
+    help="The signal-to-noise ratio instead, in steps of half a stop, as a sensor's data sheet.",
+)
 @json_option
 def measure(
-    images: tuple[Path, ...], truth: Path | None, pattern: Pattern, plot: Path | None, as_json: bool
+    images: tuple[Path, ...],
+    truth: Path | None,
+    pattern: Pattern,
+    plot: Path | None,
+    snr: bool,
+    as_json: bool,
 ) -> None:
     """Measure the noise of images: its size, correlation and distribution.
 
@@ -65,6 +77,11 @@ def measure(
     if truth is not None and len(bursts) > 1:
         raise RequestError(f"--truth: one scene has it, but there are {len(bursts)} bursts")
     clean = load_picture(truth, pattern) if truth else None
+    if snr:
+        if plot is not None or len(bursts) > 1:
+            raise RequestError("--snr: it makes a table of one scene, without --plot")
+        show_snr(snr_curve([load_picture(p, pattern) for p in bursts[0]], clean), as_json)
+        return
     reports = pool_by_iso(
         [measure_images([load_picture(p, pattern) for p in burst], clean) for burst in bursts]
     )
@@ -83,6 +100,23 @@ def measure(
         for title, (headings, *rows) in measure_tables(report):
             click.echo(f"\n{title}")
             show(headings, rows, left=0 if headings[0] else 1)
+
+
+def show_snr(curve: Sequence[SnrStep], as_json: bool) -> None:
+    """Print a curve of signal-to-noise ratios.
+
+    Raises:
+        RequestError: it has no step.
+    """
+    if not curve:
+        raise RequestError(f"--snr: no step of half a stop has {FEWEST} samples that count")
+    if as_json:
+        show_json({"snr": record_of(curve)})
+        return
+    rows = [
+        (f"{x.intensity:.4g}", f"{x.stops:.1f}", f"{x.decibels:.1f}", str(x.samples)) for x in curve
+    ]
+    show(["intensity", "stops below", "SNR, dB", "samples"], rows, left=0)
 
 
 def iso_text(report: NoiseReport) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clpipe.base.errors import RequestError
+from clpipe.camera.noise import NoiseModel
 from clpipe.chain.chain import Chain
 from clpipe.images.dng import Negative, check_array, xyz_to_camera
 from clpipe.stage import Context, Kind, StageRole, run_reference
@@ -62,9 +63,17 @@ def negative_of(chain: Chain) -> Negative:
         black_level=black,
         white_level=int(white),
         xyz_to_camera=xyz_to_camera(_colours(context, end, is_input), array),
-        noise=context.noise,
+        noise=_of_white(context),
         tone=partial(run_reference, Neutral()),
     )
+
+
+def _of_white(context: Context) -> NoiseModel | None:
+    """The noise in units of the white level, near black."""
+    noise, full = context.noise, context.full_scale
+    if noise is None or full == 1:
+        return noise
+    return NoiseModel(noise.a / full, noise.b / full**2, noise.signal_range * full)
 
 
 def _level(owner: object, name: str, default: float) -> float:

@@ -41,14 +41,14 @@ def knots_in(pairs: Sequence[Sequence[float]]) -> Knots:
     rising = all(a[0] < b[0] and a[1] < b[1] for a, b in pairwise(knots))
     if not right or not rising or knots[0] != (0, 0):
         raise ValueError(
-            f"found {pairs}; expected pairs of DN before and after, from [0, 0] on, rising in both"
+            f"knots: found {pairs}; expected pairs of DN before and after, from [0, 0] on, rising in both"
         )
     return knots
 
 
 @lru_cache(maxsize=64)  # one object for the same knots, so that it is uploaded once
 def pieces_of(knots: Knots, inverse: bool = False) -> Floats:
-    """The pieces between knots, or of the inverse: (piece, 3), beginning, value there, and slope."""
+    """The pieces between knots, or of the inverse: beginning, value there, slope; (piece, 3)."""
     points: Doubles = np.array(knots)[:, ::-1] if inverse else np.array(knots)
     slopes = np.diff(points[:, 1]) / np.diff(points[:, 0])
     return np.ascontiguousarray(np.column_stack([points[:-1], slopes]), np.float32)

@@ -48,7 +48,7 @@ class Linear(Method):
         None,
         "DN that becomes 1.",
         "DN",
-        "as quantize used it, else from the camera",
+        "as quantize used it, for the first of several readouts; else from the camera",
         gt=0,
         le=2**24 - 1,
     )
@@ -67,8 +67,16 @@ class Linear(Method):
         camera = context.camera
         black = camera.black_level if context.black_level is None else context.black_level
         white = camera.white_level if context.white_level is None else context.white_level
-        filled = self.with_defaults(black_level=black, white_level=white)
+        first = black + (white - black) / context.full_scale
+        filled = self.with_defaults(black_level=black, white_level=first)
         return type(self).model_validate(filled.model_dump())
+
+    def next_context(self, context: Context) -> Context:
+        if context.full_scale == 1 or context.white_level is None or context.black_level is None:
+            return context
+        assert self.black_level is not None and self.white_level is not None
+        whole = context.white_level - context.black_level
+        return replace(context, full_scale=whole / (self.white_level - self.black_level))
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("normalize_levels", arguments=("black_level", "scale")),)
@@ -128,7 +136,7 @@ class Pwl(Linear):
         return pieces_of(knots_in(self.knots), inverse=True)
 
     def next_context(self, context: Context) -> Context:
-        return replace(context, knots=())
+        return replace(super().next_context(context), knots=())
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("expand", arguments=("black_level", "scale", "pieces", "count")),)

@@ -1,7 +1,6 @@
 """High dynamic range in one exposure: it is read several times, and the readouts are merged."""
 
 from dataclasses import replace
-from math import log2
 from typing import ClassVar, Self
 
 import numpy as np
@@ -9,7 +8,6 @@ from pydantic import PrivateAttr
 
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
-from clpipe.camera.noise import NoiseModel
 from clpipe.reference.math import square_root
 from clpipe.reference.random import normal_at
 from clpipe.stage import (
@@ -34,7 +32,8 @@ class Readouts(SensorNoise):
 
     The first one is the camera's at its ISO: a and b are its. Each further one is less sensitive by
     ``ratio``, so the last one has its white at a signal of ``ratio ** (count - 1)``, which
-    ``quantize`` takes for the white level. The merged signal is that of the first readout that is
+    ``quantize`` takes for the white level; behind ``normalize`` 1 is the first one's white, and
+    what is brighter is above 1. The merged signal is that of the first readout that is
     below 0.85 of its white; from there to 0.95 it goes over linearly to the next one. There the
     signal-to-noise ratio dips, since the next one has collected or amplified less.
     """
@@ -82,11 +81,7 @@ class Readouts(SensorNoise):
         return own
 
     def next_context(self, context: Context) -> Context:
-        model, full = self.model(context), self.full_scale
-        scaled = NoiseModel(model.a / full, model.b / full**2, model.signal_range * full)
-        return replace(
-            context, noise=scaled, full_scale=full, headroom=context.headroom + log2(full)
-        )
+        return replace(super().next_context(context), full_scale=self.full_scale)
 
     def passes(self) -> tuple[Pass, ...]:
         numbers = ("a", "b", "later_b", "full_well", "down", "up", "range", "unit")
@@ -118,18 +113,22 @@ class Readouts(SensorNoise):
         return {**self.numbers(), **{k: CompileTime(str(v)) for k, v in structure.items()}}
 
     def own_variance(self, signal: Floats) -> Floats:
-        n, merged = self.numbers(), None
+        n = self.numbers()
+        one = np.float32(1)
+        shared = n["a"] * signal if self.shares_charge else np.zeros_like(signal)
+        merged = np.zeros_like(signal)
         for i in reversed(range(self.readouts)):
             down = n["down"] ** i
-            shot = n["a"] * signal / (np.float32(1) if self.shares_charge else down)
+            shot = np.zeros_like(signal) if self.shares_charge else n["a"] * signal / down
             own = shot + (n["later_b"] if i else n["b"]) / down**2
-            if merged is None or self.part == i:
+            if self.part is not None:
+                merged = own if i == self.part else merged
+            elif i == self.readouts - 1:
                 merged = own
-                continue
-            if self.part is None:
+            else:
                 weight = self._weight(signal * down)
-                merged = weight**2 * own + (1 - weight) ** 2 * merged
-        return np.asarray(merged, np.float32)
+                merged = weight**2 * own + (one - weight) ** 2 * merged
+        return np.asarray(merged + shared, np.float32)
 
     @staticmethod
     def _weight(read: Floats) -> Floats:
@@ -179,6 +178,7 @@ class DualGain(Readouts):
 
     method: ClassVar = "dual_gain"
     summary: ClassVar = "one charge read at two gains, and merged"
+    other_examples: ClassVar = ({"part": 1},)
     shares_charge: ClassVar = True
 
 

@@ -1,0 +1,191 @@
+"""Several readouts of an exposure and companding: noise against formulas, hand-overs, round trips."""
+
+import json
+import re
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clpipe.base.errors import RequestError
+from clpipe.chain.making import make_chain
+from clpipe.chain.settings import settings_from
+from clpipe.dataset import Dataset
+from clpipe.engine.runner import Runner
+from clpipe.images.read import read_image
+from clpipe.reference.companding import along_pieces, knots_in, pieces_of, usual_knots
+from tests.conftest import STILL_LIFE
+
+METHODS = {
+    "dual_gain": {},
+    "split_pixel": {"ratio": 32.0, "later_noise": 2.0},
+    "staggered": {"count": 3, "ratio": 8.0},
+}
+RAW = ["mosaic", "sensor_noise", "quantize", "normalize"]
+
+
+def chain_of(method, stages=RAW, **settings):
+    own = {"method": method, **METHODS[method], **settings.pop("sensor_noise", {})}
+    return make_chain(
+        settings_from({"iso": 400, "stages": stages, "sensor_noise": own, **settings})
+    )
+
+
+def decibels(signal, sigma):
+    return 20 * np.log10(signal / sigma)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_signal_to_noise_ratio_is_that_of_the_formulas(device, method):
+    chain = chain_of(method)
+    step = chain.step_named("sensor_noise").method
+    runner = Runner(chain, device, encode=False, final=True)
+    a, b, n = step.a, step.b, step.numbers()
+    last = step.ratio ** (step.readouts - 1)
+    for light, which in ((0.05, 0), (0.8, 0), (1.2, 1), (0.8 * last, step.readouts - 1)):
+        found = runner.run(np.full((300, 300, 3), light, np.float32), "snr").final
+        gain = step.ratio**which
+        shot = a * light * (1 if step.shares_charge else gain)
+        own = b if which == 0 else float(n["later_b"])
+        expected = (shot + own * gain**2) ** 0.5
+        assert found.mean() == pytest.approx(light, rel=0.004)
+        assert decibels(light, found.std()) == pytest.approx(decibels(light, expected), abs=0.15)
+        assert step.own_variance(np.float32([light])) ** 0.5 == pytest.approx(expected, rel=0.02)
+
+
+def test_the_ratio_dips_where_a_readout_takes_over(device):
+    runner = Runner(chain_of("split_pixel"), device, encode=False, final=True)
+    below, beyond = (
+        decibels(x, runner.run(np.full((300, 300, 3), x, np.float32), "dip").final.std())
+        for x in (0.83, 0.97)
+    )
+    # A photodiode that sees a 32nd has a 32nd of the electrons.
+    assert below - beyond == pytest.approx(10 * np.log10(32), abs=1)
+
+
+def test_each_part_is_there_alone(develop):
+    light = np.random.default_rng(0).random((60, 70, 3)).astype(np.float32) * 20
+    options = {"stages": ["mosaic", "sensor_noise"], "iso": 400}
+
+    def made(**own):
+        noise = {"method": "dual_gain", **own}
+        return develop(light, numpy=True, sensor_noise=noise, **options).final
+
+    merged, first, second = made(), made(part=0), made(part=1)
+    assert first.max() == 1
+    assert 14 < second.max() <= 16
+    assert np.array_equal(merged[first < 0.85], first[first < 0.85])
+    assert np.array_equal(merged[first >= 0.95], second[first >= 0.95])
+    with pytest.raises(RequestError, match=r"sensor_noise\.part: found 2; there are 0 to 1"):
+        made(part=2)
+
+
+def test_white_is_the_last_readouts_and_one_the_first_ones(develop):
+    chain = chain_of("dual_gain")
+    quantize, normalize = (chain.step_named(name).method for name in ("quantize", "normalize"))
+    assert quantize.bits == 14 + 4
+    whole = quantize.white_level - quantize.black_level
+    assert normalize.white_level - normalize.black_level == pytest.approx(whole / 16)
+    light = np.full((8, 8, 3), 40, np.float32)
+    options = {"stages": RAW, "iso": 400, "sensor_noise": {"method": "dual_gain"}}
+    assert develop(light, numpy=True, **options).final.max() == pytest.approx(16, rel=1e-5)
+
+
+def test_a_picture_of_the_first_range_is_as_ever(clpipe):
+    run = ("run", STILL_LIFE, "--iso", "400", "--format", "png")
+    clpipe(*run, "-o", "usual", "--set", "sensor_noise.method=gaussian")
+    clpipe(*run, "-o", "dual", "--set", "sensor_noise.method=dual_gain", "--truth", "clean")
+    one, two = (np.asarray(Image.open(f"{f}/still_life.png"), int) for f in ("usual", "dual"))
+    assert np.abs(one - two).mean() < 2
+    clean = np.asarray(Image.open("dual/still_life.truth_clean.png"), int)
+    assert np.abs(two - clean).mean() < 4
+
+
+@pytest.mark.parametrize(("white", "bits"), [(2**20 - 1, 12), (2**24 - 1, 16), (16383, 10)])
+def test_a_curve_of_pieces_goes_there_and_back(white, bits):
+    knots = usual_knots(white, 2**bits - 1)
+    there, back = pieces_of(knots), pieces_of(knots, inverse=True)
+    dn = np.unique(np.geomspace(1, white, 20_000).round()).astype(np.float32)
+    few = np.rint(along_pieces(dn, there))
+    assert (np.diff(few) >= 0).all()
+    assert few.max() == 2**bits - 1
+    again = along_pieces(few, back)
+    slope = np.interp(dn, there[:, 0], there[:, 2])  # of the piece, or steeper
+    steepest = np.array([there[there[:, 0] <= x][-1, 2] for x in dn[::97]])
+    error = np.abs(again - dn)[::97]
+    assert slope.min() > 0
+    assert (error <= 0.5 / steepest + dn[::97] * 1e-6 + 0.01).all()
+    # Near a square root: the step grows as shot noise does.
+    assert (0.5 / steepest <= 2 * dn[::97] ** 0.5 * (white / (2**bits - 1) ** 2) ** 0.5 + 1).all()
+
+
+def test_a_companded_raw(clpipe):
+    noise = ("--iso", "400", "--set", "sensor_noise.method=dual_gain")
+    knots = "[[0,0],[16384,2048],[262143,4095]]"
+    few = ("--set", "quantize.method=pwl", "--set", f"quantize.knots={knots}")
+    keep = ("--keep", "quantize", "--keep", "normalize", "--format", "npy", "--format", "png")
+    for folder, options in (("whole", ()), ("few", few)):
+        clpipe("run", STILL_LIFE, "-o", folder, *noise, *keep, *options)
+    whole, less = (np.load(f"{f}/still_life.quantize.npy") for f in ("whole", "few"))
+    assert (whole.dtype, less.dtype) == (np.uint32, np.uint16)
+    assert np.array_equal(less, np.rint(np.interp(whole, *zip(*json.loads(knots), strict=True))))
+    light, again = (np.load(f"{f}/still_life.normalize.npy") for f in ("whole", "few"))
+    assert np.abs(light - again).max() <= 0.5 * (262143 - 16384) / 2047 / (262143 / 16) * 1.1
+    clpipe("run", STILL_LIFE, "-o", "kept", *noise, *few, "--keep", "quantize")
+    clpipe("run", "kept/still_life.quantize.exr", "-o", "on", "--start-at", "normalize")
+    pictures = ("kept/still_life.jpg", "on/still_life.quantize.jpg")
+    assert np.array_equal(*(np.asarray(Image.open(path)) for path in pictures))
+    kept = "kept/still_life.quantize.exr"
+    result = clpipe("measure", kept, "--truth", kept, status=1)
+    assert "has fewer DN by a curve" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("quantize.method=pwl", "quantize.knots=[[0,0]]"), "knots: found .*expected pairs"),
+        (("quantize.method=pwl", "quantize.knots=[[0,0],[9,9],[5,10]]"), "rising in both"),
+        (("quantize.method=pwl", "quantize.knots=[[0,0],[16383,5000]]"), "12 bits do not hold"),
+        (("quantize.method=pwl", "quantize.knots=[[0,0],[99,50]]"), "but the white level is 16383"),
+        (("normalize.method=pwl",), "no knots are known"),
+        (("sensor_noise.method=dual_gain",), "found a white level of 262143, but it holds DN of"),
+        (("quantize.method=pwl",), "by a curve"),
+    ],
+)
+def test_what_is_refused(clpipe, options, message):
+    sets = [part for option in options for part in ("--set", option)]
+    result = clpipe("run", STILL_LIFE, "-o", "out", "--format", "dng", *sets, status=2)
+    assert re.search(message, result.stderr.replace("\n", " "))
+    assert not Path("out").exists()
+
+
+def test_a_dng_of_two_readouts_that_fit(clpipe):
+    options = ("--set", "sensor_noise.method=dual_gain", "--set", "sensor_noise.ratio=4")
+    clpipe("run", STILL_LIFE, "-o", "out", "--format", "dng", "--keep", "quantize", *options)
+    kept = read_image(Path("out/still_life.quantize.exr"), mosaic=True).pixels
+    assert kept.max() > 16383
+    assert Path("out/still_life.dng").stat().st_size > kept.size * 2
+
+
+def test_a_sample_of_more_than_16_bits():
+    noise = {"method": "dual_gain"}
+    with pytest.raises(RequestError, match="raw in DN goes to 262143, which uint16 does not hold"):
+        Dataset(STILL_LIFE, raw="mosaic", sensor_noise=noise)
+    sample = Dataset(STILL_LIFE, raw="mosaic", dtype="float32", sensor_noise=noise)[0]
+    assert sample["raw"].dtype == np.float32
+
+
+def test_the_ratio_as_a_table(clpipe, write_exr):
+    ramp = np.geomspace(1e-3, 30, 256, dtype=np.float32)
+    path = write_exr("ramp.exr", np.tile(ramp[None, :, None], (64, 1, 3)), half=False)
+    options = ("--set", "sensor_noise.method=split_pixel", "--set", "exposure.headroom=0")
+    clpipe("run", path, "-o", "out", *options, "--until", "normalize", "--truth", "clean")
+    pair = ("out/ramp.exr", "--truth", "out/ramp.truth_clean.exr")
+    steps = json.loads(clpipe("measure", *pair, "--snr", "--json").stdout)["snr"]
+    assert len(steps) > 20
+    assert all(a["intensity"] < b["intensity"] for a, b in pairwise(steps))
+    falls = [b["decibels"] < a["decibels"] - 2 for a, b in pairwise(steps)]
+    assert any(falls)  # at the hand-over
+    assert "stops below" in clpipe("measure", *pair, "--snr").stdout
