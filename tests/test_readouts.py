@@ -1,4 +1,4 @@
-"""Several readouts of an exposure and companding: noise against formulas, hand-overs, round trips."""
+"""Several readouts and companding: noise against formulas, hand-overs, round trips."""
 
 import json
 import re
@@ -15,7 +15,7 @@ from clpipe.chain.settings import settings_from
 from clpipe.dataset import Dataset
 from clpipe.engine.runner import Runner
 from clpipe.images.read import read_image
-from clpipe.reference.companding import along_pieces, knots_in, pieces_of, usual_knots
+from clpipe.reference.companding import along_pieces, pieces_of, usual_knots
 from tests.conftest import STILL_LIFE
 
 METHODS = {

@@ -41,7 +41,8 @@ def knots_in(pairs: Sequence[Sequence[float]]) -> Knots:
     rising = all(a[0] < b[0] and a[1] < b[1] for a, b in pairwise(knots))
     if not right or not rising or knots[0] != (0, 0):
         raise ValueError(
-            f"knots: found {pairs}; expected pairs of DN before and after, from [0, 0] on, rising in both"
+            f"knots: found {pairs}; expected pairs of DN before and after, from [0, 0] on, rising "
+            "in both"
         )
     return knots
 
