@@ -1,0 +1,86 @@
+"""A camera profile from the figures of a series: TOML text, with the source of every figure."""
+
+from typing import Any
+
+from clpipe.analysis.calibration.dark_profile import plus_minus
+from clpipe.analysis.calibration.line_fit import Estimate
+from clpipe.analysis.emva.figures import LEAST_DARK, Figures, NonUniformity
+from clpipe.analysis.emva.moments import Moments
+from clpipe.analysis.emva.sensor import before_rounding, full_well, noisiest_light
+from clpipe.camera.text import profile_text
+
+ISO = 100.0  # of the profile; the standard knows none
+
+
+def emva_profile(name: str, source: str, moments: Moments, figures: Figures) -> str:
+    """The profile as :func:`clpipe.camera.profile.load_camera` reads it.
+
+    Rows, columns and slopes of light or shade count as differences of single pixels, so that DSNU
+    and PRNU are the sensor's over all pixels.
+
+    Args:
+        name: of the profile.
+        source: the series, for the sources.
+        moments: of the series.
+        figures: of the series.
+    """
+    dark, gain = moments.dark_stack, figures.system_gain.value
+    dark2 = figures.dark_noise_dn.value**2
+    temporal = dark.temporal if dark2 <= LEAST_DARK else dark2
+    black, read_noise, pattern = before_rounding(dark.mean, temporal, dark.variance)
+    prnu, light = figures.prnu.total.value, moments.white - black
+    saturation = figures.saturation_electrons
+    values: dict[str, Any] = {
+        "name": name,
+        "make": "unknown",
+        "model": name,
+        "black_level": black,
+        "white_level": moments.white,
+        "white_balance_gains": (1.0, 1.0),
+        "iso_range": (ISO, ISO),
+        "quantum_efficiency": min(figures.quantum_efficiency.value, 1.0),
+        "prnu": prnu,
+        "dsnu": pattern / gain,
+    }
+    of_converter = noisiest_light(gain, read_noise, prnu, light)
+    # A step of the exposures is 12^(1/2) standard errors wide.
+    is_converter = of_converter < saturation.value + 12**0.5 * saturation.error
+    well = f"noise is greatest at {plus_minus(saturation, 'e-')}"
+    if is_converter:
+        well += ", where the converter ends"
+    else:
+        values["full_well"] = full_well(gain, read_noise, prnu, saturation.value)
+        well += f", {of_converter - saturation.value:.0f} e- before the converter ends"
+    current = figures.dark_current
+    if current and current.significant:
+        values["dark_current"] = current.value
+    stage = {"iso": [ISO], "system_gain": [gain], "read_noise": [read_noise]}
+    sources = {
+        "gain_stages": f"EMVA 1288 (release 3.1), {source}: gain "
+        f"{plus_minus(figures.system_gain, 'DN/e-')}, dark noise "
+        f"{plus_minus(figures.dark_noise, 'e-')}; ISO 100 stands for the setting of the series",
+        "levels": "black: the mean of the frames without light, before they were rounded; white: "
+        "the largest value of a frame",
+        "white_balance_gains": "not known; 1 stands in",
+        "xyz_to_camera": "not known",
+        "quantum_efficiency": f"at the light of the series: {plus_minus(figures.quantum_efficiency)}",
+        "full_well": well,
+        "prnu": f"PRNU1288: {_parts(figures.prnu, '')}; all of it drawn for each pixel",
+        "dsnu": f"DSNU1288: {_parts(figures.dsnu, 'e-')}; all of it drawn for each pixel",
+        "dark_current": f"slope of the means without light: {plus_minus(current, 'e-/s')}; at the "
+        "temperature of the series, for which 20 deg C stands in"
+        if current
+        else "not known: it takes three or more exposure times",
+        "linearity": "the sensor is off a line by "
+        f"{figures.linearity.least.value:+.2f} to {figures.linearity.most.value:+.2f} %; the "
+        "profile is linear",
+        "fixed_pattern": "hot and dead pixels, row noise: not known; zero stands in",
+    }
+    return profile_text(values, [stage], sources)
+
+
+def _parts(figure: NonUniformity, unit: str) -> str:
+    """A non-uniformity with its parts, for the sources."""
+    parts = {"rows": figure.row, "columns": figure.column, "single pixels": figure.pixel}
+    each = ", ".join(f"{name} {plus_minus(part, unit)}" for name, part in parts.items())
+    return f"{plus_minus(figure.total, unit)} ({each})"
