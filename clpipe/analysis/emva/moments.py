@@ -62,6 +62,17 @@ class Spatial:
         return of_rows - pixel / columns, of_columns - pixel / rows, pixel
 
     @property
+    def stripes(self) -> float:
+        """The variance of columns' offsets that differ from neighbour to neighbour, DN^2.
+
+        Half that of the differences of neighbouring columns, to which slopes over many columns add
+        nothing, less what differences of single pixels leave in means of columns.
+        """
+        steps = np.diff(self.mean_frame, axis=1)
+        noise = steps.var(axis=0, ddof=1).mean() / len(steps)
+        return float(np.square(steps.mean(axis=0)).mean() - noise) / 2
+
+    @property
     def error(self) -> float:
         """The standard error of the variance, of repeated stacks of the same sensor."""
         noise = 4 * max(self.variance, 0.0) * self.residue + 2 * self.residue**2

@@ -4,7 +4,7 @@ from typing import Any
 
 from clpipe.analysis.calibration.dark_profile import plus_minus
 from clpipe.analysis.calibration.line_fit import Estimate
-from clpipe.analysis.emva.figures import LEAST_DARK, Figures, NonUniformity
+from clpipe.analysis.emva.figures import LEAST_DARK, ROUNDING, Figures, NonUniformity
 from clpipe.analysis.emva.moments import Moments
 from clpipe.analysis.emva.sensor import before_rounding, full_well, noisiest_light
 from clpipe.camera.text import profile_text
@@ -15,8 +15,8 @@ ISO = 100.0  # of the profile; the standard knows none
 def emva_profile(name: str, source: str, moments: Moments, figures: Figures) -> str:
     """The profile as :func:`clpipe.camera.profile.load_camera` reads it.
 
-    Rows, columns and slopes of light or shade count as differences of single pixels, so that DSNU
-    and PRNU are the sensor's over all pixels.
+    What differs from row to row or over wide areas counts as differences of single pixels, so that
+    DSNU and PRNU of all pixels are the sensor's.
 
     Args:
         name: of the profile.
@@ -24,12 +24,19 @@ def emva_profile(name: str, source: str, moments: Moments, figures: Figures) -> 
         moments: of the series.
         figures: of the series.
     """
-    dark, gain = moments.dark_stack, figures.system_gain.value
+    dark = moments.dark_stack
     dark2 = figures.dark_noise_dn.value**2
     temporal = dark.temporal if dark2 <= LEAST_DARK else dark2
     black, read_noise, pattern = before_rounding(dark.mean, temporal, dark.variance)
+    # Less noise in the dark than before rounding tilts the line of K, which goes through zero.
+    used = moments.light[figures.fitted]
+    hidden = read_noise**2 + ROUNDING - temporal
+    gain = figures.system_gain.value - hidden * float(used.sum() / (used @ used))
+    efficiency = figures.responsivity.value / gain
     prnu, light = figures.prnu.total.value, moments.white - black
-    saturation = figures.saturation_electrons
+    saturation = figures.saturation.scaled(efficiency)
+    stripes = Estimate(dark.stripes, dark.error)
+    column2 = pattern**2 * stripes.value / dark.variance if stripes.significant else 0.0
     values: dict[str, Any] = {
         "name": name,
         "make": "unknown",
@@ -38,9 +45,9 @@ def emva_profile(name: str, source: str, moments: Moments, figures: Figures) -> 
         "white_level": moments.white,
         "white_balance_gains": (1.0, 1.0),
         "iso_range": (ISO, ISO),
-        "quantum_efficiency": min(figures.quantum_efficiency.value, 1.0),
+        "quantum_efficiency": min(efficiency, 1.0),
         "prnu": prnu,
-        "dsnu": pattern / gain,
+        "dsnu": max(pattern**2 - column2, 0.0) ** 0.5 / gain,
     }
     of_converter = noisiest_light(gain, read_noise, prnu, light)
     # A step of the exposures is 12^(1/2) standard errors wide.
@@ -54,19 +61,28 @@ def emva_profile(name: str, source: str, moments: Moments, figures: Figures) -> 
     current = figures.dark_current
     if current and current.significant:
         values["dark_current"] = current.value
-    stage = {"iso": [ISO], "system_gain": [gain], "read_noise": [read_noise]}
+    stage = {
+        "iso": [ISO],
+        "system_gain": [gain],
+        "read_noise": [read_noise],
+        "column_noise": [column2**0.5],
+    }
     sources = {
-        "gain_stages": f"EMVA 1288 (release 3.1), {source}: gain "
+        "gain_stages": f"EMVA 1288 (release 3.1), {source}: K "
         f"{plus_minus(figures.system_gain, 'DN/e-')}, dark noise "
         f"{plus_minus(figures.dark_noise, 'e-')}; ISO 100 stands for the setting of the series",
         "levels": "black: the mean of the frames without light, before they were rounded; white: "
         "the largest value of a frame",
         "white_balance_gains": "not known; 1 stands in",
         "xyz_to_camera": "not known",
-        "quantum_efficiency": f"at the light of the series: {plus_minus(figures.quantum_efficiency)}",
+        "quantum_efficiency": f"at the light of the series: "
+        f"{plus_minus(figures.quantum_efficiency)}",
         "full_well": well,
         "prnu": f"PRNU1288: {_parts(figures.prnu, '')}; all of it drawn for each pixel",
-        "dsnu": f"DSNU1288: {_parts(figures.dsnu, 'e-')}; all of it drawn for each pixel",
+        "dsnu": f"DSNU1288: {_parts(figures.dsnu, 'e-')}; what is no "
+        "column noise is drawn for each pixel",
+        "column_noise": "differences of neighbouring columns without light: "
+        f"{plus_minus(stripes.root(), 'DN')}, with rounding",
         "dark_current": f"slope of the means without light: {plus_minus(current, 'e-/s')}; at the "
         "temperature of the series, for which 20 deg C stands in"
         if current
