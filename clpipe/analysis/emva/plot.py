@@ -30,7 +30,7 @@ def emva_png(moments: Moments, figures: Figures, title: str) -> bytes:
 
     figure = Figure(figsize=(16, 20), dpi=WIDTH / 16, layout="constrained")
     figure.suptitle(title, fontsize=17)
-    panels: tuple[Callable[["Axes", Moments, Figures], None], ...] = (
+    panels: tuple[Callable[[Axes, Moments, Figures], None], ...] = (
         _sensitivity,
         _photon_transfer,
         _signal_to_noise,
@@ -65,7 +65,10 @@ def _sensitivity(panel: "Axes", moments: Moments, figures: Figures) -> None:
     slope = figures.responsivity.value
     panel.plot(ends, slope * ends, color=MODEL, lw=1.2, label=f"R = {slope:.4g} DN per photon")
     panel.set(
-        title="Sensitivity", xlabel="photons per pixel", ylabel="mean above dark, DN", xlim=(0, None)
+        title="Sensitivity",
+        xlabel="photons per pixel",
+        ylabel="mean above dark, DN",
+        xlim=(0, None),
     )
 
 

@@ -9,10 +9,8 @@ from clpipe.analysis.emva.moments import Moments
 from clpipe.analysis.emva.sensor import before_rounding, full_well, noisiest_light
 from clpipe.camera.text import profile_text
 
-ISO = 100.0  # of the profile; the standard knows none
 
-
-def emva_profile(name: str, source: str, moments: Moments, figures: Figures) -> str:
+def emva_profile(name: str, iso: float, source: str, moments: Moments, figures: Figures) -> str:
     """The profile as :func:`clpipe.camera.profile.load_camera` reads it.
 
     What differs from row to row or over wide areas counts as differences of single pixels, so that
@@ -20,6 +18,7 @@ def emva_profile(name: str, source: str, moments: Moments, figures: Figures) -> 
 
     Args:
         name: of the profile.
+        iso: what the profile calls the setting of the series; the standard knows none.
         source: the series, for the sources.
         moments: of the series.
         figures: of the series.
@@ -44,7 +43,7 @@ def emva_profile(name: str, source: str, moments: Moments, figures: Figures) -> 
         "black_level": black,
         "white_level": moments.white,
         "white_balance_gains": (1.0, 1.0),
-        "iso_range": (ISO, ISO),
+        "iso_range": (iso, iso),
         "quantum_efficiency": min(efficiency, 1.0),
         "prnu": prnu,
         "dsnu": max(pattern**2 - column2, 0.0) ** 0.5 / gain,
@@ -62,7 +61,7 @@ def emva_profile(name: str, source: str, moments: Moments, figures: Figures) -> 
     if current and current.significant:
         values["dark_current"] = current.value
     stage = {
-        "iso": [ISO],
+        "iso": [iso],
         "system_gain": [gain],
         "read_noise": [read_noise],
         "column_noise": [column2**0.5],
@@ -70,13 +69,15 @@ def emva_profile(name: str, source: str, moments: Moments, figures: Figures) -> 
     sources = {
         "gain_stages": f"EMVA 1288 (release 3.1), {source}: K "
         f"{plus_minus(figures.system_gain, 'DN/e-')}, dark noise "
-        f"{plus_minus(figures.dark_noise, 'e-')}; ISO 100 stands for the setting of the series",
+        f"{plus_minus(figures.dark_noise, 'e-')}; ISO {iso:g} stands for the setting of the "
+        "series",
         "levels": "black: the mean of the frames without light, before they were rounded; white: "
         "the largest value of a frame",
         "white_balance_gains": "not known; 1 stands in",
         "xyz_to_camera": "not known",
         "quantum_efficiency": f"at the light of the series: "
-        f"{plus_minus(figures.quantum_efficiency)}",
+        f"{plus_minus(figures.quantum_efficiency)}"
+        + ("; there is none above 1, which stands in" if efficiency > 1 else ""),
         "full_well": well,
         "prnu": f"PRNU1288: {_parts(figures.prnu, '')}; all of it drawn for each pixel",
         "dsnu": f"DSNU1288: {_parts(figures.dsnu, 'e-')}; what is no "

@@ -1,8 +1,6 @@
 """Gaussian models of a sensor: what rounding hides in the dark, and where noise is greatest."""
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.special import ndtr
 
 from clpipe.base.types import Doubles
 
@@ -15,9 +13,7 @@ SEARCHED = np.linspace(0.6, 1.1, 2001)  # of the light that fills the sensor
 ROUNDS = 20  # of the search for a full well
 
 
-def before_rounding(
-    mean: float, temporal: float, spatial: float
-) -> tuple[float, float, float]:
+def before_rounding(mean: float, temporal: float, spatial: float) -> tuple[float, float, float]:
     """The mean and the deviations over time and over pixels, DN, before frames were rounded.
 
     Args:
@@ -34,6 +30,8 @@ def before_rounding(
     >>> [round(each, 3) for each in before_rounding(*rounded(2.8, 0.3, 0.2))]
     [2.8, 0.3, 0.2]
     """
+    from scipy.optimize import least_squares
+
     plain = mean, max(temporal - 1 / 12, 0) ** 0.5, max(spatial, 0) ** 0.5
     if plain[1] > COARSE:
         return plain
@@ -46,7 +44,8 @@ def before_rounding(
     start = np.maximum(plain, (mean - 1, 0.2, 0.02))
     bounds = ([mean - 1, 1e-3, 0.0], [mean + 1, 2.0, 4.0])
     found = least_squares(misfit, start, bounds=bounds, xtol=1e-12, ftol=1e-12)
-    return tuple(found.x.tolist())
+    found_mean, over_time, over_pixels = found.x.tolist()
+    return found_mean, over_time, over_pixels
 
 
 def rounded(mean: float, over_time: float, over_pixels: float) -> tuple[float, float, float]:
@@ -57,6 +56,8 @@ def rounded(mean: float, over_time: float, over_pixels: float) -> tuple[float, f
         over_time: the deviation of a pixel, DN.
         over_pixels: the deviation of pixels, DN.
     """
+    from scipy.special import ndtr
+
     pixels = mean + over_pixels * FINE
     reach = 6 * over_time + 4 * over_pixels + 1
     steps = np.arange(np.floor(mean - reach), np.ceil(mean + reach) + 1)
@@ -81,6 +82,8 @@ def noisiest_light(gain: float, read_noise: float, prnu: float, full: float) -> 
     >>> 0.9 < noisiest_light(0.1, 2.0, 0.005, 4000) / 40000 < 1
     True
     """
+    from scipy.special import ndtr
+
     light = SEARCHED[:, None] * full * np.maximum(1 + prnu * NODES, 0)
     sigma = np.sqrt(gain * light + read_noise**2)
     u = (full - light) / sigma

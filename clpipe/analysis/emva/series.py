@@ -160,7 +160,11 @@ def read_series(path: Path) -> Series:
         if letter == "n":
             if size:
                 raise lines.error(number, "a second line n; there can be but one")
-            limits = (("bits", 1, MOST_BITS), ("width", LEAST_SIDE, 1e5), ("height", LEAST_SIDE, 1e5))
+            limits = (
+                ("bits", 1, MOST_BITS),
+                ("width", LEAST_SIDE, 1e5),
+                ("height", LEAST_SIDE, 1e5),
+            )
             size = [
                 int(lines.number(number, word, *limit))
                 for word, limit in zip(words, limits, strict=True)
@@ -214,22 +218,24 @@ def _checked(path: Path, size: Sequence[int], exposures: Sequence[Exposure]) -> 
                 f"{path}, line {each.line}: no two frames without light were exposed for "
                 f"{each.time:g} ns, too"
             )
-    stacks = []
-    for lit, letter in ((True, "b"), (False, "d")):
-        own = of(lit, False)
+    stacks: list[Exposure] = []
+    for is_lit, letter in ((True, "b"), (False, "d")):
+        own = of(is_lit, False)
         if len(own) != 1:
+            light = "with light" if is_lit else "without light"
             raise RequestError(
-                f"{path}: found {len(own)} stacks of more than two frames {'with' if lit else 'without'}"
-                f" light ({letter}); expected one"
+                f"{path}: found {len(own)} stacks of more than two frames {light} ({letter}); "
+                "expected one"
             )
-        stacks.append(own[0])
+        stacks += own
     lit, unlit = stacks
     if lit.time != unlit.time:
         raise RequestError(
             f"{path}, lines {lit.line} and {unlit.line}: the stacks were exposed for {lit.time:g} "
             f"and {unlit.time:g} ns; expected the same time"
         )
-    return Series(path, *size, bright, dark, lit, unlit)
+    bits, width, height = size
+    return Series(path, bits, width, height, bright, dark, lit, unlit)
 
 
 def series_text(series: Series, comment: str) -> str:

@@ -1,5 +1,6 @@
 """A series of a camera of clpipe's: uniform light through the raw stages of a chain."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,14 +20,14 @@ from clpipe.engine.runner import Runner
 from clpipe.images.write import write_grey_png
 
 FIRST, LAST = "crosstalk", "quantize"  # what a chain does between the clean mosaic and the raw
-BEYOND = 1.1  # times the saturation, where the series ends
+BEYOND = 0.1  # of the exposures up to the saturation; so many follow
 SATURATED = 0.01  # s: the time after which the light saturates the sensor
 SHARE = 0.5  # of the saturation, at which the stack for PRNU is taken (release 3.1, sec. 8.1)
 
 
 @dataclass(frozen=True)
 class SeriesSize:
-    """How large a series is: of a frame in px, exposures up to the saturation, frames of a stack."""
+    """How large a series is: px of a frame, exposures up to the saturation, frames of a stack."""
 
     width: int = 640
     height: int = 480
@@ -113,7 +114,8 @@ def _planned(path: Path, camera: Camera, saturation: float, size: SeriesSize) ->
         saturation: photons.
         size: of the series.
     """
-    steps = np.arange(1, int(np.ceil(size.exposures * BEYOND)) + 1) / size.exposures
+    last = size.exposures + math.ceil(size.exposures * BEYOND)
+    steps = np.arange(1, last + 1) / size.exposures
 
     def exposure(share: float, photons: float, name: str, count: int) -> Exposure:
         frames = [path.parent / "images" / f"{name}_{number:03}.png" for number in range(count)]
