@@ -15,6 +15,7 @@ ROUNDING = 1 / 12  # the variance of rounding to whole DN, DN^2
 LEAST_DARK = 0.24  # DN^2: a variance below it is one of rounding alone (sec. 6.5)
 FITTED = 0.7  # of the saturation, up to which K and R are fitted (sec. 6.4)
 LINEAR = 0.05, 0.95  # of the saturation, between which linearity is judged (sec. 6.7)
+MOST_AT_ZERO = 0.005  # of the samples without light (sec. 6.5)
 ENOUGH = 3  # exposures that are fitted, at least
 
 
@@ -85,8 +86,14 @@ def figures(moments: Moments) -> Figures:
     """The figures of a series.
 
     Raises:
-        RequestError: the series has no saturation, or noise and light do not rise together.
+        RequestError: noise without light is cut off, the series has no saturation, or noise and
+            light do not rise together.
     """
+    if moments.dark_stack.at_zero > MOST_AT_ZERO:
+        raise RequestError(
+            f"{moments.dark_stack.at_zero:.1%} of the samples without light are 0 DN, where their "
+            f"noise is cut off; EMVA 1288 allows {MOST_AT_ZERO:.1%}: raise the camera's black level"
+        )
     bright, light, noise = moments.bright, moments.light, moments.noise
     saturated = _saturation(moments)
     fitted = (light <= FITTED * light[saturated]) & (bright.photons <= bright.photons[saturated])

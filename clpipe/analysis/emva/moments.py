@@ -31,6 +31,7 @@ class Spatial:
     frames: int
     mean_frame: Doubles  # (height, width), DN
     temporal: float
+    at_zero: float = 0.0  # the share of samples of 0 DN
 
     @property
     def mean(self) -> float:
@@ -144,10 +145,12 @@ def _stack(series: Series, exposure: Exposure) -> Spatial:
     """The mean frame and the temporal variance of a stack (release 3.1, eq. 33 to 35)."""
     total = np.zeros((series.height, series.width), np.int64)
     squares = np.zeros_like(total)
+    at_zero = 0.0
     for frame in exposure.frames:
         pixels = series.read(frame).astype(np.int64)
         total += pixels
         squares += pixels * pixels
+        at_zero += np.count_nonzero(pixels == 0) / pixels.size
     count = len(exposure.frames)
     temporal = (squares.mean() - np.square(total).mean() / count) / (count - 1)
-    return Spatial(count, total / count, float(temporal))
+    return Spatial(count, total / count, float(temporal), at_zero / count)

@@ -35,7 +35,8 @@ def emva_profile(name: str, iso: float, source: str, moments: Moments, figures: 
     prnu, light = figures.prnu.total.value, moments.white - black
     saturation = figures.saturation.scaled(efficiency)
     stripes = Estimate(dark.stripes, dark.error)
-    column2 = pattern**2 * stripes.value / dark.variance if stripes.significant else 0.0
+    share = stripes.value / max(dark.variance, stripes.value) if stripes.significant else 0.0
+    column2 = share * pattern**2
     values: dict[str, Any] = {
         "name": name,
         "make": "unknown",
@@ -46,7 +47,7 @@ def emva_profile(name: str, iso: float, source: str, moments: Moments, figures: 
         "iso_range": (iso, iso),
         "quantum_efficiency": min(efficiency, 1.0),
         "prnu": prnu,
-        "dsnu": max(pattern**2 - column2, 0.0) ** 0.5 / gain,
+        "dsnu": (pattern**2 - column2) ** 0.5 / gain,
     }
     of_converter = noisiest_light(gain, read_noise, prnu, light)
     # A step of the exposures is 12^(1/2) standard errors wide.
@@ -75,7 +76,7 @@ def emva_profile(name: str, iso: float, source: str, moments: Moments, figures: 
         "the largest value of a frame",
         "white_balance_gains": "not known; 1 stands in",
         "xyz_to_camera": "not known",
-        "quantum_efficiency": f"at the light of the series: "
+        "quantum_efficiency": "at the light of the series: "
         f"{plus_minus(figures.quantum_efficiency)}"
         + ("; there is none above 1, which stands in" if efficiency > 1 else ""),
         "full_well": well,

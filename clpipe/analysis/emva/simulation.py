@@ -119,7 +119,7 @@ def _planned(path: Path, camera: Camera, saturation: float, size: SeriesSize) ->
 
     def exposure(share: float, photons: float, name: str, count: int) -> Exposure:
         frames = [path.parent / "images" / f"{name}_{number:03}.png" for number in range(count)]
-        return Exposure(round(share * SATURATED * NS, 1), photons, tuple(frames))
+        return Exposure(round(share * SATURATED * NS), float(f"{photons:.9g}"), tuple(frames))
 
     bright, dark = (
         tuple(
