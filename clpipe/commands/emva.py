@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from clpipe.analysis.emva.series import LEAST_EXPOSURES, LEAST_SIDE
+from clpipe.analysis.emva.series import LEAST_EXPOSURES, SIDES
 from clpipe.analysis.emva.simulation import SeriesSize, simulate
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
@@ -14,7 +14,6 @@ from clpipe.commands.printing import show_json
 from clpipe.commands.progress import told
 from clpipe.engine.device import open_device
 
-MOST_SIDE = 30_000  # px
 USUAL = SeriesSize()
 
 
@@ -78,10 +77,11 @@ def emva(
     require("clpipe emva", "calibrate", "scipy")
     width, _, height = size.partition("x")
     columns, rows = (int(side) if side.isdecimal() else 0 for side in (width, height))
-    if not all(LEAST_SIDE <= side <= MOST_SIDE for side in (columns, rows)):
+    least, most = SIDES
+    if not least <= min(columns, rows) <= max(columns, rows) <= most:
         raise RequestError(
-            f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 640x480, each {LEAST_SIDE} to "
-            f"{MOST_SIDE}"
+            f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 640x480, "
+            f"each {least} to {most}"
         )
     of = SeriesSize(columns, rows, exposures, stack)
     with told() as tell:

@@ -12,10 +12,10 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Doubles, Mask
 
 ROUNDING = 1 / 12  # the variance of rounding to whole DN, DN^2
-LEAST_DARK = 0.24  # DN^2: a variance below it is one of rounding alone (sec. 6.5)
-FITTED = 0.7  # of the saturation, up to which K and R are fitted (sec. 6.4)
-LINEAR = 0.05, 0.95  # of the saturation, between which linearity is judged (sec. 6.7)
-MOST_AT_ZERO = 0.005  # of the samples without light (sec. 6.5)
+LEAST_DARK = 0.24  # DN^2: a variance below it is one of rounding alone
+FITTED = 0.7  # of the saturation, up to which K and R are fitted
+LINEAR = 0.05, 0.95  # of the saturation, between which linearity is judged
+MOST_AT_ZERO = 0.005  # of the samples without light
 ENOUGH = 3  # exposures that are fitted, at least
 
 
@@ -145,7 +145,7 @@ def figures(moments: Moments) -> Figures:
 
 
 def _saturation(moments: Moments) -> int:
-    """The number of the exposure at which the noise is greatest (sec. 6.6).
+    """The number of the exposure at which the noise is greatest.
 
     From the brightest exposure on it is the first with more noise than the two next darker ones:
     noise may rise slowly up to there, and scatter. What is less than half of the most noise is a
@@ -193,7 +193,7 @@ def _quotient(above: Estimate, below: Estimate) -> Estimate:
 
 
 def _dark_variance(dark: Temporal, pixels: int) -> tuple[Estimate, Estimate | None]:
-    """The variance without light at no exposure, DN^2, and its slope, DN^2/ns (sec. 6.5, 7.1).
+    """The variance without light at no exposure, DN^2, and its slope, DN^2/ns.
 
     With fewer than three exposure times it is that of the shortest one.
     """
@@ -210,7 +210,7 @@ def _dark_variance(dark: Temporal, pixels: int) -> tuple[Estimate, Estimate | No
 def _dark_current(
     dark: Temporal, gain: Estimate, noise_slope: Estimate | None
 ) -> tuple[Estimate | None, Estimate | None]:
-    """The dark current in e-/s, from means and from variances (sec. 7.1)."""
+    """The dark current in e-/s, from means and from variances."""
     if noise_slope is None:
         return None, None
     of_mean = _line(dark.time / 1e6, dark.mean)[0].scaled(1e-6)
@@ -221,7 +221,7 @@ def _dark_current(
 
 
 def _linearity(moments: Moments, saturated: int) -> Linearity:
-    """The line of least squares of relative deviations, and these (sec. 6.7)."""
+    """The line of least squares of relative deviations, and these."""
     light, photons = moments.light, moments.bright.photons
     low, high = (share * light[saturated] for share in LINEAR)
     used = (light >= low) & (light <= high) & (photons <= photons[saturated])
@@ -241,15 +241,17 @@ def _linearity(moments: Moments, saturated: int) -> Linearity:
 
 
 def _dsnu(dark: Spatial, gain: Estimate) -> NonUniformity:
-    """The deviation of pixels without light, e- (sec. 8.2)."""
+    """The deviation of pixels without light, e-."""
     parts = (dark.variance, *dark.parts)
-    return NonUniformity(*(_quotient(Estimate(s2, dark.error).root(), gain) for s2 in parts))
+    return NonUniformity(*(_quotient(part.root(), gain) for part in parts))
 
 
 def _prnu(bright: Spatial, dark: Spatial) -> NonUniformity:
-    """The relative deviation of pixels at half the saturation, less that without light (8.2)."""
-    error, light = float(np.hypot(bright.error, dark.error)), bright.mean - dark.mean
+    """The relative deviation of pixels at half the saturation, less that without light."""
+    light = bright.mean - dark.mean
     lit, unlit = (bright.variance, *bright.parts), (dark.variance, *dark.parts)
-    return NonUniformity(
-        *(Estimate(b - d, error).root().scaled(1 / light) for b, d in zip(lit, unlit, strict=True))
+    of_light = (
+        Estimate(b.value - d.value, float(np.hypot(b.error, d.error)))
+        for b, d in zip(lit, unlit, strict=True)
     )
+    return NonUniformity(*(part.root().scaled(1 / light) for part in of_light))

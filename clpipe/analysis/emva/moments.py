@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.emva.series import Exposure, Series
 from clpipe.base.types import Array, Doubles
 
@@ -44,40 +45,52 @@ class Spatial:
         return self.temporal / self.frames
 
     @property
-    def variance(self) -> float:
-        """s^2 = s_measured^2 - sigma^2 / L (release 3.1, eq. 36)."""
-        return float(self.mean_frame.var(ddof=1)) - self.residue
+    def variance(self) -> Estimate:
+        """s^2 = s_measured^2 - sigma^2 / L."""
+        measured = float(self.mean_frame.var(ddof=1))
+        return _less(measured, self.residue, self.mean_frame.size)
 
     @property
-    def parts(self) -> tuple[float, float, float]:
+    def parts(self) -> tuple[Estimate, Estimate, Estimate]:
         """The parts of rows, columns and pixels, which add up to the variance.
 
         Means of rows have the variance row + pixel / N, those of columns column + pixel / M, for N
-        columns and M rows (after release 4.0, sec. 8.1). One below zero was not seen.
+        columns and M rows (as release 4.0 has it). One below zero was not seen.
         """
         rows, columns = self.mean_frame.shape
         total = self.variance
-        of_rows = float(self.mean_frame.mean(axis=1).var()) - self.residue / columns
-        of_columns = float(self.mean_frame.mean(axis=0).var()) - self.residue / rows
-        pixel = (total - of_rows - of_columns) / (1 - 1 / rows - 1 / columns)
-        return of_rows - pixel / columns, of_columns - pixel / rows, pixel
+        of_rows = _less(self.mean_frame.mean(axis=1).var(), self.residue / columns, rows)
+        of_columns = _less(self.mean_frame.mean(axis=0).var(), self.residue / rows, columns)
+        rest = total.value - of_rows.value - of_columns.value
+        pixel = rest / (1 - 1 / rows - 1 / columns)
+        return (
+            Estimate(of_rows.value - pixel / columns, of_rows.error),
+            Estimate(of_columns.value - pixel / rows, of_columns.error),
+            Estimate(pixel, total.error),
+        )
 
     @property
-    def stripes(self) -> float:
+    def stripes(self) -> Estimate:
         """The variance of columns' offsets that differ from neighbour to neighbour, DN^2.
 
         Half that of the differences of neighbouring columns, to which slopes over many columns add
-        nothing, less what differences of single pixels leave in means of columns.
+        nothing, less what single pixels leave in means of columns.
         """
         steps = np.diff(self.mean_frame, axis=1)
-        noise = steps.var(axis=0, ddof=1).mean() / len(steps)
-        return float(np.square(steps.mean(axis=0)).mean() - noise) / 2
+        rows, count = steps.shape
+        of_pixels = float(steps.var(axis=0, ddof=1).mean()) / 2 / rows
+        # Each column is in two differences, which makes 1.5 times the variance of a mean.
+        return _less(np.square(steps.mean(axis=0)).mean() / 2, of_pixels, count / 1.5)
 
-    @property
-    def error(self) -> float:
-        """The standard error of the variance, of repeated stacks of the same sensor."""
-        noise = 4 * max(self.variance, 0.0) * self.residue + 2 * self.residue**2
-        return float(np.sqrt(noise / self.mean_frame.size))
+
+def _less(measured: float, noise: float, count: float) -> Estimate:
+    """A variance of ``count`` values, less that of noise in them.
+
+    The standard error is that of the noise alone, so of a measurement of the same sensor again.
+    """
+    variance = float(measured) - noise
+    scatter = 4 * max(variance, 0.0) * noise + 2 * noise * noise
+    return Estimate(variance, float(np.sqrt(scatter / count)))
 
 
 @dataclass(frozen=True)
@@ -120,7 +133,7 @@ def read_moments(series: Series) -> Moments:
         one, two = (series.read(frame) for frame in exposure.frames)
         white = max(white, int(one.max()), int(two.max()))
         flicker = float(one.mean() - two.mean())
-        # Release 3.1, eq. 17 and 18: half the mean square of the difference.
+        # A frame has half the variance of the difference.
         square = float(np.square(one.astype(np.float64) - two).mean())
         mean = float(one.mean() + two.mean()) / 2
         return exposure.time, exposure.photons, mean, (square - flicker**2) / 2, flicker
@@ -142,7 +155,7 @@ def read_moments(series: Series) -> Moments:
 
 
 def _stack(series: Series, exposure: Exposure) -> Spatial:
-    """The mean frame and the temporal variance of a stack (release 3.1, eq. 33 to 35)."""
+    """The mean frame and the temporal variance of a stack."""
     total = np.zeros((series.height, series.width), np.int64)
     squares = np.zeros_like(total)
     at_zero = 0.0

@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 
 WIDTH = 1600  # px
 MEASURED, MODEL, OTHER, LIMIT = "#1f5fbf", "#222222", "#c8102e", "#8a8a8a"
-BOX = 5  # px, of the mean that is subtracted before the histogram of PRNU (release 3.1, sec. 8.4)
+BOX = 5  # px, of the mean that is subtracted before the histogram of PRNU
 BINS = 256
 
 
 def emva_png(moments: Moments, figures: Figures, title: str) -> bytes:
     """The standard's plots as a PNG, 1600 px wide.
 
-    They are sensitivity, photon transfer, signal-to-noise ratio, linearity (release 3.1, sec. 9),
+    They are sensitivity, photon transfer, signal-to-noise ratio, linearity,
     spectrograms of rows and of columns, and histograms of DSNU and PRNU.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -85,7 +85,7 @@ def _photon_transfer(panel: "Axes", moments: Moments, figures: Figures) -> None:
 
 
 def _signal_to_noise(panel: "Axes", moments: Moments, figures: Figures) -> None:
-    """SNR over photons with its model, and that with DSNU and PRNU (release 3.1, eq. 20)."""
+    """SNR over photons with its model, and that with DSNU and PRNU."""
     bright = moments.bright
     seen = (bright.variance > 0) & (moments.light > 0)
     seen &= bright.photons <= figures.saturation.value
@@ -156,7 +156,7 @@ def _columns(panel: "Axes", moments: Moments, figures: Figures) -> None:
 
 
 def _spectra(panel: "Axes", moments: Moments, figures: Figures, across: bool) -> None:
-    """Draw the roots of the mean power spectra of lines (release 3.1, sec. 8.3), both in e-."""
+    """Draw the roots of the mean power spectra of lines, both in e-."""
     gain = figures.system_gain.value
     lit = moments.bright_stack.mean_frame - moments.dark_stack.mean_frame
     unlit = moments.dark_stack

@@ -3,7 +3,6 @@
 from typing import Any
 
 from clpipe.analysis.calibration.dark_profile import plus_minus
-from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.emva.figures import LEAST_DARK, ROUNDING, Figures, NonUniformity
 from clpipe.analysis.emva.moments import Moments
 from clpipe.analysis.emva.sensor import before_rounding, full_well, noisiest_light
@@ -26,7 +25,7 @@ def emva_profile(name: str, iso: float, source: str, moments: Moments, figures: 
     dark = moments.dark_stack
     dark2 = figures.dark_noise_dn.value**2
     temporal = dark.temporal if dark2 <= LEAST_DARK else dark2
-    black, read_noise, pattern = before_rounding(dark.mean, temporal, dark.variance)
+    black, read_noise, pattern = before_rounding(dark.mean, temporal, dark.variance.value)
     # Less noise in the dark than before rounding tilts the line of K, which goes through zero.
     used = moments.light[figures.fitted]
     hidden = read_noise**2 + ROUNDING - temporal
@@ -34,8 +33,8 @@ def emva_profile(name: str, iso: float, source: str, moments: Moments, figures: 
     efficiency = figures.responsivity.value / gain
     prnu, light = figures.prnu.total.value, moments.white - black
     saturation = figures.saturation.scaled(efficiency)
-    stripes = Estimate(dark.stripes, dark.error)
-    share = stripes.value / max(dark.variance, stripes.value) if stripes.significant else 0.0
+    stripes = dark.stripes
+    share = stripes.value / max(dark.variance.value, stripes.value) if stripes.significant else 0
     column2 = share * pattern**2
     values: dict[str, Any] = {
         "name": name,

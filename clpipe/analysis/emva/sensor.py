@@ -25,8 +25,8 @@ def before_rounding(mean: float, temporal: float, spatial: float) -> tuple[float
     hides or enlarges both variances; the Gaussian sensor is then found whose rounded frames have
     the three figures.
 
-    >>> before_rounding(100.2, 4 + 1 / 12, 0.04)
-    (100.2, 2.0, 0.2)
+    >>> [round(each, 3) for each in before_rounding(100.2, 4 + 1 / 12, 0.04)]
+    [100.2, 2.0, 0.2]
     >>> [round(each, 3) for each in before_rounding(*rounded(2.8, 0.3, 0.2))]
     [2.8, 0.3, 0.2]
     """

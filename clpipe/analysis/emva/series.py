@@ -27,7 +27,7 @@ NAME = "EMVA1288_Data.txt"
 RELEASE = "3.1"
 PAIR = 2  # frames of one exposure, for temporal figures
 MOST_BITS = 16
-LEAST_SIDE = 16  # px
+SIDES = 16, 16_384  # px, least and most
 LEAST_EXPOSURES = 9  # with light; the standard asks for 50
 NS = 1e9  # in a second
 FORMS = {
@@ -134,9 +134,16 @@ class _Lines:
         except ValueError:
             value = np.nan
         if not low <= value <= high:
-            raise self.error(
-                number, f"{name}: found {one_line(word)!r}; allowed: {low:g} to {high:g}"
-            )
+            allowed = f"{low:g} to {high:g}"
+            raise self.error(number, f"{name}: found {one_line(word)!r}; allowed: {allowed}")
+        return value
+
+    def count(self, number: int, word: str, name: str, low: int, high: int) -> int:
+        """A whole number of a line."""
+        value = int(word) if word.isdecimal() and len(word) < 10 else -1
+        if not low <= value <= high:
+            allowed = f"{low} to {high}"
+            raise self.error(number, f"{name}: found {one_line(word)!r}; allowed: {allowed}")
         return value
 
 
@@ -160,36 +167,42 @@ def read_series(path: Path) -> Series:
         if letter == "n":
             if size:
                 raise lines.error(number, "a second line n; there can be but one")
-            limits = (
-                ("bits", 1, MOST_BITS),
-                ("width", LEAST_SIDE, 1e5),
-                ("height", LEAST_SIDE, 1e5),
-            )
-            size = [
-                int(lines.number(number, word, *limit))
-                for word, limit in zip(words, limits, strict=True)
-            ]
+            size = [lines.count(number, words[0], "bits", 1, MOST_BITS)]
+            size += [lines.count(number, word, "side", *SIDES) for word in words[1:]]
         elif letter == "i":
             raise lines.error(number, "a frame of no exposure; a line b or d comes first")
         elif letter in "bd":
-            time = lines.number(number, words[0], "time", 0, 1e15)
-            photons = lines.number(number, words[1], "photons", 0, 1e12) if letter == "b" else 0.0
-            if letter == "b" and not photons:
-                raise lines.error(number, "photons: found 0; frames without light are a line d")
-            frames = []
-            while frame := lines.next(only="i"):
-                frames.append(path.parent / frame[1][1].replace("\\", "/"))
-            if len(frames) < PAIR:
-                raise lines.error(
-                    number, f"found {len(frames)} frames of this exposure; at least 2 are needed"
-                )
-            key = time, photons, len(frames) == PAIR
+            own = _exposure(lines, number, words, path.parent)
+            key = own.time, own.photons, len(own.frames) == PAIR
             if key in exposures:
                 raise lines.error(number, f"the exposure of line {exposures[key].line} again")
-            exposures[key] = Exposure(time, photons, tuple(frames), number)
+            exposures[key] = own
     if not size:
         raise RequestError(f"{path}: found no line {FORMS['n']}")
     return _checked(path, size, list(exposures.values()))
+
+
+def _exposure(lines: _Lines, number: int, words: Sequence[str], folder: Path) -> Exposure:
+    """The exposure of a line b or d, and of the frames that follow it.
+
+    Args:
+        lines: of the text.
+        number: of the line.
+        words: of the line: a time and, with light, photons.
+        folder: of the text.
+    """
+    time = lines.number(number, words[0], "time", 0, 1e15)
+    photons = [lines.number(number, word, "photons", 0, 1e12) for word in words[1:]]
+    if photons == [0.0]:
+        raise lines.error(number, "photons: found 0; frames without light are a line d")
+    frames = []
+    while frame := lines.next(only="i"):
+        frames.append(folder / frame[1][1].replace("\\", "/"))
+    if len(frames) < PAIR:
+        raise lines.error(
+            number, f"found {len(frames)} frames of this exposure; at least {PAIR} are needed"
+        )
+    return Exposure(time, sum(photons), tuple(frames), number)
 
 
 def _checked(path: Path, size: Sequence[int], exposures: Sequence[Exposure]) -> Series:

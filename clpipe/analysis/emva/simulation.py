@@ -22,7 +22,7 @@ from clpipe.images.write import write_grey_png
 FIRST, LAST = "crosstalk", "quantize"  # what a chain does between the clean mosaic and the raw
 BEYOND = 0.1  # of the exposures up to the saturation; so many follow
 SATURATED = 0.01  # s: the time after which the light saturates the sensor
-SHARE = 0.5  # of the saturation, at which the stack for PRNU is taken (release 3.1, sec. 8.1)
+SHARE = 0.5  # of the saturation, at which the stack for PRNU is taken
 
 
 @dataclass(frozen=True)
