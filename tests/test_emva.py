@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clpipe.analysis.emva.figures import _saturation, figures
+from clpipe.analysis.emva.figures import figures, saturation_index
 from clpipe.analysis.emva.files import measure_series
 from clpipe.analysis.emva.moments import Spatial, read_moments
 from clpipe.analysis.emva.profile import emva_profile
@@ -238,8 +238,8 @@ def test_noise_is_greatest_where_it_scatters_little():
             self.bright = self
             self.variance = np.array(variance, float)
 
-    assert _saturation(Of(1, 2, 4.01, 3.9, 3.95, 4.0, 2, 0.1, 0.0)) == 5
-    assert _saturation(Of(1, 2, 3, 4, 2, 0.1, 0.0, 0.3, 0.0)) == 3
+    assert saturation_index(Of(1, 2, 4.01, 3.9, 3.95, 4.0, 2, 0.1, 0.0)) == 5
+    assert saturation_index(Of(1, 2, 3, 4, 2, 0.1, 0.0, 0.3, 0.0)) == 3
 
 
 def test_rows_columns_and_pixels_are_told_apart():

@@ -95,7 +95,7 @@ def figures(moments: Moments) -> Figures:
             f"noise is cut off; EMVA 1288 allows {MOST_AT_ZERO:.1%}: raise the camera's black level"
         )
     bright, light, noise = moments.bright, moments.light, moments.noise
-    saturated = _saturation(moments)
+    saturated = saturation_index(moments)
     fitted = (light <= FITTED * light[saturated]) & (bright.photons <= bright.photons[saturated])
     if fitted.sum() < ENOUGH:
         raise RequestError(
@@ -111,17 +111,14 @@ def figures(moments: Moments) -> Figures:
     dark2, noise_slope = _dark_variance(moments.dark, moments.dark_stack.mean_frame.size)
     dark_dn = dark2.root()
     dark_noise = _quotient(Estimate(dark2.value - ROUNDING, dark2.error).root(), gain)
-    in_electrons = _quotient(dark_dn, gain)
-    threshold = _quotient(Estimate(in_electrons.value + 0.5, in_electrons.error), efficiency)
+    # (sigma / K + 1/2) / QE, in which most of K cancels.
+    least = Estimate(dark_dn.value + gain.value / 2, float(np.hypot(dark_dn.error, gain.error / 2)))
+    threshold = _quotient(least, responsivity)
     # The saturation lies anywhere within half a step of the exposures.
     photons = bright.photons
     step = float(np.ptp(photons[max(saturated - 1, 0) : saturated + 2])) / 2
     saturation = Estimate(float(photons[saturated]), step / 12**0.5)
-    electrons = Estimate(
-        saturation.value * efficiency.value,
-        float(np.hypot(saturation.error, saturation.value * efficiency.error / efficiency.value))
-        * efficiency.value,
-    )
+    electrons = _quotient(saturation, _quotient(gain, responsivity))
     current, of_noise = _dark_current(moments.dark, gain, noise_slope)
     return Figures(
         system_gain=gain,
@@ -144,7 +141,7 @@ def figures(moments: Moments) -> Figures:
     )
 
 
-def _saturation(moments: Moments) -> int:
+def saturation_index(moments: Moments) -> int:
     """The number of the exposure at which the noise is greatest.
 
     From the brightest exposure on it is the first with more noise than the two next darker ones:

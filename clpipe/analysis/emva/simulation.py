@@ -85,7 +85,9 @@ def simulate(
     samples = np.uint8 if series.bits <= 8 else np.uint16
     for exposure in exposures:
         chain = make_chain(_exposed(settings, exposure), start_at=FIRST, until=LAST)
-        runner = runner.for_chain(chain) if runner else Runner(chain, device, (), False, True)
+        runner = (
+            runner.for_chain(chain) if runner else Runner(chain, device, encode=False, final=True)
+        )
         light = np.full((size.height, size.width), photon * exposure.photons, np.float32)
         for frame in exposure.frames:
             key = noise_key(settings, image_key(frame.relative_to(folder).as_posix(), ""))
