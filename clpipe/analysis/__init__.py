@@ -3,6 +3,6 @@ and the development of a camera, matched. And of light: the exposures of a seque
 compared, as figures.
 
 This room works on arrays and on files that ``images`` reads; only ``matching`` develops pictures,
-and ``metering`` runs a chain as far as its exposure. It imports ``outputs`` and below, and is the
-only room that imports SciPy and Matplotlib.
+``metering`` runs a chain as far as its exposure, and ``emva`` one as far as its raw. It imports
+``outputs`` and below, and is the only room that imports SciPy and Matplotlib.
 """

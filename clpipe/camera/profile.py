@@ -57,6 +57,7 @@ class Camera(BaseModel):
     xyz_to_camera: Matrix | None = None  # XYZ to camera RGB at D65, as a DNG's ColorMatrix2
     row_noise_ratio: NotNegative = 0.0  # row sigma over read noise, for stages without a table
     column_noise_ratio: NotNegative = 0.0
+    quantum_efficiency: Annotated[float, Field(gt=0, le=1)] | None = None  # electrons per photon
     full_well: Positive | None = None  # e-; None: the ADC clips first
     tukey_lambda: TukeyLambda | None = None  # of read noise at every ISO; None: Gaussian
     prnu: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # standard deviation over mean

@@ -8,8 +8,17 @@ from clpipe.analysis.calibration.files import calibrate_files, write_profile
 from clpipe.analysis.calibration.frames import FrameOverrides
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.result import Calibration
+from clpipe.analysis.emva.figures import Figures
+from clpipe.analysis.emva.files import measure_series, write_emva_profile
+from clpipe.base.errors import RequestError
 from clpipe.camera.text import check_profile_name
-from clpipe.commands.options import Command, dump_option, json_option, output_option
+from clpipe.commands.options import (
+    Command,
+    dump_option,
+    json_option,
+    options_set,
+    output_option,
+)
 from clpipe.commands.printing import show, show_json
 from clpipe.images.dump import parse_dump
 from clpipe.reference.cfa import PATTERNS, Pattern
@@ -18,10 +27,11 @@ CALIBRATION = (
     *("ISO", "frames", "K, DN/e-", "read, DN", "row, DN", "column, DN", "DSNU, e-", "PRNU, %"),
     *("hot", "dead", "pixels used"),
 )
+WITH_EMVA = ("emva", "output", "iso", "as_json")  # what goes with --emva
 
 
 @click.command("calibrate", cls=Command)
-@click.argument("inputs", nargs=-1, required=True, metavar="FRAMES...")
+@click.argument("inputs", nargs=-1, metavar="FRAMES...")
 @output_option(
     "CAMERA.toml", "The profile to write; CAMERA.png, a picture of the fit, is written beside it."
 )
@@ -30,6 +40,12 @@ CALIBRATION = (
     multiple=True,
     metavar="FILES",
     help="Frames without light, or a quoted glob; may be repeated.",
+)
+@click.option(
+    "--emva",
+    type=click.Path(path_type=Path),
+    metavar="EMVA1288_Data.txt",
+    help="Instead of FRAMES: a series of uniform frames, as EMVA 1288 asks for it.",
 )
 @click.option("--black-level", type=float, metavar="DN", help="In place of what the files say.")
 @click.option("--white-level", type=float, metavar="DN", help="In place of what the files say.")
@@ -45,6 +61,7 @@ def calibrate(
     inputs: tuple[str, ...],
     output: Path,
     dark: tuple[str, ...],
+    emva: Path | None,
     black_level: float | None,
     white_level: float | None,
     pattern: Pattern | None,
@@ -59,11 +76,24 @@ def calibrate(
     one static scene that has dark and bright places; a single frame gives less exact figures. Dark
     frames (lens cap on) add column noise, DSNU, hot pixels and a better b.
 
+    With --emva, a series of uniform light gives the figures of EMVA 1288 (release 3.1), and
+    CAMERA.png has the standard's plots; clpipe emva makes such a series.
+
     \b
     clpipe calibrate scene/*.CR2 --dark 'dark/*.CR2' -o my_camera.toml
+    clpipe calibrate --emva EMVA1288_Data.txt -o my_camera.toml
     clpipe run render.exr -o out --camera my_camera.toml --iso 800
     """
     check_profile_name(output)
+    if emva:
+        others = [option for name, option in options_set().items() if name not in WITH_EMVA]
+        if inputs or others:
+            found = "FRAMES" if inputs else others[0]
+            raise RequestError(f"--emva: found {found}, too; the series names its frames itself")
+        calibrate_emva(emva, output, iso, as_json)
+        return
+    if not inputs:
+        raise RequestError("calibrate: found no FRAMES; name raw frames, or a series with --emva")
     dumped = parse_dump(dump) if dump else None
     overrides = FrameOverrides(black_level, white_level, pattern, iso, dumped)
     frames, calibrations = calibrate_files(inputs, dark, overrides)
@@ -85,23 +115,70 @@ def calibrate(
     click.echo(f"\nwrote {output} and {picture}")
 
 
+def calibrate_emva(series: Path, output: Path, iso: float | None, as_json: bool) -> None:
+    """Measure a series after EMVA 1288, write the profile and say what was found."""
+    moments, found = measure_series(series)
+    picture = write_emva_profile(output, series, iso, moments, found)
+    if as_json:
+        files = {"profile": str(output), "picture": str(picture)}
+        show_json({**files, "figures": found.record()})
+        return
+    show(("figure", "value", "unit"), emva_rows(found))
+    click.echo(f"\nwrote {output} and {picture}")
+
+
+def emva_rows(found: Figures) -> list[tuple[str, str, str]]:
+    """The rows of a table of figures, with standard errors."""
+    errors = found.linearity
+    rows: list[tuple[str, Estimate | None, float, str]] = [
+        ("system gain K", found.system_gain, 1, "DN/e-"),
+        ("responsivity R", found.responsivity, 1, "DN/photon"),
+        ("quantum efficiency", found.quantum_efficiency, 100, "%"),
+        ("dark noise", found.dark_noise, 1, "e-"),
+        ("dark noise, rounding included", found.dark_noise_dn, 1, "DN"),
+        ("sensitivity threshold", found.threshold, 1, "photons"),
+        ("saturation capacity", found.saturation, 1, "photons"),
+        ("saturation capacity", found.saturation_electrons, 1, "e-"),
+        ("signal-to-noise ratio, at most", found.snr_max, 1, ""),
+        ("dynamic range", found.dynamic_range, 1, ""),
+        ("linearity error, least", errors.least, 1, "%"),
+        ("linearity error, most", errors.most, 1, "%"),
+    ]
+    for name, figure, factor, unit in (
+        ("DSNU1288", found.dsnu, 1, "e-"),
+        ("PRNU1288", found.prnu, 100, "%"),
+    ):
+        rows.append((name, figure.total, factor, unit))
+        rows += [
+            (f"{name}, {part}s", getattr(figure, part), factor, unit)
+            for part in ("row", "column", "pixel")
+        ]
+    rows += [
+        ("dark current, from means", found.dark_current, 1, "e-/s"),
+        ("dark current, from noise", found.dark_current_of_noise, 1, "e-/s"),
+    ]
+    return [(name, estimate_text(figure, factor), unit) for name, figure, factor, unit in rows]
+
+
+def estimate_text(estimate: Estimate | None, factor: float = 1) -> str:
+    """An estimate with its standard error, a dash where there is none."""
+    if estimate is None:
+        return "-"
+    return f"{estimate.value * factor:.4g} ± {estimate.error * factor:.1g}"
+
+
 def calibration_row(one: Calibration) -> tuple[str, ...]:
     """The row of one ISO, figures with their standard errors."""
-
-    def text(estimate: Estimate | None, factor: float = 1) -> str:
-        if estimate is None:
-            return "-"
-        return f"{estimate.value * factor:.4g} ± {estimate.error * factor:.1g}"
 
     return (
         f"{one.iso:g}",
         f"{one.scene_frames} + {one.dark_frames} dark",
-        text(one.pooled.gain),
-        text(one.read_noise),
-        text(one.row_noise),
-        text(one.column_noise),
-        text(one.dsnu, 1 / one.pooled.gain.value),
-        text(one.prnu, 100),
+        estimate_text(one.pooled.gain),
+        estimate_text(one.read_noise),
+        estimate_text(one.row_noise),
+        estimate_text(one.column_noise),
+        estimate_text(one.dsnu, 1 / one.pooled.gain.value),
+        estimate_text(one.prnu, 100),
         str(len(one.hot.rows)) if one.hot else "-",
         str(len(one.dead.rows)) if one.dead else "-",
         f"{one.used:.1%}",

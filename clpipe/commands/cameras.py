@@ -17,6 +17,7 @@ FIXED = {
     "white_level": "DN",
     "bits": "",
     "white_balance_gains": "red, blue",
+    "quantum_efficiency": "e-/photon",
     "full_well": "e-",
     "pixel_pitch": "um",
     "tukey_lambda": "",

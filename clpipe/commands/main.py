@@ -24,7 +24,7 @@ from clpipe.commands.notices import NOTICES
 GROUPS = {
     "Make pictures": ("run", "replay", "dataset", "meter"),
     "Look at them": ("report", "explore", "compare", "measure", "poses"),
-    "Cameras": ("cameras", "calibrate", "match"),
+    "Cameras": ("cameras", "calibrate", "emva", "match"),
     "What runs, and where": ("stages", "plan", "devices", "check", "bench"),
 }
 COMMANDS = tuple(name for names in GROUPS.values() for name in names)

@@ -225,6 +225,22 @@ def read_finished(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> SourceImage
         return SourceImage(np.ascontiguousarray(rgb), _digest(path), "", (), attributes, shot)
 
 
+def read_whole_numbers(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> Array:
+    """The first channel of a picture, (height, width), uint8 or uint16, as the file has it.
+
+    Raises:
+        ImageError: the file cannot be read, holds other samples, or is too large.
+    """
+    with open_image(path) as file:
+        spec = file.spec()
+        if spec.format.basetype not in (oiio.UINT8, oiio.UINT16):
+            raise ImageError(
+                f"{path}: holds {spec.format} samples; expected whole numbers of 8 or 16 bits"
+            )
+        check_size(path, spec.width, spec.height, max_pixels)
+        return read_samples(path, file, 0, (0,), spec.format.basetype)[..., 0]
+
+
 def photograph_facts(path: Path) -> tuple[float | None, int]:
     """The ISO in the EXIF of a finished picture, None where it does not say it, and its bits.
 

@@ -78,6 +78,7 @@ def case(number: int, seed: int, files: list[Path], folder: Path) -> Path:
 def ways(suffix: str) -> tuple[Callable[[Path], object], ...]:
     """The readers of files with an ending."""
     from clpipe.analysis.calibration.frames import FrameOverrides, read_frame
+    from clpipe.analysis.emva.series import read_series
     from clpipe.analysis.noise_models.read import import_camera
     from clpipe.analysis.pictures import load_picture
     from clpipe.batch.replay import replay_of
@@ -145,6 +146,7 @@ def ways(suffix: str) -> tuple[Callable[[Path], object], ...]:
             poses,
         ),
         ".tar": (members,),
+        ".txt": (read_series,),
     }
     images = (
         *(entering(), entering(transfer="srgb"), entering(config="unprocess")),
@@ -172,6 +174,15 @@ def attempt(path: Path) -> str:
             assert len(text) < 5000, text
             assert "bad_alloc" not in text, text
     return min(outcomes)
+
+
+def series_text() -> str:
+    """The text of a series for EMVA 1288."""
+    lines = ["# a", "v 3.1", "n 12 640 480"]
+    for number in range(1, 10):
+        for exposure in (f"b {number} {number}0,5", f"d {number}"):
+            lines += [exposure, f"i images\\{number}.png", "i b.png"]
+    return "\n".join([*lines, "b 1 5", *["i a.png"] * 3, "d 1", *["i a.png"] * 3])
 
 
 def make_seeds(folder: Path) -> list[Path]:
@@ -244,6 +255,7 @@ def make_seeds(folder: Path) -> list[Path]:
         'a.exr,b/c,800,,1e-4,bilinear\n"d, e.exr",,"{choice = [100, 400]}",3,,\n',
         "list.jsonl": '{"path": "a.exr", "iso": 800, "sensor_noise": {"a": 1e-4, "b": null}}\n'
         '{"path": "b.exr", "name": "c", "frames": 2, "exposure.ev": {"uniform": [-1, 1]}}\n',
+        "EMVA1288_Data.txt": series_text(),
         "draws.toml": 'seed = 3\niso = { log_uniform = [200, 6400] }\nskip = ["denoise"]\n'
         "[exposure]\nev = { normal = [0, 0.5] }\n[output]\njpeg_quality = 90\n",
     }

@@ -68,9 +68,19 @@ def write_profile(path: Path, frame: CalibrationFrame, calibrations: Sequence[Ca
     text = calibrated_profile(
         path.stem, frame.make, frame.model, calibrations, frame.gains, frame.xyz_to_camera
     )
+    return write_with_picture(
+        path, text, calibration_png(calibrations, f"{frame.make} {frame.model}")
+    )
 
+
+def write_with_picture(path: Path, text: str, png: bytes) -> Path:
+    """Write a profile's text, and the picture of the measurement beside it; returns its path.
+
+    Raises:
+        ImageError: a file cannot be written, or the text is no valid profile.
+    """
     picture = path.with_suffix(".png")
-    write_new(picture, calibration_png(calibrations, f"{frame.make} {frame.model}"))
+    write_new(picture, png)
     try:
         with whole_file(path) as file:
             file.write(text.encode())

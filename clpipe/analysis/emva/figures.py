@@ -1,0 +1,254 @@
+"""The figures of EMVA 1288, release 3.1, each with its standard error."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from clpipe.analysis.calibration.line_fit import Estimate
+from clpipe.analysis.emva.moments import Moments, Spatial, Temporal
+from clpipe.analysis.emva.series import NS
+from clpipe.base.errors import RequestError
+from clpipe.base.types import Doubles, Mask
+
+ROUNDING = 1 / 12  # the variance of rounding to whole DN, DN^2
+LEAST_DARK = 0.24  # DN^2: a variance below it is one of rounding alone
+FITTED = 0.7  # of the saturation, up to which K and R are fitted
+LINEAR = 0.05, 0.95  # of the saturation, between which linearity is judged
+MOST_AT_ZERO = 0.005  # of the samples without light
+ENOUGH = 3  # exposures that are fitted, at least
+
+
+@dataclass(frozen=True)
+class Linearity:
+    """The line through the light, and how far the light is off it, in % of the line.
+
+    ``slope`` and ``offset`` are in DN per photon and DN, ``deviation`` is for each exposure, and
+    ``least`` and ``most`` are those between 5 and 95 % of the saturation (LE_min and LE_max).
+    """
+
+    slope: float
+    offset: float
+    deviation: Doubles
+    used: Mask
+    least: Estimate
+    most: Estimate
+
+
+@dataclass(frozen=True)
+class NonUniformity:
+    """DSNU or PRNU: of all pixels, and its parts of rows, columns and single pixels.
+
+    A part that is not above zero is 0, with the error that it has then.
+    """
+
+    total: Estimate
+    row: Estimate
+    column: Estimate
+    pixel: Estimate
+
+
+@dataclass(frozen=True)
+class Figures:
+    """A sensor's figures. ``saturated`` is the number of the exposure at the saturation.
+
+    Dark currents are None where fewer than three exposure times tell of none.
+    """
+
+    system_gain: Estimate  # K, DN/e-
+    responsivity: Estimate  # R, DN per photon
+    quantum_efficiency: Estimate  # electrons per photon
+    dark_noise_dn: Estimate  # sigma_y.dark, DN, with rounding
+    dark_noise: Estimate  # sigma_d, e-
+    threshold: Estimate  # mu_p.min, photons: the light whose SNR is 1
+    saturation: Estimate  # mu_p.sat, photons
+    saturation_electrons: Estimate  # mu_e.sat
+    snr_max: Estimate
+    dynamic_range: Estimate
+    linearity: Linearity
+    dsnu: NonUniformity  # e-
+    prnu: NonUniformity  # relative
+    dark_current: Estimate | None  # from means, e-/s
+    dark_current_of_noise: Estimate | None  # from variances, e-/s
+    saturated: int
+    fitted: Mask  # exposures
+
+    def record(self) -> dict[str, Any]:
+        """The figures as JSON values, each with its error."""
+        plain = ("linearity", "saturated", "fitted")
+        values = {name: value for name, value in vars(self).items() if name not in plain}
+        own = {name: value and asdict(value) for name, value in values.items()}
+        limits = {"least": self.linearity.least, "most": self.linearity.most}
+        return {**own, "linearity_error": {name: asdict(e) for name, e in limits.items()}}
+
+
+def figures(moments: Moments) -> Figures:
+    """The figures of a series.
+
+    Raises:
+        RequestError: noise without light is cut off, the series has no saturation, or noise and
+            light do not rise together.
+    """
+    if moments.dark_stack.at_zero > MOST_AT_ZERO:
+        raise RequestError(
+            f"{moments.dark_stack.at_zero:.1%} of the samples without light are 0 DN, where their "
+            f"noise is cut off; EMVA 1288 allows {MOST_AT_ZERO:.1%}: raise the camera's black level"
+        )
+    bright, light, noise = moments.bright, moments.light, moments.noise
+    saturated = saturation_index(moments)
+    fitted = (light <= FITTED * light[saturated]) & (bright.photons <= bright.photons[saturated])
+    if fitted.sum() < ENOUGH:
+        raise RequestError(
+            f"found {fitted.sum()} exposures below {FITTED:.0%} of the saturation; at least "
+            f"{ENOUGH} are needed"
+        )
+    gain = _slope(light[fitted], noise[fitted])
+    responsivity = _slope(bright.photons[fitted], light[fitted])
+    for name, each in (("variance", gain), ("light", responsivity)):
+        if not each.significant:
+            raise RequestError(f"the {name} does not rise with the exposure; is it one series?")
+    efficiency = _quotient(responsivity, gain)
+    dark2, noise_slope = _dark_variance(moments.dark, moments.dark_stack.mean_frame.size)
+    dark_dn = dark2.root()
+    dark_noise = _quotient(Estimate(dark2.value - ROUNDING, dark2.error).root(), gain)
+    # (sigma / K + 1/2) / QE, in which most of K cancels.
+    least = Estimate(dark_dn.value + gain.value / 2, float(np.hypot(dark_dn.error, gain.error / 2)))
+    threshold = _quotient(least, responsivity)
+    # The saturation lies anywhere within half a step of the exposures.
+    photons = bright.photons
+    step = float(np.ptp(photons[max(saturated - 1, 0) : saturated + 2])) / 2
+    saturation = Estimate(float(photons[saturated]), step / 12**0.5)
+    electrons = _quotient(saturation, _quotient(gain, responsivity))
+    current, of_noise = _dark_current(moments.dark, gain, noise_slope)
+    return Figures(
+        system_gain=gain,
+        responsivity=responsivity,
+        quantum_efficiency=efficiency,
+        dark_noise_dn=dark_dn,
+        dark_noise=dark_noise,
+        threshold=threshold,
+        saturation=saturation,
+        saturation_electrons=electrons,
+        snr_max=electrons.root(),
+        dynamic_range=_quotient(saturation, threshold),
+        linearity=_linearity(moments, saturated),
+        dsnu=_dsnu(moments.dark_stack, gain),
+        prnu=_prnu(moments.bright_stack, moments.dark_stack),
+        dark_current=current,
+        dark_current_of_noise=of_noise,
+        saturated=saturated,
+        fitted=fitted,
+    )
+
+
+def saturation_index(moments: Moments) -> int:
+    """The number of the exposure at which the noise is greatest.
+
+    From the brightest exposure on it is the first with more noise than the two next darker ones:
+    noise may rise slowly up to there, and scatter. What is less than half of the most noise is a
+    scatter of clipped frames.
+
+    Raises:
+        RequestError: it is the brightest one.
+    """
+    variance = moments.bright.variance
+    darker = np.maximum(variance[1:-1], variance[:-2])
+    peaks = np.flatnonzero((variance[2:] > darker) & (variance[2:] > variance.max() / 2)) + 2
+    saturated = int(peaks[-1]) if len(peaks) else int(np.argmax(variance))
+    if saturated == len(variance) - 1:
+        raise RequestError(
+            "the series ends before the saturation: its brightest exposure has the most noise; "
+            "expose longer"
+        )
+    return saturated
+
+
+def _slope(x: Doubles, y: Doubles) -> Estimate:
+    """The slope of the line y = slope * x by least squares, its error from the residuals."""
+    squares = float(x @ x)
+    slope = float(x @ y) / squares
+    residuals = y - slope * x
+    return Estimate(slope, float(np.sqrt(residuals @ residuals / (len(x) - 1) / squares)))
+
+
+def _line(x: Doubles, y: Doubles) -> tuple[Estimate, Estimate]:
+    """Slope and offset of a line by least squares, their errors from the residuals."""
+    terms = np.stack([x, np.ones_like(x)], axis=1)
+    inverse = np.linalg.inv(terms.T @ terms)
+    found = inverse @ terms.T @ y
+    residuals = y - terms @ found
+    errors = np.sqrt(np.diag(inverse) * (residuals @ residuals) / (len(x) - 2))
+    slope, offset = (Estimate(float(v), float(e)) for v, e in zip(found, errors, strict=True))
+    return slope, offset
+
+
+def _quotient(above: Estimate, below: Estimate) -> Estimate:
+    """The quotient of two estimates whose errors are independent."""
+    value = above.value / below.value
+    error = np.hypot(above.error, value * below.error) / below.value
+    return Estimate(value, float(error))
+
+
+def _dark_variance(dark: Temporal, pixels: int) -> tuple[Estimate, Estimate | None]:
+    """The variance without light at no exposure, DN^2, and its slope, DN^2/ns.
+
+    With fewer than three exposure times it is that of the shortest one.
+    """
+    if len(np.unique(dark.time)) < ENOUGH:
+        variance = float(dark.variance[np.argmin(dark.time)])
+        found, slope = Estimate(variance, variance * (2 / pixels) ** 0.5), None
+    else:
+        # In ms, lest a sum of squares drowns the rest.
+        per_ms, found = _line(dark.time / 1e6, dark.variance)
+        slope = per_ms.scaled(1e-6)
+    return (found if found.value > LEAST_DARK else Estimate(LEAST_DARK, 0.0)), slope
+
+
+def _dark_current(
+    dark: Temporal, gain: Estimate, noise_slope: Estimate | None
+) -> tuple[Estimate | None, Estimate | None]:
+    """The dark current in e-/s, from means and from variances."""
+    if noise_slope is None:
+        return None, None
+    of_mean = _line(dark.time / 1e6, dark.mean)[0].scaled(1e-6)
+    return (
+        _quotient(of_mean.scaled(NS), gain),
+        _quotient(noise_slope.scaled(NS / gain.value), gain),
+    )
+
+
+def _linearity(moments: Moments, saturated: int) -> Linearity:
+    """The line of least squares of relative deviations, and these."""
+    light, photons = moments.light, moments.bright.photons
+    low, high = (share * light[saturated] for share in LINEAR)
+    used = (light >= low) & (light <= high) & (photons <= photons[saturated])
+    if used.sum() < ENOUGH:
+        raise RequestError(
+            f"found {used.sum()} exposures between {LINEAR[0]:.0%} and {LINEAR[1]:.0%} of the "
+            f"saturation; at least {ENOUGH} are needed"
+        )
+    slope, offset = np.polyfit(photons[used], light[used], 1, w=1 / light[used])
+    line = slope * photons + offset
+    deviation = 100 * (light / line - 1)
+    # What the light source, or the sensor, wavers between two frames, halved for their mean.
+    wavering = 100 * moments.bright.flicker[used] / 2 / line[used]
+    error = float(np.sqrt(np.square(wavering).mean()))
+    least, most = (Estimate(float(f(deviation[used])), error) for f in (np.min, np.max))
+    return Linearity(float(slope), float(offset), deviation, used, least, most)
+
+
+def _dsnu(dark: Spatial, gain: Estimate) -> NonUniformity:
+    """The deviation of pixels without light, e-."""
+    parts = (dark.variance, *dark.parts)
+    return NonUniformity(*(_quotient(part.root(), gain) for part in parts))
+
+
+def _prnu(bright: Spatial, dark: Spatial) -> NonUniformity:
+    """The relative deviation of pixels at half the saturation, less that without light."""
+    light = bright.mean - dark.mean
+    lit, unlit = (bright.variance, *bright.parts), (dark.variance, *dark.parts)
+    of_light = (
+        Estimate(b.value - d.value, float(np.hypot(b.error, d.error)))
+        for b, d in zip(lit, unlit, strict=True)
+    )
+    return NonUniformity(*(part.root().scaled(1 / light) for part in of_light))

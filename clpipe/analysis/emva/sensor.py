@@ -1,0 +1,102 @@
+"""Gaussian models of a sensor: what rounding hides in the dark, and where noise is greatest."""
+
+import numpy as np
+
+from clpipe.base.types import Doubles
+
+COARSE = 1.0  # DN: with more noise than that, rounding adds 1/12 DN^2 and nothing else
+NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(21)
+NODE_WEIGHTS = WEIGHTS / WEIGHTS.sum()
+FINE = np.linspace(-4, 4, 161)  # standard deviations, of pixels among which rounding is not smooth
+FINE_WEIGHTS = np.exp(-FINE * FINE / 2) / np.exp(-FINE * FINE / 2).sum()
+SEARCHED = np.linspace(0.6, 1.1, 2001)  # of the light that fills the sensor
+ROUNDS = 20  # of the search for a full well
+
+
+def before_rounding(mean: float, temporal: float, spatial: float) -> tuple[float, float, float]:
+    """The mean and the deviations over time and over pixels, DN, before frames were rounded.
+
+    Args:
+        mean: of the rounded frames, DN.
+        temporal: the variance of a rounded pixel over time, DN^2.
+        spatial: the variance of the means of rounded pixels, DN^2.
+
+    Above a deviation of 1 DN over time, rounding adds 1/12 DN^2 to it. Below, it shifts means and
+    hides or enlarges both variances; the Gaussian sensor is then found whose rounded frames have
+    the three figures.
+
+    >>> [round(each, 3) for each in before_rounding(100.2, 4 + 1 / 12, 0.04)]
+    [100.2, 2.0, 0.2]
+    >>> [round(each, 3) for each in before_rounding(*rounded(2.8, 0.3, 0.2))]
+    [2.8, 0.3, 0.2]
+    """
+    from scipy.optimize import least_squares
+
+    plain = mean, max(temporal - 1 / 12, 0) ** 0.5, max(spatial, 0) ** 0.5
+    if plain[1] > COARSE:
+        return plain
+    wanted = np.array([mean, max(temporal, 0) ** 0.5, max(spatial, 0) ** 0.5])
+
+    def misfit(sensor: Doubles) -> Doubles:
+        found_mean, *variances = rounded(*sensor)
+        return np.array([found_mean, *np.sqrt(variances)]) - wanted
+
+    start = np.maximum(plain, (mean - 1, 0.2, 0.02))
+    bounds = ([mean - 1, 1e-3, 0.0], [mean + 1, 2.0, 4.0])
+    found = least_squares(misfit, start, bounds=bounds, xtol=1e-12, ftol=1e-12)
+    found_mean, over_time, over_pixels = found.x.tolist()
+    return found_mean, over_time, over_pixels
+
+
+def rounded(mean: float, over_time: float, over_pixels: float) -> tuple[float, float, float]:
+    """The mean, DN, and the variances over time and pixels, DN^2, of a Gaussian sensor's frames.
+
+    Args:
+        mean: before rounding, DN.
+        over_time: the deviation of a pixel, DN.
+        over_pixels: the deviation of pixels, DN.
+    """
+    from scipy.special import ndtr
+
+    pixels = mean + over_pixels * FINE
+    reach = 6 * over_time + 4 * over_pixels + 1
+    steps = np.arange(np.floor(mean - reach), np.ceil(mean + reach) + 1)
+    above = ndtr((steps + 0.5 - pixels[:, None]) / over_time)
+    shares = np.diff(above, axis=1, prepend=0.0)
+    means = shares @ steps
+    temporal = shares @ (steps * steps) - means * means
+    overall = float(FINE_WEIGHTS @ means)
+    spatial = float(FINE_WEIGHTS @ np.square(means)) - overall * overall
+    return overall, float(FINE_WEIGHTS @ temporal), max(spatial, 0.0)
+
+
+def noisiest_light(gain: float, read_noise: float, prnu: float, full: float) -> float:
+    """The light, in e-, at which noise over time is greatest, before it is cut off at the top.
+
+    Args:
+        gain: DN/e-.
+        read_noise: DN.
+        prnu: relative.
+        full: the light above black at which a pixel, or the converter, is full, DN.
+
+    >>> 0.9 < noisiest_light(0.1, 2.0, 0.005, 4000) / 40000 < 1
+    True
+    """
+    from scipy.special import ndtr
+
+    light = SEARCHED[:, None] * full * np.maximum(1 + prnu * NODES, 0)
+    sigma = np.sqrt(gain * light + read_noise**2)
+    u = (full - light) / sigma
+    density, below = np.exp(-u * u / 2) / np.sqrt(2 * np.pi), ndtr(u)
+    # The variance of a standard normal that is cut off at u.
+    cut = -density + u * (1 - below)
+    variance = sigma * sigma * (below - u * density + u * u * (1 - below) - cut * cut)
+    return float(SEARCHED[np.argmax(variance @ NODE_WEIGHTS)] * full / gain)
+
+
+def full_well(gain: float, read_noise: float, prnu: float, saturation: float) -> float:
+    """The full well, in e-, with which noise is greatest at a saturation, in e-; as above."""
+    well = saturation
+    for _ in range(ROUNDS):
+        well *= saturation / noisiest_light(gain, read_noise, prnu, gain * well)
+    return well

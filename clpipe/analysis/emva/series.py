@@ -1,0 +1,266 @@
+"""The text that describes a series: ``EMVA1288_Data.txt``.
+
+Each line begins with a letter; ``#`` begins a comment:
+
+    v 3.1                         the release of the standard
+    n BITS WIDTH HEIGHT           of all frames
+    b TIME PHOTONS                frames with light follow: ns, and the mean per pixel
+    d TIME                        frames without light follow
+    i PATH                        a frame, relative to the text; / or \\ between folders
+
+Two frames are for temporal figures, more are a stack for spatial ones.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.reading import read_text
+from clpipe.base.text import one_line
+from clpipe.base.types import Array
+from clpipe.images.read import read_whole_numbers
+
+NAME = "EMVA1288_Data.txt"
+RELEASE = "3.1"
+PAIR = 2  # frames of one exposure, for temporal figures
+MOST_BITS = 16
+SIDES = 16, 16_384  # px, least and most
+LEAST_EXPOSURES = 9  # with light; the standard asks for 50
+NS = 1e9  # in a second
+FORMS = {
+    "v": "v RELEASE",
+    "n": "n BITS WIDTH HEIGHT",
+    "b": "b TIME PHOTONS",
+    "d": "d TIME",
+    "i": "i PATH",
+}
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """The frames of one exposure: its time in ns, the mean photons per pixel, their paths."""
+
+    time: float
+    photons: float  # 0: dark
+    frames: tuple[Path, ...]
+    line: int = field(default=0, compare=False)  # of the text; 0: of none
+
+
+@dataclass(frozen=True)
+class Series:
+    """A series. ``bright`` and ``dark`` are pairs, in ascending order of light and time."""
+
+    path: Path
+    bits: int
+    width: int
+    height: int
+    bright: tuple[Exposure, ...]
+    dark: tuple[Exposure, ...]
+    bright_stack: Exposure
+    dark_stack: Exposure
+
+    @property
+    def full_scale(self) -> int:
+        """The largest DN that the bits hold."""
+        return int(2**self.bits - 1)
+
+    def dark_of(self, exposure: Exposure) -> int:
+        """The number, in ``dark``, of the pair that was exposed as long; see :meth:`check`."""
+        if len(self.dark) == 1:
+            return 0
+        return [each.time for each in self.dark].index(exposure.time)
+
+    def read(self, frame: Path) -> Array:
+        """A frame in DN, (height, width), whole numbers.
+
+        Raises:
+            RequestError: it cannot be read, or has another size or more bits than the series.
+        """
+        try:
+            pixels = read_whole_numbers(frame)
+        except ImageError as error:
+            raise RequestError(str(error)) from None
+        height, width = pixels.shape
+        if (width, height) != (self.width, self.height):
+            raise RequestError(
+                f"{frame}: found {width}x{height} pixels; {self.path} says {self.width}x"
+                f"{self.height}"
+            )
+        if (most := int(pixels.max())) > self.full_scale:
+            raise RequestError(
+                f"{frame}: found {most} DN; {self.path} says {self.bits} bits, which end at "
+                f"{self.full_scale}"
+            )
+        return pixels
+
+
+class _Lines:
+    """The lines of a text with their numbers, one after the other."""
+
+    def __init__(self, path: Path, text: str) -> None:
+        self._path = path
+        numbered = enumerate(text.splitlines(), 1)
+        self._lines = [(n, line.strip()) for n, line in numbered if line.split("#")[0].strip()]
+        self._at = 0
+
+    def next(self, only: str = "") -> tuple[int, list[str]] | None:
+        """The number and the words of the next line; None at the end, or at another letter."""
+        if self._at == len(self._lines):
+            return None
+        number, line = self._lines[self._at]
+        letter, *rest = line.split(maxsplit=1)
+        form = FORMS.get(letter)
+        if form is None:
+            letters = ", ".join(FORMS)
+            raise self.error(number, f"found {one_line(line)!r}; a line begins with {letters} or #")
+        if only and letter != only:
+            return None
+        words = rest if letter == "i" else line.split()[1:]
+        if len(words) != len(form.split()) - 1:
+            raise self.error(number, f"found {one_line(line)!r}; expected {form}")
+        self._at += 1
+        return number, [letter, *words]
+
+    def error(self, number: int, message: str) -> RequestError:
+        return RequestError(f"{self._path}, line {number}: {message}")
+
+    def number(self, number: int, word: str, name: str, low: float, high: float) -> float:
+        """A number of a line, in which a comma may stand for the point."""
+        try:
+            value = float(word.replace(",", "."))
+        except ValueError:
+            value = np.nan
+        if not low <= value <= high:
+            allowed = f"{low:g} to {high:g}"
+            raise self.error(number, f"{name}: found {one_line(word)!r}; allowed: {allowed}")
+        return value
+
+    def count(self, number: int, word: str, name: str, low: int, high: int) -> int:
+        """A whole number of a line."""
+        value = int(word) if word.isdecimal() and len(word) < 10 else -1
+        if not low <= value <= high:
+            allowed = f"{low} to {high}"
+            raise self.error(number, f"{name}: found {one_line(word)!r}; allowed: {allowed}")
+        return value
+
+
+def read_series(path: Path) -> Series:
+    """Read the text of a series.
+
+    Raises:
+        RequestError: it cannot be read, a line is wrong, or it lacks what the standard asks for.
+    """
+    try:
+        text = read_text(path)
+    except OSError as error:
+        raise RequestError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise RequestError(f"{path}: it is not a text in UTF-8") from None
+    lines = _Lines(path, text)
+    size: list[int] = []
+    exposures: dict[tuple[float, float, bool], Exposure] = {}
+    while found := lines.next():
+        number, (letter, *words) = found
+        if letter == "n":
+            if size:
+                raise lines.error(number, "a second line n; there can be but one")
+            size = [lines.count(number, words[0], "bits", 1, MOST_BITS)]
+            size += [lines.count(number, word, "side", *SIDES) for word in words[1:]]
+        elif letter == "i":
+            raise lines.error(number, "a frame of no exposure; a line b or d comes first")
+        elif letter in "bd":
+            own = _exposure(lines, number, words, path.parent)
+            key = own.time, own.photons, len(own.frames) == PAIR
+            if key in exposures:
+                raise lines.error(number, f"the exposure of line {exposures[key].line} again")
+            exposures[key] = own
+    if not size:
+        raise RequestError(f"{path}: found no line {FORMS['n']}")
+    return _checked(path, size, list(exposures.values()))
+
+
+def _exposure(lines: _Lines, number: int, words: Sequence[str], folder: Path) -> Exposure:
+    """The exposure of a line b or d, and of the frames that follow it.
+
+    Args:
+        lines: of the text.
+        number: of the line.
+        words: of the line: a time and, with light, photons.
+        folder: of the text.
+    """
+    time = lines.number(number, words[0], "time", 0, 1e15)
+    photons = [lines.number(number, word, "photons", 0, 1e12) for word in words[1:]]
+    if photons == [0.0]:
+        raise lines.error(number, "photons: found 0; frames without light are a line d")
+    frames = []
+    while frame := lines.next(only="i"):
+        frames.append(folder / frame[1][1].replace("\\", "/"))
+    if len(frames) < PAIR:
+        raise lines.error(
+            number, f"found {len(frames)} frames of this exposure; at least {PAIR} are needed"
+        )
+    return Exposure(time, sum(photons), tuple(frames), number)
+
+
+def _checked(path: Path, size: Sequence[int], exposures: Sequence[Exposure]) -> Series:
+    """The series of a text's exposures.
+
+    Raises:
+        RequestError: it lacks exposures, or a dark pair or stack.
+    """
+
+    def of(lit: bool, pair: bool) -> tuple[Exposure, ...]:
+        kept = (e for e in exposures if bool(e.photons) is lit and (len(e.frames) == PAIR) is pair)
+        return tuple(sorted(kept, key=lambda e: (e.photons, e.time)))
+
+    bright, dark = of(True, True), of(False, True)
+    if len(bright) < LEAST_EXPOSURES:
+        raise RequestError(
+            f"{path}: found {len(bright)} exposures of two frames with light; at least "
+            f"{LEAST_EXPOSURES} are needed, and EMVA 1288 asks for 50"
+        )
+    if not dark:
+        raise RequestError(f"{path}: found no exposure of two frames without light (d)")
+    times = {each.time for each in dark}
+    for each in bright:
+        if len(dark) > 1 and each.time not in times:
+            raise RequestError(
+                f"{path}, line {each.line}: no two frames without light were exposed for "
+                f"{each.time:g} ns, too"
+            )
+    stacks: list[Exposure] = []
+    for is_lit, letter in ((True, "b"), (False, "d")):
+        own = of(is_lit, False)
+        if len(own) != 1:
+            light = "with light" if is_lit else "without light"
+            raise RequestError(
+                f"{path}: found {len(own)} stacks of more than two frames {light} ({letter}); "
+                "expected one"
+            )
+        stacks += own
+    lit, unlit = stacks
+    if lit.time != unlit.time:
+        raise RequestError(
+            f"{path}, lines {lit.line} and {unlit.line}: the stacks were exposed for {lit.time:g} "
+            f"and {unlit.time:g} ns; expected the same time"
+        )
+    bits, width, height = size
+    return Series(path, bits, width, height, bright, dark, lit, unlit)
+
+
+def series_text(series: Series, comment: str) -> str:
+    """The text of a series, as :func:`read_series` reads it; a comment stands at its top."""
+    lines = [
+        *(f"# {line}" for line in comment.splitlines()),
+        f"v {RELEASE}",
+        f"n {series.bits} {series.width} {series.height}",
+    ]
+    for each in (*series.bright, *series.dark, series.bright_stack, series.dark_stack):
+        light = f" {each.photons:.10g}" if each.photons else ""
+        lines.append(f"{'b' if each.photons else 'd'} {each.time:.10g}{light}")
+        folder = series.path.parent
+        lines += [f"i {frame.relative_to(folder).as_posix()}" for frame in each.frames]
+    return "\n".join(lines) + "\n"

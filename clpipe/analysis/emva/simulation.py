@@ -1,0 +1,142 @@
+"""A series of a camera of clpipe's: uniform light through the raw stages of a chain."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from clpipe.analysis.emva.sensor import noisiest_light
+from clpipe.analysis.emva.series import NAME, NS, PAIR, Exposure, Series, series_text
+from clpipe.base.errors import RequestError
+from clpipe.base.files import make_folder_of, write_new
+from clpipe.camera.profile import Camera, load_camera
+from clpipe.chain.identity import image_key, noise_key
+from clpipe.chain.making import make_chain
+from clpipe.chain.settings import Settings, overlay
+from clpipe.engine.device import Device
+from clpipe.engine.runner import Runner
+from clpipe.images.write import write_grey_png
+
+FIRST, LAST = "crosstalk", "quantize"  # what a chain does between the clean mosaic and the raw
+BEYOND = 0.1  # of the exposures up to the saturation; so many follow
+SATURATED = 0.01  # s: the time after which the light saturates the sensor
+SHARE = 0.5  # of the saturation, at which the stack for PRNU is taken
+
+
+@dataclass(frozen=True)
+class SeriesSize:
+    """How large a series is: px of a frame, exposures up to the saturation, frames of a stack."""
+
+    width: int = 640
+    height: int = 480
+    exposures: int = 50
+    stack: int = 100
+
+
+def saturation_of(camera: Camera, iso: float) -> float:
+    """The electrons at which a camera's noise is greatest; raises as :meth:`Camera.noise`."""
+    noise, unit = camera.noise(iso), camera.signal_range
+    gain = noise.a * unit
+    full = min(unit, gain * camera.full_well) if camera.full_well else unit
+    return noisiest_light(gain, noise.b**0.5 * unit, camera.prnu, full)
+
+
+def simulate(
+    camera: str,
+    iso: float | None,
+    seed: int,
+    folder: Path,
+    size: SeriesSize,
+    device: Device | None,
+    watch: Callable[[int, int], None] = lambda done, of: None,
+) -> Series:
+    """Make a series of a camera: frames as PNG, and the text that describes them, last.
+
+    The light falls on the mosaic behind the colour filters, alike for all pixels, and goes through
+    the stages from ``crosstalk`` to ``quantize``.
+
+    Args:
+        camera: a name or a profile's file.
+        iso: its ISO; None is the lowest.
+        seed: of the noise.
+        folder: where the series is written.
+        size: of the series.
+        device: where it is computed; None is NumPy.
+        watch: is told after each frame how many are done, and of how many.
+
+    Raises:
+        RequestError: there is no such camera or ISO, or the folder has a series.
+        ImageError: a file cannot be written.
+    """
+    sensor = load_camera(camera)
+    text = folder / NAME
+    if text.exists():
+        raise RequestError(f"{text}: there is a series already; name another folder")
+    values = {"camera": camera, "iso": sensor.iso_range[0] if iso is None else iso, "seed": seed}
+    settings = overlay(Settings(), values)
+    efficiency = sensor.quantum_efficiency or 1.0
+    series = _planned(text, sensor, saturation_of(sensor, settings.iso) / efficiency, size)
+    photon = sensor.signal_of(efficiency, settings.iso)
+    runner: Runner | None = None
+    exposures = (*series.bright, *series.dark, series.bright_stack, series.dark_stack)
+    total, done = sum(len(each.frames) for each in exposures), 0
+    samples = np.uint8 if series.bits <= 8 else np.uint16
+    for exposure in exposures:
+        chain = make_chain(_exposed(settings, exposure), start_at=FIRST, until=LAST)
+        runner = (
+            runner.for_chain(chain) if runner else Runner(chain, device, encode=False, final=True)
+        )
+        light = np.full((size.height, size.width), photon * exposure.photons, np.float32)
+        for frame in exposure.frames:
+            key = noise_key(settings, image_key(frame.relative_to(folder).as_posix(), ""))
+            make_folder_of(frame)
+            write_grey_png(frame, runner.run(light, key).image.astype(samples))
+            done += 1
+            watch(done, total)
+    comment = f"A series of the camera {sensor.name} at ISO {settings.iso:g}, made by clpipe emva."
+    if not sensor.quantum_efficiency:
+        comment += "\nIts quantum efficiency is not known: photons are electrons."
+    write_new(text, series_text(series, comment).encode())
+    return series
+
+
+def _exposed(settings: Settings, exposure: Exposure) -> Settings:
+    """The settings with an exposure's time, in which dark current gathers."""
+    return overlay(settings, {"dark_current": {"exposure_time": exposure.time / NS}})
+
+
+def _planned(path: Path, camera: Camera, saturation: float, size: SeriesSize) -> Series:
+    """The exposures of a series, and where its frames will lie.
+
+    Args:
+        path: of the text.
+        camera: whose series it is.
+        saturation: photons.
+        size: of the series.
+    """
+    last = size.exposures + math.ceil(size.exposures * BEYOND)
+    steps = np.arange(1, last + 1) / size.exposures
+
+    def exposure(share: float, photons: float, name: str, count: int) -> Exposure:
+        frames = [path.parent / "images" / f"{name}_{number:03}.png" for number in range(count)]
+        return Exposure(round(share * SATURATED * NS), float(f"{photons:.9g}"), tuple(frames))
+
+    bright, dark = (
+        tuple(
+            exposure(share, lit * share * saturation, f"{letter}_{number:03}", PAIR)
+            for number, share in enumerate(steps)
+        )
+        for letter, lit in (("b", 1), ("d", 0))
+    )
+    return Series(
+        path=path,
+        bits=max(camera.bits, 8),
+        width=size.width,
+        height=size.height,
+        bright=bright,
+        dark=dark,
+        bright_stack=exposure(SHARE, SHARE * saturation, "b_stack", size.stack),
+        dark_stack=exposure(SHARE, 0.0, "d_stack", size.stack),
+    )
