@@ -43,6 +43,7 @@ def emva_profile(name: str, iso: float, source: str, moments: Moments, figures: 
         "black_level": black,
         "white_level": moments.white,
         "white_balance_gains": (1.0, 1.0),
+        "filter_array": "mono",
         "iso_range": (iso, iso),
         "quantum_efficiency": min(efficiency, 1.0),
         "prnu": prnu,
@@ -74,6 +75,7 @@ def emva_profile(name: str, iso: float, source: str, moments: Moments, figures: 
         "levels": "black: the mean of the frames without light, before they were rounded; white: "
         "the largest value of a frame",
         "white_balance_gains": "not known; 1 stands in",
+        "filter_array": "not said by a series; a sensor without filters stands in",
         "xyz_to_camera": "not known",
         "quantum_efficiency": "at the light of the series: "
         f"{plus_minus(figures.quantum_efficiency)}"
