@@ -67,14 +67,14 @@ def test_keep_takes_all():
 
 
 def test_only_stages_with_several_methods_have_methods_to_time():
-    assert "mosaic" not in values("bench", "--methods", "")
+    assert "prnu" not in values("bench", "--methods", "")
     assert values("bench", "--methods", "den") == ["denoise"]
 
 
 def test_parameters():
     assert values("run", "--set", "expo") == ["exposure."]
-    names = ["quantize.method=", "quantize.bits=", "quantize.black_level=", "quantize.white_level="]
-    assert values("run", "--set", "quantize.") == names
+    names = ["bits", "black_level", "white_level", "result_bits", "knots"]
+    assert values("run", "--set", "quantize.") == [f"quantize.{n}=" for n in ["method", *names]]
     assert values("run", "--set", "gamma.method=s") == ["gamma.method=srgb"]
     assert values("run", "--set", "nothing.") == []
 

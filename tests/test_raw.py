@@ -268,8 +268,6 @@ XTRANS = "GGRGGBGGBGGRBRGRBGGGBGGRGGRGGBRBGBRG"
     ("change", "message"),
     [
         ("linear", "holds every colour at every pixel"),
-        ("x-trans", "its colours repeat every 6x6 pixels"),
-        ("one colour", "its colours repeat every 1x1 pixels"),
         ("half", "damaged, or not a raw that LibRaw knows"),
         ("no pixels", "holds no pixels"),
         ("empty", "the file is empty"),
@@ -282,11 +280,6 @@ def test_what_only_looks_like_a_raw(tmp_path, change, message):
     path = tmp_path / "a.dng"
     if change == "linear":
         write_dng(path, np.rint(colours() * 16383))
-    elif change == "x-trans":
-        cfa = field(33422, 1, *("RGB".index(c) for c in XTRANS))
-        write_dng(path, mosaic(), changes=(field(33421, 3, 6, 6), cfa))
-    elif change == "one colour":
-        write_dng(path, mosaic(), "RRRR")
     elif change == "no pixels":
         write_dng(path, mosaic() * 0)
     elif change != "missing":
@@ -296,6 +289,22 @@ def test_what_only_looks_like_a_raw(tmp_path, change, message):
     output = clpipe("run", path, "-o", tmp_path / "out", status=1)
     assert f"{path}: {message}" in output
     assert not written(tmp_path / "out")
+
+
+def test_an_x_trans_raw_of_another_program(tmp_path):
+    letters = np.array(list(XTRANS)).reshape(6, 6)
+    light = colours()
+    height, width = light.shape[:2]
+    which = np.vectorize("RGB".index)(np.tile(letters, (height // 6 + 1, width // 6 + 1)))
+    own = np.take_along_axis(light / (2.0, 1, 1.6), which[:height, :width, None], -1)[..., 0]
+    own = np.rint(own * (16383 - 512) + 512)
+    cfa = field(33422, 1, *("RGB".index(c) for c in XTRANS))
+    path = write_dng(tmp_path / "a.dng", own, changes=(field(33421, 3, 6, 6), cfa))
+    facts = read_facts(path)
+    assert facts.pattern == "/".join("".join(row) for row in letters)
+    assert np.array_equal(read_raw(path, facts), own)
+    clpipe("run", path, "-o", tmp_path / "out", "--keep", "demosaic")
+    assert read_image(tmp_path / "out" / "a.demosaic.exr").pixels == pytest.approx(light, abs=0.01)
 
 
 @pytest.mark.parametrize(

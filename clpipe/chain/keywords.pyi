@@ -143,8 +143,9 @@ class Exposure(TypedDict, total=False):
     scale: Number
 
 class Mosaic(TypedDict, total=False):
-    method: Draw | Literal["bayer"]
+    method: Draw | Literal["bayer", "array"]
     pattern: Draw | Literal["RGGB", "BGGR", "GRBG", "GBRG"]
+    array: Text
 
 class InverseWhiteBalance(TypedDict, total=False):
     method: Draw | Literal["gains"]
@@ -171,7 +172,18 @@ class Blooming(TypedDict, total=False):
     spill: Number
 
 class SensorNoise(TypedDict, total=False):
-    method: Draw | Literal["skewed_gaussian", "gaussian", "poisson", "none"]
+    method: (
+        Draw
+        | Literal[
+            "skewed_gaussian",
+            "gaussian",
+            "poisson",
+            "dual_gain",
+            "split_pixel",
+            "staggered",
+            "none",
+        ]
+    )
     a: Number
     b: Number
     system_gain: Number
@@ -184,6 +196,10 @@ class SensorNoise(TypedDict, total=False):
     p0: Number
     full_well: Number
     tukey_lambda: Number
+    ratio: Number
+    later_noise: Number
+    part: Whole
+    count: Whole
     full_signal: Number
 
 class DarkCurrent(TypedDict, total=False):
@@ -234,15 +250,18 @@ class BlackLevelError(TypedDict, total=False):
     bias: Several
 
 class Quantize(TypedDict, total=False):
-    method: Draw | Literal["linear"]
+    method: Draw | Literal["linear", "pwl"]
     bits: Whole
     black_level: Number
     white_level: Number
+    result_bits: Whole
+    knots: Several
 
 class Normalize(TypedDict, total=False):
-    method: Draw | Literal["linear"]
+    method: Draw | Literal["linear", "pwl"]
     black_level: Number
     white_level: Number
+    knots: Several
 
 class WhiteBalance(TypedDict, total=False):
     method: Draw | Literal["as_shot", "gray_world", "white_patch", "gains", "none"]
@@ -262,6 +281,8 @@ class Demosaic(TypedDict, total=False):
             "bilinear",
             "malvar2004",
             "menon2007",
+            "linear_mmse",
+            "gray",
         ]
     )
     noise: Number
