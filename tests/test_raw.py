@@ -304,7 +304,9 @@ def test_an_x_trans_raw_of_another_program(tmp_path):
     assert facts.pattern == "/".join("".join(row) for row in letters)
     assert np.array_equal(read_raw(path, facts), own)
     clpipe("run", path, "-o", tmp_path / "out", "--keep", "demosaic")
-    assert read_image(tmp_path / "out" / "a.demosaic.exr").pixels == pytest.approx(light, abs=0.01)
+    inside = np.s_[6:-6, 6:-6]  # a steep slope does not go on as periods do
+    image = read_image(tmp_path / "out" / "a.demosaic.exr").pixels
+    assert image[inside] == pytest.approx(light[inside], abs=0.002)
 
 
 @pytest.mark.parametrize(
