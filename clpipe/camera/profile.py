@@ -83,6 +83,10 @@ class Camera(BaseModel):
     dark_shading_length: Positive = 500.0  # px, over which both change
     banding_amplitude: NotNegative = 0.0  # e-, of a wave along the columns
     banding_period: Positive | None = None  # rows
+    # Where an exposure is read more than once: how much less sensitive each further readout is, and
+    # its read noise in DN over that of the first, which the gain stages are of.
+    readout_ratio: Annotated[float, Field(gt=1, le=1024)] | None = None
+    readout_noise: NotNegative | None = None
     pixel_pitch: Positive | None = None  # um, from the centre of a photosite to the next one's
     iso_range: tuple[Positive, Positive]
     gain_stages: Annotated[tuple[GainStage, ...], Field(min_length=1)]

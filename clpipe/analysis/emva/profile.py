@@ -76,7 +76,7 @@ def emva_profile(name: str, iso: float, source: str, moments: Moments, figures: 
         "the largest value of a frame",
         "white_balance_gains": "not known; 1 stands in",
         "filter_array": "not said by a series; a sensor without filters stands in",
-        "xyz_to_camera": "not known",
+        "xyz_to_camera": "not known: a series has no colours",
         "quantum_efficiency": "at the light of the series: "
         f"{plus_minus(figures.quantum_efficiency)}"
         + ("; there is none above 1, which stands in" if efficiency > 1 else ""),

@@ -24,6 +24,7 @@ from clpipe.stages.sensor_noise.common import NEVER_FULL, or_default
 from clpipe.stages.sensor_noise.model import SensorNoise
 from clpipe.stages.sensor_noise.no_noise import NoNoise
 
+RATIO = 16.0  # of a sensor that does not say its own
 ENDS, STEEP = np.float32(0.95), np.float32(10.0)  # of a hand-over, which begins at 0.85
 
 
@@ -41,12 +42,17 @@ class Readouts(SensorNoise):
     kernel: ClassVar = "sensor_noise_readouts"
     shares_charge: ClassVar[bool] = False
 
-    ratio: float = parameter(
-        16.0, "How much less sensitive each readout is than the one before.", "", gt=1, le=1024
+    ratio: float | None = parameter(
+        None,
+        "How much less sensitive each readout is than the one before.",
+        auto="from the camera; else 16",
+        gt=1,
+        le=1024,
     )
-    later_noise: float = parameter(
-        1.0,
+    later_noise: float | None = parameter(
+        None,
         "Read noise of the further readouts over that of the first, both in DN.",
+        auto="from the camera; else 1",
         ge=0,
         le=1000,
     )
@@ -69,6 +75,7 @@ class Readouts(SensorNoise):
     @property
     def full_scale(self) -> float:
         """The signal at which the last readout is white."""
+        assert self.ratio is not None
         return float(self.ratio ** (self.readouts - 1))
 
     def resolve(self, context: Context) -> Self:
@@ -76,8 +83,11 @@ class Readouts(SensorNoise):
             raise RequestError(
                 f"sensor_noise.part: found {self.part}; there are 0 to {self.readouts - 1}"
             )
+        camera = context.camera
         own = super().resolve(context)
-        own._range = context.camera.signal_range
+        own = own.with_defaults(ratio=camera.readout_ratio, later_noise=camera.readout_noise)
+        own = own.with_defaults(ratio=RATIO, later_noise=1.0)
+        own._range = camera.signal_range
         return own
 
     def next_context(self, context: Context) -> Context:
@@ -92,7 +102,7 @@ class Readouts(SensorNoise):
         return NoNoise(full_signal=self.full_scale)
 
     def numbers(self) -> dict[str, np.float32]:
-        assert self.b is not None
+        assert self.b is not None and self.ratio is not None and self.later_noise is not None
         return {
             "a": np.float32(self.a),
             "b": np.float32(self.b),
