@@ -19,6 +19,7 @@ from clpipe.images.read import read_image
 from clpipe.pipeline import Pipeline
 from clpipe.reference.filter_array import NAMED, beyond, parse_array, tiled
 from clpipe.reference.linear_mmse import linear_mmse
+from clpipe.stages import DEFAULT_CHAIN
 from clpipe.stages.demosaic.malvar2004 import malvar2004
 from clpipe.stages.mosaic import responses_of
 from tests.conftest import STILL_LIFE
@@ -259,3 +260,61 @@ def test_settings_that_draw_an_array(clpipe):
     assert ARRAYS  # what clpipe check goes through
     with pytest.raises(KeyedError):
         settings_from({"mosaic": {"method": "array", "pattern": "RGGB"}})
+
+
+WITH_REMOSAIC = [*DEFAULT_CHAIN]
+WITH_REMOSAIC.insert(WITH_REMOSAIC.index("demosaic"), "remosaic")
+
+
+def remosaiced(array, method, **settings):
+    return on(array, stages=WITH_REMOSAIC, remosaic={"method": method}, **settings)
+
+
+def test_cells_are_binned_to_a_bayer_pattern(device):
+    chain = remosaiced("quad-RGGB", "binning")
+    assert chain.step_named("demosaic").context.pattern == "RGGB"
+    assert chain.step_named("demosaic").method.method == "bounded"
+    flat = np.full((203, 300, 3), 0.4, np.float32)
+    runner = Runner(chain, device, keep=("white_balance", "remosaic"), encode=False, final=True)
+    result = runner.run(flat, "bins")
+    assert result.final.shape == (101, 150, 3)
+    whole, binned = result.kept["white_balance"], result.kept["remosaic"]
+    cells = whole[:202].reshape(101, 2, 150, 2).mean((1, 3))
+    assert binned == pytest.approx(cells, abs=1e-6)
+    green = (whole[0:202:4, 2::4], binned[0::2, 1::2])
+    assert green[1].std() == pytest.approx(green[0].std() / 2, rel=0.06)  # a mean of four
+    noise = chain.step_named("demosaic").context.noise
+    assert noise.a == pytest.approx(chain.camera.noise(800).a / 4)
+
+
+@pytest.mark.parametrize(
+    ("array", "method"),
+    [("quad-RGGB", "binning"), ("nona-RGGB", "binning"), ("x-trans", "linear_mmse")],
+)
+def test_remosaicing_in_tiles(device, monkeypatch, array, method):
+    stages = ["mosaic", "inverse_white_balance", "white_balance", "remosaic", "demosaic"]
+    demosaic = {"method": "bilinear"}
+    chain = on(array, stages=stages, remosaic={"method": method}, demosaic=demosaic)
+    image = np.random.default_rng(3).random((203, 310, 3)).astype(np.float16)
+    whole, count = in_tiles(
+        Runner(chain, device, encode=False, final=True), image, 96, 64, monkeypatch
+    )
+    assert count > 3
+    found = Runner(chain, None, encode=False, final=True).run(image, "k").final
+    assert found == pytest.approx(whole.final, abs=1e-6)
+
+
+def test_a_remosaiced_picture_is_as_the_array_saw_it(develop):
+    light = read_image(STILL_LIFE).pixels.astype(np.float32)[100:356, 200:520]
+    options = {"stages": ["mosaic", "remosaic", "demosaic"], "demosaic": {"method": "menon2007"}}
+    for array, least in (("x-trans", 32.5), ("RGBW", 29), ("quad-RGGB", 26)):
+        mosaic, remosaic = laid(array), {"method": "linear_mmse", "pattern": "GBRG"}
+        result = develop(light, mosaic=mosaic, remosaic=remosaic, numpy=True, **options).final
+        error = np.mean((np.clip(result, 0, 1) - np.clip(light, 0, 1)) ** 2)
+        assert -10 * np.log10(error) > least, array
+
+
+@pytest.mark.parametrize("array", ["x-trans", "RGGB"])
+def test_what_has_no_cells(array):
+    with pytest.raises(RequestError, match=f"the mosaic is {array}; binning is for cells of 2x2"):
+        remosaiced(array, "binning")

@@ -104,9 +104,11 @@ class Chain:
 
     @property
     def array(self) -> FilterArray | None:
-        """The filter array of its mosaic, where that has no Bayer pattern."""
+        """The filter array of its raw, where that has no Bayer pattern."""
         last = self.steps[-1]
-        return last.method.next_context(last.context).array
+        after = last.method.next_context(last.context)
+        arrays = (each.array for each in (*(step.context for step in self.steps), after))
+        return next((array for array in arrays if array), None)
 
     @property
     def result(self) -> Kind:

@@ -356,6 +356,10 @@ class MosaicDenoise(TypedDict, total=False):
     a: Number
     b: Number
 
+class Remosaic(TypedDict, total=False):
+    method: Draw | Literal["binning", "linear_mmse"]
+    pattern: Draw | Literal["RGGB", "BGGR", "GRBG", "GBRG"]
+
 class Resize(TypedDict, total=False):
     method: Draw | Literal["area", "lanczos3"]
     scale: Number
@@ -433,6 +437,7 @@ class Keywords(TypedDict, total=False):
     inverse_gamma: InverseGamma
     inverse_tone_curve: InverseToneCurve
     mosaic_denoise: MosaicDenoise
+    remosaic: Remosaic
     resize: Resize
     restore_highlights: RestoreHighlights
     output: Encoding

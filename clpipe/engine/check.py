@@ -114,6 +114,8 @@ def laid(pattern: str) -> dict[str, str]:
 
 def chain_for(stage: Stage, method: type[Method], values: Mapping[str, Any], pattern: str) -> Chain:
     """One method of a stage as a chain that starts on what it reads, in that pattern or array."""
+    if method.only_arrays and pattern not in method.only_arrays:
+        pattern = method.only_arrays[0]
     before = {Kind.MOSAIC: ("mosaic",), Kind.RAW: ("mosaic", "quantize")}.get(stage.reads, ())
     parameters: dict[str, dict[str, Any]] = {"mosaic": dict(laid(pattern))}
     own = {"method": method.method, **method.example, **values}
@@ -149,6 +151,7 @@ def check_method(
         patterns = patterns[:1]
     takes_any = method.any_array and stage.reads is Kind.MOSAIC and not values
     total, every = Difference(), (*patterns, *(ARRAYS if takes_any else ()))
+    every = method.only_arrays or every
     for pattern in every:
         total += compare(device, chain_for(stage, method, values, pattern), sizes)
     label = variant_label(method, values)

@@ -33,9 +33,9 @@ INCREMENTAL_BORDER = 4
 
 
 class _Planner:
-    def __init__(self, source: Kind, fold: bool, period: tuple[int, int] | None) -> None:
+    def __init__(self, source: Kind, fold: bool) -> None:
         self.kind = source
-        self.period = period
+        self.period: tuple[int, int] | None = None  # of the mosaic that the next step reads
         self.fold = fold
         self.launches: list[AnyLaunch] = []
         self.lines: dict[int, list[Op]] = {}  # by level
@@ -205,12 +205,13 @@ def make_plan(
         chain = chain.through(keep)
     last = chain.steps[-1].name
     final = final or last in keep
-    array = chain.array
-    period = array.period if array and array.needs_border else None
-    planner = _Planner(chain.source, fold, period)
+    planner = _Planner(chain.source, fold)
+    arrays = {step.name: step.context.array for step in chain.steps}
     kept: dict[str, Image] = {}
     arguments = {step.name: step.method.arguments(step.context) for step in chain.steps}
     for name, ops in chain_ops(chain, arguments):
+        array = arrays[name]
+        planner.period = array.period if array and array.needs_border else None
         planner.add_step(ops)
         if name in keep and name != last:
             kept[name] = planner.keep()

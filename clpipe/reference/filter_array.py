@@ -12,7 +12,7 @@ import numpy as np
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_of
 from clpipe.base.types import Array, Doubles, Floats
-from clpipe.reference.cfa import PATTERNS
+from clpipe.reference.cfa import PATTERNS, Pattern
 
 MAX_PERIOD = 8
 MIRRORED = 2  # the longest period that a mirrored border (reflect-101) goes on with
@@ -77,8 +77,13 @@ class FilterArray:
     @property
     def pattern(self) -> str:
         """A Bayer pattern, such as "RGGB", or the rows with / between."""
+        return self.bayer or "/".join(self.rows)
+
+    @property
+    def bayer(self) -> Pattern | None:
+        """Its Bayer pattern; None where it is another array."""
         joined = "".join(self.rows)
-        return joined if joined in PATTERNS and len(self.rows) == 2 else "/".join(self.rows)
+        return next((p for p in PATTERNS if p == joined and len(self.rows) == 2), None)
 
     @property
     def letters(self) -> Array:

@@ -78,12 +78,21 @@ def _best(seen: Doubles, between: Doubles, centre: Doubles) -> Doubles:
 
 def linear_mmse(mosaic: Floats, array: FilterArray) -> Floats:
     """RGB, (height, width, 3), from a white-balanced mosaic, (height, width)."""
+    return filtered(mosaic, array.period, filters(array))
+
+
+def filtered(mosaic: Floats, period: tuple[int, int], made: Floats) -> Floats:
+    """A mosaic through filters by place: (height, width, channel).
+
+    Args:
+        mosaic: (height, width).
+        period: of its array, by which it goes on beyond its edges.
+        made: the filters, (row, column, tap, channel), of a multiple of the period.
+    """
     height, width = mosaic.shape
-    rows, columns = array.period
-    made = filters(array)
-    wide = mosaic[np.ix_(beyond(height, rows, RADIUS), beyond(width, columns, RADIUS))]
-    down, across = np.arange(height) % rows, np.arange(width) % columns
-    result = np.zeros((height, width, 3), np.float32)
+    wide = mosaic[np.ix_(beyond(height, period[0], RADIUS), beyond(width, period[1], RADIUS))]
+    down, across = np.arange(height) % made.shape[0], np.arange(width) % made.shape[1]
+    result = np.zeros((height, width, made.shape[-1]), np.float32)
     for tap in range(SIDE**2):
         y, x = divmod(tap, SIDE)
         weights = made[:, :, tap][np.ix_(down, across)]

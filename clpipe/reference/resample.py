@@ -135,9 +135,7 @@ class Resampling:
 
     def values(self, width: int, height: int) -> Mapping[str, Any]:
         """See :meth:`Resampler.values`."""
-        taps = self.taps(self.along(width, height))
-        counts = {"count": np.uint32(taps.count), "stride": np.uint32(taps.stride)}
-        return {"first": taps.first, "table": taps.table, **counts}
+        return values_of(self.taps(self.along(width, height)))
 
     def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
         """See :meth:`Resampler.needed`."""
@@ -153,6 +151,68 @@ class Resampling:
         before = self.along(*size)
         taps, after = self.taps(before).count + 1, self.size(before)
         return -(-low * before // after) + taps, -(-high * before // after) + taps
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Binning: each new row, or column, is the mean of the next ``factor`` old ones.
+
+    What is left behind the last whole bin is cut off; a side that is shorter than a bin is one.
+    """
+
+    parameters: ClassVar[Parameters] = Resampling.parameters
+
+    axis: Axis
+    factor: int
+
+    @property
+    def scale(self) -> float:
+        """See :attr:`Resampler.scale`."""
+        return 1 / self.factor
+
+    def size(self, size: int) -> int:
+        """The new number of rows or columns.
+
+        >>> [Bins("rows", 2).size(n) for n in (1, 2, 5)]
+        [1, 1, 2]
+        """
+        return max(size // self.factor, 1)
+
+    def along(self, width: int, height: int) -> int:
+        """See :meth:`Resampling.along`."""
+        return height if self.axis == "rows" else width
+
+    def taps(self, size: int) -> Taps:
+        """See :meth:`Resampling.taps`."""
+        return _taps_of_bins(self, size)
+
+    def resized(self, width: int, height: int) -> tuple[int, int]:
+        """See :meth:`Resampler.resized`."""
+        by_rows = self.axis == "rows"
+        return (width, self.size(height)) if by_rows else (self.size(width), height)
+
+    def values(self, width: int, height: int) -> Mapping[str, Any]:
+        """See :meth:`Resampler.values`."""
+        return values_of(self.taps(self.along(width, height)))
+
+    def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
+        """See :meth:`Resampler.needed`."""
+        if axis != self.axis:
+            return start, stop
+        taps = self.taps(self.along(*size))
+        return int(taps.first[start]), int(taps.first[stop - 1]) + taps.count
+
+    def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
+        """See :meth:`Resampler.reach`."""
+        if axis != self.axis:
+            return low, high
+        return (low + 1) * self.factor, (high + 1) * self.factor
+
+
+def values_of(taps: Taps) -> Mapping[str, Any]:
+    """A kernel's values of taps, by the names of :attr:`Resampling.parameters`."""
+    counts = {"count": np.uint32(taps.count), "stride": np.uint32(taps.stride)}
+    return {"first": taps.first, "table": taps.table, **counts}
 
 
 def sizes(resamplings: Iterable[Resampler], width: int, height: int) -> tuple[tuple[int, int], ...]:
@@ -194,6 +254,15 @@ def _taps(resampling: Resampling, size: int) -> Taps:
     return Taps(first, own, np.ascontiguousarray(table))
 
 
+@lru_cache(maxsize=64)
+def _taps_of_bins(bins: Bins, size: int) -> Taps:
+    count, factor = bins.size(size), min(bins.factor, size)
+    padded = np.minimum(np.arange(count + PADDING), count - 1)
+    first = (padded * factor).astype(np.int32)
+    own = np.full((len(padded), factor), 1 / factor, np.float32)
+    return Taps(first, own, own if bins.axis == "rows" else np.ascontiguousarray(own.T))
+
+
 def overlap(distance: Array, ratio: float) -> Array:
     """The share of a pixel, one wide, that lies within one of width ``ratio``: the area average.
 
@@ -216,7 +285,7 @@ def lanczos3(distance: Array, ratio: float) -> Array:
     return np.where(np.abs(x) < 3, np.sinc(x) * np.sinc(x / 3), 0)
 
 
-def resample(image: Floats, resampling: Resampling) -> Floats:
+def resample(image: Floats, resampling: "Resampling | Bins") -> Floats:
     """The smaller image, (height, width[, channel]) float32; taps are added up in order.
 
     >>> halved = Resampling("columns", 0.5, overlap, 0.5)

@@ -9,9 +9,9 @@ from clpipe.stage.passes import CompileTime
 PERIOD = ("rows", "columns")  # arguments of ``kernels/lib/table.h``
 
 
-def period_of(array: FilterArray) -> dict[str, CompileTime]:
-    """The period as compiled-in arguments."""
-    return dict(zip(PERIOD, (CompileTime(f"{size}u") for size in array.period), strict=True))
+def period_of(period: tuple[int, ...]) -> dict[str, CompileTime]:
+    """A period of rows and columns as compiled-in arguments."""
+    return dict(zip(PERIOD, (CompileTime(f"{size}u") for size in period), strict=True))
 
 
 @lru_cache(maxsize=64)  # one object for the same array, so that it is uploaded once

@@ -74,6 +74,7 @@ class Method(BaseModel):
     alternatives: ClassVar[frozenset[str]] = frozenset()
     # Whether it takes mosaics of any filter array, where others of its stage know Bayer's alone.
     any_array: ClassVar[bool] = False
+    only_arrays: ClassVar[tuple[str, ...]] = ()  # on which it is checked, where it takes no others
     # Whether its image may go on beyond the picture: it does the same everywhere, or counts places
     # from the picture, which ``margins`` says.
     overscan: ClassVar[bool] = False

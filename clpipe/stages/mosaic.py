@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.reference.cfa import PATTERNS, Pattern, by_site
+from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.filter_array import (
     LETTERS,
     NAMED,
@@ -106,7 +106,7 @@ class AnyArray(Method):
 
     def arguments(self, context: Context) -> Arguments:
         array = self._laid(context)
-        return {"responses": responses_table(array), **period_of(array)}
+        return {"responses": responses_table(array), **period_of(array.period)}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         table = responses_of(self._laid(given.context))
@@ -130,8 +130,7 @@ def _of_camera(context: Context) -> Method | None:
     if not (name := context.camera.filter_array):
         return None
     array = parse_array(name)
-    bayer = next((pattern for pattern in PATTERNS if pattern == array.pattern), None)
-    return Bayer(pattern=bayer) if bayer else AnyArray(array=name)
+    return Bayer(pattern=array.bayer) if array.bayer else AnyArray(array=name)
 
 
 STAGE = Stage(

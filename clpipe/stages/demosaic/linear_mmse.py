@@ -46,7 +46,7 @@ class LinearMmse(Method):
 
     def arguments(self, context: Context) -> Arguments:
         array = context.filters
-        return {"weights": weights_table(array), **period_of(array)}
+        return {"weights": weights_table(array), **period_of(array.period)}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         return linear_mmse(image, given.context.filters)

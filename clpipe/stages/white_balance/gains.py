@@ -102,7 +102,7 @@ class OfArray(CameraGains):
 
     def arguments(self, context: Context) -> Arguments:
         table = levels_table(self._array, self.inverse)
-        return {"factors": table, **period_of(self._array)}
+        return {"factors": table, **period_of(self._array.period)}
 
     def factors_at(self, shape: tuple[int, ...]) -> Floats:
         """The factor of each pixel of a mosaic, (height, width)."""

@@ -1,0 +1,174 @@
+"""From cells of several pixels of a colour to a Bayer pattern, as sensors with quad arrays do."""
+
+import math
+from dataclasses import replace
+from functools import lru_cache
+from typing import ClassVar, Self
+
+import numpy as np
+from pydantic import PrivateAttr
+
+from clpipe.base.errors import RequestError
+from clpipe.base.types import Floats
+from clpipe.reference.cfa import Pattern
+from clpipe.reference.filter_array import FilterArray, kernel_table, parse_array
+from clpipe.reference.geometry import Scaling
+from clpipe.reference.linear_mmse import RADIUS, filtered, filters
+from clpipe.reference.resample import Bins, resample
+from clpipe.stage import (
+    PERIOD,
+    Arguments,
+    Context,
+    Kind,
+    Method,
+    Pass,
+    ReferenceContext,
+    Resample,
+    Stage,
+    Stencil,
+    parameter,
+    period_of,
+)
+
+
+class Binning(Method):
+    """The mean of each cell of equal filters, as the digital binning of 2x2 or 3x3 pixels.
+
+    Noise falls as that of a mean of 4 or 9. What is left of rows and columns behind the last whole
+    cell is cut off.
+
+    >>> from clpipe.stage import Context, ReferenceContext
+    >>> from clpipe.camera.profile import load_camera
+    >>> context = Context(load_camera("sony-a7r2"), 100, array=parse_array("quad-RGGB"))
+    >>> mosaic = np.float32([[1, 3, 5, 7], [1, 3, 5, 7]])
+    >>> Binning().resolve(context).reference(mosaic, ReferenceContext(context, {}, {})).tolist()
+    [[2.0, 6.0]]
+    """
+
+    method: ClassVar = "binning"
+    kernel: ClassVar = "remosaic_binning"
+    summary: ClassVar = "the mean of each cell, a half or a third as wide and as high"
+    any_array: ClassVar = True
+    only_arrays: ClassVar = ("quad-RGGB", "nona-RGGB")
+
+    _factor: int = PrivateAttr(2)
+
+    def resolve(self, context: Context) -> Self:
+        array = context.filters
+        factor = next((n for n in (3, 2) if binned(array, n)), None)
+        if factor is None:
+            raise RequestError(
+                f"remosaic.method=binning: the mosaic is {array.name}; binning is for cells of 2x2 "
+                "or 3x3 equal filters, such as quad-RGGB and nona-RGGB"
+            )
+        other = self.model_copy()
+        other._factor = factor
+        return other
+
+    def next_context(self, context: Context) -> Context:
+        array = binned(context.filters, self._factor)
+        assert array
+        of_one, noise = self._factor**2, context.noise
+        less = noise and replace(noise, a=noise.a / of_one, b=noise.b / of_one)
+        return replace(with_array(context, array), noise=less)
+
+    @property
+    def bins(self) -> tuple[Bins, Bins]:
+        """The binning of rows and of columns."""
+        return Bins("rows", self._factor), Bins("columns", self._factor)
+
+    def passes(self) -> tuple[Pass, ...]:
+        rows, columns = self.bins
+        return (
+            Pass("bin_rows", Resample(rows), writes="fewer_rows"),
+            Pass("bin_columns", Resample(columns), reads=("fewer_rows",)),
+        )
+
+    def geometry(self) -> Scaling | None:
+        return Scaling(self.bins)
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        rows, columns = self.bins
+        return resample(resample(image, rows), columns)
+
+
+def binned(array: FilterArray, factor: int) -> FilterArray | None:
+    """The array of an array's cells of so many equal filters; None where it has no such cells.
+
+    >>> binned(parse_array("quad-RGGB"), 2).rows, binned(parse_array("x-trans"), 2)
+    (('RG', 'GB'), None)
+    """
+    rows, columns = array.period
+    if rows % factor or columns % factor:
+        return None
+    few = array.letters[::factor, ::factor]
+    if not (few.repeat(factor, 0).repeat(factor, 1) == array.letters).all():
+        return None
+    text = "/".join("".join(row) for row in few)
+    return parse_array(text, array.gains)
+
+
+def with_array(context: Context, array: FilterArray) -> Context:
+    """The context of a mosaic of another array, which may have a Bayer pattern."""
+    bayer = array.bayer
+    return replace(context, array=None, pattern=bayer) if bayer else replace(context, array=array)
+
+
+class LinearMmse(Method):
+    """The pattern's own samples where the array has them, else linear filters of 7x7.
+
+    They are those of ``demosaic.method=linear_mmse``: white-balanced mosaics go in.
+    """
+
+    method: ClassVar = "linear_mmse"
+    kernel: ClassVar = "remosaic_linear_mmse"
+    summary: ClassVar = "a Bayer pattern of full size, by linear filters of 7x7"
+    any_array: ClassVar = True
+
+    pattern: Pattern = parameter("RGGB", "The pattern that is made.", structural=True)
+
+    def next_context(self, context: Context) -> Context:
+        return replace(context, array=None, pattern=self.pattern)
+
+    def passes(self) -> tuple[Pass, ...]:
+        return (Pass("remosaic", Stencil(RADIUS), ("weights", *PERIOD)),)
+
+    def arguments(self, context: Context) -> Arguments:
+        weights = weights_of(context.filters, self.pattern)
+        return {"weights": table_of(context.filters, self.pattern), **_period(weights)}
+
+    def reference(self, image: Floats, given: ReferenceContext) -> Floats:
+        array = given.context.filters
+        made = weights_of(array, self.pattern)
+        return filtered(image, array.period, made[..., None])[..., 0]
+
+
+def _period(weights: Floats) -> Arguments:
+    return period_of(weights.shape[:2])
+
+
+@lru_cache(maxsize=16)
+def weights_of(array: FilterArray, pattern: Pattern) -> Floats:
+    """At each place of the common period, the filter of the colour there: (row, column, tap)."""
+    wanted = parse_array(pattern)
+    rows, columns = (math.lcm(a, b) for a, b in zip(array.period, wanted.period, strict=True))
+    made = filters(array)
+    places = np.ix_(np.arange(rows) % array.period[0], np.arange(columns) % array.period[1])
+    channel = np.vectorize("RGB".index)(np.tile(wanted.letters, (rows // 2, columns // 2)))
+    chosen = np.take_along_axis(made[places], channel[..., None, None], axis=-1)
+    return np.ascontiguousarray(chosen[..., 0])
+
+
+@lru_cache(maxsize=16)  # one object for the same array, so that it is uploaded once
+def table_of(array: FilterArray, pattern: Pattern) -> Floats:
+    """The same as kernels load it: (row, tap, column)."""
+    return kernel_table(weights_of(array, pattern).transpose(0, 2, 1))
+
+
+STAGE = Stage(
+    "remosaic",
+    "Make a Bayer pattern of an array of larger cells, as sensors with quad arrays do.",
+    Kind.MOSAIC,
+    Kind.MOSAIC,
+    (Binning, LinearMmse),
+)

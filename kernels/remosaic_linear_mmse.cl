@@ -1,0 +1,16 @@
+// From any filter array to a Bayer pattern: for each place of the period, 7x7 weights of the colour that it gets.
+#include "lib/table.h"
+
+INLINE vf remosaic(site at, src_image src, __global const float *weights, uint rows, uint columns) {
+    const uint next = columns + TABLE_LANES;
+    __global const float *own = table_at(at, weights, rows, columns, 7 * 7);
+    vf sum = (vf)(0.0f);
+    UNROLL_ROWS
+    for (int dy = -3; dy <= 3; ++dy) {
+        for (int dx = -3; dx <= 3; ++dx) {
+            sum += load(own) * src_tap(src, dx, dy);
+            own += next;
+        }
+    }
+    return sum;
+}
