@@ -352,7 +352,7 @@ def test_the_limits_of_a_parameter_are_its_own():
     above = limits_of(sensor.methods[0], "tukey_lambda").low
     assert -0.5 < above < -0.4999
     assert limits_of(exposure.methods[0], "ev") == Limits(-20, 20)
-    assert limits_of(bits.methods[0], "bits") == Limits(8, 16, whole=True)
+    assert limits_of(bits.methods[0], "bits") == Limits(8, 24, whole=True)
     assert limits_of(all_stages()["mosaic"].methods[0], "pattern") is None
 
 

@@ -85,7 +85,7 @@ def raw_step(chain: Chain, arrays: ArrayFormat) -> str:
     if not after.knots and (after.white_level or 0) > HIGHEST:
         raise RequestError(
             f"the raw in DN goes to {after.white_level:.0f}, which uint16 does not hold; say "
-            "dtype='float32' for a raw in signal, or quantize.method=pwl"
+            f"dtype='float32' for a raw in signal, or {steps[-1].name}.method=pwl"
         )
     return names[-1]
 

@@ -14,7 +14,7 @@ from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
 from clpipe.reference.cfa import PATTERNS, Pattern
-from clpipe.stage import Kind, Method, Stage, variant_label, variants
+from clpipe.stage import PERIOD, Kind, Method, Stage, variant_label, variants
 
 # Odd sizes, one pixel wide and high, smaller than the widest border, more than one work-group.
 SIZES = ((1, 1), (1, 9), (11, 1), (2, 3), (6, 5), (37, 53), (9, 530))
@@ -104,7 +104,7 @@ def compare(
 
 
 # Filter arrays that are no Bayer patterns: of odd and even periods, with and without clear pixels.
-ARRAYS = ("x-trans", "RGBW", "RCCB", "RGB/GBR/BRG", "mono")
+ARRAYS = ("x-trans", "RGBW", "RCCB", "RGB/GBR/BRG")
 
 
 def laid(pattern: str) -> dict[str, str]:
@@ -131,6 +131,15 @@ def depends_on_pattern(stage: Stage, method: type[Method], values: Mapping[str, 
     return any("pattern" in pass_.all_arguments for pass_ in step.method.passes())
 
 
+def arrays_of(stage: Stage, method: type[Method], values: Mapping[str, Any]) -> tuple[str, ...]:
+    """The filter arrays on which a method is checked beside Bayer patterns: where it tells them."""
+    if values or not method.any_array or stage.reads is not Kind.MOSAIC or method.only_arrays:
+        return ()
+    step = chain_for(stage, method, values, ARRAYS[0]).steps[0]
+    tells = any(set(PERIOD) <= {*pass_.all_arguments} for pass_ in step.method.passes())
+    return ARRAYS if tells else ()
+
+
 def check_method(
     device: Device,
     stage: Stage,
@@ -149,8 +158,7 @@ def check_method(
     # A variant reads the pattern through the same functions as the method's default.
     if values or not depends_on_pattern(stage, method, values):
         patterns = patterns[:1]
-    takes_any = method.any_array and stage.reads is Kind.MOSAIC and not values
-    total, every = Difference(), (*patterns, *(ARRAYS if takes_any else ()))
+    total, every = Difference(), (*patterns, *arrays_of(stage, method, values))
     every = method.only_arrays or every
     for pattern in every:
         total += compare(device, chain_for(stage, method, values, pattern), sizes)

@@ -47,13 +47,13 @@ def negative_of(chain: Chain) -> Negative:
         )
     if context.knots:
         raise RequestError(
-            "--format dng: the raw has fewer DN by a curve (quantize.method=pwl), which converters "
-            "do not take; use --format npy, or --keep quantize"
+            "--format dng: the raw has fewer DN by a curve, which converters do not take; use "
+            "--format npy, or keep it as an EXR"
         )
     if white > MOST_DN:
         raise RequestError(
             f"--format dng: found a white level of {white:.0f}, but it holds DN of 16 bits; use "
-            "--format npy, or quantize.method=pwl"
+            "--format npy, or fewer bits"
         )
     array = replace(context.filters, gains=gains)
     check_array(array)
