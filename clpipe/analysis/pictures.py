@@ -106,8 +106,8 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
     lowest = float(-black / (white - black) * full)
     if kind == Kind.RAW.label and context.knots:
         raise ImageError(
-            f"{path}: has fewer DN by a curve, which the next stage undoes; give what --keep of that "
-            "stage makes of it"
+            f"{path}: has fewer DN by a curve, which the next stage undoes; give what is kept "
+            "behind that"
         )
     if kind == Kind.RAW.label:
         pixels = (pixels - np.float32(black)) / np.float32(white - black) * full
