@@ -318,3 +318,14 @@ def test_a_remosaiced_picture_is_as_the_array_saw_it(develop):
 def test_what_has_no_cells(array):
     with pytest.raises(RequestError, match=f"the mosaic is {array}; binning is for cells of 2x2"):
         remosaiced(array, "binning")
+
+
+def test_the_variance_of_each_channel_is_that_of_its_noise(write_exr):
+    flat = write_exr("flat.exr", np.full((240, 240, 3), 0.5, np.float32))
+    settings = {"mosaic": laid("RGBW"), "iso": 1600}
+    options = {"raw": "mosaic", "variance": True, "dtype": "float32", "truth": "clean"}
+    sample = Dataset(flat, **options, **settings)[0]
+    noise, array = sample["raw"] - sample["truth.raw"], parse_array("RGBW")
+    for letter in array.channels:
+        own = array.spread({each: float(each == letter) for each in "RGBW"}, noise.shape) > 0
+        assert noise[own].var() == pytest.approx(sample["variance"][own].mean(), rel=0.06)
