@@ -9,6 +9,7 @@ import rawpy
 from PIL import Image
 
 from clpipe.base.errors import KeyedError, RequestError
+from clpipe.camera.profile import load_camera
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.dataset import Dataset
@@ -329,3 +330,21 @@ def test_the_variance_of_each_channel_is_that_of_its_noise(write_exr):
     for letter in array.channels:
         own = array.spread({each: float(each == letter) for each in "RGBW"}, noise.shape) > 0
         assert noise[own].var() == pytest.approx(sample["variance"][own].mean(), rel=0.06)
+
+
+def test_a_sensor_without_filters_is_calibrated(clpipe, write_exr):
+    ramp = np.geomspace(0.002, 0.8, 320, dtype=np.float32)
+    path = write_exr("ramp.exr", np.tile(ramp[None, :, None], (200, 1, 3)), half=False)
+    own = ("--camera", "emva-ccd-12bit", "--set", "prnu.sigma=0", "--until", "quantize")
+    for seed in range(4):
+        out = ("-o", f"out/{seed}", "--seed", seed, "--set", "exposure.headroom=0")
+        clpipe("run", path, *out, *own, "--format", "exr")
+    clpipe("calibrate", *(f"out/{seed}/ramp.exr" for seed in range(4)), "-o", "found.toml")
+    found, known = (load_camera(name) for name in ("found.toml", "emva-ccd-12bit"))
+    assert found.filter_array == "mono"
+    gains = [camera.gain_stages[0].system_gain[0] for camera in (found, known)]
+    assert gains[0] == pytest.approx(gains[1], rel=0.05)
+    other = ("--set", "mosaic.method=array", "--until", "quantize", "--format", "exr")
+    clpipe("run", path, "-o", "trans", *other)
+    result = clpipe("calibrate", "trans/ramp.exr", "-o", "no.toml", status=2)
+    assert "it knows Bayer patterns and sensors of one channel" in result.stderr

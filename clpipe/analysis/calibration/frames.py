@@ -227,8 +227,8 @@ def _sensor(overrides: FrameOverrides, pattern: str, black: float, white: float)
     Raises:
         RequestError: its mosaic has another filter array than Bayer's.
     """
-    if pattern == MONO:  # whose sites are alike, whatever they are called
-        pattern = PATTERNS[0]
+    is_mono = pattern == MONO  # whose sites are alike, whatever they are called
+    pattern = PATTERNS[0] if is_mono else pattern
     own = next((each for each in PATTERNS if each == pattern), None)
     if own is None:
         raise RequestError(
@@ -239,4 +239,5 @@ def _sensor(overrides: FrameOverrides, pattern: str, black: float, white: float)
         overrides.pattern or own,
         black if overrides.black_level is None else overrides.black_level,
         white if overrides.white_level is None else overrides.white_level,
+        "mono" if is_mono else "",
     )

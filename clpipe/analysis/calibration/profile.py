@@ -44,6 +44,8 @@ def calibrated_profile(
         "white_level": sensor.white_level,
         "white_balance_gains": gains or (1.0, 1.0),
     }
+    if sensor.filter_array:
+        values["filter_array"] = sensor.filter_array
     if xyz_to_camera:
         values["xyz_to_camera"] = xyz_to_camera
     sources = {

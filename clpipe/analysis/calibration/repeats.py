@@ -25,6 +25,7 @@ class Sensor:
     pattern: Pattern
     black_level: float  # DN
     white_level: float  # DN
+    filter_array: str = ""  # of a sensor without filters, whose sites are alike: its name
 
     @property
     def unit(self) -> float:
