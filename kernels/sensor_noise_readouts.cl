@@ -2,27 +2,28 @@
 //
 // A readout has noise, whole DN and a white level of its own. Where one comes near its white level, the next one
 // takes over, over a tenth of the range.
-#define HANDOVER_BEGINS 0.85f
 #define HANDOVER_ENDS 0.95f
+#define READOUTS 4  // at most
 
-// `shared`: all read the same charge, so its shot noise is the same; else each has light of its own. `part` is the
-// readout that is looked at alone, or -1.
-INLINE vf readouts(vf y, site at, stream s, int count, int shared, int part, float a, float b, float later_b,
-                   float full_well, float down, float up, float range, float unit) {
-    vf charge = y;
-    if (shared) charge = vmin(y + normal_at(at, 0, s) * square_root(vmax(a * y, (vf)(0.0f))), (vf)(full_well));
-    vf values[4], weights[4];
-    float sensitivity = 1.0f, inverse = 1.0f;
+// `table` has for each readout the number of its photodiode, the share of light that this one sees, the gain at which it
+// is read, the inverse of both, and the variance of its read noise. Readouts of one photodiode follow each other, and
+// have one charge. `part` is the readout that is looked at alone, or -1.
+INLINE vf readouts(vf y, site at, stream s, int count, int part, float a, float full_well, float range, float unit,
+                   __global const float *table) {
+    vf values[READOUTS], weights[READOUTS], charge = y;
+    int photodiode = -1;
     for (int i = 0; i < count; ++i) {
-        const float own_b = i ? later_b : b;
-        const vf light = charge * sensitivity;
-        const vf variance = shared ? (vf)(own_b) : vmax(a * light + own_b, (vf)(0.0f));
-        const vf noisy = light + normal_at(at, (uint)(i + shared), s) * square_root(variance);
+        __global const float *own = table + 5 * i;
+        if ((int)own[0] != photodiode) {
+            photodiode = (int)own[0];
+            const vf light = y * own[1];
+            const vf shot = normal_at(at, (uint)photodiode, s) * square_root(vmax(a * light, (vf)(0.0f)));
+            charge = vmin(light + shot, (vf)(full_well));
+        }
+        const vf noisy = charge * own[2] + normal_at(at, (uint)(READOUTS + i), s) * square_root((vf)(own[4]));
         const vf read = vmin(nearest(noisy * range) * unit, (vf)(1.0f));
-        values[i] = read * inverse;
+        values[i] = read * own[3];
         weights[i] = vmin(vmax((HANDOVER_ENDS - read) * 10.0f, (vf)(0.0f)), (vf)(1.0f));
-        sensitivity *= down;
-        inverse *= up;
     }
     if (part >= 0) return values[part];
     vf merged = values[count - 1];

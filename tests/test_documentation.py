@@ -154,7 +154,11 @@ def test_the_profile_is_complete(tmp_path):
     assert camera.noise(400).a == pytest.approx(1.08 / (16383 - 512))
     left_out = type(camera).model_fields.keys() - camera.model_fields_set
     ratios = {"row_noise_ratio", "column_noise_ratio"}
-    readouts = {"readout_ratio", "readout_noise"}  # of sensors that read an exposure twice
+    readouts = {
+        "readout_ratio",
+        "readout_noise",
+        "photodiode_ratio",
+    }  # of sensors that read an exposure twice
     assert left_out == {"aliases", "pixel_pitch", "tukey_lambda"} | ratios | readouts
 
 

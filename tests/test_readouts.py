@@ -22,6 +22,7 @@ METHODS = {
     "dual_gain": {},
     "split_pixel": {"ratio": 32.0, "later_noise": 2.0},
     "staggered": {"count": 3, "ratio": 8.0},
+    "split_dual_gain": {"ratio": 4.0, "light_ratio": 50.0, "later_noise": 1.5},
 }
 RAW = ["mosaic", "sensor_noise", "quantize", "normalize"]
 
@@ -42,17 +43,16 @@ def test_the_signal_to_noise_ratio_is_that_of_the_formulas(device, method):
     chain = chain_of(method)
     step = chain.step_named("sensor_noise").method
     runner = Runner(chain, device, encode=False, final=True)
-    a, b, n = step.a, step.b, step.numbers()
-    last = step.ratio ** (step.readouts - 1)
-    for light, which in ((0.05, 0), (0.8, 0), (1.2, 1), (0.8 * last, step.readouts - 1)):
+    every = step.readouts
+    lit = {0: (0.05, 0.8), 1: (1.2,), len(every) - 1: (0.8 * step.full_scale,)}
+    for which, light in ((which, light) for which, lights in lit.items() for light in lights):
         found = runner.run(np.full((300, 300, 3), light, np.float32), "snr").final
-        gain = step.ratio**which
-        shot = a * light * (1 if step.shares_charge else gain)
-        own = b if which == 0 else float(n["later_b"])
-        expected = (shot + own * gain**2) ** 0.5
+        read = step.b * (step.later_noise**2 if which else 1)
+        expected = step.a * light / every[which].share + read / every[which].sensitivity ** 2
         assert found.mean() == pytest.approx(light, rel=0.004)
-        assert decibels(light, found.std()) == pytest.approx(decibels(light, expected), abs=0.15)
-        assert step.own_variance(np.float32([light])) ** 0.5 == pytest.approx(expected, rel=0.02)
+        ratios = [decibels(light, sigma) for sigma in (found.std(), expected**0.5)]
+        assert ratios[0] == pytest.approx(ratios[1], abs=0.15)
+        assert step.own_variance(np.float32([light])) == pytest.approx(expected, rel=0.04)
 
 
 def test_the_ratio_dips_where_a_readout_takes_over(device):

@@ -180,6 +180,7 @@ class SensorNoise(TypedDict, total=False):
             "poisson",
             "dual_gain",
             "split_pixel",
+            "split_dual_gain",
             "staggered",
             "none",
         ]
@@ -199,6 +200,7 @@ class SensorNoise(TypedDict, total=False):
     ratio: Number
     later_noise: Number
     part: Whole
+    light_ratio: Number
     count: Whole
     full_signal: Number
 

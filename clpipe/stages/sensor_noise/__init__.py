@@ -4,7 +4,12 @@ from clpipe.stage import Kind, Stage
 from clpipe.stages.sensor_noise.gaussian import Gaussian
 from clpipe.stages.sensor_noise.no_noise import NoNoise
 from clpipe.stages.sensor_noise.poisson import Poisson
-from clpipe.stages.sensor_noise.readouts import DualGain, SplitPixel, Staggered
+from clpipe.stages.sensor_noise.readouts import (
+    DualGain,
+    SplitDualGain,
+    SplitPixel,
+    Staggered,
+)
 from clpipe.stages.sensor_noise.skewed_gaussian import SkewedGaussian
 
 STAGE = Stage(
@@ -12,5 +17,5 @@ STAGE = Stage(
     "Add shot and read noise.",
     Kind.MOSAIC,
     Kind.MOSAIC,
-    (SkewedGaussian, Gaussian, Poisson, DualGain, SplitPixel, Staggered, NoNoise),
+    (SkewedGaussian, Gaussian, Poisson, DualGain, SplitPixel, SplitDualGain, Staggered, NoNoise),
 )

@@ -1,13 +1,15 @@
 """High dynamic range in one exposure: it is read several times, and the readouts are merged."""
 
 from dataclasses import replace
-from typing import ClassVar, Self
+from functools import lru_cache
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from pydantic import PrivateAttr
 
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
+from clpipe.camera.profile import Camera
 from clpipe.reference.math import square_root
 from clpipe.reference.random import normal_at
 from clpipe.stage import (
@@ -25,22 +27,41 @@ from clpipe.stages.sensor_noise.model import SensorNoise
 from clpipe.stages.sensor_noise.no_noise import NoNoise
 
 RATIO = 16.0  # of a sensor that does not say its own
+LIGHT_RATIO = 100.0  # of its photodiodes
+MOST = 4  # readouts
 ENDS, STEEP = np.float32(0.95), np.float32(10.0)  # of a hand-over, which begins at 0.85
+
+
+class Readout(NamedTuple):
+    """One reading of an exposure.
+
+    Args:
+        photodiode: its number; readings of one have the same charge.
+        share: of the light that it sees, over the first one's.
+        gain: over the first reading's.
+    """
+
+    photodiode: int
+    share: float
+    gain: float
+
+    @property
+    def sensitivity(self) -> float:
+        """Its signal over the first reading's."""
+        return self.share * self.gain
 
 
 class Readouts(SensorNoise):
     """Several readouts of an exposure, each with noise, rounding and a white level of its own.
 
-    The first one is the camera's at its ISO: a and b are its. Each further one is less sensitive by
-    ``ratio``, so the last one has its white at a signal of ``ratio ** (count - 1)``, which
-    ``quantize`` takes for the white level; behind ``normalize`` 1 is the first one's white, and
-    what is brighter is above 1. The merged signal is that of the first readout that is
-    below 0.85 of its white; from there to 0.95 it goes over linearly to the next one. There the
-    signal-to-noise ratio dips, since the next one has collected or amplified less.
+    The first one is the camera's at its ISO: a and b are its. The last one has its white at the
+    signal ``full_scale``, which ``quantize`` takes for the white level; behind ``normalize`` 1 is
+    the first one's white, and what is brighter is above 1. The merged signal is that of the first
+    readout that is below 0.85 of its white; from there to 0.95 it goes over linearly to the next
+    one. There the signal-to-noise ratio dips, since that has collected or amplified less.
     """
 
     kernel: ClassVar = "sensor_noise_readouts"
-    shares_charge: ClassVar[bool] = False
 
     ratio: float | None = parameter(
         None,
@@ -62,83 +83,78 @@ class Readouts(SensorNoise):
         auto="merged",
         structural=True,
         ge=0,
-        le=3,
+        le=MOST - 1,
     )
 
     _range: float = PrivateAttr(1.0)  # of the camera, DN
 
     @property
-    def readouts(self) -> int:
-        """How many readouts there are."""
-        return 2
+    def readouts(self) -> tuple[Readout, ...]:
+        """The (resolved) readouts, the most sensitive first, those of a photodiode together."""
+        raise NotImplementedError(type(self).__name__)
 
     @property
     def full_scale(self) -> float:
         """The signal at which the last readout is white."""
-        assert self.ratio is not None
-        return float(self.ratio ** (self.readouts - 1))
+        return 1 / self.readouts[-1].sensitivity
+
+    def with_camera(self, camera: Camera) -> Self:
+        """A copy in which what a camera says of its readouts replaces what is not set."""
+        own = self.with_defaults(ratio=camera.readout_ratio, later_noise=camera.readout_noise)
+        return own.with_defaults(ratio=RATIO, later_noise=1.0)
 
     def resolve(self, context: Context) -> Self:
-        if self.part is not None and self.part >= self.readouts:
-            raise RequestError(
-                f"sensor_noise.part: found {self.part}; there are 0 to {self.readouts - 1}"
-            )
-        camera = context.camera
-        own = super().resolve(context)
-        own = own.with_defaults(ratio=camera.readout_ratio, later_noise=camera.readout_noise)
-        own = own.with_defaults(ratio=RATIO, later_noise=1.0)
-        own._range = camera.signal_range
+        own = super().resolve(context).with_camera(context.camera)
+        last = len(own.readouts) - 1
+        if own.part is not None and own.part > last:
+            raise RequestError(f"sensor_noise.part: found {own.part}; there are 0 to {last}")
+        own._range = context.camera.signal_range
         return own
 
     def next_context(self, context: Context) -> Context:
         return replace(super().next_context(context), full_scale=self.full_scale)
 
     def passes(self) -> tuple[Pass, ...]:
-        numbers = ("a", "b", "later_b", "full_well", "down", "up", "range", "unit")
-        names = ("count", "shared", "part", *numbers)
+        names = ("count", "part", "a", "full_well", "range", "unit", "table")
         return (Pass("readouts", arguments=names, random=NoiseScope.IMAGE),)
 
     def without_noise(self) -> Method | None:
         return NoNoise(full_signal=self.full_scale)
 
     def numbers(self) -> dict[str, np.float32]:
-        assert self.b is not None and self.ratio is not None and self.later_noise is not None
         return {
             "a": np.float32(self.a),
-            "b": np.float32(self.b),
-            "later_b": np.float32(self.b * self.later_noise**2),
             "full_well": np.float32(or_default(self.full_signal, NEVER_FULL)),
-            "down": np.float32(1 / self.ratio),
-            "up": np.float32(self.ratio),
             "range": np.float32(self._range),
             "unit": np.float32(1 / self._range),
         }
 
+    @property
+    def table(self) -> Floats:
+        """The readouts as the kernel has them: (readout, 5)."""
+        assert self.b is not None and self.later_noise is not None
+        return _table(self.readouts, self.b, self.b * self.later_noise**2)
+
     def arguments(self, context: Context) -> Arguments:
-        structure = {
-            "count": self.readouts,
-            "shared": int(self.shares_charge),
-            "part": -1 if self.part is None else self.part,
-        }
-        return {**self.numbers(), **{k: CompileTime(str(v)) for k, v in structure.items()}}
+        structure = {"count": len(self.readouts), "part": -1 if self.part is None else self.part}
+        literals = {name: CompileTime(str(value)) for name, value in structure.items()}
+        return {**self.numbers(), **literals, "table": self.table}
 
     def own_variance(self, signal: Floats) -> Floats:
-        n = self.numbers()
-        one = np.float32(1)
-        shared = n["a"] * signal if self.shares_charge else np.zeros_like(signal)
-        merged = np.zeros_like(signal)
-        for i in reversed(range(self.readouts)):
-            down = n["down"] ** i
-            shot = np.zeros_like(signal) if self.shares_charge else n["a"] * signal / down
-            own = shot + (n["later_b"] if i else n["b"]) / down**2
-            if self.part is not None:
-                merged = own if i == self.part else merged
-            elif i == self.readouts - 1:
-                merged = own
+        left, read = np.ones_like(signal), np.zeros_like(signal)
+        of_charges: dict[int, tuple[Floats, Floats]] = {}  # weight and shot noise by photodiode
+        for i, (each, row) in enumerate(zip(self.readouts, self.table, strict=True)):
+            if self.part is None:
+                is_last = each is self.readouts[-1]
+                own = left if is_last else left * self._weight(signal * row[1] * row[2])
+                left = left - own
             else:
-                weight = self._weight(signal * down)
-                merged = weight**2 * own + (one - weight) ** 2 * merged
-        return np.asarray(merged + shared, np.float32)
+                own = np.full_like(signal, i == self.part)
+            weight = of_charges.get(each.photodiode, (np.zeros_like(signal), left))[0] + own
+            of_charges[each.photodiode] = weight, np.float32(self.a) * signal / row[1]
+            read = read + own**2 * row[4] * row[3] ** 2
+        shot = sum(weight**2 * variance for weight, variance in of_charges.values())
+        return np.asarray(shot + read, np.float32)
 
     @staticmethod
     def _weight(read: Floats) -> Floats:
@@ -147,31 +163,36 @@ class Readouts(SensorNoise):
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         n, stream = self.numbers(), given.stream[NoiseScope.IMAGE]
-        charge, first = image, int(self.shares_charge)
-        if self.shares_charge:
-            shot = square_root(np.maximum(n["a"] * image, np.float32(0)))
-            charge = np.minimum(image + normal_at(image.shape, 0, stream) * shot, n["full_well"])
-        sensitivity = inverse = np.float32(1)
         values, weights = [], []
-        for i in range(self.readouts):
-            own_b = n["later_b"] if i else n["b"]
-            light = charge * sensitivity
-            variance = (
-                np.full_like(light, own_b)
-                if self.shares_charge
-                else np.maximum(n["a"] * light + own_b, np.float32(0))
+        photodiode, charge = -1, image
+        for i, (number, share, gain, inverse, variance) in enumerate(self.table):
+            if int(number) != photodiode:
+                photodiode, light = int(number), image * share
+                shot = square_root(np.maximum(n["a"] * light, np.float32(0)))
+                noisy = light + normal_at(image.shape, photodiode, stream) * shot
+                charge = np.minimum(noisy, n["full_well"])
+            noise = normal_at(image.shape, MOST + i, stream) * square_root(
+                np.full(image.shape, variance, np.float32)
             )
-            noisy = light + normal_at(image.shape, i + first, stream) * square_root(variance)
-            read = np.minimum(np.rint(noisy * n["range"]) * n["unit"], np.float32(1))
+            read = np.rint((charge * gain + noise) * n["range"]) * n["unit"]
+            read = np.minimum(read, np.float32(1))
             values.append(read * inverse)
             weights.append(self._weight(read))
-            sensitivity, inverse = sensitivity * n["down"], inverse * n["up"]
         if self.part is not None:
             return values[self.part]
         merged = values[-1]
         for value, weight in zip(values[-2::-1], weights[-2::-1], strict=True):
             merged = weight * value + (np.float32(1) - weight) * merged
         return merged
+
+
+@lru_cache(maxsize=256)  # one object for the same readouts, so that it is uploaded once
+def _table(readouts: tuple[Readout, ...], first: float, later: float) -> Floats:
+    rows = [
+        (*each, 1 / each.sensitivity, later if number else first)
+        for number, each in enumerate(readouts)
+    ]
+    return np.array(rows, np.float32)
 
 
 class DualGain(Readouts):
@@ -182,14 +203,18 @@ class DualGain(Readouts):
 
     >>> from clpipe.stage import run_reference
     >>> noisy = run_reference(DualGain(a=1e-4, b=1e-6), np.full((200, 200), 8.0, np.float32))
-    >>> round(float(noisy.mean()), 1), round(float(noisy.var()), 4)
-    (8.0, 0.0011)
+    >>> round(float(noisy.mean()), 1), round(float(noisy.var()), 3)
+    (8.0, 0.001)
     """
 
     method: ClassVar = "dual_gain"
     summary: ClassVar = "one charge read at two gains, and merged"
     other_examples: ClassVar = ({"part": 1},)
-    shares_charge: ClassVar = True
+
+    @property
+    def readouts(self) -> tuple[Readout, ...]:
+        assert self.ratio is not None
+        return Readout(0, 1, 1), Readout(0, 1, 1 / self.ratio)
 
 
 class SplitPixel(Readouts):
@@ -197,6 +222,50 @@ class SplitPixel(Readouts):
 
     method: ClassVar = "split_pixel"
     summary: ClassVar = "a large and a small photodiode in each pixel, merged"
+
+    @property
+    def readouts(self) -> tuple[Readout, ...]:
+        assert self.ratio is not None
+        return Readout(0, 1, 1), Readout(1, 1 / self.ratio, 1)
+
+
+class SplitDualGain(Readouts):
+    """Split pixels whose photodiodes are both read at two gains, ``ratio`` apart: four readouts.
+
+    The least sensitive reading of the large photodiode is to reach further than the most sensitive
+    one of the small, so ``light_ratio`` is above ``ratio``.
+    """
+
+    method: ClassVar = "split_dual_gain"
+    summary: ClassVar = "a large and a small photodiode, each read at two gains, merged"
+
+    light_ratio: float | None = parameter(
+        None,
+        "The light that the large photodiode sees over that of the small.",
+        auto="from the camera; else 100",
+        gt=1,
+        le=10_000,
+    )
+
+    def with_camera(self, camera: Camera) -> Self:
+        own = super().with_camera(camera).with_defaults(light_ratio=camera.photodiode_ratio)
+        own = own.with_defaults(light_ratio=LIGHT_RATIO)
+        assert own.light_ratio is not None and own.ratio is not None
+        if own.light_ratio <= own.ratio:
+            raise RequestError(
+                f"sensor_noise.light_ratio: found {own.light_ratio:g}; it is above that of the "
+                f"gains, {own.ratio:g}"
+            )
+        return own
+
+    @property
+    def readouts(self) -> tuple[Readout, ...]:
+        assert self.ratio is not None and self.light_ratio is not None
+        return tuple(
+            Readout(number, share, gain)
+            for number, share in enumerate((1, 1 / self.light_ratio))
+            for gain in (1, 1 / self.ratio)
+        )
 
 
 class Staggered(Readouts):
@@ -209,8 +278,9 @@ class Staggered(Readouts):
     summary: ClassVar = "two to four exposures, each shorter than the one before, merged"
     other_examples: ClassVar = ({"count": 4},)
 
-    count: int = parameter(3, "How many exposures there are.", structural=True, ge=2, le=4)
+    count: int = parameter(3, "How many exposures there are.", structural=True, ge=2, le=MOST)
 
     @property
-    def readouts(self) -> int:
-        return self.count
+    def readouts(self) -> tuple[Readout, ...]:
+        assert self.ratio is not None
+        return tuple(Readout(i, self.ratio**-i, 1) for i in range(self.count))
