@@ -17,10 +17,12 @@ def plus_minus(estimate: Estimate, unit: str = "") -> str:
 
     >>> plus_minus(Estimate(1.41, 0.012), "DN"), plus_minus(Estimate(0.0, 0.1), "DN")
     ('1.41 +- 0.012 DN', 'not seen, below 0.2 DN')
+    >>> plus_minus(Estimate(-5.0, 0.1))  # nothing is below zero but by chance or drift
+    'not seen, below 0.2'
     """
     unit = unit and f" {unit}"
     if not estimate.significant:
-        return f"not seen, below {estimate.value + 2 * estimate.error:.2g}{unit}"
+        return f"not seen, below {max(estimate.value, 0) + 2 * estimate.error:.2g}{unit}"
     return f"{estimate.value:.4g} +- {estimate.error:.2g}{unit}"
 
 
