@@ -11,7 +11,7 @@ import numpy as np
 
 from clpipe.base.types import Array
 from clpipe.reference.intrinsics import Intrinsics
-from clpipe.reference.resample import Bins, Resampling, sizes
+from clpipe.reference.resample import Resampler, sizes
 
 
 class Margins(NamedTuple):
@@ -95,13 +95,13 @@ class Scaling:
     """Rows and columns made fewer; the edges stay where they are.
 
     >>> import numpy as np
-    >>> from clpipe.reference.resample import overlap
+    >>> from clpipe.reference.resample import Resampling, overlap
     >>> half = Scaling((Resampling("columns", 0.5, overlap, 0.5),))
     >>> half.size(8, 6), half.origins(np.array(0.5), np.array(0.5), 8, 6)
     ((4, 6), (np.float64(1.0), np.float64(0.5)))
     """
 
-    resamplings: tuple[Resampling | Bins, ...]
+    resamplings: tuple[Resampler, ...]
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """See :meth:`Geometry.size`."""
@@ -122,7 +122,7 @@ class Composition:
     """Several geometries in a row, the first one's result going into the next.
 
     >>> import numpy as np
-    >>> from clpipe.reference.resample import overlap
+    >>> from clpipe.reference.resample import Resampling, overlap
     >>> half = Scaling((Resampling("columns", 0.5, overlap, 0.5),))
     >>> twice = Composition((half, half))
     >>> twice.size(8, 6), twice.origins(np.array(0.5), np.array(0.5), 8, 6)

@@ -88,8 +88,51 @@ class Taps:
         return int(self.table.shape[1])
 
 
+class AlongAxis:
+    """What all have in common that make rows or columns fewer; see :class:`Resampler`."""
+
+    parameters: ClassVar[Parameters] = (
+        ("first", "__global const int *restrict"),
+        ("table", "__global const float *restrict"),
+        ("count", "uint"),
+        ("stride", "uint"),
+    )
+
+    axis: Axis
+
+    def size(self, size: int) -> int:
+        """The new number of rows or columns, at least 1."""
+        raise NotImplementedError(type(self).__name__)
+
+    def taps(self, size: int) -> Taps:
+        """What the new rows or columns of an image of ``size`` are made of."""
+        raise NotImplementedError(type(self).__name__)
+
+    def along(self, width: int, height: int) -> int:
+        """The one of an image's sides that becomes shorter."""
+        return height if self.axis == "rows" else width
+
+    def resized(self, width: int, height: int) -> tuple[int, int]:
+        """See :meth:`Resampler.resized`."""
+        by_rows = self.axis == "rows"
+        return (width, self.size(height)) if by_rows else (self.size(width), height)
+
+    def values(self, width: int, height: int) -> Mapping[str, Any]:
+        """See :meth:`Resampler.values`."""
+        taps = self.taps(self.along(width, height))
+        counts = {"count": np.uint32(taps.count), "stride": np.uint32(taps.stride)}
+        return {"first": taps.first, "table": taps.table, **counts}
+
+    def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
+        """See :meth:`Resampler.needed`."""
+        if axis != self.axis:
+            return start, stop
+        taps = self.taps(self.along(*size))
+        return int(taps.first[start]), int(taps.first[stop - 1]) + taps.count
+
+
 @dataclass(frozen=True)
-class Resampling:
+class Resampling(AlongAxis):
     """How many rows, or columns, an image becomes, and how.
 
     Args:
@@ -98,13 +141,6 @@ class Resampling:
         weight: the filter.
         support: the largest distance at which ``weight`` is not 0, over the ratio, less 1/2 px.
     """
-
-    parameters: ClassVar[Parameters] = (
-        ("first", "__global const int *restrict"),
-        ("table", "__global const float *restrict"),
-        ("count", "uint"),
-        ("stride", "uint"),
-    )
 
     axis: Axis
     scale: float
@@ -120,29 +156,9 @@ class Resampling:
         """
         return max(int(np.floor(size * self.scale + 0.5)), 1)
 
-    def along(self, width: int, height: int) -> int:
-        """The one of an image's sides that becomes shorter."""
-        return height if self.axis == "rows" else width
-
     def taps(self, size: int) -> Taps:
         """What the new rows or columns of an image of ``size`` are made of."""
         return _taps(self, size)
-
-    def resized(self, width: int, height: int) -> tuple[int, int]:
-        """See :meth:`Resampler.resized`."""
-        by_rows = self.axis == "rows"
-        return (width, self.size(height)) if by_rows else (self.size(width), height)
-
-    def values(self, width: int, height: int) -> Mapping[str, Any]:
-        """See :meth:`Resampler.values`."""
-        return values_of(self.taps(self.along(width, height)))
-
-    def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
-        """See :meth:`Resampler.needed`."""
-        if axis != self.axis:
-            return start, stop
-        taps = self.taps(self.along(*size))
-        return int(taps.first[start]), int(taps.first[stop - 1]) + taps.count
 
     def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
         """See :meth:`Resampler.reach`."""
@@ -154,13 +170,11 @@ class Resampling:
 
 
 @dataclass(frozen=True)
-class Bins:
+class Bins(AlongAxis):
     """Binning: each new row, or column, is the mean of the next ``factor`` old ones.
 
     What is left behind the last whole bin is cut off; a side that is shorter than a bin is one.
     """
-
-    parameters: ClassVar[Parameters] = Resampling.parameters
 
     axis: Axis
     factor: int
@@ -178,41 +192,15 @@ class Bins:
         """
         return max(size // self.factor, 1)
 
-    def along(self, width: int, height: int) -> int:
-        """See :meth:`Resampling.along`."""
-        return height if self.axis == "rows" else width
-
     def taps(self, size: int) -> Taps:
         """See :meth:`Resampling.taps`."""
         return _taps_of_bins(self, size)
-
-    def resized(self, width: int, height: int) -> tuple[int, int]:
-        """See :meth:`Resampler.resized`."""
-        by_rows = self.axis == "rows"
-        return (width, self.size(height)) if by_rows else (self.size(width), height)
-
-    def values(self, width: int, height: int) -> Mapping[str, Any]:
-        """See :meth:`Resampler.values`."""
-        return values_of(self.taps(self.along(width, height)))
-
-    def needed(self, axis: Axis, size: tuple[int, int], start: int, stop: int) -> tuple[int, int]:
-        """See :meth:`Resampler.needed`."""
-        if axis != self.axis:
-            return start, stop
-        taps = self.taps(self.along(*size))
-        return int(taps.first[start]), int(taps.first[stop - 1]) + taps.count
 
     def reach(self, axis: Axis, size: tuple[int, int], low: int, high: int) -> tuple[int, int]:
         """See :meth:`Resampler.reach`."""
         if axis != self.axis:
             return low, high
         return (low + 1) * self.factor, (high + 1) * self.factor
-
-
-def values_of(taps: Taps) -> Mapping[str, Any]:
-    """A kernel's values of taps, by the names of :attr:`Resampling.parameters`."""
-    counts = {"count": np.uint32(taps.count), "stride": np.uint32(taps.stride)}
-    return {"first": taps.first, "table": taps.table, **counts}
 
 
 def sizes(resamplings: Iterable[Resampler], width: int, height: int) -> tuple[tuple[int, int], ...]:
@@ -285,7 +273,7 @@ def lanczos3(distance: Array, ratio: float) -> Array:
     return np.where(np.abs(x) < 3, np.sinc(x) * np.sinc(x / 3), 0)
 
 
-def resample(image: Floats, resampling: "Resampling | Bins") -> Floats:
+def resample(image: Floats, resampling: AlongAxis) -> Floats:
     """The smaller image, (height, width[, channel]) float32; taps are added up in order.
 
     >>> halved = Resampling("columns", 0.5, overlap, 0.5)
