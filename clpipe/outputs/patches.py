@@ -17,7 +17,7 @@ from clpipe.chain.truth import signal_and_noise, variance_of
 from clpipe.engine.extents import Box
 from clpipe.images.tags import FLIPS, upright
 from clpipe.outputs.negative import negative_of
-from clpipe.reference.cfa import PATTERNS
+from clpipe.reference.filter_array import parse_array
 from clpipe.stage import Stencil
 
 PER_IMAGE = 16  # patches, unless another number is asked for
@@ -67,7 +67,7 @@ def first_place(pattern: str, orientation: int, size: int) -> tuple[int, int] | 
     >>> first_place("RGGB", 2, 128), first_place("GRBG", 5, 128)  # left to right; transposed
     ((1, 0), (1, 1))
     """
-    cell = cell_of(pattern)
+    cell = parse_array(pattern).letters
     rows, columns = cell.shape
     around = math.lcm(rows, columns)  # both ways, since a turn may swap them
     side = around + size % around
@@ -78,16 +78,6 @@ def first_place(pattern: str, orientation: int, size: int) -> tuple[int, int] | 
             if (turned[:rows, :columns] == cell).all():
                 return x, y
     return None
-
-
-def cell_of(pattern: str) -> Array:
-    """The letters of one period of a pattern, (row, column).
-
-    >>> cell_of("GRBG").tolist(), cell_of("RW/WB").tolist()
-    ([['G', 'R'], ['B', 'G']], [['R', 'W'], ['W', 'B']])
-    """
-    rows = (pattern[:2], pattern[2:]) if pattern in PATTERNS else pattern.split("/")
-    return np.array([list(row) for row in rows])
 
 
 @dataclass(frozen=True)
@@ -175,8 +165,8 @@ class Cutting:
         return place
 
     @property
-    def _period(self) -> tuple[int, ...]:
-        return cell_of(self.pattern).shape
+    def _period(self) -> tuple[int, int]:
+        return parse_array(self.pattern).period
 
 
 @dataclass(frozen=True)

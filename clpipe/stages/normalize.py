@@ -21,6 +21,7 @@ from clpipe.stage import (
     StageRole,
     parameter,
 )
+from clpipe.stages.quantize import MAX_DN
 
 
 class Linear(Method):
@@ -42,7 +43,7 @@ class Linear(Method):
         "DN",
         "as quantize used it, else from the camera",
         ge=0,
-        le=2**24 - 1,
+        le=MAX_DN,
     )
     white_level: float | None = parameter(
         None,
@@ -50,7 +51,7 @@ class Linear(Method):
         "DN",
         "as quantize used it, for the first of several readouts; else from the camera",
         gt=0,
-        le=2**24 - 1,
+        le=MAX_DN,
     )
 
     @model_validator(mode="after")
