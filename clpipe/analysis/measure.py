@@ -46,9 +46,8 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
             are no repeats of one scene.
         ImageError: no pixel counts.
     """
-    clean, freedom, noise = against(images, truth)
+    clean, freedom, noise, clipped = against(images, truth)
     first = images[0]
-    clipped = clipped_samples(images, np.stack([image.pixels for image in images]))
     start = ~truth.clipped() if truth else np.ones(clean.shape, bool)
     if not start.any():
         raise nothing_counts(first)
@@ -79,20 +78,21 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
     )
 
 
-def against(images: Sequence[Picture], truth: Picture | None) -> tuple[Floats, float, Floats]:
-    """The clean image, the share of freedom that it leaves, and the noise of each image.
+def against(images: Sequence[Picture], truth: Picture | None) -> tuple[Floats, float, Floats, Mask]:
+    """The clean image, the share of freedom that it leaves, each image's noise and clipped samples.
 
     Arguments and errors as for :func:`measure`.
     """
     check_partners(images, truth)
     frames = np.stack([image.pixels for image in images])
+    clipped = clipped_samples(images, frames)
     if truth:
-        return truth.pixels, 1.0, frames - truth.pixels
+        return truth.pixels, 1.0, frames - truth.pixels, clipped
     freedom = (len(images) - 1) / len(images)
     clean = frames.mean(0, dtype=np.float64).astype(np.float32)
     noise = (frames - clean) / np.float32(freedom**0.5)
     check_repeats(images, clean, noise)
-    return clean, freedom, noise
+    return clean, freedom, noise, clipped
 
 
 def at_edges(clean: Floats, noise: Floats, unclipped: Mask) -> float:

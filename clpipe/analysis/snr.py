@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.analysis.measure import against, clipped_samples
+from clpipe.analysis.measure import against
 from clpipe.analysis.pictures import Picture
 
 PER_STOP = 2  # steps of intensity
@@ -21,7 +21,7 @@ class SnrStep:
     Args:
         intensity: the mean, in the unit of the images.
         stops: how many it is below the brightest step.
-        decibels: 20 log10 of mean over standard deviation (EMVA 1288, release 4.0, sec. 3).
+        decibels: 20 log10 of mean over standard deviation, as EMVA 1288 has it.
         samples: of which there are.
     """
 
@@ -40,8 +40,7 @@ def snr_curve(images: Sequence[Picture], truth: Picture | None = None) -> list[S
     Raises:
         RequestError, ImageError: as there.
     """
-    clean, _, noise = against(images, truth)
-    clipped = clipped_samples(images, np.stack([image.pixels for image in images]))
+    clean, _, noise, clipped = against(images, truth)
     counts = (clean > 0) & ~np.any(clipped, axis=0)
     if truth:
         counts &= ~truth.clipped()
