@@ -130,25 +130,26 @@ def test_beyond_an_edge_an_array_goes_on():
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("array", "settings", "message"),
     [
         (
+            "x-trans",
             {"demosaic": {"method": "menon2007"}},
             "demosaic.method=menon2007: it knows Bayer patterns alone, but the mosaic is x-trans; "
-            "take demosaic.method=linear_mmse or gray",
+            "take demosaic.method=linear_mmse$",
         ),
+        ("mono", {"demosaic": {"method": "menon2007"}}, "take demosaic.method=gray$"),
         (
+            "x-trans",
             {"white_balance": {"method": "gray_world"}},
             "white_balance.method=gray_world: .*take white_balance.method=as_shot or gains or none",
         ),
-        ({"mosaic": {"method": "array", "array": "q"}}, "unknown filter array 'q'"),
+        ("q", {}, "unknown filter array 'q'"),
     ],
 )
-def test_what_knows_bayer_patterns_alone(settings, message):
+def test_what_knows_bayer_patterns_alone(array, settings, message):
     with pytest.raises(RequestError, match=message):
-        on("x-trans", **settings) if "mosaic" not in settings else make_chain(
-            settings_from(settings)
-        )
+        on(array, **settings)
 
 
 def test_a_camera_says_its_array(clpipe, tmp_path):

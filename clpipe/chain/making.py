@@ -219,7 +219,9 @@ def _check_array(name: str, method: Method, context: Context) -> None:
     """
     array = context.array
     if array and any("pattern" in pass_.all_arguments for pass_ in method.passes()):
-        fitting = [m.method for m in all_stages()[base_name(name)].methods if m.any_array]
+        stage = all_stages()[base_name(name)]
+        usual = stage.usual and stage.usual(context)
+        fitting = [m.method for m in ((usual,) if usual else stage.methods) if m.any_array]
         rest = f"take {name}.method={' or '.join(fitting)}" if fitting else f"skip {name}"
         raise KeyedError(
             name,
