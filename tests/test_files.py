@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -102,6 +104,33 @@ def write_and_fail(path):
     with deferred_files():
         write_whole(path, b"x")
         raise TypeError
+
+
+WRITING_WHILE_IT_ENDS = """
+import os, sys, threading, time
+from pathlib import Path
+from clpipe.base.files import deferred_files, remove_temporary_files, write_whole
+
+def write(name):
+    with deferred_files():
+        for i in range(10**9):
+            write_whole(folder / f"{name}{i % 50}", bytes(4096))
+            begun.set()
+
+folder, begun = Path(sys.argv[1]), threading.Event()
+for name in "abcd":
+    threading.Thread(target=write, args=name, daemon=True).start()
+begun.wait()
+time.sleep(0.1)
+remove_temporary_files()
+time.sleep(0.1)
+os._exit(0)
+"""
+
+
+def test_a_process_that_ends_at_once_leaves_no_part_though_other_threads_write(tmp_path):
+    subprocess.run([sys.executable, "-c", WRITING_WHILE_IT_ENDS, tmp_path], check=True)
+    assert not list(tmp_path.iterdir())
 
 
 def test_no_link_is_followed(tmp_path, monkeypatch):

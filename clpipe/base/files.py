@@ -38,6 +38,8 @@ class Stored:
 
 
 _unfinished: set[Path] = set()  # temporary files of this process, for `remove_temporary_files`
+# Held while one of them is begun. A signal's handler may take it where its thread has it already.
+_beginning = threading.RLock()
 
 LONGEST = 200  # bytes of a name that its temporary name repeats; file systems hold 255
 
@@ -176,6 +178,13 @@ def _named(path: Path) -> Iterator[None]:
         raise ImageError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
+def _begun(beside: Path) -> BinaryIO:
+    """A new temporary file, open."""
+    with _beginning:
+        _unfinished.add(beside)
+        return open(beside, "xb")
+
+
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[BinaryIO]:
     """A file to write to, which takes the place of ``path`` when all of it is on the disk.
@@ -187,11 +196,10 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
         ImageError: the file cannot be written.
     """
     beside = path.with_name(f".{shortened(path.stem)}.{secrets.token_hex(4)}.part{path.suffix}")
-    _unfinished.add(beside)
     is_written = False
     try:
         with _named(path):
-            with open(beside, "xb") as file:
+            with _begun(beside) as file:
                 yield file
                 file.flush()
                 if not hasattr(_thread, "group"):
@@ -276,7 +284,11 @@ def keep_names(folder: Path, at_once: bool = False) -> None:
 
 
 def remove_temporary_files() -> None:
-    """Delete the temporary files that are being written now; call it just before exiting."""
+    """Delete the temporary files that are being written now; call it just before exiting.
+
+    No other thread begins one afterwards: it waits for the end of the process.
+    """
+    _beginning.acquire()
     for path in list(_unfinished):
         with contextlib.suppress(OSError):
             path.unlink(missing_ok=True)
