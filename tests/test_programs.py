@@ -78,6 +78,29 @@ def test_a_user_without_a_home(monkeypatch):
     assert not cache_folder.is_usable(None)
 
 
+SIGNALS_AROUND = """
+import ctypes, signal
+
+handler_of = ctypes.CDLL(None).signal
+handler_of.restype, handler_of.argtypes = ctypes.c_void_p, [ctypes.c_int, ctypes.c_void_p]
+
+def handlers():
+    found = [handler_of(number, None) for number in (signal.SIGINT, signal.SIGTERM)]
+    handler_of(signal.SIGINT, found[0]), handler_of(signal.SIGTERM, found[1])
+    return found
+
+signal.signal(signal.SIGTERM, lambda *of: None)
+before = handlers()
+from clpipe.engine.device import open_devices
+open_devices(["cpu"])
+print(before == handlers())
+"""
+
+
+def test_signals_go_where_they_went_before_there_was_a_compiler_in_the_process(tmp_path):
+    assert python(SIGNALS_AROUND, CLPIPE_CACHE_DIR=tmp_path) == "True"
+
+
 def test_why_pocl_cannot_work_is_said(device, monkeypatch):
     if "Portable Computing" not in device.info.platform:
         pytest.skip("needs PoCL")

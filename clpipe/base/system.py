@@ -10,8 +10,10 @@ import errno
 import importlib
 import os
 import shutil
+import signal
 import stat
 import tempfile
+import threading
 from collections.abc import Collection, Iterator
 from functools import cache
 from pathlib import Path
@@ -228,6 +230,25 @@ def give_back_memory() -> None:
     """Give memory that was freed, and that the C library keeps for later, back to the system."""
     with contextlib.suppress(OSError, TypeError, AttributeError):  # another C library
         _libc().malloc_trim(0)
+
+
+@contextlib.contextmanager
+def kept_signals() -> Iterator[None]:
+    """Have signals go where they went before, whatever a library that is begun inside does.
+
+    A compiler in the process (LLVM in PoCL) takes them over at its first use, to remove its files,
+    and passes them on once; a second one that comes meanwhile ends the process where it stands.
+
+    Only the main thread can do so; in any other nothing is done.
+    """
+    before = {number: signal.getsignal(number) for number in signal.valid_signals()}
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in before.items():
+                if callable(handler) or handler is signal.SIG_IGN:
+                    signal.signal(number, handler)
 
 
 def bring_to_disk(folder: Path) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import DeviceError, RequestError
+from clpipe.base.system import kept_signals
 from clpipe.engine.builders import BinaryBuilder, PoclBuilder
 from clpipe.engine.cache_folder import cache_folder, later_runs, pocl_folder
 from clpipe.engine.codegen import Kernel
@@ -49,7 +50,8 @@ class Programs:
 
         self._cl = cl
         try:
-            self.context = cl.Context([info.handle])
+            with kept_signals():
+                self.context = cl.Context([info.handle])
         except cl.Error as error:
             raise DeviceError(f"{info.label} cannot be opened: {error}") from None
         self._programs: BoundedCache[Any] = BoundedCache(PROGRAMS)
