@@ -24,6 +24,7 @@ from clpipe.stage import (
     Method,
     Noiseless,
     NoiseScope,
+    Pass,
     Resample,
     Stage,
     StageRole,
@@ -43,7 +44,12 @@ class Step:
     context: Context
     follows_noise: bool = True
 
-    @property
+    @cached_property
+    def passes(self) -> tuple[Pass, ...]:
+        """The passes of its method."""
+        return self.method.passes()
+
+    @cached_property
     def adds_noise(self) -> bool:
         """Whether it adds noise, as its method says."""
         return self.method.without_noise() is not self.method
@@ -149,7 +155,7 @@ class Chain:
 
     @cached_property
     def _resamplings(self) -> tuple[Resampler, ...]:
-        passes = (p for step in self.steps for p in step.method.passes())
+        passes = (p for step in self.steps for p in step.passes)
         return tuple(p.access.resampler for p in passes if isinstance(p.access, Resample))
 
     @property
@@ -161,7 +167,7 @@ class Chain:
     @property
     def is_noisy(self) -> bool:
         """Whether a step draws random numbers."""
-        return any(p.random for s in self.steps for p in s.method.passes())
+        return any(p.random for s in self.steps for p in s.passes)
 
     def without_noise(self) -> "Chain":
         """The chain without the noise of its steps.
@@ -193,7 +199,7 @@ class Chain:
             if not step.follows_noise and type(method).noise_free is Method.noise_free:
                 left.append((step, step.method.without_noise()))  # as it would be resolved again
                 continue
-            context = replace(step.context, clean=True)
+            context = step.context.but(clean=True)
             with validation_errors(name, type(method)), user_code_errors(f"stage {name}", folder):
                 own = method.noise_free(context)
                 left.append((step, own and own.as_for(step.method)))
@@ -202,8 +208,16 @@ class Chain:
     def _with(self, methods: Sequence[tuple[Step, Method | None]], clean: bool) -> "Chain":
         """The chain with other methods in its steps, and no noise; see :meth:`without_noise`."""
         *others, (last, method) = methods
+        contexts: dict[int, Context] = {}  # of which most steps share theirs
+
+        def context_of(step: Step) -> Context:
+            key = id(step.context)
+            if key not in contexts:
+                contexts[key] = step.context.but(noise=None, clean=clean)
+            return contexts[key]
+
         steps = tuple(
-            replace(step, method=method, context=replace(step.context, noise=None, clean=clean))
+            replace(step, method=method, context=context_of(step))
             for step, method in (*others, (last, method or Noiseless()))
             if method
         )

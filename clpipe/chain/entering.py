@@ -85,7 +85,7 @@ def enter(
 @lru_cache(maxsize=64)
 def _with_shot(chain: Chain, shot: tuple[tuple[str, float], ...]) -> Chain:
     """The chain with what an image says of its camera; the same one where no step needs that."""
-    active = [chain.settings.method(s.name) for s in chain.steps if s.method.passes()]
+    active = [chain.settings.method(s.name) for s in chain.steps if s.passes]
     needed = {n for own in active for n in optics_names(type(own)) if getattr(own, n) is None}
     if chain.camera.dark_current:
         needed.add("exposure_time")

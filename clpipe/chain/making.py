@@ -1,7 +1,6 @@
 """Chains made of settings: each parameter resolved, and what does not fit refused."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
 
 from clpipe.base.errors import KeyedError, RequestError
@@ -144,8 +143,8 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
                 raise RequestError(misfit(name, stage, before, kind or stage.reads))
             _check_array(name, method, context)
             after = method.next_context(context)
-            if method.passes():
-                after = replace(after, optics=after.optics.set_to(method.optics()))
+            if (states := method.optics()) and method.passes():
+                after = after.but(optics=after.optics.set_to(states))
         if stage.folder:
             check_passes(name, stage, method, context)
         # What a user's stage looks at, nobody knows.

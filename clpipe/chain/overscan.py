@@ -16,7 +16,7 @@ from clpipe.reference.geometry import NO_MARGINS, Margins
 def steps_of_overscan(chain: Chain) -> int:
     """How many steps of a chain get an image that goes on beyond the picture; 0 is none."""
     for count, step in enumerate(chain.steps, 1):
-        if step.method.passes() and not step.method.overscan:
+        if step.passes and not step.method.overscan:
             return 0
         if step.method.geometry():
             return count

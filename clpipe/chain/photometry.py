@@ -96,7 +96,7 @@ def _gains(chain: Chain, estimates: Estimates) -> dict[str, list[float]]:
 def _falloff(chain: Chain) -> dict[str, Any] | None:
     """The law by which light falls off towards the corners; None where it does not."""
     step = chain.step_in(StageRole.FALLOFF)
-    if step is None or isinstance(step.method, Unchanged) or not step.method.passes():
+    if step is None or isinstance(step.method, Unchanged) or not step.passes:
         return None
     method = step.method
     return {"method": method.method, "law": method.summary, "parameters": method.model_dump()}

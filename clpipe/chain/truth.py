@@ -95,7 +95,7 @@ def variance_of(noise: Sequence[Step], signal: Floats) -> Floats:
         RequestError: a step does not know its variance.
     """
     analogue = list(takewhile(lambda step: step.stage.writes is not Kind.RAW, noise))
-    if len(analogue) < len(noise) and all(s.adds_noise or not s.method.passes() for s in analogue):
+    if len(analogue) < len(noise) and all(s.adds_noise or not s.passes for s in analogue):
         signal = np.minimum(signal, np.float32(1))
     last = max(i for i, step in enumerate(noise) if step.adds_noise)
     variance: Floats = np.zeros((), np.float32)

@@ -128,7 +128,7 @@ def chain_for(stage: Stage, method: type[Method], values: Mapping[str, Any], pat
 def depends_on_pattern(stage: Stage, method: type[Method], values: Mapping[str, Any]) -> bool:
     """Whether the kernels of a method are compiled for a CFA pattern."""
     step = chain_for(stage, method, values, PATTERNS[0]).steps[0]
-    return any("pattern" in pass_.all_arguments for pass_ in step.method.passes())
+    return any("pattern" in pass_.all_arguments for pass_ in step.passes)
 
 
 def arrays_of(stage: Stage, method: type[Method], values: Mapping[str, Any]) -> tuple[str, ...]:
@@ -136,7 +136,7 @@ def arrays_of(stage: Stage, method: type[Method], values: Mapping[str, Any]) -> 
     if values or not method.any_array or stage.reads is not Kind.MOSAIC or method.only_arrays:
         return ()
     step = chain_for(stage, method, values, ARRAYS[0]).steps[0]
-    tells = any(set(PERIOD) <= {*pass_.all_arguments} for pass_ in step.method.passes())
+    tells = any(set(PERIOD) <= {*pass_.all_arguments} for pass_ in step.passes)
     return ARRAYS if tells else ()
 
 

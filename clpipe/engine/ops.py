@@ -22,6 +22,10 @@ class Op:
     literals: tuple[tuple[str, str], ...]  # argument -> OpenCL text
     undoes_previous: bool = False  # the pass before it, of another step
 
+    def __hash__(self) -> int:
+        # Of a part, which tells most apart: chains are looked up by all of their passes.
+        return hash((self.step, self.pass_.function, self.literals))
+
     @property
     def is_inlined(self) -> bool:
         """Whether a stencil after it may redo it at each of its taps."""
@@ -83,7 +87,7 @@ def bytes_of(argument: Argument) -> bytes:
 
 def ops_of(step: Step, arguments: Mapping[str, Argument]) -> tuple[Op, ...]:
     """The passes of a step with the types of its arguments, which decide its kernels' text."""
-    passes = step.method.passes()
+    passes = step.passes
     if not passes:
         return ()
     types, literals = [], []

@@ -274,7 +274,7 @@ class Runner:
         for step in self.chain.steps:
             if values := step.method.estimates_for(width, height):
                 found[step.name] = dict(values)
-            for pass_ in step.method.passes():
+            for pass_ in step.passes:
                 if isinstance(pass_.access, Resample):
                     width, height = pass_.access.resampler.resized(width, height)
         return found

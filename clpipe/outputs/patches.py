@@ -269,7 +269,7 @@ def variance_steps(chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
     """
     signal, noise = signal_and_noise(chain)
     for step in noise:
-        if any(isinstance(pass_.access, Stencil) for pass_ in step.method.passes()):
+        if any(isinstance(pass_.access, Stencil) for pass_ in step.passes):
             raise RequestError(
                 f"variance: {step.name} mixes the noise of neighbours; move it before the noise or "
                 "behind the raw"

@@ -3,8 +3,9 @@
 import threading
 import weakref
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from copy import copy
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.optics import Optics
@@ -57,9 +58,15 @@ class Context:
     # Of the image, which holds it: chains are kept longer. Chains of one structure are alike.
     depth: weakref.ref[Depth] | None = field(default=None, compare=False, repr=False)
 
+    def but(self, **changes: Any) -> "Context":
+        """A copy with other facts: ``dataclasses.replace``, in a fifth of its time."""
+        other = copy(self)
+        vars(other).update(changes)
+        return other
+
     def without_view(self) -> "Context":
         """The context of a picture that is no longer in the render's perspective."""
-        return replace(self, optics=self.optics.without_view())
+        return self.but(optics=self.optics.without_view())
 
     def noise_parameters(self) -> tuple[float, float]:
         """The a and b of the noise that was added, else the camera's; of a clean image, zeros."""

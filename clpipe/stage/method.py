@@ -79,7 +79,7 @@ class Method(BaseModel):
     # from the picture, which ``margins`` says.
     overscan: ClassVar[bool] = False
 
-    _margins: Margins = PrivateAttr(NO_MARGINS)
+    _margins: Margins = PrivateAttr(default_factory=lambda: NO_MARGINS)  # which is not copied
 
     @property
     def margins(self) -> Margins:

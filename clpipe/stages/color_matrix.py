@@ -1,6 +1,5 @@
 """Colour matrix: from a camera's white-balanced RGB to linear sRGB."""
 
-from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -92,7 +91,7 @@ class FixedMatrix(Method):
 
     def next_context(self, context: Context) -> Context:
         colours = np.array(self.matrix) @ context.colours
-        return replace(context, colours=as_tuples(colours.tolist()))
+        return context.but(colours=as_tuples(colours.tolist()))
 
     @property
     def _array(self) -> Floats:

@@ -1,6 +1,5 @@
 """Inverse white balance: it comes before the noise, which depends on the sensor's own signal."""
 
-from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -35,7 +34,7 @@ class Gains(CameraGains):
         return ArrayGains.on(context.array, own) if context.array else own
 
     def next_context(self, context: Context) -> Context:
-        return replace(context, gains=self.gains)
+        return context.but(gains=self.gains)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("inverse_white_balance", arguments=("pattern", "red", "blue")),)

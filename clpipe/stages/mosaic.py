@@ -1,6 +1,5 @@
 """The colour filter array."""
 
-from dataclasses import replace
 from functools import lru_cache
 from typing import ClassVar
 
@@ -49,13 +48,13 @@ class Bayer(Method):
     )
 
     def next_context(self, context: Context) -> Context:
-        return replace(context, pattern=self.pattern, array=None)
+        return context.but(pattern=self.pattern, array=None)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("mosaic", arguments=("pattern",)),)
 
     def arguments(self, context: Context) -> Arguments:
-        return {"pattern": replace(context, pattern=self.pattern).cfa}
+        return {"pattern": context.but(pattern=self.pattern).cfa}
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
         red, green, blue = np.moveaxis(image, -1, 0)
@@ -99,7 +98,7 @@ class AnyArray(Method):
         return parse_array(self.array, context.camera.white_balance_gains)
 
     def next_context(self, context: Context) -> Context:
-        return replace(context, array=self._laid(context))
+        return context.but(array=self._laid(context))
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("filter_array", arguments=("responses", *PERIOD)),)

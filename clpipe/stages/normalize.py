@@ -1,6 +1,5 @@
 """Levels: from DN to signal, the first step of a raw converter."""
 
-from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -77,7 +76,7 @@ class Linear(Method):
             return context
         assert self.black_level is not None and self.white_level is not None
         whole = context.white_level - context.black_level
-        return replace(context, full_scale=whole / (self.white_level - self.black_level))
+        return context.but(full_scale=whole / (self.white_level - self.black_level))
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("normalize_levels", arguments=("black_level", "scale")),)
@@ -137,7 +136,7 @@ class Pwl(Linear):
         return pieces_of(knots_in(self.knots), inverse=True)
 
     def next_context(self, context: Context) -> Context:
-        return replace(super().next_context(context), knots=())
+        return super().next_context(context).but(knots=())
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("expand", arguments=("black_level", "scale", "pieces", "count")),)

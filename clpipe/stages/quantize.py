@@ -1,6 +1,5 @@
 """The analogue-to-digital converter."""
 
-from dataclasses import replace
 from math import ceil, log2
 from typing import ClassVar
 
@@ -95,7 +94,7 @@ class Linear(Method):
         return type(self).model_validate(filled.model_dump())
 
     def next_context(self, context: Context) -> Context:
-        return replace(context, black_level=self.black_level, white_level=self.white_level)
+        return context.but(black_level=self.black_level, white_level=self.white_level)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("quantize", arguments=("range", "black_level", "white_level")),)
@@ -171,7 +170,7 @@ class Pwl(Linear):
         return knots_in(self.knots)
 
     def next_context(self, context: Context) -> Context:
-        return replace(super().next_context(context), knots=self._knots)
+        return super().next_context(context).but(knots=self._knots)
 
     def passes(self) -> tuple[Pass, ...]:
         names = ("range", "black_level", "white_level", "pieces", "count")

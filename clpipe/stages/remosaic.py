@@ -70,7 +70,7 @@ class Binning(Method):
         assert array
         of_one, noise = self._factor**2, context.noise
         less = noise and replace(noise, a=noise.a / of_one, b=noise.b / of_one)
-        return replace(with_array(context, array), noise=less)
+        return with_array(context, array).but(noise=less)
 
     @property
     def bins(self) -> tuple[Bins, Bins]:
@@ -111,7 +111,7 @@ def binned(array: FilterArray, factor: int) -> FilterArray | None:
 def with_array(context: Context, array: FilterArray) -> Context:
     """The context of a mosaic of another array, which may have a Bayer pattern."""
     bayer = array.bayer
-    return replace(context, array=None, pattern=bayer) if bayer else replace(context, array=array)
+    return context.but(array=None, pattern=bayer) if bayer else context.but(array=array)
 
 
 class LinearMmse(Method):
@@ -128,7 +128,7 @@ class LinearMmse(Method):
     pattern: Pattern = parameter("RGGB", "The pattern that is made.", structural=True)
 
     def next_context(self, context: Context) -> Context:
-        return replace(context, array=None, pattern=self.pattern)
+        return context.but(array=None, pattern=self.pattern)
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("remosaic", Stencil(RADIUS), ("weights", *PERIOD)),)

@@ -99,6 +99,8 @@ class Rows(Method):
     @property
     def swing(self) -> np.float32:
         """The flicker that is left after a row's exposure has averaged it."""
+        if not self.flicker_depth:
+            return np.float32(0)
         return np.float32(self.flicker_depth * np.sinc(self.flicker_frequency * self.time))
 
     def passes(self) -> tuple[Pass, ...]:

@@ -131,7 +131,7 @@ def _variants(chains: Sequence[Chain], position: int) -> list[Variant]:
     found: dict[tuple[object, ...], dict[int, Step]] = {}
     for number, chain in enumerate(chains):
         step = chain.steps[position]
-        if passes := step.method.passes():
+        if passes := step.passes:
             alike = type(step.method), *(each.function for each in passes)
             found.setdefault(alike, {})[number] = step
     variants = []

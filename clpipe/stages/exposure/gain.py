@@ -1,6 +1,5 @@
 """Exposure by a number of stops."""
 
-from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -38,7 +37,7 @@ class Gain(Method):
 
     def next_context(self, context: Context) -> Context:
         time = self.time(context.exposure_time)
-        return replace(context, headroom=context.headroom + self.headroom, exposure_time=time)
+        return context.but(headroom=context.headroom + self.headroom, exposure_time=time)
 
     def time(self, exposure_time: float | None) -> float | None:
         """How long the shutter is open, s: EVs are its doing, as in a camera's bracket."""

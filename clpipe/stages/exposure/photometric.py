@@ -1,7 +1,6 @@
 """Exposure by physics: what a camera's settings make of a scene in cd/m2."""
 
 import math
-from dataclasses import replace
 from typing import ClassVar, Self
 
 import numpy as np
@@ -67,7 +66,7 @@ class Photometric(Gain):
 
     def next_context(self, context: Context) -> Context:
         headroom = context.headroom + self.headroom - math.log2(WHITE)
-        return replace(context, headroom=headroom, exposure_time=self.time(self.exposure_time))
+        return context.but(headroom=headroom, exposure_time=self.time(self.exposure_time))
 
     def factor(self, iso: float) -> np.float32:
         """The value of a render's unit, over the sensor's full scale, at an ISO."""

@@ -1,6 +1,5 @@
 """The strength of sensor noise: its parameters, and the noise model that they define."""
 
-from dataclasses import replace
 from math import isclose
 from typing import Self
 
@@ -168,7 +167,7 @@ class SensorNoise(Method):
         return filled.with_defaults(full_well=camera.full_well)
 
     def next_context(self, context: Context) -> Context:
-        return replace(context, noise=self.model(context))
+        return context.but(noise=self.model(context))
 
     def without_noise(self) -> Method | None:
         full = self.full_signal

@@ -1,6 +1,5 @@
 """High dynamic range in one exposure: it is read several times, and the readouts are merged."""
 
-from dataclasses import replace
 from functools import lru_cache
 from typing import ClassVar, NamedTuple, Self
 
@@ -112,7 +111,7 @@ class Readouts(SensorNoise):
         return own
 
     def next_context(self, context: Context) -> Context:
-        return replace(super().next_context(context), full_scale=self.full_scale)
+        return super().next_context(context).but(full_scale=self.full_scale)
 
     def passes(self) -> tuple[Pass, ...]:
         names = ("count", "part", "a", "full_well", "range", "unit", "table")

@@ -40,7 +40,7 @@ class EstimatedGains(Method):
 
     def next_context(self, context: Context) -> Context:
         # The estimates are known only when the image is processed; the as-shot gains stand in.
-        return replace(context, applied_gains=context.gains, full_scale=1.0)
+        return context.but(applied_gains=context.gains, full_scale=1.0)
 
     def search(self) -> Pass:
         """The pass that estimates "red_gain" and "blue_gain"."""
@@ -132,7 +132,7 @@ class Gains(CameraGains):
         return ArrayGains.on(context.array, own) if context.array else own
 
     def next_context(self, context: Context) -> Context:
-        return replace(context, applied_gains=self.gains, full_scale=1.0)
+        return context.but(applied_gains=self.gains, full_scale=1.0)
 
     def passes(self) -> tuple[Pass, ...]:
         return (APPLY,)
