@@ -3,7 +3,8 @@
 They are tuples because these classes are made seven times faster than dataclasses.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 from clpipe.stage import NoiseScope
 
@@ -62,6 +63,8 @@ class ResamplingValue(NamedTuple):
 
 # What follows from the image's chain, its key and its size.
 Value = ArgumentValue | StreamWord | EncodedCurves | ResamplingValue
+
+Bind = Callable[[Value], Any]  # gives a NumPy scalar or array
 
 
 Bound = Buffer | ExtentNumber | TileNumber | Value

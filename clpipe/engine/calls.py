@@ -8,6 +8,7 @@ import numpy as np
 from clpipe.base.types import Array
 from clpipe.engine.bindings import (
     ArgumentValue,
+    Bind,
     Buffer,
     EncodedCurves,
     ExtentNumber,
@@ -22,7 +23,6 @@ from clpipe.engine.extents import Extent, Extents
 from clpipe.engine.ir import Border, Finalize, Histogram, Launch, Lines, Reduce
 from clpipe.engine.work_items import PARTIALS, columns_of, local_size, round_up, summed_together
 
-Bind = Callable[[Value], Any]  # a NumPy scalar or array
 ENDS = ("src", "dst")  # buffers that are an image's own
 
 MANY = 4  # launches, after which there will be more

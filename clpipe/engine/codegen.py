@@ -28,6 +28,7 @@ from clpipe.engine.ir import (
 from clpipe.engine.kernel_builder import KernelBuilder
 from clpipe.engine.ops import Op
 from clpipe.engine.sources import LIBRARY, files_text
+from clpipe.engine.stack_kernels import opening
 from clpipe.engine.work_items import PARTIALS, RUN, columns_of, local_size, summed_together
 from clpipe.reference.filter_array import MIRRORED
 from clpipe.stage import Kind, LineTable, TableLookup
@@ -57,9 +58,14 @@ def call(op: Op, arguments: Sequence[str]) -> str:
     return f"{op.pass_.function}({', '.join(arguments)})"
 
 
-def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
-    """The OpenCL source of one launch of a plan, for a device with that many lanes."""
-    builder = KernelBuilder(plan, lanes)
+def write_kernel(
+    plan: Plan, launch: AnyLaunch | Border, lanes: int, stacked: bool = False
+) -> Kernel:
+    """The OpenCL source of one launch of a plan, for a device with that many lanes.
+
+    One that is ``stacked`` is over several images, see :mod:`clpipe.engine.stack_kernels`.
+    """
+    builder = KernelBuilder(plan, lanes, stacked)
     for number in ("width", "height", "pitch", "left", "top", "columns", "rows", "border"):
         builder.number(number)
     seen: set[str] = set()
@@ -89,14 +95,20 @@ def write_kernel(plan: Plan, launch: AnyLaunch | Border, lanes: int) -> Kernel:
             down, across = (n if n > MIRRORED else 0 for n in launch.period or (0, 0))
             plane = builder.slot(launch.slot, True)
             body = f"    fill_border({plane}, {at}, {down}, {across}, e);\n"
-    signature = ",\n    ".join(p.declaration for p in builder.parameters.values())
+            if stacked:  # of members that differ in size
+                body = f"    if (get_global_id(1) >= rows + 2 * border) return;\n{body}"
+    declared, first = [p.declaration for p in builder.parameters.values()], list[str]()
+    if stacked:
+        declared, first = opening(builder.parameters)
+    signature = ",\n    ".join(declared)
     size = 1 if isinstance(launch, Finalize) else local_size(lanes)
     setup = "".join(f"    {line}\n" for line in builder.setup)
+    start = "".join(f"    {line}\n" for line in first)
     # The hint keeps Intel's compiler from making vectors of our vectors, up to nine times slower.
     text += (
         '#line 1 "launch"\n'
         f"__kernel __attribute__((vec_type_hint(vf), reqd_work_group_size({size}, 1, 1)))\n"
-        f"void {UNNAMED}(\n    {signature})\n{{\n"
+        f"void {UNNAMED}(\n    {signature})\n{{\n{start}"
         f"    const extent e = {EXTENT};\n{setup}{body}}}\n"
     )
     name = f"launch_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
@@ -239,16 +251,19 @@ def _pixels(builder: KernelBuilder, launch: Launch) -> str:
     )
     rows = "".join(f"    {line}\n" for line in [*once, *body])
     rows = f"    const site first = site_at(x, y);\n{rows}"
+    inside, outside = "x - e.left < columns", "x - e.left >= columns"
+    if builder.stacked:  # of which members may differ in size
+        inside, outside = f"{inside} && y - e.top < rows", f"{outside} || y - e.top >= rows"
     if not launch.sums:
-        return f"{place}    if (x - e.left >= columns) return;\n{rows}"
+        return f"{place}    if ({outside}) return;\n{rows}"
     own = "(int4)(fold_columns(even_rows, first), fold_columns(odd_rows, first))"
     if (together := summed_together(builder.lanes)) == 1:
         store = f"    store_sums({own}, sums, e);\n"
-        return f"{place}    if (x - e.left >= columns) return;\n{rows}{store}"
+        return f"{place}    if ({outside}) return;\n{rows}{store}"
     # No work item may leave before a barrier.
     return (
         f"    __local int4 group[{together}];\n{place}    int4 own = (int4)(0);\n"
-        f"    if (x - e.left < columns) {{\n{rows}    own = {own};\n    }}\n"
+        f"    if ({inside}) {{\n{rows}    own = {own};\n    }}\n"
         "    store_group_sums(own, group, sums);\n"
     )
 

@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -11,8 +12,9 @@ import numpy as np
 from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array
+from clpipe.engine.bindings import Bind
 from clpipe.engine.buffers import HostImages, room_for
-from clpipe.engine.calls import Bind, Call
+from clpipe.engine.calls import Call
 from clpipe.engine.codegen import write_kernel
 from clpipe.engine.discovery import (
     DeviceInfo,
@@ -26,7 +28,9 @@ from clpipe.engine.flow import DeviceImage, Flow, ImageTask
 from clpipe.engine.ir import AnyLaunch, Border, Launch, Plan
 from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.patches import with_patches
-from clpipe.engine.programs import forget_programs, programs_of, tell_watchers
+from clpipe.engine.programs import announced, forget_programs, programs_of, tell_watchers
+from clpipe.engine.stack import Placed, Stack, StackKernel, cut, members_of
+from clpipe.engine.stack import start as start_stack
 from clpipe.engine.tiles import Tiling, tiling_of
 
 log = logging.getLogger(__name__)
@@ -49,6 +53,21 @@ def timed(events: Sequence[tuple[str, Any]]) -> list[Timing]:
         )
         for name, event in events
     ]
+
+
+def told(plan: Plan) -> Iterator[AnyLaunch]:
+    """The launches of a plan, of which those who wait for their kernels hear."""
+    for number, launch in enumerate(plan.launches):
+        tell_watchers(number, len(plan.launches))
+        yield launch
+    tell_watchers(len(plan.launches), len(plan.launches))
+
+
+def borders_of(plan: Plan, written: Launch) -> Iterator[Border]:
+    """The launches that fill the borders of the planes that a launch has written."""
+    if image := written.writes:
+        for slot in plan.slots[image.number]:
+            yield Border(slot, written.level, image.period)
 
 
 class Device:
@@ -84,6 +103,8 @@ class Device:
         self._programs = programs_of(self.info)
         self._calls: BoundedCache[list[Call]] = BoundedCache(PLANS)
         self._border_calls: BoundedCache[Call] = BoundedCache(PLANS)
+        self._stack_kernels: BoundedCache[list[StackKernel]] = BoundedCache(PLANS)
+        self._stack_borders: BoundedCache[StackKernel] = BoundedCache(PLANS)
         try:
             self._flow = Flow(
                 self._programs.context, self.info.alignment if self.info.in_place else None
@@ -116,18 +137,21 @@ class Device:
         Raises:
             DeviceError: a kernel does not compile; the message is the compiler's.
         """
+        make = partial(self._call, plan)
+        return self._calls.get(plan.unscaled, lambda: [make(x) for x in told(plan)])
 
-        def compiled() -> Iterator[Call]:
-            for number, launch in enumerate(plan.launches):
-                tell_watchers(number, len(plan.launches))
-                yield self._call(plan, launch)
-            tell_watchers(len(plan.launches), len(plan.launches))
-
-        return self._calls.get(plan.unscaled, lambda: list(compiled()))
+    def _stacked(self, plan: Plan) -> list[StackKernel]:
+        """As :meth:`compile`, of the kernels over a stack."""
+        make = partial(self._stack_kernel, plan)
+        return self._stack_kernels.get(plan.unscaled, lambda: [make(x) for x in told(plan)])
 
     def _call(self, plan: Plan, launch: AnyLaunch | Border) -> Call:
         kernel = write_kernel(plan, launch, self.info.lanes)
         return Call(kernel, self._programs.kernel(kernel))
+
+    def _stack_kernel(self, plan: Plan, launch: AnyLaunch | Border) -> StackKernel:
+        kernel = write_kernel(plan, launch, self.info.lanes, stacked=True)
+        return StackKernel(kernel, self._programs.kernel(kernel))
 
     def keep_programs(self) -> None:
         """Keep for later processes what was compiled, and launched once, since the last time."""
@@ -135,11 +159,13 @@ class Device:
 
     def _borders(self, plan: Plan, written: Launch) -> Iterator[Call]:
         """The calls that fill the borders of the planes that a launch has written."""
-        if not (image := written.writes):
-            return
-        for slot in plan.slots[image.number]:
-            border = Border(slot, written.level, image.period)
+        for border in borders_of(plan, written):
             yield self._border_calls.get(border, partial(self._call, plan, border))
+
+    def _borders_of_stack(self, plan: Plan, written: Launch) -> Iterator[StackKernel]:
+        """As :meth:`_borders`, over a stack."""
+        for border in borders_of(plan, written):
+            yield self._stack_borders.get(border, partial(self._stack_kernel, plan, border))
 
     def submit(
         self, plan: Plan, source: Array, bind: Bind, options: RunOptions
@@ -170,10 +196,78 @@ class Device:
             ImageError: the image does not fit into the device's memory, not even in tiles.
             DeviceError: a kernel does not compile.
         """
-        output = room_for(plan, source.shape[1], source.shape[0], options.into, options.boxes)
-        task = ImageTask(plan, source, bind, output, options)
+        task = self._task(plan, source, bind, options)
         enqueued = self._enqueue(task, self.memory)
         return partial(self._result, task, enqueued, self._generation)
+
+    def _task(self, plan: Plan, source: Array, bind: Bind, options: RunOptions) -> ImageTask:
+        height, width = source.shape[:2]
+        output = room_for(plan, width, height, options.into, options.boxes)
+        return ImageTask(plan, source, bind, output, options)
+
+    def submit_together(
+        self, images: Sequence[tuple[Plan, Array, Bind, RunOptions]]
+    ) -> list[Callable[[], HostImages]] | None:
+        """Enqueue images, or patches of them, in common launches; see :mod:`clpipe.engine.stack`.
+
+        Args:
+            images: what :meth:`submit` takes, of each; their plans have the same kernels.
+
+        Returns:
+            What waits for the results of each, as :meth:`submit` does; a stack that fails is done
+            again image by image. None where they are too large, or need launches of their own.
+
+        Raises:
+            ImageError, DeviceError: as :meth:`submit`.
+        """
+        if sum(max(len(options.boxes), 1) for *_, options in images) < 2:
+            return None
+        tasks = [self._task(*image) for image in images]
+        members = [members_of(task, self._tiling(task, self.memory)) for task in tasks]
+        placed = [each for own in members for each in own or ()]
+        in_place, largest = self.info.in_place, self.info.max_buffer
+        stacks = cut(placed, in_place, self.memory, largest, self.depth) if all(members) else None
+        if not stacks:
+            return None
+        begun = self._begin(stacks)
+        return [partial(self._result_of_stacks, t, begun, self._generation) for t in tasks]
+
+    def _begin(
+        self, stacks: Sequence[tuple[Sequence[Placed], dict[str, int]]]
+    ) -> list[Stack] | Exception:
+        """Enqueue stacks; what the device raises is returned."""
+        begun: list[Stack] = []
+        plan = stacks[0][0][0].task.plan
+        is_new = plan.unscaled not in self._stack_kernels
+        try:
+            with announced(self.info) if is_new else nullcontext():
+                kernels, borders = self._stacked(plan), partial(self._borders_of_stack, plan)
+            for members, strides in stacks:
+                begun.append(Stack(members, kernels, borders, strides))
+                start_stack(self._flow, begun[-1], self.memory)
+            if is_new:
+                self.keep_programs()
+            return begun
+        except (self._cl.Error, MemoryError) as error:
+            return error
+
+    def _result_of_stacks(
+        self, task: ImageTask, begun: list[Stack] | Exception, generation: int
+    ) -> HostImages:
+        """The results of an image that was enqueued with others; see :meth:`submit_together`."""
+        if generation == self._generation:
+            try:
+                if isinstance(begun, Exception):
+                    raise begun
+                for stack in begun:
+                    self._flow.finish(stack)
+                self._failures = 0
+                return task.output
+            except (self._cl.Error, MemoryError):
+                self._abandon()
+                if not self._works():
+                    self._renew()
+        return self._result(task, ImageError("it was lost"), generation)
 
     def drain(self) -> None:
         """Wait for what was enqueued, so that it uses no memory of the host any more."""

@@ -6,7 +6,7 @@ way together.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -17,9 +17,9 @@ import numpy as np
 from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.types import Array
-from clpipe.engine.bindings import slot_buffer, step_buffer
+from clpipe.engine.bindings import Bind, slot_buffer, step_buffer
 from clpipe.engine.buffers import HostImages, Pool, aligned_empty, copy_encoded, copy_plane, core_of
-from clpipe.engine.calls import Bind, Call, index_space
+from clpipe.engine.calls import Call, index_space
 from clpipe.engine.extents import Extent, Extents
 from clpipe.engine.ir import Launch, Plan
 from clpipe.engine.launch_cache import LaunchCache
@@ -55,7 +55,22 @@ class ImageTask:
 
 
 @dataclass
-class DeviceImage:
+class OnTheWay:
+    """What goes through a device together, on its way.
+
+    Attributes:
+        events: of launches and transfers, by their names.
+        tiles_left: that have not landed.
+        error: the first one of a tile that has.
+    """
+
+    events: list[tuple[str, Any]] = field(default_factory=list, init=False)
+    tiles_left: int = field(default=0, init=False)
+    error: Exception | None = field(default=None, init=False)
+
+
+@dataclass
+class DeviceImage(OnTheWay):
     """One image on its way: one try to do a task.
 
     Args:
@@ -69,9 +84,6 @@ class DeviceImage:
     calls: Sequence[Call]
     borders: Callable[[Launch], Iterable[Call]]
     tiling: Tiling
-    events: list[tuple[str, Any]] = field(default_factory=list)  # of launches and transfers
-    tiles_left: int = 0  # that have not landed
-    error: Exception | None = None  # the first one of a tile that has
 
     @property
     def is_whole(self) -> bool:
@@ -83,7 +95,7 @@ class DeviceImage:
 class DeviceTile:
     """A tile on its way: the events to wait for, and the copies to make then."""
 
-    image: DeviceImage
+    image: OnTheWay
     events: list[Any]
     copies: list[Callable[[], None]]
 
@@ -104,7 +116,7 @@ class Flow:
         self._in_place = alignment is not None
         self.queue = self.new_queue()
         self.pool = Pool(self.new_buffer)
-        self._transfers: InPlace | Staged = (
+        self.transfers: InPlace | Staged = (
             InPlace(cl, self.queue, alignment)
             if alignment
             else Staged(cl, self.queue, self.new_queue, self.pool)
@@ -133,7 +145,7 @@ class Flow:
     @property
     def depth(self) -> int:
         """The number of tiles that may be on the way at a time."""
-        return self._transfers.depth
+        return self.transfers.depth
 
     def start(self, image: DeviceImage, memory: int) -> None:
         """Enqueue all of an image, while buffers take no more than ``memory`` bytes.
@@ -141,13 +153,9 @@ class Flow:
         Where more than :attr:`depth` tiles would be on the way, the oldest ones land. Of an
         incremental plan, launches are left out whose results are on the device.
         """
-        # Nothing is known of what buffers hold until all is enqueued.
-        known, self._launch_cache, after = self._launch_cache, LaunchCache(), LaunchCache()
+        known, after = self.forget(), LaunchCache()
         tiling, task = image.tiling, image.task
-        needs = self._transfers.needs(tiling.sizes)
-        if not self.pool.has(needs, memory):
-            self.drain()  # a buffer's memory on the host goes with it, whatever writes there
-        self.pool.reserve(needs, memory)
+        self.make_room(tiling.sizes, memory)
         if task.plan.incremental and image.is_whole:
             numbers, after = known.next(
                 image.calls,
@@ -162,15 +170,51 @@ class Flow:
             tiles = tiling.tiles_of(phase)
             self._launch(image, phase.first, tiles[0], 0, {}, [])
             for tile, extents in enumerate(tiles):
-                while len(self._tiles) >= self.depth:
-                    self._land()
+                self.make_way()
                 is_last = phase is tiling.phases[-1]
                 fetches = task.options.download and is_last
                 self._pass(image, phase.each, extents, tile, fetches)
             self._launch(image, phase.last, tiles[0], 0, {}, [])
         self._launch_cache = after
 
-    def finish(self, image: DeviceImage) -> None:
+    def forget(self) -> LaunchCache:
+        """What was known of the buffers' contents, of which nothing is known from now on."""
+        known, self._launch_cache = self._launch_cache, LaunchCache()
+        return known
+
+    def make_room(self, sizes: Mapping[str, int], memory: int) -> None:
+        """Have buffers of these sizes, in bytes by name, while all take at most ``memory``."""
+        needs = self.transfers.needs(sizes)
+        if not self.pool.has(needs, memory):
+            self.drain()  # a buffer's memory on the host goes with it, whatever writes there
+        self.pool.reserve(needs, memory)
+
+    def make_way(self) -> None:
+        """Let the oldest tiles land, until one more may be on the way."""
+        while len(self._tiles) >= self.depth:
+            self._land()
+
+    def after_reads(self) -> list[Any]:
+        """The events of fetches from buffers that the next tile writes, which it waits for."""
+        reads, self._reads = self._reads, []
+        return reads
+
+    def fetch(self, sent: DeviceTile, name: str, buffer: Any, size: int, after: list[Any]) -> Array:
+        """Fetch the bytes of a buffer, when launches are done; they are there when it lands."""
+        array, event = self.transfers.fetch(name, buffer, size, after)
+        sent.image.events.append(("download", event))
+        sent.events.append(event)
+        if name != "dst":
+            self._reads.append(event)
+        return array
+
+    def push(self, tile: DeviceTile) -> None:
+        """Have a tile that was enqueued go its way."""
+        tile.image.tiles_left += 1
+        self._tiles.append(tile)
+        self.transfers.flush()
+
+    def finish(self, image: OnTheWay) -> None:
         """Wait until all tiles of an image have landed, and any that were started before it.
 
         Raises:
@@ -192,7 +236,7 @@ class Flow:
         self._reads.clear()
         for release in (
             self.queue.finish,
-            self._transfers.release,
+            self.transfers.release,
             self._tables.clear,
             self.pool.release,
         ):
@@ -209,16 +253,14 @@ class Flow:
         whole = image.task.output.encoded if fetches and image.is_whole else None
         size = extents[-1].stored.width * extents[-1].stored.height
         size *= len(plan.encoded.channels) if plan.encoded else 0
-        ends = {"src": sent[0], "dst": self._transfers.target(size, whole)}
-        wait, self._reads = [*sent[1], *self._reads], []
+        ends = {"src": sent[0], "dst": self.transfers.target(size, whole)}
+        wait = [*sent[1], *self.after_reads()]
         self._launch(image, numbers, extents, tile, ends, wait)
         last = [event for _, event in image.events[-1:]]
         sent_tile = DeviceTile(image, [*wait, *last], [])
         if fetches:
-            self._fetch(sent_tile, extents, tile, ends, size, last)
-        image.tiles_left += 1
-        self._tiles.append(sent_tile)
-        self._transfers.flush()
+            self._fetch(image, sent_tile, extents, tile, ends, size, last)
+        self.push(sent_tile)
 
     @CpuTimer("upload")
     def _send(self, image: DeviceImage, extents: Extents) -> tuple[Any, list[Any]]:
@@ -227,7 +269,7 @@ class Flow:
         if (
             image.is_whole
             and (task.options.unchanged or not task.options.download)
-            and (sent := self._transfers.again(source))
+            and (sent := self.transfers.again(source))
         ):
             return sent
         pixels = source[box.top : box.bottom, box.left : box.right]
@@ -235,7 +277,7 @@ class Flow:
             pixels = pixels.transpose(2, 0, 1)
         dtype = np.float16 if task.plan.half else np.float32
         size = source_bytes(task.plan, extents[0])
-        sent = self._transfers.upload(source, pixels, dtype, size)
+        sent = self.transfers.upload(source, pixels, dtype, size)
         image.events += [("upload", event) for event in sent[1]]
         return sent
 
@@ -259,7 +301,7 @@ class Flow:
                 calls += image.borders(launch)
             events = []
             for call in calls:
-                call.set_arguments(self.pool, ends, extents, tile, image.task.bind, self._table)
+                call.set_arguments(self.pool, ends, extents, tile, image.task.bind, self.table)
                 sizes = index_space(call.kernel, extent)
                 events.append(
                     self._cl.enqueue_nd_range_kernel(
@@ -271,6 +313,7 @@ class Flow:
 
     def _fetch(
         self,
+        image: DeviceImage,
         sent: DeviceTile,
         extents: Extents,
         tile: int,
@@ -279,17 +322,9 @@ class Flow:
         after: list[Any],
     ) -> None:
         """Fetch a tile's results, and with the last tile what was estimated from the image."""
-        image, transfers, buffers = sent.image, self._transfers, self.pool.buffers
+        buffers, fetch = self.pool.buffers, partial(self.fetch, sent, after=after)
         plan, output = image.task.plan, image.task.output
         patches = image.tiling.patches
-
-        def fetch(name: str, buffer: Any, size: int) -> Array:
-            array, event = transfers.fetch(name, buffer, size, after)
-            image.events.append(("download", event))
-            sent.events.append(event)
-            if name != "dst":
-                self._reads.append(event)
-            return array
 
         def room(result: Array, extent: Extent) -> Array:
             return result[tile] if patches else core_of(extent, result)
@@ -324,12 +359,15 @@ class Flow:
             with CpuTimer("download"):
                 for copy in tile.copies:
                     copy()
-            self._transfers.done()
+            self.transfers.done()
         except self._cl.Error as error:
             tile.image.error = tile.image.error or error
 
-    def _table(self, table: Array) -> Any:
+    def table(self, table: Array) -> Any:
         """A constant array on the device, uploaded once while it is the same object."""
+        return self._tables.get(Identity(table), lambda: self.new_table(table))
+
+    def new_table(self, table: Array) -> Any:
+        """A constant array on the device."""
         flags = self._cl.mem_flags.READ_ONLY | self._cl.mem_flags.COPY_HOST_PTR
-        upload = partial(self._cl.Buffer, self.context, flags, hostbuf=table)
-        return self._tables.get(Identity(table), upload)
+        return self._cl.Buffer(self.context, flags, hostbuf=table)

@@ -28,9 +28,10 @@ LARGER = (
 class KernelBuilder:
     """Collects the parameters of one kernel and what is set up of them, under canonical names."""
 
-    def __init__(self, plan: Plan, lanes: int) -> None:
+    def __init__(self, plan: Plan, lanes: int, stacked: bool = False) -> None:
         self.plan = plan
         self.lanes = lanes
+        self.stacked = stacked
         self.parameters: dict[str, Parameter] = {}
         self.setup: list[str] = []
         self._steps: list[str] = []

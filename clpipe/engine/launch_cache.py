@@ -15,8 +15,9 @@ import numpy as np
 from xxhash import xxh3_128_digest
 
 from clpipe.base.types import Array
+from clpipe.engine.bindings import Bind
 from clpipe.engine.buffers import Pool
-from clpipe.engine.calls import Bind, Call
+from clpipe.engine.calls import Call
 from clpipe.engine.extents import Extents
 
 

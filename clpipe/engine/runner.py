@@ -12,7 +12,14 @@ from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain
 from clpipe.chain.registry import user_code_errors
-from clpipe.engine.bindings import ArgumentValue, EncodedCurves, ResamplingValue, StreamWord, Value
+from clpipe.engine.bindings import (
+    ArgumentValue,
+    Bind,
+    EncodedCurves,
+    ResamplingValue,
+    StreamWord,
+    Value,
+)
 from clpipe.engine.buffers import HostImages
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
@@ -86,6 +93,60 @@ def check_resamplings(plan: Plan, width: int, height: int) -> None:
     """
     for resampling, size in zip(plan.resamplings, plan.sizes(width, height), strict=False):
         resampling.values(*size)
+
+
+@dataclass(frozen=True)
+class Submission:
+    """An image that is to be put through a runner; see :meth:`Runner.submit`."""
+
+    runner: "Runner"
+    image: Array
+    noise_key: str
+    options: RunOptions = DEFAULTS
+
+
+def submit_together(submissions: Sequence[Submission]) -> list[Callable[[], Result]]:
+    """Enqueue images, and small ones of alike chains in common launches.
+
+    Returns:
+        What waits for the result of each and gives it, called once and in order.
+
+    Raises:
+        ImageError, DeviceFailedError, DeviceError: as :meth:`Runner.submit`.
+    """
+    waiting: dict[int, Callable[[], Result]] = {}
+    groups: dict[tuple[int, Plan], list[tuple[int, Submission, Plan]]] = {}
+    for number, each in enumerate(submissions):
+        each.runner.check(each.image, each.options)
+        if alone := each.runner.without_device(each.image, each.noise_key, each.options):
+            waiting[number] = alone
+        else:
+            plan = each.runner.plan_for(each.image)
+            check_resamplings(plan, *each.image.shape[1::-1])
+            key = id(each.runner.device), plan.unscaled
+            groups.setdefault(key, []).append((number, each, plan))
+    for group in groups.values():
+        waiting |= zip((number for number, *_ in group), _begin(group), strict=True)
+    return [waiting[number] for number in range(len(submissions))]
+
+
+def _begin(group: Sequence[tuple[int, Submission, Plan]]) -> list[Callable[[], Result]]:
+    """Enqueue images of one device, whose plans have the same kernels."""
+    device = group[0][1].runner.device
+    assert device
+    images = [
+        (plan, each.image, each.runner._bind(plan, each.image, each.noise_key), each.options)
+        for _, each, plan in group
+    ]
+    if results := device.submit_together(images):
+        return [
+            each.runner._waiting(plan, each.image, result)
+            for (_, each, plan), result in zip(group, results, strict=True)
+        ]
+    return [
+        each.runner.submit_alone(plan, each.image, each.noise_key, each.options)
+        for _, each, plan in group
+    ]
 
 
 class Runner:
@@ -204,6 +265,36 @@ class Runner:
             DeviceFailedError: the device fails.
             DeviceError: a kernel does not compile, or the device is given up.
         """
+        return submit_together([Submission(self, image, noise_key, options)])[0]
+
+    def without_device(
+        self, image: Array, noise_key: str, options: RunOptions
+    ) -> Callable[[], Result] | None:
+        """What gives the result where there is nothing to do, or NumPy does it; else None."""
+        if not (self.encode or self.final or self.keep):
+            return lambda: Result(None, None, {}, {})
+        if not self.device:
+            return partial(self._run_numpy, np.asarray(image, np.float32), noise_key, options.boxes)
+        return None
+
+    def submit_alone(
+        self, plan: Plan, image: Array, noise_key: str, options: RunOptions
+    ) -> Callable[[], Result]:
+        """Enqueue an image for a plan, by itself; see :meth:`submit`."""
+        try:
+            self._compile_plan(plan)
+        except DeviceFailedError:
+            raise
+        except ImageError:
+            pass  # the tiny image is too large; the one below says it of this image
+        return self._submit_plan(plan, image, noise_key, options)
+
+    def check(self, image: Array, options: RunOptions) -> None:
+        """See that an image is one that the chain starts on.
+
+        Raises:
+            ImageError: it is not, or patches are asked for of images that differ in size.
+        """
         channels = len(self.chain.source.channels)
         shape = image.shape[2] if image.ndim == 3 else 1
         if image.ndim not in (2, 3) or shape != channels or 0 in image.shape:
@@ -213,18 +304,6 @@ class Runner:
             )
         if options.boxes:
             self._check_sizes(*image.shape[1::-1])
-        if not (self.encode or self.final or self.keep):
-            return lambda: Result(None, None, {}, {})
-        if not self.device:
-            return partial(self._run_numpy, np.asarray(image, np.float32), noise_key, options.boxes)
-        plan = self.plan_for(image)
-        try:
-            self._compile_plan(plan)
-        except DeviceFailedError:
-            raise
-        except ImageError:
-            pass  # the tiny image is too large; the one below says it of this image
-        return self._submit_plan(plan, image, noise_key, options)
 
     def _check_sizes(self, width: int, height: int) -> None:
         """See that all images of an image's result are of one size, so that patches are, too.
@@ -241,11 +320,8 @@ class Runner:
                     f"{last[0]}x{last[1]}; patches are cut of images of one size"
                 )
 
-    def _submit_plan(
-        self, plan: Plan, image: Array, noise_key: str, options: RunOptions
-    ) -> Callable[[], Result]:
-        """Enqueue an image for a plan."""
-        assert self.device
+    def _bind(self, plan: Plan, image: Array, noise_key: str) -> Bind:
+        """What gives the values of the kernels' parameters for an image."""
         keys: dict[str, dict[NoiseScope, Stream]] = {}
         sizes = plan.sizes(*image.shape[1::-1])
 
@@ -262,8 +338,20 @@ class Runner:
                         keys[step] = self.chain.streams(self.chain.step_named(step), noise_key)
                     return np.uint32(getattr(keys[step][scope], word))
 
-        check_resamplings(plan, *image.shape[1::-1])
-        results = self.device.submit(plan, image, bind, options)
+        return bind
+
+    def _submit_plan(
+        self, plan: Plan, image: Array, noise_key: str, options: RunOptions
+    ) -> Callable[[], Result]:
+        """Enqueue an image for a plan, by itself."""
+        assert self.device
+        results = self.device.submit(plan, image, self._bind(plan, image, noise_key), options)
+        return self._waiting(plan, image, results)
+
+    def _waiting(
+        self, plan: Plan, image: Array, results: Callable[[], HostImages]
+    ) -> Callable[[], Result]:
+        """What waits for the results that a device makes of an image, and gives them."""
         size = image.shape[1::-1]
         found = self._estimates.get(size, lambda: self._estimates_for(*size))
         return lambda: self._result(plan, results(), found)

@@ -37,6 +37,14 @@ def bytes_from(array: Array, size: int) -> Array | None:
     return whole[start : start + size] if start + size <= whole.size else None
 
 
+def fill(data: Array, parts: Sequence[Array], dtype: Any, stride: int) -> None:
+    """Copy arrays, as a type, to places of bytes that are ``stride`` apart."""
+    for number, part in enumerate(parts):
+        start, count = number * stride, part.size * np.dtype(dtype).itemsize
+        to = data[start : start + count].view(dtype).reshape(part.shape)
+        np.copyto(to, part, casting="unsafe")
+
+
 def _unmap(array: Array, queue: Any) -> None:
     """Give mapped memory back."""
     base: Any = array.base
@@ -74,8 +82,13 @@ class InPlace:
             data = bytes_from(pixels, size)
         if data is None or data.ctypes.data % self._alignment:
             data = self._room("src", size)
-            copied = data[: pixels.size * np.dtype(dtype).itemsize].view(dtype)
-            np.copyto(copied.reshape(pixels.shape), pixels, casting="unsafe")
+            fill(data, [pixels], dtype, size)
+        return self._end(self._cl.mem_flags.READ_ONLY, data), []
+
+    def upload_all(self, parts: Sequence[Array], dtype: Any, stride: int) -> Sent:
+        """A buffer of images, which begin ``stride`` bytes apart, as samples of ``dtype``."""
+        data = self._room("src", stride * len(parts))
+        fill(data, parts, dtype, stride)
         return self._end(self._cl.mem_flags.READ_ONLY, data), []
 
     def again(self, source: Array) -> Sent | None:
@@ -161,14 +174,19 @@ class Staged:
 
     def upload(self, source: Array, pixels: Array, dtype: Any, size: int) -> Sent:
         """See :meth:`InPlace.upload`."""
-        self._source = 1 - self._source
-        count = pixels.size * np.dtype(dtype).itemsize
-        data = self._page_locked(f"src{self._source}", size)[:count]
-        np.copyto(data.view(dtype).reshape(pixels.shape), pixels, casting="unsafe")
+        sent = self.upload_all([pixels], dtype, pixels.size * np.dtype(dtype).itemsize)
+        self._sent = (weakref.ref(source), sent) if pixels.size == source.size else None
+        return sent
+
+    def upload_all(self, parts: Sequence[Array], dtype: Any, stride: int) -> Sent:
+        """See :meth:`InPlace.upload_all`."""
+        self._source, self._sent = 1 - self._source, None
+        size = stride * len(parts)
+        data = self._page_locked(f"src{self._source}", size)[:size]
+        fill(data, parts, dtype, stride)
         buffer = self._pool.buffers[f"src{self._source}"]
         sent = buffer, [self._cl.enqueue_copy(self._up, buffer, data, is_blocking=False)]
         self._up.flush()
-        self._sent = (weakref.ref(source), sent) if pixels.size == source.size else None
         return sent
 
     def again(self, source: Array) -> Sent | None:
