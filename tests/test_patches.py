@@ -199,11 +199,11 @@ def test_samples_do_not_depend_on_order_shards_and_epochs(renders):
 def test_no_buffer_goes_while_an_image_is_on_the_way(renders, monkeypatch):
     """Memory of the host that a device works in would be freed under its kernels."""
     flows, replaced = [], []
-    start, reserve = Flow.start, Pool.reserve
+    make_room, reserve = Flow.make_room, Pool.reserve
 
-    def started(flow, *given):
+    def roomy(flow, *given):
         flows.append(flow)
-        return start(flow, *given)
+        return make_room(flow, *given)
 
     def reserved(pool, *given):
         before, on_the_way = pool.generation, len(flows[-1]._tiles)
@@ -211,7 +211,7 @@ def test_no_buffer_goes_while_an_image_is_on_the_way(renders, monkeypatch):
         if pool.generation != before:
             replaced.append(on_the_way)
 
-    monkeypatch.setattr(Flow, "start", started)
+    monkeypatch.setattr(Flow, "make_room", roomy)
     monkeypatch.setattr(Pool, "reserve", reserved)
     list(api.Dataset(renders, iso=ISO, patch=api.Patches(16, 3), epochs=2))
     assert len(replaced) > 1 and not any(replaced)

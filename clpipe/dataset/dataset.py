@@ -6,6 +6,9 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, Unpack
 
@@ -28,6 +31,16 @@ from clpipe.outputs.patches import Patches
 
 if TYPE_CHECKING:
     from clpipe.chain.keywords import Keywords
+
+
+PATCHES = 16  # with draws of their own that are begun together, in order
+TOGETHER = 2**27  # bytes of renders that are held for samples which are developed together
+
+
+def held_by(read: Sequence[tuple[SampleBatch, LoadedImage, Sample]]) -> int:
+    """The bytes of the renders that were read, each counted once."""
+    sources = {id(loaded.source.pixels): loaded.source.pixels.nbytes for _, loaded, _ in read}
+    return sum(sources.values())
 
 
 class Dataset(ReadOnly):
@@ -247,7 +260,7 @@ class Dataset(ReadOnly):
         return self.__getitems__([index])[0]
 
     def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
-        """Samples by their numbers, those of one image developed together.
+        """Samples by their numbers, those of one image, and small ones of any, developed together.
 
         PyTorch's ``DataLoader`` asks so for the samples of a batch. Errors as :meth:`__getitem__`.
         """
@@ -258,12 +271,39 @@ class Dataset(ReadOnly):
             # A whole picture is all that an image has; asked for twice, it is made twice.
             groups.setdefault(place[:2] if together else (i,), []).append(i)
         samples: list[Sample] = [{}] * len(places)
-        for group in groups.values():
-            epoch, image, _ = places[group[0]]
-            made = self._made(epoch, image, [places[i][2] for i in group])
+        asked = [(*places[own[0]][:2], [places[i][2] for i in own]) for own in groups.values()]
+        for group, made in zip(groups.values(), self._made_together(asked), strict=True):
             for i, sample in zip(group, made, strict=True):
                 samples[i] = sample
         return samples
+
+    def _made_together(
+        self, asked: Sequence[tuple[int, int, Sequence[int]]]
+    ) -> Iterator[list[Sample]]:
+        """Samples of several images, each by epoch, image and the numbers of its samples.
+
+        What fails together is made alone, which says why. Errors as :meth:`_made`.
+        """
+        pending: list[tuple[int, int, Sequence[int]]] = []
+        read: list[tuple[SampleBatch, LoadedImage, Sample]] = []
+        for last, each in enumerate(asked, 1 - len(asked)):
+            pending.append(each)
+            batch = self._batch(*each)
+            with suppress(ImageError):
+                read.append((batch, *self._loader.read(batch)))
+            # Of a shuffled dataset each may be of another render.
+            if last and len(read) == len(pending) and held_by(read) < TOGETHER:
+                continue
+            begun: list[Callable[[], list[Sample]]] = []
+            if len(read) == len(pending):
+                with suppress(ImageError):
+                    begun = self._loader.begin(read)
+            for number, alone in enumerate(pending):
+                made: list[Sample] | None = None
+                with suppress(ImageError):
+                    made = begun[number]() if begun else None
+                yield self._made(*alone) if made is None else made
+            pending, read = [], []
 
     def _made(self, epoch: int, image: int, numbers: Sequence[int]) -> list[Sample]:
         """Samples of an image; of the next one that has any, where it is to be skipped.
@@ -274,7 +314,7 @@ class Dataset(ReadOnly):
         for following in range(len(self._jobs)):
             batch = self._batch(epoch, (image + following) % len(self._jobs), numbers)
             try:
-                return self._loader.begin(batch, *self._loader.read(batch))()
+                return self._loader.begin([(batch, *self._loader.read(batch))])[0]()
             except ImageError as error:
                 if not self._skips:
                     raise
@@ -294,14 +334,16 @@ class Dataset(ReadOnly):
             DeviceError: there is no usable device.
         """
         set_codec_threads(max(available_processors() // self._threads, 1))
-        ahead: deque[tuple[SampleBatch, Future[Callable[[], list[Sample]]]]] = deque()
+        ahead: deque[tuple[list[SampleBatch], Future[list[Callable[[], list[Sample]]]]]] = deque()
         decoders = ThreadPoolExecutor(self._threads, "decode")
         developer = ThreadPoolExecutor(1, "device")
         self._next, self._first = self._first, 0
         try:
-            for batch in self._batches(self._next):
-                read = decoders.submit(self._loader.read, batch)
-                ahead.append((batch, developer.submit(self._begin_read, batch, read)))
+            together = PATCHES if self._draws_by_patch else 1
+            batches = self._batches(self._next)
+            while some := list(islice(batches, together)):
+                read = [decoders.submit(self._loader.read, batch) for batch in some]
+                ahead.append((some, developer.submit(self._begin_read, some, read)))
                 if len(ahead) > self._threads + 1:
                     yield from self._counted(*ahead.popleft())
             while ahead:
@@ -312,24 +354,36 @@ class Dataset(ReadOnly):
             self._loader.drain()
 
     def _begin_read(
-        self, batch: SampleBatch, read: Future[tuple[LoadedImage, Sample]]
-    ) -> Callable[[], list[Sample]]:
-        return self._loader.begin(batch, *read.result())
+        self, batches: Sequence[SampleBatch], read: Sequence[Future[tuple[LoadedImage, Sample]]]
+    ) -> list[Callable[[], list[Sample]]]:
+        """Begin with batches that are read; what fails together is tried alone, when it is due."""
+        try:
+            return self._loader.begin(
+                [(batch, *own.result()) for batch, own in zip(batches, read, strict=True)]
+            )
+        except ImageError:
+            return [
+                partial(self._alone, batch, own) for batch, own in zip(batches, read, strict=True)
+            ]
+
+    def _alone(self, batch: SampleBatch, read: Future[tuple[LoadedImage, Sample]]) -> list[Sample]:
+        return self._loader.begin([(batch, *read.result())])[0]()
 
     def _counted(
-        self, batch: SampleBatch, begun: Future[Callable[[], list[Sample]]]
+        self, batches: Sequence[SampleBatch], begun: Future[list[Callable[[], list[Sample]]]]
     ) -> Iterator[Sample]:
-        try:
-            samples = begun.result()()
-        except ImageError as error:
-            if not self._skips:
-                raise
-            warnings.warn(f"skipped: {error}", stacklevel=3)
-            self._next += len(batch.numbers)
-            return
-        for sample in samples:
-            self._next += 1
-            yield sample
+        for batch, wait in zip(batches, begun.result(), strict=True):
+            try:
+                samples = wait()
+            except ImageError as error:
+                if not self._skips:
+                    raise
+                warnings.warn(f"skipped: {error}", stacklevel=3)
+                self._next += len(batch.numbers)
+                continue
+            for sample in samples:
+                self._next += 1
+                yield sample
 
     def _numbering(self) -> Numbering:
         """How samples are numbered.

@@ -2,8 +2,9 @@
 
 import os
 import threading
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from operator import itemgetter
 from typing import Any
 
@@ -17,7 +18,7 @@ from clpipe.chain.truth import noisy_mosaic, picture_without_noise
 from clpipe.dataset.arrays import HIGHEST, ArrayFormat
 from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions
-from clpipe.engine.runner import Result, Runner
+from clpipe.engine.runner import Result, Runner, Submission, submit_together
 from clpipe.outputs.patches import Patch, Patches, facts_of, pattern_of, variance_at, variance_steps
 from clpipe.stage import Kind
 
@@ -101,6 +102,31 @@ class Prepared:
     facts: Sample
 
 
+@dataclass(frozen=True)
+class Order:
+    """An image of which samples are made.
+
+    Args:
+        chain: how it is developed.
+        pixels: the image.
+        noise_key: what its noise is made of.
+        patches: the parts of the picture that are samples; () is one sample, all of it.
+        chain_key: what the chain follows from, so that it is prepared once; None is more than can
+            be told.
+    """
+
+    chain: Chain
+    pixels: Array
+    noise_key: str
+    patches: Sequence[Patch]
+    chain_key: Hashable | None
+
+    @property
+    def options(self) -> RunOptions:
+        """How it is run."""
+        return RunOptions(unchanged=True, boxes=[patch.box for patch in self.patches])
+
+
 class Developer:
     """Develops images on a device, in the order in which they are begun.
 
@@ -117,55 +143,50 @@ class Developer:
         self._prepared: BoundedCache[Prepared] = BoundedCache(MAX_CHAINS)
         self._latest: dict[str, Runner] = {}
 
-    def begin(
-        self,
-        chain: Chain,
-        pixels: Array,
-        noise_key: str,
-        patches: Sequence[Patch],
-        chain_key: Hashable | None,
-    ) -> Callable[[], list[Sample]]:
-        """Begin with the arrays and facts of samples of one image.
-
-        Args:
-            chain: how it is developed.
-            pixels: the image.
-            noise_key: what its noise is made of.
-            patches: the parts of the picture that are samples; () is one sample, all of it.
-            chain_key: what the chain follows from, so that it is prepared once; None is more than
-                can be told.
+    def begin(self, orders: Sequence[Order]) -> list[Callable[[], list[Sample]]]:
+        """Begin with the arrays and facts of samples of images, small ones together.
 
         Returns:
-            What waits for them and gives them; it raises the same errors.
+            What waits for those of each image and gives them, called in order; it raises the same
+            errors.
 
         Raises:
-            ImageError, RequestError, MemoryError: the image cannot be developed.
+            ImageError, RequestError, MemoryError: an image cannot be developed.
         """
-        options = RunOptions(unchanged=True, boxes=[patch.box for patch in patches])
         with self._lock:
-            prepared = (
-                self._prepare(chain)
-                if chain_key is None
-                else self._prepared.get(chain_key, lambda: self._prepare(chain))
+            prepared = [self._prepared_for(order) for order in orders]
+            begun = submit_together(
+                [
+                    Submission(runner, order.pixels, order.noise_key, order.options)
+                    for order, own in zip(orders, prepared, strict=True)
+                    for runner in own.runners.values()
+                ]
             )
-            begun = {
-                name: runner.submit(pixels, noise_key, options)
-                for name, runner in prepared.runners.items()
-            }
+        waits = iter(begun)
+        return [
+            partial(self._finish, order, own, dict(zip(own.runners, waits, strict=False)))
+            for order, own in zip(orders, prepared, strict=True)
+        ]
 
-        def finish() -> list[Sample]:
-            results = {}
-            for name, wait in begun.items():
-                with self._lock:
-                    results[name] = wait()
-            if not patches:
-                return [self._sample(prepared, results, None, lambda image: image)]
-            return [
-                self._sample(prepared, results, patch, itemgetter(i))
-                for i, patch in enumerate(patches)
-            ]
+    def _prepared_for(self, order: Order) -> Prepared:
+        if order.chain_key is None:
+            return self._prepare(order.chain)
+        return self._prepared.get(order.chain_key, lambda: self._prepare(order.chain))
 
-        return finish
+    def _finish(
+        self, order: Order, prepared: Prepared, begun: Mapping[str, Callable[[], Result]]
+    ) -> list[Sample]:
+        """The samples of what was begun."""
+        results = {}
+        for name, wait in begun.items():
+            with self._lock:
+                results[name] = wait()
+        if not order.patches:
+            return [self._sample(prepared, results, None, lambda image: image)]
+        return [
+            self._sample(prepared, results, patch, itemgetter(i))
+            for i, patch in enumerate(order.patches)
+        ]
 
     def drain(self) -> None:
         """Wait for what was begun."""

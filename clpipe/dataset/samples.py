@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from clpipe.base.cache import BoundedCache
@@ -13,7 +14,7 @@ from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.chain.carry import VALID
 from clpipe.chain.identity import noise_key, of_frame
-from clpipe.dataset.developer import MAX_CHAINS, Developer, Sample, SampleSpec
+from clpipe.dataset.developer import MAX_CHAINS, Developer, Order, Sample, SampleSpec
 from clpipe.engine.device import open_device
 from clpipe.images.read import SourceImage
 from clpipe.inputs.find import Job
@@ -137,34 +138,57 @@ class SampleLoader:
         return self.renders.get(key, lambda: loader.read(job))
 
     def begin(
-        self, batch: SampleBatch, loaded: LoadedImage, carried: Sample
-    ) -> Callable[[], list[Sample]]:
-        """Begin to develop samples of an image; what is returned waits for them."""
-        job, chain = batch.job, loaded.chain
-        key = noise_key(chain.settings, loaded.key, batch.epoch)
+        self, read: Sequence[tuple[SampleBatch, LoadedImage, Sample]]
+    ) -> list[Callable[[], list[Sample]]]:
+        """Begin to develop samples of images, small ones together.
+
+        Args:
+            read: batches, each with what :meth:`read` gave of it.
+
+        Returns:
+            What waits for those of each batch and gives them, called in order.
+
+        Raises:
+            ImageError: an image cannot be developed; of several it is not said which.
+        """
+        orders = [self._order(batch, loaded) for batch, loaded, _ in read]
+        with self._errors_of(*(batch.job for batch, *_ in read)):
+            begun = self._developer().begin(orders)
+        return [
+            partial(self._finish, *each, order.patches, wait)
+            for each, order, wait in zip(read, orders, begun, strict=True)
+        ]
+
+    def _order(self, batch: SampleBatch, loaded: LoadedImage) -> Order:
+        """What is to be developed for a batch."""
+        job, chain, pixels = batch.job, loaded.chain, loaded.source.pixels
         patches: list[Patch] = []
         with self._errors_of(job):
             if self.patches:
-                size = loaded.source.pixels.shape[1::-1]
-                cutting = self.patches.cutting(chain, *size)
+                cutting = self.patches.cutting(chain, *pixels.shape[1::-1])
                 patches = self.patches.cut(cutting, batch.numbers, chain, job.key, batch.epoch)
             else:
-                self._spec.arrays.check_size(*chain.size(*loaded.source.pixels.shape[1::-1]))
-            begun = self._developer().begin(
-                chain, loaded.source.pixels, key, patches, self._chain_key(batch, loaded)
-            )
+                self._spec.arrays.check_size(*chain.size(*pixels.shape[1::-1]))
+        key = noise_key(chain.settings, loaded.key, batch.epoch)
+        return Order(chain, pixels, key, patches, self._chain_key(batch, loaded))
 
-        def finish() -> list[Sample]:
-            with self._errors_of(job):
-                samples = begun()
-            arrays, facts = self._spec.arrays, self._facts(batch, loaded)
-            for i, sample in enumerate(samples):
-                for name, layer in carried.items():
-                    sample[name] = arrays.ordered(patches[i].cut_out(layer) if patches else layer)
-                sample.update(facts)
-            return samples
-
-        return finish
+    def _finish(
+        self,
+        batch: SampleBatch,
+        loaded: LoadedImage,
+        carried: Sample,
+        patches: Sequence[Patch],
+        begun: Callable[[], list[Sample]],
+    ) -> list[Sample]:
+        """The samples of a batch that was begun."""
+        with self._errors_of(batch.job):
+            samples = begun()
+        arrays, facts = self._spec.arrays, self._facts(batch, loaded)
+        for i, sample in enumerate(samples):
+            for name, layer in carried.items():
+                sample[name] = arrays.ordered(patches[i].cut_out(layer) if patches else layer)
+            sample.update(facts)
+        return samples
 
     def _chain_key(self, batch: SampleBatch, loaded: LoadedImage) -> Hashable | None:
         """What the chain of an image follows from; None where that is its depth, too."""
@@ -174,12 +198,14 @@ class SampleLoader:
         return (loaded.key, batch.draw_key) if own else ()
 
     @contextmanager
-    def _errors_of(self, job: Job) -> Iterator[None]:
-        """Errors within say which image they are of."""
+    def _errors_of(self, *jobs: Job) -> Iterator[None]:
+        """Errors within say which image they are of, where there is one."""
         try:
             yield
         except (ImageError, RequestError, MemoryError) as error:
-            raise ImageError(self._loader.error_text(job, error)) from None
+            job, *others = jobs
+            text = str(error) if others else self._loader.error_text(job, error)
+            raise ImageError(text) from None
 
     @staticmethod
     def _facts(batch: SampleBatch, loaded: LoadedImage) -> Sample:

@@ -167,7 +167,8 @@ def launch(flow: Flow, stack: Stack, ends: dict[str, Any], wait: list[Any]) -> l
             local = spaces[0][1]
             ones = [1] * (2 - len(across))
             given = kernel.parameters, step.level, buffers, strides, members
-            arguments = arguments_of(*given, flow.table, flow.new_table)  # held until it is enqueued
+            # Held until it is enqueued, since what a kernel is given holds no buffer.
+            arguments = arguments_of(*given, flow.table, flow.new_table)
             compiled.set_args(*arguments)
             event = cl.enqueue_nd_range_kernel(
                 flow.queue,
