@@ -1,0 +1,143 @@
+"""Stacks: what goes through a device in common launches has the bits that it has alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from clpipe.chain.making import make_chain
+from clpipe.chain.settings import settings_from
+from clpipe.engine import stack
+from clpipe.engine.check import example
+from clpipe.engine.device import Device
+from clpipe.engine.extents import Box
+from clpipe.engine.options import RunOptions
+from clpipe.engine.runner import Result, Runner, Submission, cut_out, submit_together
+from clpipe.stage import Kind
+
+# Of each kind of launch: lines, stencils, sums, a histogram, a resampling, a mosaic with a period.
+CHAINS = {
+    "default": {"row_noise": {"sigma": 0.002}},
+    "estimates": {"exposure": {"method": "auto"}, "white_balance": {"method": "gray_world"}},
+    "resampled": {"distortion": {"method": "brown_conrady", "k1": -0.1, "fx": 60.0}},
+    "x-trans": {"mosaic": {"method": "array", "array": "x-trans"}},
+}
+SIZES = [(40, 48), (23, 61), (70, 33)]
+
+
+def equal(one: Result, two: Result) -> None:
+    """Fail unless two results are the same, bit for bit."""
+    for name in ("final", "encoded", "kept", "estimates"):
+        np.testing.assert_equal(getattr(one, name), getattr(two, name), err_msg=name)
+
+
+@pytest.fixture(params=["CPU", "GPU"])
+def on(device, request):
+    """The device, also as if its memory were its own."""
+    return Device(replace(device.info, type=request.param))
+
+
+@pytest.fixture
+def launches(monkeypatch):
+    """The sizes of launches from now on."""
+    seen, launch = [], cl.enqueue_nd_range_kernel
+
+    def launched(queue, kernel, size, *rest, **options):
+        seen.append(tuple(size))
+        return launch(queue, kernel, size, *rest, **options)
+
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
+    return seen
+
+
+def submissions(device, stages, sizes=SIZES):
+    """An image of each size, each with an ISO, gains and curves of its own, in halves."""
+    first, all_ = None, []
+    for number, size in enumerate(sizes):
+        own = {"iso": 400 * 2**number, "gamma": {"method": "power", "exponent": 2.0 + number / 10}}
+        chain = make_chain(settings_from({**own, **stages}))
+        first = first.for_chain(chain) if first else Runner(chain, device, ("normalize",), True)
+        image = example(Kind.RGB, size, half=True, seed=number)
+        all_.append(Submission(first, image, f"key {number}"))
+    return all_
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_members_have_the_bits_that_they_have_alone(on, launches, name):
+    asked = submissions(on, CHAINS[name])
+    alone = [each.runner.run(each.image, each.noise_key) for each in asked]
+    launches.clear()
+    for wait, expected in zip(submit_together(asked), alone, strict=True):
+        equal(wait(), expected)
+    assert {size[2:] for size in launches} == {(3,)}
+    assert len(launches) < 20
+
+
+def test_patches_of_one_image_and_of_others_go_together(on, launches):
+    asked = submissions(on, CHAINS["default"])
+    wholes = [each.runner.run(each.image, each.noise_key) for each in asked]
+    boxes = [Box(0, 0, 16, 20), Box(7, 3, 23, 23), Box(16, 1, 32, 21)]
+    cut = [replace(each, options=RunOptions(boxes=boxes)) for each in asked]
+    launches.clear()
+    for wait, whole in zip(submit_together(cut), wholes, strict=True):
+        found = wait()
+        np.testing.assert_equal(found.encoded, cut_out(whole.encoded, boxes))
+        np.testing.assert_equal(found.kept["normalize"], cut_out(whole.kept["normalize"], boxes))
+    assert {size[2:] for size in launches} == {(9,)}
+
+
+@pytest.mark.parametrize("sizes", [[(1, 7), (1, 40), (1, 1)], [(9, 1), (2, 1), (30, 1)]])
+def test_lines_of_pixels(on, sizes):
+    asked = submissions(on, {"stages": ["mosaic", "demosaic", "gamma"]}, sizes)
+    runners = {each.runner for each in asked}
+    for runner in runners:
+        runner.keep = ()
+    alone = [each.runner.run(each.image, each.noise_key) for each in asked]
+    for wait, expected in zip(submit_together(asked), alone, strict=True):
+        equal(wait(), expected)
+
+
+def test_more_than_one_stack_where_memory_is_short(on, launches, monkeypatch):
+    asked = submissions(on, CHAINS["default"])
+    alone = [each.runner.run(each.image, each.noise_key) for each in asked]
+    monkeypatch.setattr(stack, "STACK_BYTES", {True: 500_000, False: 640_000})
+    launches.clear()
+    for wait, expected in zip(submit_together(asked), alone, strict=True):
+        equal(wait(), expected)
+    assert {size[2:] for size in launches} == {(2,), (1,)}
+    on.memory = 150_000  # each alone
+    launches.clear()
+    for wait, expected in zip(submit_together(asked), alone, strict=True):
+        equal(wait(), expected)
+    assert {len(size) for size in launches} <= {1, 2}
+
+
+def test_what_takes_other_kernels_goes_by_itself(on, launches):
+    asked = submissions(on, CHAINS["default"])
+    chain = make_chain(settings_from({"stages": ["exposure", "gamma"]}))
+    other = replace(asked[0], runner=Runner(chain, on))
+    alone = [each.runner.run(each.image, each.noise_key) for each in (*asked, other)]
+    launches.clear()
+    waits = submit_together([asked[0], other, *asked[1:]])
+    found = [wait() for wait in waits]
+    for result, expected in zip([found[0], *found[2:], found[1]], alone, strict=True):
+        equal(result, expected)
+    assert {size[2:] for size in launches} == {(3,), ()}
+
+
+@pytest.mark.parametrize("error", [cl.RuntimeError("INVALID_OPERATION"), cl.MemoryError("full")])
+def test_a_stack_that_fails_is_done_image_by_image(on, monkeypatch, error):
+    asked = submissions(on, CHAINS["default"])
+    alone = [each.runner.run(each.image, each.noise_key) for each in asked]
+    before = submit_together(asked)
+    launch = cl.enqueue_nd_range_kernel
+
+    def launched(queue, kernel, size, *rest, **options):
+        if len(size) == 3:
+            raise error
+        return launch(queue, kernel, size, *rest, **options)
+
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
+    for wait, expected in zip([*before, *submit_together(asked)], alone * 2, strict=True):
+        equal(wait(), expected)
