@@ -101,6 +101,7 @@ def test_lines_of_pixels(on, sizes):
 def test_more_than_one_stack_where_memory_is_short(on, launches, monkeypatch):
     asked = submissions(on, CHAINS["default"])
     alone = [each.runner.run(each.image, each.noise_key) for each in asked]
+    monkeypatch.setattr(stack, "FEWEST", 2)
     monkeypatch.setattr(stack, "STACK_BYTES", {True: 500_000, False: 640_000})
     launches.clear()
     for wait, expected in zip(submit_together(asked), alone, strict=True):
