@@ -220,10 +220,11 @@ def test_noise_grows_with_the_iso_and_never_jumps_within_a_gain_stage(name):
     camera = load_camera(name)
     ends = [stage.iso[0] * 0.999 for stage in camera.gain_stages[1:]] + [camera.iso_range[1]]
     for stage, end in zip(camera.gain_stages, ends, strict=True):
-        isos = np.geomspace(max(stage.iso[0], camera.iso_range[0]), end, 50)
+        first = max(stage.iso[0], camera.iso_range[0])
+        isos = np.geomspace(first, end, 50 if first < end else 1)
         a = np.array([camera.noise(iso).a for iso in isos])
         b = np.array([camera.noise(iso).b for iso in isos])
-        assert np.all(np.diff(a) > 0) or camera.iso_range[0] == camera.iso_range[1]
+        assert np.all(np.diff(a) > 0)
         assert np.all(np.abs(np.diff(np.log(b))) < 0.5)
     low, high = camera.iso_range
     for iso in (low, high):

@@ -254,7 +254,7 @@ class Camera(BaseModel):
 def built_in_cameras() -> dict[str, Path]:
     """The paths of the profiles inside the package, by name."""
     folder = Path(str(resources.files("clpipe.camera") / "profiles"))
-    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+    return {path.stem: path for path in sorted(folder.glob("*.toml"), key=lambda path: path.stem)}
 
 
 def comparable(name: str) -> str:
