@@ -126,15 +126,17 @@ def resolved_steps(settings: Settings, camera: Camera, kind: Kind | None) -> lis
         with validation_errors(name, type(own)), user_code_errors(f"stage {name}", stage.folder):
             fits = stage.reads is (kind or stage.reads)
             method, follows_noise = own, True
-            if fits or isinstance(own, FromLens):
+            is_resolved = fits or isinstance(own, FromLens)
+            if is_resolved:
                 try:
                     method, follows_noise = asks_for_noise(partial(own.resolve, context))
                 except RequestError:
-                    _check_behind(wide, name, own, is_at_work=True)
+                    if wide:
+                        _check_behind(wide, name, own)
                     raise
             takes_lens |= isinstance(own, FromLens) and not isinstance(method, Unchanged)
-            if fits or isinstance(own, FromLens):  # or it was not resolved
-                _check_behind(wide, name, own, bool(method.passes()))
+            if wide and is_resolved and method.passes():
+                _check_behind(wide, name, own)
             if fits and isinstance(method, OfPanorama):
                 wide = f"{name}.method={method.method}"
             if not fits:
@@ -183,20 +185,17 @@ def optics_of(settings: Settings, camera: Camera, methods: Mapping[str, Method])
 SETTINGS = dict(zip(LENS[1:], ("focal_length", "f_number", "focus_distance"), strict=True))
 
 
-def _check_behind(wide: str, name: str, method: Method, is_at_work: bool) -> None:
+def _check_behind(wide: str, name: str, method: Method) -> None:
     """See that a step can stand behind one that makes the picture of a wide lens.
 
     Args:
-        wide: that one, for the message; "" where there is none.
-        name: of the step.
+        wide: that one, for the message.
+        name: of the step, which does something.
         method: as it was set.
-        is_at_work: whether it does anything.
 
     Raises:
         RequestError: it is of pictures in perspective.
     """
-    if not wide or not is_at_work:
-        return
     if isinstance(method, FromLens):
         raise KeyedError(
             "lens", f"lens: it is of pictures in perspective, but {wide} is a lens; leave one out"
