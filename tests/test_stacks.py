@@ -9,7 +9,7 @@ import pytest
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine import stack
-from clpipe.engine.check import example
+from clpipe.engine.check import check_stack, example
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.options import RunOptions
@@ -85,6 +85,12 @@ def test_patches_of_one_image_and_of_others_go_together(on, launches):
         np.testing.assert_equal(found.encoded, cut_out(whole.encoded, boxes))
         np.testing.assert_equal(found.kept["normalize"], cut_out(whole.kept["normalize"], boxes))
     assert {size[2:] for size in launches} == {(9,)}
+
+
+def test_the_check_of_a_device_tries_them(on, launches):
+    result = check_stack(on)
+    assert result.passed and result.difference.differing == 0 and result.cases == 7
+    assert {size[2:] for size in launches} == {(7,), ()}
 
 
 @pytest.mark.parametrize("sizes", [[(1, 7), (1, 40), (1, 1)], [(9, 1), (2, 1), (30, 1)]])

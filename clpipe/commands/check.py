@@ -31,7 +31,8 @@ def check(
 ) -> None:
     """Compare kernels with their NumPy references on a device.
 
-    Without STAGE, all stages are compared, and then the raw bit for bit.
+    Without STAGE, all stages are compared, then the raw bit for bit, and images in common launches
+    with the same alone.
     """
     for file in stage_files:
         load_stage_file(file)

@@ -12,7 +12,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
-from clpipe.engine.runner import Runner
+from clpipe.engine.runner import Runner, Submission, submit_together
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.stage import PERIOD, Kind, Method, Stage, variant_label, variants
 
@@ -230,12 +230,27 @@ def check_ends(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Chec
     return Check("source..8 bit", "half, float", cases, total, 0.0)
 
 
+def check_stack(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Check:
+    """The default chain over images of several sizes and ISOs in common launches, which must give
+    the bits that each has alone.
+    """
+    total, asked = Difference(), []
+    for seed, size in enumerate(sizes):
+        chain = make_chain(Settings(iso=ISO + 100 * seed, parameters=NOISE))
+        image = example(chain.source, size, half=True, seed=seed)
+        asked.append(Submission(Runner(chain, device, final=True), image, "check"))
+    alone = [each.runner.run(each.image, each.noise_key).final for each in asked]
+    for wait, expected in zip(submit_together(asked), alone, strict=True):
+        total += difference(wait().final, expected)
+    return Check("exposure..gamma", "common launches", len(sizes), total, 0.0)
+
+
 def check_all(
     device: Device, stages: Sequence[Stage] = (), sizes: Sequence[tuple[int, int]] = SIZES
 ) -> Iterator[Check]:
     """Every method of these stages, in all its variants.
 
-    If no stages are named: of all stages, then the raw, and how images enter and leave.
+    If no stages are named: of all stages, then the raw, how images enter and leave, and stacks.
     """
     for stage in stages or all_stages().values():
         for method in stage.methods:
@@ -245,3 +260,4 @@ def check_all(
         for noise in all_stages()["sensor_noise"].by_name:
             yield check_raw(device, noise, sizes)
         yield check_ends(device, sizes)
+        yield check_stack(device, sizes)
