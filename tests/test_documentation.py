@@ -158,6 +158,7 @@ def test_the_profile_is_complete(tmp_path):
         "readout_ratio",
         "readout_noise",
         "photodiode_ratio",
+        "photodiode_crosstalk",
     }  # of sensors that read an exposure twice
     assert left_out == {"aliases", "pixel_pitch", "tukey_lambda"} | ratios | readouts
 

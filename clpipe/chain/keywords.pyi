@@ -200,6 +200,7 @@ class SensorNoise(TypedDict, total=False):
     ratio: Number
     later_noise: Number
     part: Whole
+    crosstalk: Number
     light_ratio: Number
     count: Whole
     full_signal: Number

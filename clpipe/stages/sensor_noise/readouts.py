@@ -37,17 +37,19 @@ class Readout(NamedTuple):
 
     Args:
         photodiode: its number; readings of one have the same charge.
-        share: of the light that it sees, over the first one's.
+        share: of the light that it sees, over the first one's, as the merging takes it.
         gain: over the first reading's.
+        leak: what leaks into it of the first one's light, which the merging knows nothing of.
     """
 
     photodiode: int
     share: float
     gain: float
+    leak: float = 0.0
 
     @property
     def sensitivity(self) -> float:
-        """Its signal over the first reading's."""
+        """Its signal over the first reading's, as the merging takes it."""
         return self.share * self.gain
 
 
@@ -87,6 +89,8 @@ class Readouts(SensorNoise):
     )
 
     _range: float = PrivateAttr(1.0)  # of the camera, DN
+    _full: float | None = PrivateAttr(None)  # the signal that fills the well, without noise
+    _is_clean: bool = PrivateAttr(False)  # merges readouts that have no noise
 
     @property
     def readouts(self) -> tuple[Readout, ...]:
@@ -115,11 +119,28 @@ class Readouts(SensorNoise):
         return replace(super().next_context(context), full_scale=self.full_scale)
 
     def passes(self) -> tuple[Pass, ...]:
+        if self._is_clean:
+            return (Pass("clean_readouts", arguments=("count", "part", "full_well", "table")),)
         names = ("count", "part", "a", "full_well", "range", "unit", "table")
         return (Pass("readouts", arguments=names, random=NoiseScope.IMAGE),)
 
+    @property
+    def is_exact(self) -> bool:
+        """Whether readouts without noise, merged, are the light up to the last one's white."""
+        return self.part is None and not any(each.leak for each in self.readouts)
+
     def without_noise(self) -> Method | None:
-        return NoNoise(full_signal=self.full_scale)
+        if self._is_clean:
+            return self
+        if self.is_exact:
+            return NoNoise(full_signal=self.full_scale)
+        own = self.model_copy(update={"a": 0.0, "b": 0.0, "tukey_lambda": None})
+        own._full, own._is_clean = self.full_signal, True
+        return own
+
+    @property
+    def full_signal(self) -> float | None:
+        return self._full if self._is_clean else super().full_signal
 
     def numbers(self) -> dict[str, np.float32]:
         return {
@@ -151,7 +172,8 @@ class Readouts(SensorNoise):
             else:
                 own = np.full_like(signal, i == self.part)
             weight = of_charges.get(each.photodiode, (np.zeros_like(signal), left))[0] + own
-            of_charges[each.photodiode] = weight, np.float32(self.a) * signal / row[1]
+            light, scale = signal * row[1], row[2] * row[3]
+            of_charges[each.photodiode] = weight, np.float32(self.a) * light * scale**2
             read = read + own**2 * row[4] * row[3] ** 2
         shot = sum(weight**2 * variance for weight, variance in of_charges.values())
         return np.asarray(shot + read, np.float32)
@@ -162,19 +184,22 @@ class Readouts(SensorNoise):
         return np.minimum(np.maximum((ENDS - read) * STEEP, np.float32(0)), np.float32(1))
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        n, stream = self.numbers(), given.stream[NoiseScope.IMAGE]
+        n, stream = self.numbers(), given.stream.get(NoiseScope.IMAGE)
         values, weights = [], []
         photodiode, charge = -1, image
         for i, (number, share, gain, inverse, variance) in enumerate(self.table):
             if int(number) != photodiode:
                 photodiode, light = int(number), image * share
-                shot = square_root(np.maximum(n["a"] * light, np.float32(0)))
-                noisy = light + normal_at(image.shape, photodiode, stream) * shot
-                charge = np.minimum(noisy, n["full_well"])
-            noise = normal_at(image.shape, MOST + i, stream) * square_root(
-                np.full(image.shape, variance, np.float32)
-            )
-            read = np.rint((charge * gain + noise) * n["range"]) * n["unit"]
+                if not self._is_clean:
+                    shot = square_root(np.maximum(n["a"] * light, np.float32(0)))
+                    light = light + normal_at(image.shape, photodiode, stream) * shot
+                charge = np.minimum(light, n["full_well"])
+            read = charge * gain
+            if not self._is_clean:
+                noise = normal_at(image.shape, MOST + i, stream) * square_root(
+                    np.full(image.shape, variance, np.float32)
+                )
+                read = np.rint((read + noise) * n["range"]) * n["unit"]
             read = np.minimum(read, np.float32(1))
             values.append(read * inverse)
             weights.append(self._weight(read))
@@ -189,7 +214,13 @@ class Readouts(SensorNoise):
 @lru_cache(maxsize=256)  # one object for the same readouts, so that it is uploaded once
 def _table(readouts: tuple[Readout, ...], first: float, later: float) -> Floats:
     rows = [
-        (*each, 1 / each.sensitivity, later if number else first)
+        (
+            each.photodiode,
+            each.share + each.leak,
+            each.gain,
+            1 / each.sensitivity,
+            later if number else first,
+        )
         for number, each in enumerate(readouts)
     ]
     return np.array(rows, np.float32)
@@ -217,19 +248,49 @@ class DualGain(Readouts):
         return Readout(0, 1, 1), Readout(0, 1, 1 / self.ratio)
 
 
-class SplitPixel(Readouts):
-    """Split pixels: a large and a small photodiode, of which the small one sees 1/``ratio``."""
+class Split(Readouts):
+    """Pixels of a large and a small photodiode, side by side.
+
+    Of the light under the large one a share ``crosstalk`` makes charge in the small one, which then
+    collects 1/ratio + crosstalk of what the large one does. The merging multiplies by the ratio all
+    the same, so a ramp of light steps up by the factor 1 + crosstalk * ratio where the small one
+    takes over. What the large one loses is in its figures already.
+    """
+
+    crosstalk: float | None = parameter(
+        None,
+        "Charge that leaks into the small photodiode, over that of the large one.",
+        "",
+        "from the camera; else 0",
+        ge=0,
+        le=0.5,
+    )
+
+    def with_camera(self, camera: Camera) -> Self:
+        own = super().with_camera(camera)
+        return own.with_defaults(crosstalk=camera.photodiode_crosstalk).with_defaults(crosstalk=0.0)
+
+
+class SplitPixel(Split):
+    """Split pixels: a large and a small photodiode, of which the small one sees 1/``ratio``.
+
+    >>> from clpipe.stage import run_reference
+    >>> leaky = SplitPixel(a=0.0, b=0.0, ratio=10.0, crosstalk=0.01)
+    >>> run_reference(leaky, np.float32([[0.5, 2.0]])).astype(float).round(2).tolist()
+    [[0.5, 2.2]]
+    """
 
     method: ClassVar = "split_pixel"
     summary: ClassVar = "a large and a small photodiode in each pixel, merged"
+    other_examples: ClassVar = ({"crosstalk": 0.01},)
 
     @property
     def readouts(self) -> tuple[Readout, ...]:
         assert self.ratio is not None
-        return Readout(0, 1, 1), Readout(1, 1 / self.ratio, 1)
+        return Readout(0, 1, 1), Readout(1, 1 / self.ratio, 1, self.crosstalk or 0.0)
 
 
-class SplitDualGain(Readouts):
+class SplitDualGain(Split):
     """Split pixels whose photodiodes are both read at two gains, ``ratio`` apart: four readouts.
 
     The least sensitive reading of the large photodiode is to reach further than the most sensitive
@@ -261,11 +322,9 @@ class SplitDualGain(Readouts):
     @property
     def readouts(self) -> tuple[Readout, ...]:
         assert self.ratio is not None and self.light_ratio is not None
-        return tuple(
-            Readout(number, share, gain)
-            for number, share in enumerate((1, 1 / self.light_ratio))
-            for gain in (1, 1 / self.ratio)
-        )
+        gains, leak = (1, 1 / self.ratio), self.crosstalk or 0.0
+        large = (Readout(0, 1, gain) for gain in gains)
+        return *large, *(Readout(1, 1 / self.light_ratio, gain, leak) for gain in gains)
 
 
 class Staggered(Readouts):
