@@ -231,3 +231,14 @@ def test_a_profile_says_what_leaks(tmp_path):
     own = {"camera": str(tmp_path / "leaky.toml"), "iso": 100}
     step = chain_of("split_pixel", **own).step_named("sensor_noise").method
     assert step.crosstalk == 0.002
+
+
+def test_the_variance_beyond_the_first_white(clpipe, write_exr):
+    light = np.repeat(np.float32([0.5, 4, 12, 40]), 4).reshape(1, 16, 1).repeat(4, 0).repeat(3, 2)
+    path = write_exr("light.exr", light, half=False)
+    options = ("--iso", "400", "--set", "sensor_noise.method=dual_gain", "--stages", ",".join(RAW))
+    clpipe("run", path, "-o", "out", *options, "--truth", "variance", "--format", "npy")
+    found = np.load("out/light.truth_variance.npy")[0, ::4]
+    step = chain_of("dual_gain").step_named("sensor_noise").method
+    expected = step.own_variance(np.float32([0.5, 4, 12, 16]))  # white is at 16
+    assert found == pytest.approx(expected, rel=0.02)

@@ -164,9 +164,10 @@ class Readouts(SensorNoise):
     def own_variance(self, signal: Floats) -> Floats:
         left, read = np.ones_like(signal), np.zeros_like(signal)
         of_charges: dict[int, tuple[Floats, Floats]] = {}  # weight and shot noise by photodiode
-        for i, (each, row) in enumerate(zip(self.readouts, self.table, strict=True)):
+        readouts = self.readouts
+        for i, (each, row) in enumerate(zip(readouts, self.table, strict=True)):
             if self.part is None:
-                is_last = each is self.readouts[-1]
+                is_last = i == len(readouts) - 1
                 own = left if is_last else left * self._weight(signal * row[1] * row[2])
                 left = left - own
             else:
@@ -184,7 +185,10 @@ class Readouts(SensorNoise):
         return np.minimum(np.maximum((ENDS - read) * STEEP, np.float32(0)), np.float32(1))
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        n, stream = self.numbers(), given.stream.get(NoiseScope.IMAGE)
+        def normals(draw: int) -> Floats:
+            return normal_at(image.shape, draw, given.stream[NoiseScope.IMAGE])
+
+        n = self.numbers()
         values, weights = [], []
         photodiode, charge = -1, image
         for i, (number, share, gain, inverse, variance) in enumerate(self.table):
@@ -192,13 +196,12 @@ class Readouts(SensorNoise):
                 photodiode, light = int(number), image * share
                 if not self._is_clean:
                     shot = square_root(np.maximum(n["a"] * light, np.float32(0)))
-                    light = light + normal_at(image.shape, photodiode, stream) * shot
+                    light = light + normals(photodiode) * shot
                 charge = np.minimum(light, n["full_well"])
             read = charge * gain
             if not self._is_clean:
-                noise = normal_at(image.shape, MOST + i, stream) * square_root(
-                    np.full(image.shape, variance, np.float32)
-                )
+                sigma = square_root(np.full(image.shape, variance, np.float32))
+                noise = normals(MOST + i) * sigma
                 read = np.rint((read + noise) * n["range"]) * n["unit"]
             read = np.minimum(read, np.float32(1))
             values.append(read * inverse)
