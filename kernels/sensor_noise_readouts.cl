@@ -8,15 +8,22 @@
 // `table` has for each readout the number of its photodiode, the share of light that this one sees, the gain at which it
 // is read, what its reading is multiplied by when it is merged, and the variance of its read noise. Readouts of one
 // photodiode follow each other, and have one charge. `part` is the readout that is looked at alone, or -1.
+// `later` has what all photodiodes but the first see in their own exposures, planes of `columns` by `rows` with a vector more
+// at the right; 0 where all see the same. An image larger than it, as one that kernels are tried on, repeats its last
+// row and vector.
 INLINE vf merged(vf y, site at, stream s, bool is_noisy, int count, int part, float a, float full_well, float range,
-                 float unit, __global const float *table) {
+                 float unit, __global const float *table, __global const float *later, int columns, int rows) {
+    const int last_x = columns - LANES, last_y = rows - 1;
+    const int x = (int)at.x < last_x ? (int)at.x : last_x, line = (int)at.y < last_y ? (int)at.y : last_y;
     vf values[READOUTS], weights[READOUTS], charge = y;
     int photodiode = -1;
     for (int i = 0; i < count; ++i) {
         __global const float *own = table + 5 * i;
         if ((int)own[0] != photodiode) {
             photodiode = (int)own[0];
-            vf light = y * own[1];
+            const bool is_later = later && photodiode;
+            const vf seen = is_later ? load(later + ((long)(photodiode - 1) * rows + line) * columns + x) : y;
+            vf light = seen * own[1];
             if (is_noisy)
                 light += normal_at(at, (uint)photodiode, s) * square_root(vmax(a * light, (vf)(0.0f)));
             charge = vmin(light, (vf)(full_well));
@@ -39,11 +46,22 @@ INLINE vf merged(vf y, site at, stream s, bool is_noisy, int count, int part, fl
 
 INLINE vf readouts(vf y, site at, stream s, int count, int part, float a, float full_well, float range, float unit,
                    __global const float *table) {
-    return merged(y, at, s, true, count, part, a, full_well, range, unit, table);
+    return merged(y, at, s, true, count, part, a, full_well, range, unit, table, 0, 0, 0);
+}
+
+INLINE vf exposures(vf y, site at, stream s, int count, int part, float a, float full_well, float range, float unit,
+                    __global const float *table, __global const float *later, int columns, int rows) {
+    return merged(y, at, s, true, count, part, a, full_well, range, unit, table, later, columns, rows);
 }
 
 // The same without noise and rounding.
 INLINE vf clean_readouts(vf y, site at, int count, int part, float full_well, __global const float *table) {
     const stream none = {0, 0, 0};
-    return merged(y, at, none, false, count, part, 0.0f, full_well, 1.0f, 1.0f, table);
+    return merged(y, at, none, false, count, part, 0.0f, full_well, 1.0f, 1.0f, table, 0, 0, 0);
+}
+
+INLINE vf clean_exposures(vf y, site at, int count, int part, float full_well, __global const float *table,
+                          __global const float *later, int columns, int rows) {
+    const stream none = {0, 0, 0};
+    return merged(y, at, none, false, count, part, 0.0f, full_well, 1.0f, 1.0f, table, later, columns, rows);
 }

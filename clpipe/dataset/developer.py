@@ -18,6 +18,7 @@ from clpipe.dataset.arrays import HIGHEST, ArrayFormat
 from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result, Runner
+from clpipe.images.read import SourceImage
 from clpipe.outputs.patches import Patch, Patches, facts_of, pattern_of, variance_at, variance_steps
 from clpipe.stage import Kind
 
@@ -120,7 +121,7 @@ class Developer:
     def begin(
         self,
         chain: Chain,
-        pixels: Array,
+        source: SourceImage,
         noise_key: str,
         patches: Sequence[Patch],
         chain_key: Hashable | None,
@@ -129,7 +130,7 @@ class Developer:
 
         Args:
             chain: how it is developed.
-            pixels: the image.
+            source: the image.
             noise_key: what its noise is made of.
             patches: the parts of the picture that are samples; () is one sample, all of it.
             chain_key: what the chain follows from, so that it is prepared once; None is more than
@@ -141,7 +142,8 @@ class Developer:
         Raises:
             ImageError, RequestError, MemoryError: the image cannot be developed.
         """
-        options = RunOptions(unchanged=True, boxes=[patch.box for patch in patches])
+        boxes = [patch.box for patch in patches]
+        options = RunOptions(unchanged=True, boxes=boxes, later=source.later)
         with self._lock:
             prepared = (
                 self._prepare(chain)
@@ -149,7 +151,7 @@ class Developer:
                 else self._prepared.get(chain_key, lambda: self._prepare(chain))
             )
             begun = {
-                name: runner.submit(pixels, noise_key, options)
+                name: runner.submit(source.pixels, noise_key, options)
                 for name, runner in prepared.runners.items()
             }
 

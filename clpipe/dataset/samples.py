@@ -151,7 +151,7 @@ class SampleLoader:
             else:
                 self._spec.arrays.check_size(*chain.size(*loaded.source.pixels.shape[1::-1]))
             begun = self._developer().begin(
-                chain, loaded.source.pixels, key, patches, self._chain_key(batch, loaded)
+                chain, loaded.source, key, patches, self._chain_key(batch, loaded)
             )
 
         def finish() -> list[Sample]:

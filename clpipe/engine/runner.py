@@ -1,8 +1,8 @@
 """One image through a chain, on a device or in NumPy."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain
+from clpipe.chain.exposures import exposures_of
 from clpipe.chain.registry import user_code_errors
 from clpipe.engine.bindings import ArgumentValue, EncodedCurves, ResamplingValue, StreamWord, Value
 from clpipe.engine.buffers import HostImages
@@ -118,6 +119,7 @@ class Runner:
         self.final = final
         self.incremental = incremental
         self._arguments = {s.name: s.method.arguments(s.context) for s in chain.steps}
+        self._exposures = exposures_of(chain)
         self._own_plans: dict[tuple[bool, ...], Plan] = {}
         self._estimates: BoundedCache[dict[str, dict[str, float]]] = BoundedCache(32)  # by size
         # Shared with the runners of other chains, by a chain's structure.
@@ -132,6 +134,15 @@ class Runner:
         other = Runner(chain, self.device, self.keep, self.encode, self.final, self.incremental)
         other._plans, other._tables = self._plans, self._tables
         return other
+
+    @cached_property
+    def _later(self) -> list["Runner"]:
+        """The runners of all exposures but the first, up to the step that merges them."""
+        chains = self._exposures.later if self._exposures else ()
+        runners = [Runner(chain, self.device, encode=False, final=True) for chain in chains]
+        for runner in runners:
+            runner._plans = self._plans
+        return runners
 
     def plan(self, half: bool = True, fold: bool = True, planar: bool = False) -> Plan:
         """The plan for a source of half floats or floats, interleaved or in planes."""
@@ -158,7 +169,8 @@ class Runner:
         """
         if self.device:
             try:
-                self._compile_plan(self.plan(half))
+                for runner in (*self._later, self):
+                    runner._compile_plan(runner.plan(half))
             except DeviceFailedError as error:
                 raise DeviceError(str(error)) from None
 
@@ -215,6 +227,12 @@ class Runner:
             self._check_sizes(*image.shape[1::-1])
         if not (self.encode or self.final or self.keep):
             return lambda: Result(None, None, {}, {})
+        if self._exposures:
+            seen = options.later or [image] * len(self._later)
+            pairs = zip(self._later, seen, strict=True)
+            each = [runner.run(own, noise_key).image for runner, own in pairs]
+            merging = self.for_chain(self._exposures.merging(each))
+            return merging.submit(image, noise_key, replace(options, later=()))
         if not self.device:
             return partial(self._run_numpy, np.asarray(image, np.float32), noise_key, options.boxes)
         plan = self.plan_for(image)

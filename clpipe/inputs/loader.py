@@ -6,11 +6,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, KindError, NoPictureError, RequestError
 from clpipe.base.reading import unchanged
 from clpipe.chain.chain import Chain
 from clpipe.chain.entering import enter
+from clpipe.chain.exposures import exposures_of
 from clpipe.chain.identity import image_key
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import RENDER
@@ -41,7 +44,7 @@ from clpipe.inputs.raw import RawImage, RawLoader, may_be_dump
 from clpipe.inputs.subframes import average, exposures, shutter_of
 from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import Margins
-from clpipe.stage import Kind, StageRole
+from clpipe.stage import Kind, Span, StageRole
 
 
 @dataclass(frozen=True)
@@ -205,7 +208,9 @@ class ImageLoader:
             return read_around(job, self._read, wide)
         if shutter:
             known = shutter.with_defaults(exposure_time=self.chain.optics.exposure_time)
-            source = average(job, self._read, known)
+            exposures = exposures_of(self.chain)
+            spans = exposures.spans if exposures else (Span(),)
+            source = average(job, self._read, known, spans)
         else:
             with unchanged(job.path):
                 source = self._read(job.path)
@@ -254,9 +259,13 @@ class ImageLoader:
 
         around = source.panorama
         own = enter(loaded.chain, source.pixels, source.margins, depth, source.shot, around)
+        later = source.later
+        if own.margins != source.margins:
+            later = tuple(np.ascontiguousarray(source.margins.cropped(each)) for each in later)
         source = replace(
             source,
             pixels=own.pixels,
+            later=later,
             margins=own.margins,
             depth=own.depth,
             warnings=(*source.warnings, *own.warnings),

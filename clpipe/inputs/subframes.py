@@ -18,7 +18,7 @@ from clpipe.chain.settings import Settings
 from clpipe.images.read import SourceImage
 from clpipe.inputs.find import Job
 from clpipe.reference.geometry import Margins
-from clpipe.stage import StageRole
+from clpipe.stage import Span, StageRole
 from clpipe.stages.shutter import Rows
 
 
@@ -71,23 +71,26 @@ def exposures(jobs: Sequence[Job], settings: Settings) -> list[Job]:
     return grouped
 
 
-def average(job: Job, read: Callable[[Path], SourceImage], shutter: Rows) -> SourceImage:
+def average(
+    job: Job, read: Callable[[Path], SourceImage], shutter: Rows, spans: tuple[Span, ...]
+) -> SourceImage:
     """The exposure of a job: the mean of its frames, for each row over the time that it is exposed.
 
-    One frame is held at a time, beside the sum in float32.
+    One frame is held at a time, beside the sum in float32 of each exposure.
 
     Args:
         job: its files.
         read: reads one.
         shutter: which part of each row's exposure a frame stands for; how long that is, the first
             frame may say.
+        spans: of the exposures of a sensor that takes several in a row.
 
     Raises:
         ImageError: one cannot be read, is no picture in linear light, or is of another size.
     """
     found: list[SourceImage] = []
-    total: Floats = np.empty(0, np.float32)
-    weights: Doubles = np.empty(0)
+    totals: Floats = np.empty(0, np.float32)
+    weights: list[Doubles] = []
     for number, path in enumerate(job.paths):
         with unchanged(path):
             source = read(path)
@@ -97,23 +100,28 @@ def average(job: Job, read: Callable[[Path], SourceImage], shutter: Rows) -> Sou
         if not found:
             time = source.shot.get("exposure_time")
             shutter = shutter.with_defaults(exposure_time=time)
-            weights = weights_of(shutter, len(job.paths), pixels.shape[0], source.margins)
-            total = np.zeros(pixels.shape, np.float32)
-        elif (pixels.shape, source.margins) != (total.shape, found[0].margins):
+            weights = [
+                weights_of(each, len(job.paths), pixels.shape[0], source.margins)
+                for each in (shutter.during(spans, number) for number in range(len(spans)))
+            ]
+            totals = np.zeros((len(spans), *pixels.shape), np.float32)
+        elif (pixels.shape, source.margins) != (totals.shape[1:], found[0].margins):
             raise ImageError(
                 f"{path}: it is {_size(source, pixels)}, and {job.path}, a part of the same "
-                f"exposure, {_size(found[0], total)}"
+                f"exposure, {_size(found[0], totals[0])}"
             )
-        seen = np.flatnonzero(weights[number])
-        if seen.size:
-            rows = slice(int(seen[0]), int(seen[-1]) + 1)
-            total[rows] += weights[number, rows, None, None].astype(np.float32) * pixels[rows]
+        for total, own in zip(totals, weights, strict=True):
+            seen = np.flatnonzero(own[number])
+            if seen.size:
+                rows = slice(int(seen[0]), int(seen[-1]) + 1)
+                total[rows] += own[number, rows, None, None].astype(np.float32) * pixels[rows]
         found.append(replace(source, pixels=pixels[:0]))
     names = (os.path.relpath(path, job.path.parent) for path in job.paths)
     digests = [source.sha256 for source in found]
     return replace(
         found[0],
-        pixels=total,
+        pixels=totals[0],
+        later=tuple(totals[1:]),
         sha256=joint_digest(digests),
         warnings=tuple(dict.fromkeys(_warnings(job, found))),
         subframes=tuple(zip(names, digests, strict=True)),

@@ -1,27 +1,32 @@
 """When each row of the sensor sees the scene: a rolling shutter, and lamps that flicker."""
 
+from dataclasses import replace
 from typing import ClassVar, Self
 
 import numpy as np
+from pydantic import PrivateAttr
 
 from clpipe.base.types import Doubles, Floats
 from clpipe.camera.optics import USUAL_TIME
 from clpipe.stage import (
     Arguments,
     Context,
+    InTime,
     Kind,
     LineTable,
-    Method,
     Pass,
     ReferenceContext,
+    Span,
     Stage,
     StageRole,
     parameter,
 )
 
 
-class Rows(Method):
+class Rows(InTime):
     """Row y is exposed from y * line_time on, for exposure_time.
+
+    Further exposures of a sensor that staggers them follow in each row, one behind the other.
 
     Light that flickers as 1 + depth cos(2 pi f t + phase) comes, averaged over a row's exposure T,
     as 1 + depth sinc(f T) cos(2 pi f (y line_time + T / 2) + phase).
@@ -73,26 +78,45 @@ class Rows(Method):
         0.0, "Phase of the light when the first row's exposure starts.", "degrees", ge=-360, le=360
     )
 
+    _span: Span = PrivateAttr(Span())  # of the exposure that it is for
+    _end: float = PrivateAttr(1.0)  # of the last one, in exposures of the first
+
     def resolve(self, context: Context) -> Self:
         return self.with_optics(context).with_defaults(exposure_time=USUAL_TIME)
+
+    def next_context(self, context: Context) -> Context:
+        return replace(context, light_changes=self.subframes > 1 or bool(self.flicker_depth))
+
+    def during(self, spans: tuple[Span, ...], number: int) -> Self:
+        other = self.model_copy()
+        other._span, other._end = spans[number], spans[-1].end
+        return other
+
+    @property
+    def _longest(self) -> float:
+        return self.exposure_time or USUAL_TIME
 
     @property
     def time(self) -> float:
         """How long each row is exposed, s."""
-        return self.exposure_time or USUAL_TIME
+        return self._longest * self._span.length
 
     def times(self, rows: int) -> Doubles:
         """When the exposure of each row starts, in s: (row,)."""
-        return np.arange(rows, dtype=np.float64) * self.line_time
+        start = self._longest * self._span.start
+        return np.arange(rows, dtype=np.float64) * self.line_time + start
+
+    def duration(self, rows: int) -> float:
+        """From the start of the first row's exposure to the end of the last row's last one, s."""
+        return (rows - 1) * self.line_time + self._longest * self._end
 
     def weights(self, frames: int, rows: int) -> Doubles:
         """The share of each row's exposure that falls to each of some frames: (frame, row).
 
-        The frames follow each other without a gap, from the start of the first row's exposure to
-        the end of the last row's.
+        The frames follow each other without a gap, over all of :meth:`duration`.
         """
         starts = self.times(rows)
-        bounds = np.linspace(0, starts[-1] + self.time, frames + 1)[:, None]
+        bounds = np.linspace(0, self.duration(rows), frames + 1)[:, None]
         seen = np.clip(bounds, starts, starts + self.time)
         return np.asarray(np.diff(seen, axis=0) / self.time)
 
@@ -118,7 +142,7 @@ class Rows(Method):
     @property
     def start(self) -> np.float32:
         """The light's phase in the middle of the first row's exposure, in periods."""
-        middle = self.flicker_frequency * self.time / 2
+        middle = self.flicker_frequency * (self._longest * self._span.start + self.time / 2)
         before = self.margins.top * float(self.cycles)  # the picture's first row
         return np.float32((middle + self.flicker_phase / 360 - before) % 1)
 
