@@ -104,7 +104,9 @@ class ImageWorker:
         """
         writer = self.writer
         results = min(len(writer.renditions_of(job)), most)
-        beside = 2 * self.layers + (1 + 2 * self.later if job.subframes else self.later)
+        beside = 2 * self.layers + self.later
+        if shutter := self.loader.shutter(job):
+            beside += 1 + self.later + bool(shutter.layer_of_light)
         # Baselines are measured on floats.
         formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
         kinds = results, formats, writer.request.keep, beside, in_numpy

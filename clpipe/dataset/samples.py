@@ -130,7 +130,7 @@ class SampleLoader:
 
     def _source(self, job: Job, loader: ImageLoader) -> SourceImage:
         """The image of a job, as it is held where its pixels are those of its files."""
-        if job.subframes:  # which a shutter averages that may be drawn
+        if loader.shutter(job):  # which may be drawn
             return loader.read(job)
         overscan = not loader.raw.takes(job.path) and loader.reads_overscan
         key = job.key, stamp_of(job.path), overscan

@@ -45,6 +45,7 @@ from clpipe.inputs.subframes import average, exposures, shutter_of
 from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import Margins
 from clpipe.stage import Kind, Span, StageRole
+from clpipe.stages.shutter import Rows
 
 
 @dataclass(frozen=True)
@@ -156,7 +157,14 @@ class ImageLoader:
         """
         if self.kept:
             return list(jobs)
-        return grouped(exposures(jobs, self.settings), wide_of(self.settings))
+        wide, shutter = wide_of(self.settings), shutter_of(self.settings)
+        if wide and shutter and shutter.layer_of_light:
+            raise RequestError(
+                f"{stage_in(StageRole.SHUTTER).name}.flicker_layer: found "
+                f"{shutter.layer_of_light}, but what is seen through a wide lens has no layers of "
+                "light; without it, all light flickers"
+            )
+        return grouped(exposures(jobs, self.settings), wide)
 
     def check(self, jobs: Sequence[Job]) -> None:
         """See that the values of single images are allowed.
@@ -203,7 +211,7 @@ class ImageLoader:
                 time.
         """
         wide = None if self.kept else wide_of(self.settings)
-        shutter = shutter_of(self.settings) if job.subframes and not wide else None
+        shutter = None if wide else self.shutter(job)
         if wide and not self.raw.takes(job.path):
             return read_around(job, self._read, wide)
         if shutter:
@@ -227,12 +235,19 @@ class ImageLoader:
             )
         return source
 
-    def _read(self, path: Path) -> SourceImage:
+    def shutter(self, job: Job) -> Rows | None:
+        """What a job's image is made with as it is read; None where it stays as in its file."""
+        shutter = shutter_of(self.settings)
+        is_render = self.kept is None and not self.raw.takes(job.path)
+        is_lit = shutter is not None and bool(shutter.layer_of_light) and is_render
+        return shutter if job.subframes or is_lit else None
+
+    def _read(self, path: Path, layer: str | None = None) -> SourceImage:
         if self.raw.takes(path):
             return self.raw.read(path)
         request = self.request
         options = ReadOptions(
-            request.layer,
+            layer or request.layer,
             request.max_pixels or USUAL_MAX_PIXELS,
             request.transfer,
             self.reads_overscan,

@@ -140,6 +140,11 @@ class InTime(Method):
         """
         raise NotImplementedError(type(self).__name__)
 
+    @property
+    def layer_of_light(self) -> str:
+        """The layer of the image's file of which it must have the light; "" is none."""
+        return ""
+
 
 class OfExposures(Method):
     """A method that may make its image of several exposures, one behind the other."""
