@@ -94,11 +94,10 @@ class Rows(InTime):
         ge=-360,
         le=360,
     )
-    flicker_duty: float | None = parameter(
-        None,
-        "The share of a period in which a pulsed light is on, as an LED.",
-        auto="none; the light swings as a cosine",
-        gt=0,
+    flicker_duty: float = parameter(
+        0.0,
+        "The share of a period in which a pulsed light, as an LED, is on; 0 swings as a cosine.",
+        ge=0,
         le=1,
     )
     flicker_layer: str = parameter(
@@ -167,7 +166,7 @@ class Rows(InTime):
     def _light_until(self, time: Doubles) -> Doubles:
         """The light that there was until some times, over its mean, s."""
         cycles = self.flicker_frequency * time + self.flicker_phase / 360
-        if self.flicker_duty is None:
+        if not self.flicker_duty:
             light = self.depth * np.sin(2 * np.pi * cycles) / (2 * np.pi)
         else:
             on = np.floor(cycles) + np.minimum(cycles % 1 / self.flicker_duty, 1)
@@ -182,7 +181,7 @@ class Rows(InTime):
     @property
     def swing(self) -> float:
         """The flicker that is left after a row's exposure has averaged it."""
-        if self.flicker_duty is None:
+        if not self.flicker_duty:
             return self.depth * float(np.sinc(self.cycles))
         return self.depth * (1 - self.flicker_duty) * (self.cycles % 1) / self.cycles
 
@@ -192,7 +191,7 @@ class Rows(InTime):
         table = Pass(
             "flicker_of_rows", LineTable("rows"), ("step", "start", "swing"), writes="rows"
         )
-        if self.flicker_duty is not None:
+        if self.flicker_duty:
             given = ("step", "start", "rest", "duty", "steady", "scale")
             table = Pass("pulses_of_rows", LineTable("rows"), given, writes="rows")
         return (table, Pass("flicker", arguments=("rows",)))
@@ -201,7 +200,7 @@ class Rows(InTime):
         step = self.flicker_frequency * self.line_time % 1
         start = self.flicker_frequency * self._longest * self._span.start
         start += self.flicker_phase / 360 - self.margins.top * step  # the picture's first row
-        if self.flicker_duty is None:
+        if not self.flicker_duty:
             middle = np.float32((start + self.cycles / 2) % 1)
             return {"step": np.float32(step), "start": middle, "swing": np.float32(self.swing)}
         whole = float(np.floor(self.cycles))
@@ -219,7 +218,7 @@ class Rows(InTime):
             return image
         n: Any = self.arguments(given.context)
         rows = np.arange(image.shape[0], dtype=np.uint32)
-        if self.flicker_duty is None:
+        if not self.flicker_duty:
             turns = rows.astype(np.float32) * n["step"] + n["start"]
             gains = (1 + n["swing"] * np.cos(2 * np.pi * turns.astype(np.float64))).astype("f4")
         else:
