@@ -6,28 +6,62 @@
 #define READOUTS 4  // at most
 
 // `table` has for each readout the number of its photodiode, the share of light that this one sees, the gain at which it
-// is read, the inverse of both, and the variance of its read noise. Readouts of one photodiode follow each other, and
-// have one charge. `part` is the readout that is looked at alone, or -1.
-INLINE vf readouts(vf y, site at, stream s, int count, int part, float a, float full_well, float range, float unit,
-                   __global const float *table) {
+// is read, what its reading is multiplied by when it is merged, and the variance of its read noise. Readouts of one
+// photodiode follow each other, and have one charge. `part` is the readout that is looked at alone, or -1.
+// `later` has what all photodiodes but the first see in their own exposures, planes of `columns` by `rows` with a vector more
+// at the right; 0 where all see the same. An image larger than it, as one that kernels are tried on, repeats its last
+// row and vector.
+INLINE vf merged(vf y, site at, stream s, bool is_noisy, int count, int part, float a, float full_well, float range,
+                 float unit, __global const float *table, __global const float *later, int columns, int rows) {
+    const int last_x = columns - LANES, last_y = rows - 1;
+    const int x = (int)at.x < last_x ? (int)at.x : last_x, line = (int)at.y < last_y ? (int)at.y : last_y;
     vf values[READOUTS], weights[READOUTS], charge = y;
     int photodiode = -1;
     for (int i = 0; i < count; ++i) {
         __global const float *own = table + 5 * i;
         if ((int)own[0] != photodiode) {
             photodiode = (int)own[0];
-            const vf light = y * own[1];
-            const vf shot = normal_at(at, (uint)photodiode, s) * square_root(vmax(a * light, (vf)(0.0f)));
-            charge = vmin(light + shot, (vf)(full_well));
+            const bool is_later = later && photodiode;
+            const vf seen = is_later ? load(later + ((long)(photodiode - 1) * rows + line) * columns + x) : y;
+            vf light = seen * own[1];
+            if (is_noisy)
+                light += normal_at(at, (uint)photodiode, s) * square_root(vmax(a * light, (vf)(0.0f)));
+            charge = vmin(light, (vf)(full_well));
         }
-        const vf noisy = charge * own[2] + normal_at(at, (uint)(READOUTS + i), s) * square_root((vf)(own[4]));
-        const vf read = vmin(nearest(noisy * range) * unit, (vf)(1.0f));
+        vf read = charge * own[2];
+        if (is_noisy) {
+            const vf noisy = read + normal_at(at, (uint)(READOUTS + i), s) * square_root((vf)(own[4]));
+            read = nearest(noisy * range) * unit;
+        }
+        read = vmin(read, (vf)(1.0f));
         values[i] = read * own[3];
         weights[i] = vmin(vmax((HANDOVER_ENDS - read) * 10.0f, (vf)(0.0f)), (vf)(1.0f));
     }
     if (part >= 0) return values[part];
-    vf merged = values[count - 1];
+    vf result = values[count - 1];
     for (int i = count - 2; i >= 0; --i)
-        merged = weights[i] * values[i] + (1.0f - weights[i]) * merged;
-    return merged;
+        result = weights[i] * values[i] + (1.0f - weights[i]) * result;
+    return result;
+}
+
+INLINE vf readouts(vf y, site at, stream s, int count, int part, float a, float full_well, float range, float unit,
+                   __global const float *table) {
+    return merged(y, at, s, true, count, part, a, full_well, range, unit, table, 0, 0, 0);
+}
+
+INLINE vf exposures(vf y, site at, stream s, int count, int part, float a, float full_well, float range, float unit,
+                    __global const float *table, __global const float *later, int columns, int rows) {
+    return merged(y, at, s, true, count, part, a, full_well, range, unit, table, later, columns, rows);
+}
+
+// The same without noise and rounding.
+INLINE vf clean_readouts(vf y, site at, int count, int part, float full_well, __global const float *table) {
+    const stream none = {0, 0, 0};
+    return merged(y, at, none, false, count, part, 0.0f, full_well, 1.0f, 1.0f, table, 0, 0, 0);
+}
+
+INLINE vf clean_exposures(vf y, site at, int count, int part, float full_well, __global const float *table,
+                          __global const float *later, int columns, int rows) {
+    const stream none = {0, 0, 0};
+    return merged(y, at, none, false, count, part, 0.0f, full_well, 1.0f, 1.0f, table, later, columns, rows);
 }

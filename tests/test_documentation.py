@@ -28,8 +28,10 @@ def name_of(page):
     return page.relative_to(ROOT).as_posix()
 
 
-def write(path, pixels, type_):
+def write(path, pixels, type_, channels=()):
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], type_)
+    if channels:
+        spec.channelnames = channels
     spec.attribute("DateTime", WRITTEN)
     file = oiio.ImageOutput.create(str(path))
     assert file.open(str(path), spec)
@@ -54,6 +56,8 @@ def material(tmp_path_factory):
         part = still_life[200:264, 100 * number : 100 * number + 64]
         write(folder / "faces" / f"room_{face}.exr", part, oiio.HALF)
     small = still_life[200:264, 300:396]
+    lit, names = np.dstack([small, small / 2]), (*"RGB", *(f"Combined_LED.{c}" for c in "RGB"))
+    write(folder / "street.exr", lit, oiio.HALF, names)
     write(folder / "render.png", small, oiio.UINT8)
     write(folder / "render16.tif", small, oiio.UINT16)
     write(folder / "photo.jpg", np.clip(small, 0, 1) ** (1 / 2.2), oiio.UINT8)
@@ -158,6 +162,7 @@ def test_the_profile_is_complete(tmp_path):
         "readout_ratio",
         "readout_noise",
         "photodiode_ratio",
+        "photodiode_crosstalk",
     }  # of sensors that read an exposure twice
     assert left_out == {"aliases", "pixel_pitch", "tukey_lambda"} | ratios | readouts
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import clpipe as package
 from clpipe.base.errors import RequestError
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
@@ -189,3 +190,55 @@ def test_the_ratio_as_a_table(clpipe, write_exr):
     falls = [b["decibels"] < a["decibels"] - 2 for a, b in pairwise(steps)]
     assert any(falls)  # at the hand-over
     assert "stops below" in clpipe("measure", *pair, "--snr").stdout
+
+
+LEAKY = {"split_pixel": {"ratio": 32.0}, "split_dual_gain": {"ratio": 4.0, "light_ratio": 32.0}}
+
+
+@pytest.mark.parametrize("method", LEAKY)
+def test_light_leaks_into_the_small_photodiode(device, method):
+    small = {"method": method, "crosstalk": 0.01, **LEAKY[method]}
+    every = len(chain_of(method, sensor_noise=small).step_named("sensor_noise").method.readouts)
+    large_ends = 4 if every == 4 else 1  # the signal at which the large one is white
+
+    def made(light, **own):
+        chain = chain_of(method, sensor_noise={**small, **own})
+        runner = Runner(chain, device, encode=False, final=True)
+        image = np.full((200, 200, 3), light, np.float32)
+        truth = Runner(chain.without_noise(), device, encode=False, final=True).run(image, "")
+        return runner.run(image, "leak").final, truth.final, chain.step_named("sensor_noise").method
+
+    # It has a 32nd and a 100th of the large one's charge, and is multiplied by 32.
+    seen, truth, step = made(light := 0.5, part=every // 2)
+    assert seen.mean() == pytest.approx(light * 1.32, rel=0.002)
+    assert truth == pytest.approx(np.full_like(truth, light * 1.32), rel=2e-3)  # whole DN
+    shot = step.a * light * (1 / 32 + 0.01) * 32**2
+    assert seen.var() == pytest.approx(shot + step.b * (step.later_noise * 32) ** 2, rel=0.03)
+    assert step.own_variance(np.float32([light])) == pytest.approx(seen.var(), rel=0.03)
+    # The merged signal steps up where the large one ends.
+    for light, expected in ((0.8, 0.8), (1.1, 1.32 * 1.1)):
+        seen, truth, step = made(light * large_ends)
+        assert seen.mean() == pytest.approx(expected * large_ends, rel=0.002)
+        assert truth.mean() == pytest.approx(expected * large_ends, rel=0.001)
+        variance = step.own_variance(np.float32([light * large_ends]))
+        assert variance == pytest.approx(seen.var(), rel=0.04)
+
+
+def test_a_profile_says_what_leaks(tmp_path):
+    profile = Path(package.__file__).parent / "camera/profiles/omnivision-hdr-2019.toml"
+    text = profile.read_text().replace("\n[[", "\nphotodiode_crosstalk = 0.002\n[[", 1)
+    (tmp_path / "leaky.toml").write_text(text)
+    own = {"camera": str(tmp_path / "leaky.toml"), "iso": 100}
+    step = chain_of("split_pixel", **own).step_named("sensor_noise").method
+    assert step.crosstalk == 0.002
+
+
+def test_the_variance_beyond_the_first_white(clpipe, write_exr):
+    light = np.repeat(np.float32([0.5, 4, 12, 40]), 4).reshape(1, 16, 1).repeat(4, 0).repeat(3, 2)
+    path = write_exr("light.exr", light, half=False)
+    options = ("--iso", "400", "--set", "sensor_noise.method=dual_gain", "--stages", ",".join(RAW))
+    clpipe("run", path, "-o", "out", *options, "--truth", "variance", "--format", "npy")
+    found = np.load("out/light.truth_variance.npy")[0, ::4]
+    step = chain_of("dual_gain").step_named("sensor_noise").method
+    expected = step.own_variance(np.float32([0.5, 4, 12, 16]))  # white is at 16
+    assert found == pytest.approx(expected, rel=0.02)

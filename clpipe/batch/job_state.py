@@ -48,7 +48,7 @@ class JobState:
         """Give the memory of the image back; its size is still known."""
         if self.source:
             empty = np.broadcast_to(np.float16(0), self.source.pixels.shape)
-            self.source = replace(self.source, pixels=empty)
+            self.source = replace(self.source, pixels=empty, later=())
 
     @contextmanager
     def timed(self, step: str) -> Iterator[None]:

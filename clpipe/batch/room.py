@@ -52,8 +52,8 @@ def host_bytes(
         formats: of the last image, and of the raw.
         keep: steps whose image is written, too.
         beside: how many images of three floats there are beside it: the sum of sub-frames, and two
-            of each layer that goes along, before and after it is moved, or as it is read and as
-            kernels take it.
+            of each further exposure, of that and as kernels take it, and of each layer that goes
+            along, before and after it is moved, or as it is read and as kernels take it.
         in_numpy: whether NumPy develops it.
 
     Raises:

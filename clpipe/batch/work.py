@@ -11,7 +11,6 @@ from clpipe.base.buckets import fetched
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, NoPictureError, OutputError, RequestError
 from clpipe.base.files import FileGroup, deferred_files
-from clpipe.base.types import Array
 from clpipe.batch.job_state import JobState
 from clpipe.batch.outcome import LEFT_OUT, SKIPPED, Span
 from clpipe.batch.room import host_bytes
@@ -19,6 +18,7 @@ from clpipe.batch.runners import Runners, SpareArrays
 from clpipe.chain.baseline import with_noise
 from clpipe.chain.chain import Chain
 from clpipe.chain.depth import depth_steps
+from clpipe.chain.exposures import exposures_of
 from clpipe.chain.formats import DNG
 from clpipe.chain.rendition import Rendition
 from clpipe.engine.clipping import clipped_share
@@ -26,6 +26,7 @@ from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.runner import Result, Runner
+from clpipe.images.read import SourceImage
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.existing import Found, Redo
@@ -87,6 +88,12 @@ class ImageWorker:
         """How many layers are read beside an image: those that go along with it, and its depth."""
         return len(self.writer.request.carry) + bool(depth_steps(self.chain))
 
+    @property
+    def later(self) -> int:
+        """How many exposures there are behind the first one, between which the light changes."""
+        exposures = exposures_of(self.chain)
+        return len(exposures.spans) - 1 if exposures else 0
+
     def bytes_of(self, job: Job, most: int, in_numpy: bool) -> int:
         """The bytes of memory that a job's image takes, see :func:`~clpipe.batch.room.host_bytes`.
 
@@ -97,7 +104,9 @@ class ImageWorker:
         """
         writer = self.writer
         results = min(len(writer.renditions_of(job)), most)
-        beside = 2 * self.layers + bool(job.subframes)
+        beside = 2 * self.layers + self.later
+        if shutter := self.loader.shutter(job):
+            beside += 1 + self.later + bool(shutter.layer_of_light)
         # Baselines are measured on floats.
         formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
         kinds = results, formats, writer.request.keep, beside, in_numpy
@@ -238,10 +247,10 @@ class ImageWorker:
             DeviceError: the device cannot be used any more.
         """
         assert state.source
-        start, pixels = time.perf_counter(), state.source.pixels
+        start, source = time.perf_counter(), state.source
         timings: list[Timing] | None = [] if self._trace and runner.device else None
         boxes = [patch.box for patch in state.patches]
-        work = partial(self._submit, pixels, recipe, runner, timings, boxes)
+        work = partial(self._submit, source, recipe, runner, timings, boxes)
         wait = self._tried(state, work)
 
         def finish() -> Result | None:
@@ -262,19 +271,20 @@ class ImageWorker:
 
     def _submit(
         self,
-        pixels: Array,
+        source: SourceImage,
         recipe: Recipe,
         runner: Runner,
         timings: list[Timing] | None,
         boxes: Sequence[Box],
     ) -> Callable[[], Result]:
         """Have a runner begin with an image, whose pixels nobody changes."""
+        pixels = source.pixels
         width, height = runner.chain.size(*pixels.shape[1::-1])
         shape = (height, width, *pixels.shape[2:])
         reused = runner.encode and runner.device and not boxes
         into = self._spare.take(shape) if reused else None
         key = recipe.noise_key
-        options = RunOptions(timings, into=into, unchanged=True, boxes=boxes)
+        options = RunOptions(timings, into=into, unchanged=True, boxes=boxes, later=source.later)
         return runner.submit(pixels, key, options)
 
     @staticmethod

@@ -87,8 +87,10 @@ class Camera(BaseModel):
     # its read noise in DN over that of the first, which the gain stages are of.
     readout_ratio: Annotated[float, Field(gt=1, le=1024)] | None = None
     readout_noise: NotNegative | None = None
-    # The light that the large one of two photodiodes sees over that of the small one.
+    # The light that the large one of two photodiodes sees over that of the small one, and the
+    # charge that leaks into the small one, over that of the large one.
     photodiode_ratio: Annotated[float, Field(gt=1, le=10_000)] | None = None
+    photodiode_crosstalk: Annotated[float, Field(ge=0, le=0.5)] | None = None
     pixel_pitch: Positive | None = None  # um, from the centre of a photosite to the next one's
     iso_range: tuple[Positive, Positive]
     gain_stages: Annotated[tuple[GainStage, ...], Field(min_length=1)]

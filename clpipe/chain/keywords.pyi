@@ -46,6 +46,8 @@ class Shutter(TypedDict, total=False):
     flicker_depth: Number
     flicker_frequency: Number
     flicker_phase: Number
+    flicker_duty: Number
+    flicker_layer: Text
 
 class Defocus(TypedDict, total=False):
     method: Draw | Literal["none", "thin_lens"]
@@ -200,6 +202,7 @@ class SensorNoise(TypedDict, total=False):
     ratio: Number
     later_noise: Number
     part: Whole
+    crosstalk: Number
     light_ratio: Number
     count: Whole
     full_signal: Number

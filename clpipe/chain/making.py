@@ -9,6 +9,7 @@ from clpipe.camera.lens import calibration_of
 from clpipe.camera.optics import Optics
 from clpipe.camera.profile import Camera, load_camera
 from clpipe.chain.chain import Chain, Step
+from clpipe.chain.exposures import check_exposures
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import LENS, NOISE, RENDER
 from clpipe.chain.methods import base_name, numbered, validation_errors
@@ -75,6 +76,7 @@ def make_chain(
     if source is None:
         source = steps[first].stage.reads
     chain = Chain(tuple(steps[first:last]), source, camera, settings, tuple(names), draws)
+    check_exposures(chain)
     noiseless = NOISE in settings.skip and any(step.adds_noise for step in chain.steps)
     return chain.without_noise() if noiseless else chain
 

@@ -81,11 +81,12 @@ def variance_of(noise: Sequence[Step], signal: Floats) -> Floats:
 
         a*y + b + (prnu*y)^2 + dsnu^2 + row^2 + column^2 + 1/(12 range^2)
 
-    with y the clean signal that the noise falls on, neither rounded nor cut at black, but at most 1
-    where the ADC follows. ``a*y + b`` is that of Foi et al. (IEEE TIP 2008, eq. 2), with Poisson
-    noise and with heavy-tailed read noise, too. ``range`` is the white level above black in DN;
-    rounding has the variance 1/12 DN^2. Clipping (at 0 DN, at white, in a full well) removes noise,
-    which is not modelled; hot and dead pixels, and the rounding of the clean mosaic, are left out.
+    with y the clean signal that the noise falls on, neither rounded nor cut at black, but at most
+    white, that of the last of several readouts, where the ADC follows. ``a*y + b`` is that of Foi
+    et al. (IEEE TIP 2008, eq. 2), with Poisson noise and with heavy-tailed read noise, too.
+    ``range`` is the white level above black in DN; rounding has the variance 1/12 DN^2. Clipping
+    (at 0 DN, at white, in a full well) removes noise, which is not modelled; hot and dead pixels,
+    and the rounding of the clean mosaic, are left out.
 
     Args:
         noise: the steps from the first that adds noise to the last one of the mosaic.
@@ -96,7 +97,7 @@ def variance_of(noise: Sequence[Step], signal: Floats) -> Floats:
     """
     analogue = list(takewhile(lambda step: step.stage.writes is not Kind.RAW, noise))
     if len(analogue) < len(noise) and all(s.adds_noise or not s.passes for s in analogue):
-        signal = np.minimum(signal, np.float32(1))
+        signal = np.minimum(signal, np.float32(noise[len(analogue)].context.full_scale))
     last = max(i for i, step in enumerate(noise) if step.adds_noise)
     variance: Floats = np.zeros((), np.float32)
     for i, step in enumerate(noise):

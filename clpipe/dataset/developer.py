@@ -19,6 +19,7 @@ from clpipe.dataset.arrays import HIGHEST, ArrayFormat
 from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result, Runner, Submission, submit_together
+from clpipe.images.read import SourceImage
 from clpipe.outputs.patches import Patch, Patches, facts_of, pattern_of, variance_at, variance_steps
 from clpipe.stage import Kind
 
@@ -108,7 +109,7 @@ class Order:
 
     Args:
         chain: how it is developed.
-        pixels: the image.
+        source: the image.
         noise_key: what its noise is made of.
         patches: the parts of the picture that are samples; () is one sample, all of it.
         chain_key: what the chain follows from, so that it is prepared once; None is more than can
@@ -116,7 +117,7 @@ class Order:
     """
 
     chain: Chain
-    pixels: Array
+    source: SourceImage
     noise_key: str
     patches: Sequence[Patch]
     chain_key: Hashable | None
@@ -124,7 +125,8 @@ class Order:
     @property
     def options(self) -> RunOptions:
         """How it is run."""
-        return RunOptions(unchanged=True, boxes=[patch.box for patch in self.patches])
+        boxes = [patch.box for patch in self.patches]
+        return RunOptions(unchanged=True, boxes=boxes, later=self.source.later)
 
 
 class Developer:
@@ -157,7 +159,7 @@ class Developer:
             prepared = [self._prepared_for(order) for order in orders]
             begun = submit_together(
                 [
-                    Submission(runner, order.pixels, order.noise_key, order.options)
+                    Submission(runner, order.source.pixels, order.noise_key, order.options)
                     for order, own in zip(orders, prepared, strict=True)
                     for runner in own.runners.values()
                 ]

@@ -131,7 +131,7 @@ class SampleLoader:
 
     def _source(self, job: Job, loader: ImageLoader) -> SourceImage:
         """The image of a job, as it is held where its pixels are those of its files."""
-        if job.subframes:  # which a shutter averages that may be drawn
+        if loader.shutter(job):  # which may be drawn
             return loader.read(job)
         overscan = not loader.raw.takes(job.path) and loader.reads_overscan
         key = job.key, stamp_of(job.path), overscan
@@ -170,7 +170,7 @@ class SampleLoader:
             else:
                 self._spec.arrays.check_size(*chain.size(*pixels.shape[1::-1]))
         key = noise_key(chain.settings, loaded.key, batch.epoch)
-        return Order(chain, pixels, key, patches, self._chain_key(batch, loaded))
+        return Order(chain, loaded.source, key, patches, self._chain_key(batch, loaded))
 
     def _finish(
         self,

@@ -33,6 +33,8 @@ class RunOptions:
         unchanged: the image, if it is the same array as that before, has the same pixels still.
         boxes: the parts of the results that are made, all of one size, in their pixels; () is all
             of them. Results are then stacks of patches.
+        later: what the exposures behind the first one see, see
+            :mod:`clpipe.chain.exposures`; () is the same image.
     """
 
     timings: list[Timing] | None = None
@@ -40,3 +42,4 @@ class RunOptions:
     into: Array | None = None
     unchanged: bool = False
     boxes: Sequence[Box] = ()
+    later: Sequence[Array] = ()

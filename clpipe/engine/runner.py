@@ -1,8 +1,8 @@
 """One image through a chain, on a device or in NumPy."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain
+from clpipe.chain.exposures import exposures_of
 from clpipe.chain.registry import user_code_errors
 from clpipe.engine.bindings import (
     ArgumentValue,
@@ -104,6 +105,13 @@ class Submission:
     noise_key: str
     options: RunOptions = DEFAULTS
 
+    def merging(self) -> "Submission":
+        """The same with all exposures but the first done, where the chain has several."""
+        runner = self.runner.merging(self.image, self.noise_key, self.options.later)
+        if runner is self.runner:
+            return self
+        return replace(self, runner=runner, options=replace(self.options, later=()))
+
 
 def submit_together(submissions: Sequence[Submission]) -> list[Callable[[], Result]]:
     """Enqueue images, and small ones of alike chains in common launches.
@@ -116,8 +124,9 @@ def submit_together(submissions: Sequence[Submission]) -> list[Callable[[], Resu
     """
     waiting: dict[int, Callable[[], Result]] = {}
     groups: dict[tuple[int, Plan], list[tuple[int, Submission, Plan]]] = {}
-    for number, each in enumerate(submissions):
-        each.runner.check(each.image, each.options)
+    for number, asked in enumerate(submissions):
+        asked.runner.check(asked.image, asked.options)
+        each = asked.merging()
         if alone := each.runner.without_device(each.image, each.noise_key, each.options):
             waiting[number] = alone
         else:
@@ -179,6 +188,7 @@ class Runner:
         self.final = final
         self.incremental = incremental
         self._arguments = {s.name: s.method.arguments(s.context) for s in chain.steps}
+        self._exposures = exposures_of(chain)
         self._own_plans: dict[tuple[bool, ...], Plan] = {}
         self._estimates: BoundedCache[dict[str, dict[str, float]]] = BoundedCache(32)  # by size
         # Shared with the runners of other chains, by a chain's structure.
@@ -193,6 +203,15 @@ class Runner:
         other = Runner(chain, self.device, self.keep, self.encode, self.final, self.incremental)
         other._plans, other._tables = self._plans, self._tables
         return other
+
+    @cached_property
+    def _later(self) -> list["Runner"]:
+        """The runners of all exposures but the first, up to the step that merges them."""
+        chains = self._exposures.later if self._exposures else ()
+        runners = [Runner(chain, self.device, encode=False, final=True) for chain in chains]
+        for runner in runners:
+            runner._plans = self._plans
+        return runners
 
     def plan(self, half: bool = True, fold: bool = True, planar: bool = False) -> Plan:
         """The plan for a source of half floats or floats, interleaved or in planes."""
@@ -219,7 +238,8 @@ class Runner:
         """
         if self.device:
             try:
-                self._compile_plan(self.plan(half))
+                for runner in (*self._later, self):
+                    runner._compile_plan(runner.plan(half))
             except DeviceFailedError as error:
                 raise DeviceError(str(error)) from None
 
@@ -266,6 +286,24 @@ class Runner:
             DeviceError: a kernel does not compile, or the device is given up.
         """
         return submit_together([Submission(self, image, noise_key, options)])[0]
+
+    def merging(self, image: Array, noise_key: str, later: Sequence[Array]) -> "Runner":
+        """The runner that merges an image's exposures, of which all but the first are done; this
+        one where there are no others.
+
+        Args:
+            image: what the first of them sees.
+            noise_key: what the noise is made of.
+            later: what the others see; () is the same.
+
+        Raises:
+            ImageError, DeviceFailedError, DeviceError: as :meth:`submit`.
+        """
+        if not self._exposures or not (self.encode or self.final or self.keep):
+            return self
+        pairs = zip(self._later, later or [image] * len(self._later), strict=True)
+        seen = [runner.run(own, noise_key).image for runner, own in pairs]
+        return self.for_chain(self._exposures.merging(seen))
 
     def without_device(
         self, image: Array, noise_key: str, options: RunOptions

@@ -57,7 +57,7 @@ class SourceImage:
     array. ``layer`` is the name of the layer that was read. ``attributes`` are clpipe's own, which
     a kept image has, and a photograph's tags. ``shot`` is what the file says of exposure_time (s),
     focal_length and sensor_width (mm). ``subframes`` are the names and SHA-256 of files that were
-    averaged.
+    averaged, and ``later`` what further exposures see than that of ``pixels``, which are alike.
     ``depth`` is there where the chain needs it. ``margins`` say how far ``pixels``, and depth, go
     on beyond the picture. ``envmap`` is OpenImageIO's name of the map that the file says it is, and
     ``panorama`` what an atlas of several views is one of.
@@ -70,6 +70,7 @@ class SourceImage:
     attributes: Mapping[str, str]
     shot: Mapping[str, float] = field(default_factory=dict)
     subframes: tuple[tuple[str, str], ...] = ()
+    later: tuple[Array, ...] = ()
     depth: Depth | None = None
     margins: Margins = NO_MARGINS
     envmap: str = ""

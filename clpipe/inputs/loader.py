@@ -6,11 +6,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, KindError, NoPictureError, RequestError
 from clpipe.base.reading import unchanged
 from clpipe.chain.chain import Chain
 from clpipe.chain.entering import enter
+from clpipe.chain.exposures import exposures_of
 from clpipe.chain.identity import image_key
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.keys import RENDER
@@ -41,7 +44,8 @@ from clpipe.inputs.raw import RawImage, RawLoader, may_be_dump
 from clpipe.inputs.subframes import average, exposures, shutter_of
 from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import Margins
-from clpipe.stage import Kind, StageRole
+from clpipe.stage import Kind, Span, StageRole
+from clpipe.stages.shutter import Rows
 
 
 @dataclass(frozen=True)
@@ -153,7 +157,14 @@ class ImageLoader:
         """
         if self.kept:
             return list(jobs)
-        return grouped(exposures(jobs, self.settings), wide_of(self.settings))
+        wide, shutter = wide_of(self.settings), shutter_of(self.settings)
+        if wide and shutter and shutter.layer_of_light:
+            raise RequestError(
+                f"{stage_in(StageRole.SHUTTER).name}.flicker_layer: found "
+                f"{shutter.layer_of_light}, but what is seen through a wide lens has no layers of "
+                "light; without it, all light flickers"
+            )
+        return grouped(exposures(jobs, self.settings), wide)
 
     def check(self, jobs: Sequence[Job]) -> None:
         """See that the values of single images are allowed.
@@ -200,12 +211,14 @@ class ImageLoader:
                 time.
         """
         wide = None if self.kept else wide_of(self.settings)
-        shutter = shutter_of(self.settings) if job.subframes and not wide else None
+        shutter = None if wide else self.shutter(job)
         if wide and not self.raw.takes(job.path):
             return read_around(job, self._read, wide)
         if shutter:
             known = shutter.with_defaults(exposure_time=self.chain.optics.exposure_time)
-            source = average(job, self._read, known)
+            exposures = exposures_of(self.chain)
+            spans = exposures.spans if exposures else (Span(),)
+            source = average(job, self._read, known, spans)
         else:
             with unchanged(job.path):
                 source = self._read(job.path)
@@ -222,12 +235,19 @@ class ImageLoader:
             )
         return source
 
-    def _read(self, path: Path) -> SourceImage:
+    def shutter(self, job: Job) -> Rows | None:
+        """What a job's image is made with as it is read; None where it stays as in its file."""
+        shutter = shutter_of(self.settings)
+        is_render = self.kept is None and not self.raw.takes(job.path)
+        is_lit = shutter is not None and bool(shutter.layer_of_light) and is_render
+        return shutter if job.subframes or is_lit else None
+
+    def _read(self, path: Path, layer: str | None = None) -> SourceImage:
         if self.raw.takes(path):
             return self.raw.read(path)
         request = self.request
         options = ReadOptions(
-            request.layer,
+            layer or request.layer,
             request.max_pixels or USUAL_MAX_PIXELS,
             request.transfer,
             self.reads_overscan,
@@ -254,9 +274,13 @@ class ImageLoader:
 
         around = source.panorama
         own = enter(loaded.chain, source.pixels, source.margins, depth, source.shot, around)
+        later = source.later
+        if own.margins != source.margins:
+            later = tuple(np.ascontiguousarray(source.margins.cropped(each)) for each in later)
         source = replace(
             source,
             pixels=own.pixels,
+            later=later,
             margins=own.margins,
             depth=own.depth,
             warnings=(*source.warnings, *own.warnings),

@@ -18,12 +18,13 @@ from clpipe.chain.settings import Settings
 from clpipe.images.read import SourceImage
 from clpipe.inputs.find import Job
 from clpipe.reference.geometry import Margins
-from clpipe.stage import StageRole
+from clpipe.stage import Span, StageRole
 from clpipe.stages.shutter import Rows
 
 
 def shutter_of(settings: Settings) -> Rows | None:
-    """The shutter that averages several frames; None where each file is an exposure of its own.
+    """The shutter that has files averaged, or a layer's light flicker; None where files are taken
+    as they are.
 
     Raises:
         RequestError: how many frames it averages is drawn.
@@ -36,7 +37,9 @@ def shutter_of(settings: Settings) -> Rows | None:
             f"{name}.subframes: found a draw; it says how files are grouped, so it is one number"
         )
     shutter = settings.method(name)
-    return shutter if isinstance(shutter, Rows) and shutter.subframes > 1 else None
+    if not isinstance(shutter, Rows):
+        return None
+    return shutter if shutter.subframes > 1 or shutter.layer_of_light else None
 
 
 def exposures(jobs: Sequence[Job], settings: Settings) -> list[Job]:
@@ -49,7 +52,7 @@ def exposures(jobs: Sequence[Job], settings: Settings) -> list[Job]:
         RequestError: there are too few or too many files in a folder, or rows differ.
     """
     shutter = shutter_of(settings)
-    if shutter is None or any(job.subframes for job in jobs):
+    if shutter is None or shutter.subframes == 1 or any(job.subframes for job in jobs):
         return list(jobs)
     count = shutter.subframes
     grouped = []
@@ -71,63 +74,87 @@ def exposures(jobs: Sequence[Job], settings: Settings) -> list[Job]:
     return grouped
 
 
-def average(job: Job, read: Callable[[Path], SourceImage], shutter: Rows) -> SourceImage:
+def average(
+    job: Job,
+    read: Callable[[Path, str | None], SourceImage],
+    shutter: Rows,
+    spans: tuple[Span, ...],
+) -> SourceImage:
     """The exposure of a job: the mean of its frames, for each row over the time that it is exposed.
 
-    One frame is held at a time, beside the sum in float32.
+    One frame is held at a time, beside the sum in float32 of each exposure.
 
     Args:
         job: its files.
-        read: reads one.
+        read: reads one, or a layer of it.
         shutter: which part of each row's exposure a frame stands for; how long that is, the first
             frame may say.
+        spans: of the exposures of a sensor that takes several in a row.
 
     Raises:
         ImageError: one cannot be read, is no picture in linear light, or is of another size.
     """
     found: list[SourceImage] = []
-    total: Floats = np.empty(0, np.float32)
-    weights: Doubles = np.empty(0)
+    totals: Floats = np.empty(0, np.float32)
+    weights: list[tuple[Doubles, Doubles]] = []  # of all, and of more of the light that flickers
     for number, path in enumerate(job.paths):
         with unchanged(path):
-            source = read(path)
+            source = read(path, None)
+            light = read(path, shutter.layer_of_light) if shutter.layer_of_light else None
         pixels = source.pixels
         if pixels.ndim != 3:
             raise ImageError(f"{path}: a mosaic; subframes are averaged of renders")
         if not found:
             time = source.shot.get("exposure_time")
             shutter = shutter.with_defaults(exposure_time=time)
-            weights = weights_of(shutter, len(job.paths), pixels.shape[0], source.margins)
-            total = np.zeros(pixels.shape, np.float32)
-        elif (pixels.shape, source.margins) != (total.shape, found[0].margins):
+            size = len(job.paths), pixels.shape[0], source.margins
+            for each in range(len(spans)):
+                own = shutter.during(spans, each)
+                plain, lit = (weights_of(own, *size, lit=is_lit) for is_lit in (False, True))
+                weights.append((plain, lit - plain))
+            totals = np.zeros((len(spans), *pixels.shape), np.float32)
+        elif (pixels.shape, source.margins) != (totals.shape[1:], found[0].margins):
             raise ImageError(
                 f"{path}: it is {_size(source, pixels)}, and {job.path}, a part of the same "
-                f"exposure, {_size(found[0], total)}"
+                f"exposure, {_size(found[0], totals[0])}"
             )
-        seen = np.flatnonzero(weights[number])
-        if seen.size:
-            rows = slice(int(seen[0]), int(seen[-1]) + 1)
-            total[rows] += weights[number, rows, None, None].astype(np.float32) * pixels[rows]
-        found.append(replace(source, pixels=pixels[:0]))
+        for total, (plain, more) in zip(totals, weights, strict=True):
+            _add(total, plain[number], pixels)
+            if light:
+                _add(total, more[number], light.pixels)
+        warnings = (*source.warnings, *(light.warnings if light else ()))
+        found.append(replace(source, pixels=pixels[:0], warnings=warnings))
+    averaged = replace(found[0], pixels=totals[0], later=tuple(totals[1:]))
+    if len(found) == 1:
+        return averaged
     names = (os.path.relpath(path, job.path.parent) for path in job.paths)
     digests = [source.sha256 for source in found]
     return replace(
-        found[0],
-        pixels=total,
+        averaged,
         sha256=joint_digest(digests),
         warnings=tuple(dict.fromkeys(_warnings(job, found))),
         subframes=tuple(zip(names, digests, strict=True)),
     )
 
 
-def weights_of(shutter: Rows, frames: int, rows: int, margins: Margins) -> Doubles:
-    """The weights of frames for each row, (frame, row).
+def _add(total: Floats, weights: Doubles, pixels: Array) -> None:
+    """Add an image to a sum, times a number for each row."""
+    seen = np.flatnonzero(weights)
+    if seen.size:
+        rows = slice(int(seen[0]), int(seen[-1]) + 1)
+        total[rows] += weights[rows, None, None].astype(np.float32) * pixels[rows]
+
+
+def weights_of(
+    shutter: Rows, frames: int, rows: int, margins: Margins, lit: bool = False
+) -> Doubles:
+    """The weights of frames for each row, (frame, row); see :meth:`Rows.weights`.
 
     Rows beyond the picture are exposed with its first or its last one, as frames last no longer.
     """
     _, height = margins.inside(0, rows)
     in_picture = np.clip(np.arange(rows) - margins.top, 0, height - 1)
-    return shutter.weights(frames, height)[:, in_picture]
+    return shutter.weights(frames, height, lit)[:, in_picture]
 
 
 def _size(source: SourceImage, pixels: Array) -> str:

@@ -6,6 +6,7 @@ import numpy as np
 
 from clpipe.base.types import Doubles
 from clpipe.chain.chain import Chain
+from clpipe.chain.exposures import exposures_of
 from clpipe.images.read import SourceImage
 from clpipe.reference.pose import from_quaternion, to_quaternion
 from clpipe.stage import StageRole
@@ -18,17 +19,18 @@ def motion_records(chain: Chain, source: SourceImage) -> dict[str, Any]:
     """The poses of an exposure's files, and those of its first and last row, as JSON values.
 
     Times are in s from the start of the first row's exposure. Each file stands for an equal part
-    of the time until the last row's ends, and its pose is that of the part's middle; a row's is
-    that of the middle of its own exposure, between these (shortest arc, Shoemake 1985). Nothing
-    where the camera does not move, or no shutter is in the chain.
+    of the time until the last row's last exposure ends, and its pose is that of the part's middle;
+    a row's is that of the middle of its own (first) exposure, between these (shortest arc,
+    Shoemake 1985). Nothing where the camera does not move, or no shutter is in the chain.
     """
     poses, step = chain.settings.render.motion, chain.step_in(StageRole.SHUTTER)
     if poses is None or step is None or not isinstance(step.method, Rows):
         return {}
-    shutter = step.method
+    exposures = exposures_of(chain)
+    shutter = step.method.during(exposures.spans, 0) if exposures else step.method
     _, rows = source.margins.inside(*source.pixels.shape[1::-1])
     readout = float(shutter.times(rows)[-1])
-    span = readout + shutter.time
+    span = shutter.duration(rows)
     times = (np.arange(len(poses)) + 0.5) * span / len(poses)
     moved = [(to_quaternion(r), -np.array(r).T @ np.array(t)) for r, t in poses]
     seen = {"first_row": shutter.time / 2, "last_row": readout + shutter.time / 2}

@@ -1,6 +1,6 @@
 """Parts that several methods have in common: bases to derive from, and a check of window sizes."""
 
-from typing import ClassVar, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -112,6 +112,53 @@ class OfDepth(Method):
 
         Raises:
             RequestError: it cannot.
+        """
+        raise NotImplementedError(type(self).__name__)
+
+
+class Span(NamedTuple):
+    """When an exposure begins, and how long it is, in exposures of the first one."""
+
+    start: float = 0.0
+    length: float = 1.0
+
+    @property
+    def end(self) -> float:
+        """When it ends."""
+        return self.start + self.length
+
+
+class InTime(Method):
+    """A method whose image depends on when it is exposed, see :attr:`Context.light_changes`."""
+
+    def during(self, spans: tuple[Span, ...], number: int) -> Self:
+        """The method for one of several exposures.
+
+        Args:
+            spans: of all of them.
+            number: of the one.
+        """
+        raise NotImplementedError(type(self).__name__)
+
+    @property
+    def layer_of_light(self) -> str:
+        """The layer of the image's file of which it must have the light; "" is none."""
+        return ""
+
+
+class OfExposures(Method):
+    """A method that may make its image of several exposures, one behind the other."""
+
+    @property
+    def spans(self) -> tuple[Span, ...]:
+        """Of the exposures that the (resolved) method is to get; one where all see the same."""
+        raise NotImplementedError(type(self).__name__)
+
+    def with_later(self, images: Floats) -> Self:
+        """The (resolved) method with what all exposures but the first see.
+
+        Args:
+            images: of its kind, (exposure, height, width).
         """
         raise NotImplementedError(type(self).__name__)
 

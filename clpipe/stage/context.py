@@ -50,6 +50,7 @@ class Context:
     colours: Matrix = IDENTITY  # linear sRGB to what red, green and blue are, white-balanced
     noise: NoiseModel | None = None  # of the sensor noise that was added
     full_scale: float = 1.0  # the signal at the white level: above 1 behind several readouts
+    light_changes: bool = False  # while the picture is exposed
     knots: Knots = ()  # of companding, DN to fewer DN; () is none
     optics: Optics = field(default_factory=Optics, compare=False, repr=False)
     clean: bool = False  # the image has no noise, and nothing may follow from what it would have

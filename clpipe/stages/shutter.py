@@ -1,36 +1,46 @@
 """When each row of the sensor sees the scene: a rolling shutter, and lamps that flicker."""
 
-from typing import ClassVar, Self
+from dataclasses import replace
+from typing import Any, ClassVar, Self
 
 import numpy as np
+from pydantic import PrivateAttr
 
 from clpipe.base.types import Doubles, Floats
 from clpipe.camera.optics import USUAL_TIME
 from clpipe.stage import (
     Arguments,
     Context,
+    InTime,
     Kind,
     LineTable,
-    Method,
     Pass,
     ReferenceContext,
+    Span,
     Stage,
     StageRole,
     parameter,
 )
 
 
-class Rows(Method):
+class Rows(InTime):
     """Row y is exposed from y * line_time on, for exposure_time.
 
+    Further exposures of a sensor that staggers them follow in each row, one behind the other.
+
     Light that flickers as 1 + depth cos(2 pi f t + phase) comes, averaged over a row's exposure T,
-    as 1 + depth sinc(f T) cos(2 pi f (y line_time + T / 2) + phase).
+    as 1 + depth sinc(f T) cos(2 pi f (y line_time + T / 2) + phase). With a duty it is pulsed, as
+    an LED's: 1 - depth, and depth / duty more while the fraction of f t + phase / 2 pi is below
+    the duty; a row gets the share of its exposure in which it is on. Both have the mean 1.
 
     >>> from clpipe.stage import run_reference
     >>> banded = Rows(exposure_time=1e-3, line_time=1e-3, flicker_depth=0.5, flicker_frequency=250)
     >>> seen = run_reference(banded, np.ones((5, 1, 3), np.float32))
     >>> [round(float(y), 2) for y in seen[:, 0, 0]]
     [1.32, 0.68, 0.68, 1.32, 1.32]
+    >>> pulsed = Rows(exposure_time=2e-3, line_time=2e-3, flicker_duty=0.25, flicker_frequency=100)
+    >>> [round(float(y), 2) for y in run_reference(pulsed, np.ones((6, 1, 3), np.float32))[:, 0, 0]]
+    [4.0, 1.0, 0.0, 0.0, 0.0, 4.0]
     """
 
     method: ClassVar = "rows"
@@ -39,6 +49,10 @@ class Rows(Method):
     summary: ClassVar = "rows one after the other, or all at once"
     tolerance: ClassVar = 1e-5
     example: ClassVar = {"flicker_depth": 0.4, "line_time": 1e-3, "exposure_time": 4e-3}
+    other_examples: ClassVar = (
+        {"flicker_duty": 0.3, "flicker_frequency": 93.0, "line_time": 1e-3},
+        {"flicker_duty": 0.7, "flicker_frequency": 480.0, "line_time": 3e-4, "flicker_depth": 0.8},
+    )
 
     subframes: int = parameter(
         1,
@@ -63,76 +77,166 @@ class Rows(Method):
         ge=0,
         le=1,
     )
-    flicker_depth: float = parameter(
-        0.0, "How much the light swings about its mean; 0 is steady.", "", ge=0, le=1
+    flicker_depth: float | None = parameter(
+        None,
+        "How much the light swings about its mean, or which share of it is pulsed; 0 is steady.",
+        auto="1 with a duty, else 0",
+        ge=0,
+        le=1,
     )
     flicker_frequency: float = parameter(
-        100.0, "Frequency of the light, twice that of the mains.", "Hz", gt=0, le=1e6
+        100.0, "Frequency of the light, of a lamp twice that of the mains.", "Hz", gt=0, le=1e6
     )
     flicker_phase: float = parameter(
-        0.0, "Phase of the light when the first row's exposure starts.", "degrees", ge=-360, le=360
+        0.0,
+        "Phase of the light when the first row's exposure starts; a pulse begins at 0.",
+        "degrees",
+        ge=-360,
+        le=360,
+    )
+    flicker_duty: float = parameter(
+        0.0,
+        "The share of a period in which a pulsed light, as an LED, is on; 0 swings as a cosine.",
+        ge=0,
+        le=1,
+    )
+    flicker_layer: str = parameter(
+        "",
+        "The layer of the render that has the flickering light alone; without one, all flickers.",
     )
 
+    _span: Span = PrivateAttr(Span())  # of the exposure that it is for
+    _end: float = PrivateAttr(1.0)  # of the last one, in exposures of the first
+
     def resolve(self, context: Context) -> Self:
-        return self.with_optics(context).with_defaults(exposure_time=USUAL_TIME)
+        known = self.with_optics(context).with_defaults(exposure_time=USUAL_TIME)
+        return known.with_defaults(flicker_depth=self.depth)
+
+    def next_context(self, context: Context) -> Context:
+        return replace(context, light_changes=self.subframes > 1 or bool(self.depth))
+
+    @property
+    def depth(self) -> float:
+        """How much the light swings, or which share of it is pulsed."""
+        usual = 1.0 if self.flicker_duty else 0.0
+        return usual if self.flicker_depth is None else self.flicker_depth
+
+    @property
+    def layer_of_light(self) -> str:
+        return self.flicker_layer if self.depth else ""
+
+    def during(self, spans: tuple[Span, ...], number: int) -> Self:
+        other = self.model_copy()
+        other._span, other._end = spans[number], spans[-1].end
+        return other
+
+    @property
+    def _longest(self) -> float:
+        return self.exposure_time or USUAL_TIME
 
     @property
     def time(self) -> float:
         """How long each row is exposed, s."""
-        return self.exposure_time or USUAL_TIME
+        return self._longest * self._span.length
 
     def times(self, rows: int) -> Doubles:
         """When the exposure of each row starts, in s: (row,)."""
-        return np.arange(rows, dtype=np.float64) * self.line_time
+        start = self._longest * self._span.start
+        return np.arange(rows, dtype=np.float64) * self.line_time + start
 
-    def weights(self, frames: int, rows: int) -> Doubles:
+    def duration(self, rows: int) -> float:
+        """From the start of the first row's exposure to the end of the last row's last one, s."""
+        return (rows - 1) * self.line_time + self._longest * self._end
+
+    def weights(self, frames: int, rows: int, lit: bool = False) -> Doubles:
         """The share of each row's exposure that falls to each of some frames: (frame, row).
 
-        The frames follow each other without a gap, from the start of the first row's exposure to
-        the end of the last row's.
+        The frames follow each other without a gap, over all of :meth:`duration`.
+
+        Args:
+            frames, rows: how many there are.
+            lit: of the light that flickers, over its mean; shares then need not add up to 1.
         """
         starts = self.times(rows)
-        bounds = np.linspace(0, starts[-1] + self.time, frames + 1)[:, None]
+        bounds = np.linspace(0, self.duration(rows), frames + 1)[:, None]
         seen = np.clip(bounds, starts, starts + self.time)
-        return np.asarray(np.diff(seen, axis=0) / self.time)
+        shares = np.diff(self._light_until(seen) if lit else seen, axis=0)
+        return np.asarray(shares / self.time)
+
+    def _light_until(self, time: Doubles) -> Doubles:
+        """The light that there was until some times, over its mean, s."""
+        cycles = self.flicker_frequency * time + self.flicker_phase / 360
+        if not self.flicker_duty:
+            light = self.depth * np.sin(2 * np.pi * cycles) / (2 * np.pi)
+        else:
+            on = np.floor(cycles) + np.minimum(cycles % 1 / self.flicker_duty, 1)
+            light = self.depth * (on - cycles)
+        return np.asarray(time + light / self.flicker_frequency)
 
     @property
-    def swing(self) -> np.float32:
+    def cycles(self) -> float:
+        """Periods of the light while a row is exposed."""
+        return self.flicker_frequency * self.time
+
+    @property
+    def swing(self) -> float:
         """The flicker that is left after a row's exposure has averaged it."""
-        if not self.flicker_depth:
-            return np.float32(0)
-        return np.float32(self.flicker_depth * np.sinc(self.flicker_frequency * self.time))
+        if not self.flicker_duty:
+            return self.depth * float(np.sinc(self.cycles))
+        return self.depth * (1 - self.flicker_duty) * (self.cycles % 1) / self.cycles
 
     def passes(self) -> tuple[Pass, ...]:
-        if not self.swing:
+        if not self.swing or self.layer_of_light:  # which was done as the file was read
             return ()
-        given = ("cycles", "start", "swing")
-        return (
-            Pass("flicker_of_rows", LineTable("rows"), given, writes="rows"),
-            Pass("flicker", arguments=("rows",)),
+        table = Pass(
+            "flicker_of_rows", LineTable("rows"), ("step", "start", "swing"), writes="rows"
         )
-
-    @property
-    def cycles(self) -> np.float32:
-        """Periods of the light from a row to the next, less whole ones."""
-        return np.float32(self.flicker_frequency * self.line_time % 1)
-
-    @property
-    def start(self) -> np.float32:
-        """The light's phase in the middle of the first row's exposure, in periods."""
-        middle = self.flicker_frequency * self.time / 2
-        before = self.margins.top * float(self.cycles)  # the picture's first row
-        return np.float32((middle + self.flicker_phase / 360 - before) % 1)
+        if self.flicker_duty:
+            given = ("step", "start", "rest", "duty", "steady", "scale")
+            table = Pass("pulses_of_rows", LineTable("rows"), given, writes="rows")
+        return (table, Pass("flicker", arguments=("rows",)))
 
     def arguments(self, context: Context) -> Arguments:
-        return {"cycles": self.cycles, "start": self.start, "swing": self.swing}
+        step = self.flicker_frequency * self.line_time % 1
+        start = self.flicker_frequency * self._longest * self._span.start
+        start += self.flicker_phase / 360 - self.margins.top * step  # the picture's first row
+        if not self.flicker_duty:
+            middle = np.float32((start + self.cycles / 2) % 1)
+            return {"step": np.float32(step), "start": middle, "swing": np.float32(self.swing)}
+        whole = float(np.floor(self.cycles))
+        return {
+            "step": _turn(step),
+            "start": _turn(start),
+            "rest": np.float32(self.cycles - whole),
+            "duty": np.float32(self.flicker_duty),
+            "steady": np.float32(1 - self.depth + self.depth * whole / self.cycles),
+            "scale": np.float32(self.depth / self.flicker_duty / self.cycles),
+        }
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        if not self.swing:
+        if not self.passes():
             return image
-        turns = np.arange(image.shape[0], dtype=np.float32) * self.cycles + self.start
-        gains = 1 + self.swing * np.cos(2 * np.pi * turns.astype(np.float64))
-        return image * gains.astype(np.float32)[:, None, None]
+        n: Any = self.arguments(given.context)
+        rows = np.arange(image.shape[0], dtype=np.uint32)
+        if not self.flicker_duty:
+            turns = rows.astype(np.float32) * n["step"] + n["start"]
+            gains = (1 + n["swing"] * np.cos(2 * np.pi * turns.astype(np.float64))).astype("f4")
+        else:
+            begins = ((rows * n["step"] + n["start"]) >> 8).astype(np.float32) * np.float32(2**-24)
+            ends, zero, one = begins + n["rest"], np.float32(0), np.float32(1)
+            first = np.minimum(ends, n["duty"]) - begins
+            second = np.minimum(ends, one + n["duty"]) - one
+            gains = n["steady"] + n["scale"] * (np.maximum(first, zero) + np.maximum(second, zero))
+        return image * gains[:, None, None]
+
+
+def _turn(cycles: float) -> np.uint32:
+    """What is left of whole periods, in 2^-32 of one: its sums stay exact.
+
+    >>> int(_turn(-2.75)) == 2**30
+    True
+    """
+    return np.uint32(round(cycles % 1 * 2**32) % 2**32)
 
 
 STAGE = Stage(

@@ -4,13 +4,10 @@ from clpipe.stage import Kind, Stage
 from clpipe.stages.sensor_noise.gaussian import Gaussian
 from clpipe.stages.sensor_noise.no_noise import NoNoise
 from clpipe.stages.sensor_noise.poisson import Poisson
-from clpipe.stages.sensor_noise.readouts import (
-    DualGain,
-    SplitDualGain,
-    SplitPixel,
-    Staggered,
-)
+from clpipe.stages.sensor_noise.readouts import DualGain
 from clpipe.stages.sensor_noise.skewed_gaussian import SkewedGaussian
+from clpipe.stages.sensor_noise.split_pixel import SplitDualGain, SplitPixel
+from clpipe.stages.sensor_noise.staggered import Staggered
 
 STAGE = Stage(
     "sensor_noise",

@@ -38,7 +38,7 @@ class Gaussian(SensorNoise):
         names = ("a", "full_well", "read_noise", "shape", "scale")
         return (Pass(of_tukey, arguments=names, random=NoiseScope.IMAGE),)
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
         if self.tukey_lambda is None:  # here a negative signal lowers the variance below b
             return np.maximum(self.own_variance(signal), np.float32(0)) + before
         return super().variance(before, signal, context)

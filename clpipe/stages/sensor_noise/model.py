@@ -178,7 +178,7 @@ class SensorNoise(Method):
         """The signal at which the well is full; None without a full well, or where a is 0."""
         return self.full_well * self.a if self.full_well and self.a else None
 
-    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats:
+    def variance(self, before: Floats, signal: Floats, context: Context) -> Floats | None:
         """a*y + b, y clipped to 0..full well; that a full well cuts the noise is not modelled."""
         return self.own_variance(np.maximum(signal, np.float32(0))) + before
 

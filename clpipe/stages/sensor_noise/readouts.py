@@ -26,7 +26,6 @@ from clpipe.stages.sensor_noise.model import SensorNoise
 from clpipe.stages.sensor_noise.no_noise import NoNoise
 
 RATIO = 16.0  # of a sensor that does not say its own
-LIGHT_RATIO = 100.0  # of its photodiodes
 MOST = 4  # readouts
 ENDS, STEEP = np.float32(0.95), np.float32(10.0)  # of a hand-over, which begins at 0.85
 
@@ -36,17 +35,19 @@ class Readout(NamedTuple):
 
     Args:
         photodiode: its number; readings of one have the same charge.
-        share: of the light that it sees, over the first one's.
+        share: of the light that it sees, over the first one's, as the merging takes it.
         gain: over the first reading's.
+        leak: what leaks into it of the first one's light, which the merging knows nothing of.
     """
 
     photodiode: int
     share: float
     gain: float
+    leak: float = 0.0
 
     @property
     def sensitivity(self) -> float:
-        """Its signal over the first reading's."""
+        """Its signal over the first reading's, as the merging takes it."""
         return self.share * self.gain
 
 
@@ -86,6 +87,8 @@ class Readouts(SensorNoise):
     )
 
     _range: float = PrivateAttr(1.0)  # of the camera, DN
+    _full: float | None = PrivateAttr(None)  # the signal that fills the well, without noise
+    _is_clean: bool = PrivateAttr(False)  # merges readouts that have no noise
 
     @property
     def readouts(self) -> tuple[Readout, ...]:
@@ -114,11 +117,39 @@ class Readouts(SensorNoise):
         return super().next_context(context).but(full_scale=self.full_scale)
 
     def passes(self) -> tuple[Pass, ...]:
-        names = ("count", "part", "a", "full_well", "range", "unit", "table")
-        return (Pass("readouts", arguments=names, random=NoiseScope.IMAGE),)
+        function, *further = self.function
+        if self._is_clean:
+            names = ("count", "part", "full_well", "table", *further)
+            return (Pass(f"clean_{function}", arguments=names),)
+        names = ("count", "part", "a", "full_well", "range", "unit", "table", *further)
+        return (Pass(function, arguments=names, random=NoiseScope.IMAGE),)
+
+    @property
+    def function(self) -> tuple[str, ...]:
+        """The kernel function, and what it takes beside the readouts."""
+        return ("readouts",)
+
+    def seen(self, image: Floats, photodiode: int) -> Floats:
+        """What one of the photodiodes sees of an image, over the light of the first one."""
+        return image
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether readouts without noise, merged, are the light up to the last one's white."""
+        return self.part is None and not any(each.leak for each in self.readouts)
 
     def without_noise(self) -> Method | None:
-        return NoNoise(full_signal=self.full_scale)
+        if self._is_clean:
+            return self
+        if self.is_exact:
+            return NoNoise(full_signal=self.full_scale)
+        own = self.model_copy(update={"a": 0.0, "b": 0.0, "tukey_lambda": None})
+        own._full, own._is_clean = self.full_signal, True
+        return own
+
+    @property
+    def full_signal(self) -> float | None:
+        return self._full if self._is_clean else super().full_signal
 
     def numbers(self) -> dict[str, np.float32]:
         return {
@@ -142,15 +173,17 @@ class Readouts(SensorNoise):
     def own_variance(self, signal: Floats) -> Floats:
         left, read = np.ones_like(signal), np.zeros_like(signal)
         of_charges: dict[int, tuple[Floats, Floats]] = {}  # weight and shot noise by photodiode
-        for i, (each, row) in enumerate(zip(self.readouts, self.table, strict=True)):
+        readouts = self.readouts
+        for i, (each, row) in enumerate(zip(readouts, self.table, strict=True)):
             if self.part is None:
-                is_last = each is self.readouts[-1]
+                is_last = i == len(readouts) - 1
                 own = left if is_last else left * self._weight(signal * row[1] * row[2])
                 left = left - own
             else:
                 own = np.full_like(signal, i == self.part)
             weight = of_charges.get(each.photodiode, (np.zeros_like(signal), left))[0] + own
-            of_charges[each.photodiode] = weight, np.float32(self.a) * signal / row[1]
+            light, scale = signal * row[1], row[2] * row[3]
+            of_charges[each.photodiode] = weight, np.float32(self.a) * light * scale**2
             read = read + own**2 * row[4] * row[3] ** 2
         shot = sum(weight**2 * variance for weight, variance in of_charges.values())
         return np.asarray(shot + read, np.float32)
@@ -161,19 +194,24 @@ class Readouts(SensorNoise):
         return np.minimum(np.maximum((ENDS - read) * STEEP, np.float32(0)), np.float32(1))
 
     def reference(self, image: Floats, given: ReferenceContext) -> Floats:
-        n, stream = self.numbers(), given.stream[NoiseScope.IMAGE]
+        def normals(draw: int) -> Floats:
+            return normal_at(image.shape, draw, given.stream[NoiseScope.IMAGE])
+
+        n = self.numbers()
         values, weights = [], []
         photodiode, charge = -1, image
         for i, (number, share, gain, inverse, variance) in enumerate(self.table):
             if int(number) != photodiode:
-                photodiode, light = int(number), image * share
-                shot = square_root(np.maximum(n["a"] * light, np.float32(0)))
-                noisy = light + normal_at(image.shape, photodiode, stream) * shot
-                charge = np.minimum(noisy, n["full_well"])
-            noise = normal_at(image.shape, MOST + i, stream) * square_root(
-                np.full(image.shape, variance, np.float32)
-            )
-            read = np.rint((charge * gain + noise) * n["range"]) * n["unit"]
+                photodiode, light = int(number), self.seen(image, int(number)) * share
+                if not self._is_clean:
+                    shot = square_root(np.maximum(n["a"] * light, np.float32(0)))
+                    light = light + normals(photodiode) * shot
+                charge = np.minimum(light, n["full_well"])
+            read = charge * gain
+            if not self._is_clean:
+                sigma = square_root(np.full(image.shape, variance, np.float32))
+                noise = normals(MOST + i) * sigma
+                read = np.rint((read + noise) * n["range"]) * n["unit"]
             read = np.minimum(read, np.float32(1))
             values.append(read * inverse)
             weights.append(self._weight(read))
@@ -188,7 +226,13 @@ class Readouts(SensorNoise):
 @lru_cache(maxsize=256)  # one object for the same readouts, so that it is uploaded once
 def _table(readouts: tuple[Readout, ...], first: float, later: float) -> Floats:
     rows = [
-        (*each, 1 / each.sensitivity, later if number else first)
+        (
+            each.photodiode,
+            each.share + each.leak,
+            each.gain,
+            1 / each.sensitivity,
+            later if number else first,
+        )
         for number, each in enumerate(readouts)
     ]
     return np.array(rows, np.float32)
@@ -214,72 +258,3 @@ class DualGain(Readouts):
     def readouts(self) -> tuple[Readout, ...]:
         assert self.ratio is not None
         return Readout(0, 1, 1), Readout(0, 1, 1 / self.ratio)
-
-
-class SplitPixel(Readouts):
-    """Split pixels: a large and a small photodiode, of which the small one sees 1/``ratio``."""
-
-    method: ClassVar = "split_pixel"
-    summary: ClassVar = "a large and a small photodiode in each pixel, merged"
-
-    @property
-    def readouts(self) -> tuple[Readout, ...]:
-        assert self.ratio is not None
-        return Readout(0, 1, 1), Readout(1, 1 / self.ratio, 1)
-
-
-class SplitDualGain(Readouts):
-    """Split pixels whose photodiodes are both read at two gains, ``ratio`` apart: four readouts.
-
-    The least sensitive reading of the large photodiode is to reach further than the most sensitive
-    one of the small, so ``light_ratio`` is above ``ratio``.
-    """
-
-    method: ClassVar = "split_dual_gain"
-    summary: ClassVar = "a large and a small photodiode, each read at two gains, merged"
-
-    light_ratio: float | None = parameter(
-        None,
-        "The light that the large photodiode sees over that of the small.",
-        auto="from the camera; else 100",
-        gt=1,
-        le=10_000,
-    )
-
-    def with_camera(self, camera: Camera) -> Self:
-        own = super().with_camera(camera).with_defaults(light_ratio=camera.photodiode_ratio)
-        own = own.with_defaults(light_ratio=LIGHT_RATIO)
-        assert own.light_ratio is not None and own.ratio is not None
-        if own.light_ratio <= own.ratio:
-            raise RequestError(
-                f"sensor_noise.light_ratio: found {own.light_ratio:g}; it is above that of the "
-                f"gains, {own.ratio:g}"
-            )
-        return own
-
-    @property
-    def readouts(self) -> tuple[Readout, ...]:
-        assert self.ratio is not None and self.light_ratio is not None
-        return tuple(
-            Readout(number, share, gain)
-            for number, share in enumerate((1, 1 / self.light_ratio))
-            for gain in (1, 1 / self.ratio)
-        )
-
-
-class Staggered(Readouts):
-    """Staggered exposures (DOL): 2 to 4 in a row, each ``ratio`` times shorter than the one before.
-
-    All see the same scene: motion between them is not modelled.
-    """
-
-    method: ClassVar = "staggered"
-    summary: ClassVar = "two to four exposures, each shorter than the one before, merged"
-    other_examples: ClassVar = ({"count": 4},)
-
-    count: int = parameter(3, "How many exposures there are.", structural=True, ge=2, le=MOST)
-
-    @property
-    def readouts(self) -> tuple[Readout, ...]:
-        assert self.ratio is not None
-        return tuple(Readout(i, self.ratio**-i, 1) for i in range(self.count))

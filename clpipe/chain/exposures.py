@@ -1,0 +1,84 @@
+"""Chains that make a picture of several exposures, between which the light changes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from clpipe.base.errors import RequestError
+from clpipe.base.types import Floats
+from clpipe.chain.chain import Chain, Step
+from clpipe.stage import InTime, OfExposures, Reduction, Span
+
+
+@dataclass(frozen=True)
+class Exposures:
+    """The exposures of a chain.
+
+    Args:
+        chain: the chain.
+        place: of the step that merges them.
+        spans: when each of them is.
+    """
+
+    chain: Chain
+    place: int
+    spans: tuple[Span, ...]
+
+    @property
+    def step(self) -> Step:
+        """The step that merges them."""
+        return self.chain.steps[self.place]
+
+    @cached_property
+    def later(self) -> tuple[Chain, ...]:
+        """What all exposures but the first go through, up to that step."""
+        return tuple(self._before(number) for number in range(1, len(self.spans)))
+
+    def _before(self, number: int) -> Chain:
+        steps = tuple(
+            replace(step, method=step.method.during(self.spans, number))
+            if isinstance(step.method, InTime)
+            else step
+            for step in self.chain.steps[: self.place]
+        )
+        return replace(self.chain, steps=steps)
+
+    def merging(self, images: Sequence[Floats]) -> Chain:
+        """The chain with what all exposures but the first became in :attr:`later`."""
+        method = self.step.method
+        assert isinstance(method, OfExposures)
+        own = replace(self.step, method=method.with_later(np.stack(images)))
+        before, after = self.chain.steps[: self.place], self.chain.steps[self.place + 1 :]
+        return replace(self.chain, steps=(*before, own, *after))
+
+
+def exposures_of(chain: Chain) -> Exposures | None:
+    """The exposures of a chain; None where it has one, or the light does not change."""
+    for place, step in enumerate(chain.steps):
+        if isinstance(step.method, OfExposures) and len(step.method.spans) > 1:
+            return Exposures(chain, place, step.method.spans)
+    return None
+
+
+def check_exposures(chain: Chain) -> None:
+    """See that each exposure of a chain can go through it by itself.
+
+    Raises:
+        RequestError: it cannot.
+    """
+    if not (exposures := exposures_of(chain)):
+        return
+    first, merging = chain.steps[0], exposures.step
+    if first.context.light_changes:
+        raise RequestError(
+            f"{merging.name}: each of its exposures sees another moment, but an image that enters "
+            f"at {first.name} is that of one; start earlier, or leave subframes and flicker out"
+        )
+    for step in chain.steps[: exposures.place]:
+        if any(isinstance(each.access, Reduction) for each in step.method.passes()):
+            raise RequestError(
+                f"{step.name}.method={step.method.method}: it would measure each of the exposures "
+                f"of {merging.name} by itself; take another method, such as gain with an ev"
+            )

@@ -1,0 +1,89 @@
+"""Split pixels: each has a large and a small photodiode."""
+
+from typing import ClassVar, Self
+
+from clpipe.base.errors import RequestError
+from clpipe.camera.profile import Camera
+from clpipe.stage import parameter
+from clpipe.stages.sensor_noise.readouts import Readout, Readouts
+
+LIGHT_RATIO = 100.0  # of a sensor that does not say its own
+
+
+class Split(Readouts):
+    """Pixels of a large and a small photodiode, side by side.
+
+    Of the light under the large one a share ``crosstalk`` makes charge in the small one, which then
+    collects 1/ratio + crosstalk of what the large one does. The merging multiplies by the ratio all
+    the same, so a ramp of light steps up by the factor 1 + crosstalk * ratio where the small one
+    takes over. What the large one loses is in its figures already.
+    """
+
+    crosstalk: float | None = parameter(
+        None,
+        "Charge that leaks into the small photodiode, over that of the large one.",
+        "",
+        "from the camera; else 0",
+        ge=0,
+        le=0.5,
+    )
+
+    def with_camera(self, camera: Camera) -> Self:
+        own = super().with_camera(camera)
+        return own.with_defaults(crosstalk=camera.photodiode_crosstalk).with_defaults(crosstalk=0.0)
+
+
+class SplitPixel(Split):
+    """Split pixels: a large and a small photodiode, of which the small one sees 1/``ratio``.
+
+    >>> from clpipe.stage import run_reference
+    >>> leaky = SplitPixel(a=0.0, b=0.0, ratio=10.0, crosstalk=0.01)
+    >>> run_reference(leaky, np.float32([[0.5, 2.0]])).astype(float).round(2).tolist()
+    [[0.5, 2.2]]
+    """
+
+    method: ClassVar = "split_pixel"
+    summary: ClassVar = "a large and a small photodiode in each pixel, merged"
+    other_examples: ClassVar = ({"crosstalk": 0.01},)
+
+    @property
+    def readouts(self) -> tuple[Readout, ...]:
+        assert self.ratio is not None
+        return Readout(0, 1, 1), Readout(1, 1 / self.ratio, 1, self.crosstalk or 0.0)
+
+
+class SplitDualGain(Split):
+    """Split pixels whose photodiodes are both read at two gains, ``ratio`` apart: four readouts.
+
+    The least sensitive reading of the large photodiode is to reach further than the most sensitive
+    one of the small, so ``light_ratio`` is above ``ratio``.
+    """
+
+    method: ClassVar = "split_dual_gain"
+    summary: ClassVar = "a large and a small photodiode, each read at two gains, merged"
+
+    light_ratio: float | None = parameter(
+        None,
+        "The light that the large photodiode sees over that of the small.",
+        auto="from the camera; else 100",
+        gt=1,
+        le=10_000,
+    )
+
+    def with_camera(self, camera: Camera) -> Self:
+        own = super().with_camera(camera).with_defaults(light_ratio=camera.photodiode_ratio)
+        own = own.with_defaults(light_ratio=LIGHT_RATIO)
+        assert own.light_ratio is not None and own.ratio is not None
+        if own.light_ratio <= own.ratio:
+            raise RequestError(
+                f"sensor_noise.light_ratio: found {own.light_ratio:g}; it is above that of the "
+                f"gains, {own.ratio:g}"
+            )
+        return own
+
+    @property
+    def readouts(self) -> tuple[Readout, ...]:
+        assert self.ratio is not None and self.light_ratio is not None
+        gains, leak = (1, 1 / self.ratio), self.crosstalk or 0.0
+        large = (Readout(0, 1, gain) for gain in gains)
+        return *large, *(Readout(1, 1 / self.light_ratio, gain, leak) for gain in gains)
