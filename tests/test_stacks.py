@@ -13,7 +13,8 @@ from clpipe.engine.check import check_stack, example
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.options import RunOptions
-from clpipe.engine.runner import Result, Runner, Submission, cut_out, submit_together
+from clpipe.engine.runner import Result, Runner, cut_out
+from clpipe.engine.submission import Submission, submit_together
 from clpipe.stage import Kind
 
 # Of each kind of launch: lines, stencils, sums, a histogram, a resampling, a mosaic with a period.

@@ -18,7 +18,8 @@ from clpipe.chain.truth import noisy_mosaic, picture_without_noise
 from clpipe.dataset.arrays import HIGHEST, ArrayFormat
 from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions
-from clpipe.engine.runner import Result, Runner, Submission, submit_together
+from clpipe.engine.runner import Result, Runner
+from clpipe.engine.submission import Submission, submit_together
 from clpipe.images.read import SourceImage
 from clpipe.outputs.patches import Patch, Patches, facts_of, pattern_of, variance_at, variance_steps
 from clpipe.stage import Kind

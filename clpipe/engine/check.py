@@ -12,7 +12,8 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
-from clpipe.engine.runner import Runner, Submission, submit_together
+from clpipe.engine.runner import Runner
+from clpipe.engine.submission import Submission, submit_together
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.stage import PERIOD, Kind, Method, Stage, variant_label, variants
 

@@ -1,7 +1,7 @@
 """One image through a chain, on a device or in NumPy."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
@@ -29,11 +29,10 @@ from clpipe.engine.ops import chain_ops
 from clpipe.engine.options import RunOptions
 from clpipe.engine.plan import make_plan
 from clpipe.engine.programs import announced
+from clpipe.engine.submission import DEFAULTS, Submission, check_resamplings, submit_together
 from clpipe.reference.curve import compose, to_8_bit
 from clpipe.reference.random import Stream
 from clpipe.stage import NoiseScope, ReferenceContext, Resample
-
-DEFAULTS = RunOptions()
 
 
 @dataclass(frozen=True)
@@ -84,78 +83,6 @@ def is_planar(image: Array) -> bool:
 def cut_out(image: Array, boxes: Sequence[Box]) -> Array:
     """Parts of an image, all of one size, behind each other: (patch, height, width[, channel])."""
     return np.stack([image[box.top : box.bottom, box.left : box.right] for box in boxes])
-
-
-def check_resamplings(plan: Plan, width: int, height: int) -> None:
-    """See that an image of that size can be resampled as a plan does.
-
-    Raises:
-        ImageError: it cannot, as a lens would fold it over.
-    """
-    for resampling, size in zip(plan.resamplings, plan.sizes(width, height), strict=False):
-        resampling.values(*size)
-
-
-@dataclass(frozen=True)
-class Submission:
-    """An image that is to be put through a runner; see :meth:`Runner.submit`."""
-
-    runner: "Runner"
-    image: Array
-    noise_key: str
-    options: RunOptions = DEFAULTS
-
-    def merging(self) -> "Submission":
-        """The same with all exposures but the first done, where the chain has several."""
-        runner = self.runner.merging(self.image, self.noise_key, self.options.later)
-        if runner is self.runner:
-            return self
-        return replace(self, runner=runner, options=replace(self.options, later=()))
-
-
-def submit_together(submissions: Sequence[Submission]) -> list[Callable[[], Result]]:
-    """Enqueue images, and small ones of alike chains in common launches.
-
-    Returns:
-        What waits for the result of each and gives it, called once and in order.
-
-    Raises:
-        ImageError, DeviceFailedError, DeviceError: as :meth:`Runner.submit`.
-    """
-    waiting: dict[int, Callable[[], Result]] = {}
-    groups: dict[tuple[int, Plan], list[tuple[int, Submission, Plan]]] = {}
-    for number, asked in enumerate(submissions):
-        asked.runner.check(asked.image, asked.options)
-        each = asked.merging()
-        if alone := each.runner.without_device(each.image, each.noise_key, each.options):
-            waiting[number] = alone
-        else:
-            plan = each.runner.plan_for(each.image)
-            check_resamplings(plan, *each.image.shape[1::-1])
-            key = id(each.runner.device), plan.unscaled
-            groups.setdefault(key, []).append((number, each, plan))
-    for group in groups.values():
-        waiting |= zip((number for number, *_ in group), _begin(group), strict=True)
-    return [waiting[number] for number in range(len(submissions))]
-
-
-def _begin(group: Sequence[tuple[int, Submission, Plan]]) -> list[Callable[[], Result]]:
-    """Enqueue images of one device, whose plans have the same kernels."""
-    device = group[0][1].runner.device
-    assert device
-    images = [
-        (plan, each.image, each.runner._bind(plan, each.image, each.noise_key), each.options)
-        for _, each, plan in group
-    ]
-    if results := device.submit_together(images):
-        return [
-            each.runner._waiting(plan, each.image, result)
-            for (_, each, plan), result in zip(group, results, strict=True)
-        ]
-    return [
-        each.runner.submit_alone(plan, each.image, each.noise_key, each.options)
-        for _, each, plan in group
-    ]
 
 
 class Runner:
@@ -358,7 +285,7 @@ class Runner:
                     f"{last[0]}x{last[1]}; patches are cut of images of one size"
                 )
 
-    def _bind(self, plan: Plan, image: Array, noise_key: str) -> Bind:
+    def bind(self, plan: Plan, image: Array, noise_key: str) -> Bind:
         """What gives the values of the kernels' parameters for an image."""
         keys: dict[str, dict[NoiseScope, Stream]] = {}
         sizes = plan.sizes(*image.shape[1::-1])
@@ -383,10 +310,10 @@ class Runner:
     ) -> Callable[[], Result]:
         """Enqueue an image for a plan, by itself."""
         assert self.device
-        results = self.device.submit(plan, image, self._bind(plan, image, noise_key), options)
-        return self._waiting(plan, image, results)
+        results = self.device.submit(plan, image, self.bind(plan, image, noise_key), options)
+        return self.waiting(plan, image, results)
 
-    def _waiting(
+    def waiting(
         self, plan: Plan, image: Array, results: Callable[[], HostImages]
     ) -> Callable[[], Result]:
         """What waits for the results that a device makes of an image, and gives them."""
