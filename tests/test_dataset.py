@@ -9,11 +9,13 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from PIL import Image
 
 import clpipe as api
 from clpipe.base.errors import DeviceError, ImageError, RequestError
+from clpipe.dataset import dataset as module
 from clpipe.dataset.samples import SampleLoader
 from tests.conftest import same_samples as same
 
@@ -163,6 +165,39 @@ def test_a_damaged_image_is_skipped_where_that_is_asked_for(renders):
         api.Dataset(renders, iso=ISO)
     with pytest.warns(UserWarning, match="in/r2.exr: damaged, .*; left out"):
         assert len(api.Dataset(renders, iso=ISO, on_error="skip")) == 4
+
+
+def test_samples_of_a_batch_go_through_together_and_are_the_same(renders, monkeypatch):
+    drawn = {"iso": {"log_uniform": [400, ISO]}, "patch": api.Patches(16, 4), "raw": "packed"}
+    samples = api.Dataset(renders, **drawn, on_error="skip")
+    numbers = [0, 7, 5, 18, 2, 13, 8]  # of two sizes of renders, each with an ISO of its own
+    alone = [samples[number] for number in numbers]
+    sizes, launch = [], cl.enqueue_nd_range_kernel
+
+    def launched(queue, kernel, size, *rest, **options):
+        sizes.append(tuple(size))
+        return launch(queue, kernel, size, *rest, **options)
+
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
+    for one, two in zip(samples.__getitems__(numbers), alone, strict=True):
+        same(one, two)
+    assert {size[2:] for size in sizes} == {(7,)}
+    in_order = list(samples)
+    for number, one in zip(numbers, alone, strict=True):
+        same(in_order[number], one)
+    monkeypatch.setattr(module, "MOST_PIXELS", 300)  # two patches
+    sizes.clear()
+    for one, two in zip(samples.__getitems__(numbers), alone, strict=True):
+        same(one, two)
+    assert {size[2:] for size in sizes} <= {(2,), ()}
+    data = Path("in/r1.exr").read_bytes()
+    Path("in/r1.exr").write_bytes(data[: len(data) // 2])
+    again = api.Dataset(renders, **drawn, on_error="skip")
+    with pytest.warns(UserWarning, match="skipped: in/r1.exr"):
+        found = again.__getitems__([0, 5, 18])
+    same(found[0], alone[0])
+    same(found[2], alone[3])
+    assert found[1]["key"] == "r2.exr"
 
 
 def test_what_is_refused(renders):

@@ -34,13 +34,20 @@ if TYPE_CHECKING:
 
 
 PATCHES = 16  # with draws of their own that are begun together, in order
-TOGETHER = 2**27  # bytes of renders that are held for samples which are developed together
+# Samples are developed together until these are reached: bytes of renders, of which those of a
+# shuffled dataset all differ, and pixels of samples, of which more would only wait in memory.
+MOST_BYTES = 2**27
+MOST_PIXELS = 2**21
 
 
-def held_by(read: Sequence[tuple[SampleBatch, LoadedImage, Sample]]) -> int:
-    """The bytes of the renders that were read, each counted once."""
-    sources = {id(loaded.source.pixels): loaded.source.pixels.nbytes for _, loaded, _ in read}
-    return sum(sources.values())
+def are_enough(read: Sequence[tuple[SampleBatch, LoadedImage, Sample]], side: int | None) -> bool:
+    """Whether so many batches are developed together, whose patches have such sides, in px."""
+    sources = {id(loaded.source.pixels): loaded.source.pixels for _, loaded, _ in read}.values()
+    if side:
+        pixels = sum(len(batch.numbers) for batch, *_ in read) * side**2
+    else:
+        pixels = sum(each.shape[0] * each.shape[1] for each in sources)
+    return pixels >= MOST_PIXELS or sum(each.nbytes for each in sources) >= MOST_BYTES
 
 
 class Dataset(ReadOnly):
@@ -284,6 +291,7 @@ class Dataset(ReadOnly):
 
         What fails together is made alone, which says why. Errors as :meth:`_made`.
         """
+        side = self._patches.size if self._patches else None
         pending: list[tuple[int, int, Sequence[int]]] = []
         read: list[tuple[SampleBatch, LoadedImage, Sample]] = []
         for last, each in enumerate(asked, 1 - len(asked)):
@@ -291,8 +299,7 @@ class Dataset(ReadOnly):
             batch = self._batch(*each)
             with suppress(ImageError):
                 read.append((batch, *self._loader.read(batch)))
-            # Of a shuffled dataset each may be of another render.
-            if last and len(read) == len(pending) and held_by(read) < TOGETHER:
+            if last and len(read) == len(pending) and not are_enough(read, side):
                 continue
             begun: list[Callable[[], list[Sample]]] = []
             if len(read) == len(pending):
