@@ -282,7 +282,7 @@ def test_edges_are_interpolated_along_themselves(shared_data):
 
 @pytest.mark.parametrize("angle", [0, 45, 90, 135])
 def test_stripes_of_any_direction_stay(angle):
-    """Gray stripes of 4 px: linear filters of quad arrays make zippers of them."""
+    """Gray stripes of 4 px, the period of quad arrays: linear filters make zippers of them."""
     y, x = np.indices((48, 48))
     across = x * np.sin(np.radians(angle)) - y * np.cos(np.radians(angle))
     stripes = np.repeat(0.5 + 0.4 * np.sin(across * np.pi / 2)[..., None], 3, axis=2)
@@ -327,6 +327,39 @@ def test_cells_are_binned_to_a_bayer_pattern(device):
     assert green[1].std() == pytest.approx(green[0].std() / 2, rel=0.06)  # a mean of four
     noise = chain.step_named("demosaic").context.noise
     assert noise.a == pytest.approx(chain.camera.noise(800).a / 4)
+
+
+def test_charge_is_read_once_where_it_is_binned_before_the_noise(device):
+    """The sum of four pixels: the shot noise is the same, the read noise that of one or of four."""
+    light, a, b = 0.05, 1e-3, 2e-4
+    noise = {"method": "gaussian", "a": a, "b": b}
+    variance = {}
+    for binned, stages, signal in (
+        ("charge", ["mosaic", "remosaic", "sensor_noise"], 4 * light),
+        ("DN", ["mosaic", "sensor_noise", "remosaic"], light),
+    ):
+        chain = on("quad-RGGB", stages=stages, remosaic={"method": "binning"}, sensor_noise=noise)
+        flat = np.full((400, 400, 3), signal, np.float32)
+        cells = Runner(chain, device, encode=False, final=True).run(flat, "charge").final
+        total = cells * (4 * light / signal)
+        assert total.mean() == pytest.approx(4 * light, rel=2e-3)
+        variance[binned] = total.var()
+    assert variance["charge"] == pytest.approx(4 * light * a + b, rel=0.03)
+    assert variance["DN"] == pytest.approx(4 * light * a + 4 * b, rel=0.03)
+
+
+def test_a_cell_of_charge_saturates_as_one_readout(develop):
+    stages = [*DEFAULT_CHAIN]
+    stages.insert(stages.index("mosaic") + 1, "remosaic")
+    light = np.full((16, 16, 3), 0.3, np.float32)
+    options = {"mosaic": laid("quad-RGGB"), "remosaic": {"method": "binning"}, "skip": ["noise"]}
+    result = develop(
+        light, numpy=True, stages=stages, keep=("normalize",), exposure={"ev": 3}, **options
+    )
+    kept = result.kept["normalize"]
+    assert kept.shape == (8, 8)
+    assert kept[0::2, 1::2] == pytest.approx(1)  # green has 1.2 of its white
+    assert (kept[0::2, 0::2] < 0.5).all()  # red has not
 
 
 @pytest.mark.parametrize(
