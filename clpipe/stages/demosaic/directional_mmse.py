@@ -37,7 +37,8 @@ def tables(array: FilterArray) -> tuple[Floats, Floats]:
 class DirectionalMmse(Method):
     """Linear filters of 7x7 under eight models of images: longer along the row, the column or a
     diagonal, with little colour or much. At each pixel each counts by how well it foretells the
-    samples around, so edges are interpolated along themselves.
+    samples around, so edges are interpolated along themselves. A sample of red, green or blue is
+    kept up to rounding.
     """
 
     method: ClassVar = "directional_mmse"
