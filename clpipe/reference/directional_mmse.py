@@ -80,7 +80,7 @@ def errors(mosaic: Floats, array: FilterArray) -> Floats:
 def trust(squared: Floats) -> Floats:
     """How much each model counts, (height, width, model), from :func:`errors`; the sum is 1.
 
-    >>> trust(np.float32([[[0.01, 0.02]]])).round(3).tolist()
+    >>> trust(np.float32([[[0.01, 0.02]]])).astype(float).round(3).tolist()
     [[[0.941, 0.059]]]
     """
     height, width = squared.shape[:2]
