@@ -18,6 +18,7 @@ from clpipe.engine.runner import Runner
 from clpipe.images.raw import read_facts, read_raw
 from clpipe.images.read import read_image
 from clpipe.pipeline import Pipeline
+from clpipe.reference.directional_mmse import directional_mmse
 from clpipe.reference.filter_array import NAMED, beyond, parse_array, tiled
 from clpipe.reference.linear_mmse import linear_mmse
 from clpipe.stages import DEFAULT_CHAIN
@@ -96,9 +97,17 @@ def test_the_raw_is_the_same_bit_for_bit(device, scalar_device, array):
         assert (found.largest, found.differing) == (0, 0)
 
 
-@pytest.mark.parametrize("array", ["x-trans", "RGB/GBR/BRG"])
-def test_tiles_and_patches_have_the_bits_of_the_whole(device, monkeypatch, array):
-    chain = on(array, stages=["mosaic", "inverse_white_balance", "white_balance", "demosaic"])
+@pytest.mark.parametrize(
+    ("array", "method"),
+    [
+        ("x-trans", "linear_mmse"),
+        ("RGB/GBR/BRG", "linear_mmse"),
+        ("x-trans", "directional_mmse"),
+    ],
+)
+def test_tiles_and_patches_have_the_bits_of_the_whole(device, monkeypatch, array, method):
+    stages = ["mosaic", "inverse_white_balance", "white_balance", "demosaic"]
+    chain = on(array, stages=stages, demosaic={"method": method})
     image = np.random.default_rng(3).random((203, 310, 3)).astype(np.float16)
     runner = Runner(chain, device, keep=("mosaic",), encode=False, final=True)
     _, count = in_tiles(runner, image, 96, 64, monkeypatch)
@@ -115,7 +124,8 @@ def test_flat_colours_stay(array):
         return
     for colour in colours:
         flat = np.ones((13, 17, 1), np.float32) * np.float32(colour)
-        assert linear_mmse(mosaic_of(flat, own), own) == pytest.approx(flat, abs=2e-6)
+        for method in (linear_mmse, directional_mmse):
+            assert method(mosaic_of(flat, own), own) == pytest.approx(flat, abs=2e-6)
 
 
 def test_beyond_an_edge_an_array_goes_on():
@@ -254,6 +264,36 @@ def test_how_well_arrays_are_demosaiced(shared_data):
         assert mean(name) > least, name
 
 
+def test_edges_are_interpolated_along_themselves(shared_data):
+    """CPSNR on parts of the Kodak set; those of the whole are in docs/quality.md."""
+    paths = [shared_data / "kodak" / f"kodim{number:02}.png" for number in (5, 19, 23)]
+    images = [
+        np.asarray(Image.open(path).convert("RGB"))[160:288, 320:448] / np.float32(255)
+        for path in paths
+    ]
+    for name, more in {"x-trans": 1.0, "quad-RGGB": 1.5, "RGBW": 0.5, "RCCB": 1.0}.items():
+        array = parse_array(name, GAINS)
+        linear, directional = (
+            np.mean([cpsnr(method(mosaic_of(each, array), array), each) for each in images])
+            for method in (linear_mmse, directional_mmse)
+        )
+        assert directional > linear + more, name
+
+
+@pytest.mark.parametrize("angle", [0, 45, 90, 135])
+def test_stripes_of_any_direction_stay(angle):
+    """Gray stripes of 4 px, the period of quad arrays: linear filters make zippers of them."""
+    y, x = np.indices((48, 48))
+    across = x * np.sin(np.radians(angle)) - y * np.cos(np.radians(angle))
+    stripes = np.repeat(0.5 + 0.4 * np.sin(across * np.pi / 2)[..., None], 3, axis=2)
+    array, inside = parse_array("quad-RGGB", GAINS), np.s_[8:-8, 8:-8]
+    error = {
+        method: np.sqrt(np.mean((method(mosaic_of(stripes, array), array) - stripes)[inside] ** 2))
+        for method in (linear_mmse, directional_mmse)
+    }
+    assert error[directional_mmse] < error[linear_mmse] / 3, error
+
+
 def test_settings_that_draw_an_array(clpipe):
     choices = "{choice=['x-trans','RCCB']}"
     options = ("--set", "mosaic.method=array", "--set", f"mosaic.array={choices}")
@@ -287,6 +327,39 @@ def test_cells_are_binned_to_a_bayer_pattern(device):
     assert green[1].std() == pytest.approx(green[0].std() / 2, rel=0.06)  # a mean of four
     noise = chain.step_named("demosaic").context.noise
     assert noise.a == pytest.approx(chain.camera.noise(800).a / 4)
+
+
+def test_charge_is_read_once_where_it_is_binned_before_the_noise(device):
+    """The sum of four pixels: the shot noise is the same, the read noise that of one or of four."""
+    light, a, b = 0.05, 1e-3, 2e-4
+    noise = {"method": "gaussian", "a": a, "b": b}
+    variance = {}
+    for binned, stages, signal in (
+        ("charge", ["mosaic", "remosaic", "sensor_noise"], 4 * light),
+        ("DN", ["mosaic", "sensor_noise", "remosaic"], light),
+    ):
+        chain = on("quad-RGGB", stages=stages, remosaic={"method": "binning"}, sensor_noise=noise)
+        flat = np.full((400, 400, 3), signal, np.float32)
+        cells = Runner(chain, device, encode=False, final=True).run(flat, "charge").final
+        total = cells * (4 * light / signal)
+        assert total.mean() == pytest.approx(4 * light, rel=2e-3)
+        variance[binned] = total.var()
+    assert variance["charge"] == pytest.approx(4 * light * a + b, rel=0.03)
+    assert variance["DN"] == pytest.approx(4 * light * a + 4 * b, rel=0.03)
+
+
+def test_a_cell_of_charge_saturates_as_one_readout(develop):
+    stages = [*DEFAULT_CHAIN]
+    stages.insert(stages.index("mosaic") + 1, "remosaic")
+    light = np.full((16, 16, 3), 0.3, np.float32)
+    options = {"mosaic": laid("quad-RGGB"), "remosaic": {"method": "binning"}, "skip": ["noise"]}
+    result = develop(
+        light, numpy=True, stages=stages, keep=("normalize",), exposure={"ev": 3}, **options
+    )
+    kept = result.kept["normalize"]
+    assert kept.shape == (8, 8)
+    assert kept[0::2, 1::2] == pytest.approx(1)  # green has 1.2 of its white
+    assert (kept[0::2, 0::2] < 0.5).all()  # red has not
 
 
 @pytest.mark.parametrize(

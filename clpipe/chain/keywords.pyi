@@ -287,6 +287,7 @@ class Demosaic(TypedDict, total=False):
             "malvar2004",
             "menon2007",
             "linear_mmse",
+            "directional_mmse",
             "gray",
         ]
     )

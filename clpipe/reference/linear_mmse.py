@@ -6,6 +6,7 @@ statistics" (ICIP 2005): of each place of the period, the filters that leave the
 error. The statistics are a model's here, so that they are there for any array.
 """
 
+from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
@@ -30,50 +31,79 @@ def filters(array: FilterArray) -> Floats:
     They keep a sample of red, green or blue, and leave a flat colour as it is; of an array that
     cannot tell all colours, flat gray.
     """
+    between, centre = (NEIGHBOURS ** np.hypot(*apart) for apart in distances())
     rows, columns = array.period
-    span = range(-RADIUS, RADIUS + 1)
-    taps = np.array([(y, x) for y in span for x in span])
-    between = _covariance(np.linalg.norm(taps[:, None] - taps, axis=-1))
-    centre = _covariance(np.linalg.norm(taps, axis=-1))
-    made = np.zeros((rows, columns, len(taps), 3), np.float32)
-    for row in range(rows):
-        for column in range(columns):
-            letters = [
-                array.rows[(row + y) % rows][(column + x) % columns] for y, x in taps.tolist()
-            ]
-            seen = np.array([array.responses[letter] for letter in letters])  # (tap, rgb)
-            own = _best(seen, between, centre)
-            middle = seen[len(taps) // 2]
-            if 1 in middle.tolist():  # a colour that is there
-                own[:, middle.argmax()] = np.arange(len(taps)) == len(taps) // 2
-            made[row, column] = own
+    made = np.zeros((rows, columns, SIDE**2, 3), np.float32)
+    for row, column, seen in windows(array):
+        made[row, column] = best(seen, between, centre, CHROMA, NOISE)
     return made
 
 
-def _covariance(distance: Doubles) -> Doubles:
-    """The covariance of colours at a distance: its shape, and 3x3."""
-    gray = np.ones((3, 3))
-    colours = gray + CHROMA * (np.eye(3) - gray / 3)
-    return np.asarray(NEIGHBOURS**distance)[..., None, None] * colours
+def distances() -> tuple[Doubles, Doubles]:
+    """How far apart two taps of a window are, and a tap and the centre, in x and y.
+
+    Both in px: (2, tap, tap) and (2, tap).
+    """
+    span = np.arange(-RADIUS, RADIUS + 1.0)
+    x, y = np.tile(span, SIDE), np.repeat(span, SIDE)
+    places = np.stack([x, y])
+    return places[:, :, None] - places[:, None], places
 
 
-def _best(seen: Doubles, between: Doubles, centre: Doubles) -> Doubles:
-    """The filters of one place, (tap, channel): least mean square error, flat colours exact.
+def windows(array: FilterArray) -> Iterator[tuple[int, int, Doubles]]:
+    """Each place of an array's period: its row, its column, and what each tap sees, (tap, 3)."""
+    rows, columns = array.period
+    span = range(-RADIUS, RADIUS + 1)
+    for row in range(rows):
+        for column in range(columns):
+            letters = [
+                array.rows[(row + y) % rows][(column + x) % columns] for y in span for x in span
+            ]
+            yield row, column, np.array([array.responses[letter] for letter in letters])
+
+
+def covariance(seen: Doubles, between: Doubles, chroma: float, noise: float) -> Doubles:
+    """The covariance of a window's samples under a model, (tap, tap).
 
     Args:
         seen: what each tap sees of a colour, (tap, 3).
-        between: the covariance of the colours of two taps, (tap, tap, 3, 3).
-        centre: that of the colours of a tap and the centre, (tap, 3, 3).
+        between: the correlation of two taps' colours, (tap, tap).
+        chroma: the variance of chroma, where that of luma is 1.
+        noise: that of what the model leaves out.
     """
-    samples = np.einsum("ia,ijab,jb->ij", seen, between, seen) + NOISE * np.eye(len(seen))
-    wanted = np.einsum("iab,ib->ia", centre, seen)
+    return np.asarray(between * (seen @ _colours(chroma) @ seen.T) + noise * np.eye(len(seen)))
+
+
+def _colours(chroma: float) -> Doubles:
+    """The covariance of red, green and blue in one place."""
+    gray = np.ones((3, 3))
+    return np.asarray(gray + chroma * (np.eye(3) - gray / 3))
+
+
+def best(seen: Doubles, between: Doubles, centre: Doubles, chroma: float, noise: float) -> Doubles:
+    """The filters of one place, (tap, channel): least mean square error, flat colours exact, and a
+    sample of red, green or blue kept.
+
+    Args:
+        seen: what each tap sees of a colour, (tap, 3).
+        between: the correlation of the colours of two taps, (tap, tap).
+        centre: that of the colours of a tap and the centre, (tap,).
+        chroma: the variance of chroma, where that of luma is 1.
+        noise: that of what the model leaves out.
+    """
+    samples = covariance(seen, between, chroma, noise)
+    wanted = centre[:, None] * (seen @ _colours(chroma))
     tells_colours = np.linalg.matrix_rank(seen, 1e-3) == 3
     exact = np.eye(3) if tells_colours else np.ones((3, 1))  # flat colours, in columns
     lit = seen @ exact
     both = np.linalg.solve(samples, np.concatenate([wanted, lit], axis=1))
     free, flat = both[:, :3], both[:, 3:]
     lacking = exact.T - lit.T @ free
-    return np.asarray(free + flat @ np.linalg.solve(lit.T @ flat, lacking))
+    made = np.asarray(free + flat @ np.linalg.solve(lit.T @ flat, lacking))
+    middle = len(seen) // 2
+    if 1 in seen[middle].tolist():  # a colour that is there
+        made[:, seen[middle].argmax()] = np.arange(len(seen)) == middle
+    return made
 
 
 def linear_mmse(mosaic: Floats, array: FilterArray) -> Floats:

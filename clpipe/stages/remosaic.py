@@ -34,7 +34,8 @@ from clpipe.stage import (
 class Binning(Method):
     """The mean of each cell of equal filters, as the digital binning of 2x2 or 3x3 pixels.
 
-    Noise falls as that of a mean of 4 or 9. What is left of rows and columns behind the last whole
+    Noise that is there falls as that of a mean of 4 or 9. Between mosaic and sensor_noise it bins
+    charge: noise comes once for each cell. What is left of rows and columns behind the last whole
     cell is cut off.
 
     >>> from clpipe.stage import Context, ReferenceContext

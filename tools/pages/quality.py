@@ -58,10 +58,12 @@ DEMOSAIC: dict[str, tuple[Choice, float | None]] = {
     "malvar2004": ({"method": "malvar2004"}, 33.53),
     "menon2007": ({"method": "menon2007"}, 37.47),
     "linear_mmse": ({"method": "linear_mmse"}, None),
+    "directional_mmse": ({"method": "directional_mmse"}, None),
     **{
-        f"linear_mmse, {name}": ({"method": "linear_mmse", "array": name}, None)
+        f"{method}, {name}": ({"method": method, "array": name}, None)
         for name in NAMED
         if name not in ("mono", *PATTERNS)
+        for method in ("linear_mmse", "directional_mmse")
     },
 }
 TOLERANCE = 0.05

@@ -3,6 +3,7 @@
 from clpipe.stage import Context, Kind, Method, Stage
 from clpipe.stages.demosaic.bilinear import Bilinear
 from clpipe.stages.demosaic.bounded import Bounded
+from clpipe.stages.demosaic.directional_mmse import DirectionalMmse
 from clpipe.stages.demosaic.edge_directed import EdgeDirected
 from clpipe.stages.demosaic.edge_directed_median import EdgeDirectedMedian
 from clpipe.stages.demosaic.linear_mmse import Gray, LinearMmse
@@ -24,7 +25,7 @@ STAGE = Stage(
     Kind.RGB,
     (
         *(Bounded, EdgeDirectedMedian, EdgeDirected, Median, Bilinear, Malvar2004, Menon2007),
-        *(LinearMmse, Gray),
+        *(LinearMmse, DirectionalMmse, Gray),
     ),
     usual=_of_array,
 )
