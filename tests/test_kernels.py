@@ -168,7 +168,8 @@ def test_the_command_checks_every_stage(clpipe, monkeypatch):
     # The tests above run what it runs.
     monkeypatch.setattr("clpipe.engine.check.compare", lambda *_, **__: Difference(1))
     record = json.loads(clpipe("check", "--small", "--json").stdout)
-    assert record["failed"] == 0 and len(record["checks"]) == len(VARIANTS) + len(noises) + 1
+    assert record["failed"] == 0 and len(record["checks"]) == len(VARIANTS) + len(noises) + 2
     checked = {(check["stage"], check["method"].split()[0]) for check in record["checks"]}
     assert checked >= {(stage.name, method.method) for stage, method in METHODS}
-    assert {"exposure..quantize", "source..8 bit"} <= {check["stage"] for check in record["checks"]}
+    ends = {"exposure..quantize", "source..8 bit", "exposure..gamma"}
+    assert ends <= {check["stage"] for check in record["checks"]}

@@ -36,6 +36,7 @@ class Split(Readouts):
 class SplitPixel(Split):
     """Split pixels: a large and a small photodiode, of which the small one sees 1/``ratio``.
 
+    >>> import numpy as np
     >>> from clpipe.stage import run_reference
     >>> leaky = SplitPixel(a=0.0, b=0.0, ratio=10.0, crosstalk=0.01)
     >>> run_reference(leaky, np.float32([[0.5, 2.0]])).astype(float).round(2).tolist()
