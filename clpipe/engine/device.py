@@ -246,6 +246,7 @@ class Device:
                 begun.append(Stack(members, kernels, borders, strides))
                 start_stack(self._flow, begun[-1], self.memory)
             if is_new:
+                self.drain()  # PoCL is done with a kernel when it has been launched
                 self.keep_programs()
             return begun
         except (self._cl.Error, MemoryError) as error:
