@@ -51,6 +51,7 @@ def mosaic_of(image: np.ndarray, array) -> np.ndarray:
         ("RG//GB", "rows of one length"),
         ("/".join(["RGB"] * 9), "at most 8x8"),
         ("R" * 9, "at most 8x8"),
+        ("HR/GB", "polarisers .* do not go with colours"),
     ],
 )
 def test_what_is_no_filter_array(text, message):
@@ -85,6 +86,51 @@ def test_a_clear_pixel_saturates_first(develop):
         expected = 0.9 * 2**0.5 * array.levels[letter]
         assert kept[letters == number] == pytest.approx(expected, abs=1e-4)
     assert array.levels["W"] == 1 > array.levels["G"] > array.levels["B"] > array.levels["R"]
+
+
+def stokes(image):
+    """S0, S1 and S2 of what polarisers at 0, 60 and 120 degrees pass, by the law of Malus."""
+    angles = np.deg2rad([0, 60, 120])
+    law = np.stack([np.ones(3), np.cos(2 * angles), np.sin(2 * angles)], axis=1)
+    return image @ np.linalg.inv(law).T
+
+
+@pytest.mark.parametrize("method", ["linear_mmse", "directional_mmse"])
+def test_a_polarised_array_measures_degree_and_angle(device, method):
+    y, x = np.mgrid[0:60, 0:80]
+    s0 = 0.3 + 0.1 * np.sin(x / 9)
+    degree, angle = 0.1 + 0.5 * x / 80, np.deg2rad(180 * y / 60 - 90)  # of linear polarisation
+    s1, s2 = (s0 * degree * part(2 * angle) for part in (np.cos, np.sin))
+    passed = [s0 + s1 * np.cos(2 * t) + s2 * np.sin(2 * t) for t in np.deg2rad([0, 60, 120])]
+    image = np.stack(passed, axis=-1).astype(np.float32)
+    stages = ["mosaic", "inverse_white_balance", "white_balance", "demosaic"]
+    chain = on("polarised", stages=stages, demosaic={"method": method})
+    assert chain.camera.white_balance_gains != (1, 1)  # which colours have, and polarisers not
+    found = stokes(Runner(chain, device, final=True, encode=False).run(image, "k").final)
+    inside = np.s_[6:-6, 6:-6]
+    measured = np.hypot(found[..., 1], found[..., 2]) / found[..., 0]
+    assert np.abs(measured - degree)[inside].max() < 0.02
+    off = np.arctan2(found[..., 2], found[..., 1]) / 2 - angle
+    off = np.rad2deg((off + np.pi / 2) % np.pi - np.pi / 2)
+    assert np.abs(off)[inside].max() < 1.5
+    # Each pixel by itself, written down once more: 90, 45 / 135, 0 degrees.
+    mosaic = Runner(chain.through(["mosaic"]), device, final=True, encode=False).run(image, "k")
+    for (row, column), degrees in {(0, 0): 90, (0, 1): 45, (1, 0): 135, (1, 1): 0}.items():
+        turn = 2 * np.deg2rad(degrees)
+        expected = s0 + s1 * np.cos(turn) + s2 * np.sin(turn)
+        cell = np.s_[row::2, column::2]
+        np.testing.assert_allclose(mosaic.final[cell], expected[cell], atol=1e-6)
+
+
+def test_a_polarised_array_has_no_colours():
+    with pytest.raises(KeyedError, match=r"mosaic.array: .*polarised.*; skip inverse_color_matrix"):
+        on("polarised")
+    chain = on("polarised", skip=["inverse_color_matrix"])
+    assert "polarised" in chain.array.name
+    flat = np.full((12, 12, 3), 0.2, np.float32)  # unpolarised light is gray
+    stages = ["mosaic", "inverse_white_balance", "white_balance", "demosaic"]
+    gray = Runner(on("polarised", stages=stages), None, final=True, encode=False).run(flat, "k")
+    np.testing.assert_allclose(gray.final, 0.2, atol=1e-6)
 
 
 @pytest.mark.parametrize("array", ["x-trans", "RGBW"])

@@ -22,7 +22,7 @@ LANES = 16  # the most that a device has: what is behind a row of a table, to be
 # what the others see, as ideal dyes do (Bayer and others use R, G, B; Yamanaka, US 4,054,906, and
 # Compton and Hamilton, US 8,139,130, others). A mono sensor has no filter. An RGB render says
 # nothing of near infrared: that channel sees a quarter of what a clear one does.
-PASSES: dict[str, tuple[float, float, float]] = {
+PASSES: dict[str, tuple[float, ...]] = {
     "R": (1, 0, 0),
     "G": (0, 1, 0),
     "B": (0, 0, 1),
@@ -32,6 +32,16 @@ PASSES: dict[str, tuple[float, float, float]] = {
     "M": (1, 0, 1),
     "I": (0.25, 0.25, 0.25),
     "L": (1, 1, 1),
+}
+
+# Polarisers, by the angle that passes, in degrees. Linearly polarised light is three numbers, as
+# colour is: red, green and blue are then what polarisers at these other angles pass (Fessenkov).
+# What passes at any angle follows from them by the law of Malus; unpolarised light is gray.
+POLARISERS = {"H": 0, "D": 45, "V": 90, "A": 135}
+ANGLES = (0, 60, 120)
+PASSES |= {
+    letter: tuple((1 + 2 * np.cos(np.deg2rad(2 * (angle - own)))) / 3 for own in ANGLES)
+    for letter, angle in POLARISERS.items()
 }
 LETTERS = "".join(PASSES)
 
@@ -48,6 +58,7 @@ NAMED: dict[str, str] = {
     "RGGB-IR": "BGRG/GIGI/RGBG/GIGI",
     "quad-RGGB": "RRGG/RRGG/GGBB/GGBB",
     "nona-RGGB": "RRRGGG/RRRGGG/RRRGGG/GGGBBB/GGGBBB/GGGBBB",
+    "polarised": "VD/AH",
     "x-trans": "GBGGRG/RGRBGB/GBGGRG/GRGGBG/BGBRGR/GRGGBG",
 }
 
@@ -101,6 +112,11 @@ class FilterArray:
         return len(self.channels) == 1
 
     @property
+    def is_polarised(self) -> bool:
+        """Whether its channels are polarisers, without colours."""
+        return set(self.channels) <= POLARISERS.keys()
+
+    @property
     def needs_border(self) -> bool:
         """Whether reflect-101 gives a pixel beyond the edge another channel than the array has."""
         return max(self.period) > MIRRORED
@@ -123,7 +139,7 @@ class FilterArray:
         return {letter: value / largest for letter, value in sums.items()}
 
     def _raw(self, letter: str) -> Doubles:
-        red, blue = self.gains
+        red, blue = (1.0, 1.0) if letter in POLARISERS else self.gains
         return np.array(PASSES[letter]) / (red, 1.0, blue)
 
     def by_place(self, values: Mapping[str, float]) -> Floats:
@@ -181,7 +197,10 @@ def parse_array(text: str, gains: tuple[float, float] = (1.0, 1.0)) -> FilterArr
             f"found {text!r}; expected rows of one length, with / between, and at most "
             f"{MAX_PERIOD}x{MAX_PERIOD} letters"
         )
-    return FilterArray(text, rows, gains)
+    array = FilterArray(text, rows, gains)
+    if not array.is_polarised and POLARISERS.keys() & {*array.channels}:
+        raise RequestError(f"found {text!r}; polarisers (H, D, V, A) do not go with colours")
+    return array
 
 
 def beyond(size: int, period: int, reach: int) -> Array:

@@ -5,7 +5,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from clpipe.base.errors import KeyedError
 from clpipe.base.types import Floats
+from clpipe.camera.profile import IDENTITY
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.filter_array import (
     LETTERS,
@@ -64,7 +66,9 @@ class Bayer(Method):
 class AnyArray(Method):
     """A filter array of any period to 8x8: mono, RCCB, Quad Bayer, X-Trans, or rows of letters.
 
-    Channels are R, G, B, W (clear), Y, C, M, I (near infrared) and L (no filter at all). What each
+    Channels are R, G, B, W (clear), Y, C, M, I (near infrared) and L (no filter at all), or
+    the polarisers H, D, V and A (0, 45, 90 and 135 degrees), for which a render's red, green and
+    blue are what polarisers at 0, 60 and 120 degrees pass. What each
     sees of white-balanced red, green and blue follows from the camera's white balance; white is 1
     in all of them. Behind inverse_white_balance white fills the most sensitive channel, as that is
     what a camera exposes for.
@@ -91,7 +95,13 @@ class AnyArray(Method):
     )
 
     def resolve(self, context: Context) -> "Method":
-        self._laid(context)  # or it is refused
+        array = self._laid(context)  # or it is refused
+        if array.is_polarised and context.colours != IDENTITY:
+            raise KeyedError(
+                "mosaic.array",
+                f"mosaic.array: found {array.name}, but the render was given a camera's colours, "
+                "and its channels are what polarisers pass; skip inverse_color_matrix",
+            )
         return self
 
     def _laid(self, context: Context) -> FilterArray:
