@@ -65,8 +65,9 @@ def parse_darktable(values: Any, path: Path, camera: str | None) -> SensorModel:
         raise RequestError(f"{path}: {make} {model}: profiles{fault.key}: {fault.text}") from None
     if X_TRANS.fullmatch(model):
         raise RequestError(
-            f"{path}: {make} {model} has no Bayer pattern but X-Trans, for which neither this "
-            "conversion nor the mosaic is"
+            f"{path}: {make} {model} has no Bayer pattern but X-Trans; its noise was measured "
+            "behind another demosaicing, for which this conversion is not; fujifilm-x-t3 is "
+            "built in"
         )
     slopes: dict[float, float] = {}
     for profile in sorted(checked, key=lambda profile: profile.iso):
