@@ -7,7 +7,7 @@ from clpipe import Pipeline
 from clpipe.analysis.calibration.calibrate import ROUNDING, calibrate
 from clpipe.analysis.calibration.gain_stages import gain_stages
 from clpipe.analysis.calibration.line_fit import Estimate, Line, Table, fit_line
-from clpipe.analysis.calibration.repeats import CHANNELS, Sensor, neighbours
+from clpipe.analysis.calibration.repeats import Sensor, neighbours
 from clpipe.analysis.calibration.result import Calibration
 from clpipe.base.errors import ImageError
 from clpipe.camera.profile import load_camera
@@ -99,7 +99,7 @@ def test_what_clpipe_puts_in_comes_back(pattern, iso):
     for key, truth in (("a", noise.a), ("b", noise.b)):
         relative, errors = off(Estimate(**_plain(record[key])), truth)
         assert relative < 0.01 and errors < 3, key
-    for name in CHANNELS:
+    for name in ("R", "G1", "G2", "B"):
         assert off(found.lines[name].gain, noise.a * sensor.unit)[1] < 4.5, name
     assert off(found.row_noise, row * sensor.unit)[0] < 0.03
     assert off(found.column_noise, columns.image[0].std() * column * sensor.unit)[0] < 0.03
@@ -162,9 +162,9 @@ def test_a_plain_line_would_be_too_flat():
 def test_neighbours_share_no_row_with_the_pixel():
     image = np.zeros((12, 12), np.float32)
     image[6] = 1
-    around = neighbours(image)
+    around = neighbours(image, (2, 2))
     assert not around[6].any() and around[4].all() and around[8].all()
-    assert neighbours(np.tile(np.arange(12, dtype=np.float32), (12, 1)))[5, 5] == 5
+    assert neighbours(np.tile(np.arange(12, dtype=np.float32), (12, 1)), (2, 2))[5, 5] == 5
 
 
 def test_b_is_the_noise_before_rounding():

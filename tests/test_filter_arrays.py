@@ -464,7 +464,22 @@ def test_a_sensor_without_filters_is_calibrated(clpipe, write_exr):
     assert found.filter_array == "mono"
     gains = [camera.gain_stages[0].system_gain[0] for camera in (found, known)]
     assert gains[0] == pytest.approx(gains[1], rel=0.05)
-    other = ("--set", "mosaic.method=array", "--until", "quantize", "--format", "exr")
-    clpipe("run", path, "-o", "trans", *other)
-    result = clpipe("calibrate", "trans/ramp.exr", "-o", "no.toml", status=2)
-    assert "it knows Bayer patterns and sensors of one channel" in result.stderr
+
+
+@pytest.mark.parametrize("array", ["quad-RGGB", "x-trans", "RCCB"])
+def test_a_sensor_of_any_array_is_calibrated(clpipe, write_exr, array):
+    ramp = np.geomspace(0.002, 0.8, 480, dtype=np.float32)
+    colours = np.float32([0.6, 1, 0.5])  # so that filters next to each other differ
+    path = write_exr("ramp.exr", ramp[None, :, None] * colours * np.ones((240, 1, 1)), half=False)
+    own = ("--set", "mosaic.method=array", "--set", f"mosaic.array={array}", "--iso", 1600)
+    own += ("--until", "quantize", "--skip", "inverse_color_matrix", "--device", "numpy")
+    own += ("--set", "prnu.sigma=0.006", "--set", "exposure.headroom=0", "--format", "exr")
+    for seed in range(4):
+        clpipe("run", path, "-o", f"out/{seed}", "--seed", seed, *own)
+    clpipe("calibrate", *(f"out/{seed}/ramp.exr" for seed in range(4)), "-o", "found.toml")
+    found, known = load_camera("found.toml"), load_camera("sony-a7r2")
+    assert found.filter_array == array
+    gain, other = found.gain_stages[0], known.noise(1600)
+    unit = known.signal_range
+    assert gain.system_gain[0] == pytest.approx(other.a * unit, rel=0.03)
+    assert gain.read_noise[0] == pytest.approx(other.b**0.5 * unit, rel=0.1)

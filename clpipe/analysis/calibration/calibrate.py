@@ -23,7 +23,7 @@ from clpipe.analysis.calibration.checks import (
 from clpipe.analysis.calibration.dark import DarkFrames
 from clpipe.analysis.calibration.dark_figures import DarkFigures, dark_figures
 from clpipe.analysis.calibration.line_fit import Bin, binned, fit_line
-from clpipe.analysis.calibration.repeats import CHANNELS, Sensor
+from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.analysis.calibration.result import Calibration
 from clpipe.analysis.calibration.single_image import LevelSets
 from clpipe.base.errors import ImageError
@@ -151,11 +151,11 @@ def _from_repeats(
         variance, own_rows = repeats.without_rows(each, line)
         tables.append(each.tables(variance))
         rows.append(own_rows)
-    line = fit_line([table[name] for table in tables for name in CHANNELS])
+    line = fit_line([table[name] for table in tables for name in sensor.channels])
     check_static(stack, line)
     for each, what in zip(stacks, ("frame", "dark frame"), strict=False):
         check_alike(each, line, what)
-    lines = {name: fit_channel(tables, name) for name in CHANNELS}
+    lines = {name: fit_channel(tables, name) for name in sensor.channels}
     pooled = check_significant(line).lowered(rounding)
     pattern = darkness.pattern(pooled, rounding) if darkness else None
     dsnu = pattern.dsnu.value if pattern else 0.0

@@ -83,7 +83,7 @@ def variances(frames: Floats, sensor: Sensor) -> tuple[Estimate, Estimate]:
     freedom = of_pixels.size * (count - 1)
     scatter = float(of_pixels.std()) / of_pixels.size**0.5
     flat = mean.copy()
-    for site in sites_of(sensor.pattern):
+    for site in sites_of(sensor.bayer):
         part = flat[site]
         part -= part.mean(axis=0, keepdims=True)
         part -= part.mean(axis=1, keepdims=True)

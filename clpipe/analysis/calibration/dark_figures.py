@@ -84,7 +84,7 @@ def dark_figures(dark: Floats, sensor: Sensor, hot: Pixels) -> DarkFigures:
     good = np.ones(dark.shape[1:], bool)
     good[hot.rows, hot.columns] = False
     frames = len(dark)
-    sites = sites_of(sensor.pattern)
+    sites = sites_of(sensor.bayer)
     levels = np.array([[float(f[s].mean(where=good[s])) for s in sites] for f in dark])
     mean = dark.mean(axis=0, dtype=np.float64)
     rest = (dark - mean.astype(np.float32)) * np.float32((frames / max(frames - 1, 1)) ** 0.5)

@@ -20,7 +20,7 @@ from clpipe.images.read import RENDER_SUFFIXES, read_image
 from clpipe.inputs.kept import embedded_settings
 from clpipe.inputs.raw import may_be_dump
 from clpipe.reference.cfa import PATTERNS, Pattern
-from clpipe.reference.filter_array import MONO
+from clpipe.reference.filter_array import MONO, NAMED
 from clpipe.stage import Kind
 
 MOSAICS = (*RENDER_SUFFIXES, ".png")  # endings of files with a mosaic that are not camera raws
@@ -222,22 +222,12 @@ def _from_kept(
 
 
 def _sensor(overrides: FrameOverrides, pattern: str, black: float, white: float) -> Sensor:
-    """Pattern and levels: the user's, else those of the file.
-
-    Raises:
-        RequestError: its mosaic has another filter array than Bayer's.
-    """
-    is_mono = pattern == MONO  # whose sites are alike, whatever they are called
-    pattern = PATTERNS[0] if is_mono else pattern
-    own = next((each for each in PATTERNS if each == pattern), None)
-    if own is None:
-        raise RequestError(
-            f"calibrate: found frames of the filter array {pattern}; it knows Bayer patterns and "
-            "sensors of one channel"
-        )
+    """Pattern and levels: the user's, else those of the file."""
+    stated = overrides.pattern or pattern
+    name = "" if stated in PATTERNS else next((n for n, r in NAMED.items() if r == stated), stated)
     return Sensor(
-        overrides.pattern or own,
+        PATTERNS[0] if stated == MONO else stated,  # its sites are alike, whatever they are called
         black if overrides.black_level is None else overrides.black_level,
         white if overrides.white_level is None else overrides.white_level,
-        "mono" if is_mono else "",
+        name,
     )

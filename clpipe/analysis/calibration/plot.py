@@ -9,6 +9,9 @@ import numpy as np
 from clpipe.analysis.calibration.result import Calibration
 
 COLOURS = {"R": "#c8312b", "G1": "#2f9e44", "G2": "#8fb339", "B": "#2b62c8", "all": "#6b6b6b"}
+# Of the filters of other arrays.
+COLOURS |= {"G": "#2f9e44", "W": "#9a9a9a", "Y": "#c9a227", "C": "#1aa0b0", "M": "#b0409a"}
+OTHER = "#6b6b6b"
 WIDTH = 1600  # px
 COLUMNS = 3  # of panels, one for each ISO
 
@@ -56,14 +59,14 @@ def _variance_over_mean(panel: object, one: Calibration) -> None:
         errors = np.array([b.error for b in bins])
         most = max(most, *light) if len(light) else most
         panel.errorbar(
-            light, variance, errors, fmt="o", ms=4, lw=1, color=COLOURS[name], label=name
+            light, variance, errors, fmt="o", ms=4, lw=1, color=COLOURS.get(name, OTHER), label=name
         )
     ends = np.array([0.0, most * 1.05])
     gain, floor = one.pooled.gain, one.pooled.floor
     for name, line in one.lines.items():
         own = line.gain.value * ends + line.floor.value
         label = None if name in one.bins else f"fit, {name}"
-        panel.plot(ends, own, color=COLOURS[name], lw=0.8, alpha=0.7, label=label)
+        panel.plot(ends, own, color=COLOURS.get(name, OTHER), lw=0.8, alpha=0.7, label=label)
     panel.plot(ends, gain.value * ends + floor.value, color="black", lw=1.3, label="fit, all")
     panel.set(
         title=f"ISO {one.iso:g}: variance = {gain.value:.4g} · mean + {floor.value:.3g}",

@@ -9,28 +9,50 @@ import numpy as np
 from clpipe.analysis.calibration.line_fit import Estimate, Line, Table
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Floats
-from clpipe.reference.cfa import Pattern, sites
+from clpipe.reference.cfa import PATTERNS, Pattern, sites
+from clpipe.reference.filter_array import MIRRORED
 
-CHANNELS = ("R", "G1", "G2", "B")
 # The limits are choices; tests/test_calibrate.py has a case on each side of the last two.
 FAR_FROM_CLIPPING = 4.0  # standard deviations of a frame
 LARGEST_FLICKER = 0.05  # of the mean brightness; more is taken for another exposure
 MOVING = 0.02  # share of the variance that neighbours share; more is taken for motion
+
+Site = tuple[slice, slice]  # the rows and columns of a filter's place in the period
 
 
 @dataclass(frozen=True)
 class Sensor:
     """The pattern and levels of a sensor, which give its frames a meaning."""
 
-    pattern: Pattern
+    pattern: str  # Bayer's, or the rows of another filter array
     black_level: float  # DN
     white_level: float  # DN
-    filter_array: str = ""  # of a sensor without filters, whose sites are alike: its name
+    filter_array: str = ""  # its name as a profile has it, where it is not Bayer's
 
     @property
     def unit(self) -> float:
         """The white level minus the black level in DN: the DN of signal 1."""
         return self.white_level - self.black_level
+
+    @property
+    def bayer(self) -> Pattern:
+        """Its Bayer pattern; of another array one that stands in where there is no light."""
+        return next((pattern for pattern in PATTERNS if pattern == self.pattern), PATTERNS[0])
+
+    @property
+    def channels(self) -> dict[str, list[Site]]:
+        """The places of each channel: R, G1, G2 and B of a Bayer pattern, else of each filter."""
+        found: dict[str, list[Site]] = {}
+        for name, site in sites(self.pattern).items():
+            channel = name if self.pattern in PATTERNS else name.rstrip("0123456789")
+            found.setdefault(channel, []).append(site)
+        return found
+
+    @property
+    def period(self) -> tuple[int, int]:
+        """After how many rows and columns the filters repeat."""
+        rows, columns = next(iter(sites(self.pattern).values()))
+        return rows.step, columns.step
 
 
 @dataclass(frozen=True)
@@ -47,7 +69,7 @@ class Stack:
     """Frames of one exposure as their mean and the deviations from it, in DN.
 
     ``light``, (height, width), is the mean above black; ``around`` is the mean of each pixel's
-    neighbours of the same colour in other rows, see :func:`neighbours`; ``rest``, (frames, height,
+    neighbours of the same filter in other rows, see :func:`neighbours`; ``rest``, (frames, height,
     width), is the frames minus their mean. ``used`` is True for the pixels that count.
     """
 
@@ -69,15 +91,23 @@ class Stack:
     def without_columns(self, offsets: Floats) -> "Stack":
         """The stack with the offsets of columns, (width,), subtracted from its light."""
         light = self.light - offsets
-        return replace(self, light=light, around=neighbours(light))
+        return replace(self, light=light, around=neighbours(light, self.sensor.period))
 
     def tables(self, variance: Array) -> dict[str, Table]:
         """The table of each channel, from the variances of pixels, (height, width), DN^2."""
         tables = {}
-        for name, site in sites(self.sensor.pattern).items():
-            used = self.used[site]
-            rows = 2 * np.nonzero(used)[0] + site[0].start
-            s, light, around = (x[site][used] for x in (variance, self.light, self.around))
+        for name, places in self.sensor.channels.items():
+            used = [self.used[site] for site in places]
+            rows = np.concatenate(
+                [
+                    site[0].step * np.nonzero(own)[0] + site[0].start
+                    for site, own in zip(places, used, strict=True)
+                ]
+            )
+            s, light, around = (
+                np.concatenate([x[site][own] for site, own in zip(places, used, strict=True)])
+                for x in (variance, self.light, self.around)
+            )
             tables[name] = Table.of(s, light, around, rows, self.sensor.unit, self.degrees)
         return tables
 
@@ -101,17 +131,35 @@ def stacked(frames: Floats, sensor: Sensor, what: str = "frames") -> Stack:
     mean = frames.mean(axis=0, dtype=np.float64).astype(np.float32)
     rest = np.subtract(frames, mean, out=frames)
     light = mean - np.float32(sensor.black_level)
-    return Stack(light, neighbours(light), rest, np.ones(light.shape, bool), sensor)
+    return Stack(light, neighbours(light, sensor.period), rest, np.ones(light.shape, bool), sensor)
 
 
-def neighbours(image: Floats) -> Floats:
-    """The mean of the six pixels of the same colour in the rows two above and two below.
+def neighbours(image: Floats, period: tuple[int, int]) -> Floats:
+    """The mean of six pixels of the same filter, in the rows of a period above and below.
 
     They share no noise with the pixel, row noise included.
     """
-    padded = np.pad(image, 2, mode="reflect")
-    rows = padded[:-4] + padded[4:]
-    return (rows[:, :-4] + rows[:, 2:-2] + rows[:, 4:]) / np.float32(6)
+    above, below = beside(image.shape[0], period[0])
+    before, behind = beside(image.shape[1], period[1])
+    rows = image[above] + image[below]
+    return (rows[:, before] + rows + rows[:, behind]) / np.float32(6)
+
+
+def beside(size: int, period: int) -> tuple[Array, Array]:
+    """For each row, the ones a period before and behind; at an end, where a mirror (reflect-101)
+    would have other filters, twice the one that is there.
+
+    >>> [each.tolist() for each in beside(9, 4)]
+    [[4, 5, 6, 7, 0, 1, 2, 3, 4], [4, 5, 6, 7, 8, 1, 2, 3, 4]]
+    """
+    place = np.arange(size)
+    before, behind = place - period, place + period
+    first, last = before < 0, behind >= size
+    if period <= MIRRORED:
+        before, behind = abs(before), np.where(last, 2 * (size - 1) - behind, behind)
+    else:
+        before, behind = np.where(first, behind, before), np.where(last, place - period, behind)
+    return before.clip(0, size - 1), behind.clip(0, size - 1)
 
 
 def ceiling(frames: Floats, sensor: Sensor) -> float:

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from clpipe.analysis.calibration.line_fit import Estimate, Line
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.base.types import Floats
-from clpipe.reference.cfa import sites
 
 # Daubechies' wavelet and scaling function with three vanishing moments (sec. II-A). The wavelet has
 # the norm 1, the scaling function the sum 1.
@@ -256,7 +255,8 @@ def single_image(
     low = -sensor.black_level / unit
     dark_sets = [dark] if dark else []
     places = {
-        name: smooth_places(light[site] / unit) for name, site in sites(sensor.pattern).items()
+        name: [smooth_places(light[site] / unit) for site in own]
+        for name, own in sensor.channels.items()
     }
 
     def line(parts: Sequence[Places]) -> tuple[Line, LevelSets]:
@@ -265,9 +265,9 @@ def single_image(
         pixels = int(sets.count.sum()) * 4  # a place is a detail, one of every 2x2 pixels
         return Line(gain.scaled(unit), floor.scaled(unit**2), pixels), sets
 
-    whole, sets = line(list(places.values()))
+    whole, sets = line([part for parts in places.values() for part in parts])
     lines = {}
-    for name, part in places.items():
+    for name, parts in places.items():
         with contextlib.suppress(ValueError):
-            lines[name] = line([part])[0]
+            lines[name] = line(parts)[0]
     return lines, whole, sets
