@@ -201,11 +201,14 @@ def test_a_run_that_was_cut_off_goes_on(bucket, clpipe, monkeypatch):
     Flaky.forbidden = "000001.tar"
     told = clpipe(*command, status=1).stderr
     assert "flaky://b/set/000001.tar: cannot be written: the token has expired" in told
-    assert sorted(tars(bucket)) == ["000000.tar"]
+    # The last one, of a single image, may have been on its way when the second one was refused.
+    begun = set(tars(bucket))
+    assert {"000000.tar"} <= begun <= {"000000.tar", "000002.tar"}
     Flaky.forbidden = ""
     before = bucket.modified("/b/set/000000.tar")
     told = clpipe(*command).stderr
-    assert "7 of 7 images done (3 of them were there already)" in told
+    there = 2 + len(begun)
+    assert f"7 of 7 images done ({there} of them were there already)" in told
     assert bucket.modified("/b/set/000000.tar") == before
     assert sorted(tars(bucket)) == ["000000.tar", "000001.tar", "000002.tar"]
     # A tar that was cut off, and one whose index was: both are made again.
