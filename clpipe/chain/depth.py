@@ -35,9 +35,7 @@ def with_depth(chain: Chain, depth: Depth) -> Chain:
                 "where it is; put it behind"
             )
     steps = tuple(
-        replace(step, context=replace(step.context, depth=reference))
-        if step.name in needing
-        else step
+        replace(step, context=step.context.but(depth=reference)) if step.name in needing else step
         for step in chain.steps
     )
     return replace(chain, steps=steps)

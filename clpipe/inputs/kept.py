@@ -157,7 +157,7 @@ def _without_input_noise(chain: Chain) -> Chain:
     steps: list[Step] = []
     noise = None
     for step in chain.steps:
-        steps.append(replace(step, context=replace(step.context, noise=noise)))
+        steps.append(replace(step, context=step.context.but(noise=noise)))
         noise = step.method.next_context(steps[-1].context).noise
     return replace(chain, steps=tuple(steps))
 

@@ -7,10 +7,10 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from clpipe.base.types import Floats
+from clpipe.reference.filter_array import LANES
 from clpipe.stage import Arguments, Context, OfExposures, Span, parameter
 from clpipe.stages.sensor_noise.readouts import MOST, Readout, Readouts
 
-VECTOR = 16  # lanes at most
 NOTHING = np.zeros((MOST - 1, 1, 1), np.float32)  # is there before there is an image
 
 
@@ -65,7 +65,7 @@ class Staggered(Readouts, OfExposures):
         if not self._is_apart:
             return super().arguments(context)
         later = NOTHING if self._later is None else self._later
-        later = np.pad(later, ((0, 0), (0, 0), (0, VECTOR)))
+        later = np.pad(later, ((0, 0), (0, 0), (0, LANES)))
         rows, columns = (np.int32(size) for size in later.shape[1:])
         return {**super().arguments(context), "later": later, "columns": columns, "rows": rows}
 
