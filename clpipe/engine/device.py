@@ -24,12 +24,13 @@ from clpipe.engine.discovery import (
     shared_out,
     usable_memory,
 )
-from clpipe.engine.flow import DeviceImage, Flow, ImageTask
+from clpipe.engine.flow import DeviceImage, Flow
 from clpipe.engine.ir import AnyLaunch, Border, Launch, Plan
+from clpipe.engine.members import ImageTask, Member
 from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.patches import with_patches
 from clpipe.engine.programs import announced, forget_programs, programs_of, tell_watchers
-from clpipe.engine.stack import Placed, Stack, StackKernel, cut, members_of
+from clpipe.engine.stack import Stack, StackKernel, cut, members_of
 from clpipe.engine.stack import start as start_stack
 from clpipe.engine.tiles import Tiling, tiling_of
 
@@ -233,7 +234,7 @@ class Device:
         return [partial(self._result_of_stacks, t, begun, self._generation) for t in tasks]
 
     def _begin(
-        self, stacks: Sequence[tuple[Sequence[Placed], dict[str, int]]]
+        self, stacks: Sequence[tuple[Sequence[Member], dict[str, int]]]
     ) -> list[Stack] | Exception:
         """Enqueue stacks; what the device raises is returned."""
         begun: list[Stack] = []

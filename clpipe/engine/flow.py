@@ -9,7 +9,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,13 +16,12 @@ import numpy as np
 from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.types import Array
-from clpipe.engine.bindings import Bind, slot_buffer, step_buffer
-from clpipe.engine.buffers import HostImages, Pool, aligned_empty, copy_encoded, copy_plane, core_of
+from clpipe.engine.buffers import Pool, aligned_empty
 from clpipe.engine.calls import Call, index_space
-from clpipe.engine.extents import Extent, Extents
-from clpipe.engine.ir import Launch, Plan
+from clpipe.engine.extents import Extents
+from clpipe.engine.ir import Launch
 from clpipe.engine.launch_cache import LaunchCache
-from clpipe.engine.options import RunOptions
+from clpipe.engine.members import ImageTask, Member, fetch_results
 from clpipe.engine.tiles import Phase, Tiling, source_bytes
 from clpipe.engine.transfers import InPlace, Staged
 
@@ -33,25 +31,6 @@ TABLES = 1 << 26  # bytes of arrays that are kept on the device, 64 of them at m
 def room_of_table(buffer: Any) -> int:
     """The room that a table's buffer takes of :data:`TABLES`: its bytes, but one may take all."""
     return min(max(buffer.size, TABLES // 64), TABLES)
-
-
-@dataclass(frozen=True)
-class ImageTask:
-    """The work that is to be done to one image.
-
-    Args:
-        plan: the plan.
-        source: the image, (height, width[, channel]).
-        bind: gives the values of kernel parameters.
-        output: where the results go.
-        options: how, see :class:`RunOptions`.
-    """
-
-    plan: Plan
-    source: Array
-    bind: Bind
-    output: HostImages
-    options: RunOptions
 
 
 @dataclass
@@ -248,8 +227,9 @@ class Flow:
     ) -> None:
         """Send a tile if a kernel reads it, launch kernels, and fetch what they made of it."""
         plan = image.task.plan
+        own = Member(extents, image.task, tile if image.tiling.patches else None)
         reads_source = any(image.calls[number].reads_source for number in numbers)
-        sent = self._send(image, extents) if reads_source else (None, [])
+        sent = self._send(image, own) if reads_source else (None, [])
         whole = image.task.output.encoded if fetches and image.is_whole else None
         size = extents[-1].stored.width * extents[-1].stored.height
         size *= len(plan.encoded.channels) if plan.encoded else 0
@@ -259,25 +239,22 @@ class Flow:
         last = [event for _, event in image.events[-1:]]
         sent_tile = DeviceTile(image, [*wait, *last], [])
         if fetches:
-            self._fetch(image, sent_tile, extents, tile, ends, size, last)
+            is_last = tile == len(image.tiling.patches or image.tiling.tiles) - 1
+            fetch_results(self, sent_tile, [own], {}, ends, last, is_last)
         self.push(sent_tile)
 
     @CpuTimer("upload")
-    def _send(self, image: DeviceImage, extents: Extents) -> tuple[Any, list[Any]]:
+    def _send(self, image: DeviceImage, own: Member) -> tuple[Any, list[Any]]:
         """Send what a tile stores of the source, unless it is there already."""
-        task, source, box = image.task, image.task.source, extents[0].stored
+        task, source = image.task, image.task.source
         if (
             image.is_whole
             and (task.options.unchanged or not task.options.download)
             and (sent := self.transfers.again(source))
         ):
             return sent
-        pixels = source[box.top : box.bottom, box.left : box.right]
-        if task.plan.planar:
-            pixels = pixels.transpose(2, 0, 1)
-        dtype = np.float16 if task.plan.half else np.float32
-        size = source_bytes(task.plan, extents[0])
-        sent = self.transfers.upload(source, pixels, dtype, size)
+        size = source_bytes(task.plan, own.extents[0])
+        sent = self.transfers.upload(source, own.pixels, own.dtype, size)
         image.events += [("upload", event) for event in sent[1]]
         return sent
 
@@ -310,43 +287,6 @@ class Flow:
                 )
                 wait = []
             image.events.append((launch.name, events[0]))  # nothing waits for borders
-
-    def _fetch(
-        self,
-        image: DeviceImage,
-        sent: DeviceTile,
-        extents: Extents,
-        tile: int,
-        ends: dict[str, Any],
-        size: int,
-        after: list[Any],
-    ) -> None:
-        """Fetch a tile's results, and with the last tile what was estimated from the image."""
-        buffers, fetch = self.pool.buffers, partial(self.fetch, sent, after=after)
-        plan, output = image.task.plan, image.task.output
-        patches = image.tiling.patches
-
-        def room(result: Array, extent: Extent) -> Array:
-            return result[tile] if patches else core_of(extent, result)
-
-        if output.encoded is not None and not extents[-1].core.is_empty:
-            pixels = fetch("dst", ends["dst"], size)
-            encoded = room(output.encoded, extents[-1])
-            sent.copies.append(partial(copy_encoded, extents[-1], pixels, encoded))
-        for number, result in output.images.items():
-            extent = extents[plan.level_of(number)]
-            if extent.core.is_empty:
-                continue
-            for channel, slot in enumerate(plan.slots[number]):
-                name = slot_buffer(slot)
-                plane = fetch(name, buffers[name], extent.plane_bytes).view(np.float32)
-                to = room(result, extent)
-                sent.copies.append(partial(copy_plane, extent, plane, to, channel))
-        if tile == len(patches or image.tiling.tiles) - 1:
-            for step, values in output.estimates.items():
-                name = step_buffer("estimates", step)
-                found = fetch(name, buffers[name], values.nbytes).view(values.dtype)
-                sent.copies.append(partial(np.copyto, values, found))
 
     def _land(self) -> None:
         """Wait for the oldest tile on the way, and copy its results; an error is its image's."""

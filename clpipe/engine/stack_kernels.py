@@ -6,14 +6,13 @@ the index space counts them. Of a buffer the table has the distance between memb
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from clpipe.base.types import Array
-from clpipe.engine.bindings import Bind, Buffer, ExtentNumber, Parameter, TileNumber
-from clpipe.engine.extents import Extents
+from clpipe.engine.bindings import Buffer, ExtentNumber, Parameter, TileNumber
+from clpipe.engine.members import Member
 
 TABLE = "numbers"
 BYTES = {"uchar": 1, "half": 2, "float": 4, "uint": 4, "int4": 16, "long4": 32}
@@ -43,14 +42,6 @@ def opening(parameters: Mapping[str, Parameter]) -> tuple[list[str], list[str]]:
             type_ = parameter.declaration.split()[0]
             lines.append(f"const {type_} {name} = {AS_TYPE[type_].format(number)};")
     return declared, lines
-
-
-@dataclass(frozen=True)
-class Member:
-    """What a kernel is given for a member of a stack: its place, and its image's values."""
-
-    extents: Extents
-    bind: Bind
 
 
 def arguments_of(
@@ -88,7 +79,7 @@ def arguments_of(
             case TileNumber():
                 pass  # of each the first
             case value:
-                found = [member.bind(value) for member in members]
+                found = [member.task.bind(value) for member in members]
                 if isinstance(found[0], np.ndarray):
                     array, numbers[:, place] = side_by_side(found)
                     pointers.append((table if array is found[0] else new_table)(array))
