@@ -340,7 +340,7 @@ def test_another_chain_of_the_same_structure_is_not_planned_again(device, monkey
 
 
 def test_a_device_keeps_the_kernels_of_so_many_plans(device, monkeypatch):
-    monkeypatch.setattr("clpipe.engine.device.PLANS", 2)
+    monkeypatch.setattr("clpipe.engine.plan_kernels.PLANS", 2)
     fresh, image = Device(device.info), example(Kind.RGB, (9, 20))
     stages = (("exposure",), ("gamma",), ("exposure", "gamma"), ("exposure",))
     runners = [

@@ -2,20 +2,17 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
 from clpipe.base.types import Array
 from clpipe.engine.bindings import Bind
 from clpipe.engine.buffers import HostImages, room_for
-from clpipe.engine.calls import Call
-from clpipe.engine.codegen import write_kernel
 from clpipe.engine.discovery import (
     DeviceInfo,
     choose,
@@ -25,17 +22,17 @@ from clpipe.engine.discovery import (
     usable_memory,
 )
 from clpipe.engine.flow import DeviceImage, Flow
-from clpipe.engine.ir import AnyLaunch, Border, Launch, Plan
+from clpipe.engine.ir import Plan
 from clpipe.engine.members import ImageTask, Member
 from clpipe.engine.options import RunOptions, Timing
 from clpipe.engine.patches import with_patches
-from clpipe.engine.programs import announced, forget_programs, programs_of, tell_watchers
-from clpipe.engine.stack import Stack, StackKernel, cut, members_of
+from clpipe.engine.plan_kernels import calls_with, stack_kernels_with
+from clpipe.engine.programs import announced, forget_programs, programs_of
+from clpipe.engine.stack import Stack, cut, members_of
 from clpipe.engine.stack import start as start_stack
 from clpipe.engine.tiles import Tiling, tiling_of
 
 log = logging.getLogger(__name__)
-PLANS = 64  # whose kernels stay at hand
 FAILURES = 3  # images in a row that a device fails at, before it is given up
 
 
@@ -54,21 +51,6 @@ def timed(events: Sequence[tuple[str, Any]]) -> list[Timing]:
         )
         for name, event in events
     ]
-
-
-def told(plan: Plan) -> Iterator[AnyLaunch]:
-    """The launches of a plan, of which those who wait for their kernels hear."""
-    for number, launch in enumerate(plan.launches):
-        tell_watchers(number, len(plan.launches))
-        yield launch
-    tell_watchers(len(plan.launches), len(plan.launches))
-
-
-def borders_of(plan: Plan, written: Launch) -> Iterator[Border]:
-    """The launches that fill the borders of the planes that a launch has written."""
-    if image := written.writes:
-        for slot in plan.slots[image.number]:
-            yield Border(slot, written.level, image.period)
 
 
 class Device:
@@ -102,10 +84,8 @@ class Device:
             DeviceError: the device cannot be opened.
         """
         self._programs = programs_of(self.info)
-        self._calls: BoundedCache[list[Call]] = BoundedCache(PLANS)
-        self._border_calls: BoundedCache[Call] = BoundedCache(PLANS)
-        self._stack_kernels: BoundedCache[list[StackKernel]] = BoundedCache(PLANS)
-        self._stack_borders: BoundedCache[StackKernel] = BoundedCache(PLANS)
+        self._calls = calls_with(self._programs, self.info.lanes)
+        self._stack_kernels = stack_kernels_with(self._programs, self.info.lanes)
         try:
             self._flow = Flow(
                 self._programs.context, self.info.alignment if self.info.in_place else None
@@ -130,43 +110,11 @@ class Device:
 
     def is_compiled(self, plan: Plan) -> bool:
         """Whether the kernels of a plan are compiled."""
-        return plan.unscaled in self._calls
-
-    def compile(self, plan: Plan) -> list[Call]:
-        """The compiled kernels of a plan, from the first call on without compiling.
-
-        Raises:
-            DeviceError: a kernel does not compile; the message is the compiler's.
-        """
-        make = partial(self._call, plan)
-        return self._calls.get(plan.unscaled, lambda: [make(x) for x in told(plan)])
-
-    def _stacked(self, plan: Plan) -> list[StackKernel]:
-        """As :meth:`compile`, of the kernels over a stack."""
-        make = partial(self._stack_kernel, plan)
-        return self._stack_kernels.get(plan.unscaled, lambda: [make(x) for x in told(plan)])
-
-    def _call(self, plan: Plan, launch: AnyLaunch | Border) -> Call:
-        kernel = write_kernel(plan, launch, self.info.lanes)
-        return Call(kernel, self._programs.kernel(kernel))
-
-    def _stack_kernel(self, plan: Plan, launch: AnyLaunch | Border) -> StackKernel:
-        kernel = write_kernel(plan, launch, self.info.lanes, stacked=True)
-        return StackKernel(kernel, self._programs.kernel(kernel))
+        return plan in self._calls
 
     def keep_programs(self) -> None:
         """Keep for later processes what was compiled, and launched once, since the last time."""
         self._programs.keep()
-
-    def _borders(self, plan: Plan, written: Launch) -> Iterator[Call]:
-        """The calls that fill the borders of the planes that a launch has written."""
-        for border in borders_of(plan, written):
-            yield self._border_calls.get(border, partial(self._call, plan, border))
-
-    def _borders_of_stack(self, plan: Plan, written: Launch) -> Iterator[StackKernel]:
-        """As :meth:`_borders`, over a stack."""
-        for border in borders_of(plan, written):
-            yield self._stack_borders.get(border, partial(self._stack_kernel, plan, border))
 
     def submit(
         self, plan: Plan, source: Array, bind: Bind, options: RunOptions
@@ -239,10 +187,11 @@ class Device:
         """Enqueue stacks; what the device raises is returned."""
         begun: list[Stack] = []
         plan = stacks[0][0][0].task.plan
-        is_new = plan.unscaled not in self._stack_kernels
+        is_new = plan not in self._stack_kernels
         try:
             with announced(self.info) if is_new else nullcontext():
-                kernels, borders = self._stacked(plan), partial(self._borders_of_stack, plan)
+                kernels = self._stack_kernels.of(plan)
+            borders = partial(self._stack_kernels.borders, plan)
             for members, strides in stacks:
                 begun.append(Stack(members, kernels, borders, strides))
                 start_stack(self._flow, begun[-1], self.memory)
@@ -287,9 +236,9 @@ class Device:
     def _enqueue(self, task: ImageTask, memory: int) -> DeviceImage | Exception:
         """Enqueue an image; what the device raises is returned."""
         try:
-            borders = partial(self._borders, task.plan)
+            borders = partial(self._calls.borders, task.plan)
             tiling = self._tiling(task, memory)
-            image = DeviceImage(task, self.compile(task.plan), borders, tiling)
+            image = DeviceImage(task, self._calls.of(task.plan), borders, tiling)
             self._flow.start(image, self.memory)
             return image
         except (self._cl.Error, MemoryError) as error:
