@@ -1,9 +1,9 @@
 """What is kept of compiled kernels is looked at before it is used, and is this user's alone."""
 
+import mmap
 import os
 import subprocess
 import sys
-import time
 import zipfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -122,6 +122,15 @@ def test_a_packed_program_is_put_back(tmp_path):
     assert (tmp_path / "two/AB/CDEF/f/8-1-1/f.so").read_bytes() == b"library"
 
 
+def test_a_library_in_use_is_not_written_to(tmp_path):
+    path = put(tmp_path / "one/AB/CDEF/f.so", b"library")
+    packed = builders._packed(tmp_path / "one", "AB/CDEF", frozenset({"f.so"}))
+    path.write_bytes(b"running")
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
+        builders._unpack(packed, tmp_path / "one")
+        assert mapped[:] == path.read_bytes() == b"running"
+
+
 def test_nothing_is_put_elsewhere(tmp_path):
     path = tmp_path / "a.zip"
     names = ["../x", "/x", "AB/../x", "AB/CD/../../../x", "AB/CD/./x", "x", "AB/cd/x"]
@@ -138,6 +147,9 @@ def test_without_room_to_compile_pocl_is_not_asked(tmp_path, monkeypatch):
     builder = PoclBuilder(None, Store(None), tmp_path / "pocl")
     with pytest.raises(DeviceError, match=r"needs 32 MiB of room there .* TMPDIR"):
         builder.build(TEXT, [])
+    monkeypatch.undo()
+    with pytest.raises(DeviceError, match=r"removed while this process used it .* start again"):
+        PoclBuilder(None, Store(None), tmp_path / "gone" / "pocl").build(TEXT, [])
     monkeypatch.setattr(builders, "has_room", lambda _: True)
     monkeypatch.setattr(PoclBuilder, "_has_compiled", False)
     monkeypatch.setattr(builders, "memory_left", lambda: Left(50 << 20, "ulimit -v"))
@@ -214,46 +226,69 @@ def test_folders_that_are_made_are_the_users_alone(tmp_path):
 FOLDER_OF_A_PROCESS = (
     "from clpipe.engine.process_folder import process_folder; print(process_folder(), flush=True)"
 )
+needs_locks = pytest.mark.skipif(not system.fcntl, reason="needs file locks (Linux or macOS)")
 
 
-@pytest.fixture
-def ended(tmp_path, monkeypatch):
-    """The folder of a process that was killed a while ago."""
-    if not system.fcntl:
-        pytest.skip("needs locks of the system")
-    monkeypatch.setattr(process_folder.tempfile, "tempdir", str(tmp_path))
-    code = f"{FOLDER_OF_A_PROCESS}; import os; os.kill(os.getpid(), 9)"
+@needs_locks
+def test_folders_of_killed_processes_are_removed_and_others_stay(tmp_path):
+    kill = f"{FOLDER_OF_A_PROCESS}; import os; os.kill(os.getpid(), 9)"
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True)
-    folder = Path(done.stdout.decode().strip())
-    assert folder.is_dir() and tmp_path in folder.parents
-    os.utime(folder, (time.time() - 100,) * 2)
-    return folder
-
-
-def test_a_process_removes_its_folder_and_those_of_killed_ones(ended, tmp_path):
-    own = Path(python(FOLDER_OF_A_PROCESS, TMPDIR=tmp_path))
-    assert own.parent == ended.parent
-    assert not own.exists() and not ended.exists()
-
-
-def test_a_folder_in_use_or_just_made_stays(ended, tmp_path):
-    code = f"{FOLDER_OF_A_PROCESS}; import sys; sys.stdin.read()"
-    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", kill], env=environment, capture_output=True)
+    killed = Path(done.stdout.decode().strip())
+    assert killed.is_dir() and tmp_path in killed.parents
+    foreign = killed.with_name("mine")
+    foreign.mkdir()
+    wait = f"{FOLDER_OF_A_PROCESS}; import sys; sys.stdin.read()"
     streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, "-c", code], env=environment, **streams) as process:
+    with subprocess.Popen([sys.executable, "-c", wait], env=environment, **streams) as process:
         used = Path(process.stdout.readline().strip())
-        os.utime(used, (time.time() - 100,) * 2)
-        young = ended.with_name("young")
-        young.mkdir()
-        python(FOLDER_OF_A_PROCESS, TMPDIR=tmp_path)
-        assert used.is_dir() and young.is_dir()
+        for path in used.iterdir():  # as a program may that cleans up temporary files
+            path.unlink()
+        own = Path(python(FOLDER_OF_A_PROCESS, TMPDIR=tmp_path))
+        assert own.parent == used.parent == killed.parent
+        assert not own.exists() and not killed.exists()
+        assert used.is_dir() and foreign.is_dir()
         process.stdin.close()
 
 
+@needs_locks
+def test_a_new_folder_that_another_process_removes_is_made_again(tmp_path, monkeypatch):
+    make, made = process_folder.tempfile.mkdtemp, []
+
+    def removed_once(**options):
+        made.append(Path(make(**options)))
+        if len(made) == 1:
+            process_folder._remove_if_left(made[0])
+        return made[-1]
+
+    monkeypatch.setattr(process_folder.tempfile, "mkdtemp", removed_once)
+    assert process_folder._folder_in(tmp_path) == made[1].resolve()
+    assert made[1].is_dir() and not made[0].exists()
+
+
+FORK = """
+import os, sys
+from clpipe.engine.process_folder import process_folder
+parents = process_folder()
+reader, writer = os.pipe()
+child = os.fork()
+if child == 0:
+    os.close(writer)
+    os.read(reader, 1)  # until the parent has ended
+    own = process_folder()
+    print(own != parents, own.is_dir(), parents.exists(), flush=True)
+    os._exit(0)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork (Linux or macOS)")
+def test_a_forked_process_has_a_folder_of_its_own(tmp_path):
+    assert python(FORK, TMPDIR=tmp_path) == "True True False"
+
+
 def test_a_parent_that_somebody_else_made_is_passed_over(tmp_path):
-    (tmp_path / f"clpipe-{os.getuid()}").mkdir(mode=0o700)
-    (tmp_path / f"clpipe-{os.getuid()}").chmod(0o777)
+    (tmp_path / f"clpipe-processes-{os.getuid()}").mkdir(mode=0o700)
+    (tmp_path / f"clpipe-processes-{os.getuid()}").chmod(0o777)
     assert Path(python(FOLDER_OF_A_PROCESS, TMPDIR=tmp_path)).parent == tmp_path
 
 

@@ -205,7 +205,7 @@ def fetch(path: Path) -> None:
 
 
 def _fetch(url: str, path: Path) -> None:
-    part = path.with_name(f"{path.name}.part")
+    part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")  # processes may share it
 
     def work() -> None:
         system, remote = _opened(url)

@@ -17,7 +17,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.errors import DeviceError
+from clpipe.base.errors import DeviceError, ImageError
+from clpipe.base.files import passing_files, write_new
 from clpipe.base.memory import in_words, memory_left
 from clpipe.engine.process_folder import ROOM, has_room
 from clpipe.engine.store import Store
@@ -107,12 +108,19 @@ class PoclBuilder:
         return program
 
     def _check_room(self) -> None:
-        """See that there is room for PoCL to compile, which ends the process where there is none.
+        """Check that PoCL can compile. It ends the process if the disk or memory is full.
 
         Raises:
-            DeviceError: there is too little, on the disk or in memory.
+            DeviceError: disk or memory are too small, or the folder has been removed.
         """
-        if not has_room(self._folder.parent):
+        try:
+            enough = has_room(self._folder.parent)
+        except OSError as error:
+            raise DeviceError(
+                f"{self._folder.parent}: PoCL's folder has been removed while this process used it "
+                f"({error.strerror}); start again, and exclude it from clean-ups of temporary files"
+            ) from None
+        if not enough:
             raise DeviceError(
                 f"{self._folder}: PoCL needs {ROOM >> 20} MiB of room there to compile in; free "
                 "some, or name another folder for temporary files with TMPDIR"
@@ -126,13 +134,14 @@ class PoclBuilder:
         PoclBuilder._has_compiled = True
 
     def keep(self) -> None:
-        """Keep what PoCL has made of programs since they were built."""
-        for (source, options), (name, kept) in list(self._built.items()):
-            files = _files_of(self._folder / name)
-            if files - kept:
-                data = _packed(self._folder, name, files)
-                self._store.keep(data, source, *options)
-                self._built[source, options] = name, files
+        """Store what PoCL has compiled since the programs were built."""
+        with self._one_at_a_time:
+            for (source, options), (name, kept) in list(self._built.items()):
+                files = _files_of(self._folder / name)
+                if files - kept:
+                    data = _packed(self._folder, name, files)
+                    self._store.keep(data, source, *options)
+                    self._built[source, options] = name, files
 
 
 PROGRAM = re.compile(r"[A-Z]{2}/[A-Z]+")
@@ -176,12 +185,18 @@ def _packed(folder: Path, program: str, files: frozenset[str]) -> bytes:
 
 
 def _unpack(data: bytes, folder: Path) -> None:
-    """Put a packed program into PoCL's folder, as far as it can be."""
-    with suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(io.BytesIO(data)) as archive:
+    """Write the files of a packed program that PoCL's folder does not have yet.
+
+    A library that is there may be mapped and running: writing to it would end the process (SIGBUS).
+    """
+    with (
+        suppress(ImageError, zipfile.BadZipFile),
+        passing_files(),
+        zipfile.ZipFile(io.BytesIO(data)) as archive,
+    ):
         for name, content in _contents(archive):
-            path = folder / name
-            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            path.write_bytes(content)
+            if not (folder / name).exists():
+                write_new(folder / name, content)
 
 
 def _contents(archive: zipfile.ZipFile) -> Iterator[tuple[str, bytes]]:

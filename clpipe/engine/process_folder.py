@@ -1,10 +1,15 @@
-"""A folder of this process alone, in which runtimes compile, and which goes with the process."""
+"""A folder of this process alone, in which runtimes compile, removed when the process ends.
+
+A process locks its folder, and the system releases the lock when the process ends, however that
+happens. So later processes remove the folders that killed ones left, and no folder in use.
+Programs that clean up temporary files, like systemd-tmpfiles, skip locked folders too.
+"""
 
 import atexit
 import os
+import re
 import shutil
 import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
@@ -14,13 +19,17 @@ from clpipe.base.files import discard
 from clpipe.base.system import fcntl, forbids_programs, use, writable_by_others
 
 ROOM = 32 * 2**20  # bytes; with less, PoCL's compiler may end the process
-IN_USE = "in_use"  # the file that a process has alone as long as it uses its folder
-YOUNG = 60.0  # s in which a folder may not have that file yet
+NAME = re.compile(r"clpipe-\d+-\w+")  # of a process's folder: its number, and random characters
 
 
 @cache
 def process_folder() -> Path | None:
-    """The folder, with :data:`ROOM` and where programs may be run; None where there is none."""
+    """Return this process's folder, which is made at the first call.
+
+    Returns:
+        A folder with :data:`ROOM` bytes free, from which programs may be run; None if no folder for
+        temporary files allows that.
+    """
     for place in temporary_places():
         with suppress(OSError):
             if has_room(place) and not forbids_programs(place):
@@ -28,59 +37,70 @@ def process_folder() -> Path | None:
     return None
 
 
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=process_folder.cache_clear)  # a child makes its own
+
+
 def temporary_places() -> Iterator[Path]:
-    """Folders for temporary files, the usual one first."""
+    """Yield the folders for temporary files, the usual one first."""
     with suppress(FileNotFoundError):
         yield Path(tempfile.gettempdir())
     yield from (place for place in (Path("/var/tmp"), Path("/dev/shm")) if place.is_dir())  # noqa: S108
 
 
 def has_room(folder: Path) -> bool:
-    """Whether there is room to compile in a folder.
+    """Return whether :data:`ROOM` bytes are free in a folder.
 
     Raises:
-        OSError: it cannot be looked at.
+        OSError: the folder is missing or cannot be read.
     """
     return shutil.disk_usage(folder).free >= ROOM
 
 
 def _folder_in(place: Path) -> Path:
-    """A new folder below one for temporary files, from which those of ended processes are removed.
+    """Make a locked folder below one for temporary files; remove those that killed processes left.
 
     Raises:
         OSError: it cannot be made.
     """
-    ours = place / f"clpipe-{os.getuid() if hasattr(os, 'getuid') else 'kernels'}"
+    ours = place / f"clpipe-processes-{os.getuid() if hasattr(os, 'getuid') else 'kernels'}"
     with suppress(OSError):
         ours.mkdir(mode=0o700)
     if ours.is_symlink() or not ours.is_dir() or writable_by_others(ours):
         ours = place  # somebody else has made it
     elif fcntl:
-        for left in ours.iterdir():
-            if _is_left(left):
-                discard(left)
-    folder = Path(tempfile.mkdtemp(prefix=f"clpipe-{os.getpid()}-", dir=ours)).resolve()
-    use(os.open(folder / IN_USE, os.O_RDWR | os.O_CREAT, 0o600), alone=True, wait=False)
-    atexit.register(_remove, folder, os.getpid())
-    return folder
+        for folder in ours.iterdir():
+            if NAME.fullmatch(folder.name) and not folder.is_symlink():
+                _remove_if_left(folder)
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=f"clpipe-{os.getpid()}-", dir=ours)).resolve()
+        if not fcntl or _locked(folder):
+            atexit.register(_remove, folder, os.getpid())
+            return folder
 
 
-def _is_left(folder: Path) -> bool:
-    """Whether the process that made a folder has ended without removing it."""
-    try:
-        if time.time() - folder.stat().st_mtime < YOUNG:
-            return False
-        lock = os.open(folder / IN_USE, os.O_RDWR)
-    except FileNotFoundError:
-        return True
-    except OSError:
-        return False
-    try:
-        return use(lock, alone=True, wait=False)
-    finally:
+def _locked(folder: Path) -> bool:
+    """Lock a new folder until this process ends; False if another process has just removed it."""
+    with suppress(FileNotFoundError):
+        lock = os.open(folder, os.O_RDONLY)
+        use(lock, alone=True)
+        if folder.exists():
+            return True
         os.close(lock)
+    return False
+
+
+def _remove_if_left(folder: Path) -> None:
+    """Remove a folder unless a process holds its lock."""
+    with suppress(OSError):
+        lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            if use(lock, alone=True, wait=False):
+                discard(folder)
+        finally:
+            os.close(lock)
 
 
 def _remove(folder: Path, process: int) -> None:
-    if os.getpid() == process:  # a fork ends, too
+    if os.getpid() == process:  # a forked child runs this too
         shutil.rmtree(folder, ignore_errors=True)
