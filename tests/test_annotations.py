@@ -383,6 +383,17 @@ def mask_with(counts, size=(HEIGHT, WIDTH)):
             lambda coco: coco["images"].append({**coco["images"][0], "id": 8}),
             "found images/a.jpg a second time",
         ),
+        (lambda coco: coco["images"][0].update(id=[7]), "images[0].id: found [7]; expected the id"),
+        (lambda coco: coco["images"][0].pop("id"), "images[0].id: found None; expected the id"),
+        (
+            lambda coco: first(coco, image_id={"a": 7}),
+            "annotations[0].image_id: found {'a': 7}; expected the id of an image, a number or a",
+        ),
+        (
+            lambda coco: coco["images"][0].update(width=10**4000, height=10**4000),
+            "expected whole px from 1 to 100000",
+        ),
+        (mask_with([10**4299] * 20), "expected run lengths (whole numbers from 0 to 10000000000)"),
     ],
 )
 def test_coco_files_that_are_none(clpipe, coco, damage, message):
