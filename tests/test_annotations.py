@@ -412,6 +412,9 @@ def test_coco_files_that_are_none(clpipe, coco, damage, message):
         ("label_2/a.txt", "Car 0 0 0 1 1 nan 3 1 1 1 1 1 1 1", "a type and 14 numbers"),
         ("scene_gt.json", '{"3": 5}', "found 5; expected a list of objects"),
         ("scene_gt.json", '{"3": []}', "3.cam_K: found [1, 2]; expected nine numbers"),
+        ("scene_gt.json", f'{{"{"9" * 4400}": []}}', "999; expected its number, from 0 to 99999"),
+        ("scene_gt.json", f'{{"{"9" * 300}": [{{}}]}}', "999; expected its number, from 0 to 9999"),
+        ("scene_gt.json", '{"4": [{}]}', "4[0].px_count_all: found 1000000000000000000000000000"),
     ],
 )
 def test_kittis_and_bops_files_that_are_none(clpipe, write_exr, name, text, message):
@@ -420,6 +423,7 @@ def test_kittis_and_bops_files_that_are_none(clpipe, write_exr, name, text, mess
     path.parent.mkdir(parents=True)
     path.write_text(text)
     path.with_name("scene_camera.json").write_text('{"3": {"cam_K": [1, 2]}}')
+    path.with_name("scene_gt_info.json").write_text(f'{{"4": [{{"px_count_all": {10**400}}}]}}')
     asked = path if path.suffix == ".json" else path.parent
     said = clpipe("run", "in", "-o", "o", "--annotations", asked, status=2).stderr
     assert message in said

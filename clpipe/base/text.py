@@ -44,6 +44,20 @@ def printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else "?" for letter in line)
 
 
+MOST_DIGITS = 18  # of a whole number; int() raises ValueError for more than 4300
+
+
+def whole_number(text: str) -> int:
+    """Returns the whole number that a text of decimal digits stands for.
+
+    Returns -1 if the text has other characters, no digits, or more than 18 digits.
+
+    >>> whole_number("42"), whole_number("-3"), whole_number("9" * 5000)
+    (42, -1, -1)
+    """
+    return int(text) if text.isdecimal() and len(text) <= MOST_DIGITS else -1
+
+
 def duration(seconds: float) -> str:
     """A length of time for people.
 
