@@ -31,6 +31,8 @@ def one_line(text: str) -> str:
     >>> one_line("in/a" + chr(10) + chr(27) + "[31m.exr")
     'in/a\\n\\x1b[31m.exr'
     """
+    if text.isprintable():  # as nearly all are
+        return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
