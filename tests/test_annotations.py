@@ -383,6 +383,17 @@ def mask_with(counts, size=(HEIGHT, WIDTH)):
             lambda coco: coco["images"].append({**coco["images"][0], "id": 8}),
             "found images/a.jpg a second time",
         ),
+        (lambda coco: coco["images"][0].update(id=[7]), "images[0].id: found [7]; expected the id"),
+        (lambda coco: coco["images"][0].pop("id"), "images[0].id: found None; expected the id"),
+        (
+            lambda coco: first(coco, image_id={"a": 7}),
+            "annotations[0].image_id: found {'a': 7}; expected the id of an image, a number or a",
+        ),
+        (
+            lambda coco: coco["images"][0].update(width=10**4000, height=10**4000),
+            "expected whole px from 1 to 100000",
+        ),
+        (mask_with([10**4299] * 20), "expected run lengths (whole numbers from 0 to 10000000000)"),
     ],
 )
 def test_coco_files_that_are_none(clpipe, coco, damage, message):
@@ -401,6 +412,9 @@ def test_coco_files_that_are_none(clpipe, coco, damage, message):
         ("label_2/a.txt", "Car 0 0 0 1 1 nan 3 1 1 1 1 1 1 1", "a type and 14 numbers"),
         ("scene_gt.json", '{"3": 5}', "found 5; expected a list of objects"),
         ("scene_gt.json", '{"3": []}', "3.cam_K: found [1, 2]; expected nine numbers"),
+        ("scene_gt.json", f'{{"{"9" * 4400}": []}}', "999; expected its number, from 0 to 99999"),
+        ("scene_gt.json", f'{{"{"9" * 300}": [{{}}]}}', "999; expected its number, from 0 to 9999"),
+        ("scene_gt.json", '{"4": [{}]}', "4[0].px_count_all: found 1000000000000000000000000000"),
     ],
 )
 def test_kittis_and_bops_files_that_are_none(clpipe, write_exr, name, text, message):
@@ -409,6 +423,7 @@ def test_kittis_and_bops_files_that_are_none(clpipe, write_exr, name, text, mess
     path.parent.mkdir(parents=True)
     path.write_text(text)
     path.with_name("scene_camera.json").write_text('{"3": {"cam_K": [1, 2]}}')
+    path.with_name("scene_gt_info.json").write_text(f'{{"4": [{{"px_count_all": {10**400}}}]}}')
     asked = path if path.suffix == ".json" else path.parent
     said = clpipe("run", "in", "-o", "o", "--annotations", asked, status=2).stderr
     assert message in said

@@ -1,5 +1,6 @@
 """Many images: resuming, failing alone, being stopped, being looked at."""
 
+import contextlib
 import errno
 import itertools
 import json
@@ -404,6 +405,33 @@ def test_two_runs_in_one_folder(tmp_path):
     with output_folder(tmp_path / "out", Shard()):
         pass
     assert not list((tmp_path / "out").iterdir())
+
+
+STOPPED_TWICE = """
+import os, signal
+from pathlib import Path
+from clpipe.batch.interrupt import interruptible
+from clpipe.inputs.find import Shard
+from clpipe.outputs.folder import output_folder
+with output_folder(Path("out"), Shard(1, 2)), interruptible(lambda: None):
+    for _ in range(2):
+        os.kill(os.getpid(), signal.SIGINT)
+    signal.pause()
+"""
+
+
+@pytest.mark.parametrize("is_shared", [False, True])
+def test_a_run_that_is_stopped_twice_removes_its_lock(tmp_path, is_shared):
+    out, other = tmp_path / "out", Shard(2, 2)
+    with output_folder(out, other) if is_shared else contextlib.nullcontext():
+        ended = subprocess.run(
+            [sys.executable, "-c", STOPPED_TWICE],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )
+        assert ended.returncode == 130
+        assert [path.name for path in out.iterdir()] == [LOCK] * is_shared
+    assert not is_shared or not list(out.iterdir())
 
 
 def test_halves_of_a_killed_run_are_removed(tmp_path):

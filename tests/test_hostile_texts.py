@@ -12,14 +12,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clpipe.analysis.crops import choose_places
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import parse_toml
 from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.files import load_config
 from clpipe.chain.settings import settings_from
 from clpipe.chain.toml import toml_value
+from clpipe.commands.chain_options import patch_count
+from clpipe.inputs.find import parse_shard
 from clpipe.inputs.kept import embedded_settings
 from clpipe.inputs.manifest import read_manifest
+from clpipe.scenes.view_request import parse_frames, parse_resolution
 from tests.conftest import ROOT, reseal
 
 
@@ -130,6 +134,35 @@ def test_toml_that_would_take_all_memory_or_time(tmp_path, text):
         assert len(str(refused.value)) < 1000
     cell = text.removeprefix("x = ")
     assert toml_value(cell) == cell  # text, which no parameter takes
+
+
+LONG = "9" * 4400  # more digits than int() takes
+
+
+@pytest.mark.parametrize(
+    ("parse", "text", "message"),
+    [
+        (parse_shard, f"1/{LONG}", "--shard: found '1/999"),
+        (parse_frames, f"1-{LONG}", "each from 0 to 1048574"),
+        (parse_frames, "0-99999999999", "each from 0 to 1048574"),
+        (parse_resolution, f"{LONG}x9", "expected WIDTHxHEIGHT"),
+        (patch_count, LONG, "expected 1 to 9999, or grid"),
+        (
+            lambda text: choose_places((text,), np.zeros((9, 9, 3), np.float32)),
+            f"0,0,9x{LONG}",
+            "expected X,Y,",
+        ),
+    ],
+)
+def test_options_with_a_number_of_too_many_digits(parse, text, message):
+    with pytest.raises(RequestError, match=message):
+        parse(text)
+
+
+@pytest.mark.parametrize("command", [("bench",), ("emva", "--camera", "nikon-d850", "-o", "out")])
+def test_a_size_of_too_many_digits(clpipe, command):
+    said = clpipe(*command, "--size", f"640x{LONG}", status=2).stderr
+    assert "expected WIDTHxHEIGHT" in said
 
 
 def test_names_that_no_file_can_have():

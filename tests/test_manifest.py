@@ -1,8 +1,10 @@
 """Manifests: what their rows say, and what is said of a row that is wrong."""
 
 import json
+import ntpath
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -13,7 +15,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
 from clpipe.chain.toml import toml_value
-from clpipe.inputs.manifest import Row, check_rows, read_manifest
+from clpipe.inputs.manifest import Row, check_output_name, check_rows, read_manifest
 from tests.conftest import noise_report
 
 DEFAULT = settings_from({})
@@ -191,11 +193,24 @@ def test_rows_lie_over_settings(manifest):
             (f"path,name\na.exr,{name}\n", "row 2: name: found .*a path in the output folder")
             for name in ("/x", "../x", "a/../../x", "a/..", "..", ".", "a//b", "x/", "./x", "a/./b")
         ),
+        *(
+            (f"path,name\na.exr,{name}\n", "row 2: name: found .* no backslash, .* choose another")
+            for name in (".hidden", ".clpipe.lock", "a/.b", "a\\..\\evil", "~/evil", "a/~b/c")
+        ),
     ],
 )
 def test_a_csv_that_is_wrong(manifest, text, message):
     with pytest.raises(RequestError, match=message):
         manifest(text)
+
+
+@pytest.mark.parametrize("name", ["..\\evil", "a\\..\\evil", "C:evil", "C:/evil", "//host/share/x"])
+def test_a_name_stays_in_the_output_folder_on_windows(monkeypatch, name):
+    windows = SimpleNamespace(sep="\\", path=ntpath)
+    monkeypatch.setattr("clpipe.inputs.manifest.os", windows)
+    with pytest.raises(RequestError, match="a path in the output folder"):
+        check_output_name(name)
+    check_output_name("a/b.c")
 
 
 @pytest.mark.parametrize(

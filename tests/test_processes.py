@@ -1,5 +1,6 @@
 """A run by several processes on this machine: the same bytes, whoever dies."""
 
+import io
 import json
 import os
 import signal
@@ -14,7 +15,10 @@ import pytest
 import clpipe as package
 from clpipe.base.errors import DeviceError, RequestError
 from clpipe.batch import processes
+from clpipe.batch.local_worker import Seat
+from clpipe.batch.pipes import Pipe
 from clpipe.batch.run_log import read_log
+from clpipe.batch.spec import RunSpec
 from tests.conftest import ROOT, contents, statuses, written
 
 RUN = ("-o", "out", "--iso", 3200)
@@ -214,6 +218,35 @@ def test_processes_that_all_die_end_the_run(renders, monkeypatch):
     monkeypatch.setattr(processes, "FUTILE", 4)
     with pytest.raises(DeviceError, match=r"4 processes in a row ended before .* with status 9"):
         list(package.run("in", "out", processes=2, device="numpy"))
+
+
+def test_ctrl_c_does_not_reach_a_process_before_its_first_line(renders, monkeypatch):
+    renders(2)
+    interrupted = "import os, signal; os.kill(os.getpid(), signal.SIGINT); "
+    monkeypatch.setattr(processes, "PROGRAM", interrupted + processes.PROGRAM)
+    run = package.run("in", "out", processes=2, device="numpy")
+    assert [outcome.status for outcome in run] == ["done"] * 2
+
+
+@pytest.mark.parametrize("gone", ["before it says what to do", "after it says what to do"])
+def test_a_process_whose_run_has_gone_ends_silently(renders, monkeypatch, gone):
+    renders(1)
+    sent = io.BytesIO()
+    if gone.startswith("after"):
+        pipe = Pipe(io.BytesIO(), sent)
+        run = package.run("in", "out", device="numpy")
+        pipe.send(RunSpec(run._request, run.where, run.jobs[0]), Seat(0, 1, 1))
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "wb") as nobody_reads:
+        ended = subprocess.run(
+            [sys.executable, "-c", processes.START],
+            input=sent.getvalue(),
+            stdout=nobody_reads,
+            stderr=subprocess.PIPE,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )
+    assert (ended.returncode, ended.stderr) == (1, b"")
 
 
 def test_nothing_runs_from_the_working_directory_and_nothing_is_left(renders, tmp_path, clpipe):

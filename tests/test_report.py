@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import os
 import re
 import shutil
 from html.parser import HTMLParser
@@ -22,7 +23,8 @@ from tests.conftest import reseal
 
 pytest.importorskip("jinja2")
 
-HOSTILE = "<img src=x onerror=alert(1)>&amp;"
+HOSTILE = "<img src=x onerror=alert(1)>&amp;\x1b[31m\n"
+SHOWN = r"<img src=x onerror=alert(1)>&amp;\x1b[31m\n"
 NUMPY = ("--device", "numpy")
 
 
@@ -104,7 +106,7 @@ def test_figures_pictures_and_failures(out):
     assert "pictures 3" in page.said and "failed 1" in page.said
     assert "cut.exr" in page.said
     entries = page.data["sheet-data"]
-    assert [entry["name"] for entry in entries] == [HOSTILE, "a", "b"]
+    assert [entry["name"] for entry in entries] == [SHOWN, "a", "b"]
     assert all(entry["image"].startswith("data:image/webp;base64,") for entry in entries)
     assert {entry["iso"] for entry in entries} == {1600}
     large = page.data["look-data"]
@@ -132,6 +134,14 @@ def test_it_is_one_file_in_which_nothing_is_markup_but_ours(out):
     assert len(page.text) < 15 << 20
 
 
+def test_names_with_characters_that_cannot_be_printed(out):
+    out = out.rename(out.with_name(os.fsdecode(b"o\x1b\xff")))
+    page = report(out)
+    assert not re.search(r"[\x00-\x09\x0b-\x1f]|\\u001b", page.text)
+    assert r"o\x1b\udcff: report of a run" in page.said
+    assert page.said.count(SHOWN) > 2
+
+
 def test_the_law_is_held_against_raws(out):
     page = report(out)
     assert "Raws against the law that was asked" in page.said
@@ -142,6 +152,7 @@ def test_the_law_is_held_against_raws(out):
     assert f"{fit['a']:.4g} ± {fit['a_error']:.1g}" in page.said
     assert f"{fit['b']:.4g} ± {fit['b_error']:.1g}" in page.said
     (name,) = re.findall(r"Against (.*?)\.truth\.jpg, in flat places", page.said)
+    name = name.replace(SHOWN, HOSTILE)
     pair = (out / f"{name}.jpg", "--truth", out / f"{name}.truth.jpg")
     channels = json.loads(clpipe("measure", *pair, "--json"))["channels"]
     assert f"R {channels['R']['sigma'] * 255:.2f}, G" in page.said
@@ -167,8 +178,8 @@ def test_files_that_are_gone_or_changed_are_named(out):
     assert "b.jpg: was changed since; its SHA-256" in page.said
     assert "b.normalize.exr: has 5 bytes, not the " in page.said
     by_name = {entry["name"]: entry for entry in page.data["sheet-data"]}
-    assert not by_name["a"]["image"] and not by_name["b"]["image"] and by_name[HOSTILE]["image"]
-    assert by_name["a"]["odd"] and not by_name[HOSTILE]["odd"]
+    assert not by_name["a"]["image"] and not by_name["b"]["image"] and by_name[SHOWN]["image"]
+    assert by_name["a"]["odd"] and not by_name[SHOWN]["odd"]
 
 
 def test_half_a_run_and_a_log_that_is_cut_off(out):
@@ -180,7 +191,7 @@ def test_half_a_run_and_a_log_that_is_cut_off(out):
     page = report(out)
     assert "cut off, or still going" in page.said
     assert "b.json: was changed since clpipe wrote it" in page.said and "notes" not in page.said
-    assert [entry["name"] for entry in page.data["sheet-data"]] == [HOSTILE, "a"]
+    assert [entry["name"] for entry in page.data["sheet-data"]] == [SHOWN, "a"]
 
 
 def test_hostile_sidecars(out):

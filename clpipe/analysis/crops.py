@@ -16,7 +16,7 @@ MIDDLE = 0.2, 0.8  # display values between which a flat place is, in the mean
 BLACK = 0.08  # display value of luma; what is darker shows nothing,
 MOST_BLACK = 0.05  # and is at most this share of a dark place
 
-BY_HAND = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<box>\d+,\d+,\d+x\d+)")
+BY_HAND = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<box>\d{1,9},\d{1,9},\d{1,9}x\d{1,9})")
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from clpipe.analysis.plot import (
 )
 from clpipe.analysis.report import NoiseReport
 from clpipe.analysis.spatial import LAGS
+from clpipe.base.text import one_line
 
 NEUTRAL = INK["mosaic"]  # in :mod:`clpipe.analysis.plot`
 PAGE_COLOURS = resources.files("clpipe.analysis") / "colours.css"  # of the pages
@@ -84,7 +85,7 @@ def _text(figure: Figure, title: str) -> str:
     own = f"d{zlib.crc32(text.encode()):x}"
     text = re.sub(r'(id="|url\(#|href="#)', rf"\g<1>{own}", text)
     text = re.sub(r'width="[\d.]+pt" height="[\d.]+pt"', 'width="100%"', text, count=1)
-    label = title.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
+    label = one_line(title).replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
     return text.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)
 
 

@@ -233,6 +233,23 @@ def give_back_memory() -> None:
 
 
 @contextlib.contextmanager
+def blocked_signals(numbers: Collection[int]) -> Iterator[None]:
+    """Block signals in this thread until the ``with`` block ends.
+
+    A process that is started in the block inherits this for good, so it never gets the signals.
+    Windows cannot block signals, so this does nothing there.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
 def kept_signals() -> Iterator[None]:
     """Have signals go where they went before, whatever a library that is begun inside does.
 

@@ -31,6 +31,8 @@ def one_line(text: str) -> str:
     >>> one_line("in/a" + chr(10) + chr(27) + "[31m.exr")
     'in/a\\n\\x1b[31m.exr'
     """
+    if text.isprintable():  # as nearly all are
+        return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
@@ -42,6 +44,20 @@ def printable(text: str) -> str:
     """
     line = " ".join(text.split())
     return "".join(letter if letter.isprintable() else "?" for letter in line)
+
+
+MOST_DIGITS = 18  # of a whole number; int() raises ValueError for more than 4300
+
+
+def whole_number(text: str) -> int:
+    """Returns the whole number that a text of decimal digits stands for.
+
+    Returns -1 if the text has other characters, no digits, or more than 18 digits.
+
+    >>> whole_number("42"), whole_number("-3"), whole_number("9" * 5000)
+    (42, -1, -1)
+    """
+    return int(text) if text.isdecimal() and len(text) <= MOST_DIGITS else -1
 
 
 def duration(seconds: float) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 from clpipe.base.files import remove_temporary_files
+from clpipe.outputs.folder import release_folders
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -18,7 +19,9 @@ INTERRUPTED = 130
 
 @contextlib.contextmanager
 def interruptible(stop: Callable[[], None]) -> Iterator[None]:
-    """Call ``stop`` at the first signal; at the second, end the process and leave no half file.
+    """Call ``stop`` at the first signal; at the second, end the process.
+
+    The process then leaves no half-written file and no lock file.
 
     Signals only come to the main thread; in any other this does nothing.
     """
@@ -31,6 +34,7 @@ def interruptible(stop: Callable[[], None]) -> Iterator[None]:
         nonlocal is_stopping
         if is_stopping:
             remove_temporary_files()
+            release_folders()
             os._exit(INTERRUPTED)
         is_stopping = True
         stop()

@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from clpipe.base.errors import ClpipeError
 from clpipe.base.files import discard, remove_temporary_files
@@ -54,7 +54,7 @@ class Seat:
 
 def main() -> None:
     """Do what standard input says."""
-    pipe = Pipe(sys.stdin.buffer, os.fdopen(os.dup(1), "wb"))
+    pipe = _PipeToRun(sys.stdin.buffer, os.fdopen(os.dup(1), "wb"))
     os.dup2(2, 1)  # what libraries print is no message
     gc.freeze()  # what is imported stays: looking through it again and again takes time
     spec, seat = pipe.receive()
@@ -76,6 +76,30 @@ def _leave(status: int) -> NoReturn:
     if process_folder.cache_info().currsize and (folder := process_folder()):
         discard(folder)
     os._exit(status)
+
+
+class _PipeToRun(Pipe):
+    """The pipe to the run's process. Ends this process silently if the run's process is gone."""
+
+    def send(self, *message: Any) -> None:
+        """Send values."""
+        try:
+            super().send(*message)
+        except OSError:
+            _abandon()
+
+    def receive(self) -> Any:
+        """Return the next message."""
+        try:
+            return super().receive()
+        except EOFError:
+            _abandon()
+
+
+def _abandon() -> NoReturn:
+    """End this process without finishing its images."""
+    remove_temporary_files()
+    _leave(1)
 
 
 def _work(pipe: Pipe, spec: RunSpec, seat: Seat) -> None:
@@ -112,18 +136,14 @@ def _work(pipe: Pipe, spec: RunSpec, seat: Seat) -> None:
 
 def _listen(pipe: Pipe, jobs: Jobs, batch: Batch | InTurn) -> None:
     """Take jobs in, until it is said that there are no more."""
-    try:
-        while True:
-            what, *values = pipe.receive()
-            for job in values[0] if what == "jobs" else ():
-                jobs.put(job)
-            if what == "stop":
-                batch.stop()
-            if what != "jobs":
-                jobs.put(None)
-    except EOFError:  # the run's process was killed
-        remove_temporary_files()
-        _leave(1)
+    while True:
+        what, *values = pipe.receive()
+        for job in values[0] if what == "jobs" else ():
+            jobs.put(job)
+        if what == "stop":
+            batch.stop()
+        if what != "jobs":
+            jobs.put(None)
 
 
 def _tell(pipe: Pipe, finished: "queue.SimpleQueue[Outcome | None]") -> None:

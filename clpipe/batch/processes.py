@@ -22,7 +22,8 @@ from dataclasses import dataclass, field
 from clpipe.base.errors import ClpipeError, DeviceError, RequestError
 from clpipe.base.memory import available_memory
 from clpipe.base.processors import available_processors
-from clpipe.base.system import processor_numbers
+from clpipe.base.system import blocked_signals, processor_numbers
+from clpipe.batch.interrupt import SIGNALS
 from clpipe.batch.local_worker import Seat
 from clpipe.batch.outcome import FAILED, Outcome
 from clpipe.batch.pipes import Pipe
@@ -190,12 +191,13 @@ class Processes:
         limits = {name: os.environ.get(name, str(share)) for name in THREADS}
         program = PROGRAM.format(path=json.dumps(sys.path), start=START)
         try:
-            popen = subprocess.Popen(  # noqa: S603 - this program
-                [sys.executable, "-P", "-c", program],  # nothing from the working directory
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                env={**os.environ, **limits},
-            )
+            with blocked_signals(SIGNALS):
+                popen = subprocess.Popen(  # noqa: S603 - this program
+                    [sys.executable, "-P", "-c", program],  # nothing from the working directory
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    env={**os.environ, **limits},
+                )
         except OSError as error:
             raise RequestError(
                 f"--processes: {self._count}: no process can be started ({error.strerror}); ask "

@@ -7,6 +7,7 @@ import click
 
 from clpipe.base.errors import RequestError
 from clpipe.base.processors import available_processors
+from clpipe.base.text import whole_number
 from clpipe.batch.bench import CPU_STEPS, BatchSpeed, bench_batch, loads
 from clpipe.chain.methods import stage_named
 from clpipe.chain.request import Request
@@ -62,9 +63,8 @@ def bench(
     The image is in half floats when it enters, and in eight bits when it leaves; both stay on the
     device.
     """
-    width, _, height = size.partition("x")
-    numbers = width.isdecimal() and height.isdecimal()
-    if not numbers or not 0 < int(width) * int(height) <= MAX_PIXELS:
+    width, height = map(whole_number, size.partition("x")[::2])
+    if min(width, height) < 1 or width * height > MAX_PIXELS:
         raise RequestError(
             f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 6000x4000, "
             f"at most {MAX_PIXELS} pixels"
@@ -76,7 +76,7 @@ def bench(
         raise RequestError("bench: it times the kernels of a device; numpy has none")
     if methods is not None:
         stage = stage_named("--methods", methods)
-        speeds = bench_methods(device, stage, chain.settings, int(width), int(height), repeat)
+        speeds = bench_methods(device, stage, chain.settings, width, height, repeat)
         if as_json:
             show_json({**machine_record(device), "methods": [asdict(speed) for speed in speeds]})
             return
@@ -97,7 +97,7 @@ def bench(
         show(BATCH_HEADINGS, map(batch_row, batches), left=1)
         ask_for_report(device)
         return
-    report = run_bench(device, chain, int(width), int(height), repeat)
+    report = run_bench(device, chain, width, height, repeat)
     if as_json:
         show_json(report.record() | machine_record(device))
         return

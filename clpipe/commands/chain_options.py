@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from clpipe.base.errors import RequestError
+from clpipe.base.text import whole_number
 from clpipe.chain.files import built_in_configs
 from clpipe.chain.formats import EVERY_FORMAT
 from clpipe.chain.keys import ABOUT
@@ -179,8 +180,8 @@ def patch_count(text: str) -> int | str:
     """
     if text == "grid":
         return text
-    if text.isascii() and text.isdigit() and 0 < int(text) <= MOST_PATCHES:
-        return int(text)
+    if 0 < (count := whole_number(text)) <= MOST_PATCHES:
+        return count
     raise RequestError(
         f"--patches-per-image: found {text!r}; expected 1 to {MOST_PATCHES}, or grid"
     )

@@ -8,6 +8,7 @@ from clpipe.analysis.emva.series import LEAST_EXPOSURES, SIDES
 from clpipe.analysis.emva.simulation import SeriesSize, simulate
 from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
+from clpipe.base.text import whole_number
 from clpipe.commands.completion import cameras
 from clpipe.commands.options import Command, device_option, json_option, output_option
 from clpipe.commands.printing import show_json
@@ -75,8 +76,7 @@ def emva(
     clpipe calibrate --emva series/EMVA1288_Data.txt -o again.toml
     """
     require("clpipe emva", "calibrate", "scipy")
-    width, _, height = size.partition("x")
-    columns, rows = (int(side) if side.isdecimal() else 0 for side in (width, height))
+    columns, rows = map(whole_number, size.partition("x")[::2])
     least, most = SIDES
     if not least <= min(columns, rows) <= max(columns, rows) <= most:
         raise RequestError(

@@ -2,6 +2,7 @@
 
 import ast
 import gc
+import io
 import logging
 import re
 import sys
@@ -150,6 +151,8 @@ def main() -> None:
     clpipe run render.exr -o out --iso 3200
     clpipe stages sensor_noise
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a file's name may not be UTF-8
+        sys.stdout.reconfigure(errors="backslashreplace")  # as for stderr
     logger = logging.getLogger("clpipe")
     logger.setLevel(logging.INFO)
     if NOTICES not in logger.handlers:

@@ -12,6 +12,8 @@ LARGEST = 1 << 30  # bytes of a file
 
 FARTHEST = 1e5  # px from the corner of a render, of a place in it or beside it
 
+MOST_PIXELS = 10**10  # of a render, as FARTHEST squared
+
 Record = dict[str, Any]
 
 

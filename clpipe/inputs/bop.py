@@ -10,12 +10,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from clpipe.inputs.annotations import FARTHEST, AnnotatedRender, Record, parsed, refuse
+from clpipe.base.text import whole_number
+from clpipe.inputs.annotations import (
+    FARTHEST,
+    MOST_PIXELS,
+    AnnotatedRender,
+    Record,
+    parsed,
+    refuse,
+)
 
 POSES, INFOS, CAMERAS = "scene_gt.json", "scene_gt_info.json", "scene_camera.json"
 MASKS = ("mask", "mask_visib")
 BOXES = ("bbox_obj", "bbox_visib")
 DIGITS = 6  # of an image's number in the names of files
+LAST = 10**9 - 1  # the largest number of an image
+COUNTS = ("px_count_all", "px_count_valid")  # which change with the size of a mask
 
 
 @dataclass(frozen=True)
@@ -91,6 +101,9 @@ def _by_image(path: Path) -> dict[int, Record]:
     values = parsed(path)
     if not is_by_image(values):
         refuse(path, "it", values, "images by their numbers")
+    for key in values:
+        if not 0 <= whole_number(key) <= LAST:
+            refuse(path, "image", key, f"its number, from 0 to {LAST}; renumber this image")
     return {int(key): value for key, value in values.items()}
 
 
@@ -99,6 +112,10 @@ def _check(path: Path, place: str, info: Record) -> None:
         box = info.get(name, [0] * 4)
         if not isinstance(box, list) or len(box) != 4 or not all(_is_number(v) for v in box):
             refuse(path, f"{place}.{name}", box, "x, y, width and height")
+    for name in COUNTS if isinstance(info, dict) else ():
+        count = info.get(name, 0)
+        if not isinstance(count, int | float) or not 0 <= count <= MOST_PIXELS:
+            refuse(path, f"{place}.{name}", count, "a number of pixels")
     if not isinstance(info, dict):
         refuse(path, place, info, "an object")
 

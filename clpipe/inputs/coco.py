@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from clpipe.base.errors import RequestError
-from clpipe.inputs.annotations import FARTHEST, AnnotatedRender, Record, refuse
+from clpipe.inputs.annotations import FARTHEST, MOST_PIXELS, AnnotatedRender, Record, refuse
 
 LISTS = ("images", "annotations", "categories")
 
@@ -54,22 +54,35 @@ def read_coco(path: Path, values: Any) -> Coco:
     names: dict[Any, str] = {}
     for number, image in enumerate(images):
         sizes = [image.get(name) for name in ("width", "height")]
-        if not all(isinstance(side, int) and side > 0 for side in sizes):
-            refuse(path, f"images[{number}]", f"width and height {sizes}", "whole px above 0")
-        if not isinstance(image.get("file_name"), str) or image.get("id") in of_image:
+        if not all(isinstance(side, int) and 0 < side <= FARTHEST for side in sizes):
+            allowed = f"whole px from 1 to {FARTHEST:.0f}"
+            refuse(path, f"images[{number}]", f"width and height {sizes}", allowed)
+        _check_id(path, f"images[{number}].id", image.get("id"))
+        if not isinstance(image.get("file_name"), str) or image["id"] in of_image:
             refuse(path, f"images[{number}]", "no file_name, or an id that is there twice", "both")
         if image["file_name"] in sizes_of:
             refuse(path, f"images[{number}]", f"{image['file_name']} a second time", "it once")
         sizes_of[image["file_name"]] = (image["width"], image["height"])
-        of_image[image.get("id")] = []
-        names[image.get("id")] = image["file_name"]
+        of_image[image["id"]] = []
+        names[image["id"]] = image["file_name"]
     for number, each in enumerate(annotations):
         place = f"annotations[{number}]"
-        if each.get("image_id") not in of_image:
-            refuse(path, place, f"image_id {each.get('image_id')!r}", "that of an image")
+        _check_id(path, f"{place}.image_id", each.get("image_id"))
+        if each["image_id"] not in of_image:
+            refuse(path, place, f"image_id {each['image_id']!r}", "that of an image")
         _check(path, place, each, sizes_of[names[each["image_id"]]])
         of_image[each["image_id"]].append(each)
     return Coco(path, values, of_image)
+
+
+def _check_id(path: Path, place: str, found: Any) -> None:
+    """Check that a value can identify an image.
+
+    Raises:
+        RequestError: it is neither a number nor a text.
+    """
+    if not isinstance(found, int | float | str):
+        refuse(path, place, found, "the id of an image, a number or a text")
 
 
 def _check(path: Path, place: str, annotation: Record, size: tuple[int, int]) -> None:
@@ -127,8 +140,8 @@ def runs_of(counts: Any) -> list[int]:
     ([3, 2, 4], [0, 8, 33], [0, 8, 0, 13])
     """
     if isinstance(counts, list):
-        if not all(isinstance(n, int) and not isinstance(n, bool) and n >= 0 for n in counts):
-            raise ValueError("whole numbers from 0 on")
+        if not all(type(n) is int and 0 <= n <= MOST_PIXELS for n in counts):
+            raise ValueError(f"whole numbers from 0 to {MOST_PIXELS}")
         return counts
     if not isinstance(counts, str):
         raise ValueError("a list or a text")

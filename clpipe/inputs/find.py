@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from clpipe.base.buckets import check_url, is_glob, is_url, listed, url_of
 from clpipe.base.errors import ImageError, RequestError
-from clpipe.base.text import printable
+from clpipe.base.text import printable, whole_number
 from clpipe.chain.rendition import Rendition
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import RENDER_SUFFIXES
@@ -320,8 +320,7 @@ def parse_shard(text: str) -> Shard:
     Raises:
         RequestError: the text does not have that form.
     """
-    number, slash, of = text.partition("/")
-    right = slash and number.isdecimal() and of.isdecimal()
-    if not right or not 1 <= int(number) <= int(of) <= 1_000_000:
+    number, of = map(whole_number, text.partition("/")[::2])
+    if not 1 <= number <= of <= 1_000_000:
         raise RequestError(f"--shard: found {text!r}; expected I/N, such as 1/8, I from 1 to N")
-    return Shard(int(number), int(of))
+    return Shard(number, of)

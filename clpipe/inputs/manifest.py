@@ -258,7 +258,7 @@ def _row(
     path, name, frames = record.get("path", ""), record.get("name", ""), record.get("frames")
     if os.path.basename(path) in ("", ".", ".."):
         raise RequestError(f"path: found {path!r}, which names no image")
-    check_output_name(name)
+    _check_name(name)
     if frames is not None and (type(frames) is not int or not 0 < frames <= MAX_FRAMES):
         raise RequestError(
             f"frames: found {frames!r}, but it is a whole number from 1 to {MAX_FRAMES}"
@@ -283,14 +283,33 @@ def _row(
 
 
 def check_output_name(name: str) -> None:
-    """See that a name of outputs stays in the output folder; "" is allowed.
+    """Check that a name of outputs stays in the output folder; "" is allowed.
 
     Raises:
         RequestError: it does not.
     """
-    if name and ("\0" in name or not {"", ".", ".."}.isdisjoint(name.split("/"))):
+    parts = name.replace(os.sep, "/").split("/")
+    has_drive = os.path.splitdrive(name)[0]  # as in C:name, on Windows
+    if name and ("\0" in name or has_drive or not {"", ".", ".."}.isdisjoint(parts)):
         raise RequestError(
             f"name: found {name!r}, but it is a path in the output folder, such as a/frame_0001"
+        )
+
+
+def _check_name(name: str) -> None:
+    """Check the name that a row gives its outputs; "" is allowed.
+
+    Hidden pictures are rejected because reports and later runs do not see them.
+
+    Raises:
+        RequestError: it leaves the output folder, or a part of it is hidden or looks like another
+            path.
+    """
+    check_output_name(name)
+    if "\\" in name or any(part.startswith((".", "~")) for part in name.split("/")):
+        raise RequestError(
+            f"name: found {name!r}, but a name has no backslash, and no part of it begins with a "
+            "point or ~; choose another, such as a/frame_0001"
         )
 
 

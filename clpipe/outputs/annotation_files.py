@@ -13,7 +13,7 @@ from clpipe.base.types import Array, Doubles
 from clpipe.images.openimageio import read_grey
 from clpipe.images.write import write_grey_png
 from clpipe.inputs.annotations import AnnotatedRender, Annotations, Record
-from clpipe.inputs.bop import BOXES, CAMERAS, DIGITS, INFOS, MASKS, POSES, Bop, BopObject
+from clpipe.inputs.bop import BOXES, CAMERAS, COUNTS, DIGITS, INFOS, MASKS, POSES, Bop, BopObject
 from clpipe.inputs.coco import Coco
 from clpipe.inputs.kitti import CALIBRATION, CENTRE, MATRICES, Kitti, KittiObject
 from clpipe.outputs.annotated import Way, mapped_annotation, mapped_box, moved_mask
@@ -236,7 +236,7 @@ class _Seen:
         whole, seen = counts.get(MASKS[0]), counts.get(MASKS[1])
         if whole and whole[0]:
             grown = whole[1] / whole[0]
-            for name in ("px_count_all", "px_count_valid"):
+            for name in COUNTS:
                 if name in known.info:
                     self.info[name] = round(known.info[name] * grown)
         if seen:

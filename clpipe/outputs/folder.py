@@ -24,6 +24,10 @@ LOCK = ".clpipe.lock"
 
 UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part\.\w+")  # as whole_file names them
 
+# Locks of this process: the file, its descriptor, and the first byte and the length of the part
+# that is held.
+_held: set[tuple[Path, int, int, int]] = set()
+
 
 def write_problem(folder: Path, with_space: bool = True) -> str:
     """Why nothing can be written to a folder, "" where it can.
@@ -62,11 +66,23 @@ def output_folder(folder: Path, shard: Shard) -> Iterator[None]:
     # Each shard holds its part of a file in which nothing is ever written.
     first = HOLDABLE * (shard.number - 1) // shard.of
     share = HOLDABLE * shard.number // shard.of - first
-    lock = _locked(folder / LOCK, share, first)
+    held = folder / LOCK, _locked(folder / LOCK, share, first), first, share
+    _held.add(held)
     try:
         yield
     finally:
-        let_go(folder / LOCK, lock, first, share)
+        _held.discard(held)
+        let_go(*held)
+
+
+def release_folders() -> None:
+    """Remove the lock files that no other process holds; call it just before exiting.
+
+    It is for an exit that skips the end of :func:`output_folder`. A signal handler may call it.
+    """
+    while _held:
+        with contextlib.suppress(OSError):
+            let_go(*_held.pop())
 
 
 def _locked(path: Path, length: int, first: int) -> int:

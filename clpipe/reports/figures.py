@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Any
 
 from clpipe.base.memory import in_words
-from clpipe.base.text import duration
+from clpipe.base.text import duration, one_line
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS
 from clpipe.engine.clipping import MUCH
 from clpipe.reports.run import Made, Run
@@ -207,7 +207,7 @@ def text_of(value: Any) -> str:
     """A value of a sidecar for people."""
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: "-"}[value]
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    return f"{value:.6g}" if isinstance(value, float) else one_line(str(value))
 
 
 @dataclass(frozen=True)

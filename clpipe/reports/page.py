@@ -12,7 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from clpipe.analysis.svg import PAGE_COLOURS, bars_svg, histogram_svg, lines_svg, shares_svg
 from clpipe.base.about import __version__
-from clpipe.base.text import duration
+from clpipe.base.text import duration, one_line
 from clpipe.batch.outcome import DONE, FAILED, SKIPPED, STEPS
 from clpipe.reports import figures
 from clpipe.reports.figures import Parameter, Session, Step, text_of
@@ -63,6 +63,7 @@ def html(runs: Sequence[Run], tell: Callable[[str], None] = lambda _: None) -> s
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
         autoescape=True,
+        finalize=visible,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -137,6 +138,21 @@ def html(runs: Sequence[Run], tell: Callable[[str], None] = lambda _: None) -> s
     )
 
 
+def visible(value: Any) -> Any:
+    r"""Return a value with an escape for each character of its texts that cannot be printed.
+
+    Markup stays as it is.
+
+    >>> visible({"name": "a" + chr(27), "odd": [chr(10)]})
+    {'name': 'a\\x1b', 'odd': ['\\n']}
+    """
+    if type(value) is str:
+        return one_line(value)
+    if isinstance(value, Mapping):
+        return {key: visible(each) for key, each in value.items()}
+    return list(map(visible, value)) if isinstance(value, list | tuple) else value
+
+
 def labels_of(runs: Sequence[Run]) -> list[str]:
     """What tells the runs apart: the names of their folders, or their paths; "" of a single one."""
     if len(runs) == 1:
@@ -172,7 +188,7 @@ def differences(first: Sequence[Step], second: Sequence[Step]) -> list[tuple[str
 
 def script_json(value: Any) -> str:
     """JSON that can stand in a ``<script>``, whatever its texts hold."""
-    text = json.dumps(value, separators=(",", ":"))
+    text = json.dumps(visible(value), separators=(",", ":"))
     for character in "<>&\u2028\u2029":
         text = text.replace(character, f"\\u{ord(character):04x}")
     return text

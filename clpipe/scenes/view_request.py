@@ -6,11 +6,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clpipe.base.errors import RequestError
+from clpipe.base.text import whole_number
 from clpipe.inputs.render_cameras import read_views
 
 PATHS = ("orbit", "arc", "random")
 USUAL_VIEWS = 24
 LARGEST = 2**16  # px, the longer side of a render
+LAST_FRAME = 2**20 - 2  # the largest that Blender knows
 
 
 def asked_views(
@@ -91,10 +93,14 @@ def parse_frames(text: str) -> list[int]:
     """
     frames: dict[int, None] = {}
     for part in text.split(","):
-        first, _, last = part.strip().partition("-")
-        if not first.isdecimal() or not (last or first).isdecimal():
-            raise RequestError(f"--frames: found {text!r}; expected frames, such as 1-24 or 1,5,9")
-        frames |= dict.fromkeys(range(int(first), int(last or first) + 1))
+        begin, _, end = part.strip().partition("-")
+        first, last = whole_number(begin), whole_number(end or begin)
+        if not (0 <= first <= LAST_FRAME and 0 <= last <= LAST_FRAME):
+            raise RequestError(
+                f"--frames: found {text!r}; expected frames, such as 1-24 or 1,5,9, each from 0 to "
+                f"{LAST_FRAME}"
+            )
+        frames |= dict.fromkeys(range(first, last + 1))
     if not frames:
         raise RequestError(f"--frames: found {text!r}, which is no frame; expected such as 1-24")
     return list(frames)
@@ -109,10 +115,10 @@ def parse_resolution(text: str) -> tuple[int, int]:
     Raises:
         RequestError: it is none.
     """
-    sides = [int(side) for side in text.lower().split("x") if side.isdecimal()]
-    if len(sides) != 2 or text.lower().count("x") != 1 or not all(0 < s <= LARGEST for s in sides):
+    width, height = map(whole_number, text.lower().partition("x")[::2])
+    if not (0 < width <= LARGEST and 0 < height <= LARGEST):
         raise RequestError(f"--resolution: found {text!r}; expected WIDTHxHEIGHT, such as 960x640")
-    return sides[0], sides[1]
+    return width, height
 
 
 def parse_box(text: str) -> list[float]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import read_text
-from clpipe.base.text import one_line
+from clpipe.base.text import one_line, whole_number
 from clpipe.base.types import Array
 from clpipe.images.read import read_whole_numbers
 
@@ -140,7 +140,7 @@ class _Lines:
 
     def count(self, number: int, word: str, name: str, low: int, high: int) -> int:
         """A whole number of a line."""
-        value = int(word) if word.isdecimal() and len(word) < 10 else -1
+        value = whole_number(word)
         if not low <= value <= high:
             allowed = f"{low} to {high}"
             raise self.error(number, f"{name}: found {one_line(word)!r}; allowed: {allowed}")
