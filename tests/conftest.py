@@ -25,7 +25,8 @@ from clpipe.outputs.sealed import SEAL, sealed
 from clpipe.stage import Kind
 
 ROOT = Path(__file__).resolve().parent.parent
-STILL_LIFE = ROOT / "tests" / "data" / "still_life.exr"
+DATA = ROOT / "tests" / "data"
+STILL_LIFE = DATA / "still_life.exr"
 SHARED = ROOT.parent / "shared" / "data"
 
 
@@ -134,8 +135,9 @@ def scalar_device(device: Device) -> Device:
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
+    """The folder of additional files whose licences do not let clpipe ship them."""
     if not SHARED.is_dir():
-        pytest.skip("needs the developers' folder of real inputs, which is not here")
+        pytest.skip("needs the files in ../shared/data that tests/data/README.md lists")
     return SHARED
 
 
