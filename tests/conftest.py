@@ -216,10 +216,10 @@ def browser_page() -> Iterator[Any]:
     But for a line of Chromium's own for each answer with status 400, which is a refusal that the
     page shows.
     """
-    playwright = pytest.importorskip("playwright.sync_api")
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     if not chromium:
-        pytest.skip("there is no Chromium")
+        pytest.skip("needs the program chromium")
     with playwright.sync_playwright() as play:
         browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1400, "height": 900})
