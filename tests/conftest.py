@@ -25,7 +25,8 @@ from clpipe.outputs.sealed import SEAL, sealed
 from clpipe.stage import Kind
 
 ROOT = Path(__file__).resolve().parent.parent
-STILL_LIFE = ROOT / "tests" / "data" / "still_life.exr"
+DATA = ROOT / "tests" / "data"
+STILL_LIFE = DATA / "still_life.exr"
 SHARED = ROOT.parent / "shared" / "data"
 
 
@@ -134,8 +135,9 @@ def scalar_device(device: Device) -> Device:
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
+    """The folder of additional files whose licences do not let clpipe ship them."""
     if not SHARED.is_dir():
-        pytest.skip("needs the developers' folder of real inputs, which is not here")
+        pytest.skip("needs the files in ../shared/data that tests/data/README.md lists")
     return SHARED
 
 
@@ -214,10 +216,10 @@ def browser_page() -> Iterator[Any]:
     But for a line of Chromium's own for each answer with status 400, which is a refusal that the
     page shows.
     """
-    playwright = pytest.importorskip("playwright.sync_api")
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs the package playwright")
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     if not chromium:
-        pytest.skip("there is no Chromium")
+        pytest.skip("needs the program chromium")
     with playwright.sync_playwright() as play:
         browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1400, "height": 900})

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-pytest.importorskip("pycocotools")
-pytest.importorskip("shapely")
+pytest.importorskip("pycocotools", reason="needs pycocotools, in the extra annotations")
+pytest.importorskip("shapely", reason="needs Shapely, in the extra annotations")
 
 from pycocotools import mask as coder
 from pycocotools.coco import COCO

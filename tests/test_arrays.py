@@ -36,7 +36,7 @@ def test_tensors_on_the_cpu_are_taken_as_they_are():
 
 
 def test_torch_tensors_are_taken():
-    torch = pytest.importorskip("torch")
+    torch = pytest.importorskip("torch", reason="needs PyTorch, in the extra train")
     pipeline = Pipeline(**CHAIN)
     made = pipeline.process(torch.from_numpy(IMAGE), "a").image
     assert np.array_equal(made, pipeline.process(IMAGE, "a").image)

@@ -131,7 +131,7 @@ def test_missing_wheels_are_said(settings, tmp_path, monkeypatch):
 @pytest.fixture
 def blender(extension, tmp_path, monkeypatch):
     """Blender with the extension and a small scene; the extension's module, and the scene."""
-    bpy = pytest.importorskip("bpy")
+    bpy = pytest.importorskip("bpy", reason="needs bpy, in the extra blender")
     folder = tmp_path / "clpipe_extension"
     with zipfile.ZipFile(extension) as packed:
         packed.extractall(folder, [n for n in packed.namelist() if not n.startswith("private/")])
@@ -159,7 +159,7 @@ def render(**options):
 
 
 def test_blender_finds_nothing_wrong_with_the_manifest(extension):
-    bpy = pytest.importorskip("bpy")
+    bpy = pytest.importorskip("bpy", reason="needs bpy, in the extra blender")
     folder = Path(bpy.utils.system_resource("SCRIPTS"), "addons_core", "bl_pkg", "cli")
     tool = [sys.executable, folder / "blender_ext.py", "validate", extension]
     done = subprocess.run(tool, capture_output=True, text=True)

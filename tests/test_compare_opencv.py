@@ -87,7 +87,7 @@ def test_the_methods_that_are_compared_exist():
 
 @pytest.fixture
 def script():
-    pytest.importorskip("cv2", reason="needs OpenCV, of the extra compare")
+    pytest.importorskip("cv2", reason="needs OpenCV, in the extra compare")
     from tools.compare.opencv_chain import OpenCVChain
 
     return OpenCVChain(Request.from_options().chain())

@@ -150,7 +150,7 @@ def test_glibc_and_linux_agree_on_this_machine():
 def pip_pocl(device):
     """The PoCL that the wheel brings: the one that the name is set in."""
     if "PoCL 3.0" not in device.info.handle.platform.version:
-        pytest.skip("needs pip's PoCL 3.0")
+        pytest.skip("needs version 3.0 of the package pocl-binary-distribution")
     return device.info
 
 

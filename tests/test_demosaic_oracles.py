@@ -80,7 +80,7 @@ def test_malvar_2004_is_the_published_filters(mosaic, pattern, device):
 
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_bilinear_is_that_of_opencv(mosaic, pattern):
-    cv2 = pytest.importorskip("cv2")
+    cv2 = pytest.importorskip("cv2", reason="needs OpenCV, in the extra compare")
     raw = np.rint(mosaic * WHITE).astype(np.uint16)
     expected = cv2.cvtColor(raw, getattr(cv2, f"COLOR_{OPENCV[pattern]}2RGB"))
     found = demosaiced(raw.astype(np.float32), pattern, "bilinear", None)

@@ -242,7 +242,7 @@ def test_the_architecture_counts_its_rooms():
 @pytest.mark.slow
 def test_the_site_builds(tmp_path):
     """As tools/docs does it: a link, an anchor or a name that leads nowhere is an error."""
-    pytest.importorskip("mkdocs", reason="needs the extra docs: sh tools/docs")
+    pytest.importorskip("mkdocs", reason="needs MkDocs, in the extra docs")
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "-d", tmp_path]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -370,7 +370,7 @@ PACKAGE = {
 def test_the_reference_sets(name):
     folder = os.environ.get("CLPIPE_EMVA")
     if not folder:
-        pytest.skip("needs a checkout of EMVA1288/datasets, which CLPIPE_EMVA names")
+        pytest.skip("needs a clone of EMVA1288/datasets; set CLPIPE_EMVA to its path")
     found = figures(read_moments(read_series(Path(folder) / name / "EMVA1288_Data.txt")))
     ours = (
         found.system_gain.value,

@@ -21,7 +21,7 @@ from clpipe.inputs.find import find_jobs
 from tests.conftest import ROOT
 from tests.conftest import cli_output as clpipe
 
-pytest.importorskip("starlette")
+pytest.importorskip("starlette", reason="needs Starlette, in the extra explore")
 
 from clpipe.camera.lens import calibration_of
 from clpipe.camera.profile import load_camera
@@ -256,7 +256,7 @@ def test_lenses_are_listed_or_the_extra_is_named(monkeypatch):
 
 
 def test_every_lens_in_the_list_is_one():
-    pytest.importorskip("lensfunpy")
+    pytest.importorskip("lensfunpy", reason="needs lensfunpy, in the extra lens")
     names = key_controls()["lens"]["suggested"]
     assert len(names) > 500 and names == sorted(set(names))
     for name in names[::100]:

@@ -21,7 +21,7 @@ from PIL import Image
 from clpipe.commands.main import main
 from tests.conftest import cli_output as clpipe
 
-pytest.importorskip("starlette")
+pytest.importorskip("starlette", reason="needs Starlette, in the extra explore")
 
 from clpipe.explorer.server import Server, in_json
 from clpipe.explorer.view import View

@@ -48,7 +48,7 @@ def test_the_raw_is_compiled_without_spills_and_fused_multiply_adds(job, target,
     try:
         result = tool.TARGETS[target](source)
     except tool.MissingError as error:
-        pytest.skip(f"there is {error}")
+        pytest.skip(f"needs {str(error).removeprefix('no ')}")
     assert tool.wrong_with(job, result) == "" and result.registers and result.instructions > 100
 
 

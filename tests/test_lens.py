@@ -197,7 +197,7 @@ def test_a_lens_costs_one_launch_and_vignetting_none():
     ],
 )
 def test_lensfun_says_the_same(camera, name, setting, size):
-    lensfunpy = pytest.importorskip("lensfunpy")
+    lensfunpy = pytest.importorskip("lensfunpy", reason="needs lensfunpy, in the extra lens")
     steps = make_chain(settings_from({"camera": camera, "lens": name, **setting})).steps
     (bend,) = (s.method.lens() for s in steps if s.name == "distortion")
     vignetting = next(s for s in steps if s.name == "vignetting")
@@ -248,13 +248,13 @@ def test_lensfun_says_the_same(camera, name, setting, size):
     ],
 )
 def test_lenses_that_lensfun_does_not_have_or_not_so(setting, said):
-    pytest.importorskip("lensfunpy")
+    pytest.importorskip("lensfunpy", reason="needs lensfunpy, in the extra lens")
     with pytest.raises(RequestError, match=said):
         make_chain(settings_from(setting))
 
 
 def test_a_lens_is_set_as_a_camera_is(clpipe, write_exr):
-    pytest.importorskip("lensfunpy")
+    pytest.importorskip("lensfunpy", reason="needs lensfunpy, in the extra lens")
     write_exr("a.exr", np.full((20, 30, 3), 0.5))
     Path("m.csv").write_text(
         "path,lens,focal_length,aperture\na.exr,Canon EF 24-70mm f/2.8L,24,2.8\n"

@@ -462,6 +462,17 @@ def test_a_shift_by_a_pixel_is_refused_and_strong_noise_is_not(developed, tmp_pa
         measure([frames[0], moved])
 
 
+def test_a_frame_and_the_mean_of_others_are_repeats(developed):
+    """Correlated noise, like that of a camera's JPEGs, is not mistaken for another scene."""
+    look = ("-c", "nikon-d800-jpeg")
+    name = developed(*look, "--frames", 4, "--format", "jpg")
+    first, *others = (load_picture(Path(f"{name}.frame{k}.jpg")) for k in range(4))
+    mean = np.mean([frame.pixels for frame in others], axis=0, dtype=np.float32)
+    clean = load_picture(Path(developed(*look, "--skip", "noise", "--format", "png") + ".png"))
+    repeats = measure([first, replace(first, path=Path("mean.png"), pixels=mean)])
+    assert repeats.share > measure([first], clean).share / 2  # places that noise leaves flat
+
+
 def test_repeats_of_real_cameras_are_repeats(shared_data):
     for name in ("5dmark3_iso3200_1", "d800_iso1600_1"):
         paths = (shared_data / "real_noise" / f"{name}_{end}.png" for end in ("real", "mean"))

@@ -196,7 +196,7 @@ def test_a_lens_is_that_of_the_depth_of_field(clpipe, point):
 
 
 def test_a_lens_by_name_is_that_of_the_depth_of_field(clpipe, point):
-    pytest.importorskip("lensfunpy")
+    pytest.importorskip("lensfunpy", reason="needs lensfunpy, in the extra lens")
     run = [each if each != "defocus" else "defocus,vignetting" for each in (*RUN, *THIN)]
     clpipe(*run, *ZOOM, "--set", "render.sensor_width=36", "-o", "o")
     assert spread_of(Path("o/a.exr")) == pytest.approx(disc(70, 2.8, 0.1), abs=0.3)

@@ -106,7 +106,7 @@ def test_focus_and_defaults_are_said_and_shared(clpipe, write_exr):
 
 
 def test_a_lens_and_a_raw_say_the_same(clpipe, grey):
-    pytest.importorskip("lensfunpy")
+    pytest.importorskip("lensfunpy", reason="needs lensfunpy, in the extra lens")
     lens = ("--lens", "Canon EF 24-70mm f/2.8L", "--focal-length", 24, "--aperture", 4)
     set_ = (*lens, "--focus-distance", 2, *SHOT, "--set", "exposure.ev=0.5")
     clpipe("run", "in/a.exr", "-o", "o", "--device", "numpy", "--format", "jpg", *set_)
@@ -128,7 +128,7 @@ def test_the_equivalent_focal_length_follows_from_what_is_known(clpipe, grey):
     assert exif("o/a.png")[0xA405] == 24  # 24 px of 36 are as 16 mm of 24, and 24 of 36
     clpipe(*run, "-o", "p", "--focal-length", 16)
     assert 0xA405 not in exif("p/a.png")
-    pytest.importorskip("lensfunpy")
+    pytest.importorskip("lensfunpy", reason="needs lensfunpy, in the extra lens")
     zoom = ("--lens", "Canon EF 24-70mm f/2.8L", "--focal-length", 35)
     clpipe(*run, "-o", "q", *zoom, "--camera", "sony-a7r2")
     assert exif("q/a.png")[0xA405] == 35

@@ -223,7 +223,7 @@ def shifted(rng, disparity):
 
 @pytest.mark.parametrize("half", [False, True])
 def test_matching_finds_the_depth(half):
-    pytest.importorskip("cv2")
+    pytest.importorskip("cv2", reason="needs OpenCV, in the extra compare")
     left, right = (view_at(x, size=(256, 128)) for x in (0.0, 0.4))
     pair = stereo.Pair(left, right, half)
     found = pair.find(*shifted(np.random.default_rng(2), 10))
@@ -236,8 +236,8 @@ def test_matching_finds_the_depth(half):
 
 
 def test_the_experiment_at_thumbnail_scale(tmp_path, monkeypatch, capsys, views):
-    pytest.importorskip("cv2")
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("cv2", reason="needs OpenCV, in the extra compare")
+    pytest.importorskip("matplotlib", reason="needs Matplotlib, in the extra calibrate")
     data, factor, records = tmp_path / "data", 5, scene_views.rig()
     data.mkdir()
     for record in records:

@@ -4,6 +4,7 @@ import re
 import struct
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -16,55 +17,54 @@ from clpipe.commands.main import main
 from clpipe.images.colour import CIE_XYZ, SRGB, rgb_to_xyz, to_linear_srgb
 from clpipe.images.read import ReadOptions, read_image, read_source
 from clpipe.stage import Kind
-from tests.conftest import ROOT
+from tests.conftest import DATA, ROOT
 from tests.exr import exr
 
-# Height, width, means of red, green and blue. Sizes and means of those that are RGB as they are
-# were found with the OpenEXR package; the others are converted from its values.
+# Height, width, and the means of red, green and blue in the files of tests/data/openexr. The means
+# are from the samples that the OpenEXR package decodes; NumPy applied windows, chroma and
+# chromaticities. Chromaticities_XYZ has the means of the same crop of its sRGB version,
+# Chromaticities/Rec709.exr.
 PICTURES = {
-    "exr/Beachball_multipart.0001.exr": (1556, 2048, 0.054262, 0.044184, 0.061408),
-    "exr/Chromaticities_XYZ.exr": (406, 610, 0.36526, 0.27779, 0.11534),
-    "exr/ScanLines_Cannon.exr": (566, 780, 0.34709, 0.35931, 0.34587),
-    "exr/ScanLines_Carrots.exr": (400, 600, 0.20892, 0.13207, 0.052943),
-    "exr/ScanLines_Desk.exr": (874, 644, 6.064, 6.0484, 2.8502),
-    "exr/Tiles_GoldenGate.exr": (860, 1262, 0.091795, 0.097724, 0.28013),
-    "exr/blender_world_forest.exr": (512, 1024, 0.72915, 0.78062, 0.8972),
-    "exr/blender_world_interior.exr": (512, 1024, 0.99463, 0.87383, 0.72128),
-    "exr/blender_world_night.exr": (512, 1024, 0.14056, 0.1186, 0.087739),
-    "exr_odd/DisplayWindow_t03.exr": (280, 370, 0.0053378, 0.0062066, 0.74247),
-    "exr_odd/DisplayWindow_t08.exr": (401, 501, 0.0044798, 0.0054853, 0.44204),
-    "exr_odd/DisplayWindow_t13.exr": (101, 101, 0, 9.803e-05, 0),
-    "exr_odd/LuminanceChroma_Flowers.exr": (734, 784, 0.7045, 0.72126, 1.7451),
-    "exr_odd/TestImages_AllHalfValues.exr": (256, 256, 0, 0, 0),
-    "exr_odd/TestImages_BrightRingsNanInf.exr": (800, 800, 27.585, 27.585, 27.585),
-    "exr_odd/TestImages_GrayRampsHorizontal.exr": (800, 800, 0.64293, 0.64293, 0.64293),
-    "exr_odd/TestImages_WideColorGamut.exr": (800, 800, 1.0991, 0.96227, 1.0819),
+    "Beachball_multipart": (64, 96, 0.16145, 0.39802, 0.26212),
+    "Chromaticities_XYZ": (96, 128, 1.31317, 0.31803, 0.23258),
+    "DisplayWindow_t03": (280, 370, 0.0053378, 0.0062066, 0.74247),
+    "DisplayWindow_t08": (401, 501, 0.0044798, 0.0054853, 0.44204),
+    "DisplayWindow_t13": (101, 101, 0, 9.803e-05, 0),
+    "LuminanceChroma_Flowers": (64, 784, 0.69151, 0.70532, 1.80984),
+    "ScanLines_Cannon": (96, 128, 0.31781, 0.32564, 0.30412),
+    "ScanLines_Carrots": (96, 128, 0.19549, 0.13658, 0.11362),
+    "ScanLines_Desk": (96, 128, 8.0272, 7.4736, 3.6098),
+    "TestImages_AllHalfValues": (256, 256, 0, 0, 0),
+    "TestImages_BrightRingsNanInf": (800, 800, 27.585, 27.585, 27.585),
+    "TestImages_GrayRampsHorizontal": (800, 800, 0.64293, 0.64293, 0.64293),
+    "TestImages_WideColorGamut": (800, 800, 1.0991, 0.96227, 1.0819),
+    "Tiles_GoldenGate": (100, 150, 0.17151, 0.13147, 0.30627),
+    "world_night": (256, 1024, 0.23914, 0.20376, 0.16248),
 }
 REFUSALS = {
-    "exr_odd/MultiResolution_WavyLinesCube.exr": "a texture",
-    "exr_odd/v2_LowResLeftView_Trunks.exr": "a deep image",
+    "MultiResolution_ColorCodedLevels": "a texture",
+    "v2_LowResLeftView_Trunks": "a deep image",
 }
 ACES = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
 
 
-def test_every_real_file_is_in_the_table(shared_data):
-    found = {f"{d}/{p.name}" for d in ("exr", "exr_odd") for p in (shared_data / d).iterdir()}
-    assert found == {*PICTURES, *REFUSALS}
+def test_every_file_is_in_the_tables():
+    assert {p.stem for p in (DATA / "openexr").glob("*.exr")} == {*PICTURES, *REFUSALS}
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_the_right_picture(shared_data, name):
+def test_the_right_picture(name):
     height, width, *means = PICTURES[name]
-    pixels = read_image(shared_data / name).pixels
+    pixels = read_image(DATA / "openexr" / f"{name}.exr").pixels
     assert pixels.shape == (height, width, 3)
     found = pixels.mean((0, 1), dtype=np.float64)
     assert np.allclose(found, means, rtol=2e-4, atol=1e-7), found
 
 
 @pytest.mark.parametrize("name", REFUSALS)
-def test_the_right_refusal(shared_data, name):
+def test_the_right_refusal(name):
     with pytest.raises(ImageError, match=REFUSALS[name]):
-        read_image(shared_data / name)
+        read_image(DATA / "openexr" / f"{name}.exr")
 
 
 REFUSED_IN_PEACE = r"""
@@ -94,14 +94,16 @@ def refused(*paths: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_damaged_files_cost_nothing(shared_data, tmp_path):
-    """As they are called, and called .exr, which is when they are read as such."""
-    damaged = sorted((shared_data / "exr_damaged").iterdir())
+def test_damaged_files_cost_nothing(tmp_path):
+    """Each file is read under its own name and with .exr appended, which selects the reader."""
+    with zipfile.ZipFile(DATA / "openexr" / "damaged.zip") as archive:
+        damaged = [tmp_path / name for name in archive.namelist()]
+        archive.extractall(tmp_path)
     assert len(damaged) == 23
-    called = [tmp_path / f"{path.name}.exr" for path in damaged]
-    for path, copy in zip(damaged, called, strict=True):
+    renamed = [path.with_name(f"{path.name}.exr") for path in damaged]
+    for path, copy in zip(damaged, renamed, strict=True):
         copy.write_bytes(path.read_bytes())
-    refused(*damaged, *called)
+    refused(*damaged, *renamed)
 
 
 def test_too_many_pixels_are_refused_before_memory_is_taken(tmp_path):

@@ -21,7 +21,7 @@ from clpipe.reports.shown import Budget, large, places_of
 from tests.conftest import cli_output as clpipe
 from tests.conftest import reseal
 
-pytest.importorskip("jinja2")
+pytest.importorskip("jinja2", reason="needs Jinja2, in the extra report")
 
 HOSTILE = "<img src=x onerror=alert(1)>&amp;\x1b[31m\n"
 SHOWN = r"<img src=x onerror=alert(1)>&amp;\x1b[31m\n"

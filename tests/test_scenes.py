@@ -275,7 +275,7 @@ def example(folder, name, *words):
 
 def test_views_of_mitsuba_become_a_dataset(clpipe, tmp_path):
     """A floor seen twice: its points are where the other view's depth and camera say."""
-    pytest.importorskip("mitsuba")
+    pytest.importorskip("mitsuba", reason="needs the package mitsuba")
     example(
         tmp_path,
         "mitsuba_views.py",
@@ -308,7 +308,7 @@ def seen_again(folder, one, two):
 
 def test_views_of_a_room_see_what_the_camera_looks_at(clpipe, tmp_path):
     """An orbit leads behind the walls; no view is from there, and each sees most objects."""
-    pytest.importorskip("bpy")
+    pytest.importorskip("bpy", reason="needs bpy, in the extra blender")
     example(tmp_path, "room_scene.py", "room.blend")
     small = ("--resolution", "48x32", "--samples", 1, "--device", "numpy", "--no-denoise")
     said = clpipe("dataset", "room.blend", "-o", "set", "--views", 8, *small).stderr
@@ -325,7 +325,7 @@ def test_views_of_a_room_see_what_the_camera_looks_at(clpipe, tmp_path):
 
 def test_blender_itself_renders_a_scene(clpipe, tmp_path):
     """Its depth, cameras and object numbers agree with each other, and it makes the same again."""
-    pytest.importorskip("bpy")
+    pytest.importorskip("bpy", reason="needs bpy, in the extra blender")
     example(tmp_path, "room_scene.py", "room.blend")
     small = ("--resolution", "48x32", "--samples", 4, "--device", "numpy", "--path", "arc")
     for name in ("one", "two"):

@@ -6,7 +6,7 @@ import pytest
 import clpipe as api
 from clpipe.reference.cfa import PATTERNS
 
-torch = pytest.importorskip("torch", reason="needs torch")
+torch = pytest.importorskip("torch", reason="needs PyTorch, in the extra train")
 
 from clpipe.dataset.arrays import packed  # noqa: E402  behind the import that may skip
 from clpipe.torch import RawNoise  # noqa: E402

@@ -12,7 +12,7 @@ from PIL import Image
 from tests.conftest import ROOT, STILL_LIFE
 
 pytestmark = [pytest.mark.tools, pytest.mark.slow]
-torch = pytest.importorskip("torch", reason="needs torch")
+torch = pytest.importorskip("torch", reason="needs PyTorch, in the extra train")
 
 
 @pytest.fixture
@@ -114,7 +114,9 @@ def test_scores_are_what_they_are_called():
     clean = torch.rand(3, 40, 50, generator=torch.Generator().manual_seed(1))
     assert psnr(clean + 0.01, clean) == pytest.approx(40, abs=1e-3)
     assert ssim(clean, clean) == pytest.approx(1)
-    skimage = pytest.importorskip("skimage.metrics", reason="needs scikit-image")
+    skimage = pytest.importorskip(
+        "skimage.metrics", reason="needs scikit-image, in the extra compare"
+    )
     noisy = clean + 0.1 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(2))
     own = skimage.structural_similarity(
         clean.numpy(), noisy.numpy(), channel_axis=0, data_range=1, gaussian_weights=True

@@ -145,7 +145,7 @@ def test_this_machines_device_computes_as_numpy_does(device, monkeypatch):
 def test_the_cpu_that_llvm_does_not_know_is_found(device):
     info = device.info
     if "PoCL 3.0" not in info.handle.platform.version:
-        pytest.skip("needs pip's PoCL 3.0")
+        pytest.skip("needs version 3.0 of the package pocl-binary-distribution")
     compile_for(info.handle, Target("generic", "as on an AMD Zen 5"))
     try:
         problem = trial.problem_of(info.handle, 8)

@@ -40,7 +40,7 @@ def copy(tmp_path):
 def git(copy, monkeypatch):
     """Git in that folder, where two commits were made."""
     if not shutil.which("git"):
-        pytest.skip("git is not installed")
+        pytest.skip("needs the program git")
     for name in [name for name in os.environ if name.startswith("GIT_")]:
         monkeypatch.delenv(name)
     monkeypatch.setenv("GIT_CONFIG_GLOBAL", os.devnull)
@@ -104,7 +104,7 @@ def test_git_archive(copy, git, tmp_path, tagged):
     with tarfile.open(tmp_path / "a.tar") as archive:
         archive.extractall(tmp_path / "unpacked", filter="data")
     if "%(describe" in (tmp_path / "unpacked" / ABOUT).read_text().partition("_ARCHIVED")[2]:
-        pytest.skip("this git is older than 2.35, and leaves the tag out")
+        pytest.skip("needs git 2.35 or newer")
     assert version_at(tmp_path / "unpacked") == expected
 
 
