@@ -308,8 +308,8 @@ def _check_name(name: str) -> None:
     check_output_name(name)
     if "\\" in name or any(part.startswith((".", "~")) for part in name.split("/")):
         raise RequestError(
-            f"name: found {name!r}, but a name has no backslash, and no part of it begins with a "
-            "point or ~; choose another, such as a/frame_0001"
+            f"name: found {name!r}, but a name has no backslash, and no part begins with a "
+            "period or ~; choose another, such as a/frame_0001"
         )
 
 
