@@ -122,7 +122,7 @@ def test_a_lock_has_all_that_is_asked_for(extra):
 
 def test_a_lock_names_no_index_and_no_folder():
     locks = sorted((ROOT / "locks").iterdir())
-    assert {lock.stem for lock in locks} == {"clpipe", "dev", "docs"}
+    assert {lock.stem for lock in locks} == {"clpipe", "dev", "docs", "pip"}
     for lock in locks:
         assert not re.search(r"://|--(extra-)?index|--find-links|@ |\s/", lock.read_text())
 
