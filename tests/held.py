@@ -1,8 +1,9 @@
 """Runs in a process of their own that a test stops, kills or resumes at a defined point.
 
 A held run does not start an image whose name is ``HOLD`` or sorts after it until the file ``GO``
-exists in its working directory. So the test knows exactly which images the run has finished when
-it sends a signal, however fast or slow the machine is.
+exists in its working directory. Each of its processes that has come to such an image creates a file
+``held.<number of the process>`` there. So the test knows which images the run has begun when it
+sends a signal, however fast or slow the machine is.
 """
 
 import os
@@ -25,15 +26,17 @@ import os, pathlib, time
 from clpipe.batch.work import ImageWorker
 decode = ImageWorker.decode
 def held(self, job, admit):
-    while job.path.stem.replace(".", "") >= {HOLD!r} and not os.path.exists({GO!r}):
-        time.sleep(0.01)
+    if job.path.stem.replace(".", "") >= {HOLD!r}:
+        pathlib.Path("held." + str(os.getpid())).touch()
+        while not os.path.exists({GO!r}):
+            time.sleep(0.01)
     return decode(self, job, admit)
 ImageWorker.decode = held
 """
 # In the processes that a run starts, not in the run's own process.
 HOLDING_PROCESSES = f"""
 from clpipe.batch import processes
-processes.START = f"exec({{{HOLDING!r}!r}}); {{processes.START}}"
+processes.START = "exec(" + repr({HOLDING!r}) + "); " + processes.START
 """
 PROGRAM = "exec({planted!r}); from clpipe.__main__ import main; main()"
 
@@ -58,11 +61,15 @@ def start(
     return subprocess.Popen(command, cwd=folder, env=variables, stderr=subprocess.PIPE, text=True)
 
 
-def wait_until(is_so: Callable[[], bool], what: str) -> None:
-    """Wait until a condition holds. Fail with a message after :data:`GUARD`."""
+def wait_until(
+    is_so: Callable[[], bool], what: str, process: "subprocess.Popen[str] | None" = None
+) -> None:
+    """Wait until a condition holds. Fail after :data:`GUARD`, or if the process ends before."""
     end = time.monotonic() + GUARD
     while not is_so():
         assert time.monotonic() < end, f"waited {GUARD:g} s for {what}"
+        if process and process.poll() is not None and not is_so():
+            raise AssertionError(f"the run ended without {what}: {finish(process)}")
         time.sleep(0.01)
 
 

@@ -543,7 +543,7 @@ def test_a_wrong_shard(text):
 def test_stopped_once_what_is_begun_is_finished(clpipe, renders, tmp_path, number):
     renders(60)
     process = start("in", *RUN, "--jobs", 1, planted=HOLDING)
-    wait_until(lambda: sidecars(tmp_path / "out") == 20, "the images before the held one")
+    wait_until(lambda: sidecars(tmp_path / "out") == 20, "the images before the held one", process)
     interrupt(process, number)
     Path(GO).touch()
     assert "not begun" in finish(process)
@@ -558,7 +558,7 @@ def test_stopped_once_what_is_begun_is_finished(clpipe, renders, tmp_path, numbe
 def test_stopped_twice_it_ends_now(clpipe, renders, tmp_path):
     renders(60)
     process = start("in", *RUN, "--jobs", 1, planted=HOLDING)
-    wait_until(lambda: sidecars(tmp_path / "out") == 20, "the images before the held one")
+    wait_until(lambda: sidecars(tmp_path / "out") == 20, "the images before the held one", process)
     interrupt(process)
     process.send_signal(signal.SIGINT)  # the held image never ends
     finish(process)
