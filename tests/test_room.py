@@ -74,9 +74,11 @@ class Entering:
         self._thread.start()
 
     def _enter(self):
-        self._room.enter(*self._arguments)
-        self._has_entered = True
-        self._settled.set()
+        try:
+            self._room.enter(*self._arguments)
+            self._has_entered = True
+        finally:
+            self._settled.set()
 
     @property
     def has_to_wait(self):
