@@ -6,7 +6,6 @@ import itertools
 import json
 import logging
 import os
-import random
 import re
 import shutil
 import signal
@@ -16,15 +15,16 @@ import threading
 import time
 import tracemalloc
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from clpipe.base.errors import DeviceError, ImageError, OutputError, RequestError
-from clpipe.batch import replay
+from clpipe.batch import job_state, replay, threads
 from clpipe.batch.job_state import JobState
 from clpipe.batch.outcome import DONE, Outcome, Span
-from clpipe.batch.room import host_bytes
+from clpipe.batch.room import Room, host_bytes
 from clpipe.batch.run_log import read_log
 from clpipe.batch.threads import Batch
 from clpipe.batch.trace import Trace
@@ -41,6 +41,17 @@ from clpipe.outputs import sidecar
 from clpipe.outputs.folder import LOCK, output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
 from tests.conftest import ROOT, contents, reseal, statuses, written
+from tests.held import (
+    GO,
+    GUARD,
+    HOLDING,
+    finish,
+    interrupt,
+    kill_after,
+    sidecars,
+    start,
+    wait_until,
+)
 
 # A chain that other tests compile too.
 RUN = ("-o", "out", "--iso", 3200)
@@ -184,8 +195,8 @@ def test_several_devices_share_a_run(clpipe, renders, tmp_path):
     clpipe("run", renders(24), "-o", "whole", *RUN[2:])
     both = ("--device", "0", "--device", "1")
     environment = {"POCL_DEVICES": "pthread pthread"}
-    process = start(tmp_path, "in", *RUN, *both, environment=environment)
-    stderr = process.communicate()[1]
+    process = start("in", *RUN, *both, environment=environment)
+    stderr = finish(process)
     if "unknown device '1'" in stderr:
         pytest.skip("needs PoCL, which makes two devices of one CPU")
     assert process.returncode == 0, stderr
@@ -198,7 +209,7 @@ def test_devices_develop_at_the_same_time(renders, tmp_path, monkeypatch):
     start, both = ImageWorker.start, threading.Barrier(2)
 
     def together(self, state, recipe, runner):
-        both.wait(timeout=20)  # for the other device's image
+        both.wait(GUARD)  # for the other device's image
         return start(self, state, recipe, runner)
 
     monkeypatch.setattr(ImageWorker, "start", together)
@@ -216,18 +227,19 @@ def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, m
     monkeypatch.setattr("clpipe.batch.threads.COMMITTED", 2)
     worker, jobs = worker_of(tmp_path)
     batch = Batch(worker, [None], threads=2)
-    decode, decoded, seen = ImageWorker.decode, [], []
+    decode, decoded = ImageWorker.decode, []
 
     def counted(self, job, admit):
         decoded.append(job)
         return decode(self, job, admit)
 
     monkeypatch.setattr(ImageWorker, "decode", counted)
-    for done, _ in enumerate(batch.run(jobs)):
-        time.sleep(0.01)  # whoever waits for outcomes is slow
-        seen.append(len(decoded) - done)
     assert batch.in_flight == 4
-    assert max(seen) <= batch.in_flight + 2 + 1
+    for taken, _ in enumerate(batch.run(jobs), 1):
+        most = taken + batch.in_flight + 2
+        # All that may be decoded before the next outcome is taken, and no more.
+        wait_until(lambda most=most: len(decoded) >= min(most, 30), f"{most} images")
+        assert len(decoded) <= most
 
 
 @pytest.mark.slow
@@ -476,7 +488,7 @@ def test_the_folder_has_gone(clpipe, renders, monkeypatch):
     def fail_to_write(path, spec, pixels):
         stored = real(path, spec, pixels)
         if path.name == "r002.jpg":
-            wait_for(Path("out"), 2)
+            wait_until(lambda: sidecars(Path("out")) >= 2, "2 sidecars")
             Path("out").rename("elsewhere")
         return stored
 
@@ -554,46 +566,30 @@ def test_a_wrong_shard(text):
         parse_shard(text)
 
 
-def start(folder, *arguments, environment=None):
-    command = [sys.executable, "-m", "clpipe", "run", *map(str, arguments)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), **(environment or {})}
-    return subprocess.Popen(command, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True)
-
-
-def wait_for(folder, count):
-    """Wait until so many pictures are there."""
-    for _ in range(6000):
-        if len([path for path in folder.glob("*.json") if path.name[0] != "."]) >= count:
-            return
-        time.sleep(0.01)
-    raise AssertionError(f"{folder} never held {count} pictures")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopped_once_what_is_begun_is_finished(clpipe, renders, tmp_path, number):
     renders(60)
-    process = start(tmp_path, "in", *RUN, "--jobs", 1)
-    wait_for(tmp_path / "out", 3)
-    process.send_signal(number)
-    stderr = process.communicate()[1]
-    assert process.returncode == 130, stderr
-    assert "not begun" in stderr
+    process = start("in", *RUN, "--jobs", 1, planted=HOLDING)
+    wait_until(lambda: sidecars(tmp_path / "out") == 20, "the images before the held one", process)
+    interrupt(process, number)
+    Path(GO).touch()
+    assert "not begun" in finish(process)
+    assert process.returncode == 130
     found = written(tmp_path / "out")
-    assert 6 <= len(found) < 120
-    assert all(f"{Path(n).stem}.jpg" in found for n in found if n.endswith(".json"))
+    assert found == sorted(f"r{i:03}.{e}" for i in range(21) for e in ("jpg", "json"))
     assert read_log(tmp_path / "out" / "run.jsonl")[-1]["interrupted"]
     clpipe("run", "in", *RUN)
     assert len(written(tmp_path / "out")) == 120
 
 
-def test_stopped_twice_it_ends_now(renders, tmp_path):
+def test_stopped_twice_it_ends_now(clpipe, renders, tmp_path):
     renders(60)
-    process = start(tmp_path, "in", *RUN, "--jobs", 1)
-    wait_for(tmp_path / "out", 2)
-    process.send_signal(signal.SIGINT)
-    process.send_signal(signal.SIGINT)
-    process.communicate()
+    process = start("in", *RUN, "--jobs", 1, planted=HOLDING)
+    wait_until(lambda: sidecars(tmp_path / "out") == 20, "the images before the held one", process)
+    interrupt(process)
+    process.send_signal(signal.SIGINT)  # the held image never ends
+    finish(process)
     assert process.returncode == 130
     assert not [p for p in (tmp_path / "out").iterdir() if ".part." in p.name]
 
@@ -602,17 +598,14 @@ def test_stopped_twice_it_ends_now(renders, tmp_path):
 def test_killed_and_resumed_again_and_again(clpipe, renders, tmp_path):
     renders(24)
     clpipe("run", "in", "-o", "whole", *RUN[2:])
-    rng = random.Random(0)
     finished = {}
-    for _ in range(3):
-        process = start(tmp_path, "in", *RUN)
-        time.sleep(rng.uniform(0.3, 1.6))
-        process.kill()
-        process.communicate()
-        for name in written(tmp_path / "out") if (tmp_path / "out").exists() else ():
+    for count in (1, 7, 16):
+        kill_after(start("in", *RUN), tmp_path / "out", count)
+        for name in written(tmp_path / "out"):
             if name.endswith(".json") and not name.startswith("."):
                 at = (tmp_path / "out" / name).stat().st_mtime_ns
                 assert finished.setdefault(name, at) == at, f"{name} was made again"
+        assert len(finished) >= count
     clpipe("run", "in", *RUN)
     assert contents("out") == contents("whole")
 
@@ -838,7 +831,7 @@ def test_a_thread_that_dies_ends_the_run(renders, tmp_path, monkeypatch):
             patch.setattr(JobState, "outcome", die)  # of what is done behind an image's back
             thread = threading.Thread(target=run, args=(Batch(worker, [None], 1),), daemon=True)
             thread.start()
-            thread.join(20)
+            thread.join(GUARD)
             assert not thread.is_alive()
         assert len(caught) == 1 and "a mistake of ours" in caught[0]
 
@@ -847,14 +840,14 @@ def test_what_a_device_leaves_another_does(renders, tmp_path, monkeypatch, caplo
     renders(8)
     (tmp_path / "out").mkdir()
     worker, jobs = worker_of(tmp_path)
-    broken = []
+    broken, is_broken = [], threading.Event()
 
     def start(self, state, recipe, runner):
         if threading.current_thread().name == "device 0":
             broken.append(state.job)
+            is_broken.set()
             raise DeviceError("it is given up")
-        while not broken:
-            time.sleep(0.01)
+        assert is_broken.wait(GUARD)
         return right(self, state, recipe, runner)
 
     right = ImageWorker.start
@@ -869,39 +862,56 @@ def test_what_a_device_leaves_another_does(renders, tmp_path, monkeypatch, caplo
         list(Batch(worker_of(tmp_path)[0], [None]).run(jobs))
 
 
-def test_images_wait_for_room(renders, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("room", "together"), [(1, 1), (2, 2), (100, 4)])
+def test_images_wait_for_room(renders, tmp_path, monkeypatch, room, together):
+    """As many images as fit are in memory at a time: they wait for each other, and no more come."""
     renders(12)
     (tmp_path / "out").mkdir()
     worker, jobs = worker_of(tmp_path)
     inside, seen, lock = set(), [], threading.Lock()
     read, encode = ImageLoader.read, ImageWorker.encode
+    barrier = threading.Barrier(together)
 
     def reading(self, job):
         with lock:
             inside.add(job.key)
             seen.append(len(inside))
+        barrier.wait(GUARD)
         return read(self, job)
 
     def encoding(self, task, *arguments):
-        time.sleep(0.05)
-        encode(self, task, *arguments)
+        written = encode(self, task, *arguments)
         with lock:
             inside.remove(task.job.key)
+        return written
 
     monkeypatch.setattr(ImageLoader, "read", reading)
     monkeypatch.setattr(ImageWorker, "encode", encoding)
-    large = host_bytes(worker.loader.claim(jobs[1]), worker.chain, 1, ("png",), ())
-    assert large == 24 * 32 * (6 + 3 + 1)
-    for room, most in ((1, 1), (2 * large, 2), (100 * large, 4)):
-        seen.clear()
-        outcomes = list(Batch(worker, [None], threads=4, room=room).run(jobs))
-        assert [o.status for o in outcomes] == ["done"] * 12
-        assert 1 <= max(seen) <= most if most < 4 else max(seen) > 2
-        waited = 12 * 3 * 0.05  # s in all, where one at a time is inside
-        assert sum(o.seconds("decode") for o in outcomes) < waited / 2  # waiting is none of it
-        worker = worker_of(tmp_path)[0]
-        for path in (tmp_path / "out").iterdir():
-            path.unlink()
+    large = worker.bytes_of(jobs[1], 1, in_numpy=True)
+    outcomes = list(Batch(worker, [None], threads=4, room=room * large).run(jobs))
+    assert [o.status for o in outcomes] == ["done"] * 12
+    assert together == 4 or max(seen) == together
+
+
+def test_waiting_for_room_is_not_time_of_decoding(renders, tmp_path, monkeypatch):
+    renders(3)
+    (tmp_path / "out").mkdir()
+    worker, jobs = worker_of(tmp_path)
+    waited, enter = [0.0], Room.enter
+
+    def clock():
+        return time.perf_counter() + waited[0]
+
+    def slow(*arguments):
+        waited[0] += 1e6  # s
+        enter(*arguments)
+
+    for module in (threads, job_state):
+        monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=clock, time=time.time))
+    monkeypatch.setattr(Room, "enter", slow)
+    outcomes = list(Batch(worker, [None], threads=1).run(jobs))
+    assert waited == [3e6]
+    assert all(0 < o.seconds("decode") < 1e6 for o in outcomes)
 
 
 def test_what_images_take(tmp_path, write_exr):

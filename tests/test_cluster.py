@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import socket
+import threading
 import time
 from contextlib import nullcontext
 from dataclasses import replace
@@ -35,6 +36,7 @@ from clpipe.engine.discovery import shared_out
 from clpipe.engine.hardware import Hardware
 from clpipe.inputs.find import Job
 from tests.conftest import ROOT
+from tests.held import GUARD, wait_until
 
 IMAGES = 16
 
@@ -54,8 +56,10 @@ def workers():
 
 
 @pytest.fixture
-def address(workers):
-    workers.wait_for_workers(2, timeout=120)
+def address(workers, monkeypatch):
+    for limit in ("TIMEOUT", "PATIENCE", "LONG"):
+        monkeypatch.setattr(cluster, limit, GUARD)  # a busy machine takes its time
+    workers.wait_for_workers(2, timeout=GUARD)
     return workers.scheduler.address
 
 
@@ -230,17 +234,47 @@ def test_workers_of_another_make(clpipe, renders, workers, address, name, value,
         workers.run(pretend, workers=[worker])
 
 
-def test_a_log_that_cannot_be_written_ends_the_run(clpipe, renders, address, monkeypatch):
+def hold(name, reached, go):
+    """On a worker: create a file at an image of this name, and wait there for another file."""
+    decode = work.ImageWorker.decode
+
+    def planted(this, job, begin):
+        if job.path.name == name:
+            Path(reached).touch()
+            while not Path(go).exists():
+                time.sleep(0.01)
+        return decode(this, job, begin)
+
+    work.ImageWorker.decode = planted
+
+
+def test_a_log_that_cannot_be_written_ends_the_run(
+    clpipe, renders, workers, address, monkeypatch, tmp_path
+):
+    """What another worker has begun by then is finished before the run ends."""
+    reached, go = tmp_path / "reached", tmp_path / "go"
+    workers.run(hold, "f04.exr", str(reached), str(go))  # the first one of the second chunk
+    halt = cluster.Cluster._halt
+
     def full(self, outcome):
+        wait_until(reached.exists, "an image on the other worker")
         raise OutputError("the disk is full")
 
+    def halted(self):
+        halt(self)
+        threading.Timer(0.3, go.touch).start()  # a run that did not wait would have ended by then
+
     monkeypatch.setattr(RunLog, "add", full)
-    told = clpipe("run", "in", "-o", "out", "--dask", address, status=1)
-    assert "the disk is full" in told.stderr
-    made = contents("out")
-    assert 0 < len(made) < 2 * IMAGES
-    time.sleep(0.3)
-    assert contents("out") == made  # no worker is at it any more
+    monkeypatch.setattr(cluster.Cluster, "_halt", halted)
+    try:
+        options = ("--device", "numpy", "--dask", address)  # compiles nothing
+        told = clpipe("run", "in", "-o", "out", *options, status=1)
+        assert "the disk is full" in told.stderr
+        made = contents("out")
+        assert Path("f04.json") in made
+        assert len(made) <= 2 * 8  # of two chunks, one on each worker
+    finally:
+        go.touch()
 
 
 def test_a_worker_of_another_make_that_comes_later(clpipe, renders, address, monkeypatch):
@@ -356,6 +390,16 @@ def test_a_scheduler_that_cannot_be_reached(clpipe, renders, monkeypatch):
         for address in (f"tcp://127.0.0.1:{port}", "tcp://127.0.0.1:1", "nonsense", ""):
             told = clpipe("run", "in", "-o", "out", "--dask", address, status=2).stderr
             assert f"no Dask scheduler answers at '{address}'" in told
+    assert not Path("out").exists()
+
+
+@pytest.mark.slow
+def test_a_scheduler_without_workers(clpipe, renders, monkeypatch):
+    def too_late(self, count, timeout):
+        raise TimeoutError
+
+    monkeypatch.setattr(cluster, "TIMEOUT", GUARD)
+    monkeypatch.setattr(Client, "wait_for_workers", too_late)
     with LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0", processes=False) as empty:
         address = empty.scheduler_address
         told = clpipe("run", "in", "-o", "out", "--dask", address, status=2).stderr

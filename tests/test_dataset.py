@@ -124,13 +124,13 @@ def test_only_a_few_are_ahead(dataset, monkeypatch):
 
     monkeypatch.setattr(SampleLoader, "read", reading)
     endless = api.Dataset("in", iso=ISO, epochs=None, threads=2)
-    before = threading.active_count()
+    before = set(threading.enumerate())
     samples = iter(endless)
     for _ in range(3):
         next(samples)
     assert len(read) <= 3 + 2 + 2
     samples.close()
-    assert threading.active_count() == before
+    assert before.issuperset(threading.enumerate())
 
 
 def test_samples_do_not_share_memory(dataset):
@@ -272,7 +272,7 @@ def test_a_worker_that_is_forked_says_so_and_does_not_hang(dataset):
     dataset[0]
     pool = multiprocessing.get_context("fork").Pool(1)
     with pool, pytest.raises(DeviceError, match="forked from one that had used OpenCL"):
-        pool.apply_async(dataset.__getitem__, (1,)).get(timeout=60)
+        pool.apply_async(dataset.__getitem__, (1,)).get(timeout=600)
 
 
 def test_it_pickles_before_and_after_it_was_used(dataset):

@@ -1,5 +1,6 @@
 """``clpipe explore``: what its server answers, and what its page does in a browser."""
 
+import asyncio
 import http.client
 import json
 import logging
@@ -9,8 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
-import time
-from contextlib import closing
+from contextlib import closing, suppress
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -20,9 +20,11 @@ from PIL import Image
 
 from clpipe.commands.main import main
 from tests.conftest import cli_output as clpipe
+from tests.held import GUARD
 
 pytest.importorskip("starlette", reason="needs Starlette, in the extra explore")
 
+from clpipe.explorer import patience
 from clpipe.explorer.server import Server, in_json
 from clpipe.explorer.view import View
 from tests.test_explore import NOISY, explorer_of
@@ -40,7 +42,7 @@ def served(explorer):
     thread.start()
     yield server.address
     server.stop()
-    thread.join(10)
+    thread.join(GUARD)
     assert not thread.is_alive()
 
 
@@ -50,7 +52,9 @@ def answer(address, name, question=None, host=None, token=None):
     body = question if question is None or isinstance(question, bytes) else json.dumps(question)
     path = f"/{token}/" if token is not None else parts.path
     headers = {"Host": host} if host else {}
-    with closing(http.client.HTTPConnection(parts.hostname, parts.port, timeout=60)) as connection:
+    with closing(
+        http.client.HTTPConnection(parts.hostname, parts.port, timeout=GUARD)
+    ) as connection:
         connection.request("GET" if body is None else "POST", path + name, body, headers)
         response = connection.getresponse()
         return response.status, response.headers, response.read()
@@ -147,29 +151,53 @@ def test_a_browser_that_goes_away_leaves_the_others_alone(served, caplog, reques
 
 
 def test_a_connection_that_asks_nothing_whole_is_not_held(served, monkeypatch):
-    monkeypatch.setattr("clpipe.explorer.patience.PATIENCE", 0.5)
     parts = urlsplit(served)
-    head = f"POST {parts.path}start HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 2\r\n"
-    whole = f"{head}\r\n{{}}".encode()
-    for sent in (b"", head.encode(), whole[:-1], whole + head.encode()):
-        with socket.create_connection((parts.hostname, parts.port)) as slow:
-            slow.settimeout(20)
+    head = f"POST {parts.path}start HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 2\r\n".encode()
+    whole = head + b"\r\n{}"
+
+    def until_closed(connection):
+        return b"".join(iter(lambda: connection.recv(1 << 16), b""))
+
+    monkeypatch.setattr(patience, "PATIENCE", 0.1)
+    for sent in (b"", head, whole[:-1]):
+        with socket.create_connection((parts.hostname, parts.port), timeout=GUARD) as slow:
             slow.sendall(sent)
-            received = b"".join(iter(lambda: slow.recv(1 << 16), b""))  # until it is closed
-        assert (b" 200 " in received[:20]) == sent.startswith(whole)
+            assert until_closed(slow) == b""
+    monkeypatch.setattr(patience, "PATIENCE", GUARD)
+    with socket.create_connection((parts.hostname, parts.port), timeout=GUARD) as slow:
+        slow.sendall(whole)
+        assert b" 200 " in slow.recv(20)
+        monkeypatch.setattr(patience, "PATIENCE", 0.1)
+        with suppress(ConnectionError):  # uvicorn closes connections on which nothing comes
+            slow.sendall(head)
+            until_closed(slow)
 
 
 def test_a_question_may_take_longer_to_answer_than_to_ask(explorer, monkeypatch):
-    monkeypatch.setattr("clpipe.explorer.patience.PATIENCE", 0.2)
-    monkeypatch.setattr(Server, "_start", lambda self, question: time.sleep(1) or in_json({}))
-    slow = Server(explorer)
-    thread = threading.Thread(target=slow.run, daemon=True)
+    call_later, limits, cancelled = asyncio.BaseEventLoop.call_later, [], []
+
+    def noted(loop, delay, *arguments, **options):
+        handle = call_later(loop, delay, *arguments, **options)
+        if delay == GUARD:
+            limits.append(handle)
+        return handle
+
+    def answering(self, question):
+        cancelled.extend(limit.cancelled() for limit in limits)
+        return in_json({})
+
+    monkeypatch.setattr(patience, "PATIENCE", GUARD)
+    monkeypatch.setattr(asyncio.BaseEventLoop, "call_later", noted)
+    monkeypatch.setattr(Server, "_start", answering)
+    server = Server(explorer)
+    thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
     try:
-        assert answer(slow.address, "start", {})[0] == 200
+        assert answer(server.address, "start", {})[0] == 200
     finally:
-        slow.stop()
-        thread.join(10)
+        server.stop()
+        thread.join(GUARD)
+    assert cancelled and all(cancelled)  # while the answer is being made, no limit is left
 
 
 def test_two_explorers_at_once(served, two_renders):
@@ -181,7 +209,7 @@ def test_two_explorers_at_once(served, two_renders):
             assert len(json.loads(answer(address, "start", {})[2])["images"]) == count
     finally:
         other.stop()
-        thread.join(10)
+        thread.join(GUARD)
 
 
 def test_a_port_in_use_is_said(two_renders):
@@ -203,7 +231,7 @@ def test_ctrl_c_ends_it_quietly(two_renders):
         address = next(word for word in line.split() if word.startswith("http"))
         assert answer(address, "")[0] == 200
         process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=GUARD)
     assert (process.returncode, errors) == (0, "")
 
 
@@ -220,7 +248,7 @@ def page(browser_page, served, monkeypatch, tmp_path):
 
 
 def settle(page):
-    page.wait_for_selector('body[data-settled="true"]', timeout=60_000)
+    page.wait_for_selector('body[data-settled="true"]', timeout=1e3 * GUARD)
 
 
 def put(page, key, value):
@@ -317,7 +345,7 @@ def test_stages_pixels_comparison_and_noise(page):
     for field, value in (("left", "8"), ("top", "8"), ("width", "48"), ("height", "48")):
         page.fill(f"#{field}", value)
     page.click("#measure")
-    page.wait_for_selector("#noise-plot svg", timeout=60_000)
+    page.wait_for_selector("#noise-plot svg", timeout=1e3 * GUARD)
     assert page.locator("#noise-table tbody tr").count() == 6
 
 

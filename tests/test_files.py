@@ -115,15 +115,15 @@ def write(name):
     with deferred_files():
         for i in range(10**9):
             write_whole(folder / f"{name}{i % 50}", bytes(4096))
-            begun.set()
+            if i == 50:
+                writing.wait()
 
-folder, begun = Path(sys.argv[1]), threading.Event()
+folder, writing = Path(sys.argv[1]), threading.Barrier(5)
 for name in "abcd":
     threading.Thread(target=write, args=name, daemon=True).start()
-begun.wait()
-time.sleep(0.1)
+writing.wait()  # each thread is in the midst of its files
 remove_temporary_files()
-time.sleep(0.1)
+time.sleep(0.1)  # a thread that went on would leave something
 os._exit(0)
 """
 

@@ -9,10 +9,17 @@ import pytest
 import clpipe as api
 from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.chain.making import make_chain
+from clpipe.chain.settings import settings_from
 from clpipe.dataset.arrays import packed
 from clpipe.dataset.numbering import Numbering
 from clpipe.engine.buffers import Pool
+from clpipe.engine.device import Device
+from clpipe.engine.extents import Box
 from clpipe.engine.flow import Flow
+from clpipe.engine.options import RunOptions
+from clpipe.engine.runner import Runner
+from clpipe.engine.submission import Submission, submit_together
 from clpipe.images.tags import FLIPS, upright
 from clpipe.outputs.patches import Cutting, first_place
 from clpipe.reference.cfa import PATTERNS
@@ -196,25 +203,38 @@ def test_samples_do_not_depend_on_order_shards_and_epochs(renders):
     assert [tuple(s["place"]) for s in other] != places[:9]
 
 
-def test_no_buffer_goes_while_an_image_is_on_the_way(renders, monkeypatch):
-    """Memory of the host that a device works in would be freed under its kernels."""
-    flows, replaced = [], []
+@pytest.mark.parametrize("patches", [0, 2, 5])
+def test_no_buffer_is_replaced_while_an_image_is_on_the_device(device, monkeypatch, patches):
+    """Otherwise a device that works in the host's memory would write to freed memory."""
+    fresh = Device(device.info)
+    runner = Runner(make_chain(settings_from({"iso": ISO})), fresh)
+    submissions = []
+    for side in (16, 70, 120):
+        boxes = [Box(i, i, i + side // 2, i + side // 2) for i in range(patches)]
+        image = np.full((side, side, 3), 0.2, np.float16)
+        submissions.append(Submission(runner, image, "k", RunOptions(boxes=boxes)))
+    submit_together(submissions[:1])[0]()  # compiles
+    fresh.limit(fresh.memory)  # release all buffers
+    before, replaced = [], []
     make_room, reserve = Flow.make_room, Pool.reserve
 
-    def roomy(flow, *given):
-        flows.append(flow)
-        return make_room(flow, *given)
+    def recording_make_room(flow, *arguments):
+        before.append(len(flow._tiles))
+        return make_room(flow, *arguments)
 
-    def reserved(pool, *given):
-        before, on_the_way = pool.generation, len(flows[-1]._tiles)
-        reserve(pool, *given)
-        if pool.generation != before:
-            replaced.append(on_the_way)
+    def recording_reserve(pool, *arguments):
+        generation, tiles = pool.generation, len(fresh._flow._tiles)
+        reserve(pool, *arguments)
+        if pool.generation != generation:
+            replaced.append(tiles)
 
-    monkeypatch.setattr(Flow, "make_room", roomy)
-    monkeypatch.setattr(Pool, "reserve", reserved)
-    list(api.Dataset(renders, iso=ISO, patch=api.Patches(16, 3), epochs=2))
-    assert len(replaced) > 1 and not any(replaced)
+    monkeypatch.setattr(Flow, "make_room", recording_make_room)
+    monkeypatch.setattr(Pool, "reserve", recording_reserve)
+    waits = [submit_together([each])[0] for each in submissions]
+    assert before == [0, 1, 1]  # an image is on the device when the next one needs larger buffers
+    assert replaced == [0, 0, 0]
+    for wait in waits:
+        wait()
 
 
 def test_training_goes_on_where_it_was(renders):

@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from clpipe.batch.pipes import Pipe
 from clpipe.batch.run_log import read_log
 from clpipe.batch.spec import RunSpec
 from tests.conftest import ROOT, contents, statuses, written
+from tests.held import GO, HOLDING_PROCESSES, finish, interrupt, start, wait_until
 
 RUN = ("-o", "out", "--iso", 3200)
 TWO = (*RUN, "--processes", 2)
@@ -49,28 +49,28 @@ def renders(write_exr, tmp_path, monkeypatch):
     return write
 
 
-def start(*arguments):
-    command = [sys.executable, "-m", "clpipe", "run", "in", *map(str, arguments)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
-
-
-def children(process):
-    found = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    names = {pid: Path(f"/proc/{pid}/cmdline").read_text() for pid in found}
-    return [int(pid) for pid, name in names.items() if "local_worker" in name]
-
-
-def wait_until(is_so):
-    for _ in range(6000):
-        if is_so():
-            return
-        time.sleep(0.01)
-    raise AssertionError
+def is_running(pid):
+    """Whether a process exists and is no zombie, which has no command any more."""
+    try:
+        return bool(Path(f"/proc/{pid}/cmdline").read_bytes())
+    except OSError:
+        return False
 
 
 def pictures():
     return len(list(Path("out").glob("r*.json")))
+
+
+def held_run():
+    """A run by two processes that have both come to a held image, and the numbers of these two."""
+    process = start("in", *TWO, planted=HOLDING_PROCESSES)
+    wait_until(lambda: len(held()) == 2, "two processes that hold", process)
+    return process, held()
+
+
+def held():
+    """The numbers of the processes that have come to a held image."""
+    return sorted(int(path.suffix[1:]) for path in Path().glob("held.*"))
 
 
 @pytest.mark.slow
@@ -93,12 +93,12 @@ def test_two_processes_make_the_bytes_of_one(clpipe, renders):
 
 @pytest.mark.slow
 def test_a_process_that_is_killed_takes_nothing_with_it(clpipe, renders):
-    renders(120)
+    renders(60)
     clpipe("run", "in", "-o", "whole", *RUN[2:])
-    process = start(*TWO)
-    wait_until(lambda: pictures() > 2)
-    os.kill(children(process)[0], signal.SIGKILL)
-    assert "120 of 120 images done" in process.communicate()[1]
+    process, others = held_run()
+    os.kill(others[0], signal.SIGKILL)
+    Path(GO).touch()
+    assert "60 of 60 images done" in finish(process)
     assert process.returncode == 0
     assert contents("out") == contents("whole")
     assert not [name for name in written(Path("out")) if ".part." in name]
@@ -106,29 +106,26 @@ def test_a_process_that_is_killed_takes_nothing_with_it(clpipe, renders):
 
 @pytest.mark.slow
 def test_processes_end_with_the_one_that_started_them(clpipe, renders):
-    renders(300)
-    process = start(*TWO)
-    wait_until(lambda: pictures() > 2)
-    others = children(process)
+    renders(60)
+    process, others = held_run()
     process.kill()
-    process.communicate()
-    wait_until(lambda: not any(Path(f"/proc/{pid}/status").exists() for pid in others))
-    assert 2 < pictures() < 300
+    finish(process)
+    wait_until(lambda: not any(map(is_running, others)), "the end of the other processes")
+    assert pictures() <= 20
     told = clpipe("run", "in", *RUN)
-    assert "300 of 300 images done (" in told.stderr
+    assert "60 of 60 images done (" in told.stderr
 
 
 @pytest.mark.slow
 def test_stopped_once_what_is_begun_is_finished(renders):
-    renders(300)
-    process = start(*TWO)
-    wait_until(lambda: pictures() > 2)
-    process.send_signal(signal.SIGINT)
-    stderr = process.communicate()[1]
+    renders(100)
+    process, _ = held_run()
+    interrupt(process)
+    Path(GO).touch()
+    assert "not begun" in finish(process)
     assert process.returncode == 130
-    assert "not begun" in stderr
     found = written(Path("out"))
-    assert 6 <= len(found) < 600
+    assert 2 * (20 + 2) <= len(found) < 200
     assert {Path(n).stem for n in found if n.endswith("json")} == {
         Path(n).stem for n in found if n.endswith("jpg")
     }

@@ -18,6 +18,7 @@ from clpipe.batch.threads import Batch
 from clpipe.engine.discovery import find_devices
 from clpipe.images.claims import claim_of
 from tests.conftest import ROOT
+from tests.held import GUARD
 
 MIB = 2**20
 LIMITED = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="this system has no such limit")
@@ -44,6 +45,51 @@ def room_of(free, *devices, size=None, drop=lambda: None):
     return room
 
 
+@pytest.fixture(autouse=True)
+def clock(monkeypatch):
+    """The rooms' clock in s, which only sleeping moves, and the test."""
+    now = [0.0]
+
+    def sleep(seconds):
+        now[0] += seconds
+
+    monkeypatch.setattr(rooms, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
+    return now
+
+
+class Entering:
+    """A thread that takes room, and whether it has to wait for it."""
+
+    def __init__(self, room, *arguments):
+        self._room, self._arguments = room, arguments
+        self._settled, self._has_entered = threading.Event(), False
+        wait = room._changed.wait
+
+        def noted(timeout=None):
+            self._settled.set()
+            return wait(timeout)
+
+        room._changed.wait = noted
+        self._thread = threading.Thread(target=self._enter, daemon=True)
+        self._thread.start()
+
+    def _enter(self):
+        try:
+            self._room.enter(*self._arguments)
+            self._has_entered = True
+        finally:
+            self._settled.set()
+
+    @property
+    def has_to_wait(self):
+        assert self._settled.wait(GUARD)
+        return not self._has_entered
+
+    def finish(self):
+        self._thread.join(GUARD)
+        assert self._has_entered
+
+
 def test_what_never_fits_is_refused_and_what_fits_is_let_in():
     room = room_of(100 * MIB)
     for _ in range(2):
@@ -56,13 +102,10 @@ def test_what_never_fits_is_refused_and_what_fits_is_let_in():
 def test_what_fits_alone_waits_for_the_others():
     room = room_of(200 * MIB, size=100 * MIB)
     room.enter("small", 10 * MIB)
-    entered = threading.Event()
-    thread = threading.Thread(target=lambda: (room.enter("large", 120 * MIB), entered.set()))
-    thread.start()
-    assert not entered.wait(0.2)
+    large = Entering(room, "large", 120 * MIB)
+    assert large.has_to_wait
     room.leave("small")
-    assert entered.wait(5)
-    thread.join()
+    large.finish()
 
 
 def test_for_a_large_image_devices_hold_little():
@@ -81,27 +124,24 @@ def test_for_a_large_image_devices_hold_little():
     assert device.limits == [LEAST]  # it would not have helped
 
 
-def test_what_was_taken_before_may_be_freed_late(monkeypatch):
-    left = [200 * MIB, 200 * MIB]
-    room = Room(None, (), left=lambda: Left(left.pop() if len(left) > 1 else left[0], ""))
+def test_what_was_taken_before_may_be_freed_late(clock):
+    freed = rooms.PATIENCE / 2  # s
+    room = Room(None, (), left=lambda: Left((60 if 0 < clock[0] < freed else 200) * MIB, ""))
     room.enter("a", 150 * MIB)
     room.leave("a")
-    left[:] = [200 * MIB, 60 * MIB, 60 * MIB]
-    monkeypatch.setattr(rooms, "LASTS", 0.0)
+    clock[0] = 1e-3
     room.enter("b", 150 * MIB)
+    assert clock[0] >= freed
 
 
 def test_large_images_wait_for_the_compiler():
     room = Room(None, (SharingDevice(0),), left=lambda: Left(STARTING + 100 * MIB, ""))
     room.enter("small", 10 * MIB)
     room.leave("small")
-    thread = threading.Thread(target=lambda: room.enter("large", 150 * MIB), daemon=True)
-    thread.start()
-    thread.join(0.2)
-    assert thread.is_alive()
+    large = Entering(room, "large", 150 * MIB)
+    assert large.has_to_wait
     room.started()
-    thread.join(5)
-    assert not thread.is_alive()
+    large.finish()
 
 
 def test_nothing_is_let_in_at_the_end():
@@ -112,12 +152,15 @@ def test_nothing_is_let_in_at_the_end():
         room.enter("b", 60 * MIB)
 
 
-def test_small_images_are_not_slowed_by_measuring():
+def test_small_images_are_not_slowed_by_measuring(clock):
     count = []
     room = Room(None, (), left=lambda: count.append(1) or Left(2**34, ""))
     for number in range(100):
         room.enter(str(number), MIB)
-    assert len(count) < 5
+    assert len(count) == 1
+    clock[0] += 2 * rooms.LASTS
+    room.enter("later", MIB)
+    assert len(count) == 2
 
 
 def test_what_files_claim(write_exr, tmp_path):
@@ -241,12 +284,13 @@ from clpipe.base.system import save_addresses
 save_addresses()
 def work():
     held = [bytes(600) for _ in range(100)]
-    barrier.wait()
+    barrier.wait()  # all hold memory
+    barrier.wait()  # it was measured
 barrier = threading.Barrier(7)
 before = _listed(Path("/proc/self/status"), "VmSize")
 threads = [threading.Thread(target=work) for _ in range(6)]
 for thread in threads: thread.start()
-import time; time.sleep(0.2)
+barrier.wait()
 print(_listed(Path("/proc/self/status"), "VmSize") - before)
 barrier.wait()
 """

@@ -3,13 +3,8 @@
 import io
 import json
 import os
-import random
 import re
-import signal
-import subprocess
-import sys
 import tarfile
-import time
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +19,8 @@ from clpipe.batch.tars import cut
 from clpipe.inputs.find import Job
 from clpipe.outputs import folder as output_folders
 from clpipe.outputs import writer
-from tests.conftest import ROOT, statuses, written
+from tests.conftest import statuses, written
+from tests.held import GO, HOLDING, finish, interrupt, start, wait_until
 
 # A chain that other tests compile too.
 OTHER = ("-o", "out", "--iso", 3200, "--webdataset")
@@ -295,42 +291,44 @@ def test_the_disk_is_full(clpipe, renders, when):
     assert contents("out") == contents("whole")
 
 
-def start(folder, *arguments):
-    command = [sys.executable, "-m", "clpipe", "run", *map(str, arguments)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.Popen(command, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True)
-
-
 @pytest.mark.slow
 def test_killed_and_resumed_again_and_again(clpipe, renders, tmp_path):
     renders(24)
     clpipe("run", "in", "-o", "whole", *RUN[2:])
-    rng = random.Random(0)
-    done = []
-    for _ in range(3):
-        process = start(tmp_path, "in", *RUN)
-        time.sleep(rng.uniform(0.4, 1.2))
+    for count in (1, 6, 13):
+        process = start("in", *RUN)
+        wait_until(
+            lambda count=count, process=process: (
+                len(logged_as_done()) >= count or process.poll() is not None
+            ),
+            f"{count} images in the log",
+        )
         process.kill()
-        process.communicate()
+        finish(process)
     clpipe("run", "in", *RUN)
     assert contents("out") == contents("whole")
     assert not [n for n in os.listdir("out") if n.startswith(".")]
-    for line in read_log(OUT / "run.jsonl"):
-        if line.get("status") == "done":
-            done.append(line["name"])
+    done = logged_as_done()
     assert len(done) == len(set(done)), "an image was made twice"
 
 
+def logged_as_done():
+    """The images that the log lists as done, by all runs together."""
+    try:
+        lines = read_log(OUT / "run.jsonl")
+    except OSError:
+        return []
+    return [line["name"] for line in lines if line.get("status") == "done"]
+
+
 @pytest.mark.slow
-def test_stopped_and_gone_on_with(clpipe, renders, tmp_path):
+def test_stopped_and_gone_on_with(clpipe, renders):
     renders(60)
-    process = start(tmp_path, "in", *RUN, "--jobs", 1)
-    for _ in range(3000):
-        if (tmp_path / "out" / "000000.tar").exists():
-            break
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    assert "not begun" in process.communicate()[1]
+    process = start("in", *RUN, "--jobs", 1, planted=HOLDING)
+    wait_until((OUT / "000000.tar").exists, "the first tar", process)
+    interrupt(process)
+    Path(GO).touch()
+    assert "not begun" in finish(process)
     assert process.returncode == 130
     before = stamps("out")
     clpipe("run", "in", *RUN)

@@ -185,10 +185,10 @@ class Room:
                     self._limits[device] = device.memory
                     device.limit(least)
             end = time.monotonic() + PATIENCE
-            while time.monotonic() < end:
-                if self._fits(size):
-                    return
+            while not (fits := self._fits(size)) and time.monotonic() < end:
                 time.sleep(PATIENCE / 20)
+            if fits:
+                return
             free = self._free(size)
             there = free.bytes if free else 0
             self._restore()
