@@ -111,6 +111,7 @@ def test_outlines_lie_where_the_picture_has_the_shapes(clpipe, coco, way):
     assert found[1]["keypoints"][3:6] == [0, 0, 0]
 
 
+@pytest.mark.slow
 def test_what_overscan_shows_is_annotated(clpipe, coco, write_exr):
     masks = np.stack([mask_of(points, 24) for points in SHAPES.values()], -1).astype(np.float32)
     window = {"x": -24, "y": -24, "full_width": WIDTH, "full_height": HEIGHT}
@@ -127,6 +128,7 @@ def test_what_overscan_shows_is_annotated(clpipe, coco, write_exr):
     assert np.mean(told.annToMask(found[3]) != (picture[..., 0] > 0.5)) < 0.01
 
 
+@pytest.mark.slow
 def test_patches_have_their_own(clpipe, coco):
     patches = ("--patch", 48, "--patches-per-image", 12, "--augment", "--seed", 3)
     clpipe("run", "in/a.exr", "-o", "o", *RUN, *PLAIN, *BARREL, *patches)
@@ -149,6 +151,7 @@ def test_patches_have_their_own(clpipe, coco):
         assert seen(Path("o") / told.imgs[number]["file_name"]).max() < 0.5
 
 
+@pytest.mark.slow
 def test_each_series_and_a_resumed_run_have_theirs(clpipe, coco):
     run = ("run", "in", "-o", "o", "--iso", "100,800", *RUN[:2], *RUN[4:])
     clpipe(*run, *BARREL)
@@ -301,6 +304,7 @@ def test_bops_scene(clpipe, coco, bop):
     assert camera["model"] == "OPENCV" and camera["distortion"]["k1"] == -0.25
 
 
+@pytest.mark.slow
 def test_bops_masks_are_of_all_or_of_none(clpipe, coco, bop):
     clpipe("run", "in/000003.exr", "-o", "o", *AS_BOP)
     with_mask = json.loads(Path("o/scene_gt_info.json").read_text())["3"][1]

@@ -38,6 +38,7 @@ def test_it_gives_what_the_references_give(camera, render):
     assert np.abs(one.image.astype(int) - two.image).max() <= 1
 
 
+@pytest.mark.slow
 def test_overrides_hold_for_one_image_and_compile_nothing(camera, render):
     plain = camera.process(render, "a")
     compiled = len(camera._runner.device._programs)
@@ -69,6 +70,7 @@ def test_many_images(camera, render):
     assert len(shots) == 3
 
 
+@pytest.mark.slow
 def test_from_a_file_and_in_part(tmp_path, render):
     path = tmp_path / "pipeline.toml"
     path.write_text('iso = 400\n[demosaic]\nmethod = "bilinear"\n')
@@ -93,6 +95,7 @@ def test_a_raw_in_whole_numbers(render):
         clpipe.Pipeline(start_at="normalize").process(raw.astype(np.int8), "a")
 
 
+@pytest.mark.slow
 def test_what_a_user_may_write(render):
     matrix = np.eye(3)
     camera = clpipe.Pipeline(

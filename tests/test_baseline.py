@@ -113,6 +113,7 @@ def test_it_is_as_strong_in_jpegs_on_request(clpipe, render, tmp_path, subsampli
     assert list(reached.values()) == pytest.approx([1] * 3, abs=0.03)
 
 
+@pytest.mark.slow
 def test_it_is_made_again_alone_the_same(clpipe, render, tmp_path):
     command = ("run", render, "-o", "out", *NUMPY, "--truth", "iid", "--bracket=-1,0")
     clpipe(*command, "--format", "png", "--format", "dng")

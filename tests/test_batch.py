@@ -191,6 +191,7 @@ def test_a_shard_without_images_is_no_mistake(clpipe, renders):
     assert not Path("out").exists()
 
 
+@pytest.mark.slow
 def test_several_devices_share_a_run(clpipe, renders, tmp_path):
     clpipe("run", renders(24), "-o", "whole", *RUN[2:])
     both = ("--device", "0", "--device", "1")
@@ -221,6 +222,7 @@ def test_devices_develop_at_the_same_time(renders, tmp_path, monkeypatch):
     assert sorted(workers) == ["device 0"] * 4 + ["device 1"] * 4
 
 
+@pytest.mark.slow
 def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, monkeypatch):
     renders(30)
     (tmp_path / "out").mkdir()
@@ -390,6 +392,7 @@ def test_a_disk_without_room_is_no_problem_where_all_is_done(clpipe, renders, mo
     assert {name: data for name, data in contents("out").items() if name in before} == before
 
 
+@pytest.mark.slow
 def test_two_runs_in_one_folder(tmp_path):
     holder = (
         "import sys; from pathlib import Path; from clpipe.outputs.folder import output_folder\n"
@@ -432,6 +435,7 @@ with output_folder(Path("out"), Shard(1, 2)), interruptible(lambda: None):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_shared", [False, True])
 def test_a_run_that_is_stopped_twice_removes_its_lock(tmp_path, is_shared):
     out, other = tmp_path / "out", Shard(2, 2)
@@ -530,6 +534,7 @@ def test_a_manifest_and_draws(clpipe, renders):
     assert statuses("out") == {"a/low.0001": "skipped", "a/high": "done", "r001.exr": "skipped"}
 
 
+@pytest.mark.slow
 def test_what_is_drawn_for_an_image_is_drawn_again_where_it_re_enters(clpipe, renders):
     renders(3)
     Path("draws.toml").write_text("iso = { log_uniform = [200, 12800] }\n")
@@ -732,6 +737,7 @@ def test_a_sidecar_whose_request_somebody_edited(clpipe, renders, key, value):
     assert not Path("b").exists()
 
 
+@pytest.mark.slow
 def test_a_replay_says_that_the_bytes_are_the_same(clpipe, renders):
     clpipe("run", renders(1), *RUN)
     for _ in ("made", "there already"):

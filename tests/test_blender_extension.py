@@ -25,7 +25,7 @@ from clpipe.commands.main import main
 from tests.conftest import ROOT
 from tools.blender import extension as builder
 
-pytestmark = pytest.mark.tools
+pytestmark = pytest.mark.slow
 
 
 def load(name, path):

@@ -62,6 +62,7 @@ def test_a_slanted_edge_is_as_sharp_as_the_lens_says(lens, device):
     assert found / sharp == pytest.approx(said, abs=0.02)
 
 
+@pytest.mark.slow
 def test_light_is_moved_and_none_is_lost(device):
     image = np.random.default_rng(5).random((90, 110, 3), np.float32) ** 4
     image[:40] = image[-40:] = image[:, :40] = image[:, -40:] = 0.25
@@ -109,6 +110,7 @@ def test_a_streak_is_as_long_and_lies_as_is_said(device):
     assert len(streak(200.0, 45.0)) < 600
 
 
+@pytest.mark.slow
 def test_streaks_in_perspective_follow_the_turned_camera(device):
     image = np.zeros((121, 161, 3), np.float32)
     places = [(80, 60), (20, 20), (140, 30), (30, 100)]

@@ -172,6 +172,7 @@ def test_what_is_wrong_with_a_url_is_said(bucket, clpipe, monkeypatch):
     assert "flaky://b/renders: cannot be listed: " in told("flaky://b/renders", "-o", "p", status=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [0.0, 0.25])
 def test_tars_behind_a_url_are_those_of_a_folder(bucket, clpipe, rate):
     clpipe("run", "in", "-o", "here", "--webdataset", 3, *RUN)
@@ -195,6 +196,7 @@ def test_tars_behind_a_url_are_those_of_a_folder(bucket, clpipe, rate):
     assert "(7 of them were there already)" in told.stderr
 
 
+@pytest.mark.slow
 def test_a_run_that_was_cut_off_goes_on(bucket, clpipe, monkeypatch):
     command = ("run", "in", "-o", "flaky://b/set", "--webdataset", 3, *RUN)
     monkeypatch.setattr(buckets, "TRIES", 1)
@@ -258,6 +260,7 @@ def test_from_python(bucket, monkeypatch):
         list(package.run("in", "flaky://b/other", device="numpy", webdataset=4))
 
 
+@pytest.mark.slow
 def test_one_render_by_several_isos_and_processes(bucket, clpipe):
     told = clpipe(
         *("run", "flaky://b/renders/x0", "-o", "o", *RUN[2:], "--iso", "100,200,400,800"),

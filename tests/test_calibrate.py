@@ -167,6 +167,7 @@ def test_neighbours_share_no_row_with_the_pixel():
     assert neighbours(np.tile(np.arange(12, dtype=np.float32), (12, 1)), (2, 2))[5, 5] == 5
 
 
+@pytest.mark.slow
 def test_b_is_the_noise_before_rounding():
     found = calibrate(100, frames(scene(), 8, 0.3, 0.7), frames(scene() * 0, 8, 0.3, 0.7, seed=1),
                       SENSOR)  # fmt: skip
@@ -178,6 +179,7 @@ def test_b_is_the_noise_before_rounding():
     assert found.rounding == ROUNDING
 
 
+@pytest.mark.slow
 def test_dark_frames_give_columns_dsnu_and_the_black_level():
     random = np.random.default_rng(1)
     light = scene()
@@ -198,6 +200,7 @@ def test_dark_frames_give_columns_dsnu_and_the_black_level():
     assert one.row_noise is not None and one.dsnu is not None
 
 
+@pytest.mark.slow
 def test_prnu_of_a_flat_scene_only():
     random = np.random.default_rng(2)
     response = 1 + 0.006 * random.standard_normal((256, 384))
@@ -230,6 +233,7 @@ def test_hot_pixels_of_a_scene():
     assert any("judged on the scene" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_clipped_pixels_do_not_bend_the_line():
     found = calibrate(100, frames(scene(top=2.0)), None, SENSOR)
     assert off(found.pooled.gain, 2)[0] < 0.01 and off(found.pooled.gain, 2)[1] < 3
@@ -245,6 +249,7 @@ def test_clipped_pixels_do_not_bend_the_line():
     assert off(found.pooled.gain, 2)[0] < 0.01
 
 
+@pytest.mark.slow
 def test_a_wrong_black_level_and_a_bent_response_are_told():
     shots = frames(scene())
     wrong = calibrate(100, shots.copy(), None, Sensor("RGGB", 480, 16383))
@@ -255,6 +260,7 @@ def test_a_wrong_black_level_and_a_bent_response_are_told():
     assert any("from the line at" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_a_lamp_may_flicker_and_no_more():
     brightness = 1 + 0.01 * np.random.default_rng(5).standard_normal(8)
     found = calibrate(100, frames(scene(), brightness=brightness), None, SENSOR)
@@ -277,6 +283,7 @@ def test_a_scene_that_moves_is_refused():
         calibrate(400, part, None, SENSOR)
 
 
+@pytest.mark.slow
 def test_a_picture_without_noise_among_the_frames_is_refused():
     shots = np.concatenate([frames(scene(), 6), frames(scene(), 1, gain=1e-6, read=0.0)])
     with pytest.raises(ImageError, match=r"frame 7 of 7 .* has 0\.\d+ times the others' variance"):
@@ -305,6 +312,7 @@ def test_frames_that_cannot_tell_are_refused():
         calibrate(100, flat, None, SENSOR)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gain", "read"), [(0.5, 3.0), (40.0, 41.0)])
 def test_a_single_image(gain, read):
     found = calibrate(100, frames(scene(384, 512), 1, gain, read), None, SENSOR)
@@ -313,6 +321,7 @@ def test_a_single_image(gain, read):
     assert found.row_noise is None and found.hot is None
 
 
+@pytest.mark.slow
 def test_a_single_image_with_dark_frames():
     dark = frames(scene(384, 512) * 0, 4, 5.0, 5.3, row=2.65, seed=2)
     found = calibrate(100, frames(scene(384, 512), 1, 5.0, 5.3), dark, SENSOR)
@@ -320,6 +329,7 @@ def test_a_single_image_with_dark_frames():
     assert off(found.row_noise, 2.65)[0] < 0.05
 
 
+@pytest.mark.slow
 def test_a_single_image_that_clips_and_has_rows():
     found = calibrate(100, frames(scene(384, 512, top=1.5), 1, 40.0, 41.0, row=30), None, SENSOR)
     assert off(found.pooled.gain, 40)[0] < 0.08

@@ -50,6 +50,7 @@ def within(estimate, truth, sigmas=4.0):
     return abs(estimate.value - truth) <= sigmas * estimate.error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_errors_of_the_black_level(pattern):
     bias, sigma = (1.5, -0.5, 0.25, 2.0), 0.3
@@ -81,6 +82,7 @@ def test_gaussian_noise_has_its_l_kurtosis():
     assert l_kurtosis(np.random.default_rng(0).random(1_000_000)) == pytest.approx(0, abs=0.002)
 
 
+@pytest.mark.slow
 def test_a_wave_over_the_rows():
     wave = {"amplitude": 0.5 / UNIT, "period": 13.7}
     found = figures(dark_frames(6, banding=wave)).banding
@@ -90,6 +92,7 @@ def test_a_wave_over_the_rows():
     assert figures(dark_frames(6)).banding is None
 
 
+@pytest.mark.slow
 def test_pixels_that_jump():
     given = {"share": 0.01, "amplitude": 40 / UNIT}
     found = figures(dark_frames(16, random_telegraph=given))
@@ -101,6 +104,7 @@ def test_pixels_that_jump():
     assert figures(dark_frames(4, random_telegraph=given)).rts_share is None
 
 
+@pytest.mark.slow
 def test_smooth_maps_over_the_iso():
     shading = {"slope": 0.002 / UNIT, "offset": 1.0 / UNIT, "length": 120.0}
     by_iso, maps = {}, {}
@@ -126,6 +130,7 @@ def test_smooth_maps_over_the_iso():
     assert figures(dark_frames(2, (63, 640))).shading is None
 
 
+@pytest.mark.slow
 def test_a_profile_of_dark_frames_makes_such_frames_again():
     stages = {
         "black_level_error": {"bias": [2 / UNIT, 0.0, 0.0, -1 / UNIT], "sigma": 0.3 / UNIT},

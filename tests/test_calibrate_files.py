@@ -55,6 +55,7 @@ def shots(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_profile_that_loads_and_runs(shots, tmp_path):
     profile = tmp_path / "mine.toml"
     dark = ("--dark", f"{shots}/dark/*.exr")
@@ -80,6 +81,7 @@ def test_a_profile_that_loads_and_runs(shots, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mine.png", "mine.toml", "out"]
 
 
+@pytest.mark.slow
 def test_hot_and_dead_pixels_come_back(shots, tmp_path):
     light = np.full((128, 128, 3), 0.3, np.float32)
     write(tmp_path / "scene.exr", light * np.linspace(0.1, 1, 128, dtype=np.float32)[None, :, None])
@@ -99,6 +101,7 @@ def test_hot_and_dead_pixels_come_back(shots, tmp_path):
     assert camera.dead_pixel_share == pytest.approx(3e-3, rel=0.4)
 
 
+@pytest.mark.slow
 def test_json_has_every_figure_with_its_error(shots, tmp_path):
     scene_frames = (f"{shots}/scene/*.exr", "-o", tmp_path / "p.toml", "--json")
     record = json.loads(call("calibrate", *scene_frames, "--dark", shots / "dark").output)
@@ -115,6 +118,7 @@ def test_json_has_every_figure_with_its_error(shots, tmp_path):
     assert "for want of dark frames" in sources["column_noise"]
 
 
+@pytest.mark.slow
 def test_dark_frames_among_the_frames_are_dark_frames(shots, tmp_path):
     both = (shots / "scene", shots / "dark", "--dark", f"{shots}/dark/*")
     text = call("calibrate", *both, "-o", tmp_path / "p.toml").output
@@ -135,6 +139,7 @@ def test_signal_and_dn_say_the_same(shots, tmp_path):
     assert np.array_equal(dn.read(), signal.read())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["tif", "png", "exr"])
 def test_mosaics_from_elsewhere(tmp_path, ending):
     for k, frame in enumerate(frames(scene(96, 128), 3)):
@@ -152,6 +157,7 @@ def test_mosaics_from_elsewhere(tmp_path, ending):
     assert camera.sources["white_balance_gains"] == "not known; 1 stands in"
 
 
+@pytest.mark.slow
 def test_headerless_dumps(tmp_path):
     for k, frame in enumerate(frames(scene(96, 128), 3)):
         (tmp_path / f"{k}.raw").write_bytes(frame.astype("<u2").tobytes())
@@ -166,6 +172,7 @@ def test_headerless_dumps(tmp_path):
     assert camera.gain_stages[0].system_gain[0] == pytest.approx(2, rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_single_frame_is_judged_alone(tmp_path):
     write(tmp_path / "a.exr", frames(scene(384, 512), 1)[0])
     text = call("calibrate", tmp_path / "a.exr", "-o", tmp_path / "p.toml", *LEVELS).output
@@ -230,6 +237,7 @@ def test_options_win_over_what_the_file_says(shots):
     assert (frame.iso, frame.sensor.black_level, frame.sensor.pattern) == (1234, 500, "BGGR")
 
 
+@pytest.mark.slow
 def test_a_real_raw(tmp_path):
     path = DATA / "raw" / "colorchart.dng"
     facts = read_facts(path)

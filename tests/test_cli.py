@@ -108,6 +108,7 @@ def test_a_second_run_makes_the_same_bytes(clpipe, small, tmp_path):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_float_exr_of_the_last_stage(clpipe, small):
     clpipe(
         "run",
@@ -138,6 +139,7 @@ def test_gray_world_gains_are_in_the_sidecar(clpipe, small, tmp_path):
     assert estimates["blue_gain"] == pytest.approx(1.36, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_configuration_with_options_over_it(clpipe, small, tmp_path):
     (tmp_path / "p.toml").write_text(
         'iso = 200\nskip = ["denoise"]\n[mosaic]\npattern = "GBRG"\n[exposure]\nev = 1\n'
@@ -353,6 +355,7 @@ def test_bench(clpipe):
     assert "expected WIDTHxHEIGHT" in clpipe("bench", "--size", "big", status=2).stderr
 
 
+@pytest.mark.slow
 def test_bench_of_methods(clpipe):
     options = ("--size", "320x200", "--repeat", 1)
     method, strength = ("--set", "denoise.method=mean"), ("--set", "denoise.luma_strength=0.5")
@@ -454,6 +457,7 @@ def test_a_plan_prints_the_source_of_a_launch(clpipe):
     assert "give one" in clpipe("plan", "--source", 4, "--json", status=2).stderr
 
 
+@pytest.mark.slow
 def test_a_chain_printed_as_toml_makes_the_same_picture(clpipe, small, tmp_path):
     options = ("--iso", 1600, "--set", "demosaic.method=menon2007", "--skip", "denoise")
     (tmp_path / "mine.toml").write_text(clpipe("plan", "--toml", "-c", "paper", *options).stdout)
@@ -472,6 +476,7 @@ def python(code, **environment):
     )
 
 
+@pytest.mark.slow
 def test_no_platform_at_all(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "clpipe", "run", STILL_LIFE, "-o", tmp_path / "out"],
@@ -490,6 +495,7 @@ def test_no_platform_at_all(tmp_path):
         assert done.returncode == 3
 
 
+@pytest.mark.slow
 def test_a_missing_linker_is_said_before_it_aborts_the_process(tmp_path):
     done = python(
         "from clpipe.commands.main import main; main(['check', '--small'])", PATH=str(tmp_path)
@@ -498,6 +504,7 @@ def test_a_missing_linker_is_said_before_it_aborts_the_process(tmp_path):
     assert "PoCL needs a linker" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", ["--help", "--version", "stages", "cameras --json", "plan"])
 def test_what_cannot_be_printed_is_said_so(arguments):
     command = [sys.executable, "-m", "clpipe", *arguments.split()]
@@ -516,6 +523,7 @@ def test_a_log_that_cannot_be_written_is_named_and_the_summary_is_printed(clpipe
     assert int(done) == len(list((tmp_path / "out").glob("*.jpg"))) > 0
 
 
+@pytest.mark.slow
 def test_a_screen_that_takes_no_more_ends_no_run(clpipe, small, tmp_path):
     run = [sys.executable, "-m", "clpipe", "run", small, "-o", tmp_path / "out"]
     with open("/dev/full", "w") as full:

@@ -13,6 +13,8 @@ from clpipe.analysis.crops import FOUND, choose_places
 from clpipe.analysis.pictures import Picture
 from clpipe.reference.transfer import srgb_curve
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def write_png(tmp_path):

@@ -15,7 +15,7 @@ from tools.compare.charts import chart_image, chart_patches, patch_means, satura
 from tools.compare.fidelity import colour_errors
 from tools.pages import side_by_side
 
-pytestmark = pytest.mark.tools
+pytestmark = pytest.mark.slow
 
 COPY = tool.Converter("copy", "none", "cp DNG PICTURE")
 PRINT = tool.Converter("print", "none", "cat DNG")

@@ -12,7 +12,7 @@ from tools.compare import methods as other_methods
 from tools.compare import opencv as tool
 from tools.compare import turns
 
-pytestmark = pytest.mark.tools
+pytestmark = pytest.mark.slow
 
 
 def test_works_take_turns_and_what_comes_before_is_not_counted(monkeypatch):

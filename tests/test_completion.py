@@ -12,6 +12,8 @@ from clpipe.commands.main import COMMANDS, main, summary
 from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 
 def completed(*words):
     """The completions of the last word, with those before it on the command line."""

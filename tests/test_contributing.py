@@ -5,6 +5,7 @@ import re
 import subprocess
 from dataclasses import replace
 
+import pytest
 from click.testing import CliRunner
 
 from clpipe.chain.registry import load_stage_file
@@ -22,6 +23,7 @@ def block(language: str) -> str:
     return next(block.text for block in blocks(PAGE) if block.language == language)
 
 
+@pytest.mark.slow
 def test_the_example_stage_works(device, tmp_path, monkeypatch):
     monkeypatch.setattr("clpipe.chain.registry._from_files", {})
     (tmp_path / "vignette.cl").write_text(block("c"))
@@ -33,6 +35,7 @@ def test_the_example_stage_works(device, tmp_path, monkeypatch):
         assert result.passed, result
 
 
+@pytest.mark.slow
 def test_the_commands_it_shows_work(tmp_path, monkeypatch):
     monkeypatch.setattr("clpipe.chain.registry._from_files", {})
     monkeypatch.chdir(tmp_path)

@@ -24,6 +24,8 @@ from clpipe.engine.cpu_target import (
 )
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 HASWELL = "ssse3 sse4_1 avx f16c avx2 fma bmi1 bmi2 abm cx16 popcnt"
 AVX512 = f"{HASWELL} avx512f avx512bw avx512dq avx512cd avx512vl"
 POCL = "OpenCL 3.0 PoCL 3.0-rc2  Linux, Release, RELOC, LLVM 14.0.6, SLEEF, DISTRO, POCL_DEBUG"
@@ -204,7 +206,6 @@ def raw_for(target, device="pocl"):
     return done.stdout.split()
 
 
-@pytest.mark.slow
 def test_a_narrow_target_makes_the_same_raw_of_a_half_render(pip_pocl):
     # PoCL's library is still the one for this CPU: vload_half8 of it is called in other registers.
     (expected,) = raw_for("", "numpy")

@@ -65,6 +65,7 @@ def test_truths_with_and_without_denoising(renders):
     assert not np.array_equal(truths[1], truths[2])
 
 
+@pytest.mark.slow
 def test_the_noise_is_as_the_sample_says(write_exr, tmp_path):
     write_exr("flat.exr", np.full((256, 256, 3), 0.2, np.float32))
     (sample,) = api.Dataset(
@@ -167,6 +168,7 @@ def test_a_damaged_image_is_skipped_where_that_is_asked_for(renders):
         assert len(api.Dataset(renders, iso=ISO, on_error="skip")) == 4
 
 
+@pytest.mark.slow
 def test_samples_of_a_batch_go_through_together_and_are_the_same(renders, monkeypatch):
     drawn = {"iso": {"log_uniform": [400, ISO]}, "patch": api.Patches(16, 4), "raw": "packed"}
     samples = api.Dataset(renders, **drawn, on_error="skip")
@@ -229,6 +231,7 @@ def test_what_is_refused(renders):
         api.Dataset(["in/r0.exr", Path("in")])
 
 
+@pytest.mark.slow
 def test_kept_images_enter(clpipe, renders, dataset):
     clpipe("run", renders, "-o", "kept", "--iso", ISO, "--keep", "normalize")
     again = api.Dataset("kept/*.normalize.exr", start_at="white_balance")
@@ -260,6 +263,7 @@ class Loader:
             yield from pool.map(self.dataset.__getitem__, range(len(self.dataset)))
 
 
+@pytest.mark.slow
 def test_workers_that_are_spawned_make_the_same(renders):
     patches = api.Dataset(renders, iso=ISO, patch=api.Patches(16, 2), truth=False)
     whole = list(patches)

@@ -55,6 +55,7 @@ def depth_of(write_exr, tmp_path, monkeypatch):
     return write
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", [None, "numpy"])
 @pytest.mark.parametrize("kind", WHOLE)
 @pytest.mark.filterwarnings("ignore:.*pixels are spread")

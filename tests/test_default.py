@@ -70,6 +70,7 @@ def test_colours_are_those_of_the_render():
     assert colour_errors(patch_means(each), chart_patches()).largest_hue > 6
 
 
+@pytest.mark.slow
 def test_saturated_colours_have_no_dots():
     image, places = patch_image(saturated_patches()), patch_places(256)
 

@@ -250,6 +250,7 @@ def test_a_second_run_compiles_nothing(device, monkeypatch):
     Runner(changed, fresh).run(image, "k")
 
 
+@pytest.mark.slow
 def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
     fresh = Device(device.info)
     runner = Runner(make_chain(settings_from({})), fresh)
@@ -339,6 +340,7 @@ def test_another_chain_of_the_same_structure_is_not_planned_again(device, monkey
     assert np.array_equal(runner.for_chain(changed).run(image, "k").encoded, alone)
 
 
+@pytest.mark.slow
 def test_a_device_keeps_the_kernels_of_so_many_plans(device, monkeypatch):
     monkeypatch.setattr("clpipe.engine.plan_kernels.PLANS", 2)
     fresh, image = Device(device.info), example(Kind.RGB, (9, 20))

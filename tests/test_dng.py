@@ -186,6 +186,7 @@ def test_a_converter_gives_the_colours_of_our_own_picture(tmp_path, options):
     assert np.abs(np.percentile(ratio, [5, 95], axis=0) - 1).max() < 0.03
 
 
+@pytest.mark.slow
 def test_the_preview_is_our_neutral_picture(tmp_path):
     formats = ("--format", "dng", "--format", "png", "--truth", "clean")
     plain = ("--skip", "denoise", "--skip", "sharpen", "--set", "tone_curve.method=neutral")
@@ -281,6 +282,7 @@ def test_a_burst_has_a_dng_of_each_frame_and_of_the_truth(scene, tmp_path):
     assert np.abs(np.mean(frames, axis=0) - truth).mean() < 100
 
 
+@pytest.mark.slow
 def test_a_kept_raw_as_a_dng_loses_nothing(scene, tmp_path):
     options = ("--iso", 800, "--set", "mosaic.pattern=GRBG", "--keep", "quantize")
     clpipe("run", scene(24, 30), "-o", tmp_path / "a", *options, "--format", "dng")
@@ -291,6 +293,7 @@ def test_a_kept_raw_as_a_dng_loses_nothing(scene, tmp_path):
     assert one.read_bytes() == two.read_bytes()
 
 
+@pytest.mark.slow
 def test_a_mosaic_from_elsewhere_as_a_dng(write_exr, tmp_path):
     dn = np.random.default_rng(0).integers(0, 4096, (25, 31, 1)).astype(np.float32)
     mosaic = write_exr("m.exr", dn, "Y", half=False)

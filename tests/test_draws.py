@@ -356,6 +356,7 @@ def test_the_limits_of_a_parameter_are_its_own():
     assert limits_of(all_stages()["mosaic"].methods[0], "pattern") is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "share"),
     [

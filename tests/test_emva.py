@@ -277,6 +277,7 @@ def test_a_full_well_puts_the_noise_where_it_was():
     assert noisiest_light(0.02, 0.3, 0.014, 0.02 * well) == pytest.approx(10_000, rel=0.002)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["full", "quiet"])
 def test_a_sensor_that_saturates_before_its_converter(tmp_path, how):
     well = 2800
@@ -292,6 +293,7 @@ def test_a_sensor_that_saturates_before_its_converter(tmp_path, how):
     assert saturation_of(camera, 100) == pytest.approx(found.saturation_electrons.value, rel=0.06)
 
 
+@pytest.mark.slow
 def test_a_camera_comes_back(clpipe):
     """A series of a profile gives its figures, and a profile whose series has the same ones."""
     Path("mine.toml").write_text(MINE.format(more=""))
@@ -323,6 +325,7 @@ def test_a_camera_comes_back(clpipe):
         assert total["value"] == pytest.approx(own["value"], rel=0.05), name
 
 
+@pytest.mark.slow
 def test_a_series_is_the_same_again_and_replaces_none(clpipe):
     Path("mine.toml").write_text(MINE.format(more="dark_current = 3000"))
     small = ("--size", "32x16", "--exposures", 9, "--stack", 3, "--device", "numpy")

@@ -14,7 +14,7 @@ import yaml
 from clpipe.commands.run import run
 from tests.conftest import ROOT
 
-pytestmark = pytest.mark.tools
+pytestmark = pytest.mark.slow
 
 EXAMPLES = ROOT / "tools" / "examples"
 

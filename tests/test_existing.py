@@ -260,6 +260,7 @@ def program(monkeypatch):
     return be
 
 
+@pytest.mark.slow
 def test_pictures_of_another_program_are_made_again_and_that_is_said(again, clpipe, program):
     program("f" * 64)
     stderr = clpipe("run", "in", *RUN).stderr

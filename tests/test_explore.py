@@ -156,6 +156,7 @@ def test_several_inputs_are_applied_to_as_they_were_given(two_renders):
     assert run_command([Path("-a.exr")], []) == "clpipe run ./-a.exr -o out"
 
 
+@pytest.mark.slow
 def test_noise_of_all_of_a_picture_is_that_of_measure(explorer, two_renders, tmp_path):
     out = tmp_path / "out"
     options = ["--iso", 6400, "--truth", "development", "--truth", "mosaic", "--format", "png"]

@@ -223,6 +223,7 @@ def test_a_port_in_use_is_said(two_renders):
     assert f"--port {port}: cannot be used: Address already in use" in result.output
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_it_quietly(two_renders):
     command = [sys.executable, "-m", "clpipe", "explore", str(two_renders), "--device", "numpy"]
     with subprocess.Popen(command, stdout=-1, stderr=-1, text=True) as process:

@@ -134,6 +134,7 @@ def test_a_polarised_array_has_no_colours():
     np.testing.assert_allclose(gray.final, 0.2, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("array", ["x-trans", "RGBW"])
 def test_the_raw_is_the_same_bit_for_bit(device, scalar_device, array):
     until = {"stages": [*settings_from({}).stages[:25]], **NOISE}
@@ -144,6 +145,7 @@ def test_the_raw_is_the_same_bit_for_bit(device, scalar_device, array):
         assert (found.largest, found.differing) == (0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("array", "method"),
     [
@@ -209,6 +211,7 @@ def test_what_knows_bayer_patterns_alone(array, settings, message):
         on(array, **settings)
 
 
+@pytest.mark.slow
 def test_a_camera_says_its_array(clpipe, tmp_path):
     profile = tmp_path / "mono.toml"
     text = next(Path(__file__).parents[1].glob("clpipe/camera/profiles/sony-a7r2.toml")).read_text()
@@ -226,6 +229,7 @@ def test_a_camera_says_its_array(clpipe, tmp_path):
     assert (step.method.method, step.method.pattern) == ("bayer", "GBRG")
 
 
+@pytest.mark.slow
 def test_an_image_kept_on_the_way_goes_on(clpipe):
     run = ("run", STILL_LIFE, "--set", "mosaic.method=array", "--iso", "1600")
     clpipe(*run, "-o", "whole", "--keep", "normalize")
@@ -238,6 +242,7 @@ def test_an_image_kept_on_the_way_goes_on(clpipe):
     assert "G20" in report.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("array", ["x-trans", "mono", "quad-RGGB", "RCCB"])
 def test_a_dng_of_another_array(clpipe, array):
     clpipe(
@@ -276,6 +281,7 @@ def test_an_array_that_no_dng_holds(clpipe):
     assert "RGGB-IR has the channel I, which DNG does not know" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_dataset_of_another_array():
     options = {"mosaic": {"method": "array", "array": "quad-RGGB"}, "iso": 800}
     data = Dataset(STILL_LIFE, patch=32, raw="mosaic", variance=True, **options)
@@ -356,6 +362,7 @@ def remosaiced(array, method, **settings):
     return on(array, stages=WITH_REMOSAIC, remosaic={"method": method}, **settings)
 
 
+@pytest.mark.slow
 def test_cells_are_binned_to_a_bayer_pattern(device):
     chain = remosaiced("quad-RGGB", "binning")
     assert chain.step_named("demosaic").context.pattern == "RGGB"
@@ -373,6 +380,7 @@ def test_cells_are_binned_to_a_bayer_pattern(device):
     assert noise.a == pytest.approx(chain.camera.noise(800).a / 4)
 
 
+@pytest.mark.slow
 def test_charge_is_read_once_where_it_is_binned_before_the_noise(device):
     """The sum of four pixels: the shot noise is the same, the read noise that of one or of four."""
     light, a, b = 0.05, 1e-3, 2e-4
@@ -406,6 +414,7 @@ def test_a_cell_of_charge_saturates_as_one_readout(develop):
     assert (kept[0::2, 0::2] < 0.5).all()  # red has not
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("array", "method"),
     [("quad-RGGB", "binning"), ("nona-RGGB", "binning"), ("x-trans", "linear_mmse")],
@@ -439,6 +448,7 @@ def test_what_has_no_cells(array):
         remosaiced(array, "binning")
 
 
+@pytest.mark.slow
 def test_the_variance_of_each_channel_is_that_of_its_noise(write_exr):
     flat = write_exr("flat.exr", np.full((240, 240, 3), 0.5, np.float32))
     settings = {"mosaic": laid("RGBW"), "iso": 1600}
@@ -450,6 +460,7 @@ def test_the_variance_of_each_channel_is_that_of_its_noise(write_exr):
         assert noise[own].var() == pytest.approx(sample["variance"][own].mean(), rel=0.06)
 
 
+@pytest.mark.slow
 def test_a_sensor_without_filters_is_calibrated(clpipe, write_exr):
     ramp = np.geomspace(0.002, 0.8, 320, dtype=np.float32)
     path = write_exr("ramp.exr", np.tile(ramp[None, :, None], (200, 1, 3)), half=False)
@@ -464,6 +475,7 @@ def test_a_sensor_without_filters_is_calibrated(clpipe, write_exr):
     assert gains[0] == pytest.approx(gains[1], rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("array", ["quad-RGGB", "x-trans", "RCCB"])
 def test_a_sensor_of_any_array_is_calibrated(clpipe, write_exr, array):
     ramp = np.geomspace(0.002, 0.8, 480, dtype=np.float32)

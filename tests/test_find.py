@@ -94,6 +94,7 @@ def test_exclude(folder, caplog):
             find_jobs([inputs], NOWHERE, exclude=["*"])
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_read_is_refused(tmp_path):
     """Not silently left out; as another user, since root can read everything."""
     (tmp_path / "in" / "locked").mkdir(parents=True)

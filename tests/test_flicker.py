@@ -112,6 +112,7 @@ def test_each_frame_has_the_light_of_its_time(lit):
         assert found[row, 0] == pytest.approx(frame, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_short_exposure_misses_the_pulse(lit):
     # On for 2 of each 10 ms; exposed for 8, 2 and 0.5 ms, one behind the other.
     lamp = {"flicker_frequency": 100.0, "flicker_duty": 0.2, "exposure_time": 8e-3}

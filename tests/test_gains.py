@@ -7,7 +7,7 @@ import pytest
 
 from tools.pages.gains import drawn, gains_of
 
-pytestmark = pytest.mark.tools
+pytestmark = pytest.mark.slow
 SCORES = {
     "noisy": {"psnr": [[30.0, 34.0]]},
     "awgn": {"psnr": [[30.5, 33.0], [31.5, 34.0]]},

@@ -8,7 +8,7 @@ import pytest
 
 from tools.stress import gpu_compile as tool
 
-pytestmark = pytest.mark.tools
+pytestmark = pytest.mark.slow
 
 FUSED = {  # the same line with a fused multiply-add of floats, and one of integers
     tool.NVIDIA_FUSED: ("FFMA R1, R2, R3, R4 ;", "IMAD R1, R2, R3, R4 ;"),

@@ -113,6 +113,7 @@ def deep(path, width: int, height: int) -> bytes:
     return path.read_bytes().replace(small, large)
 
 
+@pytest.mark.slow
 def test_images_that_claim_too_much_are_refused_in_little_memory(tmp_path):
     planes = {c: (np.zeros((1000, 1)), 1) for c in "RGB"}
     chroma = {"Y": (np.zeros((1000, 2)), 1), "RY": (np.zeros((500, 1)), 2)}
@@ -200,6 +201,7 @@ def test_a_dump_of_another_size_is_not_read(tmp_path, clpipe):
     assert "a.raw: 1099511627776 bytes, but 96x80 uint8 has 7680" in done.output
 
 
+@pytest.mark.slow
 def test_exif_that_repeats_itself_is_given_up(tmp_path, monkeypatch):
     """65,535 tags of 999 values each, all of the same bytes: minutes, read one by one."""
     tags = struct.pack("<HHII", 33434, 1, 999, 8) * 65_535

@@ -106,6 +106,7 @@ def test_figures_of_a_camera_that_no_sensor_has(tmp_path, old, new, key):
         load_camera(str(path))
 
 
+@pytest.mark.slow
 def test_a_working_directory_that_has_gone(tmp_path):
     gone = tmp_path / "gone"
     gone.mkdir()

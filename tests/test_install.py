@@ -15,8 +15,9 @@ from clpipe import __version__
 from clpipe.base import extras
 from tests.conftest import ROOT, STILL_LIFE
 
+pytestmark = pytest.mark.slow
 
-@pytest.mark.slow
+
 def test_the_installed_package_works_from_anywhere(tmp_path):
     target = tmp_path / "site"
     options = ["--no-deps", "--no-build-isolation", "--quiet", "--disable-pip-version-check"]

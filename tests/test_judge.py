@@ -11,6 +11,8 @@ from scipy import ndimage
 from tools.compare import judge
 from tools.compare.telling import PATCH, auc, distance, statistics, told
 
+pytestmark = pytest.mark.slow
+
 
 def patches(seed, count=60, blur=0.8, skew=0.0):
     """The statistics of patches of noise of a blur, (patch, statistic)."""

@@ -23,15 +23,13 @@ from clpipe.engine.sources import kernel_folder
 from clpipe.reference.cfa import PATTERNS
 from clpipe.stage import Kind, variant_label, variants
 from clpipe.stages.denoise.strength import WindowDenoiser
+from tests import methods
 
-METHODS = [(stage, method) for stage in all_stages().values() for method in stage.methods]
 VARIANTS = [
     pytest.param(stage, method, values, id=f"{stage.name}-{variant_label(method, values)}")
-    for stage, method in METHODS
+    for stage, method in methods.METHODS
     for values in variants(method)
 ]
-# Variants of a method differ in arithmetic alone, which lanes do not change.
-ON_ONE_LANE = [each for each in VARIANTS if not each.values[2]]
 SMALL_SIZES = SIZES[:6]
 
 
@@ -45,9 +43,9 @@ def test_kernel_agrees_with_its_reference(device, stage, method, values):
     assert result.passed, result
 
 
-@pytest.mark.parametrize(("stage", "method", "values"), ON_ONE_LANE)
-def test_kernel_agrees_with_its_reference_on_one_lane(scalar_device, stage, method, values):
-    result = check_method(scalar_device, stage, method, SMALL_SIZES, ("GRBG",), values)
+@pytest.mark.parametrize(("stage", "method"), methods.ALL)
+def test_kernel_agrees_with_its_reference_on_one_lane(scalar_device, stage, method):
+    result = check_method(scalar_device, stage, method, SMALL_SIZES, ("GRBG",))
     assert result.passed, result
 
 
@@ -63,6 +61,7 @@ def test_structural_choices_are_found():
     assert list(variants(all_stages()["mosaic"].methods[0])) == [{}]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [3, 5])
 def test_median_of_zeros_and_ones(device, size):
     # By the zero-one principle a network that sorts zeros and ones right sorts everything right.
@@ -102,6 +101,7 @@ WINDOWS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "sizes"), WINDOWS, ids=lambda x: str(getattr(x, "method", x)))
 def test_windows_of_all_sizes_on_small_images(device, scalar_device, method, sizes):
     values = {"method": method.method, "luma_size": sizes[0], "chroma_size": sizes[1], **LOUD}
@@ -125,6 +125,7 @@ def test_a_strength_of_0_is_off(device, method):
 MOSAIC_WINDOWS = [("GRBG", 1), ("GRBG", 15), ("GBRG", 7)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pattern", "size"), MOSAIC_WINDOWS)
 def test_mosaic_windows_of_all_sizes_on_small_images(device, scalar_device, pattern, size):
     parameters = {
@@ -143,6 +144,7 @@ def test_mosaic_windows_of_all_sizes_on_small_images(device, scalar_device, patt
         assert compare(scalar_device, chain, SMALL[:4]).largest < 2e-4
 
 
+@pytest.mark.slow
 def test_sums_over_the_blocks_of_a_wide_stencil(device, scalar_device):
     stages = ("mosaic", "mosaic_denoise", "white_balance")
     parameters = {"mosaic_denoise": {"a": 0.02}, "white_balance": {"method": "gray_world"}}
@@ -160,9 +162,10 @@ def test_a_wrong_kernel_is_caught(device, monkeypatch):
 
 def test_every_kernel_file_belongs_to_a_method():
     files = {path.stem for path in kernel_folder().glob("*.cl")}
-    assert {method.kernel for _, method in METHODS if method.kernel} == files
+    assert {method.kernel for _, method in methods.METHODS if method.kernel} == files
 
 
+@pytest.mark.slow
 def test_the_command_checks_every_stage(clpipe, monkeypatch):
     noises = all_stages()["sensor_noise"].methods
     # The tests above run what it runs.
@@ -170,6 +173,6 @@ def test_the_command_checks_every_stage(clpipe, monkeypatch):
     record = json.loads(clpipe("check", "--small", "--json").stdout)
     assert record["failed"] == 0 and len(record["checks"]) == len(VARIANTS) + len(noises) + 2
     checked = {(check["stage"], check["method"].split()[0]) for check in record["checks"]}
-    assert checked >= {(stage.name, method.method) for stage, method in METHODS}
+    assert checked >= {(stage.name, method.method) for stage, method in methods.METHODS}
     ends = {"exposure..quantize", "source..8 bit", "exposure..gamma"}
     assert ends <= {check["stage"] for check in record["checks"]}

@@ -87,6 +87,7 @@ def test_what_is_estimated_from_the_image_is_estimated_again_when_it_changes(dev
     assert ran(iso=3200) == [LINES, *every[2:]]
 
 
+@pytest.mark.slow
 def test_launches_before_a_method_that_is_switched_are_left_out(device):
     developer, image = Developer(device.info), example(Kind.RGB, (50, 70), half=True)
     for settings in ({}, MEAN):
@@ -238,6 +239,7 @@ class Walk:
         return len(runner.plan(True, min(self.image.shape[:2]) > 1).launches) - ran
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["CPU", "GPU"])
 def test_the_same_bits_after_any_changes(device, kind, monkeypatch):
     walk = Walk(replace(device.info, type=kind), device, monkeypatch)

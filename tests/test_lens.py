@@ -118,6 +118,7 @@ def test_points_are_where_the_model_says(name):
         assert abs((near * y).sum() / near.sum() - to_y) < 0.02
 
 
+@pytest.mark.slow
 def test_what_the_lens_does_not_see_is_black_and_fit_leaves_none(device):
     image = np.ones((150, 203, 3), np.float32)
     plain, fitted = (

@@ -13,6 +13,8 @@ from clpipe.base.errors import RequestError
 from clpipe.inputs.manifest import check_rows, read_manifest
 from tests.test_manifest import DEFAULT
 
+pytestmark = pytest.mark.slow
+
 # Whatever a manifest holds, what is said of it is a RequestError; what is written is read again.
 
 few = settings(max_examples=200, deadline=None, database=None, derandomize=True)

@@ -188,6 +188,7 @@ def test_the_configuration_develops_what_was_measured(found):
     assert (folder / "look.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_the_table(found, clpipe, monkeypatch, tmp_path):
     _, folder = found
@@ -331,6 +332,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(search, "FULL", 1)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_stopped_it_ends_with_the_best_so_far(clpipe, burst, tmp_path, monkeypatch):
     frames = saved(tmp_path, **{f"{k}": frame for k, frame in enumerate(burst[:3])})
@@ -351,6 +353,7 @@ def test_stopped_it_ends_with_the_best_so_far(clpipe, burst, tmp_path, monkeypat
     assert not (tmp_path / "a.toml").exists()
 
 
+@pytest.mark.slow
 def test_without_matplotlib_it_only_cannot_draw(burst, tmp_path):
     frames = saved(tmp_path, **{f"{k}": frame for k, frame in enumerate(burst[:3])})
     script = """if True:
@@ -528,6 +531,7 @@ MEASURED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("look", PAIRS)
 def test_looks_have_the_figures_of_the_cameras(look, device):
     """The scene is not the cameras', and noise depends on the scene, so tolerances are wide."""
@@ -544,6 +548,7 @@ def test_looks_have_the_figures_of_the_cameras(look, device):
     assert [ours[name] for name in WITHIN] == pytest.approx(within, abs=0.12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("look", PAIRS)
 def test_looks_are_like_the_cameras(look, device, shared_data):
     pictures = f"{shared_data}/real_noise/{PAIRS[look]}"

@@ -51,6 +51,7 @@ def developed(tmp_path_factory):
     return develop
 
 
+@pytest.mark.slow
 def test_the_raw_has_the_noise_of_the_camera(developed, measured):
     noisy = developed("--until", "quantize")
     clean = developed("--until", "quantize", "--skip", "noise")
@@ -97,6 +98,7 @@ def test_the_law_of_a_raw_within_one_percent():
     assert abs(whole.law.b - b) < 3 * whole.law.b_error
 
 
+@pytest.mark.slow
 def test_repeats_measure_what_the_truth_does(developed, measured):
     names = [developed("--until", "normalize", "--seed", str(seed)) + ".exr" for seed in range(6)]
     clean = developed("--until", "normalize", "--skip", "noise")
@@ -115,6 +117,7 @@ def test_repeats_measure_what_the_truth_does(developed, measured):
     assert "two frames" in " ".join(pair["notes"])
 
 
+@pytest.mark.slow
 def test_processing_correlates_noise(developed, measured):
     formats = ("--format", "jpg", "--format", "png", "--format", "exr", "--keep", "demosaic")
     noisy = developed(*formats)
@@ -142,6 +145,7 @@ def test_processing_correlates_noise(developed, measured):
     assert sigma["jpg"] == pytest.approx(sigma["png"], rel=0.15)
 
 
+@pytest.mark.slow
 def test_the_tables_and_the_picture(developed, clpipe, tmp_path):
     noisy = developed("--until", "quantize")
     clean = developed("--until", "quantize", "--skip", "noise")
@@ -236,6 +240,7 @@ def burst(folder, name, seed, sigma, iso=None, height=96):
         picture.save(folder / name.format(k), exif=exif)
 
 
+@pytest.mark.slow
 def test_bursts_of_several_scenes_are_one_figure_for_each_iso(tmp_path, measured, clpipe):
     out = tmp_path / "out"
     burst(out / "low", "one.frame{}.png", 1, 3, 100)
@@ -265,6 +270,7 @@ def test_bursts_of_several_scenes_are_one_figure_for_each_iso(tmp_path, measured
     assert "3 x display, 128x96, ISO 800, against their mean" in text
 
 
+@pytest.mark.slow
 def test_a_raws_law_is_pooled_by_its_errors():
     random, a, b, reports = np.random.default_rng(7), 6e-4, 1e-4, []
     for size in (200, 800):
@@ -332,6 +338,7 @@ def test_a_mosaic_that_says_nothing_is_taken_as_it_is(write_exr, measured):
     assert max(channels["B"]["intensity"]["mean"]) < 1600 < max(channels["R"]["intensity"]["mean"])
 
 
+@pytest.mark.slow
 def test_no_noise_is_said_not_divided_by(clpipe, tmp_path, measured):
     clean = png(tmp_path / "clean.png", scene_of(8).astype(np.uint8)).with_suffix("")
     report = measured(f"{clean}.png", "--truth", f"{clean}.png")
@@ -398,6 +405,7 @@ def test_odd_and_tiny_mosaics():
         assert measure_tables(report)
 
 
+@pytest.mark.slow
 def test_load_says_what_it_read(clpipe, tmp_path):
     kinds = {"mosaic": "mosaic", "quantize": "mosaic", "demosaic": "rgb", "gamma": "display"}
     keep = [word for stage in kinds for word in ("--keep", stage)]
@@ -451,6 +459,7 @@ def test_another_scene_among_the_repeats_is_refused():
                 measure([repeats[0], other])
 
 
+@pytest.mark.slow
 def test_a_shift_by_a_pixel_is_refused_and_strong_noise_is_not(developed, tmp_path):
     name = developed("--iso", 12800, "--frames", 3, "--format", "png")
     frames = [load_picture(tmp_path / f"{name}.frame{k}.png") for k in range(3)]
@@ -462,6 +471,7 @@ def test_a_shift_by_a_pixel_is_refused_and_strong_noise_is_not(developed, tmp_pa
         measure([frames[0], moved])
 
 
+@pytest.mark.slow
 def test_a_frame_and_the_mean_of_others_are_repeats(developed):
     """Correlated noise, like that of a camera's JPEGs, is not mistaken for another scene."""
     look = ("-c", "nikon-d800-jpeg")
@@ -473,6 +483,7 @@ def test_a_frame_and_the_mean_of_others_are_repeats(developed):
     assert repeats.share > measure([first], clean).share / 2  # places that noise leaves flat
 
 
+@pytest.mark.slow
 def test_repeats_of_real_cameras_are_repeats(shared_data):
     for name in ("5dmark3_iso3200_1", "d800_iso1600_1"):
         paths = (shared_data / "real_noise" / f"{name}_{end}.png" for end in ("real", "mean"))

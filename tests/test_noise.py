@@ -166,6 +166,7 @@ def test_column_noise_is_one_offset_a_column_fixed_to_the_camera(develop):
         assert np.array_equal(image, lines(develop, "column_noise", **other))
 
 
+@pytest.mark.slow
 def test_repeated_stages_draw_different_noise(develop):
     grey = np.full((64, 64), 0.5, np.float32)
     settings = {"sensor_noise": {"a": 0, "b": 1e-4}, "sensor_noise_2": {"a": 0, "b": 1e-4}}

@@ -178,6 +178,7 @@ POSE = {"R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "t": [0, 0, 0]}
 VIEW = {"file": "a.exr", "K": [[350, 0, 180], [0, 350, 120], [0, 0, 1]], **POSE}
 
 
+@pytest.mark.slow
 def test_the_poses_of_a_35_mm_render_are_those_of_its_depth_of_field(clpipe, point):
     Path("cameras.json").write_text(json.dumps({"views": [VIEW]}))
     posed = (*RUN, *DEFOCUS, "--poses", "cameras.json")
@@ -204,6 +205,7 @@ def test_a_lens_by_name_is_that_of_the_depth_of_field(clpipe, point):
     assert "render.focal_length: 35, but focal_length: 70; set one" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "stated",
     [("--focal-length", 35, "--aperture", 4), (*FOCAL, "--set", "defocus.f_number=4", *THIN)],
@@ -215,6 +217,7 @@ def test_exif_has_it_wherever_it_is_stated(clpipe, point, stated):
     assert (inner[0x829D], inner[0x920A]) == (4, 35)
 
 
+@pytest.mark.slow
 def test_what_an_exr_says_of_its_camera_is_taken_where_nothing_else_is_said(clpipe, point):
     with OpenEXR.File("in/a.exr", separate_channels=True) as file:
         said = {"effectiveFocalLength": 35.0, "sensorOverallDimensions": np.float32([36, 24])}

@@ -149,6 +149,7 @@ def test_a_configuration_says_how_files_are_written(scene, tmp_path):
     assert (again.output, again.render) == (first.output, first.render)
 
 
+@pytest.mark.slow
 def test_a_kept_image_knows_how_it_was_to_be_written(scene, tmp_path):
     set_ = ("--set", "output.jpeg_quality=50")
     clpipe("run", scene, "-o", tmp_path / "a", *set_, "--keep", "denoise")

@@ -18,7 +18,7 @@ from tests.conftest import ROOT, STILL_LIFE
 from tests.dng import write_dng
 from tools.pages import figures
 
-pytestmark = pytest.mark.tools
+pytestmark = pytest.mark.slow
 
 PAGE = ROOT / "docs" / "paper.md"
 

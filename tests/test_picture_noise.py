@@ -60,6 +60,7 @@ def test_a_chain_may_end_before_the_display():
         make_chain(settings_from({"skip": ["tone_curve", "gamma"], "picture_noise": loud}))
 
 
+@pytest.mark.slow
 def test_sigma_is_as_given_and_channels_are_independent(develop, grey):
     image = noisy(develop, grey, method="iid_gaussian", sigma=[0.01, 0.02, 0.04]) - grey
     assert image.std((0, 1)) == pytest.approx([0.01, 0.02, 0.04], rel=0.01)
@@ -76,6 +77,7 @@ def test_noise_is_new_in_each_image(develop, grey):
     assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 0.01
 
 
+@pytest.mark.slow
 def test_sigma_follows_intensity(develop, grey):
     for level, sigma in ((-1, 0.01), (0, 0.01), (0.25, 0.03), (0.5, 0.05), (0.75, 0.025), (1, 0)):
         image = np.full_like(grey, level)
@@ -240,6 +242,7 @@ def loop(tmp_path_factory):
     return reports
 
 
+@pytest.mark.slow
 def test_the_matched_variance_is_measured_again(loop):
     for name in "RGB":
         camera, baseline = (loop[x]["channels"][name] for x in ("camera", "iid_gaussian"))

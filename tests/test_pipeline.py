@@ -37,6 +37,7 @@ def runner(settings, device, **options):
     return Runner(make_chain(settings_from(settings)), device, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", SETTINGS)
 @pytest.mark.parametrize("shape", [(67, 101), (1, 40), (3, 3)])
 def test_what_is_kept_changes_no_bit(device, still_life, settings, shape):
@@ -279,6 +280,7 @@ def judged(device, still_life):
     return judge
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("iso", [1600, 3200, 12800])
 def test_non_local_means_is_the_best_denoiser(judged, iso):
     noisy = judged(iso, skip=["denoise"])
@@ -291,6 +293,7 @@ def test_non_local_means_is_the_best_denoiser(judged, iso):
         assert default[i] > noisy[i] + 0.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("iso", [1600, 12800])
 def test_the_papers_denoising_makes_a_better_picture(judged, iso):
     paper = load_config("paper").values
@@ -305,6 +308,7 @@ def with_mosaic_denoise(after):
     return chain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", ["normalize", "white_balance"])
 def test_denoising_the_mosaic_makes_a_better_picture(judged, after):
     noisy = judged(3200, skip=["denoise"])
@@ -313,6 +317,7 @@ def test_denoising_the_mosaic_makes_a_better_picture(judged, after):
     assert ours[1] > noisy[1] + 2
 
 
+@pytest.mark.slow
 def test_denoising_the_mosaic_takes_noise_away_and_leaves_edges(develop):
     image = np.full((96, 128, 3), 0.1, np.float32)
     image[:, 64:] = 0.6

@@ -10,7 +10,7 @@ from clpipe.engine.cpu_target import TARGETS, row_of
 from tools.stress.emulated import EMULATED, measure_emulated, script
 from tools.stress.runtimes import UnavailableError
 
-pytestmark = pytest.mark.tools
+pytestmark = pytest.mark.slow
 
 X86 = [cpu for cpu in EMULATED if cpu.machine == "x86_64"]
 

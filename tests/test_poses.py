@@ -213,6 +213,7 @@ def test_a_run_in_parts_makes_the_same_bytes(clpipe, renders):
     assert json.loads(Path("o/cameras.json").read_text())["views"][0]["t"] == [0, 0, 9.0]
 
 
+@pytest.mark.slow
 def test_each_kind_of_picture_is_a_model_of_its_own(clpipe, renders):
     roles = {"": "", "truth": ".truth", "truth_clean": ".truth_clean", "iid": ".iid"}
     run = ("run", renders, "--poses", "cameras.json", "--device", "numpy", "--format", "png")
@@ -233,6 +234,7 @@ def test_each_kind_of_picture_is_a_model_of_its_own(clpipe, renders):
     assert Path("o/models/truth_clean/cameras.json").exists()
 
 
+@pytest.mark.slow
 def test_frames_and_exposures_are_in_it(clpipe, write_exr):
     write_exr("in/x/a b.exr", np.full((6, 8, 3), 0.2))
     write_exr("in/x/c.exr", np.full((6, 8, 3), 0.2))

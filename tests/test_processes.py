@@ -21,6 +21,8 @@ from clpipe.batch.spec import RunSpec
 from tests.conftest import ROOT, contents, statuses, written
 from tests.held import GO, HOLDING_PROCESSES, finish, interrupt, start, wait_until
 
+pytestmark = pytest.mark.slow
+
 RUN = ("-o", "out", "--iso", 3200)
 TWO = (*RUN, "--processes", 2)
 DEADLY = """
@@ -73,7 +75,6 @@ def held():
     return sorted(int(path.suffix[1:]) for path in Path().glob("held.*"))
 
 
-@pytest.mark.slow
 def test_two_processes_make_the_bytes_of_one(clpipe, renders):
     renders(24)
     Path("in/damaged.exr").write_bytes(b"no EXR")
@@ -91,7 +92,6 @@ def test_two_processes_make_the_bytes_of_one(clpipe, renders):
     assert "24 of them were there already" in again.stderr
 
 
-@pytest.mark.slow
 def test_a_process_that_is_killed_takes_nothing_with_it(clpipe, renders):
     renders(60)
     clpipe("run", "in", "-o", "whole", *RUN[2:])
@@ -104,7 +104,6 @@ def test_a_process_that_is_killed_takes_nothing_with_it(clpipe, renders):
     assert not [name for name in written(Path("out")) if ".part." in name]
 
 
-@pytest.mark.slow
 def test_processes_end_with_the_one_that_started_them(clpipe, renders):
     renders(60)
     process, others = held_run()
@@ -116,7 +115,6 @@ def test_processes_end_with_the_one_that_started_them(clpipe, renders):
     assert "60 of 60 images done (" in told.stderr
 
 
-@pytest.mark.slow
 def test_stopped_once_what_is_begun_is_finished(renders):
     renders(100)
     process, _ = held_run()
@@ -134,7 +132,6 @@ def test_stopped_once_what_is_begun_is_finished(renders):
     assert last["done"] == len(found) // 2
 
 
-@pytest.mark.slow
 def test_an_image_that_kills_processes_fails_alone(clpipe, renders, monkeypatch):
     renders(9)
     Path("in/r005.exr").rename("in/deadly.exr")

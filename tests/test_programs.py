@@ -53,12 +53,14 @@ def test_the_cache_folder_is_the_users_or_a_named_one(tmp_path):
     assert python(FOLDER, HOME=tmp_path, CLPIPE_CACHE_DIR=tmp_path / "x") == str(tmp_path / "x")
 
 
+@pytest.mark.slow
 def test_in_a_home_that_cannot_be_written_to_nothing_is_kept(tmp_path):
     (tmp_path / "file").touch()
     assert python(FOLDER, HOME=tmp_path / "file") == "None"
     python(DEVELOP, HOME=tmp_path / "file")
 
 
+@pytest.mark.slow
 def test_pocl_compiles_in_a_folder_of_the_process(tmp_path):
     (tmp_path / "file").touch()
     code = f"{DEVELOP}; import os; print(os.environ['POCL_CACHE_DIR'])"
@@ -97,6 +99,7 @@ print(before == handlers())
 """
 
 
+@pytest.mark.slow
 def test_signals_go_where_they_went_before_there_was_a_compiler_in_the_process(tmp_path):
     assert python(SIGNALS_AROUND, CLPIPE_CACHE_DIR=tmp_path) == "True"
 

@@ -9,7 +9,7 @@ from tests.conftest import STILL_LIFE
 from tests.photographs import photographs
 from tools.pages import quality
 
-pytestmark = pytest.mark.tools
+pytestmark = pytest.mark.slow
 
 
 # CPSNR on the photographs of tests/data, in dB. The package colour-demosaicing 0.2.7 computed the

@@ -81,6 +81,7 @@ def test_the_matrix_of_the_file_takes_its_colours_to_srgb(tmp_path):
     assert np.abs(developed(tmp_path / "a.exr") - srgb)[4:-4, 4:-4].max() < 2e-3
 
 
+@pytest.mark.slow
 def test_without_a_matrix_the_profile_has_one_or_colours_stay(tmp_path):
     write_dng(tmp_path / "a.dng", mosaic(), matrix=None)
     assert "warning" not in clpipe("run", tmp_path / "a.dng", "-o", tmp_path)
@@ -164,6 +165,7 @@ def test_exif_that_a_kept_image_carries_may_be_damaged(tmp_path):
         assert "clpipe:exif and clpipe:orientation are damaged" in output
 
 
+@pytest.mark.slow
 def test_options_and_configuration_win_over_the_file(tmp_path):
     write_dng(tmp_path / "a.dng", mosaic("GRBG"), "GRBG")
     (tmp_path / "c.toml").write_text("iso = 1600\n[normalize]\nblack_level = 600\n")
@@ -186,6 +188,7 @@ def test_options_and_configuration_win_over_the_file(tmp_path):
     assert sidecar(tmp_path / "a.json")["iso"] == 100
 
 
+@pytest.mark.slow
 def test_raws_and_renders_of_a_folder_go_their_own_ways(tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()
@@ -207,6 +210,7 @@ def test_raws_and_renders_of_a_folder_go_their_own_ways(tmp_path):
     assert not (out / "b.sensor_noise.exr").exists() and (out / "a.sensor_noise.exr").exists()
 
 
+@pytest.mark.slow
 def test_noise_can_be_added_to_a_raw_where_that_is_asked_for(tmp_path):
     write_dng(tmp_path / "a.dng", mosaic())
     stages = "mosaic,quantize,normalize,sensor_noise,white_balance,demosaic,gamma"
@@ -291,6 +295,7 @@ def test_what_only_looks_like_a_raw(tmp_path, change, message):
     assert not written(tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_an_x_trans_raw_of_another_program(tmp_path):
     letters = np.array(list(XTRANS)).reshape(6, 6)
     light = colours()

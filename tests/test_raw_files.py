@@ -44,6 +44,7 @@ def test_additional_files(shared_data, tmp_path, name, expected):
     assert picture.shape == expected and looks_right(picture)
 
 
+@pytest.mark.slow
 def test_four_phases_of_one_picture(tmp_path):
     """A mosaic whose samples change places within each 2x2 cell stays the same picture."""
     dn = np.fromfile(ROSE, "<u2").reshape(128, 2, 128, 2).swapaxes(1, 2).reshape(128, 128, 4)

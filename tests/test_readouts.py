@@ -39,6 +39,7 @@ def decibels(signal, sigma):
     return 20 * np.log10(signal / sigma)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_the_signal_to_noise_ratio_is_that_of_the_formulas(device, method):
     chain = chain_of(method)
@@ -94,6 +95,7 @@ def test_white_is_the_last_readouts_and_one_the_first_ones(develop):
     assert develop(light, numpy=True, **options).final.max() == pytest.approx(16, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_picture_of_the_first_range_is_as_ever(clpipe):
     run = ("run", STILL_LIFE, "--iso", "400", "--format", "png")
     clpipe(*run, "-o", "usual", "--set", "sensor_noise.method=gaussian")
@@ -122,6 +124,7 @@ def test_a_curve_of_pieces_goes_there_and_back(white, bits):
     assert (0.5 / steepest <= 2 * dn[::97] ** 0.5 * (white / (2**bits - 1) ** 2) ** 0.5 + 1).all()
 
 
+@pytest.mark.slow
 def test_a_companded_raw(clpipe):
     noise = ("--iso", "400", "--set", "sensor_noise.method=dual_gain")
     knots = "[[0,0],[16384,2048],[262143,4095]]"
@@ -170,6 +173,7 @@ def test_a_dng_of_two_readouts_that_fit(clpipe):
     assert Path("out/still_life.dng").stat().st_size > kept.size * 2
 
 
+@pytest.mark.slow
 def test_a_sample_of_more_than_16_bits():
     noise = {"method": "dual_gain"}
     with pytest.raises(RequestError, match="raw in DN goes to 262143, which uint16 does not hold"):
@@ -195,6 +199,7 @@ def test_the_ratio_as_a_table(clpipe, write_exr):
 LEAKY = {"split_pixel": {"ratio": 32.0}, "split_dual_gain": {"ratio": 4.0, "light_ratio": 32.0}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", LEAKY)
 def test_light_leaks_into_the_small_photodiode(device, method):
     small = {"method": method, "crosstalk": 0.01, **LEAKY[method]}
@@ -233,6 +238,7 @@ def test_a_profile_says_what_leaks(tmp_path):
     assert step.crosstalk == 0.002
 
 
+@pytest.mark.slow
 def test_the_variance_beyond_the_first_white(clpipe, write_exr):
     light = np.repeat(np.float32([0.5, 4, 12, 40]), 4).reshape(1, 16, 1).repeat(4, 0).repeat(3, 2)
     path = write_exr("light.exr", light, half=False)

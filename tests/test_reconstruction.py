@@ -11,7 +11,7 @@ from tools.reconstruction import multiview, report, stereo
 from tools.reconstruction import pictures as picture_kinds
 from tools.reconstruction import views as scene_views
 
-pytestmark = pytest.mark.tools
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

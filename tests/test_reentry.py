@@ -235,6 +235,7 @@ def test_a_kept_image_that_is_taken_for_a_render_is_told(kept, tmp_path):
     assert "was kept after demosaic; is it a render? See --start-at" in output
 
 
+@pytest.mark.slow
 def test_a_repeated_stage_can_be_entered(tmp_path):
     image = crop(tmp_path)
     chain = "mosaic,demosaic,denoise,denoise,gamma"

@@ -37,6 +37,7 @@ def stage_file(tmp_path):
     return tmp_path / "vignette.py"
 
 
+@pytest.mark.slow
 def test_a_stage_file_is_a_stage_like_any_other(clpipe, stage_file, tmp_path):
     assert "vignette" in clpipe("stages", "--stage-file", stage_file)
     assert "focal_length" in clpipe("stages", "vignette", "--stage-file", stage_file)
@@ -161,6 +162,7 @@ def run_with_package(folder, *arguments):
     return subprocess.run(command, capture_output=True, text=True)
 
 
+@pytest.mark.slow
 def test_a_stage_of_an_installed_package(tmp_path):
     install(tmp_path)
     done = run_with_package(tmp_path, "plan", "--stages", "exposure,vignette")
@@ -168,6 +170,7 @@ def test_a_stage_of_an_installed_package(tmp_path):
     assert "vignette" in run_with_package(tmp_path, "stages").stdout
 
 
+@pytest.mark.slow
 def test_a_package_whose_stage_cannot_be_loaded(tmp_path):
     install(tmp_path, PYTHON.replace("import numpy as np", "import numpi as np"))
     done = run_with_package(tmp_path, "stages")

@@ -92,6 +92,7 @@ def refused(*paths: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_damaged_files_cost_nothing(tmp_path):
     """Each file is read under its own name and with .exr appended, which selects the reader."""
     with zipfile.ZipFile(DATA / "openexr" / "damaged.zip") as archive:
@@ -104,6 +105,7 @@ def test_damaged_files_cost_nothing(tmp_path):
     refused(*damaged, *renamed)
 
 
+@pytest.mark.slow
 def test_too_many_pixels_are_refused_before_memory_is_taken(tmp_path):
     planes = {c: (np.zeros((1000, 1)), 1) for c in "RGB"}
     chroma = {"Y": (np.zeros((1000, 2)), 1), "RY": (np.zeros((500, 1)), 2)}

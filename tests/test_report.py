@@ -21,6 +21,8 @@ from clpipe.reports.shown import Budget, large, places_of
 from tests.conftest import cli_output as clpipe
 from tests.conftest import reseal
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("jinja2", reason="needs Jinja2, in the extra report")
 
 HOSTILE = "<img src=x onerror=alert(1)>&amp;\x1b[31m\n"

@@ -140,6 +140,7 @@ def test_kernels_do_not_depend_on_the_scale():
         assert write_kernel(one, mine, 8).source == write_kernel(two, other, 8).source
 
 
+@pytest.mark.slow
 def test_an_image_of_which_one_pixel_is_left(device):
     settings = {**TWICE, "stages": TWICE["stages"][:-1], "resize": {"scale": 0.125}}
     chain = make_chain(settings_from(settings))

@@ -267,6 +267,7 @@ print(held - _listed(Path("/proc/self/status"), "VmSize") > 100 << 20)
 """
 
 
+@pytest.mark.slow
 @LIMITED
 def test_where_memory_ends_tiles_become_smaller(device):
     if device is None or not device.info.in_place:

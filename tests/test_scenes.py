@@ -94,6 +94,7 @@ def test_a_scene_becomes_a_dataset(clpipe, scene, blender, tmp_path):
         assert np.asarray(sheet).std() > 20
 
 
+@pytest.mark.slow
 def test_it_goes_on_where_it_was_and_makes_the_same(clpipe, scene, blender, tmp_path):
     command = ("dataset", scene, *blender, *NUMPY, "--path", "arc", "--views", 4, "--iso", 800)
     clpipe(*command, "-o", "whole")
@@ -127,6 +128,7 @@ def _sha256(path):
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+@pytest.mark.slow
 def test_frames_have_flow_and_may_become_more(clpipe, scene, blender, tmp_path):
     command = ("dataset", scene, "-o", "set", *blender, *NUMPY)
     clpipe(*command, "--frames", "1,3")
@@ -138,6 +140,7 @@ def test_frames_have_flow_and_may_become_more(clpipe, scene, blender, tmp_path):
     assert 'with views "frames"' in clpipe(*command, "--views", 2, status=2).stderr
 
 
+@pytest.mark.slow
 def test_a_dataset_grows(clpipe, scene, blender, tmp_path):
     command = ("dataset", scene, "-o", "set", *blender, *NUMPY, "--views", 9)
     clpipe(*command, "--iso", 800, "--licence", "CC-BY-4.0", "--author", "A. Maker")
@@ -176,6 +179,7 @@ def test_a_dataset_grows(clpipe, scene, blender, tmp_path):
         )
 
 
+@pytest.mark.slow
 def test_views_that_see_too_little_are_told(clpipe, scene, blender, tmp_path):
     scene.write_text("a maze")
     said = clpipe("dataset", scene, "-o", "set", *blender, *NUMPY, "--views", 2).stderr
@@ -183,6 +187,7 @@ def test_views_that_see_too_little_are_told(clpipe, scene, blender, tmp_path):
     assert "**Which views:** 3 of 9 places" in (tmp_path / "set/README.md").read_text()
 
 
+@pytest.mark.slow
 def test_a_lens_takes_the_focal_length_of_the_scenes_cameras(clpipe, scene, blender, tmp_path):
     lens = ("--set", "distortion.method=brown_conrady", "--set", "distortion.k1=-0.1")
     clpipe("dataset", scene, "-o", "set", *blender, *NUMPY[:2], "--views", 1, *lens)
@@ -192,6 +197,7 @@ def test_a_lens_takes_the_focal_length_of_the_scenes_cameras(clpipe, scene, blen
     assert "unknown" in clpipe("dataset", scene, "-o", "n", *blender, *wrong, status=2).stderr
 
 
+@pytest.mark.slow
 def test_cameras_of_a_file_are_rendered(clpipe, scene, blender, tmp_path):
     clpipe("dataset", scene, "-o", "a", *blender, *NUMPY, "--views", 2)
     poses = tmp_path / "a/renders/cameras.json"

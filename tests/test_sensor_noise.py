@@ -90,6 +90,7 @@ def test_tukey_lambda_is_that_of_scipy(shape):
     assert np.abs(z / exact - 1)[np.abs(exact) > 0.01].max() < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["skewed_gaussian", "gaussian", "poisson"])
 @pytest.mark.parametrize("more", [{}, {"tukey_lambda": -0.15}])
 def test_mean_and_variance_are_those_asked_for(develop, method, more):
@@ -106,6 +107,7 @@ def test_mean_and_variance_are_those_asked_for(develop, method, more):
     assert kurtosis(dark) == pytest.approx(float(excess), rel=0.25, abs=0.02)
 
 
+@pytest.mark.slow
 def test_tails_of_the_gaussian_to_five_sigma(develop):
     n = 24_000_000
     z = draw(develop, 0.5, n, method="gaussian", a=1e-4, b=0.0) - 0.5
@@ -224,6 +226,7 @@ def fixed(develop, key="k", seed=0, iso=3200, level=0.0, **stages):
     return develop(flat, key, source=Kind.MOSAIC, stages=list(stages), seed=seed, iso=iso, **stages)
 
 
+@pytest.mark.slow
 def test_what_is_fixed_to_a_camera_is_the_same_in_every_frame(develop, tmp_path):
     stages = {
         "prnu": {"sigma": 0.01},

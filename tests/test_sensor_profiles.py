@@ -7,6 +7,8 @@ from clpipe.analysis.emva.files import measure_series
 from clpipe.analysis.emva.simulation import SeriesSize, simulate
 from clpipe.camera.profile import load_camera
 
+pytestmark = pytest.mark.slow
+
 SIZE = SeriesSize(width=96, height=64, exposures=12, stack=16)
 # Data sheets after EMVA 1288, by camera and ISO: K in DN/e-, dark noise and saturation in e-, SNR
 # at most and dynamic range in dB. The last three of the IMX264 are its sibling's without filters,

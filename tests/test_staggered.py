@@ -124,6 +124,7 @@ def test_shares_of_frames_are_those_of_time():
             assert weights[:, row] == pytest.approx(expected, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_clean", [False, True])
 def test_the_kernel_merges_as_numpy(device, scalar_device, is_clean):
     chain = chain_of(shutter={"subframes": 3}, sensor_noise={"later_noise": 1.5})
@@ -144,6 +145,7 @@ def test_the_kernel_merges_as_numpy(device, scalar_device, is_clean):
     assert np.array_equal(patches, cut)
 
 
+@pytest.mark.slow
 def test_without_change_it_is_as_without_time(device):
     image = (np.random.default_rng(1).random((20, 30, 3)) * 6).astype(np.float32)
     still, timed = (chain_of(shutter={"subframes": n}) for n in (1, 2))
@@ -153,6 +155,7 @@ def test_without_change_it_is_as_without_time(device):
     assert np.array_equal(one.final, two.final)
 
 
+@pytest.mark.slow
 def test_a_lamp_flickers_in_each_exposure(develop):
     lamp = {"exposure_time": 4e-3, "flicker_depth": 0.5, "flicker_frequency": 100.0}
     given = {"stages": ["shutter", "mosaic", "sensor_noise"], "iso": 400, "shutter": lamp}

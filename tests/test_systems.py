@@ -20,6 +20,8 @@ from clpipe.outputs import folder as output_folders
 from clpipe.outputs.folder import LOCK, output_folder, write_problem
 from tests.conftest import ROOT, written
 
+pytestmark = pytest.mark.slow
+
 # What Windows' Python has none of; macOS lacks the first lines of it. The library's own modules
 # that read such names when they are called get what they have on Windows.
 TAKE_AWAY = """
@@ -95,7 +97,6 @@ def test_every_module_loads(tmp_path):
     assert int(done.stdout) == len(modules) - 1  # the package itself
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("taken", "device", "shards"),
     [(TAKE_AWAY, ("--device", "numpy"), ("1/2", "2/2")), (FOR_POCL, (), ("1/1",))],

@@ -26,24 +26,8 @@ from clpipe.engine.tiles import (
 )
 from clpipe.reference.cfa import PATTERNS
 from clpipe.stage import Kind, StageRole
+from tests import methods
 from tests.test_contributing import block
-
-METHODS = [
-    pytest.param(stage, method, id=f"{stage.name}-{method.method}")
-    for stage in all_stages().values()
-    for method in stage.methods
-]
-
-
-def accesses(stage, method):
-    chain = chain_for(stage, method, {}, "GRBG")
-    own = [pass_.access for pass_ in chain.steps[0].method.passes()]
-    shapes = [getattr(each, name, 0) > 0 for each in own for name in ("bins", "vectors_per_row")]
-    return *map(type, own), *shapes
-
-
-# One lane differs in how pixels are read and written: a method for each way to do that is enough.
-WAYS = {accesses(*each.values): each for each in METHODS}
 
 GRAY_WORLD = {"white_balance": {"method": "gray_world"}}
 
@@ -127,18 +111,10 @@ def test_tables_of_lines_are_as_long_as_the_image_that_has_them(lanes):
             assert sizes[step_buffer(op.pass_.writes, op.step)] >= 4 * vectors * lanes
 
 
-@pytest.mark.parametrize(("stage", "method"), METHODS)
-def test_every_stage(device, monkeypatch, stage, method):
-    is_in_tiles(device, monkeypatch, stage, method)
-
-
-@pytest.mark.parametrize(("stage", "method"), WAYS.values())
-def test_every_way_to_touch_pixels_on_one_lane(scalar_device, monkeypatch, stage, method):
-    is_in_tiles(scalar_device, monkeypatch, stage, method)
-
-
-def is_in_tiles(device, monkeypatch, stage, method):
-    """Fail unless a method's chain of test_kernels.py gives the same in tiles."""
+@pytest.mark.parametrize("lanes", ["many lanes", "one lane"])
+@pytest.mark.parametrize(("stage", "method"), methods.ALL)
+def test_every_stage(device, scalar_device, monkeypatch, stage, method, lanes):
+    device = device if lanes == "many lanes" else scalar_device
     chain = chain_for(stage, method, {}, "GRBG")
     runner = Runner(chain, device, encode=False, final=True)
     image = example(chain.source, (150, 203))
@@ -150,6 +126,7 @@ def is_in_tiles(device, monkeypatch, stage, method):
         assert result.estimates["white_balance"]["red_gain"] != 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scalar", [False, True])
 def test_auto_exposure_by_a_percentile(device, scalar_device, monkeypatch, scalar):
     stage = all_stages()["exposure"]
@@ -174,6 +151,7 @@ def test_the_default_chain(device, monkeypatch, pattern, balance):
         assert count >= 4
 
 
+@pytest.mark.slow
 def test_sizes_at_which_tiles_are_narrow_or_end_with_the_image(device, monkeypatch):
     runner = Runner(make_chain(settings_from({"iso": 3200, **GRAY_WORLD})), device)
     random = np.random.default_rng(0)
@@ -187,6 +165,7 @@ def test_sizes_at_which_tiles_are_narrow_or_end_with_the_image(device, monkeypat
     assert len(counts) > 6
 
 
+@pytest.mark.slow
 def test_numbers_found_twice_and_kept_images(device, monkeypatch):
     settings = {
         "stages": ["mosaic", "white_balance", "demosaic", "mosaic", "white_balance"],
@@ -206,6 +185,7 @@ def test_numbers_found_twice_and_kept_images(device, monkeypatch):
     assert fused.final.tobytes() == kept.final.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", ["skewed_gaussian", "poisson"])
 def test_every_source_of_noise(device, monkeypatch, noise):
     names = list(all_stages())
@@ -218,6 +198,7 @@ def test_every_source_of_noise(device, monkeypatch, noise):
     assert count >= 6
 
 
+@pytest.mark.slow
 def test_a_stage_of_somebody_else_reads_places_in_the_image(device, tmp_path, monkeypatch):
     monkeypatch.setattr("clpipe.chain.registry._from_files", {})
     (tmp_path / "vignette.cl").write_text(block("c"))

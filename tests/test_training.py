@@ -11,7 +11,7 @@ from PIL import Image
 
 from tests.conftest import ROOT, STILL_LIFE
 
-pytestmark = [pytest.mark.tools, pytest.mark.slow]
+pytestmark = pytest.mark.slow
 torch = pytest.importorskip("torch", reason="needs PyTorch, in the extra train")
 
 

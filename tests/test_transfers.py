@@ -163,6 +163,7 @@ def test_transfers_of_an_image_run_beside_the_kernels_of_its_neighbours(gpu_runn
     ] * 5
 
 
+@pytest.mark.slow
 def test_images_that_are_only_floats_do_not_mix(gpu_runner):
     runner = Runner(gpu_runner.chain, gpu_runner.device, encode=False, final=True)
     expected = [runner.run(image, "k").final for image in IMAGES]

@@ -155,6 +155,7 @@ def crop(write_exr, name="a.exr", size=(24, 32)):
     return write_exr(name, read_image(STILL_LIFE).pixels[200 : 200 + size[0], 300 : 300 + size[1]])
 
 
+@pytest.mark.slow
 def test_what_lies_beside_a_picture(clpipe, write_exr):
     clpipe("run", crop(write_exr), "-o", "o", "--iso", 3200, *ALL, "--keep", "normalize")
     names = ["a", "a.truth", "a.truth_mosaic", "a.truth_variance"]
@@ -194,6 +195,7 @@ def test_what_lies_beside_a_picture(clpipe, write_exr):
     assert records["a.truth"]["noise"] is records["a.truth_mosaic"]["noise"] is None
 
 
+@pytest.mark.slow
 def test_a_truth_that_enters_again_claims_no_noise(clpipe, write_exr):
     clpipe("run", crop(write_exr), "-o", "o", "--iso", 3200, "--set", "sensor_noise.a=1e-3", *ALL)
     clpipe("run", "o/a.truth_mosaic.exr", "-o", "b", "--start-at", "white_balance")
@@ -296,6 +298,7 @@ def test_only_what_is_missing_is_made(clpipe, write_exr):
     assert len(made(*ALL, "--seed", 3)) == len(written(Path("o"))) == 8
 
 
+@pytest.mark.slow
 def test_a_burst_has_each_truth_once(clpipe, write_exr):
     clpipe("run", crop(write_exr), "-o", "o", "--iso", 3200, "--frames", 2, *ALL)
     names = ("frame0.jpg", "frame1.jpg", "truth.jpg", "truth_mosaic.exr", "truth_variance.exr")
@@ -327,6 +330,7 @@ def test_a_truth_that_cannot_be_known_is_refused_before_anything_runs(
     assert not Path("o").exists()
 
 
+@pytest.mark.slow
 def test_noise_behind_the_mosaic_alone_has_no_clean_mosaic(clpipe, write_exr):
     noise = ("--set", "picture_noise.method=iid_gaussian", "--set", "picture_noise.sigma=0.1")
     quiet = (*noise, "--skip", "sensor_noise", "--skip", "row_noise")

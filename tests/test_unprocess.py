@@ -67,6 +67,7 @@ def test_a_curve_that_falls_cannot_be_undone(tmp_path):
         InverseFile(path=str(tmp_path / "falling.csv"))
 
 
+@pytest.mark.slow
 def test_a_picture_comes_back_as_it_was():
     picture = smooth()
     pipeline = Pipeline("unprocess", skip=QUIET)
@@ -80,6 +81,7 @@ def test_a_picture_comes_back_as_it_was():
     assert np.abs(again[inside].astype(int) - picture[inside]).mean() < 0.6
 
 
+@pytest.mark.slow
 def test_white_is_where_the_sensor_clips():
     raw = Pipeline("unprocess", skip=QUIET, until="quantize").process(smooth(), "p").image
     assert np.all(raw[22:48, 22:48] == 16383)
@@ -87,6 +89,7 @@ def test_white_is_where_the_sensor_clips():
     assert tinted.process(smooth(), "p").image[22:48, 22:48].min() < 8000
 
 
+@pytest.mark.slow
 def test_another_camera_has_its_own_noise():
     noisy = Pipeline("unprocess", camera="canon-5d2", iso=3200, until="normalize")
     clean = Pipeline("unprocess", camera="canon-5d2", iso=3200, until="normalize", skip=QUIET[:2])

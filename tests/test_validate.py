@@ -16,7 +16,7 @@ from clpipe.pipeline import Pipeline
 from clpipe.reference.transfer import srgb_curve
 from tools.pages import real_cameras, side_by_side, validate
 
-pytestmark = pytest.mark.tools
+pytestmark = pytest.mark.slow
 
 # Two of the 68 loops that the tool closes.
 LOOPS = [

@@ -17,6 +17,8 @@ from clpipe.engine.discovery import find_devices
 from clpipe.engine.runner import Runner
 from clpipe.engine.vendors import drivers_visible, intel_library
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def installed(tmp_path, monkeypatch):

@@ -130,6 +130,7 @@ def test_a_device_is_tried_for_each_target_it_may_compile_for(device, monkeypatc
     assert Verdicts(attempts={first: "no", second: "nor"}).of(platform, handle) == (wide, "no")
 
 
+@pytest.mark.slow
 def test_this_machines_device_computes_as_numpy_does(device, monkeypatch):
     info = device.info
     assert trial.problem_of(info.handle, info.lanes) == ""
@@ -154,6 +155,7 @@ def test_the_cpu_that_llvm_does_not_know_is_found(device):
     assert problem == "it compiles nothing: unknown target CPU 'generic'"
 
 
+@pytest.mark.slow
 def test_the_trial_as_a_program(device):
     found = tried(Verdicts())
     info = device.info

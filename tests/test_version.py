@@ -123,6 +123,7 @@ def test_an_sdist_and_an_installed_wheel_have_the_version_of_their_checkout(copy
     assert version_at(copy) == "1.2.3+g1"
 
 
+@pytest.mark.slow
 def test_both_versions_are_where_they_belong(clpipe, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     full = full_version()

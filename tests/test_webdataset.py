@@ -143,6 +143,7 @@ def test_a_second_run_makes_nothing(clpipe, renders):
     assert all(before[name] != at for name, at in stamps("out").items())
 
 
+@pytest.mark.slow
 def test_what_is_missing_or_changed_is_made_again(clpipe, renders, write_exr):
     clpipe("run", renders(), *RUN)
     whole, before = contents("out"), stamps("out")
@@ -173,6 +174,7 @@ def test_an_image_that_is_gone_goes_from_its_tar_and_a_new_one_comes(clpipe, ren
     assert list(statuses("out").values()).count("done") == 1
 
 
+@pytest.mark.slow
 def test_an_image_that_failed_is_left_out_and_tried_again(clpipe, renders):
     clpipe("run", renders(), "-o", "whole", *RUN[2:])
     whole = Path("in/r.002.exr").read_bytes()
@@ -263,6 +265,7 @@ def test_a_tar_that_is_cut_off_is_made_again(clpipe, renders):
     assert 0 < list(statuses("out").values()).count("done") < 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("when", ["picture", "tar"])
 def test_the_disk_is_full(clpipe, renders, when):
     clpipe("run", renders(), "-o", "whole", *RUN[2:])
@@ -356,6 +359,7 @@ def test_what_is_left_of_a_kill_while_packing_goes(clpipe, renders):
 PATCHES = ("--patch", 12, "--augment", "--patches-per-image", 3, "--keep", "quantize")
 
 
+@pytest.mark.slow
 def test_patches_are_samples_as_dataset_makes_them(clpipe, renders):
     options = (*PATCHES, "--truth", "clean", "--format", "npy")
     clpipe("run", renders(3), *RUN, *options)
@@ -384,6 +388,7 @@ def test_patches_are_samples_as_dataset_makes_them(clpipe, renders):
             assert said[name] == made[name]
 
 
+@pytest.mark.slow
 def test_tars_of_patches_resume(clpipe, renders):
     run = (*RUN, *PATCHES)
     clpipe("run", renders(6), *run)

@@ -133,6 +133,7 @@ def test_a_wide_picture_is_where_the_scene_is(device, kind, model):
     assert not seen[beyond].any()
 
 
+@pytest.mark.slow
 def test_tiles_have_the_same_bits(device, monkeypatch):
     panorama = PANORAMAS["cube"]
     chain = make_chain(settings_from(settings_of("unified", fx=240.0, fy=240.0)))
@@ -213,6 +214,7 @@ def colours(image):
     return dict(zip("RGB", np.moveaxis(np.float32(image), 2, 0), strict=True))
 
 
+@pytest.mark.slow
 def test_six_files_a_cube_map_and_a_map_become_a_picture(write, clpipe):
     cube = PANORAMAS["cube"]
     for name, image in zip(CUBE, images_of(cube), strict=True):
@@ -350,6 +352,7 @@ MOVE = (0.02, 0.0, 0.05)
 NORMALS = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]], np.float32)  # by label
 
 
+@pytest.mark.slow
 def test_layers_of_faces_go_along(write, clpipe):
     for name, view in zip(CUBE, PANORAMAS["cube"].views, strict=True):
         rays = rays_of(view)
@@ -416,6 +419,7 @@ def test_poses_and_camera_files_are_the_wide_cameras(write, clpipe):
     assert frames["distortion_residual"] == pytest.approx(lens_of("unified").intrinsics().residual)
 
 
+@pytest.mark.slow
 def test_a_dataset_of_faces_that_exist(write, clpipe):
     for view in ("one", "two"):
         for name, image in zip(CUBE, images_of(PANORAMAS["cube"]), strict=True):
