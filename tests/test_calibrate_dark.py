@@ -66,6 +66,7 @@ def test_errors_of_the_black_level(pattern):
     assert none is not None and none.value < 3 * none.error + 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [-0.2, 0.0, 0.14])
 @pytest.mark.parametrize("frames", [2, 6])
 def test_the_shape_of_read_noise(shape, frames):

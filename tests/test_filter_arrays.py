@@ -96,6 +96,7 @@ def stokes(image):
     return image @ np.linalg.inv(law).T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["linear_mmse", "directional_mmse"])
 def test_a_polarised_array_measures_degree_and_angle(device, method):
     y, x = np.mgrid[0:60, 0:80]
@@ -308,6 +309,7 @@ def fitted(mosaic: np.ndarray, array) -> np.ndarray:
     return np.linalg.solve(products + 1e-9 * np.eye(3), sums[..., None])[..., 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "over_baseline", "over_linear"),
     [

@@ -16,6 +16,7 @@ from clpipe.engine.check import (
     check_method,
     check_raw,
     compare,
+    depends_on_pattern,
     example,
 )
 from clpipe.engine.runner import Runner
@@ -35,11 +36,31 @@ SMALL_SIZES = SIZES[:6]
 
 @pytest.mark.parametrize(("stage", "method", "values"), VARIANTS)
 def test_kernel_agrees_with_its_reference(device, stage, method, values):
+    result = check_method(device, stage, method, patterns=("GRBG",), values=values)
+    assert result.difference.samples > 1000
+    assert result.passed, result
+
+
+ON_PATTERNS = [
+    pytest.param(stage, method, id=f"{stage.name}-{method.method}")
+    for stage, method in methods.METHODS
+    if depends_on_pattern(stage, method, {})
+]
+
+
+@pytest.mark.slow  # every method reads the pattern by the functions of lib/cfa.h
+@pytest.mark.parametrize(("stage", "method"), ON_PATTERNS)
+def test_kernel_agrees_with_its_reference_in_every_pattern(device, stage, method):
     # In several launches, patterns in which red stands in either row and in either column.
     in_one = len(chain_for(stage, method, {}, "GRBG").steps[0].method.passes()) == 1
-    patterns = PATTERNS if in_one else ("GRBG", "GBRG")
-    result = check_method(device, stage, method, patterns=patterns, values=values)
-    assert result.difference.samples > 1000
+    result = check_method(device, stage, method, patterns=PATTERNS if in_one else ("GBRG",))
+    assert result.passed, result
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_bilinear_agrees_with_its_reference_in_every_pattern(device, pattern):
+    stage = all_stages()["demosaic"]
+    result = check_method(device, stage, stage.by_name["bilinear"], patterns=(pattern,))
     assert result.passed, result
 
 
@@ -76,11 +97,17 @@ def test_median_of_zeros_and_ones(device, size):
 
 
 @pytest.mark.parametrize("noise", ["skewed_gaussian", "gaussian", "poisson"])
-def test_raw_is_bit_for_bit_the_references(device, scalar_device, noise):
-    several = PATTERNS if noise == "skewed_gaussian" else ("GRBG",)
-    for any_device, patterns in ((device, several), (scalar_device, ("GRBG",))):
-        result = check_raw(any_device, noise, patterns=patterns)
-        assert result.difference.differing == 0, result
+def test_raw_is_bit_for_bit_the_references(device, noise):
+    result = check_raw(device, noise, patterns=("GRBG",))
+    assert result.difference.differing == 0, result
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", ["skewed_gaussian", "gaussian", "poisson"])
+def test_raw_is_bit_for_bit_the_references_in_every_way(device, scalar_device, noise):
+    for pattern in PATTERNS if noise == "skewed_gaussian" else ():
+        assert check_raw(device, noise, patterns=(pattern,)).difference.differing == 0
+    assert check_raw(scalar_device, noise, patterns=("GRBG",)).difference.differing == 0
 
 
 def test_images_enter_and_leave_as_the_references_say(device, scalar_device):

@@ -167,6 +167,7 @@ def test_a_known_development_comes_back(found):
     assert strength == pytest.approx(KNOWN["denoise"]["luma_strength"], rel=0.2)
 
 
+@pytest.mark.slow
 def test_crops_that_were_not_searched_prove_it(found):
     report, _ = found
     for name in ("right", "below", "diagonal", "half", "red_green", "rms"):

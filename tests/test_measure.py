@@ -70,6 +70,7 @@ def test_the_raw_has_the_noise_of_the_camera(developed, measured):
         assert 0.95 * pixels < one["samples"] <= pixels
 
 
+@pytest.mark.slow
 def test_row_noise_is_found_and_shared_by_the_sites_of_a_row(developed, measured):
     noisy = developed("--until", "quantize", "--set", "row_noise.sigma=0.004")
     clean = developed("--until", "quantize", "--skip", "noise")

@@ -250,6 +250,7 @@ def test_the_matched_variance_is_measured_again(loop):
         assert np.std(baseline["intensity"]["sigma"]) < 0.1 * np.std(camera["intensity"]["sigma"])
 
 
+@pytest.mark.slow
 def test_the_matched_curve_is_measured_again(loop):
     for name in "RGB":
         camera, baseline = (

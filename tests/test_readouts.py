@@ -182,6 +182,7 @@ def test_a_sample_of_more_than_16_bits():
     assert sample["raw"].dtype == np.float32
 
 
+@pytest.mark.slow
 def test_the_ratio_as_a_table(clpipe, write_exr):
     ramp = np.geomspace(1e-3, 30, 256, dtype=np.float32)
     path = write_exr("ramp.exr", np.tile(ramp[None, :, None], (64, 1, 3)), half=False)

@@ -172,6 +172,7 @@ def test_whatever_a_forged_sidecar_holds_no_command_ends_in_a_traceback(made, cl
             assert "unexpected" not in again.stderr, (key, odd)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ["iso", "noise", "width", "camera", "outputs"])
 def test_a_card_goes_without_what_a_forged_sidecar_holds(clpipe, write_exr, key):
     for name in "ab":

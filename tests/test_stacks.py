@@ -33,7 +33,7 @@ def equal(one: Result, two: Result) -> None:
         np.testing.assert_equal(getattr(one, name), getattr(two, name), err_msg=name)
 
 
-@pytest.fixture(params=["CPU", "GPU"])
+@pytest.fixture(params=["CPU", pytest.param("GPU", marks=pytest.mark.slow)])
 def on(device, request):
     """The device, also as if its memory were its own."""
     return Device(replace(device.info, type=request.param))
