@@ -300,7 +300,9 @@ def test_a_trace_is_told_by_one_clock(clpipe, renders, address):
     threads = [e["args"]["name"] for e in events if e["ph"] == "M"]
     assert threads and all(name.startswith("tcp://") for name in threads)
     ends = [e["ts"] + e["dur"] for e in events if e["ph"] == "X"]
-    assert len(ends) == 6 and 0 < max(ends) < 1e6 * (time.perf_counter() - began)
+    # Another clock would be hours away: how long this machine has been on, or the time of day.
+    minutes, took = 300e6, 1e6 * (time.perf_counter() - began)
+    assert len(ends) == 6 and -minutes < min(ends) <= max(ends) < took + minutes
 
 
 def test_a_worker_sees_the_same_files(tmp_path):
