@@ -3,6 +3,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,12 @@ ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT / "tests" / "data"
 STILL_LIFE = DATA / "still_life.exr"
 SHARED = ROOT.parent / "shared" / "data"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Exclude the doctests of clpipe.torch without torch; test_torch.py names what to install."""
+    if not find_spec("torch"):
+        config.option.ignore_glob = [*config.option.ignore_glob, str(ROOT / "clpipe/torch/*")]
 
 
 WRITTEN = "2026:01:01 00:00:00"  # the time in a file is a part of what its noise belongs to
