@@ -29,7 +29,10 @@ from clpipe.engine.runner import Runner
 from tests.conftest import STILL_LIFE
 
 SMALL = {"stages": ["exposure", "gamma"]}
-FOLDER = "from clpipe.engine.cache_folder import cache_folder; print(cache_folder())"
+FOLDER = (
+    "from clpipe.engine.cache_folder import cache_folder, later_runs;"
+    "print(cache_folder()); print(later_runs())"
+)
 DEVELOP = (
     "import numpy, clpipe; clpipe.Pipeline(stages=['exposure', 'gamma'], device='cpu')"
     ".process(numpy.zeros((4, 4, 3), numpy.float32), 'a')"
@@ -49,22 +52,24 @@ def python(code, **environment):
 
 
 def test_the_cache_folder_is_the_users_or_a_named_one(tmp_path):
-    assert python(FOLDER, HOME=tmp_path) == str(tmp_path / ".cache" / "clpipe")
-    assert python(FOLDER, HOME=tmp_path, CLPIPE_CACHE_DIR=tmp_path / "x") == str(tmp_path / "x")
+    (tmp_path / "file").touch()
+    home, named, none = tmp_path / ".cache" / "clpipe", tmp_path / "x", tmp_path / "file"
+    assert python(FOLDER, HOME=tmp_path).split("\n") == [
+        str(home),
+        f"later runs find them in {home}",
+    ]
+    told = python(FOLDER, HOME=tmp_path, CLPIPE_CACHE_DIR=named).split("\n")
+    assert told == [str(named), f"later runs find them in {named}"]
+    told = python(FOLDER, CLPIPE_CACHE_DIR=none).split("\n")
+    assert told == ["None", f"later runs do so again, because they cannot be kept in {none}"]
 
 
 @pytest.mark.slow
-def test_in_a_home_that_cannot_be_written_to_nothing_is_kept(tmp_path):
+def test_in_a_home_that_cannot_be_written_to_pocl_compiles_in_a_folder_of_the_process(tmp_path):
     (tmp_path / "file").touch()
-    assert python(FOLDER, HOME=tmp_path / "file") == "None"
-    python(DEVELOP, HOME=tmp_path / "file")
-
-
-@pytest.mark.slow
-def test_pocl_compiles_in_a_folder_of_the_process(tmp_path):
-    (tmp_path / "file").touch()
-    code = f"{DEVELOP}; import os; print(os.environ['POCL_CACHE_DIR'])"
-    used = python(code, CLPIPE_CACHE_DIR=tmp_path, POCL_CACHE_DIR=tmp_path / "file" / "x")
+    code = f"{DEVELOP}; import os; print(os.environ['POCL_CACHE_DIR']); {FOLDER}"
+    used, kept, _ = python(code, HOME=tmp_path / "file", POCL_CACHE_DIR=tmp_path / "x").split("\n")
+    assert kept == "None" and not (tmp_path / "x").exists()
     assert not Path(used).exists()  # it went with the process
 
 
@@ -117,14 +122,6 @@ def test_why_pocl_cannot_work_is_said(device, monkeypatch):
     monkeypatch.setattr(cache_folder, "process_folder", lambda: Path("somewhere"))
     with pytest.raises(DeviceError, match=r"Computing Language.: it offers no device"):
         choose(None, find_devices())
-
-
-def test_later_runs_find_only_what_lasts(tmp_path):
-    words = "from clpipe.engine.cache_folder import later_runs; print(later_runs())"
-    assert python(words, CLPIPE_CACHE_DIR=tmp_path) == f"later runs find them in {tmp_path}"
-    (tmp_path / "file").touch()
-    told = python(words, CLPIPE_CACHE_DIR=tmp_path / "file")
-    assert told == f"later runs do so again, because they cannot be kept in {tmp_path / 'file'}"
 
 
 def test_a_pocl_with_other_headers_declares_the_functions_itself(device, monkeypatch):

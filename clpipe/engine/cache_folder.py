@@ -39,7 +39,7 @@ def user_folder(name: str | None = None) -> Path | None:
     return None
 
 
-@cache  # before prepare_environment() changes the environment
+@cache
 def lasting_folder() -> Path | None:
     """The folder that ``CLPIPE_CACHE_DIR`` names, else the user's cache folder for clpipe."""
     named = os.environ.get(VARIABLE)
@@ -87,6 +87,7 @@ def prepare_environment() -> None:
     PoCL believes all that it finds, so it gets a folder of this process alone, whatever the
     variable says. pyopencl fails to start where its cache folder cannot be used.
     """
+    lasting_folder()  # remembers the user's folder, before XDG_CACHE_HOME changes below
     if folder := pocl_folder():
         os.environ["POCL_CACHE_DIR"] = str(folder)
     if not is_usable(user_folder()) and (folder := process_folder()):
