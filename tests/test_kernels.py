@@ -27,7 +27,13 @@ from clpipe.stages.denoise.strength import WindowDenoiser
 from tests import methods
 
 VARIANTS = [
-    pytest.param(stage, method, values, id=f"{stage.name}-{variant_label(method, values)}")
+    pytest.param(
+        stage,
+        method,
+        values,
+        id=f"{stage.name}-{variant_label(method, values)}",
+        marks=[pytest.mark.slow] if values else [],
+    )
     for stage, method in methods.METHODS
     for values in variants(method)
 ]

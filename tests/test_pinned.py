@@ -92,7 +92,13 @@ def digests(options: str, folder: Path) -> dict[str, str]:
     }
 
 
-@pytest.mark.parametrize("name", RUNS)
+# Their kernels take longest to compile, and are compared with NumPy in any case.
+SLOW = {"methods", "syb3r"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in RUNS]
+)
 def test_a_run_makes_what_it_has_always_made(name: str, device: Device, tmp_path: Path) -> None:
     made = digests(RUNS[name], tmp_path)
     pinned = json.loads(PINNED.read_text())[name]

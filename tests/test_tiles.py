@@ -111,7 +111,7 @@ def test_tables_of_lines_are_as_long_as_the_image_that_has_them(lanes):
             assert sizes[step_buffer(op.pass_.writes, op.step)] >= 4 * vectors * lanes
 
 
-@pytest.mark.parametrize("lanes", ["many lanes", "one lane"])
+@pytest.mark.parametrize("lanes", ["many lanes", pytest.param("one lane", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("stage", "method"), methods.ALL)
 def test_every_stage(device, scalar_device, monkeypatch, stage, method, lanes):
     device = device if lanes == "many lanes" else scalar_device
