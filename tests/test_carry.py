@@ -218,6 +218,16 @@ def test_companions(clpipe, write_exr, file, pattern, channel):
     )
 
 
+@pytest.mark.parametrize("names", [("a_depth.exr", "a.depth.exr"), ("a_one.exr", "a_two.exr")])
+def test_of_two_companions_none_is_taken(clpipe, write_exr, names):
+    write_exr("in/a.exr", np.ones((4, 6, 3)))
+    for name in names:
+        write_exr(f"in/{name}", np.ones((4, 6, 1)), "depth.Z")
+    refused = clpipe(*RUN, "in/a.exr", "--carry", "depth", status=1).output
+    assert all(name in refused for name in names)
+    clpipe(*RUN, "in/a.exr", "--until", "exposure", "--carry", f"depth={{name}}{names[1][1:]}")
+
+
 def test_a_run_resumes_with_carried_files(clpipe, render):
     render(only=["R", "G", "B"])
     render("in/a_aux.exr", only=["View.Depth.Z", "View.IndexOB.X"])

@@ -79,6 +79,8 @@ class JobState:
             tuple(self.spans),
             self.clipped,
             self.old,
+            self.source.layer if self.source else "",
+            self.source.part if self.source else 0,
         )
 
 

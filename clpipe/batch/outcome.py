@@ -45,6 +45,8 @@ class Outcome:
         spans: what was done when.
         clipped: the share of clipped pixels, 0 to 1; of several renditions, the largest.
         old: how many of its renditions are there, but were made by another program.
+        layer: the name of the layer that was read as the picture; "" for one without a name.
+        part: the number of its part in the file, from 0.
     """
 
     job: Job
@@ -58,6 +60,8 @@ class Outcome:
     spans: tuple[Span, ...] = ()
     clipped: float = 0.0
     old: int = 0
+    layer: str = ""
+    part: int = 0
 
     def seconds(self, step: str) -> float:
         """How many seconds a step took, over all renditions of the image."""

@@ -171,6 +171,8 @@ class RunLog:
                 "name": job.key,
                 "stem": job.stem,
                 "status": outcome.status,
+                "layer": outcome.layer,
+                "part": outcome.part,
                 "megapixels": round(outcome.megapixels, 6),
                 **{f"{step}_seconds": round(outcome.seconds(step), 6) for step in STEPS},
                 "outputs": list(outcome.outputs),

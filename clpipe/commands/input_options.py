@@ -10,7 +10,7 @@ from clpipe.images.read import TRANSFERS
 transfer_option = click.option(
     "--transfer",
     type=click.Choice(list(TRANSFERS)),
-    help="The transfer curve of renders in whole numbers (PNG, TIFF of 8 or 16 bits).",
+    help="The transfer curve of renders in whole numbers (PNG, TIFF and others).",
 )
 
 layer_option = click.option(

@@ -4,6 +4,7 @@ images one every so often."""
 import contextlib
 import shlex
 import time
+from collections import Counter
 from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Self
 
@@ -82,6 +83,7 @@ class Reporter:
         self._bar: Progress | None = None
         self._shows = console.is_terminal and not quiet
         self._live = contextlib.ExitStack()
+        self._warned: Counter[str] = Counter()  # printed once, and counted
 
     def __enter__(self) -> Self:
         self._live.enter_context(NOTICES.printed_by(self.print))
@@ -119,9 +121,10 @@ class Reporter:
             self.print(f"clpipe: {outcome.error}")
         if self._quiet:
             return
-        for warning in outcome.warnings:
-            if outcome.status == DONE:
+        for warning in outcome.warnings if outcome.status == DONE else ():
+            if not self._warned[warning]:
                 self.print(f"clpipe: {outcome.job.shown}: warning: {warning}")
+            self._warned[warning] += 1
         if self._bar and self._several:
             self._show(self._state())
         elif self._summary.total > FEW:
@@ -190,6 +193,9 @@ class Reporter:
         if self._bar:
             self._bar.stop()
         summary, counts = self._summary, self._summary.counts
+        for text, count in self._warned.items():
+            if count > 1:
+                self.print(f"{count} images have this warning: {text}")
         if summary.much_clipped and not self._quiet:
             self.print(self._clipping())
         if not self._quiet:

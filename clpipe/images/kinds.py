@@ -28,6 +28,41 @@ NAMES: dict[LayerKind, tuple[str, ...]] = {
 
 CHANNELS: dict[LayerKind, int] = {"flow": 2, "normal": 3}  # at least
 
+# Layers that renderers write next to the picture: data, and single components of the light. The
+# names are those in the manuals of Blender, LuxCore, RenderMan, Arnold, V-Ray, Houdini and Unreal;
+# lower case, with _ between and around words.
+AOV = re.compile(
+    "|".join(
+        (
+            *(
+                "albedo",
+                "base_?colou?r",
+                "depth",
+                "normal(?!i[sz])",
+                "crypto",
+                "occlusion",
+                "noisy",
+            ),
+            *(
+                "denoising",
+                "(?<!com)position",
+                "velocity",
+                "motion_?vec",
+                "optical_?flow",
+                "tangent",
+            ),
+            *("shadow", "diffuse", "gloss[yi]", "specular", "reflect", "refract", "transmi[st]"),
+            *("subsurface", "emissi(on|ve)", "illuminat", "irradiance", "caustic", "indirect"),
+            *("light_?(select|group)", "lighting", "wire_?colou?r", "(sample|ray)_?(rate|count)"),
+            *("matte", "mask", "opacity", "convergence", "variance", "roughness", "metallic"),
+            *("curvature", "cpu_?time", "(material|object|instance|render|shape|prim)_?id"),
+            "_(diff|gloss|trans|volume|subsurface)_?(dir|ind|col)_",
+            "_(ids?|index_?(ob|ma)|ao|nn?|p|pref|pworld|z|st|uvw?|sss|gi|mse|var)_",
+            "_(emit|env|mist|alpha|mtlid|unlit|freestyle)_",
+        )
+    )
+)
+
 
 def kind_named(name: str) -> LayerKind | None:
     """What a layer holds, by its name; None where that does not say it.
@@ -37,6 +72,21 @@ def kind_named(name: str) -> LayerKind | None:
     """
     plain = re.sub(r"[^a-z]", "", name.rpartition(".")[2].lower())
     return next((kind for kind, names in NAMES.items() if plain in names), None)
+
+
+def is_aov(name: str) -> bool:
+    """Whether a layer's name says that the layer is an AOV, so not the finished picture.
+
+    Args:
+        name: without the names of parts and view layers before it.
+
+    >>> [is_aov(name) for name in ("ALBEDO", "MaterialID", "crypto_asset00", "Noisy Image", "N")]
+    [True, True, True, True, True]
+    >>> [is_aov(name) for name in ("Combined", "composition", "RGB_IMAGEPIPELINE", "video", "")]
+    [False, False, False, False, False]
+    """
+    words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)
+    return bool(kind_named(name) or AOV.search(f"_{'_'.join(words)}_".lower()))
 
 
 def vectors_of(name: str, channels: tuple[str, ...]) -> tuple[Vector, ...]:

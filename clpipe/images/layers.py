@@ -1,5 +1,6 @@
 """Parts, layers and channels: where in a file the picture is."""
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,9 +9,24 @@ from typing import Any
 from clpipe.base.errors import ImageError, KindError, NoPictureError
 from clpipe.base.text import printable
 from clpipe.images.attributes import own_attributes
+from clpipe.images.kinds import is_aov
 
-# Layers that hold the finished picture, in order of preference: without a name, then common names.
-PICTURE_LAYERS = ("", "combined", "beauty", "rgba", "rgb", "color", "default")
+# Names of layers that hold the finished picture, in order of preference: lower case, letters alone.
+# The first are channels R, G and B without a layer: Nuke, Arnold, V-Ray, Mitsuba, Octane, Unreal.
+PICTURE_LAYERS = (
+    "",
+    "composite.combined",  # Blender, after its compositor
+    "combined",  # Blender
+    *("rgbimagepipeline", "rgbaimagepipeline"),  # LuxCore
+    "ci",  # RenderMan
+    "c",  # Houdini
+    "beauty",  # Arnold, V-Ray, Octane, Karma
+    "finalimage",  # Unreal
+    *("rgba", "rgb"),  # Arnold, Nuke, LuxCore
+    *("effectsresult", "rgbcolor"),  # V-Ray
+    *("main", "image", "color", "colour", "default"),
+)
+CONTAINED = ("rgba", "rgb", "color", "colour", "default", "main", "image")  # in layers of any kind
 
 MOST_PARTS = 1000  # each takes as long as there are parts before it
 
@@ -19,20 +35,30 @@ MOST_PARTS = 1000  # each takes as long as there are parts before it
 class PictureLocation:
     """Where in a file a picture is: the part's number, the layer's name, the channels' numbers.
 
-    The channels are R, G and B, or X, Y and Z where ``xyz`` is set, or one alone.
+    The channels are R, G and B, or X, Y and Z where ``xyz`` is set, or one alone. ``view`` is the
+    number of the view of a stereo picture, and ``name`` the layer's name without that of the view.
     """
 
     part: int
     layer: str
     channels: tuple[int, ...]
     xyz: bool = False
+    view: int = 0
+    name: str = ""
 
     @property
-    def rank(self) -> tuple[bool, int, int, str]:
-        """The order of preference: colour first, then common names, then places in the file."""
-        name = self.layer.lower().rpartition(".")[2]
-        names = [*PICTURE_LAYERS, name]
-        return len(self.channels) < 3, names.index(name), self.part, self.layer
+    def rank(self) -> tuple[bool, int, int]:
+        """The order of preference: colour first, then known names, then views. Others are equal."""
+        *above, last = (re.sub(r"[^a-z0-9]", "", part) for part in self.name.lower().split("."))
+        candidates = (f"{above[-1] if above else ''}.{last}", last)
+        places = [PICTURE_LAYERS.index(each) for each in candidates if each in PICTURE_LAYERS]
+        return len(self.channels) < 3, min(places, default=len(PICTURE_LAYERS)), self.view
+
+    @property
+    def is_aov(self) -> bool:
+        """Whether its name is that of an AOV."""
+        *above, last = self.name.split(".")
+        return is_aov(last) or (last.lower() in CONTAINED and any(map(is_aov, above)))
 
 
 def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> PictureLocation:
@@ -51,6 +77,7 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
     pictures: list[PictureLocation] = []
     channel_names: list[str] = []
     refusals: list[str] = []
+    views: list[str] = []
     several_parts = file.seek_subimage(1, 0)
     part = 0
     while file.seek_subimage(part, 0):
@@ -65,38 +92,91 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
         channel_names += [name for name in names if name not in channel_names]
         kept = "kind" in own_attributes(spec)
         part_name = str(spec.getattribute("oiio:subimagename") or "") if several_parts else ""
+        stated = spec.getattribute("view") or spec.getattribute("multiView") or ()
+        views += [stated] if isinstance(stated, str) else [str(each) for each in stated]
         if mosaic:
             channel = mosaic_channel(names)
-            in_part = [PictureLocation(part - 1, *channel)] if channel else []
-        else:
-            in_part = [
-                PictureLocation(part - 1, full_name(part_name, own_name), channels, xyz)
-                for own_name, channels, xyz in _layers(names, kept)
-            ]
-        if kept and not in_part:
+            pictures += [PictureLocation(part - 1, *channel)] if channel else []
+            continue
+        found = list(_layers(names, kept))
+        if kept and not found:
             raise KindError(path, own_attributes(spec))
-        pictures += in_part
-    if layer is not None and pictures:
-        pictures = _of_layer(path, pictures, layer)
+        for own_name, channels, xyz in found:
+            full = full_name(part_name, own_name)
+            refusals += (problem := _whole_numbers(spec, full, channels))
+            if not problem:
+                view, name = _view_of(full, views)
+                pictures.append(PictureLocation(part - 1, full, channels, xyz, view, name))
     if not pictures and refusals:
         raise ImageError(f"{path}: {refusals[0]}")
     if not pictures:
         listed = ", ".join(name for name in channel_names[:20] if name) or "none"
         missing = "no single channel with a mosaic" if mosaic else "no R, G and B channels"
         raise NoPictureError(f"{path}: {missing}; found {printable(listed)}")
-    best = min(pictures, key=lambda picture: picture.rank)
+    best = _chosen(path, pictures) if layer is None else _of_layer(path, pictures, layer)
     file.seek_subimage(best.part, 0)
     file.geterror()  # clears it: the loop asked for parts and levels that do not exist
     return best
 
 
-def _of_layer(path: Path, pictures: list[PictureLocation], layer: str) -> list[PictureLocation]:
-    """The pictures in a layer of this name, in any case.
+def _view_of(name: str, views: Sequence[str]) -> tuple[int, str]:
+    """The number of a layer's view, 0 where it has none, and the layer's name without it.
+
+    >>> _view_of("rgba_right", ["left", "right"]), _view_of("beauty.left", ["left"])
+    ((1, 'rgba'), (0, 'beauty'))
+    """
+    for number, view in enumerate(dict.fromkeys(views)):
+        if name == view or (view and name.endswith((f".{view}", f"_{view}"))):
+            return number, name[: -len(view)].rstrip("._")
+    return 0, name
+
+
+def _whole_numbers(spec: Any, layer: str, channels: Sequence[int]) -> list[str]:
+    """Why channels of an OpenEXR file hold numbers of objects and no light; nothing if they may."""
+    formats = spec.channelformats or [spec.format] * spec.nchannels
+    types = dict.fromkeys(str(formats[i]) for i in channels)
+    if "uint" not in types or spec.getattribute("openexr:lineOrder") is None:
+        return []
+    name = f"layer {printable(layer)}" if layer else "its picture"
+    return [
+        f"{name} has channels of type {' and '.join(types)}. Channels of type uint hold IDs or "
+        "masks, not light. A picture has channels of type half or float; this file has no others"
+    ]
+
+
+def _chosen(path: Path, pictures: Sequence[PictureLocation]) -> PictureLocation:
+    """The picture among the layers that may be one.
+
+    Raises:
+        NoPictureError: all of them are AOVs by their names.
+        ImageError: there are several of one rank.
+    """
+    candidates = [picture for picture in pictures if not picture.is_aov]
+    if not candidates:
+        first = pictures[0].layer
+        listed = printable(", ".join(dict.fromkeys(picture.layer for picture in pictures)))
+        raise NoPictureError(
+            f"{path}: has no layer with the finished picture. These layers are AOVs by their "
+            f"names: {listed}. To read one as the picture, use --layer {printable(first)}"
+        )
+    best = min(candidates, key=lambda picture: picture.rank)
+    equal = {each.layer.lower(): each.layer for each in candidates if each.rank == best.rank}
+    if len(equal) > 1:
+        listed = printable(", ".join(name or "the one without a name" for name in equal.values()))
+        raise ImageError(
+            f"{path}: {len(equal)} layers may be the picture: {listed}. Name one with --layer, "
+            f"such as --layer {printable(next(filter(None, equal.values())))}"
+        )
+    return best
+
+
+def _of_layer(path: Path, pictures: list[PictureLocation], layer: str) -> PictureLocation:
+    """The picture in the layer of this name, in any case; of several parts, in the first.
 
     Raises:
         ImageError: there is none.
     """
-    named = [picture for picture in pictures if picture.layer.lower() == layer.lower()]
+    named = next((each for each in pictures if each.layer.lower() == layer.lower()), None)
     if not named:
         listed = ", ".join(dict.fromkeys(p.layer or "one without a name" for p in pictures))
         raise ImageError(
@@ -126,13 +206,17 @@ def full_name(part: str, layer: str) -> str:
 def _layers(names: Sequence[str], kept: bool) -> Iterator[tuple[str, tuple[int, ...], bool]]:
     """The layers that can be a picture: name, channels, and whether these are X, Y and Z.
 
-    X, Y and Z are a picture only in a layer without a name; in others they are positions or
-    normals. Y is luminance only where nothing but alpha and depth is beside it. ``kept`` images,
-    those that clpipe wrote, have neither.
+    Channels are called R, G and B, or red, green and blue, as Nuke does in layers. X, Y and Z are a
+    picture only in a layer without a name; in others they are positions or normals. Y is luminance
+    only where nothing but alpha and depth is beside it. ``kept`` images, those that clpipe wrote,
+    have neither.
+
+    >>> list(_layers(["comp.red", "comp.green", "comp.blue"], kept=False))
+    [('comp', (0, 1, 2), False)]
     """
     for layer in dict.fromkeys(name.rpartition(".")[0] for name in names):
         place = {
-            name.rpartition(".")[2].lower(): i
+            _channel(name.rpartition(".")[2]): i
             for i, name in enumerate(names)
             if name.rpartition(".")[0].lower() == layer.lower()
         }
@@ -146,6 +230,12 @@ def _layers(names: Sequence[str], kept: bool) -> Iterator[tuple[str, tuple[int, 
         else:
             continue
         yield layer, tuple(place[c] for c in colours), colours == "xyz"
+
+
+def _channel(name: str) -> str:
+    """A channel's name in lower case, and one letter for a colour's name and alpha."""
+    lower = name.lower()
+    return lower[0] if lower in ("red", "green", "blue", "alpha") else lower
 
 
 def mosaic_channel(names: Sequence[str]) -> tuple[str, tuple[int]] | None:
@@ -164,6 +254,9 @@ def picture_channels(names: Sequence[str]) -> tuple[str, tuple[int, ...]] | None
     >>> picture_channels(["View.Depth.Z", "View.Combined.B", "View.Combined.G", "View.Combined.R"])
     ('View.Combined', (3, 2, 1))
     """
-    pictures = [PictureLocation(0, *layer) for layer in _layers(names, kept=True)]
-    best = min(pictures, key=lambda picture: picture.rank, default=None)
+    pictures = [
+        PictureLocation(0, name, channels, xyz, 0, name)
+        for name, channels, xyz in _layers(names, kept=True)
+    ]
+    best = min(pictures, key=lambda picture: (picture.is_aov, picture.rank), default=None)
     return (best.layer, best.channels) if best else None

@@ -1,30 +1,59 @@
 """Opening files with OpenImageIO, and its errors and threads."""
 
 import contextlib
+import re
+import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
+from PIL import Image
 
 from clpipe.base.errors import ImageError
 from clpipe.base.reading import check_regular
 from clpipe.base.text import printable
 from clpipe.base.types import Array
+from clpipe.images import pfm, radiance
 
 ERROR_LENGTH = 400  # characters; some repeat what they found, of any length
 
 # How a file of each format begins. OpenImageIO would try its readers for twenty more, which see
-# fewer damaged files than these do.
+# fewer damaged files than these do. A Targa file has no such bytes.
 BEGINNINGS = (
     b"v/1\x01",  # OpenEXR
-    b"#?",  # Radiance
-    *(b"PF", b"Pf"),  # PFM
+    radiance.MAGIC,
+    *pfm.MAGICS,
     *(b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"),  # TIFF, BigTIFF
     b"\x89PNG",
     b"\xff\xd8\xff",  # JPEG
+    b"BM",  # BMP
+    b"RIFF",  # WebP
 )
+TARGA = ".tga"
+READ = "OpenEXR, Radiance HDR, PFM, TIFF, PNG, JPEG, BMP, Targa and WebP"
+
+# Formats that are not read, by the bytes that they begin with and where these are.
+OTHERS = {
+    (0, b"GIF8"): "GIF",
+    (0, b"\0\0\0\x0cjP"): "JPEG 2000",
+    (0, b"\xffO\xffQ"): "JPEG 2000",
+    (0, b"\0\0\0\x0cJXL "): "JPEG XL",
+    (0, b"\xff\x0a"): "JPEG XL",
+    (4, b"ftypheic"): "HEIC",
+    (4, b"ftypheix"): "HEIC",
+    (4, b"ftypmif1"): "HEIF",
+    (4, b"ftypavif"): "AVIF",
+    (0, b"8BPS"): "Photoshop",
+    (0, b"SDPX"): "DPX",
+    (0, b"XPDS"): "DPX",
+    (0, b"\x80*_\xd7"): "Cineon",
+    (0, b"DDS "): "DDS",
+    (0, b"%PDF"): "PDF",
+    **{(0, b"P%d" % i): "PNM" for i in range(1, 8)},
+}
 
 
 class SubsampledError(ImageError):
@@ -58,28 +87,122 @@ def open_image(path: Path) -> Iterator[Any]:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
     if not size:
         raise ImageError(f"{path}: the file is empty")
-    if not beginning.startswith(BEGINNINGS):
-        raise ImageError(f"{path}: cannot be read as an image: {error_text('')}")
+    if not beginning.startswith(BEGINNINGS) and path.suffix.lower() != TARGA:
+        raise ImageError(f"{path}: cannot be read as an image: {_unread(beginning)}")
     try:
         hints = oiio.ImageSpec()
         hints.attribute("pnm:pfmflip", 1)  # else OpenImageIO 3.2 reads PFM upside down
-        file = oiio.ImageInput.open(str(path), hints)
-        if file is None:
-            reason = error_text(oiio.geterror())
-            failure = SubsampledError if reason.startswith("Subsampled channels") else ImageError
-            raise failure(f"{path}: cannot be read as an image: {reason}")
-        with contextlib.closing(file):
-            yield file
+        hints.attribute("oiio:UnassociatedAlpha", 1)  # or encoded values are multiplied by it
+        with _readable(path, beginning, size) as readable:
+            file = oiio.ImageInput.open(str(readable), hints)
+            if file is None:
+                reason = error_text(oiio.geterror())
+                is_subsampled = reason.startswith("Subsampled channels")
+                failure = SubsampledError if is_subsampled else ImageError
+                raise failure(f"{path}: cannot be read as an image: {reason}")
+            with contextlib.closing(file):
+                yield file
     except UnicodeDecodeError:  # any call that returns text from the file can raise it
         raise ImageError(f"{path}: damaged: a name or attribute in it is not UTF-8") from None
+
+
+def _unread(beginning: bytes) -> str:
+    """Why a file that begins like this is not read."""
+    if beginning.startswith(b"\x93NUMPY"):
+        return "it is a NumPy array, not an image file; write its pixels as an OpenEXR file"
+    for (place, mark), name in OTHERS.items():
+        if beginning[place:].startswith(mark):
+            return (
+                f"it is a {name} file; clpipe reads {READ}. Convert it with ImageMagick or "
+                "OpenImageIO's oiiotool, for example to PNG or TIFF"
+            )
+    return error_text("")
+
+
+@contextlib.contextmanager
+def _readable(path: Path, beginning: bytes, size: int) -> Iterator[Path]:
+    """The file, or a temporary copy with another header where OpenImageIO misreads its own."""
+    header: radiance.RadianceHeader | pfm.PfmHeader | None = None
+    if beginning.startswith(radiance.MAGIC):
+        known = radiance_header(path)
+        header = None if known.is_usual else known
+    elif beginning.startswith(pfm.MAGICS):
+        with path.open("rb") as file:
+            header = pfm.pfm_header(file.read(radiance.HEADER_BYTES), size)
+    if header is None:
+        yield path
+        return
+    with tempfile.NamedTemporaryFile(suffix=path.suffix) as copy:
+        with path.open("rb") as file:
+            file.seek(header.end)
+            copy.write(header.usual)
+            shutil.copyfileobj(file, copy)
+        copy.flush()
+        yield Path(copy.name)
+
+
+def radiance_header(path: Path) -> radiance.RadianceHeader:
+    """The header of a Radiance picture.
+
+    Raises:
+        ImageError: it is damaged, or the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return radiance.radiance_header(file.read(radiance.HEADER_BYTES))
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+    except ImageError as error:
+        raise ImageError(f"{path}: {error}") from None
 
 
 def error_text(text: str) -> str:
     """An error of a library in one short line; it gives none for some damaged files."""
     if not text or "could not find a format reader" in text:
-        return "it is damaged, or of no known format"
+        return f"it is damaged, or of no known format; clpipe reads {READ}"
     line = printable(text)
     return line if len(line) <= ERROR_LENGTH else f"{line[:ERROR_LENGTH]}..."
+
+
+UNREAD_COMPRESSION = re.compile(r"(\w+) compression support is not configured|scheme (\d+) ")
+
+
+def damage_text(text: str) -> str:
+    """Why samples of an open file could not be read, by OpenImageIO's error.
+
+    >>> damage_text("TIFFReadEncodedStrip failed: LERC compression support is not configured")[:32]
+    'its compression, LERC, cannot be'
+    """
+    if found := UNREAD_COMPRESSION.search(text):
+        return (
+            f"its compression, {found[1] or f'TIFF scheme {found[2]}'}, cannot be decoded by this "
+            "build of OpenImageIO. Write the file again with another one, such as ZIP or LZW, for "
+            "example with ImageMagick: magick IN -compress zip OUT"
+        )
+    return f"damaged: {error_text(text)}"
+
+
+def read_with_pillow(path: Path, spec: Any, part: int, type_: Any) -> Array | None:
+    """A TIFF of 8 bits whose compression OpenImageIO lacks, (height, width, channel).
+
+    Args:
+        path: the file.
+        spec: OpenImageIO's of the page.
+        part: the number of the page.
+        type_: ``oiio.FLOAT`` scales samples to 0..1; others leave them as they are.
+
+    Returns:
+        None where Pillow cannot read it like that, either.
+    """
+    if spec.format.basetype != oiio.UINT8 or spec.getattribute("tiff:Compression") is None:
+        return None
+    try:
+        with Image.open(path) as file:
+            file.seek(part)
+            samples = np.asarray(file).reshape(spec.height, spec.width, spec.nchannels)
+    except (OSError, ValueError, SyntaxError):
+        return None
+    return samples / np.float32(255) if type_ == oiio.FLOAT else samples
 
 
 def read_grey(path: Path) -> Array:
@@ -91,5 +214,5 @@ def read_grey(path: Path) -> Array:
     with open_image(path) as file:
         pixels = file.read_image(0, 0, 0, 1)
         if pixels is None:
-            raise ImageError(f"{path}: {error_text(file.geterror())}")
+            raise ImageError(f"{path}: {damage_text(file.geterror())}")
         return np.asarray(pixels)[..., 0]

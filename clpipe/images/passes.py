@@ -15,6 +15,7 @@ from clpipe.images.layers import MOST_PARTS, full_name
 from clpipe.images.openimageio import open_image
 from clpipe.images.pixels import check_size
 from clpipe.images.read import read_samples
+from clpipe.images.statements import statements
 from clpipe.reference.carried import LayerKind
 
 CRYPTOMATTE = "cryptomatte/"  # begins the names of attributes that say what its numbers stand for
@@ -158,6 +159,10 @@ def read_layer(
         pixels = read_samples(path, file, location.part, location.places, type_)
         if pixels.dtype.kind != "f":
             pixels = pixels.astype(np.uint32)
+        stated = statements(path, file)
+        if stated.orientation != 1:  # no such file has windows
+            turned = stated.upright(pixels)
+            return turned, (0, 0), (turned.shape[1], turned.shape[0])
         return (
             np.ascontiguousarray(pixels),
             (spec.x - spec.full_x, spec.y - spec.full_y),

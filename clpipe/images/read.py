@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,9 @@ from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
-from clpipe.base.types import Array, Doubles
+from clpipe.base.types import Array, Doubles, Floats
 from clpipe.images.attributes import own_attributes, photograph_attributes, shot_attributes
-from clpipe.images.colour import CIE_XYZ, SRGB, to_linear_srgb
+from clpipe.images.colour import SRGB, to_linear_srgb
 from clpipe.images.layers import (
     MOST_PARTS,
     PictureLocation,
@@ -25,7 +25,7 @@ from clpipe.images.layers import (
 )
 from clpipe.images.luminance_chroma import read_luminance_chroma
 from clpipe.images.openexr import read_channels
-from clpipe.images.openimageio import SubsampledError, error_text, open_image
+from clpipe.images.openimageio import SubsampledError, damage_text, open_image, read_with_pillow
 from clpipe.images.pixels import (
     HALF_MAX,
     USUAL_MAX_PIXELS,
@@ -36,6 +36,7 @@ from clpipe.images.pixels import (
     make_finite,
     margins_of,
 )
+from clpipe.images.statements import Statements, over_black, statements
 from clpipe.reference.defocus import Depth
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.panorama import Panorama
@@ -43,7 +44,8 @@ from clpipe.reference.transfer import inverse_srgb_curve
 from clpipe.stage import Kind
 
 RENDER_SUFFIXES = (".exr", ".hdr", ".pfm", ".tif", ".tiff")
-PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
+PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".bmp", ".tga", ".webp")
+WHOLE = (oiio.UINT8, oiio.UINT16, oiio.UINT32, oiio.INT8, oiio.INT16, oiio.INT32)
 LARGE_FILE = 4 << 20  # bytes; to start a thread takes as long as the SHA-256 of a small one
 READ_AT_ONCE = 8  # channels; those of a picture may lie hundreds apart
 
@@ -54,7 +56,8 @@ class SourceImage:
 
     ``pixels`` is (height, width, 3) linear RGB or a (height, width) mosaic, float16 or float32,
     finite. It is C-contiguous, or planar: a transposed view of a C-contiguous (3, height, width)
-    array. ``layer`` is the name of the layer that was read. ``attributes`` are clpipe's own, which
+    array. ``layer`` and ``part`` are the name of the layer that was read and the number of its part
+    in the file, from 0. ``attributes`` are clpipe's own, which
     a kept image has, and a photograph's tags. ``shot`` is what the file says of exposure_time (s),
     focal_length and sensor_width (mm). ``subframes`` are the names and SHA-256 of files that were
     averaged, and ``later`` what further exposures see than that of ``pixels``, which are alike.
@@ -75,6 +78,7 @@ class SourceImage:
     margins: Margins = NO_MARGINS
     envmap: str = ""
     panorama: Panorama | None = None
+    part: int = 0
 
 
 @dataclass(frozen=True)
@@ -86,10 +90,10 @@ class _Decoded:
     layer: str
     attributes: Mapping[str, str]
     shot: Mapping[str, float]
-    chromaticities: Any  # as the file states them; None: linear sRGB's
-    neutral: Any  # OpenEXR's adoptedNeutral, as the file states it
+    stated: Statements
     margins: Margins
     envmap: str = ""
+    part: int = 0
 
 
 def read_image(
@@ -102,9 +106,11 @@ def read_image(
     """Read the picture of a file as linear sRGB, in its display window, with finite samples.
 
     The picture is R, G and B by name, else X, Y and Z, else luminance, which becomes grey. Other
-    primaries than sRGB's are converted. Half samples stay half unless they are converted. Alpha,
-    depth and other layers are not read. NaN and infinity become 0, with a warning. Pixels of the
-    display window outside the data window are black.
+    primaries than sRGB's are converted, the orientation is applied, and straight alpha multiplies
+    the light, as if the picture stood before black. Half samples stay half unless they are
+    converted. Depth and other layers are not read. NaN and infinity become 0, with a warning.
+    Pixels of the display window outside the data window are black. What the file states and
+    clpipe does not apply is in the warnings.
 
     Args:
         path: the file.
@@ -125,22 +131,16 @@ def read_image(
         if mosaic or layer is not None:
             raise
         decoded = _decode_luminance_chroma(path, max_pixels, overscan)
-    warnings = []
-    pixels = decoded.pixels
+    pixels, stated = decoded.pixels, decoded.stated
+    warnings = list(stated.warnings_with("linear"))
     if count := make_finite(pixels):
         warnings.append(f"{count} samples were NaN or infinite and were set to 0")
     if pixels.ndim == 2 and not mosaic:
         pixels = np.stack([pixels] * 3, axis=-1)
-        warnings.append("it holds luminance alone; the picture is grey")
+        warnings.append(GREY)
     elif not mosaic:
-        matrix = _srgb_matrix(path, decoded)
-        if matrix is not None:
-            with np.errstate(all="ignore"):  # overflow is clipped below
-                pixels = by_rows(
-                    lambda rows: np.nan_to_num(rows.astype(np.float32) @ matrix.T, copy=False),
-                    pixels,
-                )
-            warnings.append("its colours were converted to linear sRGB")
+        pixels, said = _in_srgb(path, pixels, stated)
+        warnings += said
     # Beyond half it is so bright that nothing is lost, and no stage's squares overflow.
     if not mosaic and pixels.dtype == np.float32 and (beyond := clip_to_half(pixels)):
         warnings.append(f"{beyond} samples beyond {HALF_MAX:g}, the range of half, were clipped")
@@ -153,7 +153,27 @@ def read_image(
         decoded.shot,
         margins=decoded.margins,
         envmap=decoded.envmap,
+        part=decoded.part,
     )
+
+
+GREY = "it holds luminance alone; the picture is grey"
+
+
+def _in_srgb(path: Path, light: Array, stated: Statements) -> tuple[Array, list[str]]:
+    """Light in linear sRGB, from the primaries that the file states, and what was done.
+
+    Raises:
+        ImageError: the colours that the file states are impossible.
+    """
+    matrix = _srgb_matrix(path, stated)
+    if matrix is None:
+        return light, []
+    with np.errstate(all="ignore"):  # overflow is clipped later
+        converted = by_rows(
+            lambda rows: np.nan_to_num(rows.astype(np.float32) @ matrix.T, copy=False), light
+        )
+    return converted, ["its colours were converted to linear sRGB"]
 
 
 TRANSFERS: dict[str, Callable[[Doubles], Doubles]] = {
@@ -167,8 +187,8 @@ class ReadOptions:
     """How files are read.
 
     ``layer``, ``max_pixels`` and, for linear RGB, ``overscan`` are those of :func:`read_image`.
-    ``transfer``, one of :data:`TRANSFERS`, is how renders in whole numbers (PNG, TIFF) are encoded;
-    None refuses them.
+    ``transfer``, one of :data:`TRANSFERS`, is how renders in whole numbers (PNG, TIFF and others)
+    are encoded; None rejects them.
     """
 
     layer: str | None = None
@@ -183,47 +203,123 @@ def read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
     Raises:
         ImageError: the file cannot be read, or holds another kind.
     """
-    if (
-        kind is Kind.RGB
-        and options.transfer
-        and (finished := read_finished(path, options.max_pixels))
-    ):
-        curve = TRANSFERS[options.transfer]
-        linear = by_rows(lambda rows: curve(rows.astype(np.float64)), finished.pixels)
-        return replace(finished, pixels=linear)
+    transfer = options.transfer if kind is Kind.RGB else None
+    if transfer and (encoded := _read_encoded(path, options.max_pixels)):
+        return _as_light(path, encoded, transfer)
     if kind is not Kind.DISPLAY:
         mosaic = len(kind.channels) == 1
         overscan = options.overscan and kind is Kind.RGB
         return read_image(path, mosaic, options.layer, options.max_pixels, overscan)
-    if finished := read_finished(path, options.max_pixels):
+    if finished := read_finished(path, options.max_pixels, grey=True):
         return finished
     image = read_image(path, False, options.layer, options.max_pixels)
     if image.attributes.get("kind") != kind.label:
         raise ImageError(
-            f"{path}: holds linear light, but the chain starts on finished pictures "
-            "(JPEG, PNG or TIFF, 8 or 16 bits)"
+            f"{path}: holds linear light, but the chain starts on finished pictures, such as a "
+            "JPEG or PNG. For a render, leave out -c unprocess"
         )
     return image
 
 
-def read_finished(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> SourceImage | None:
+@dataclass(frozen=True)
+class _Encoded:
+    """A picture in whole numbers: RGB, (height, width, 3), and alpha, both in 0..1 as stored."""
+
+    pixels: Floats
+    alpha: Floats | None
+    sha256: str
+    stated: Statements
+    is_grey: bool
+    attributes: Mapping[str, str]
+    shot: Mapping[str, float]
+
+
+@CpuTimer("decode")
+def _read_encoded(path: Path, max_pixels: int) -> _Encoded | None:
+    """The picture of a file in whole numbers; None where its samples are something else.
+
+    Raises:
+        ImageError: as :func:`read_finished`.
+    """
+    with open_image(path) as file:
+        spec = file.spec()
+        names = list(spec.channelnames)
+        picture = picture_channels(names)
+        channels = picture[1] if picture else tuple(i for i, n in enumerate(names) if n == "Y")
+        if file.format_name() == "openexr" or spec.format.basetype not in WHOLE or not channels:
+            return None
+        check_size(path, spec.width, spec.height, max_pixels)
+        stated = statements(path, file)
+        has_alpha = 0 <= spec.alpha_channel < spec.nchannels
+        wanted = (*channels, *([spec.alpha_channel] if has_alpha else []))
+        samples = read_samples(path, file, 0, wanted, oiio.FLOAT)  # scales whole numbers to 0..1
+        rgb = samples[..., : len(channels)]
+        attributes, shot = photograph_attributes(spec)
+        return _Encoded(
+            np.repeat(rgb, 3, axis=-1) if len(channels) == 1 else np.ascontiguousarray(rgb),
+            np.ascontiguousarray(samples[..., -1]) if has_alpha else None,
+            _digest(path),
+            stated,
+            len(channels) == 1,
+            attributes,
+            shot,
+        )
+
+
+def _as_light(path: Path, encoded: _Encoded, transfer: str) -> SourceImage:
+    """An encoded render as linear sRGB over black.
+
+    Alpha multiplies light, not encoded values. Encoded values that it has multiplied already, as an
+    associated alpha channel says, are divided by it first.
+
+    Raises:
+        ImageError: the colours that the file states are impossible.
+    """
+    pixels, alpha, stated = encoded.pixels, encoded.alpha, encoded.stated
+    if alpha is not None and stated.is_associated:
+        opaque = np.where(alpha > 0, alpha, np.float32(1))[..., np.newaxis]
+        pixels = np.minimum(pixels / opaque, 1)
+    curve = TRANSFERS[transfer]
+    light: Array = by_rows(lambda rows: curve(rows.astype(np.float64)), pixels)
+    light, said = _in_srgb(path, light, stated)
+    if alpha is not None:
+        light = over_black(light, alpha)
+    warnings = (*stated.warnings_with(transfer), *said, *([GREY] if encoded.is_grey else []))
+    attributes = {**encoded.attributes, "orientation": "1"}
+    return SourceImage(
+        stated.upright(light), encoded.sha256, "", warnings, attributes, encoded.shot
+    )
+
+
+def read_finished(
+    path: Path, max_pixels: int = USUAL_MAX_PIXELS, grey: bool = False
+) -> SourceImage | None:
     """Read a finished picture (JPEG, PNG, TIFF): display values, (height, width, 3), 0..1.
 
-    None where the file does not hold red, green and blue in whole numbers of 8 or 16 bits; then it
-    is one for :func:`read_image`. Alpha is not read. ``max_pixels`` is that of :func:`read_image`.
+    Alpha is not applied; a warning says so where a pixel is not opaque.
+
+    Args:
+        path: the file.
+        max_pixels: that of :func:`read_image`.
+        grey: read a picture in grey, too, which may as well be a mosaic.
+
+    Returns:
+        None where the file does not hold whole numbers; then it is one for :func:`read_image`.
 
     Raises:
         ImageError: the file is missing, empty, damaged, not an image or too large.
     """
-    with open_image(path) as file:
-        spec = file.spec()
-        picture = picture_channels(list(spec.channelnames))
-        if picture is None or spec.format.basetype not in (oiio.UINT8, oiio.UINT16):
-            return None
-        check_size(path, spec.width, spec.height, max_pixels)
-        rgb = read_samples(path, file, 0, picture[1], oiio.FLOAT)  # scales whole numbers to 0..1
-        attributes, shot = photograph_attributes(spec)
-        return SourceImage(np.ascontiguousarray(rgb), _digest(path), "", (), attributes, shot)
+    encoded = _read_encoded(path, max_pixels)
+    if encoded is None or (encoded.is_grey and not grey):
+        return None
+    warnings = [*encoded.stated.warnings_with("srgb"), *([GREY] if encoded.is_grey else [])]
+    if _srgb_matrix(path, encoded.stated) is not None:
+        warnings.append("its primaries are not those of sRGB; its colours are read as sRGB")
+    if encoded.alpha is not None and encoded.alpha.min() < 1:
+        warnings.append("its alpha channel is not used")
+    return SourceImage(
+        *(encoded.pixels, encoded.sha256, "", tuple(warnings), encoded.attributes, encoded.shot)
+    )
 
 
 def read_whole_numbers(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> Array:
@@ -282,19 +378,26 @@ def _decode(
         data, display = (spec.width, spec.height), (spec.full_width, spec.full_height)
         x, y = spec.x - spec.full_x, spec.y - spec.full_y
         margins = margins_of(x, y, data, display) if overscan else NO_MARGINS
+        stated = statements(path, file, location.xyz)
         pixels, digest = _with_digest(
             path, lambda: _read_part(path, file, location, mosaic, max_pixels, margins)
         )
+        if not mosaic:
+            pixels = stated.light(pixels)
+            if stated.alpha >= 0:
+                alpha = read_samples(path, file, location.part, [stated.alpha], oiio.FLOAT)
+                pixels = over_black(pixels, alpha[..., 0])
+            pixels = stated.upright(pixels)
         return _Decoded(
             pixels,
             digest,
             location.layer,
             own_attributes(spec),
             shot_attributes(spec),
-            CIE_XYZ if location.xyz else spec.getattribute("chromaticities"),
-            spec.getattribute("adoptedNeutral"),
+            stated,
             margins,
             str(spec.getattribute("textureformat") or ""),
+            location.part,
         )
 
 
@@ -309,8 +412,8 @@ def _decode_luminance_chroma(path: Path, max_pixels: int, overscan: bool) -> _De
     place = window.x + margins.left, window.y + margins.top
     pixels = display_window(window.pixels, *place, width, height)
     header = window.attributes
-    chromaticities, neutral = header.get("chromaticities"), header.get("adoptedNeutral")
-    return _Decoded(pixels, _digest(path), "", {}, {}, chromaticities, neutral, margins)
+    stated = Statements(header.get("chromaticities"), header.get("adoptedNeutral"))
+    return _Decoded(pixels, _digest(path), "", {}, {}, stated, margins)
 
 
 def _with_digest(path: Path, read: Callable[[], Array]) -> tuple[Array, str]:
@@ -338,17 +441,17 @@ def _digest(path: Path) -> str:
         raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _srgb_matrix(path: Path, decoded: _Decoded) -> Array | None:
+def _srgb_matrix(path: Path, stated: Statements) -> Array | None:
     """The 3x3 matrix to linear sRGB; None where the file is in linear sRGB or does not say.
 
     Raises:
         ImageError: the colours that the file states are impossible.
     """
-    if decoded.chromaticities is None and decoded.neutral is None:
+    if stated.chromaticities is None and stated.neutral is None:
         return None
-    chromaticities = SRGB if decoded.chromaticities is None else decoded.chromaticities
+    chromaticities = SRGB if stated.chromaticities is None else stated.chromaticities
     try:
-        return to_linear_srgb(chromaticities, decoded.neutral)
+        return to_linear_srgb(chromaticities, stated.neutral)
     except ImageError as error:
         raise ImageError(f"{path}: {error}") from None
 
@@ -373,8 +476,9 @@ def _read_part(
     whole = mosaic and types <= {oiio.UINT16, oiio.UINT32}
     if not whole and not types <= {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}:
         raise ImageError(
-            f"{path}: holds {spec.format} samples, not linear float ones; "
-            "give an OpenEXR file, or say --transfer linear or srgb; a photograph: -c unprocess"
+            f"{path}: this {file.format_name().upper()} file has samples of type {spec.format}, "
+            "but clpipe expects linear light in floats. For a render, add --transfer srgb (or "
+            "linear). For a photograph, use -c unprocess"
         )
     width, height = margins.around(spec.full_width, spec.full_height)
     check_size(path, width, height, max_pixels)
@@ -411,7 +515,10 @@ def read_samples(path: Path, file: Any, part: int, channels: Sequence[int], type
     data = file.read_image(part, 0, first, last, type_)
     problem = file.geterror()
     if data is None or problem:
-        raise ImageError(f"{path}: damaged: {error_text(problem)}")
+        data = read_with_pillow(path, spec, part, type_)
+        if data is None:
+            raise ImageError(f"{path}: {damage_text(problem)}")
+        data = data[..., first:last]
     pixels = np.asarray(data).reshape(spec.height, spec.width, last - first)
     order = [i - first for i in channels]
     return pixels if order == list(range(last - first)) else pixels[..., order]

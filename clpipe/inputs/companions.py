@@ -99,6 +99,7 @@ class Finder:
                     )
                 named = locations
             if named:
+                self._check_alone(asked.name, file)
                 return [self._found(asked, file, each) for each in named]
         layers = [each.without_rank for file in self.layers for each in self._of(file)]
         names = dict.fromkeys(layer.rpartition(".")[2] for layer in layers if layer)
@@ -109,6 +110,28 @@ class Finder:
             f"{self.path}: --carry: {message.replace('; allowed:', '; there are:')}; looked in it"
             f"{beside}"
         )
+
+    def _check_alone(self, name: str, file: Path) -> None:
+        """See that no other companion of the same format holds a layer, which may differ.
+
+        Raises:
+            ImageError: there is one.
+        """
+        is_called = self._is_called(file, name)
+        for other in companions_of(self.path, self.patterns) if file != self.path else ():
+            if other == file or other.suffix.lower() != file.suffix.lower():
+                continue
+            is_second = (
+                self._is_called(other, name)
+                if is_called
+                else self._holds_no_colour(other) and _named(other, name, self._of(other))
+            )
+            if is_second:
+                pattern = f"{{name}}{file.name.removeprefix(self.path.stem)}"
+                raise ImageError(
+                    f"{self.path}: --carry {name}: {file.name} and {other.name} both have it. "
+                    f"Name the right one, such as --carry {name}={pattern}"
+                )
 
     def _files(self, name: str) -> Iterator[Path]:
         """Where a layer may be, in the order in which it is looked for."""
@@ -183,7 +206,7 @@ def companions_of(path: Path, patterns: Sequence[str] = ()) -> list[Path]:
     named = [path.parent / pattern.replace("{name}", path.stem) for pattern in patterns]
     for file, pattern in zip(named, patterns, strict=True):
         if not file.is_file():
-            raise ImageError(f"{path}: it has no companion {file} (--companion '{pattern}')")
+            raise ImageError(f"{path}: it has no companion {file} (--carry ...={pattern})")
     if patterns:
         return named
     names = _names_in(str(path.parent), stamp_of(path.parent)[1])

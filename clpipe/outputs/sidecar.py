@@ -104,6 +104,7 @@ def sidecar(
         **({"subframes": subframe_records(source, stamps)} if source.subframes else {}),
         **({"panorama": source.panorama.record} if source.panorama else {}),
         "layer": source.layer,
+        "part": source.part,
         "name": job.stem,
         "picture": rendition.suffix,
         **asdict(rendition),

@@ -1,0 +1,35 @@
+"""PFM pictures: the text at the start of the file."""
+
+import re
+from dataclasses import dataclass
+
+MAGICS = (b"PF", b"Pf")
+SPACE = rb"(?:\s+|\s*#[^\n]*\n)+"
+HEADER = re.compile(rb"(P[Ff])" + SPACE + rb"(\d+)" + SPACE + rb"(\d+)" + SPACE + rb"([-+.\deE]+)")
+
+
+@dataclass(frozen=True)
+class PfmHeader:
+    """A header that OpenImageIO reads for the samples of a file, which begin at ``end``."""
+
+    usual: bytes
+    end: int
+
+
+def pfm_header(start: bytes, size: int) -> PfmHeader | None:
+    r"""The header of a PFM file whose lines end in CR and LF; None where it has no CR.
+
+    One character follows the number of scale, or CR and LF do: the file's length tells.
+
+    >>> pfm_header(b"Pf\r\n1 1\r\n-1.0\r\n\0\0\x80\x3f", 19)
+    PfmHeader(usual=b'Pf\n1 1\n-1.0\n', end=15)
+
+    Args:
+        start: of the file.
+        size: of the file, bytes.
+    """
+    if not (found := HEADER.match(start)) or b"\r" not in start[: found.end() + 1]:
+        return None
+    samples = int(found[2]) * int(found[3]) * (3 if found[1] == b"PF" else 1) * 4
+    both = start[found.end() : found.end() + 2] == b"\r\n" and size - samples != found.end() + 1
+    return PfmHeader(b"%s\n%s %s\n%s\n" % found.groups(), found.end() + 1 + both)

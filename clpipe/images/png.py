@@ -1,0 +1,78 @@
+"""What the chunks of a PNG say of its colours (PNG specification, third edition, 2025)."""
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+MAGIC = b"\x89PNG\r\n\x1a\n"
+MOST_CHUNKS = 1000  # before the first of the samples
+
+# ITU-T H.273 (2024), tables 2 and 3: x and y of red, green, blue and white; names of curves.
+PRIMARIES = {
+    1: (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290),
+    9: (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290),
+    11: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.314, 0.351),
+    12: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290),
+}
+CURVES = {1: "BT.709", 4: "gamma 2.2", 5: "gamma 2.8", 8: "linear", 13: "srgb", 16: "PQ", 18: "HLG"}
+SRGB_GAMMA = 1 / 2.2
+
+
+@dataclass(frozen=True)
+class PngColours:
+    """The colours that a PNG states.
+
+    Args:
+        chromaticities: x and y of red, green, blue and white; None where none are stated.
+        curve: how light is encoded: "srgb", "linear" or another name; "" where it is not stated.
+        chunk: the chunk that states the curve.
+        unknown: primaries that are stated, but that clpipe does not know; "" where there are none.
+    """
+
+    chromaticities: tuple[float, ...] | None = None
+    curve: str = ""
+    chunk: str = ""
+    unknown: str = ""
+
+
+def png_colours(path: Path) -> PngColours:
+    """The colours that the chunks of a PNG state; of several, the one with the highest priority.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    chunks = dict(_chunks(path))
+    if len(chunks.get(b"cICP", b"")) == 4:
+        primaries, number = chunks[b"cICP"][:2]
+        unknown = "" if primaries in PRIMARIES else f"primaries {primaries}"
+        named = CURVES.get(number, f"number {number}")
+        return PngColours(PRIMARIES.get(primaries), named, "cICP", unknown)
+    if b"iCCP" in chunks:  # named by its description
+        return PngColours()
+    if b"sRGB" in chunks:
+        return PngColours(PRIMARIES[1], "srgb", "sRGB")
+    curve, chromaticities = "", None
+    if len(chunks.get(b"gAMA", b"")) == 4:
+        gamma = struct.unpack(">I", chunks[b"gAMA"])[0] / 100_000
+        usual = {"linear": 1.0, "srgb": SRGB_GAMMA}
+        near = [name for name, value in usual.items() if abs(gamma - value) < 0.01]
+        curve = near[0] if near else f"gamma {1 / max(gamma, 1e-5):.3g}"
+    if len(chunks.get(b"cHRM", b"")) == 32:
+        white, colours = (values := struct.unpack(">8I", chunks[b"cHRM"]))[:2], values[2:]
+        chromaticities = tuple(value / 100_000 for value in (*colours, *white))
+    return PngColours(chromaticities, curve, "gAMA")
+
+
+def _chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
+    """Name and content of each short chunk before the samples."""
+    with path.open("rb") as file:
+        file.seek(len(MAGIC))
+        for _ in range(MOST_CHUNKS):
+            head = file.read(8)
+            if len(head) < 8 or head[4:] == b"IDAT":
+                return
+            (size,) = struct.unpack(">I", head[:4])
+            content = file.read(size) if size <= 32 else b""
+            file.seek(size - len(content) + 4, 1)
+            yield head[4:], content

@@ -1,0 +1,145 @@
+"""What a file states about its samples: colours, light, alpha, orientation, and what is unused."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+
+from clpipe.base.errors import ImageError
+from clpipe.base.text import printable
+from clpipe.base.types import Array, Floats
+from clpipe.images import png, radiance
+from clpipe.images.colour import CIE_XYZ
+from clpipe.images.openimageio import radiance_header
+from clpipe.images.pixels import by_rows
+from clpipe.images.tags import FLIPS, upright
+
+
+@dataclass(frozen=True)
+class Statements:
+    """What a file states about its samples.
+
+    Args:
+        chromaticities: x and y of red, green, blue and white; None: linear sRGB's.
+        neutral: x and y of OpenEXR's adoptedNeutral.
+        orientation: EXIF's, of the samples as they are stored; 1 is upright.
+        alpha: the number of the alpha channel by which colours are yet to be multiplied; -1: none.
+        is_associated: whether colours were already multiplied by an alpha channel.
+        curve: how light is encoded, see :class:`clpipe.images.png.PngColours`; "": not stated.
+        header: of a Radiance picture.
+        warnings: statements that are not applied.
+    """
+
+    chromaticities: Any = None
+    neutral: Any = None
+    orientation: int = 1
+    alpha: int = -1
+    is_associated: bool = False
+    curve: str = ""
+    header: radiance.RadianceHeader | None = None
+    warnings: tuple[str, ...] = ()
+
+    def warnings_with(self, transfer: str) -> tuple[str, ...]:
+        """The warnings where samples are taken for light that was encoded with a curve."""
+        if self.curve in ("", transfer):
+            return self.warnings
+        return (*self.warnings, f"it states the transfer curve {self.curve}; read as {transfer}")
+
+    def light(self, pixels: Array) -> Array:
+        """Linear light from the samples of a Radiance picture; those of others are light."""
+        if (header := self.header) is None:
+            return pixels
+        return by_rows(lambda rows: radiance.to_light(rows, header), pixels)
+
+    def upright(self, pixels: Array) -> Array:
+        """Pixels as they are looked at."""
+        return pixels if self.orientation == 1 else upright(pixels, self.orientation)
+
+
+def statements(path: Path, file: Any, xyz: bool = False) -> Statements:
+    """What a file states about the samples of the part that it is at.
+
+    Args:
+        path: the file.
+        file: the open ``oiio.ImageInput``.
+        xyz: whether its channels are X, Y and Z.
+
+    Raises:
+        ImageError: the file cannot be read.
+    """
+    spec, format_ = file.spec(), file.format_name()
+    warnings = []
+    aspect = spec.getattribute("PixelAspectRatio")
+    header = radiance_header(path) if format_ == "hdr" else None
+    if header:
+        aspect = 1 / header.pixel_aspect  # of its height to its width
+    if isinstance(aspect, float) and abs(aspect - 1) > 1e-3:
+        warnings.append(
+            f"its pixel aspect ratio of {aspect:.4g} is not applied; its pixels are read as square"
+        )
+    if nits := spec.getattribute("whiteLuminance"):
+        warnings.append(f"its whiteLuminance of {nits:g} cd/m2 is not used; 1.0 is white")
+    if profile := _profile(spec):
+        warnings.append(f"its ICC profile, {printable(profile)}, is not applied; read as sRGB")
+    is_float = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+    if is_float and spec.getattribute("tiff:PhotometricInterpretation") == 0:
+        warnings.append("it states that 0 is white (MinIsWhite), which is not applied to floats")
+    part = file.current_subimage()
+    if format_ == "tiff":
+        if file.seek_subimage(part + 1, 0):
+            warnings.append("it has several pages; only the first one was read")
+        file.seek_subimage(part, 0)
+        file.geterror()  # clears it: the next page need not exist
+    chromaticities = CIE_XYZ if xyz else spec.getattribute("chromaticities")
+    curve = ""
+    if format_ == "png":
+        colours = png_colours(path)
+        chromaticities = chromaticities or colours.chromaticities
+        if colours.curve not in ("", "srgb", "linear"):
+            curve = f"{colours.curve} ({colours.chunk} chunk)"
+        else:
+            curve = colours.curve
+        if colours.unknown:
+            warnings.append(f"its cICP chunk states {colours.unknown}, not known; read as sRGB")
+    stated = spec.getattribute("Orientation") if format_ != "openexr" else 1
+    if header:
+        stated = header.orientation  # OpenImageIO 3.2 takes two of the eight for each other
+    is_straight = bool(spec.getattribute("oiio:UnassociatedAlpha"))
+    alpha = spec.alpha_channel
+    return Statements(
+        chromaticities if chromaticities or header is None else header.chromaticities,
+        spec.getattribute("adoptedNeutral"),
+        stated if stated in FLIPS else 1,
+        alpha if is_straight else -1,
+        not is_straight and 0 <= alpha < spec.nchannels,
+        curve,
+        header,
+        tuple(warnings),
+    )
+
+
+def png_colours(path: Path) -> png.PngColours:
+    """The colours that a PNG states.
+
+    Raises:
+        ImageError: the file cannot be read.
+    """
+    try:
+        return png.png_colours(path)
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _profile(spec: Any) -> str:
+    """The name of an ICC profile; "" where there is none, or where it is sRGB's."""
+    if spec.getattribute("ICCProfile") is None:
+        return ""
+    name = str(spec.getattribute("ICCProfile:profile_description") or "without a name")
+    return "" if "srgb" in name.lower() else name
+
+
+def over_black(light: Array, alpha: Array) -> Floats:
+    """Linear light, (height, width[, 3]), times alpha: the picture before black, as in OpenEXR."""
+    return light * (alpha if light.ndim == 2 else alpha[..., np.newaxis])

@@ -1,0 +1,125 @@
+"""Which layer of a render is the picture: by known names, never by the alphabet."""
+
+import json
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from clpipe.base.errors import ImageError, NoPictureError
+from clpipe.images.kinds import is_aov
+from clpipe.images.read import read_image
+from tests.conftest import run_cli
+
+PICTURE, OTHER = (0.125, 0.25, 0.5), (4.0, 4.0, 4.0)
+
+
+def write_layers(path, *names, letters="RGB", picture=0):
+    """An OpenEXR file whose layers of these names hold OTHER, but for one that holds PICTURE."""
+    channels = {}
+    for number, name in enumerate(names):
+        for letter, value in zip(letters, PICTURE if number == picture else OTHER, strict=True):
+            channel = f"{name}.{letter}" if name else letter
+            channels[channel] = np.full((6, 8), value, np.float32)
+    OpenEXR.File({}, channels).write(str(path))
+    return path
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("RGB_IMAGEPIPELINE", "ALBEDO", "RGB", "MATERIAL_ID", "AVG_SHADING_NORMAL"),  # LuxCore
+        ("Ci", "Albedo", "directDiffuse", "normal_var", "albedo_mse"),  # RenderMan
+        ("Composite.Combined", "Another.Combined", "ViewLayer.Combined"),  # Blender
+        ("ViewLayer.Combined", "ViewLayer.AO", "ViewLayer.DiffCol", "ViewLayer.Noisy Image"),
+        ("Background.Combined", "Background.Albedo", "Background.CryptoObject00"),
+        ("Beauty", "AO", "Denoising Albedo"),
+        ("C", "albedo", "directdiffuse", "beautyunshadowed", "N"),  # Houdini
+        ("FinalImage", "FinalImageMovieRenderQueue_WorldDepth", "FinalImageWorldNormal"),  # Unreal
+        ("", "Ci", "beauty", "Albedo"),  # Nuke, Mitsuba, Arnold, V-Ray
+        ("effectsResult", "VRayDiffuseFilter", "VRayReflection", "VRayMtlID"),  # V-Ray
+        ("RGBA", "diffuse_albedo", "crypto_asset00", "shadow_matte", "sss"),  # Arnold
+        ("my_image", "albedo", "sh_normal"),  # Mitsuba; unknown, but alone
+        ("comp_v2", "zz_depth"),
+    ],
+)
+def test_the_finished_picture_is_read(tmp_path, names):
+    for order in (names, names[::-1]):  # whatever the order in the file, which is alphabetical
+        path = write_layers(tmp_path / "a.exr", *order, picture=order.index(names[0]))
+        source = read_image(path)
+        assert source.layer == names[0]
+        assert source.pixels[0, 0].tolist() == list(PICTURE)
+
+
+@pytest.mark.parametrize("letters", [("red", "green", "blue"), ("r", "g", "b")])
+def test_channels_may_be_called_by_their_colours(tmp_path, letters):
+    path = write_layers(tmp_path / "a.exr", "beauty", "albedo", letters=letters)
+    assert read_image(path).pixels[0, 0].tolist() == list(PICTURE)
+
+
+@pytest.mark.parametrize(
+    "names", [("Background.Combined", "ViewLayer.Combined"), ("fog", "sky"), ("key", "Fill")]
+)
+def test_of_several_candidates_none_is_taken(tmp_path, names):
+    path = write_layers(tmp_path / "a.exr", *names, "normals")
+    with pytest.raises(ImageError, match=r"2 layers may be the picture: .*--layer") as error:
+        read_image(path)
+    assert all(name in str(error.value) for name in names)
+    assert "normals" not in str(error.value)
+    assert read_image(path, layer=names[0].lower()).layer == names[0]
+
+
+@pytest.mark.parametrize("name", ["albedo", "ViewLayer.Normal", "AO", "crypto_object", "Depth"])
+def test_an_aov_alone_is_no_picture_unless_it_is_named(tmp_path, name):
+    path = write_layers(tmp_path / "a.exr", name)
+    with pytest.raises(NoPictureError, match=f"AOVs by their names: {name}. .*--layer {name}"):
+        read_image(path)
+    assert read_image(path, layer=name).pixels[0, 0].tolist() == list(PICTURE)
+
+
+def test_names_that_only_look_like_aovs():
+    names = (
+        "composition",
+        "normalized",
+        "vinyl",
+        "plaid",
+        "Environment",
+        "zoom",
+        "beauty_denoised",
+    )
+    assert not [name for name in names if is_aov(name)]
+
+
+def test_the_first_view_is_the_picture(tmp_path):
+    parts = []
+    for view, value in (("right", 0.25), ("left", 0.5)):
+        planes = {letter: np.full((6, 8), value, np.float32) for letter in "RGB"}
+        parts.append(OpenEXR.Part({"view": view}, planes, f"rgba_{view}"))
+    OpenEXR.File(parts).write(str(tmp_path / "parts.exr"))
+    source = read_image(tmp_path / "parts.exr")
+    assert (source.layer, source.part, source.pixels[0, 0, 0]) == ("rgba_right", 0, 0.25)
+    assert read_image(tmp_path / "parts.exr", layer="rgba_left").part == 1
+
+
+def test_whole_numbers_are_ids(tmp_path):
+    ids = {f"{letter}": np.full((6, 8), 7, np.uint32) for letter in "RGB"}
+    OpenEXR.File({}, ids).write(str(tmp_path / "ids.exr"))
+    with pytest.raises(ImageError, match=r"type uint\. Channels of type uint hold IDs or masks"):
+        read_image(tmp_path / "ids.exr")
+    mixed = {**ids, "R": np.zeros((6, 8), np.float32)}
+    OpenEXR.File({}, mixed).write(str(tmp_path / "mixed.exr"))
+    with pytest.raises(ImageError, match="type float and uint"):
+        read_image(tmp_path / "mixed.exr")
+    beside = {**ids, **{f"Image.{c}": np.full((6, 8), 0.5, np.float32) for c in "RGB"}}
+    OpenEXR.File({}, beside).write(str(tmp_path / "beside.exr"))
+    assert read_image(tmp_path / "beside.exr").layer == "Image"
+
+
+def test_sidecar_and_log_record_layer_and_part(tmp_path):
+    write_layers(tmp_path / "a.exr", "RGB_IMAGEPIPELINE", "ALBEDO")
+    run_cli("run", tmp_path / "a.exr", "-o", tmp_path / "out", "--device", "numpy")
+    sidecar = json.loads((tmp_path / "out" / "a.json").read_text())
+    lines = map(json.loads, (tmp_path / "out" / "run.jsonl").read_text().splitlines())
+    (line,) = [each for each in lines if each["event"] == "image"]
+    for record in (sidecar, line):
+        assert (record["layer"], record["part"]) == ("RGB_IMAGEPIPELINE", 0)
