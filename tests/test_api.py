@@ -91,7 +91,7 @@ def test_a_raw_in_whole_numbers(render):
     raw = shot.kept["quantize"].astype(np.uint16)
     developed = clpipe.Pipeline(start_at="normalize", iso=800).process(raw, "a")
     assert np.array_equal(developed.image, shot.image)
-    with pytest.raises(clpipe.ImageError, match=r"found int8; .*image.astype\(np.uint16\)"):
+    with pytest.raises(clpipe.ImageError, match=r"type int8, .* pass image.astype\(np.uint16\)"):
         clpipe.Pipeline(start_at="normalize").process(raw.astype(np.int8), "a")
 
 
@@ -114,9 +114,12 @@ def test_what_a_user_may_write(render):
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (np.zeros((4, 4, 3), np.uint8), "found uint8; expected rgb in floats"),
-        ([[1.0]], "found list; expected an array"),
-        (np.zeros((4, 4), np.float32), "shape .4, 4.; expected .height, width, 3."),
+        (
+            np.zeros((4, 4, 3), np.uint8),
+            "samples of type uint8, but the chain starts on rgb in floats",
+        ),
+        ([[1.0]], "a list, but an array is expected"),
+        (np.zeros((4, 4), np.float32), "shape .4, 4., but .height, width, 3. is expected"),
         (np.zeros((4, 4, 4), np.float32), "shape .4, 4, 4."),
         (np.full((4, 4, 3), np.nan, np.float32), "48 samples that are NaN or infinite"),
         (np.zeros((0, 4, 3), np.float32), "shape .0, 4, 3."),

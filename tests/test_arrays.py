@@ -45,21 +45,27 @@ def test_torch_tensors_are_taken():
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        ((IMAGE * 255).astype(np.uint8), "found uint8; .*is it linear. image / np.float32.WHITE."),
-        (IMAGE > 0.5, "found bool; expected rgb in floats"),
-        (IMAGE.tolist(), "found list; expected an array: numpy.asarray"),
-        (np.dstack([IMAGE, IMAGE[..., :1]]), r"\(6, 8, 4\); .*without alpha: image\[..., :3\]"),
-        (IMAGE[..., 0], r"\(6, 8\); .*a grey image: np.repeat"),
-        (IMAGE[..., :1], r"\(6, 8, 1\); .*a grey image: np.repeat"),
-        (np.moveaxis(IMAGE, -1, 0), r"\(3, 6, 8\); .*channels last: np.moveaxis"),
-        (IMAGE[None], r"\(1, 6, 8, 3\); .*a batch, image by image: process_many"),
-        (IMAGE[:0], r"found shape \(0, 8, 3\); expected \(height, width, 3\)"),
-        (Tensor(IMAGE, on_cpu=False), r"a Tensor that cannot be shared .*; .*image.cpu\(\)"),
-        (Tensor(IMAGE, requires_grad=True), r"a Tensor with a gradient; give image.detach\(\)"),
+        ((IMAGE * 255).astype(np.uint8), "type uint8, .* pass image / np.float32.WHITE."),
+        (IMAGE > 0.5, "type bool, but the chain starts on rgb in floats"),
+        (IMAGE.tolist(), "a list, but an array is expected. Pass numpy.asarray"),
+        (
+            np.dstack([IMAGE, IMAGE[..., :1]]),
+            r"\(6, 8, 4\), .*To leave out alpha, pass image\[..., :3\]",
+        ),
+        (IMAGE[..., 0], r"\(6, 8\), .*For a grey image, pass np.repeat"),
+        (IMAGE[..., :1], r"\(6, 8, 1\), .*For a grey image, pass np.repeat"),
+        (np.moveaxis(IMAGE, -1, 0), r"\(3, 6, 8\), .*pass np.moveaxis"),
+        (IMAGE[None], r"\(1, 6, 8, 3\), .*For a batch, use process_many"),
+        (IMAGE[:0], r"has shape \(0, 8, 3\), but \(height, width, 3\) is expected"),
+        (
+            Tensor(IMAGE, on_cpu=False),
+            r"a Tensor whose memory cannot be shared .* pass image.cpu\(\)",
+        ),
+        (Tensor(IMAGE, requires_grad=True), r"a Tensor with a gradient. Pass image.detach\(\)"),
     ],
 )
 def test_what_is_refused_says_what_helps(image, message):
-    with pytest.raises(ImageError, match=f"^view_7: image: .*{message}"):
+    with pytest.raises(ImageError, match=f"^view_7: (the )?image .*{message}"):
         Pipeline(**CHAIN).process(image, "view_7")
 
 
@@ -68,15 +74,15 @@ def test_what_is_refused_says_what_helps(image, message):
     [
         ((1, 6, 8), r"image\[0\]"),
         ((6, 8, 1), r"image\[\.\.\., 0\]"),
-        ((6, 8, 3), "colours enter a chain at mosaic or before it"),
-        ((6, 8, 5), "a batch, image by image: .*"),
+        ((6, 8, 3), "start the chain at mosaic or before it"),
+        ((6, 8, 5), "For a batch, use .*"),
     ],
 )
 def test_mosaics_have_two_dimensions(shape, way):
     mosaics = Pipeline(device="numpy", start_at="normalize")
-    with pytest.raises(ImageError, match=rf"expected \(height, width\); {way}$"):
+    with pytest.raises(ImageError, match=rf"\(height, width\) is expected\. .*{way}"):
         mosaics.process(np.ones(shape, np.float32), "a")
-    with pytest.raises(ImageError, match=r"found int64; .*image.astype\(np.uint16\)"):
+    with pytest.raises(ImageError, match=r"type int64, .* pass image.astype\(np.uint16\)"):
         mosaics.process(np.ones((6, 8), np.int64), "a")
 
 
@@ -84,7 +90,7 @@ def test_what_is_not_finite_is_counted_and_placed():
     image = IMAGE.copy()
     image[2, 3, 1] = np.nan
     image[4:, 0] = np.inf
-    message = "view_7: .*found 7 samples .*, the first at row 2, column 3, channel 1; np.nan_to_num"
+    message = "view_7: the image has 7 samples .*, the first at row 2, column 3, channel 1. .*nan"
     with pytest.raises(ImageError, match=message):
         Pipeline(**CHAIN).process(image, "view_7")
 

@@ -321,14 +321,14 @@ def test_a_pipeline_moves_arrays():
         (("--carry", "Depth:flow"), "its layer Depth has 1 channel, but flow has 2 or more"),
         (
             ("--carry", "odd"),
-            "what its layer odd holds cannot be told by its name; say it: --carry",
+            "the name of its layer odd does not tell what it holds. Add its kind: --carry",
         ),
         (
             ("--carry", "small:depth"),
             "its layer small has 3x2 pixels, but the picture in/a.exr has 14x9",
         ),
-        (("--carry", "two"), "has no layer called two, but several others (b, c); carry one of"),
-        (("--carry", "Depth", "--carry", "View.Depth"), "are both the channel View.Depth.Z"),
+        (("--carry", "two"), "has no layer called two, but several others (b, c). Name one of"),
+        (("--carry", "Depth", "--carry", "View.Depth"), "both name the channel View.Depth.Z"),
         (("--carry", "seg={name}_no.exr"), "it has no companion in/a_no.exr"),
         (("--carry", "broken"), "a_broken.exr: cannot be read as an image"),
     ],

@@ -200,7 +200,7 @@ def test_raws_and_renders_of_a_folder_go_their_own_ways(tmp_path):
     (folder / "d.nef").write_bytes(b"\xff\xd8\xff\xe0 nothing")
     out = tmp_path / "out"
     output = clpipe("run", folder, "-o", out, "--keep", "all", "--iso", 800, status=1)
-    assert "d.nef: it is a JPEG, not a camera's raw" in output
+    assert "d.nef: it is a JPEG, not a camera raw" in output
     assert "4 of 5 images done, 1 failed" in output
     alone = tmp_path / "alone"
     clpipe("run", folder / "b.dng", folder / "c.DNG", "-o", alone, "--iso", 800)
@@ -271,11 +271,11 @@ XTRANS = "GGRGGBGGBGGRBRGRBGGGBGGRGGRGGBRBGBRG"
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("linear", "holds every colour at every pixel"),
+        ("linear", "has every colour at every pixel"),
         ("half", "damaged, or not a raw that LibRaw knows"),
         ("no pixels", "holds no pixels"),
         ("empty", "the file is empty"),
-        ("jpeg", "it is a JPEG, not a camera's raw"),
+        ("jpeg", "it is a JPEG, not a camera raw"),
         ("text", "damaged, or not a raw that LibRaw knows"),
         ("missing", "no such file"),
     ],
@@ -317,7 +317,10 @@ def test_an_x_trans_raw_of_another_program(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--start-at", "denoise"), "a raw enters at normalize; denoise reads rgb"),
+        (
+            ("--start-at", "denoise"),
+            "a camera raw starts at normalize, but --start-at denoise reads rgb",
+        ),
         (("--keep", "sensor_noise"), "unknown stage in this chain 'sensor_noise'"),
         (("--stages", "mosaic,demosaic,gamma"), "no stage of the chain reads a raw"),
         (("--until", "quantize"), "normalize comes after quantize"),

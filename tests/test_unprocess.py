@@ -165,7 +165,7 @@ def test_each_chain_wants_its_own_kind(tmp_path, write_exr):
     Image.fromarray(smooth()).save(tmp_path / "photo.png")
     for path, more, message in (
         (render, ["-c", "unprocess"], "holds linear light, but the chain starts on finished"),
-        (tmp_path / "photo.png", [], "a photograph: -c unprocess"),
+        (tmp_path / "photo.png", [], "For a photograph, use -c unprocess"),
     ):
         arguments = ["run", str(path), "-o", str(tmp_path / "out"), *more]
         result = CliRunner().invoke(main, arguments, catch_exceptions=False)

@@ -232,7 +232,7 @@ def test_six_files_a_cube_map_and_a_map_become_a_picture(write, clpipe):
     assert record["output"].get("focal_length") is None
     assert "3 of them" in clpipe("run", "in", "-o", "o", *RUN, *options_of("unified")).output
     assert clpipe("run", "in/strip.exr", "-o", "p", "--stages", "exposure", status=1).output.count(
-        "a cube map, not a picture; look at it through a wide lens"
+        "a cube map, not a picture. To view it through a wide lens"
     )
     write("in/room_up.exr", **colours(np.zeros((9, 9, 3))))
     told = clpipe("run", "in", "-o", "o", *RUN, *options_of("unified"), status=1).output

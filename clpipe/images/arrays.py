@@ -23,14 +23,16 @@ def as_array(value: Any, what: str) -> Array:
         return value
     kind = type(value).__name__
     if not hasattr(value, "__dlpack__"):
-        raise ImageError(f"{what}: found {kind}; expected an array: numpy.asarray({what})")
+        raise ImageError(
+            f"{what} is a {kind}, but an array is expected. Pass numpy.asarray({what})"
+        )
     if getattr(value, "requires_grad", False):
-        raise ImageError(f"{what}: found a {kind} with a gradient; give {what}.detach()")
+        raise ImageError(f"{what} is a {kind} with a gradient. Pass {what}.detach()")
     try:
         return np.from_dlpack(value)
     except (BufferError, RuntimeError, TypeError, ValueError) as error:
         raise ImageError(
-            f"{what}: found a {kind} that cannot be shared ({error}); if it is on a GPU, give "
+            f"{what} is a {kind} whose memory cannot be shared ({error}). If it is on a GPU, pass "
             f"{what}.cpu()"
         ) from None
 
@@ -51,9 +53,16 @@ def as_image(value: Any, kind: Kind) -> Array:
     if kind is Kind.DISPLAY and image.dtype in (np.uint8, np.uint16):
         return image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
     if image.dtype.kind != "f" and not (is_mosaic and image.dtype in (np.uint16, np.uint32)):
-        ways = "is it linear? image / np.float32(WHITE); a finished picture: Pipeline('unprocess')"
-        ways = "DN go in as uint16: image.astype(np.uint16)" if is_mosaic else ways
-        raise ImageError(f"image: found {image.dtype}; expected {kind.label} in floats; {ways}")
+        way = (
+            "For DN, pass image.astype(np.uint16)"
+            if is_mosaic
+            else "For linear values, pass image / np.float32(WHITE), with the value of white. "
+            "For a finished picture, use Pipeline('unprocess')"
+        )
+        raise ImageError(
+            f"the image has samples of type {image.dtype}, but the chain starts on {kind.label} in "
+            f"floats. {way}"
+        )
     if image.dtype not in (np.float16, np.float32):
         image = image.astype(np.float32)
     if not np.isfinite(image).all():
@@ -61,8 +70,8 @@ def as_image(value: Any, kind: Kind) -> Array:
         names = ("row", "column", "channel")[: image.ndim]
         place = ", ".join(f"{name} {i}" for name, i in zip(names, wrong[0], strict=True))
         raise ImageError(
-            f"image: found {len(wrong)} samples that are NaN or infinite, the first at {place}; "
-            "np.nan_to_num(image) replaces them"
+            f"the image has {len(wrong)} samples that are NaN or infinite, the first at {place}. "
+            "Replace them, for example with np.nan_to_num(image)"
         )
     return image
 
@@ -79,15 +88,17 @@ def check_shape(shape: tuple[int, ...], kind: Kind) -> None:
         return
     way = ""
     if channels == 1 and len(shape) == 3 and 1 in (shape[0], shape[2]):
-        way = "image[0]" if shape[0] == 1 else "image[..., 0]"
+        way = f"Pass {'image[0]' if shape[0] == 1 else 'image[..., 0]'}"
     elif channels == 1 and len(shape) == 3 and shape[2] == 3:
-        way = "colours enter a chain at mosaic or before it"
+        way = "To process colours, start the chain at mosaic or before it"
     elif channels > 1 and len(shape) == 3 and shape[2] == 4:
-        way = "without alpha: image[..., :3]"
+        way = "To leave out alpha, pass image[..., :3]"
     elif channels > 1 and len(shape) == 3 and shape[0] in (3, 4):
-        way = "channels last: np.moveaxis(image[:3], 0, -1)"
+        way = "Channels are last: pass np.moveaxis(image[:3], 0, -1)"
     elif channels > 1 and (len(shape) == 2 or shape[2:] == (1,)):
-        way = "a grey image: np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)"
+        way = "For a grey image, pass np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)"
     elif len(shape) == (4 if channels > 1 else 3):
-        way = "a batch, image by image: process_many(zip(images, keys))"
-    raise ImageError(f"image: found shape {shape}; expected {expected}{'; ' * bool(way)}{way}")
+        way = "For a batch, use process_many(zip(images, keys))"
+    raise ImageError(
+        f"the image has shape {shape}, but {expected} is expected{'. ' * bool(way)}{way}"
+    )

@@ -112,7 +112,8 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
     if not pictures:
         listed = ", ".join(name for name in channel_names[:20] if name) or "none"
         missing = "no single channel with a mosaic" if mosaic else "no R, G and B channels"
-        raise NoPictureError(f"{path}: {missing}; found {printable(listed)}")
+        way = "" if mosaic else ". To use its layers as ground truth of a picture, see --carry"
+        raise NoPictureError(f"{path}: {missing}; found {printable(listed)}{way}")
     best = _chosen(path, pictures) if layer is None else _of_layer(path, pictures, layer)
     file.seek_subimage(best.part, 0)
     file.geterror()  # clears it: the loop asked for parts and levels that do not exist
@@ -180,7 +181,8 @@ def _of_layer(path: Path, pictures: list[PictureLocation], layer: str) -> Pictur
     if not named:
         listed = ", ".join(dict.fromkeys(p.layer or "one without a name" for p in pictures))
         raise ImageError(
-            f"{path}: no layer {layer!r} with a picture; its layers: {printable(listed)}"
+            f"{path}: no layer {layer!r} with a picture; its layers: {printable(listed)}. Name one "
+            "of them with --layer"
         )
     return named
 
@@ -188,8 +190,12 @@ def _of_layer(path: Path, pictures: list[PictureLocation], layer: str) -> Pictur
 def _refusal(spec: Any, has_levels: bool) -> str:
     """Why a part is not a picture, whatever its channels are called; "" where it may be one."""
     if spec.deep:
-        return "a deep image (many samples a pixel); flatten it in the renderer first"
-    return "a texture (one image in several sizes), not a picture" if has_levels else ""
+        return "a deep image (many samples a pixel). Render or flatten it to a flat image first"
+    if has_levels:
+        return (
+            "a texture (one image in several sizes), not a picture. Write its largest level alone"
+        )
+    return ""
 
 
 def full_name(part: str, layer: str) -> str:

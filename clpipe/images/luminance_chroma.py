@@ -56,8 +56,8 @@ def read_luminance_chroma(path: Path, max_pixels: int) -> DataWindow:
     is_flat = all(part.header["type"].name == "scanlineimage" for part in parts)
     if not set(CHANNELS) <= set(names) or not is_flat:
         raise ImageError(
-            f"{path}: subsampled channels can be read as {', '.join(CHANNELS)} only; "
-            f"found {printable(', '.join(names))}"
+            f"{path}: has subsampled channels {printable(', '.join(names))}, but clpipe reads only "
+            f"{', '.join(CHANNELS)}. Write the picture as R, G and B"
         )
     (left, top), (right, bottom) = (corner.tolist() for corner in header["dataWindow"])
     (x, y), (x_end, y_end) = (corner.tolist() for corner in header["displayWindow"])

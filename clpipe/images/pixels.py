@@ -23,9 +23,12 @@ def check_size(path: Path, width: int, height: int, max_pixels: int) -> None:
     Raises:
         ImageError: it has none, or more.
     """
-    if width < 1 or height < 1 or width * height > max_pixels:
+    if width < 1 or height < 1:
+        raise ImageError(f"{path}: damaged: its header states {width}x{height} pixels")
+    if width * height > max_pixels:
         raise ImageError(
-            f"{path}: {width}x{height} pixels; at most {max_pixels} are read (--max-pixels)"
+            f"{path}: {width}x{height} pixels; at most {max_pixels} are read. To read more, set "
+            "--max-pixels"
         )
 
 

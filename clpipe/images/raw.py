@@ -203,7 +203,9 @@ def _opened(path: Path, max_pixels: int) -> Iterator[Any]:
             raise ImageError(f"{path}: the file is empty")
         for mark, what in OTHERS.items():
             if start.startswith(mark):
-                raise ImageError(f"{path}: it is {what}, not a camera's raw, whatever its name")
+                raise ImageError(
+                    f"{path}: it is {what}, not a camera raw. Give it the extension of its format"
+                )
         with rawpy.imread(str(path)) as raw:
             check_size(path, raw.sizes.raw_width, raw.sizes.raw_height, max_pixels)
             yield raw
@@ -240,15 +242,16 @@ def _pattern(path: Path, raw: Any, exif: "Exif") -> str:
     """
     if raw.raw_type.name != "Flat" or raw.raw_pattern is None:
         raise ImageError(
-            f"{path}: holds every colour at every pixel (a LinearRaw DNG of three colours); "
-            "a mosaic is needed"
+            f"{path}: has every colour at every pixel (a LinearRaw DNG of three colours), but "
+            "clpipe develops mosaics. Develop it to a TIFF elsewhere and use -c unprocess"
         )
     if raw.num_colors == 1:
         return MONO
     own = exif.text(MODEL).partition(BEHIND)[2]  # which LibRaw may take for another one
     if {*own} - {*"RGB/"}:
         raise ImageError(
-            f"{path}: its filter array is {own}; of a DNG those of red, green and blue are taken"
+            f"{path}: its filter array is {own}. clpipe reads DNG files whose array has red, green "
+            "and blue only. Keep the mosaic as EXR (--keep mosaic) to read it again"
         )
     if own:
         return own
@@ -260,8 +263,8 @@ def _pattern(path: Path, raw: Any, exif: "Exif") -> str:
     if {*"".join(rows)} == {*"RGB"} and (height, width) != (2, 2):
         return "/".join(rows)
     raise ImageError(
-        f"{path}: its pattern is {'/'.join(rows)}; one of {', '.join(PATTERNS)} is needed, or a "
-        "larger one of red, green and blue, or one colour alone"
+        f"{path}: its pattern is {'/'.join(rows)}. clpipe develops {', '.join(PATTERNS)}, larger "
+        "patterns of red, green and blue, and sensors without colours"
     )
 
 

@@ -332,7 +332,8 @@ def read_whole_numbers(path: Path, max_pixels: int = USUAL_MAX_PIXELS) -> Array:
         spec = file.spec()
         if spec.format.basetype not in (oiio.UINT8, oiio.UINT16):
             raise ImageError(
-                f"{path}: holds {spec.format} samples; expected whole numbers of 8 or 16 bits"
+                f"{path}: has samples of type {spec.format}, but whole numbers of 8 or 16 bits are "
+                "expected"
             )
         check_size(path, spec.width, spec.height, max_pixels)
         return read_samples(path, file, 0, (0,), spec.format.basetype)[..., 0]
@@ -507,7 +508,9 @@ def read_samples(path: Path, file: Any, part: int, channels: Sequence[int], type
     """
     spec = file.spec()
     if spec.depth > 1:
-        raise ImageError(f"{path}: a volume of {spec.depth} images, not a picture")
+        raise ImageError(
+            f"{path}: a volume of {spec.depth} images, not a picture. Write each of them as a file"
+        )
     first, last = min(channels), max(channels) + 1
     if last - first > READ_AT_ONCE:
         planes = [read_samples(path, file, part, [i], type_) for i in channels]

@@ -64,7 +64,8 @@ def _check_names(path: Path, found: Sequence[FoundLayer]) -> None:
             other = owners.setdefault(channel, each)
             if other is not each:
                 raise ImageError(
-                    f"{path}: --carry {other.name} and {each.name} are both the channel {channel}"
+                    f"{path}: --carry {other.name} and {each.name} both name the channel "
+                    f"{channel}. Name it once"
                 )
 
 
@@ -94,8 +95,8 @@ class Finder:
                 if len(locations) != 1:
                     listed = ", ".join(each.name or "one without a name" for each in locations)
                     raise ImageError(
-                        f"{file}: has no layer called {asked.name}, but several others ({listed}); "
-                        "carry one of these"
+                        f"{file}: has no layer called {asked.name}, but several others ({listed}). "
+                        "Name one of them in --carry"
                     )
                 named = locations
             if named:
@@ -164,8 +165,8 @@ class Finder:
         kind = asked.kind or kind_of(asked.name, location)
         if kind is None:
             raise ImageError(
-                f"{file}: what its layer {asked.name} holds cannot be told by its name; say it: "
-                f"--carry {asked.name}:KIND, which is {', '.join(RESAMPLING)}"
+                f"{file}: the name of its layer {asked.name} does not tell what it holds. Add its "
+                f"kind: --carry {asked.name}:KIND, where KIND is {', '.join(RESAMPLING)}"
             )
         least = CHANNELS.get(kind, 1)
         if len(location.channels) < least:

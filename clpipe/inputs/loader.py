@@ -224,14 +224,14 @@ class ImageLoader:
                 source = self._read(job.path)
         if source.envmap == CUBE_MAP:
             raise ImageError(
-                f"{job.path}: a cube map, not a picture; look at it through a wide lens, as with "
+                f"{job.path}: a cube map, not a picture. To view it through a wide lens, add --set "
                 f"{stage_in(StageRole.VIEW).name}.method=kannala_brandt"
             )
         width, height = source.margins.inside(*source.pixels.shape[1::-1])
         if job.size and job.size != (width, height):
             raise ImageError(
-                f"{job.path}: has {width}x{height} pixels, but its camera in --poses is of "
-                f"{job.size[0]}x{job.size[1]}; render it at that size, or give the camera of this"
+                f"{job.path}: has {width}x{height} pixels, but its camera in --poses has "
+                f"{job.size[0]}x{job.size[1]}. Correct the camera's size, or render at that size"
             )
         return source
 

@@ -149,8 +149,8 @@ class RawLoader:
         settings = chain.settings
         if chain.source is not Kind.RAW:
             raise ImageError(
-                f"{path}: a raw enters at {first_raw_step(settings)}; "
-                f"{self.request.start_at} reads {chain.source.label}"
+                f"{path}: a camera raw starts at {first_raw_step(settings)}, but --start-at "
+                f"{self.request.start_at} reads {chain.source.label}. Leave out --start-at"
             )
         name = name_of(StageRole.PATTERN)
         own = settings.parameters.get(name, {})
