@@ -8,7 +8,8 @@ import pytest
 
 from clpipe.base.errors import ImageError, NoPictureError
 from clpipe.images.kinds import is_aov
-from clpipe.images.read import read_image
+from clpipe.images.read import ReadOptions, read_image, read_source
+from clpipe.stage import Kind
 from tests.conftest import run_cli
 
 PICTURE, OTHER = (0.125, 0.25, 0.5), (4.0, 4.0, 4.0)
@@ -63,7 +64,7 @@ def test_channels_may_be_called_by_their_colours(tmp_path, letters):
 def test_of_several_candidates_none_is_taken(tmp_path, names):
     path = write_layers(tmp_path / "a.exr", *names, "normals")
     with pytest.raises(ImageError, match=r"2 layers may be the picture: .*--layer") as error:
-        read_image(path)
+        read_source(path, Kind.RGB, ReadOptions())
     assert all(name in str(error.value) for name in names)
     assert "normals" not in str(error.value)
     assert read_image(path, layer=names[0].lower()).layer == names[0]
@@ -73,7 +74,7 @@ def test_of_several_candidates_none_is_taken(tmp_path, names):
 def test_an_aov_alone_is_no_picture_unless_it_is_named(tmp_path, name):
     path = write_layers(tmp_path / "a.exr", name)
     with pytest.raises(NoPictureError, match=f"AOVs by their names: {name}. .*--layer {name}"):
-        read_image(path)
+        read_source(path, Kind.RGB, ReadOptions())
     assert read_image(path, layer=name).pixels[0, 0].tolist() == list(PICTURE)
 
 

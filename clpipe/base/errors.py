@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from clpipe.base.text import one_line
 
@@ -38,9 +38,23 @@ class KeyedError(RequestError):
 
 
 class ImageError(ClpipeError):
-    """One image cannot be read, processed or written; the run goes on with the others."""
+    """One image cannot be read, processed or written; the run continues with the others.
+
+    Args:
+        message: what is wrong.
+        way: a sentence with options that help, which some commands lack; not in the text.
+    """
 
     exit_status = 1
+
+    def __init__(self, message: str = "", way: str = "") -> None:
+        super().__init__(message)
+        self.way = way
+
+    @property
+    def with_way(self) -> Self:
+        """The error with the options that help in its text."""
+        return type(self)(f"{self}. {self.way}") if self.way else self
 
 
 class NoPictureError(ImageError):

@@ -112,8 +112,8 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
     if not pictures:
         listed = ", ".join(name for name in channel_names[:20] if name) or "none"
         missing = "no single channel with a mosaic" if mosaic else "no R, G and B channels"
-        way = "" if mosaic else ". To use its layers as ground truth of a picture, see --carry"
-        raise NoPictureError(f"{path}: {missing}; found {printable(listed)}{way}")
+        way = "" if mosaic else "To use its layers as ground truth of a picture, see --carry"
+        raise NoPictureError(f"{path}: {missing}; found {printable(listed)}", way)
     best = _chosen(path, pictures) if layer is None else _of_layer(path, pictures, layer)
     file.seek_subimage(best.part, 0)
     file.geterror()  # clears it: the loop asked for parts and levels that do not exist
@@ -158,15 +158,16 @@ def _chosen(path: Path, pictures: Sequence[PictureLocation]) -> PictureLocation:
         listed = printable(", ".join(dict.fromkeys(picture.layer for picture in pictures)))
         raise NoPictureError(
             f"{path}: has no layer with the finished picture. These layers are AOVs by their "
-            f"names: {listed}. To read one as the picture, use --layer {printable(first)}"
+            f"names: {listed}",
+            f"To read one as the picture, use --layer {printable(first)}",
         )
     best = min(candidates, key=lambda picture: picture.rank)
     equal = {each.layer.lower(): each.layer for each in candidates if each.rank == best.rank}
     if len(equal) > 1:
         listed = printable(", ".join(name or "the one without a name" for name in equal.values()))
         raise ImageError(
-            f"{path}: {len(equal)} layers may be the picture: {listed}. Name one with --layer, "
-            f"such as --layer {printable(next(filter(None, equal.values())))}"
+            f"{path}: {len(equal)} layers may be the picture: {listed}",
+            f"Name one, such as --layer {printable(next(filter(None, equal.values())))}",
         )
     return best
 

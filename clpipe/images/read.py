@@ -203,6 +203,14 @@ def read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
     Raises:
         ImageError: the file cannot be read, or holds another kind.
     """
+    try:
+        return _read_source(path, kind, options)
+    except ImageError as error:
+        raise error.with_way from None
+
+
+def _read_source(path: Path, kind: Kind, options: ReadOptions) -> SourceImage:
+    """See :func:`read_source`; errors do not name options."""
     transfer = options.transfer if kind is Kind.RGB else None
     if transfer and (encoded := _read_encoded(path, options.max_pixels)):
         return _as_light(path, encoded, transfer)
@@ -478,8 +486,8 @@ def _read_part(
     if not whole and not types <= {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}:
         raise ImageError(
             f"{path}: this {file.format_name().upper()} file has samples of type {spec.format}, "
-            "but clpipe expects linear light in floats. For a render, add --transfer srgb (or "
-            "linear). For a photograph, use -c unprocess"
+            "but linear light in floats is expected",
+            "For a render, add --transfer srgb (or linear). For a photograph, use -c unprocess",
         )
     width, height = margins.around(spec.full_width, spec.full_height)
     check_size(path, width, height, max_pixels)
