@@ -10,6 +10,7 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image, ImageCms
 
+from clpipe import Dataset
 from clpipe.base.errors import ImageError
 from clpipe.images.colour import SRGB, to_linear_srgb
 from clpipe.images.read import ReadOptions, read_finished, read_image, read_source
@@ -366,3 +367,12 @@ def test_a_warning_is_printed_once_in_a_run(tmp_path):
     assert "3 images have this warning: its pixel aspect ratio" in done.stderr
     sidecars = [json.loads(each.read_text()) for each in (tmp_path / "out").glob("*.json")]
     assert sum("aspect" in str(each["warnings"]) for each in sidecars) == 3
+
+
+def test_a_dataset_warns_once(tmp_path):
+    for name in "abc":
+        write_hdr(tmp_path / f"{name}.hdr", lines=("PIXASPECT=2",))
+    dataset = Dataset(tmp_path, device="numpy", threads=1)
+    with pytest.warns(UserWarning, match="aspect ratio of 0.5") as caught:
+        assert len(list(dataset)) == 3
+    assert sum("aspect ratio" in str(each.message) for each in caught) == 1

@@ -79,6 +79,7 @@ class SampleLoader:
         self._spec = spec
         self._device = device
         self._opened: Developer | None = None
+        self._warned: set[str] = set()
 
     def __getstate__(self) -> Mapping[str, Any]:
         return {**self.__dict__, "_opened": None}  # a device stays with its process
@@ -125,7 +126,8 @@ class SampleLoader:
                 f"{job.path}: was kept after another step than the one before "
                 f"{loader.request.start_at}; name the images to go on from by a glob"
             )
-        for warning in loaded.source.warnings:
+        for warning in set(loaded.source.warnings) - self._warned:  # once, not for each image
+            self._warned.add(warning)
             warnings.warn(f"{job.path}: {warning}", stacklevel=2)
         return loaded, carried
 
