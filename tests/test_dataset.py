@@ -162,9 +162,11 @@ def test_a_damaged_image_is_skipped_where_that_is_asked_for(renders):
     with pytest.raises(ImageError, match=r"in/r2.exr"):
         list(api.Dataset(renders, iso=ISO))
     Path("in/r2.exr").write_bytes(b"no image")
-    with pytest.raises(RequestError, match=r"in/r2.exr: damaged, .*; remove it, or say on_error="):
+    with pytest.raises(
+        RequestError, match=r"in/r2.exr: cannot be read .*\. Remove such files, or set on_error="
+    ):
         api.Dataset(renders, iso=ISO)
-    with pytest.warns(UserWarning, match="in/r2.exr: damaged, .*; left out"):
+    with pytest.warns(UserWarning, match="skipped: in/r2.exr: cannot be read"):
         assert len(api.Dataset(renders, iso=ISO, on_error="skip")) == 4
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from clpipe.base.errors import RequestError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.memory import parse_size
 from clpipe.chain.isos import draw_note
 from clpipe.inputs.find import Job, find_jobs
@@ -66,9 +66,18 @@ def jobs_of(
     damaged = [job for job, is_whole in zip(jobs, opens, strict=True) if not is_whole]
     if not damaged:
         return jobs
-    others = f" and {len(damaged) - 1} others" if len(damaged) > 1 else ""
-    text = f"{damaged[0].path}{others}: damaged, or no image that can be read"
+    others = f" (and {len(damaged) - 1} other files)" if len(damaged) > 1 else ""
+    text = f"{_reason(loader, damaged[0])}{others}"
     if not skips or len(damaged) == len(jobs):
-        raise RequestError(f"{text}; remove it, or say on_error='skip'")
-    warnings.warn(f"{text}; left out", stacklevel=4)
+        raise RequestError(f"{text}. Remove such files, or set on_error='skip'")
+    warnings.warn(f"skipped: {text}", stacklevel=4)
     return [job for job, is_whole in zip(jobs, opens, strict=True) if is_whole]
+
+
+def _reason(loader: ImageLoader, job: Job) -> str:
+    """Why the header of a job's file cannot be read."""
+    try:
+        loader.for_job(job).read(job)
+    except ImageError as error:
+        return str(error)
+    return f"{job.path}: its header cannot be read"
