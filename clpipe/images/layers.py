@@ -159,15 +159,16 @@ def _chosen(path: Path, pictures: Sequence[PictureLocation]) -> PictureLocation:
         raise NoPictureError(
             f"{path}: has no layer with the finished picture. These layers are AOVs by their "
             f"names: {listed}",
-            f"To read one as the picture, use --layer {printable(first)}",
+            f"To read one as the picture, add --layer {printable(first)} (in Python, layer=)",
         )
     best = min(candidates, key=lambda picture: picture.rank)
     equal = {each.layer.lower(): each.layer for each in candidates if each.rank == best.rank}
     if len(equal) > 1:
         listed = printable(", ".join(name or "the one without a name" for name in equal.values()))
+        first = next(filter(None, equal.values()))
         raise ImageError(
             f"{path}: {len(equal)} layers may be the picture: {listed}",
-            f"Name one, such as --layer {printable(next(filter(None, equal.values())))}",
+            f"Name one with --layer (in Python, layer=), such as {printable(first)}",
         )
     return best
 
