@@ -208,12 +208,19 @@ def test_whole_numbers_of_any_size(tmp_path, type_, largest):
         assert np.ptp(found * largest) > 1
 
 
-def test_tiff_with_zero_as_white(tmp_path):
-    Image.fromarray(CODES[..., 0]).save(tmp_path / "a.tif", tiffinfo={262: 0})
-    with Image.open(tmp_path / "a.tif") as file:
-        assert file.tag_v2[262] == 0
-        shown = np.asarray(file.convert("L"), np.float32)
-    assert read(tmp_path / "a.tif", "linear").pixels[..., 0] == pytest.approx(shown / 255, abs=1e-5)
+@pytest.mark.parametrize("bits", [1, 8, 16, 32])
+def test_tiff_with_zero_as_white(tmp_path, bits):
+    path = tmp_path / "a.tif"
+    stored = LIGHT[..., 0] if bits > 1 else (X > 3).astype(np.float32)
+    if bits == 1:
+        Image.fromarray(X > 3).save(path)
+    else:
+        write_tiff(path, stored[..., None], getattr(oiio, f"UINT{bits}"), "Y")
+    data = path.read_bytes()
+    tag = struct.pack("<HHI", 262, 3, 1)  # PhotometricInterpretation
+    assert tag + b"\1" in data
+    path.write_bytes(data.replace(tag + b"\1", tag + b"\0"))
+    assert read(path, "linear").pixels[..., 0] == pytest.approx(1 - stored, abs=0.003)
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lzma"])

@@ -262,6 +262,7 @@ def _read_encoded(path: Path, max_pixels: int) -> _Encoded | None:
         wanted = (*channels, *([spec.alpha_channel] if has_alpha else []))
         samples = read_samples(path, file, 0, wanted, oiio.FLOAT)  # scales whole numbers to 0..1
         rgb = samples[..., : len(channels)]
+        rgb = 1 - rgb if stated.is_inverted else rgb
         attributes, shot = photograph_attributes(spec)
         return _Encoded(
             np.repeat(rgb, 3, axis=-1) if len(channels) == 1 else np.ascontiguousarray(rgb),

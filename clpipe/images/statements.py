@@ -28,6 +28,7 @@ class Statements:
         alpha: the number of the alpha channel by which colours are yet to be multiplied; -1: none.
         is_associated: whether colours were already multiplied by an alpha channel.
         curve: how light is encoded, see :class:`clpipe.images.png.PngColours`; "": not stated.
+        is_inverted: whether 0 is white, which OpenImageIO applies to samples of 8 bits only.
         header: of a Radiance picture.
         warnings: statements that are not applied.
     """
@@ -38,6 +39,7 @@ class Statements:
     alpha: int = -1
     is_associated: bool = False
     curve: str = ""
+    is_inverted: bool = False
     header: radiance.RadianceHeader | None = None
     warnings: tuple[str, ...] = ()
 
@@ -83,8 +85,8 @@ def statements(path: Path, file: Any, xyz: bool = False) -> Statements:
         warnings.append(f"its whiteLuminance of {nits:g} cd/m2 is not used; 1.0 is white")
     if profile := _profile(spec):
         warnings.append(f"its ICC profile, {printable(profile)}, is not applied; read as sRGB")
-    is_float = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
-    if is_float and spec.getattribute("tiff:PhotometricInterpretation") == 0:
+    is_inverted = spec.getattribute("tiff:PhotometricInterpretation") == 0
+    if is_inverted and spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
         warnings.append("it states that 0 is white (MinIsWhite), which is not applied to floats")
     part = file.current_subimage()
     if format_ == "tiff":
@@ -115,6 +117,7 @@ def statements(path: Path, file: Any, xyz: bool = False) -> Statements:
         alpha if is_straight else -1,
         not is_straight and 0 <= alpha < spec.nchannels,
         curve,
+        is_inverted and spec.format.basetype != oiio.UINT8,
         header,
         tuple(warnings),
     )
