@@ -256,8 +256,8 @@ def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
     runner = Runner(make_chain(settings_from({})), fresh)
     runner.compile()
     made = []
-    make = fresh._flow.pool._make
-    monkeypatch.setattr(fresh._flow.pool, "_make", lambda size: made.append(size) or make(size))
+    make = fresh.flow.pool._make
+    monkeypatch.setattr(fresh.flow.pool, "_make", lambda size: made.append(size) or make(size))
     images = [
         np.full((h, w, 3), 0.4, np.float16) for h, w in ((60, 50), (20, 90), (7, 8), (60, 50))
     ]
@@ -267,7 +267,7 @@ def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
     ]
     most = max(made)
     assert (
-        len(made) == len(fresh._flow.pool.buffers) + 1
+        len(made) == len(fresh.flow.pool.buffers) + 1
     )  # a line table, for the width of the second one
     # What is held for others goes when it would take more than is allowed.
     fresh.memory = fresh.bytes_held
@@ -277,7 +277,7 @@ def test_buffers_are_used_again_for_images_of_other_sizes(device, monkeypatch):
     fresh.memory = 8 * most
     runner.run(images[0], "k")
     other.run(images[0], "k")
-    assert len(fresh._flow.pool.buffers) > 4
+    assert len(fresh.flow.pool.buffers) > 4
 
 
 @pytest.mark.parametrize("byte", [0xFF, 0x7F])  # NaN, and numbers near the largest

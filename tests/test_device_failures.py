@@ -13,10 +13,10 @@ from clpipe.batch.work import ImageWorker
 from clpipe.chain.making import make_chain
 from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
-from clpipe.engine import device as devices
 from clpipe.engine import programs
 from clpipe.engine.device import Device
 from clpipe.engine.programs import programs_of
+from clpipe.engine.recovery import FAILURES
 from clpipe.engine.runner import Runner
 from clpipe.inputs.find import find_jobs
 from clpipe.inputs.loader import ImageLoader
@@ -104,7 +104,7 @@ def test_an_image_that_fails_again_fails_alone(device, monkeypatch):
 def test_a_device_that_fails_at_everything_is_given_up(device, monkeypatch):
     runner = runner_on(device)
     Fault(monkeypatch, range(1000))
-    for _ in range(devices.FAILURES - 1):
+    for _ in range(FAILURES - 1):
         with pytest.raises(DeviceFailedError):
             runner.run(IMAGE, "k")
     with pytest.raises(DeviceError, match="failed at 3 images in a row and is given up"):

@@ -19,7 +19,6 @@ from clpipe.engine.extents import Box
 from clpipe.engine.flow import Flow
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Runner
-from clpipe.engine.submission import Submission, submit_together
 from clpipe.images.tags import FLIPS, upright
 from clpipe.outputs.patches import Cutting, first_place
 from clpipe.reference.cfa import PATTERNS
@@ -208,12 +207,11 @@ def test_no_buffer_is_replaced_while_an_image_is_on_the_device(device, monkeypat
     """Otherwise a device that works in the host's memory would write to freed memory."""
     fresh = Device(device.info)
     runner = Runner(make_chain(settings_from({"iso": ISO})), fresh)
-    submissions = []
+    images = []
     for side in (16, 70, 120):
         boxes = [Box(i, i, i + side // 2, i + side // 2) for i in range(patches)]
-        image = np.full((side, side, 3), 0.2, np.float16)
-        submissions.append(Submission(runner, image, "k", RunOptions(boxes=boxes)))
-    submit_together(submissions[:1])[0]()  # compiles
+        images.append((np.full((side, side, 3), 0.2, np.float16), "k", RunOptions(boxes=boxes)))
+    runner.run(*images[0])  # compiles
     fresh.limit(fresh.memory)  # release all buffers
     before, replaced = [], []
     make_room, reserve = Flow.make_room, Pool.reserve
@@ -223,14 +221,14 @@ def test_no_buffer_is_replaced_while_an_image_is_on_the_device(device, monkeypat
         return make_room(flow, *arguments)
 
     def recording_reserve(pool, *arguments):
-        generation, tiles = pool.generation, len(fresh._flow._tiles)
+        generation, tiles = pool.generation, len(fresh.flow._tiles)
         reserve(pool, *arguments)
         if pool.generation != generation:
             replaced.append(tiles)
 
     monkeypatch.setattr(Flow, "make_room", recording_make_room)
     monkeypatch.setattr(Pool, "reserve", recording_reserve)
-    waits = [submit_together([each])[0] for each in submissions]
+    waits = [runner.submit(*image) for image in images]
     assert before == [0, 1, 1]  # an image is on the device when the next one needs larger buffers
     assert replaced == [0, 0, 0]
     for wait in waits:

@@ -1,6 +1,6 @@
 """Stacks: what goes through a device in common launches has the bits that it has alone."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl as cl
@@ -12,9 +12,9 @@ from clpipe.engine import stack
 from clpipe.engine.check import check_stack, example
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
-from clpipe.engine.options import RunOptions
+from clpipe.engine.options import DEFAULTS, RunOptions
 from clpipe.engine.runner import Result, Runner, cut_out
-from clpipe.engine.submission import Submission, submit_together
+from clpipe.engine.submission import submit_together
 from clpipe.stage import Kind
 
 # Of each kind of launch: lines, stencils, sums, a histogram, a resampling, a mosaic with a period.
@@ -52,6 +52,22 @@ def launches(monkeypatch):
     return seen
 
 
+@dataclass(frozen=True)
+class Asked:
+    """An image that is to go through a runner."""
+
+    runner: Runner
+    image: np.ndarray
+    noise_key: str
+    options: RunOptions = DEFAULTS
+
+
+def submit(asked):
+    """Submit images together, and return what waits for the result of each."""
+    works = [each.runner.work(each.image, each.noise_key, each.options) for each in asked]
+    return submit_together(works)
+
+
 def submissions(device, stages, sizes=SIZES):
     """An image of each size, each with an ISO, gains and curves of its own, in halves."""
     first, all_ = None, []
@@ -60,7 +76,7 @@ def submissions(device, stages, sizes=SIZES):
         chain = make_chain(settings_from({**own, **stages}))
         first = first.for_chain(chain) if first else Runner(chain, device, ("normalize",), True)
         image = example(Kind.RGB, size, half=True, seed=number)
-        all_.append(Submission(first, image, f"key {number}"))
+        all_.append(Asked(first, image, f"key {number}"))
     return all_
 
 
@@ -69,7 +85,7 @@ def test_members_have_the_bits_that_they_have_alone(on, launches, name):
     asked = submissions(on, CHAINS[name])
     alone = [each.runner.run(each.image, each.noise_key) for each in asked]
     launches.clear()
-    for wait, expected in zip(submit_together(asked), alone, strict=True):
+    for wait, expected in zip(submit(asked), alone, strict=True):
         equal(wait(), expected)
     assert {size[2:] for size in launches} == {(3,)}
     assert len(launches) < 20
@@ -81,7 +97,7 @@ def test_patches_of_one_image_and_of_others_go_together(on, launches):
     boxes = [Box(0, 0, 16, 20), Box(7, 3, 23, 23), Box(16, 1, 32, 21)]
     cut = [replace(each, options=RunOptions(boxes=boxes)) for each in asked]
     launches.clear()
-    for wait, whole in zip(submit_together(cut), wholes, strict=True):
+    for wait, whole in zip(submit(cut), wholes, strict=True):
         found = wait()
         np.testing.assert_equal(found.encoded, cut_out(whole.encoded, boxes))
         np.testing.assert_equal(found.kept["normalize"], cut_out(whole.kept["normalize"], boxes))
@@ -101,7 +117,7 @@ def test_lines_of_pixels(on, sizes):
     for runner in runners:
         runner.keep = ()
     alone = [each.runner.run(each.image, each.noise_key) for each in asked]
-    for wait, expected in zip(submit_together(asked), alone, strict=True):
+    for wait, expected in zip(submit(asked), alone, strict=True):
         equal(wait(), expected)
 
 
@@ -113,7 +129,7 @@ def test_more_than_one_stack_where_memory_is_short(on, launches, monkeypatch):
     def depths():
         """Submit the images and return how many of them each launch covers."""
         launches.clear()
-        for wait, expected in zip(submit_together(asked), alone, strict=True):
+        for wait, expected in zip(submit(asked), alone, strict=True):
             equal(wait(), expected)
         return {size[2:] for size in launches}
 
@@ -134,7 +150,7 @@ def test_what_takes_other_kernels_goes_by_itself(on, launches):
     other = replace(asked[0], runner=Runner(chain, on))
     alone = [each.runner.run(each.image, each.noise_key) for each in (*asked, other)]
     launches.clear()
-    waits = submit_together([asked[0], other, *asked[1:]])
+    waits = submit([asked[0], other, *asked[1:]])
     found = [wait() for wait in waits]
     for result, expected in zip([found[0], *found[2:], found[1]], alone, strict=True):
         equal(result, expected)
@@ -145,7 +161,7 @@ def test_what_takes_other_kernels_goes_by_itself(on, launches):
 def test_a_stack_that_fails_is_done_image_by_image(on, monkeypatch, error):
     asked = submissions(on, CHAINS["default"])
     alone = [each.runner.run(each.image, each.noise_key) for each in asked]
-    before = submit_together(asked)
+    before = submit(asked)
     launch = cl.enqueue_nd_range_kernel
 
     def launched(queue, kernel, size, *rest, **options):
@@ -154,5 +170,5 @@ def test_a_stack_that_fails_is_done_image_by_image(on, monkeypatch, error):
         return launch(queue, kernel, size, *rest, **options)
 
     monkeypatch.setattr(cl, "enqueue_nd_range_kernel", launched)
-    for wait, expected in zip([*before, *submit_together(asked)], alone * 2, strict=True):
+    for wait, expected in zip([*before, *submit(asked)], alone * 2, strict=True):
         equal(wait(), expected)

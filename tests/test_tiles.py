@@ -326,7 +326,7 @@ def test_buffers_that_cannot_be_made(device, monkeypatch):
     runner = Runner(make_chain(settings_from({"iso": 3200, **GRAY_WORLD})), device)
     image = example(Kind.RGB, (150, 203), half=True)
     whole = runner.run(image, "k")
-    pool = device._flow.pool
+    pool = device.flow.pool
     make, sizes = pool._make, []
 
     def scarce(size):

@@ -140,10 +140,10 @@ def gpu_runner(runner: Runner) -> Runner:
 
 def test_transfers_of_an_image_run_beside_the_kernels_of_its_neighbours(gpu_runner, monkeypatch):
     expected = [gpu_runner.run(image, "k").encoded for image in IMAGES]
-    device, gate = gpu_runner.device, cl.UserEvent(gpu_runner.device._flow.context)
+    device, gate = gpu_runner.device, cl.UserEvent(gpu_runner.device.flow.context)
     seen = queued(device, monkeypatch)
     # Kernels are held back: the first one's, and so all that follow.
-    cl._enqueue_marker_with_wait_list(device._flow.queue, [gate])
+    cl._enqueue_marker_with_wait_list(device.flow.queue, [gate])
     timings: list[list[Timing]] = [[], []]
     begun = [gpu_runner.submit(IMAGES[i], "k", RunOptions(timings[i])) for i in range(2)]
     wanted = ["enqueue_copy", "enqueue_nd_range_kernel", "enqueue_copy"] * 2

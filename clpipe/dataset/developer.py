@@ -19,7 +19,7 @@ from clpipe.dataset.arrays import HIGHEST, ArrayFormat
 from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result, Runner
-from clpipe.engine.submission import Submission, submit_together
+from clpipe.engine.submission import submit_together
 from clpipe.images.read import SourceImage
 from clpipe.outputs.patches import Patch, Patches, facts_of, pattern_of, variance_at, variance_steps
 from clpipe.stage import Kind
@@ -160,7 +160,7 @@ class Developer:
             prepared = [self._prepared_for(order) for order in orders]
             begun = submit_together(
                 [
-                    Submission(runner, order.source.pixels, order.noise_key, order.options)
+                    runner.work(order.source.pixels, order.noise_key, order.options)
                     for order, own in zip(orders, prepared, strict=True)
                     for runner in own.runners.values()
                 ]

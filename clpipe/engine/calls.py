@@ -18,9 +18,8 @@ from clpipe.engine.bindings import (
     Value,
 )
 from clpipe.engine.buffers import Pool
-from clpipe.engine.codegen import Kernel
 from clpipe.engine.extents import Extent, Extents
-from clpipe.engine.ir import Border, Finalize, Histogram, Launch, Lines, Reduce
+from clpipe.engine.ir import Border, Finalize, Histogram, Kernel, Launch, Lines, Reduce
 from clpipe.engine.work_items import PARTIALS, columns_of, local_size, round_up, summed_together
 
 ENDS = ("src", "dst")  # buffers that are an image's own

@@ -13,7 +13,7 @@ from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
-from clpipe.engine.submission import Submission, submit_together
+from clpipe.engine.submission import submit_together
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.stage import PERIOD, Kind, Method, Stage, variant_label, variants
 
@@ -235,13 +235,14 @@ def check_stack(device: Device, sizes: Sequence[tuple[int, int]] = SIZES) -> Che
     """The default chain over images of several sizes and ISOs in common launches, which must give
     the bits that each has alone.
     """
-    total, asked = Difference(), []
+    total, works, alone = Difference(), [], []
     for seed, size in enumerate(sizes):
         chain = make_chain(Settings(iso=ISO + 100 * seed, parameters=NOISE))
         image = example(chain.source, size, half=True, seed=seed)
-        asked.append(Submission(Runner(chain, device, final=True), image, "check"))
-    alone = [each.runner.run(each.image, each.noise_key).final for each in asked]
-    for wait, expected in zip(submit_together(asked), alone, strict=True):
+        runner = Runner(chain, device, final=True)
+        alone.append(runner.run(image, "check").final)
+        works.append(runner.work(image, "check"))
+    for wait, expected in zip(submit_together(works), alone, strict=True):
         total += difference(wait().final, expected)
     return Check("exposure..gamma", "common launches", len(sizes), total, 0.0)
 

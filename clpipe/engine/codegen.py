@@ -11,24 +11,23 @@ its text. So two plans that share a launch share its program, however else they 
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-from clpipe.engine.bindings import Parameter, step_buffer
+from clpipe.engine.bindings import step_buffer
 from clpipe.engine.ir import (
     AnyLaunch,
     Border,
     Finalize,
     Histogram,
+    Kernel,
     Launch,
     Lines,
     Plan,
     Read,
     Reduce,
 )
-from clpipe.engine.kernel_builder import KernelBuilder
+from clpipe.engine.kernel_builder import KernelBuilder, opening
 from clpipe.engine.ops import Op
 from clpipe.engine.sources import LIBRARY, files_text
-from clpipe.engine.stack_kernels import opening
 from clpipe.engine.work_items import PARTIALS, RUN, columns_of, local_size, summed_together
 from clpipe.reference.filter_array import MIRRORED
 from clpipe.stage import Kind, LineTable, TableLookup
@@ -37,20 +36,6 @@ from clpipe.stage import Kind, LineTable, TableLookup
 # Philox call and the phase of a Bayer pattern are too.
 EXTENT = "{width, height, pitch, left * LANES, top * 4, columns, rows, border}"
 UNNAMED = "kernel_without_a_name_yet"
-
-
-@dataclass(frozen=True)
-class Kernel:
-    """A launch as OpenCL: the kernel's name, its whole source and its parameters in order.
-
-    ``files`` are the kernel files that the source includes.
-    """
-
-    name: str
-    source: str
-    parameters: tuple[Parameter, ...]
-    launch: AnyLaunch | Border
-    files: tuple[str, ...]
 
 
 def call(op: Op, arguments: Sequence[str]) -> str:
@@ -63,7 +48,7 @@ def write_kernel(
 ) -> Kernel:
     """The OpenCL source of one launch of a plan, for a device with that many lanes.
 
-    One that is ``stacked`` is over several images, see :mod:`clpipe.engine.stack_kernels`.
+    One that is ``stacked`` is over several images, see :mod:`clpipe.engine.stack`.
     """
     builder = KernelBuilder(plan, lanes, stacked)
     for number in ("width", "height", "pitch", "left", "top", "columns", "rows", "border"):

@@ -5,11 +5,8 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import partial
-from typing import Any
 
-import numpy as np
-
-from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
+from clpipe.base.errors import DeviceError
 from clpipe.base.types import Array
 from clpipe.engine.bindings import Bind
 from clpipe.engine.buffers import HostImages, room_for
@@ -24,33 +21,16 @@ from clpipe.engine.discovery import (
 from clpipe.engine.flow import DeviceImage, Flow
 from clpipe.engine.ir import Plan
 from clpipe.engine.members import ImageTask, Member
-from clpipe.engine.options import RunOptions, Timing
+from clpipe.engine.options import RunOptions
 from clpipe.engine.patches import with_patches
 from clpipe.engine.plan_kernels import calls_with, stack_kernels_with
 from clpipe.engine.programs import announced, forget_programs, programs_of
+from clpipe.engine.recovery import Recovery
 from clpipe.engine.stack import Stack, cut, members_of
 from clpipe.engine.stack import start as start_stack
 from clpipe.engine.tiles import Tiling, tiling_of
 
 log = logging.getLogger(__name__)
-FAILURES = 3  # images in a row that a device fails at, before it is given up
-
-
-def timed(events: Sequence[tuple[str, Any]]) -> list[Timing]:
-    """The timings of events. The queue has just been finished, so the last one ends now."""
-    if not events:
-        return []
-    offset = time.perf_counter() - events[-1][1].profile.end * 1e-9
-    transfers = ("upload", "download")
-    return [
-        Timing(
-            name,
-            (event.profile.end - event.profile.start) * 1e-9,
-            event.profile.start * 1e-9 + offset,
-            name in transfers,
-        )
-        for name, event in events
-    ]
 
 
 class Device:
@@ -73,8 +53,7 @@ class Device:
         self.info = chosen
         self.memory = memory or usable_memory(chosen)
         self._cl = cl
-        self._failures = 0  # images in a row
-        self._generation = 0  # counts up when what is on the way is lost
+        self._recovery = Recovery(self)
         self._open()
 
     def _open(self) -> None:
@@ -87,7 +66,7 @@ class Device:
         self._calls = calls_with(self._programs, self.info.lanes)
         self._stack_kernels = stack_kernels_with(self._programs, self.info.lanes)
         try:
-            self._flow = Flow(
+            self.flow = Flow(
                 self._programs.context, self.info.alignment if self.info.in_place else None
             )
         except self._cl.Error as error:
@@ -96,17 +75,17 @@ class Device:
     @property
     def bytes_held(self) -> int:
         """Device memory of the buffers that are kept from image to image."""
-        return self._flow.pool.bytes
+        return self.flow.pool.bytes
 
     def limit(self, memory: int) -> None:
         """Let its buffers take no more than these bytes; nothing may be on the way."""
         self.memory = memory
-        self._abandon()
+        self._recovery.abandon()
 
     @property
     def depth(self) -> int:
         """The number of images that it can work on at a time."""
-        return self._flow.depth
+        return self.flow.depth
 
     def is_compiled(self, plan: Plan) -> bool:
         """Whether the kernels of a plan are compiled."""
@@ -133,21 +112,16 @@ class Device:
             options: what comes back, and how.
 
         Returns:
-            What waits for the results and gives them, called once and in the order of images. If
-            the device runs out of memory before the limit is reached, buffers of earlier images are
-            given back, then tiles become smaller. If a kernel fails, the image is tried once more;
-            if its context is of no more use then, everything is made anew before. It raises
-            ImageError where memory is not enough for tiles of any size, DeviceFailedError where the
-            device fails again, and DeviceError where it has failed at :data:`FAILURES` images in a
-            row.
+            What waits for the results and gives them, called once and in the order of images; see
+            :meth:`clpipe.engine.recovery.Recovery.result`.
 
         Raises:
             ImageError: the image does not fit into the device's memory, not even in tiles.
             DeviceError: a kernel does not compile.
         """
         task = self._task(plan, source, bind, options)
-        enqueued = self._enqueue(task, self.memory)
-        return partial(self._result, task, enqueued, self._generation)
+        enqueued = self.enqueue(task, self.memory)
+        return partial(self._recovery.result, task, enqueued, self._recovery.generation)
 
     def _task(self, plan: Plan, source: Array, bind: Bind, options: RunOptions) -> ImageTask:
         height, width = source.shape[:2]
@@ -172,14 +146,15 @@ class Device:
         if sum(max(len(options.boxes), 1) for *_, options in images) < 2:
             return None
         tasks = [self._task(*image) for image in images]
-        members = [members_of(task, self._tiling(task, self.memory)) for task in tasks]
+        members = [members_of(task, self.tiling(task, self.memory)) for task in tasks]
         placed = [each for own in members for each in own or ()]
         in_place, largest = self.info.in_place, self.info.max_buffer
         stacks = cut(placed, in_place, self.memory, largest, self.depth) if all(members) else None
         if not stacks:
             return None
         begun = self._begin(stacks)
-        return [partial(self._result_of_stacks, t, begun, self._generation) for t in tasks]
+        wait, generation = self._recovery.result_of_stacks, self._recovery.generation
+        return [partial(wait, task, begun, generation) for task in tasks]
 
     def _begin(
         self, stacks: Sequence[tuple[Sequence[Member], dict[str, int]]]
@@ -194,7 +169,7 @@ class Device:
             borders = partial(self._stack_kernels.borders, plan)
             for members, strides in stacks:
                 begun.append(Stack(members, kernels, borders, strides))
-                start_stack(self._flow, begun[-1], self.memory)
+                start_stack(self.flow, begun[-1], self.memory)
             if is_new:
                 self.drain()  # PoCL is done with a kernel when it has been launched
                 self.keep_programs()
@@ -202,117 +177,7 @@ class Device:
         except (self._cl.Error, MemoryError) as error:
             return error
 
-    def _result_of_stacks(
-        self, task: ImageTask, begun: list[Stack] | Exception, generation: int
-    ) -> HostImages:
-        """The results of an image that was enqueued with others; see :meth:`submit_together`."""
-        if generation == self._generation:
-            try:
-                if isinstance(begun, Exception):
-                    raise begun
-                for stack in begun:
-                    self._flow.finish(stack)
-                self._failures = 0
-                return task.output
-            except (self._cl.Error, MemoryError):
-                self._abandon()
-                if not self._works():
-                    self._renew()
-        return self._result(task, ImageError("it was lost"), generation)
-
-    def drain(self) -> None:
-        """Wait for what was enqueued, so that it uses no memory of the host any more."""
-        self._flow.drain()
-
-    def _tiling(self, task: ImageTask, memory: int) -> Tiling:
-        height, width = task.source.shape[:2]
-        largest = min(memory, self.info.max_buffer)
-        lanes = self.info.lanes
-        tiling = tiling_of(task.plan, width, height, lanes, memory, largest, self.depth)
-        if not task.options.boxes:
-            return tiling
-        return with_patches(task.plan, task.options.boxes, tiling, lanes, memory, self.depth)
-
-    def _enqueue(self, task: ImageTask, memory: int) -> DeviceImage | Exception:
-        """Enqueue an image; what the device raises is returned."""
-        try:
-            borders = partial(self._calls.borders, task.plan)
-            tiling = self._tiling(task, memory)
-            image = DeviceImage(task, self._calls.of(task.plan), borders, tiling)
-            self._flow.start(image, self.memory)
-            return image
-        except (self._cl.Error, MemoryError) as error:
-            return error
-
-    def _result(
-        self,
-        task: ImageTask,
-        enqueued: DeviceImage | Exception,
-        generation: int,
-    ) -> HostImages:
-        """The results of an image that was enqueued in a generation; see :meth:`submit`."""
-        cl, memory = self._cl, self.memory
-        full: Exception | None = None  # the device's error when its memory ran out
-        failed = False
-        while True:
-            if generation != self._generation:  # what was enqueued is lost
-                try:
-                    enqueued, generation = self._enqueue(task, memory), self._generation
-                except ImageError:
-                    if full is None:
-                        raise
-                    height, width = task.source.shape[:2]
-                    raise ImageError(
-                        f"{width}x{height} pixels: {self.info.label} is out of memory, in tiles of "
-                        f"any size; others may be using it ({full})"
-                    ) from None
-            try:
-                if isinstance(enqueued, Exception):
-                    raise enqueued
-                self._flow.finish(enqueued)
-            except (cl.Error, MemoryError) as error:
-                self._abandon()
-                if not self._works():
-                    self._renew()
-                elif isinstance(error, cl.MemoryError | MemoryError):
-                    memory = memory if full is None else self._tiling(task, memory).bytes // 2
-                    full = error
-                    continue
-                if not failed:
-                    failed = True
-                    continue
-                self._count_failure(error)
-                raise DeviceFailedError(f"{self.info.label} failed: {error}") from None
-            self._failures = 0
-            if task.options.timings is not None:
-                task.options.timings.extend(timed(enqueued.events))
-            return task.output if task.options.download else HostImages({}, None, {})
-
-    def _abandon(self) -> None:
-        """After a failure: wait for all that is on the way, and give all memory back.
-
-        What other images were on the way must be started again.
-        """
-        self._generation += 1
-        self._flow.abandon()
-
-    def _works(self) -> bool:
-        """Whether the context still does what it is told, after an error.
-
-        Codes do not say: NVIDIA reports a kernel that reads astray as CL_OUT_OF_RESOURCES, which is
-        also a lack of memory. But after it everything in that context fails.
-        """
-        cl, sent, back = self._cl, np.arange(4, dtype=np.uint8), np.zeros(4, np.uint8)
-        try:
-            queue = self._flow.new_queue()
-            flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
-            cl.enqueue_copy(queue, back, cl.Buffer(self._flow.context, flags, hostbuf=sent))
-            queue.finish()
-        except cl.Error:
-            return False
-        return np.array_equal(sent, back)
-
-    def _renew(self) -> None:
+    def reopen(self) -> None:
         """Leave a context that is of no more use, with all that is in it, for a new one.
 
         Raises:
@@ -322,27 +187,39 @@ class Device:
         forget_programs(self.info, self._programs)
         self._open()
 
-    def _count_failure(self, error: Exception) -> None:
-        """Count an image that the device failed at, though it was tried again.
+    def drain(self) -> None:
+        """Wait for what was enqueued, so that it uses no memory of the host any more."""
+        self.flow.drain()
 
-        Raises:
-            DeviceError: there were too many in a row.
-        """
-        self._failures += 1
-        if self._failures >= FAILURES:
-            raise DeviceError(
-                f"{self.info.label} failed at {self._failures} images in a row and is given up: "
-                f"{error}"
-            ) from None
+    def tiling(self, task: ImageTask, memory: int) -> Tiling:
+        """Return the tiles of an image within so many bytes."""
+        height, width = task.source.shape[:2]
+        largest = min(memory, self.info.max_buffer)
+        lanes = self.info.lanes
+        tiling = tiling_of(task.plan, width, height, lanes, memory, largest, self.depth)
+        if not task.options.boxes:
+            return tiling
+        return with_patches(task.plan, task.options.boxes, tiling, lanes, memory, self.depth)
+
+    def enqueue(self, task: ImageTask, memory: int) -> DeviceImage | Exception:
+        """Enqueue an image; what the device raises is returned."""
+        try:
+            borders = partial(self._calls.borders, task.plan)
+            tiling = self.tiling(task, memory)
+            image = DeviceImage(task, self._calls.of(task.plan), borders, tiling)
+            self.flow.start(image, self.memory)
+            return image
+        except (self._cl.Error, MemoryError) as error:
+            return error
 
     def copy_speed(self, size: int = 96 * 2**20) -> float:
         """Bytes a second, read plus written, of the device's own buffer copy; the best of five."""
         cl = self._cl
-        one, two = (self._flow.new_buffer(size) for _ in range(2))
+        one, two = (self.flow.new_buffer(size) for _ in range(2))
         best = 0.0
         for _ in range(6):
             start = time.perf_counter()
-            cl.enqueue_copy(self._flow.queue, two, one, byte_count=size).wait()
+            cl.enqueue_copy(self.flow.queue, two, one, byte_count=size).wait()
             best = max(best, 2 * size / (time.perf_counter() - start))
         one.release()
         two.release()

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,13 @@ import numpy as np
 from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.types import Array
-from clpipe.engine.buffers import Pool, aligned_empty
+from clpipe.engine.bindings import slot_buffer, step_buffer
+from clpipe.engine.buffers import Pool, aligned_empty, copy_encoded, copy_plane
 from clpipe.engine.calls import Call, index_space
 from clpipe.engine.extents import Extents
 from clpipe.engine.ir import Launch
 from clpipe.engine.launch_cache import LaunchCache
-from clpipe.engine.members import ImageTask, Member, fetch_results
+from clpipe.engine.members import ImageTask, Member
 from clpipe.engine.tiles import Phase, Tiling, source_bytes
 from clpipe.engine.transfers import InPlace, Staged
 
@@ -187,6 +189,60 @@ class Flow:
             self._reads.append(event)
         return array
 
+    def fetch_results(
+        self,
+        sent: DeviceTile,
+        members: Sequence[Member],
+        strides: Mapping[str, int],
+        ends: Mapping[str, Any],
+        after: list[Any],
+        estimates: bool = True,
+    ) -> None:
+        """Fetch the results of members of one plan, when launches are done.
+
+        Args:
+            sent: gets the copies that are to be made when it lands.
+            members: the members.
+            strides: bytes from a member to the next in each buffer; one has none.
+            ends: the buffers that are no pool's, "dst" of them.
+            after: the events of the launches.
+            estimates: whether what was estimated from the image is fetched, too.
+        """
+        plan, output = members[0].task.plan, members[0].task.output
+        buffers = {**self.pool.buffers, **ends}
+
+        def parts(name: str, sizes: Sequence[int]) -> list[Array]:
+            stride = strides.get(name, 0)
+            size = stride * (len(members) - 1) + sizes[-1]
+            whole = self.fetch(sent, name, buffers[name], size, after)
+            return [whole[n * stride : n * stride + own] for n, own in enumerate(sizes)]
+
+        last = [member.extents[-1] for member in members]
+        if plan.encoded and not last[0].core.is_empty:
+            samples = len(plan.encoded.channels)
+            sizes = [each.stored.width * each.stored.height * samples for each in last]
+            for member, extent, pixels in zip(members, last, parts("dst", sizes), strict=True):
+                encoded = member.task.output.encoded
+                assert encoded is not None
+                room = member.room(encoded, extent)
+                sent.copies.append(partial(copy_encoded, extent, pixels, room))
+        for number in output.images:
+            own = [member.extents[plan.level_of(number)] for member in members]
+            if own[0].core.is_empty:
+                continue
+            sizes = [extent.plane_bytes for extent in own]
+            for channel, slot in enumerate(plan.slots[number]):
+                found = parts(slot_buffer(slot), sizes)
+                for member, extent, plane in zip(members, own, found, strict=True):
+                    room = member.room(member.task.output.images[number], extent)
+                    copy = partial(copy_plane, extent, plane.view(np.float32), room, channel)
+                    sent.copies.append(copy)
+        for step, values in output.estimates.items() if estimates else ():
+            found = parts(step_buffer("estimates", step), [values.nbytes] * len(members))
+            for member, part in zip(members, found, strict=True):
+                to = member.task.output.estimates[step]
+                sent.copies.append(partial(np.copyto, to, part.view(to.dtype)))
+
     def push(self, tile: DeviceTile) -> None:
         """Have a tile that was enqueued go its way."""
         tile.image.tiles_left += 1
@@ -240,7 +296,7 @@ class Flow:
         sent_tile = DeviceTile(image, [*wait, *last], [])
         if fetches:
             is_last = tile == len(image.tiling.patches or image.tiling.tiles) - 1
-            fetch_results(self, sent_tile, [own], {}, ends, last, is_last)
+            self.fetch_results(sent_tile, [own], {}, ends, last, is_last)
         self.push(sent_tile)
 
     @CpuTimer("upload")

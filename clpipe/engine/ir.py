@@ -6,6 +6,7 @@ Images of one size are a level. The source is on level 0; each resampling leads 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
+from clpipe.engine.bindings import Parameter
 from clpipe.engine.ops import Op
 from clpipe.reference.resample import Resampler, sizes
 from clpipe.stage import Kind, Pointwise, Resample, Stencil
@@ -175,6 +176,15 @@ class Plan:
         """The width and height of images on each level, from those of the source."""
         return sizes(self.resamplings, width, height)
 
+    def check_resamplings(self, width: int, height: int) -> None:
+        """Check that an image of that size can be resampled.
+
+        Raises:
+            ImageError: it cannot, for example because a lens would fold it over.
+        """
+        for resampling, size in zip(self.resamplings, self.sizes(width, height), strict=False):
+            resampling.values(*size)
+
     def level_of(self, number: int) -> int:
         """The level of an image that is a result, by its number."""
         results = [image for _, image in self.kept] + ([self.final] if self.final else [])
@@ -188,3 +198,17 @@ class Plan:
             frozenset(image.level for image in images if slot in self.slots[image.number])
             for slot in range(self.slot_count)
         )
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A launch as OpenCL: the kernel's name, its whole source and its parameters in order.
+
+    ``files`` are the kernel files that the source includes.
+    """
+
+    name: str
+    source: str
+    parameters: tuple[Parameter, ...]
+    launch: AnyLaunch | Border
+    files: tuple[str, ...]

@@ -1,6 +1,6 @@
 """The parameters of a kernel, collected while its text is written, under canonical names."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from clpipe.engine.bindings import (
     ArgumentValue,
@@ -23,6 +23,11 @@ LARGER = (
     "{from_width, from_height, from_pitch, from_left * LANES, from_top * 4, from_columns, "
     "from_rows, border}"
 )
+
+# The kernel over a stack of images reads a table of numbers with a row for each image, which holds
+# the plain kernel's parameters. The third dimension of the index space counts the images.
+TABLE = "numbers"
+AS_TYPE = {"uint": "{}", "int": "as_int({})", "float": "as_float({})"}
 
 
 class KernelBuilder:
@@ -150,3 +155,28 @@ def estimates_of(plan: Plan, step: str) -> tuple[str, ...]:
         if isinstance(launch, Finalize) and launch.op.step == step:
             return launch.op.reduction.estimates
     return ()
+
+
+def element_of(parameter: Parameter) -> str | None:
+    """The OpenCL type of what a parameter points to; None where it is a number."""
+    type_, star, _ = parameter.declaration.partition("*")
+    return type_.split()[-1] if star else None
+
+
+def opening(parameters: Mapping[str, Parameter]) -> tuple[list[str], list[str]]:
+    """The parameters that a stack's kernel has instead of the plain one's, and its first lines.
+
+    Args:
+        parameters: the plain kernel's, by their names in the text.
+    """
+    declared = [f"__global const uint *restrict {TABLE}"]
+    lines = [f"{TABLE} += get_global_id(2) * {len(parameters)};"]
+    for place, (name, parameter) in enumerate(parameters.items()):
+        number = f"{TABLE}[{place}]"
+        if element_of(parameter):
+            declared.append(parameter.declaration)
+            lines.append(f"{name} += get_global_id(2) * {number};")
+        else:
+            type_ = parameter.declaration.split()[0]
+            lines.append(f"const {type_} {name} = {AS_TYPE[type_].format(number)};")
+    return declared, lines

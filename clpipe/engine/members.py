@@ -3,22 +3,17 @@
 A tile or a patch that goes by itself is the one member of its pass; a stack has several.
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from clpipe.base.types import Array
-from clpipe.engine.bindings import Bind, slot_buffer, step_buffer
-from clpipe.engine.buffers import HostImages, copy_encoded, copy_plane, core_of
+from clpipe.engine.bindings import Bind
+from clpipe.engine.buffers import HostImages, core_of
 from clpipe.engine.extents import Extent, Extents
 from clpipe.engine.ir import Plan
 from clpipe.engine.options import RunOptions
-
-if TYPE_CHECKING:
-    from clpipe.engine.flow import DeviceTile, Flow
 
 
 @dataclass(frozen=True)
@@ -69,59 +64,3 @@ class Member:
     def room(self, result: Array, extent: Extent) -> Array:
         """Where what it makes belongs in its image's result."""
         return core_of(extent, result) if self.patch is None else result[self.patch]
-
-
-def fetch_results(
-    flow: "Flow",
-    sent: "DeviceTile",
-    members: Sequence[Member],
-    strides: Mapping[str, int],
-    ends: Mapping[str, Any],
-    after: list[Any],
-    estimates: bool = True,
-) -> None:
-    """Fetch the results of members of one plan, when launches are done.
-
-    Args:
-        flow: whose buffers hold them.
-        sent: gets the copies that are to be made when it lands.
-        members: the members.
-        strides: bytes from a member to the next in each buffer; one has none.
-        ends: the buffers that are no pool's, "dst" of them.
-        after: the events of the launches.
-        estimates: whether what was estimated from the image is fetched, too.
-    """
-    plan, output = members[0].task.plan, members[0].task.output
-    buffers = {**flow.pool.buffers, **ends}
-
-    def parts(name: str, sizes: Sequence[int]) -> list[Array]:
-        stride = strides.get(name, 0)
-        size = stride * (len(members) - 1) + sizes[-1]
-        whole = flow.fetch(sent, name, buffers[name], size, after)
-        return [whole[n * stride : n * stride + own] for n, own in enumerate(sizes)]
-
-    last = [member.extents[-1] for member in members]
-    if plan.encoded and not last[0].core.is_empty:
-        samples = len(plan.encoded.channels)
-        sizes = [each.stored.width * each.stored.height * samples for each in last]
-        for member, extent, pixels in zip(members, last, parts("dst", sizes), strict=True):
-            encoded = member.task.output.encoded
-            assert encoded is not None
-            room = member.room(encoded, extent)
-            sent.copies.append(partial(copy_encoded, extent, pixels, room))
-    for number in output.images:
-        own = [member.extents[plan.level_of(number)] for member in members]
-        if own[0].core.is_empty:
-            continue
-        sizes = [extent.plane_bytes for extent in own]
-        for channel, slot in enumerate(plan.slots[number]):
-            found = parts(slot_buffer(slot), sizes)
-            for member, extent, plane in zip(members, own, found, strict=True):
-                room = member.room(member.task.output.images[number], extent)
-                copy = partial(copy_plane, extent, plane.view(np.float32), room, channel)
-                sent.copies.append(copy)
-    for step, values in output.estimates.items() if estimates else ():
-        found = parts(step_buffer("estimates", step), [values.nbytes] * len(members))
-        for member, part in zip(members, found, strict=True):
-            to = member.task.output.estimates[step]
-            sent.copies.append(partial(np.copyto, to, part.view(to.dtype)))

@@ -43,3 +43,6 @@ class RunOptions:
     unchanged: bool = False
     boxes: Sequence[Box] = ()
     later: Sequence[Array] = ()
+
+
+DEFAULTS = RunOptions()

@@ -18,8 +18,8 @@ from clpipe.base.errors import DeviceError, RequestError
 from clpipe.base.system import kept_signals
 from clpipe.engine.builders import BinaryBuilder, PoclBuilder
 from clpipe.engine.cache_folder import cache_folder, later_runs, pocl_folder
-from clpipe.engine.codegen import Kernel
 from clpipe.engine.discovery import DeviceInfo
+from clpipe.engine.ir import Kernel
 from clpipe.engine.runtimes import is_pocl
 from clpipe.engine.store import Store
 

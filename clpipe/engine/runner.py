@@ -1,7 +1,7 @@
 """One image through a chain, on a device or in NumPy."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -26,10 +26,10 @@ from clpipe.engine.device import Device
 from clpipe.engine.extents import Box
 from clpipe.engine.ir import Finalize, Plan
 from clpipe.engine.ops import chain_ops
-from clpipe.engine.options import RunOptions
+from clpipe.engine.options import DEFAULTS, RunOptions
 from clpipe.engine.plan import make_plan
 from clpipe.engine.programs import announced
-from clpipe.engine.submission import DEFAULTS, Submission, check_resamplings, submit_together
+from clpipe.engine.submission import Work, submit_together
 from clpipe.reference.curve import compose, to_8_bit
 from clpipe.reference.random import Stream
 from clpipe.stage import NoiseScope, ReferenceContext, Resample
@@ -181,11 +181,11 @@ class Runner:
             shape = (height, width, 3)[: 2 if len(self.chain.source.channels) == 1 else 3]
             tiny = np.zeros(shape, np.float16 if plan.half else np.float32)
             try:
-                check_resamplings(plan, width, height)
+                plan.check_resamplings(width, height)
             except ImageError:
                 return  # which larger images need not be refused for
             with announced(self.device.info):
-                self._submit_plan(plan, tiny, "", RunOptions())()
+                self.device.submit(plan, tiny, self.bind(plan, tiny, ""), RunOptions())()
             self.device.keep_programs()
 
     def run(self, image: Array, noise_key: str, options: RunOptions = DEFAULTS) -> Result:
@@ -212,9 +212,47 @@ class Runner:
             DeviceFailedError: the device fails.
             DeviceError: a kernel does not compile, or the device is given up.
         """
-        return submit_together([Submission(self, image, noise_key, options)])[0]
+        return submit_together([self.work(image, noise_key, options)])[0]
 
-    def merging(self, image: Array, noise_key: str, later: Sequence[Array]) -> "Runner":
+    def work(
+        self, image: Array, noise_key: str, options: RunOptions = DEFAULTS
+    ) -> Work[Result] | Callable[[], Result]:
+        """One image for :func:`clpipe.engine.submission.submit_together`.
+
+        All its exposures but the first are done at once. Arguments and errors as :meth:`submit`.
+
+        Returns:
+            The work, or a callable that returns the result where no device is needed.
+        """
+        self.check(image, options)
+        runner = self._merging(image, noise_key, options.later)
+        return runner._work(
+            image, noise_key, replace(options, later=()) if options.later else options
+        )
+
+    def _work(
+        self, image: Array, noise_key: str, options: RunOptions
+    ) -> Work[Result] | Callable[[], Result]:
+        """See :meth:`work`; of an image whose other exposures are done."""
+        if not (self.encode or self.final or self.keep):
+            return lambda: Result(None, None, {}, {})
+        if not self.device:
+            return partial(self._run_numpy, np.asarray(image, np.float32), noise_key, options.boxes)
+        width, height = image.shape[1::-1]
+        plan = self.plan_for(image)
+        plan.check_resamplings(width, height)
+        estimates = self._estimates.get((width, height), lambda: self._estimates_for(width, height))
+        return Work(
+            self.device,
+            plan,
+            image,
+            self.bind(plan, image, noise_key),
+            options,
+            partial(self._compile_plan, plan),
+            partial(self._result, plan, estimates),
+        )
+
+    def _merging(self, image: Array, noise_key: str, later: Sequence[Array]) -> "Runner":
         """The runner that merges an image's exposures, of which all but the first are done; this
         one where there are no others.
 
@@ -231,28 +269,6 @@ class Runner:
         pairs = zip(self._later, later or [image] * len(self._later), strict=True)
         seen = [runner.run(own, noise_key).image for runner, own in pairs]
         return self.for_chain(self._exposures.merging(seen))
-
-    def without_device(
-        self, image: Array, noise_key: str, options: RunOptions
-    ) -> Callable[[], Result] | None:
-        """What gives the result where there is nothing to do, or NumPy does it; else None."""
-        if not (self.encode or self.final or self.keep):
-            return lambda: Result(None, None, {}, {})
-        if not self.device:
-            return partial(self._run_numpy, np.asarray(image, np.float32), noise_key, options.boxes)
-        return None
-
-    def submit_alone(
-        self, plan: Plan, image: Array, noise_key: str, options: RunOptions
-    ) -> Callable[[], Result]:
-        """Enqueue an image for a plan, by itself; see :meth:`submit`."""
-        try:
-            self._compile_plan(plan)
-        except DeviceFailedError:
-            raise
-        except ImageError:
-            pass  # the tiny image is too large; the one below says it of this image
-        return self._submit_plan(plan, image, noise_key, options)
 
     def check(self, image: Array, options: RunOptions) -> None:
         """See that an image is one that the chain starts on.
@@ -305,22 +321,6 @@ class Runner:
 
         return bind
 
-    def _submit_plan(
-        self, plan: Plan, image: Array, noise_key: str, options: RunOptions
-    ) -> Callable[[], Result]:
-        """Enqueue an image for a plan, by itself."""
-        assert self.device
-        results = self.device.submit(plan, image, self.bind(plan, image, noise_key), options)
-        return self.waiting(plan, image, results)
-
-    def waiting(
-        self, plan: Plan, image: Array, results: Callable[[], HostImages]
-    ) -> Callable[[], Result]:
-        """What waits for the results that a device makes of an image, and gives them."""
-        size = image.shape[1::-1]
-        found = self._estimates.get(size, lambda: self._estimates_for(*size))
-        return lambda: self._result(plan, results(), found)
-
     def _estimates_for(self, width: int, height: int) -> dict[str, dict[str, float]]:
         """Numbers that follow from the size of the steps' images, by step."""
         found = {}
@@ -333,7 +333,7 @@ class Runner:
         return found
 
     @staticmethod
-    def _result(plan: Plan, output: HostImages, from_size: dict[str, dict[str, float]]) -> Result:
+    def _result(plan: Plan, from_size: dict[str, dict[str, float]], output: HostImages) -> Result:
         """The results that the device made of an image, by steps."""
         names = {
             x.op.step: x.op.reduction.estimates for x in plan.launches if isinstance(x, Finalize)

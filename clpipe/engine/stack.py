@@ -2,20 +2,24 @@
 
 A launch costs a few microseconds on the host and leaves a GPU empty where the image is small. The
 members of a stack are launched together, each with its own values, in buffers that hold all of
-them one behind the other; each has the bits that it has alone.
+them one behind the other; each has the bits that it has alone. Their kernels have the bodies of the
+plain ones, and read what differs between members from a table, see :func:`opening`.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from clpipe.base.types import Array
+from clpipe.engine.bindings import Buffer, ExtentNumber, Parameter, TileNumber
 from clpipe.engine.buffers import PAGE
 from clpipe.engine.calls import ENDS, index_space
-from clpipe.engine.codegen import Kernel
 from clpipe.engine.flow import DeviceTile, Flow, OnTheWay
-from clpipe.engine.ir import Launch
-from clpipe.engine.members import ImageTask, Member, fetch_results
-from clpipe.engine.stack_kernels import arguments_of
+from clpipe.engine.ir import Kernel, Launch
+from clpipe.engine.kernel_builder import element_of
+from clpipe.engine.members import ImageTask, Member
 from clpipe.engine.tiles import Tiling, buffer_sizes
 from clpipe.engine.work_items import round_up
 
@@ -23,6 +27,7 @@ from clpipe.engine.work_items import round_up
 # images of 128x128 pixels twice as fast in stacks as alone and 256x256 a third faster, but loses a
 # tenth with 512x512, which leave its cache between two launches.
 STACK_BYTES = {True: 2**24, False: 2**29}
+BYTES = {"uchar": 1, "half": 2, "float": 4, "uint": 4, "int4": 16, "long4": 32}
 FEWEST = 4  # members, or images are so large that launches are few
 
 
@@ -119,7 +124,7 @@ def start(flow: Flow, stack: Stack, memory: int) -> None:
     wait = [*events, *flow.after_reads()]
     last = launch(flow, stack, ends, list(wait))
     sent = DeviceTile(stack, [*wait, *last], [])
-    fetch_results(flow, sent, members, strides, ends, last)
+    flow.fetch_results(sent, members, strides, ends, last)
     flow.push(sent)
 
 
@@ -158,3 +163,63 @@ def launch(flow: Flow, stack: Stack, ends: dict[str, Any], wait: list[Any]) -> l
                 stack.events.append((step.name, event))
                 last = [event]
     return last
+
+
+def arguments_of(
+    parameters: Sequence[Parameter],
+    level: int,
+    buffers: Mapping[str, Any],
+    strides: Mapping[str, int],
+    members: Sequence[Member],
+    table: Callable[[Array], Any],
+    new_table: Callable[[Array], Any],
+) -> list[Any]:
+    """The arguments of a stack's kernel, in order.
+
+    Args:
+        parameters: the plain kernel's, in order.
+        level: of its launch.
+        buffers: by name.
+        strides: bytes from a member to the next in each buffer.
+        members: of the stack.
+        table: gives a buffer that holds an array, which is used again for the same object.
+        new_table: gives a new one.
+    """
+    numbers = np.zeros((len(members), len(parameters)), np.uint32)
+    pointers = []
+    for place, parameter in enumerate(parameters):
+        match parameter.bound:
+            case Buffer(name):
+                pointers.append(buffers[name])
+                element = element_of(parameter)
+                assert element
+                numbers[:, place] = strides[name] // BYTES[element]
+            case ExtentNumber(name, larger):
+                of = max(level - 1, 0) if larger else level
+                numbers[:, place] = [member.extents[of].numbers[name] for member in members]
+            case TileNumber():
+                pass  # of each the first
+            case value:
+                found = [member.task.bind(value) for member in members]
+                if isinstance(found[0], np.ndarray):
+                    array, numbers[:, place] = side_by_side(found)
+                    pointers.append((table if array is found[0] else new_table)(array))
+                else:
+                    numbers[:, place] = np.array(found, found[0].dtype).view(np.uint32)
+    return [new_table(numbers), *pointers]
+
+
+def side_by_side(arrays: Sequence[Array]) -> tuple[Array, int]:
+    """Arrays one behind the other, and the elements from each to the next: 0 if all are one object.
+
+    >>> side_by_side([np.array([1, 2, 3]), np.array([4])])[0].tolist()
+    [1, 2, 3, 4, 0, 0]
+    """
+    first = arrays[0]
+    if all(array is first for array in arrays):
+        return first, 0
+    longest = max(array.size for array in arrays)
+    both = np.zeros((len(arrays), longest), first.dtype)
+    for row, array in zip(both, arrays, strict=True):
+        row[: array.size] = array.reshape(-1)
+    return both.reshape(-1), longest

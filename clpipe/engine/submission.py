@@ -1,86 +1,90 @@
-"""Images that are to go through runners: together, where they are small and their chains alike."""
+"""Images that are to go through devices: together, where they are small and their chains alike."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
+from clpipe.base.errors import DeviceFailedError, ImageError
 from clpipe.base.types import Array
+from clpipe.engine.bindings import Bind
+from clpipe.engine.buffers import HostImages
+from clpipe.engine.device import Device
 from clpipe.engine.ir import Plan
 from clpipe.engine.options import RunOptions
 
-if TYPE_CHECKING:
-    from clpipe.engine.runner import Result, Runner
-
-DEFAULTS = RunOptions()
-
-
-def check_resamplings(plan: Plan, width: int, height: int) -> None:
-    """See that an image of that size can be resampled as a plan does.
-
-    Raises:
-        ImageError: it cannot, as a lens would fold it over.
-    """
-    for resampling, size in zip(plan.resamplings, plan.sizes(width, height), strict=False):
-        resampling.values(*size)
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
-class Submission:
-    """An image that is to be put through a runner; see :meth:`Runner.submit`."""
+class Work(Generic[R]):
+    """An image that is to go through a device.
 
-    runner: "Runner"
+    Args:
+        device: the device.
+        plan: what is done.
+        image: (height, width[, channel]).
+        bind: returns the values of kernel parameters.
+        options: what comes back, and how.
+        compile: compiles the plan's kernels, if they are not compiled yet.
+        finish: makes a result of what comes back.
+    """
+
+    device: Device
+    plan: Plan
     image: Array
-    noise_key: str
-    options: RunOptions = DEFAULTS
+    bind: Bind
+    options: RunOptions
+    compile: Callable[[], None]
+    finish: Callable[[HostImages], R]
 
-    def merging(self) -> "Submission":
-        """The same with all exposures but the first done, where the chain has several."""
-        runner = self.runner.merging(self.image, self.noise_key, self.options.later)
-        if runner is self.runner:
-            return self
-        return replace(self, runner=runner, options=replace(self.options, later=()))
+    @property
+    def order(self) -> tuple[Plan, Array, Bind, RunOptions]:
+        """What the device takes."""
+        return self.plan, self.image, self.bind, self.options
+
+    def waiting(self, results: Callable[[], HostImages]) -> Callable[[], R]:
+        """Return a callable that waits for the results of the device and returns the result."""
+        return lambda: self.finish(results())
 
 
-def submit_together(submissions: Sequence[Submission]) -> list[Callable[[], "Result"]]:
+def submit_together(works: Sequence[Work[R] | Callable[[], R]]) -> list[Callable[[], R]]:
     """Enqueue images, and small ones of alike chains in common launches.
 
+    Args:
+        works: the images. A callable in place of one needs no device: it returns the result.
+
     Returns:
-        What waits for the result of each and gives it, called once and in order.
+        A callable for each, which waits for its result and returns it; called once and in order.
 
     Raises:
-        ImageError, DeviceFailedError, DeviceError: as :meth:`Runner.submit`.
+        ImageError, DeviceFailedError, DeviceError: as :meth:`Device.submit`.
     """
-    waiting: dict[int, Callable[[], Result]] = {}
-    groups: dict[tuple[int, Plan], list[tuple[int, Submission, Plan]]] = {}
-    for number, asked in enumerate(submissions):
-        asked.runner.check(asked.image, asked.options)
-        each = asked.merging()
-        if alone := each.runner.without_device(each.image, each.noise_key, each.options):
-            waiting[number] = alone
+    waiting: dict[int, Callable[[], R]] = {}
+    groups: dict[tuple[int, Plan], list[tuple[int, Work[R]]]] = {}
+    for number, each in enumerate(works):
+        if isinstance(each, Work):
+            groups.setdefault((id(each.device), each.plan.unscaled), []).append((number, each))
         else:
-            plan = each.runner.plan_for(each.image)
-            check_resamplings(plan, *each.image.shape[1::-1])
-            key = id(each.runner.device), plan.unscaled
-            groups.setdefault(key, []).append((number, each, plan))
+            waiting[number] = each
     for group in groups.values():
-        waiting |= zip((number for number, *_ in group), _begin(group), strict=True)
-    return [waiting[number] for number in range(len(submissions))]
+        begun = _begin([each for _, each in group])
+        waiting |= zip((number for number, _ in group), begun, strict=True)
+    return [waiting[number] for number in range(len(works))]
 
 
-def _begin(group: Sequence[tuple[int, Submission, Plan]]) -> list[Callable[[], "Result"]]:
+def _begin(works: Sequence[Work[R]]) -> list[Callable[[], R]]:
     """Enqueue images of one device, whose plans have the same kernels."""
-    device = group[0][1].runner.device
-    assert device
-    images = [
-        (plan, each.image, each.runner.bind(plan, each.image, each.noise_key), each.options)
-        for _, each, plan in group
-    ]
-    if results := device.submit_together(images):
-        return [
-            each.runner.waiting(plan, each.image, result)
-            for (_, each, plan), result in zip(group, results, strict=True)
-        ]
-    return [
-        each.runner.submit_alone(plan, each.image, each.noise_key, each.options)
-        for _, each, plan in group
-    ]
+    if results := works[0].device.submit_together([each.order for each in works]):
+        return [each.waiting(result) for each, result in zip(works, results, strict=True)]
+    return [_begin_alone(each) for each in works]
+
+
+def _begin_alone(work: Work[R]) -> Callable[[], R]:
+    """Enqueue an image by itself."""
+    try:
+        work.compile()
+    except DeviceFailedError:
+        raise
+    except ImageError:
+        pass  # the tiny image is too large; the device says it of this image
+    return work.waiting(work.device.submit(*work.order))

@@ -57,6 +57,8 @@ class PictureLocation:
     @property
     def is_aov(self) -> bool:
         """Whether its name is that of an AOV."""
+        if not self.name:
+            return False
         *above, last = self.name.split(".")
         return is_aov(last) or (last.lower() in CONTAINED and any(map(is_aov, above)))
 
@@ -161,6 +163,8 @@ def _chosen(path: Path, pictures: Sequence[PictureLocation]) -> PictureLocation:
             f"names: {listed}",
             f"To read one as the picture, add --layer {printable(first)} (in Python, layer=)",
         )
+    if len(candidates) == 1:
+        return candidates[0]
     best = min(candidates, key=lambda picture: picture.rank)
     equal = {each.layer.lower(): each.layer for each in candidates if each.rank == best.rank}
     if len(equal) > 1:
@@ -266,5 +270,6 @@ def picture_channels(names: Sequence[str]) -> tuple[str, tuple[int, ...]] | None
         PictureLocation(0, name, channels, xyz, 0, name)
         for name, channels, xyz in _layers(names, kept=True)
     ]
-    best = min(pictures, key=lambda picture: (picture.is_aov, picture.rank), default=None)
-    return (best.layer, best.channels) if best else None
+    if len(pictures) > 1:
+        pictures.sort(key=lambda picture: (picture.is_aov, picture.rank))
+    return (pictures[0].layer, pictures[0].channels) if pictures else None

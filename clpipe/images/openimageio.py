@@ -5,6 +5,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ BEGINNINGS = (
     b"BM",  # BMP
     b"RIFF",  # WebP
 )
+TEXTS = (radiance.MAGIC, *pfm.MAGICS)
 TARGA = ".tga"
 READ = "OpenEXR, Radiance HDR, PFM, TIFF, PNG, JPEG, BMP, Targa and WebP"
 
@@ -93,7 +95,8 @@ def open_image(path: Path) -> Iterator[Any]:
         hints = oiio.ImageSpec()
         hints.attribute("pnm:pfmflip", 1)  # else OpenImageIO 3.2 reads PFM upside down
         hints.attribute("oiio:UnassociatedAlpha", 1)  # or encoded values are multiplied by it
-        with _readable(path, beginning, size) as readable:
+        has_text = beginning.startswith(TEXTS)  # in its header, which OpenImageIO may misread
+        with _readable(path, beginning, size) if has_text else nullcontext(path) as readable:
             file = oiio.ImageInput.open(str(readable), hints)
             if file is None:
                 reason = error_text(oiio.geterror())
@@ -126,7 +129,7 @@ def _readable(path: Path, beginning: bytes, size: int) -> Iterator[Path]:
     if beginning.startswith(radiance.MAGIC):
         known = radiance_header(path)
         header = None if known.is_usual else known
-    elif beginning.startswith(pfm.MAGICS):
+    else:
         with path.open("rb") as file:
             header = pfm.pfm_header(file.read(radiance.HEADER_BYTES), size)
     if header is None:

@@ -39,8 +39,8 @@ from clpipe.chain.registry import all_stages
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
 from clpipe.engine.check import ISO, NOISE, chain_for
-from clpipe.engine.codegen import Kernel, write_kernel
-from clpipe.engine.ir import Launch
+from clpipe.engine.codegen import write_kernel
+from clpipe.engine.ir import Kernel, Launch
 from clpipe.engine.plan import make_plan
 from clpipe.engine.work_items import columns_of
 from clpipe.reference.cfa import PATTERNS

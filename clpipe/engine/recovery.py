@@ -1,0 +1,194 @@
+"""What happens when a device fails: images are tried again, in a new context if need be."""
+
+import time
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
+from clpipe.engine.buffers import HostImages
+from clpipe.engine.discovery import DeviceInfo
+from clpipe.engine.flow import DeviceImage, Flow
+from clpipe.engine.members import ImageTask
+from clpipe.engine.options import Timing
+from clpipe.engine.stack import Stack
+from clpipe.engine.tiles import Tiling
+
+FAILURES = 3  # images in a row that a device fails at, before it is given up
+
+
+class Recoverable(Protocol):
+    """A device, as recovery sees it."""
+
+    info: DeviceInfo
+    memory: int
+    flow: Flow
+
+    def enqueue(self, task: ImageTask, memory: int) -> DeviceImage | Exception:
+        """Enqueue an image within so many bytes; what the device raises is returned."""
+        ...
+
+    def tiling(self, task: ImageTask, memory: int) -> Tiling:
+        """Return the tiles of an image within so many bytes."""
+        ...
+
+    def reopen(self) -> None:
+        """Open the device in a new context.
+
+        Raises:
+            DeviceError: it cannot be opened.
+        """
+        ...
+
+
+class Recovery:
+    """Waits for images on a device, and tries again what fails.
+
+    Args:
+        device: the device.
+
+    Attributes:
+        generation: counts up when everything on the device is lost.
+    """
+
+    def __init__(self, device: Recoverable) -> None:
+        import pyopencl as cl
+
+        self.generation = 0
+        self._cl = cl
+        self._device = device
+        self._failures = 0  # images in a row
+
+    def result(
+        self, task: ImageTask, enqueued: DeviceImage | Exception, generation: int
+    ) -> HostImages:
+        """Wait for the results of an image that was enqueued in a generation.
+
+        If the device runs out of memory before the limit is reached, the buffers of earlier images
+        are released, then tiles become smaller. If a kernel fails, the image is tried once more, in
+        a new context if the old one is of no more use.
+
+        Raises:
+            ImageError: memory is not enough for tiles of any size.
+            DeviceFailedError: the device failed twice.
+            DeviceError: the device has failed at :data:`FAILURES` images in a row.
+        """
+        cl, device = self._cl, self._device
+        memory = device.memory
+        full: Exception | None = None  # the device's error when its memory ran out
+        failed = False
+        while True:
+            if generation != self.generation:  # what was enqueued is lost
+                try:
+                    enqueued, generation = device.enqueue(task, memory), self.generation
+                except ImageError:
+                    if full is None:
+                        raise
+                    height, width = task.source.shape[:2]
+                    raise ImageError(
+                        f"{width}x{height} pixels: {device.info.label} is out of memory, in tiles "
+                        f"of any size; others may be using it ({full})"
+                    ) from None
+            try:
+                if isinstance(enqueued, Exception):
+                    raise enqueued
+                device.flow.finish(enqueued)
+            except (cl.Error, MemoryError) as error:
+                if self._context_survives() and isinstance(error, cl.MemoryError | MemoryError):
+                    memory = memory if full is None else device.tiling(task, memory).bytes // 2
+                    full = error
+                    continue
+                if not failed:
+                    failed = True
+                    continue
+                self._count_failure(error)
+                raise DeviceFailedError(f"{device.info.label} failed: {error}") from None
+            self._failures = 0
+            if task.options.timings is not None:
+                task.options.timings.extend(timed(enqueued.events))
+            return task.output if task.options.download else HostImages({}, None, {})
+
+    def result_of_stacks(
+        self, task: ImageTask, begun: Sequence[Stack] | Exception, generation: int
+    ) -> HostImages:
+        """Wait for the results of an image in stacks; if one fails, the image goes by itself.
+
+        Raises:
+            ImageError, DeviceFailedError, DeviceError: as :meth:`result`.
+        """
+        if generation == self.generation:
+            try:
+                if isinstance(begun, Exception):
+                    raise begun
+                for stack in begun:
+                    self._device.flow.finish(stack)
+                self._failures = 0
+                return task.output
+            except (self._cl.Error, MemoryError):
+                self._context_survives()
+        return self.result(task, ImageError("it was lost"), generation)
+
+    def abandon(self) -> None:
+        """Wait for everything on the device and release all memory; images must start again."""
+        self.generation += 1
+        self._device.flow.abandon()
+
+    def _context_survives(self) -> bool:
+        """Abandon everything after an error; open the device again if its context is of no use.
+
+        Raises:
+            DeviceError: the device cannot be opened again.
+        """
+        self.abandon()
+        if self._works():
+            return True
+        self._device.reopen()
+        return False
+
+    def _works(self) -> bool:
+        """Whether the context still does what it is told, after an error.
+
+        Codes do not say: NVIDIA reports a kernel that reads astray as CL_OUT_OF_RESOURCES, which is
+        also a lack of memory. But after it everything in that context fails.
+        """
+        cl, sent, back = self._cl, np.arange(4, dtype=np.uint8), np.zeros(4, np.uint8)
+        flow = self._device.flow
+        try:
+            queue = flow.new_queue()
+            flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
+            cl.enqueue_copy(queue, back, cl.Buffer(flow.context, flags, hostbuf=sent))
+            queue.finish()
+        except cl.Error:
+            return False
+        return np.array_equal(sent, back)
+
+    def _count_failure(self, error: Exception) -> None:
+        """Count an image that the device failed at, though it was tried again.
+
+        Raises:
+            DeviceError: there were too many in a row.
+        """
+        self._failures += 1
+        if self._failures >= FAILURES:
+            raise DeviceError(
+                f"{self._device.info.label} failed at {self._failures} images in a row and is "
+                f"given up: {error}"
+            ) from None
+
+
+def timed(events: Sequence[tuple[str, Any]]) -> list[Timing]:
+    """The timings of events. The queue has just been finished, so the last one ends now."""
+    if not events:
+        return []
+    offset = time.perf_counter() - events[-1][1].profile.end * 1e-9
+    transfers = ("upload", "download")
+    return [
+        Timing(
+            name,
+            (event.profile.end - event.profile.start) * 1e-9,
+            event.profile.start * 1e-9 + offset,
+            name in transfers,
+        )
+        for name, event in events
+    ]
