@@ -277,7 +277,7 @@ def test_what_is_said_without_lensfunpy(clpipe, monkeypatch):
     by_name._loaded.cache_clear()
     monkeypatch.setitem(sys.modules, "lensfunpy", None)
     said = clpipe("plan", "--lens", "any", status=2).stderr
-    assert "lensfunpy, which is not here; pip install 'clpipe[lens]'" in said
+    assert "lensfunpy, which is not here; pip install lensfunpy" in said
 
 
 def test_kernels_are_not_refused_for_the_image_that_compiles_them(device):

@@ -11,10 +11,11 @@ from typing import Any
 from xml.etree import ElementTree
 
 from clpipe.base.errors import KeyedError, RequestError
+from clpipe.base.extras import installing
 from clpipe.base.text import one_line
 from clpipe.camera.profile import Camera
 
-INSTALL = "pip install 'clpipe[lens]'"
+INSTALL = installing("lensfunpy")
 FAR = 1000.0  # m, at which lensfun's calibrations for infinity stand
 OTHERS = 2  # words of a lens's name, beside the maker, that may be left out
 RECTILINEAR = "RECTILINEAR"  # lensfun's type of the lenses that are known here

@@ -1,14 +1,21 @@
 """``clpipe cameras``: the built-in cameras, the noise of one, or a profile of a noise model."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import click
 
 from clpipe.base.errors import RequestError
-from clpipe.camera.profile import Camera, built_in_cameras, load_camera
+from clpipe.camera.profile import (
+    Camera,
+    built_in_cameras,
+    built_in_name,
+    cameras_called,
+    load_camera,
+)
 from clpipe.commands.completion import cameras_or_import
-from clpipe.commands.options import Command, json_option, output_option
+from clpipe.commands.options import EXISTING, Command, json_option, output_option
 from clpipe.commands.printing import Rows, short_text, show, show_json
 
 # What a camera has at every ISO, with units.
@@ -44,7 +51,7 @@ UNKNOWN = "unknown"
 
 
 @click.command("import", cls=Command)
-@click.argument("path", metavar="FILE", type=click.Path(path_type=Path))
+@click.argument("path", metavar="FILE", type=EXISTING)
 @click.option(
     "--camera", metavar="NAME", help="Which camera of a noiseprofiles.json, by make and model."
 )
@@ -93,8 +100,8 @@ class CamerasCommand(Command):
 def cameras(name: str | None, iso: float | None, as_json: bool) -> None:
     """List the cameras, show the noise of one, or make one of a noise model (cameras import).
 
-    NAME is that of the list, or a make and model. Noise is shown in three forms, with the source of
-    each figure.
+    NAME is that of the list, or a make and model; a part of it lists all that match. Noise is
+    shown in three forms, with the source of each figure.
 
     \b
     clpipe cameras "Canon 5D Mark III" --iso 3200
@@ -103,12 +110,11 @@ def cameras(name: str | None, iso: float | None, as_json: bool) -> None:
     if name is None:
         if iso is not None:
             raise RequestError("--iso: it needs the name of a camera")
-        records = [camera_record(load_camera(n)) for n in built_in_cameras()]
-        if as_json:
-            show_json(records)
-            return
-        every = map(load_camera, built_in_cameras())
-        show(("camera", "make and model", "also called", "ISO"), map(camera_row, every))
+        show_cameras(map(load_camera, built_in_cameras()), as_json)
+        return
+    called = [] if built_in_name(name) else cameras_called(name)
+    if iso is None and len(called) > 1:
+        show_cameras(map(load_camera, called), as_json)
         return
     camera = load_camera(name)
     if as_json:
@@ -120,6 +126,14 @@ def cameras(name: str | None, iso: float | None, as_json: bool) -> None:
         click.echo("")
     for key, source in camera.sources.items():
         click.echo(f"{key}: {source}")
+
+
+def show_cameras(cameras: Iterable[Camera], as_json: bool) -> None:
+    """Print a list of cameras, as a table or as JSON."""
+    if as_json:
+        show_json(list(map(camera_record, cameras)))
+    else:
+        show(("camera", "make and model", "also called", "ISO"), map(camera_row, cameras))
 
 
 def make_and_model(camera: Camera) -> str:

@@ -8,14 +8,12 @@ from clpipe.analysis.comparison import Comparison
 from clpipe.analysis.comparison import compare as compare_pictures
 from clpipe.analysis.crops import FOUND, HEIGHT, WIDTH
 from clpipe.base.extras import require
-from clpipe.commands.options import Command, output_option
+from clpipe.commands.options import EXISTING, Command, output_option
 from clpipe.commands.printing import number, show
-
-FILE = click.Path(path_type=Path)
 
 
 @click.command("compare", cls=Command)
-@click.argument("pictures", nargs=-1, required=True, type=FILE, metavar="PICTURE...")
+@click.argument("pictures", nargs=-1, required=True, type=EXISTING, metavar="PICTURE...")
 @output_option(
     "FIGURE", "The figure to write, as .png, .pdf or .svg; may be repeated.", multiple=True
 )
@@ -38,7 +36,7 @@ FILE = click.Path(path_type=Path)
     "--truth",
     "truths",
     multiple=True,
-    type=FILE,
+    type=EXISTING,
     metavar="FILE",
     help="The same without noise: one for all PICTUREs, or one for each in the same order.",
 )
@@ -78,7 +76,7 @@ def compare(
     clpipe run render.exr -o shots --iso 100,3200
     clpipe compare shots/iso100/render.jpg shots/iso3200/render.jpg -o figure.pdf
     """
-    require("clpipe compare", "calibrate", "matplotlib", "scipy")
+    require("clpipe compare", "matplotlib", "scipy")
     from clpipe.analysis.comparison_plot import check_name, draw
 
     for output in outputs:

@@ -21,6 +21,7 @@ from clpipe.chain.request import Request
 from clpipe.commands.chain_options import carry_option, format_option, series_options
 from clpipe.commands.input_options import poses_option
 from clpipe.commands.options import (
+    EXISTING,
     GroupedCommand,
     device_option,
     options_set,
@@ -46,7 +47,7 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
 
 
 @click.command("dataset", cls=GroupedCommand)
-@click.argument("source", type=click.Path(path_type=Path), metavar="SCENE.blend|FOLDER")
+@click.argument("source", type=EXISTING, metavar="SCENE.blend|FOLDER")
 @output_option("DS", "The folder of the dataset; it is made where it is missing.")
 @click.option(
     "--views",

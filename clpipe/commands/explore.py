@@ -44,7 +44,7 @@ def explore(
     clpipe explore render.exr
     clpipe explore renders/ --iso 3200 -c paper
     """
-    require("clpipe explore", "explore", "starlette", "uvicorn", "matplotlib")
+    require("clpipe explore", "starlette", "uvicorn", "matplotlib")
     from clpipe.explorer.explorer import Explorer
     from clpipe.explorer.server import Server
 

@@ -11,6 +11,7 @@ from clpipe.batch.session import Images, Run
 from clpipe.batch.where import Where
 from clpipe.commands.input_options import max_pixels_option
 from clpipe.commands.options import (
+    EXISTING,
     Command,
     device_option,
     memory_option,
@@ -22,8 +23,8 @@ from clpipe.commands.progress import follow
 
 
 @click.command("replay", cls=Command)
-@click.argument("sidecar", type=click.Path(path_type=Path), metavar="SIDECAR")
-@click.argument("image", required=False, type=click.Path(path_type=Path), metavar="[INPUT]")
+@click.argument("sidecar", type=EXISTING, metavar="SIDECAR")
+@click.argument("image", required=False, type=EXISTING, metavar="[INPUT]")
 @out_option
 @stage_file_option
 @device_option

@@ -213,7 +213,7 @@ def read_annotations(path: Path, per_tar: int | None, shard: Shard) -> Annotatio
     Raises:
         RequestError: they cannot be read, or the run has not all of its pictures in its folder.
     """
-    require("--annotations", "annotations", "pycocotools", "shapely")
+    require("--annotations", "pycocotools", "shapely")
     if per_tar or shard.of > 1:
         raise RequestError(
             "--annotations: they are written of all pictures of a folder; leave --webdataset and "

@@ -54,7 +54,7 @@ def jobs_of(
     owners: dict[str, Job] = {}
     for job in jobs:
         if job.listed and not job.path.exists():  # those of a folder were found there
-            raise RequestError(f"{job.label}: no such file or folder")
+            raise RequestError(f"{job.label}: there is no such file or folder")
         other = owners.setdefault(job.key, job)
         if other is not job:
             raise RequestError(

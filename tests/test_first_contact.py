@@ -1,0 +1,121 @@
+"""First commands with a mistake: each is answered with what is wrong and with what was meant."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+RUN = ("run", "render.exr", "-o", "out")
+IS_MISSING = "there is no such file or folder"
+
+
+@pytest.fixture
+def folder(write_exr):
+    """A render, a folder of renders and a folder of PNGs."""
+    for name in ("render.exr", "renders/a.exr"):
+        write_exr(name, np.full((8, 8, 3), 0.2))
+    Path("pngs").mkdir()
+    for name in "abc":
+        Path(f"pngs/{name}.png").touch()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("rnu",), "No such command 'rnu'. Did you mean 'clpipe run'?"),
+        (("denoise", "--help"), "It is a stage; to see what it does, use 'clpipe stages denoise'."),
+        (("help", "rnu"), "Did you mean 'clpipe run'?"),
+        (("import", "a.dng"), "Did you mean 'clpipe cameras import'?"),
+        (("sony-a7r2",), "use 'clpipe cameras sony-a7r2'"),
+        (("render.exr",), "use 'clpipe run render.exr -o OUT'"),
+        (("version",), "Did you mean 'clpipe --version'?"),
+        (("quux",), "The commands are run, replay, "),
+        (("--iso", "800", "run"), "Options follow the command"),
+        (("stages", "noise"), "did you mean 'sensor_noise', 'row_noise', 'column_noise' or 'pict"),
+        ((*RUN, "--skip", "noize"), "did you mean 'noise'?); allowed: noise, "),
+        ((*RUN, "--set", "luma_strength=2"), "did you mean 'denoise.luma_strength=2'?"),
+        ((*RUN, "--set", "luma_strenght=2"), "did you mean 'denoise.luma_strength=2'?"),
+        ((*RUN, "--set", "iso=800"), "use --iso 800"),
+        ((*RUN, "--set", "noise_key=a"), "use --noise-key a"),
+        ((*RUN, "--set", "denoise=mean"), "did you mean 'denoise.method=mean'?"),
+        ((*RUN, "--set", "exposure.ev 1"), "'clpipe stages' lists the stages"),
+        (("cameras", "canon", "--iso", "800"), "most similar: canon-5d2, canon-5d3, canon-5d4, "),
+        ((*RUN, "--iso", "99999"), "use 25600; no built-in camera goes further"),
+        ((*RUN, "--camera", "canon-6d", "--iso", "9e3"), "use 6400, or a camera that has it: fuji"),
+        ((*RUN, "--iso", "60"), "use 100, or a camera that has it: sony-a7s2"),
+        ((*RUN, "--iso", "9"), "use 100; the built-in camera that goes furthest is sony-a7s2, to"),
+        (
+            (*RUN, "--iso", "100", "200", "400"),
+            "200: {}. To give --iso several values, use --iso 1",
+        ),
+        ((*RUN, "--skip", "gamma", "noise"), "several values, use --skip gamma --skip noise"),
+        (("run", "rendr.exr", "-o", "out"), "rendr.exr: {}; did you mean render.exr?"),
+        (("run", "rendrs/a.exr", "-o", "out"), "rendrs/a.exr: {}; did you mean renders/a.exr?"),
+        (("run", "pngs", "-o", "out"), "the folder has 3 .png. Finished pictures are not linear"),
+        (("explore", "pngs"), "For renders, add --transfer srgb; for photographs, use -c unproc"),
+    ],
+)
+def test_what_was_meant_is_said(clpipe, folder, words, message):
+    said = clpipe(*words, status=2).stderr
+    assert message.format(IS_MISSING) in said
+    assert not Path("out").exists()
+
+
+def test_another_camera_is_not_built_in(clpipe, folder):
+    said = clpipe(*RUN, "--camera", "sony a7iii", status=2).stderr
+    assert "it is not built in" in said and "did you mean" not in said
+    assert "'clpipe cameras import' or 'clpipe calibrate'" in said
+
+
+def test_help_is_a_command(clpipe):
+    assert clpipe("help", "stages").stdout == clpipe("stages", "--help").stdout
+    assert clpipe("help").stdout == clpipe("--help").stdout
+    assert "noiseprofiles.json" in clpipe("help", "cameras", "import").stdout
+
+
+def test_a_part_of_a_name_lists_the_cameras(clpipe):
+    assert len(json.loads(clpipe("cameras", "Canon 5D Mark", "--json").stdout)) == 3
+    assert "canon-80d" in clpipe("cameras", "canon").stdout
+    assert "canon-80d" not in clpipe("cameras", "nikon").stdout
+
+
+INPUTS = {
+    "run": "run {} -o out",
+    "explore": "explore {}",
+    "meter": "meter {} -o a.csv",
+    "measure": "measure {}",
+    "measure --truth": "measure render.exr --truth {}",
+    "replay": "replay {} -o out",
+    "replay INPUT": "replay render.exr {} -o out",
+    "dataset": "dataset {} -o set",
+    "match": "match {} -o a.toml",
+    "match --mean": "match render.exr --mean {} -o a.toml",
+    "compare": "compare {} -o a.png",
+    "calibrate": "calibrate {} -o a.toml",
+    "calibrate --dark": "calibrate render.exr --dark {} -o a.toml",
+    "calibrate --emva": "calibrate --emva {} -o a.toml",
+    "cameras import": "cameras import {}",
+    "report": "report {}",
+    "poses": "poses {}",
+    "--poses": "run render.exr -o out --poses {}",
+    "--annotations": "run render.exr -o out --annotations {}",
+    "--stage-file": "stages --stage-file {}.py",
+    "--camera": "plan --camera {}.toml",
+    "--config": "plan -c {}.toml",
+}
+
+
+@pytest.mark.parametrize("words", INPUTS.values(), ids=INPUTS)
+def test_a_missing_input_has_one_status_and_one_line(clpipe, folder, words):
+    said = clpipe(*words.format("gone").split(), status=2).stderr
+    assert said.startswith("clpipe: gone") and IS_MISSING in said
+    assert len(said.splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", ["jpeg", "TIFF", "tiff16"])
+def test_formats_have_other_names(clpipe, folder, name):
+    usual = {"jpeg": "jpg", "TIFF": "tif", "tiff16": "tif16"}[name]
+    clpipe(*RUN, "--device", "numpy", "--format", name)
+    record = json.loads(Path("out/render.json").read_text())
+    assert record["request"]["formats"] == [usual]
