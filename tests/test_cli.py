@@ -354,6 +354,15 @@ def test_bench(clpipe):
     assert "expected WIDTHxHEIGHT" in clpipe("bench", "--size", "big", status=2).stderr
 
 
+@pytest.mark.parametrize(
+    "asked", ["--start-at normalize", "--start-at demosaic", "--stages normalize,white_balance"]
+)
+def test_bench_makes_an_input_that_the_chain_starts_on(clpipe, asked):
+    size = ("--size", "64x48", "--repeat", 1, "--json")
+    record = json.loads(clpipe("bench", *size, *asked.split()).stdout)
+    assert record["launches"][0]["name"].startswith(asked.split()[1].partition(",")[0])
+
+
 @pytest.mark.slow
 def test_bench_of_methods(clpipe):
     options = ("--size", "320x200", "--repeat", 1)
